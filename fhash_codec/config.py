@@ -1,0 +1,84 @@
+"""What the user can set for an encoding: one frozen record whose fields carry their own help and limits.
+
+The command line takes the names, defaults and help of its options from these fields, so that there is one place to read and to change.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+from fhash_formats.errors import InputError
+
+TABLE_TYPES = ("float32", "float16", "uint8")
+ENGINES = ("slab", "naive")
+
+
+def setting(
+    default: Any, help: str, *, choices: tuple[str, ...] = (), low: float | None = None, high: float | None = None, option: str = ""
+) -> Any:
+    """A dataclass field with its help (unit and range included), its allowed values, and its command-line name where that differs."""
+    return dataclasses.field(default=default, metadata={"help": help, "choices": choices, "low": low, "high": high, "option": option})
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncodeConfig:
+    """Settings of `encode`; raises InputError for a value that is not allowed."""
+
+    profile: str = setting("paper", "model and training: 'paper' is the published F-Hash", choices=("paper",))
+    features: tuple[str, ...] = setting(
+        ("all",), "what to keep: interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE or all; repeat to merge several", option="feature"
+    )
+    dilation: int = setting(1, "vertices by which features grow in every direction", low=0, high=64)
+    key_frames: str = setting("all", "steps to train on: all, every:K, auto:N (N chosen by interpolation error) or a list such as 0,4,9")
+    fold: int = setting(2, "ratio of resolution from one level to the next", low=2, high=64)
+    embedding_size: int = setting(2, "numbers trained at each grid corner", low=1, high=16)
+    hidden_layers: int = setting(1, "hidden layers of the network", low=0, high=8)
+    width: int = setting(64, "neurons of each hidden layer", low=1, high=1024)
+    epochs: int = setting(20, "passes over the coreset", low=0, high=100_000)
+    learning_rate: float = setting(0.01, "Adam's learning rate at the start", low=1e-8, high=1.0)
+    schedule: str = setting("cosine", "course of the learning rate over the training", choices=("cosine", "constant"))
+    batch: int = setting(0, "samples per training step, 0 for a size that suits the data", low=0, high=2**31)
+    psnr: float | None = setting(None, "promise of quality in dB over the coreset of all steps; missing it ends with exit code 3", low=0.0, high=400.0)
+    tables: str = setting("float16", "number type of the stored tables", choices=TABLE_TYPES)
+    engine: str = setting("auto", "training engine", choices=("auto", *ENGINES))
+    device: str = setting("auto", "where to train", choices=("auto", "cpu", "cuda"))
+    seed: int = setting(0, "seed of every random choice", low=0, high=2**63 - 1)
+    timings: bool = setting(True, "store seconds with the training history; without them the same input gives the same bytes")
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            _check(field, getattr(self, field.name))
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values by field name; `from_dict` gives the same record back."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> EncodeConfig:
+        """A record from `to_dict`'s values; an unknown name raises InputError that offers the nearest known one."""
+        known = [field.name for field in dataclasses.fields(cls)]
+        for name in values:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
+                raise InputError(f"unknown setting '{name}'; did you mean '{near[0]}'?")
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+
+
+def _check(field: dataclasses.Field[Any], value: Any) -> None:
+    limits = field.metadata
+    name = (limits["option"] or field.name).replace("_", "-")
+    if limits["choices"] and value not in limits["choices"]:
+        raise InputError(f"{name} is '{value}'; allowed: {', '.join(limits['choices'])}")
+    if limits["low"] is not None and value is not None:
+        low, high = cast(float, limits["low"]), cast(float, limits["high"])
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or not low <= value <= high:
+            raise InputError(f"{name} is {value}; allowed: {low:g} to {high:g}")
+        if isinstance(field.default, int) and not isinstance(value, int):
+            raise InputError(f"{name} is {value}; a whole number is needed")
+    if field.name == "features" and not value:
+        raise InputError("feature is empty; name at least one, such as 'all'")

@@ -1,0 +1,1 @@
+"""Engines: how the network is trained and evaluated; same results, different speed."""
