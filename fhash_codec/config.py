@@ -31,7 +31,9 @@ class EncodeConfig:
 
     profile: str = setting("paper", "model and training: 'paper' is the published F-Hash", choices=("paper",))
     features: tuple[str, ...] = setting(
-        ("all",), "what to keep: interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE or all; repeat to merge several", option="feature"
+        ("all",),
+        "what to keep: interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE or all; repeat to merge several",
+        option="feature",
     )
     dilation: int = setting(1, "vertices by which features grow in every direction", low=0, high=64)
     key_frames: str = setting("all", "steps to train on: all, every:K, auto:N (N chosen by interpolation error) or a list such as 0,4,9")
@@ -43,7 +45,9 @@ class EncodeConfig:
     learning_rate: float = setting(0.01, "Adam's learning rate at the start", low=1e-8, high=1.0)
     schedule: str = setting("cosine", "course of the learning rate over the training", choices=("cosine", "constant"))
     batch: int = setting(0, "samples per training step, 0 for a size that suits the data", low=0, high=2**31)
-    psnr: float | None = setting(None, "promise of quality in dB over the coreset of all steps; missing it ends with exit code 3", low=0.0, high=400.0)
+    psnr: float | None = setting(
+        None, "promise of quality in dB over the coreset of all steps; missing it ends with exit code 3", low=0.0, high=400.0
+    )
     tables: str = setting("float16", "number type of the stored tables", choices=TABLE_TYPES)
     engine: str = setting("auto", "training engine", choices=("auto", *ENGINES))
     device: str = setting("auto", "where to train", choices=("auto", "cpu", "cuda"))
@@ -66,7 +70,8 @@ class EncodeConfig:
             if name not in known:
                 near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
                 raise InputError(f"unknown setting '{name}'; did you mean '{near[0]}'?")
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+        given: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+        return cls(**given)
 
 
 def _check(field: dataclasses.Field[Any], value: Any) -> None:

@@ -1,0 +1,28 @@
+# Everything runs in .venv, which is made (or brought up to date) on the first call. Needs python3 >= 3.11 with venv and pip.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test clean
+
+# Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png.
+demo: .venv/.stamp
+	$(BIN)/fhash demo -o demo --force
+
+test: .venv/.stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+# torch comes first and alone: where pip has more than one build of the pinned version (a CPU wheel beside the one with CUDA),
+# the choice is made before any other requirement counts.
+.venv/.stamp: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit("fhash needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv build dist demo *.egg-info .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,168 @@
+"""`fhash decode`: a region of a container at any steps or times, as a file or as a short table of statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from fhash_cli.options import IntervalsType, SliceType, check_writable, force_option, json_option, quiet_option, run_argument
+from fhash_cli.output import Progress, emit, extent, listed, number, spans, table
+from fhash_cli.selection import Span, coordinates, region_of, region_of_box, steps_of
+from fhash_formats.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from fhash_codec import Volume
+
+TYPES = ("float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")
+
+
+@click.command("decode")
+@run_argument
+@click.option("--t", "steps", type=SliceType(), help="Steps, half-open as in Python: 42, 40:50, ::2, -1. Default: all.")
+@click.option("--time", "times", metavar="T", type=float, multiple=True, help="A physical time, between steps too; may be repeated.")
+@click.option("--roi", metavar="z0:z1,y0:y1,x0:x1", type=IntervalsType(int), help="Region in vertices, half-open as in Python.")
+@click.option("--box", metavar="z0:z1,y0:y1,x0:x1", type=IntervalsType(float), help="Region in physical positions, both ends included.")
+@click.option("-o", "output", metavar="OUT", type=click.Path(), help="File to write: .npy, .h5, .nc, .zarr, .raw, .vti, .vtr or .pvd.")
+@click.option("--outside", type=click.Choice(["nan", "background"]), default="nan", show_default=True, help="Values outside the coreset.")
+@click.option("--dtype", type=click.Choice(TYPES), help="Convert the values; integers are rounded and clipped to the type's range.")
+@force_option
+@json_option
+@quiet_option
+def command(
+    run: str,
+    steps: slice | None,
+    times: tuple[float, ...],
+    roi: Sequence[Sequence[int | None]] | None,
+    box: Sequence[Sequence[float | None]] | None,
+    output: str | None,
+    outside: Literal["nan", "background"],
+    dtype: str | None,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Rebuild a region of RUN.fhz; without -o, print statistics of it."""
+    import numpy as np
+
+    import fhash_codec
+    from fhash_formats import Region, save_region
+
+    if steps is not None and times:
+        raise click.UsageError("--t and --time exclude each other")
+    if roi is not None and box is not None:
+        raise click.UsageError("--roi and --box exclude each other")
+    if output is not None:
+        check_writable(output, force, region=True)
+    with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
+        chosen = [volume.step_of_time(time) for time in times] if times else steps_of(volume, steps)
+        region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
+        kind = np.dtype(dtype or volume.dtype)
+        statistics = Statistics()
+
+        def frames() -> Iterator[npt.NDArray[Any]]:
+            for done, step in enumerate(chosen):
+                frame = volume.read(step, region, outside=outside)
+                statistics.add(frame, _inside(volume, step, region, frame, outside))
+                yield convert(frame, kind)
+                progress("decoding", done + 1, len(chosen))
+
+        z, y, x = (high - low for low, high in region)
+        shape = (len(chosen), z, y, x)
+        paths = []
+        if output is None:
+            for _ in frames():
+                pass
+        else:
+            whole = Region(
+                name=volume.name,
+                units=volume.units,
+                dtype=kind,
+                shape=shape,
+                coords=coordinates(volume, chosen, region),
+                attributes=volume.attrs,
+            )
+            paths = [str(path) for path in save_region(output, whole, frames(), force=force)]
+        result = {"paths": paths, "shape": shape, "dtype": kind.name, "steps": chosen, "region": region, **statistics.result()}
+        emit(result, table(_rows(result, volume.units)), as_json)
+
+
+class Statistics:
+    """Smallest, largest and mean value, and the share inside the coreset, of frames that are seen one at a time; NaN is left out."""
+
+    def __init__(self) -> None:
+        self.low, self.high, self.sum = float("inf"), float("-inf"), 0.0
+        self.values = self.inside = self.all = 0
+
+    def add(self, frame: npt.NDArray[Any], inside: int) -> None:
+        """Take in a frame of any shape, `inside` of whose vertices belong to the coreset."""
+        import numpy as np
+
+        known = frame[~np.isnan(frame)]
+        self.all += frame.size
+        self.inside += inside
+        self.values += known.size
+        if known.size:
+            self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
+            self.sum += float(known.sum(dtype=np.float64))
+
+    def result(self) -> dict[str, float | None]:
+        """JSON values; None where no vertex has a value."""
+        found = self.values > 0
+        return {
+            "min": self.low if found else None,
+            "max": self.high if found else None,
+            "mean": self.sum / self.values if found else None,
+            "coreset_fraction": self.inside / self.all,
+        }
+
+
+def convert(frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any]) -> npt.NDArray[Any]:
+    """A decoded frame in another number type: rounded and clipped for integers; raises InputError where the type cannot hold a value."""
+    import numpy as np
+
+    if kind == frame.dtype:
+        return frame
+    if kind.kind == "f":
+        with np.errstate(over="ignore"):
+            narrow = frame.astype(kind)
+        if np.isinf(narrow).any():
+            raise InputError(f"a value of {float(np.nanmax(np.abs(frame))):.6g} does not fit {kind}; choose a wider type")
+        return narrow
+    if np.isnan(frame).any():
+        raise InputError(
+            f"the region holds vertices without a value (NaN), which {kind} cannot hold; add --outside background, or take a float type"
+        )
+    limits = np.iinfo(kind)
+    rounded = np.rint(frame.astype(np.float64))
+    # The largest 64-bit integers have no float64 of their own: the float of the limit lies one above it.
+    full = rounded >= float(limits.max)
+    whole = np.where(full, 0.0, np.maximum(rounded, float(limits.min))).astype(kind)
+    whole[full] = limits.max
+    return np.asarray(whole)
+
+
+def _inside(volume: Volume, step: float, region: Sequence[Span], frame: npt.NDArray[Any], outside: str) -> int:
+    """How many vertices of a decoded frame belong to the coreset."""
+    import numpy as np
+
+    if outside == "nan":
+        return frame.size - int(np.isnan(frame).sum())
+    return int(volume.occupancy(step)[tuple(slice(*span) for span in region)].sum())
+
+
+def _rows(result: dict[str, Any], units: str) -> list[tuple[str, str]]:
+    return [
+        *(("written", path) for path in result["paths"]),
+        ("steps", listed([f"{step:g}" for step in result["steps"]])),
+        ("region", spans(result["region"])),
+        ("t, z, y, x", f"{extent(result['shape'])}, {result['dtype']}"),
+        ("smallest", number(result["min"], units, digits=6)),
+        ("largest", number(result["max"], units, digits=6)),
+        ("mean", number(result["mean"], units, digits=6)),
+        ("in the coreset", f"{result['coreset_fraction']:.3%}"),
+    ]

@@ -1,0 +1,38 @@
+"""`fhash diff`: the quality of a container, measured on the file against the data, with gates for scripts."""
+
+from __future__ import annotations
+
+import click
+
+from fhash_cli.options import SourceOptions, json_option, quiet_option, run_argument, series_options
+from fhash_cli.output import Progress, emit, extent, number, quality_rows, size, table
+
+
+@click.command("diff")
+@click.argument("data", type=click.Path())
+@run_argument
+@series_options
+@click.option("--min-psnr", metavar="DB", type=click.FloatRange(0), help="Exit code 3 if the PSNR in the coreset is below this.")
+@click.option("--max-error", metavar="E", type=click.FloatRange(0), help="Exit code 3 if the largest error in the coreset is above this.")
+@json_option
+@quiet_option
+def command(
+    data: str, run: str, source: SourceOptions, min_psnr: float | None, max_error: float | None, as_json: bool, quiet: bool
+) -> None:
+    """Compare RUN.fhz with the DATA it was made from, over all steps."""
+    import fhash_codec
+    from fhash_formats.errors import QualityError
+
+    with source.open(data) as series, Progress(quiet=quiet) as progress:
+        report = fhash_codec.diff(series, run, progress=progress)
+    rows = [
+        ("size", f"{size(report['bytes'])} of {size(report['raw_bytes'])}, {number(report['ratio'])}x smaller"),
+        ("steps, z, y, x", extent(report["shape"])),
+        *quality_rows(report, series.units),
+    ]
+    emit(report, table(rows), as_json)
+    # No PSNR is defined where nothing differs, which meets any gate, and where the data are constant, which meets none.
+    if min_psnr is not None and report["rmse"] != 0 and not (report["psnr"] is not None and report["psnr"] >= min_psnr):
+        raise QualityError(f"{run}: PSNR {number(report['psnr'], 'dB')} in the coreset; at least {min_psnr:g} dB was asked for")
+    if max_error is not None and not report["max_abs_error"] <= max_error:
+        raise QualityError(f"{run}: largest error {report['max_abs_error']:.6g} in the coreset; at most {max_error:g} was asked for")

@@ -1,0 +1,61 @@
+"""`fhash encode`: a series in, a container out."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fhash_cli.options import SourceOptions, check_writable, config_options, force_option, json_option, quiet_option, series_options
+from fhash_cli.output import Progress, emit, extent, number, quality_rows, size, spans, table
+from fhash_formats.errors import QualityError
+
+if TYPE_CHECKING:
+    from fhash_codec.config import EncodeConfig
+
+
+@click.command("encode")
+@click.argument("data", type=click.Path())
+@click.option("-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write.")
+@series_options
+@config_options()
+@force_option
+@json_option
+@quiet_option
+def command(data: str, output: str, source: SourceOptions, config: EncodeConfig, force: bool, as_json: bool, quiet: bool) -> None:
+    """Find the features of DATA, fit a network to them and write it as RUN.fhz.
+
+    DATA is a file of HDF5, NetCDF, numpy or raw values, a Zarr folder, or a pattern of such files in quotes ('step_*.raw').
+    Ctrl-C saves a checkpoint beside RUN.fhz; the same command goes on from it.
+    """
+    import fhash_codec
+    from fhash_codec.report import report as figures
+
+    check_writable(output, force)
+    with source.open(data) as series, Progress(quiet=quiet) as progress:
+        missed, begun = None, time.perf_counter()
+        try:
+            report = fhash_codec.encode(series, output, config, force=force, progress=progress)
+        except QualityError as error:
+            # The file is written, and how far it is from the promise is a result all the same.
+            missed = error
+            with fhash_codec.open(output) as volume:
+                report = figures(volume, volume.info["quality"], seconds=time.perf_counter() - begun)
+    emit(report, table(report_rows(report, series.units)), as_json)
+    if missed is not None:
+        raise missed
+
+
+def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
+    """An encoding's report as a table."""
+    return [
+        ("written", str(report["path"])),
+        ("size", f"{size(report['bytes'])} of {size(report['raw_bytes'])}, {number(report['ratio'])}x smaller"),
+        ("steps, z, y, x", extent(report["shape"])),
+        ("key frames", str(len(report["key_frames"]))),
+        ("coreset", f"{report['coreset_fraction']:.3%} of the domain, in {spans(report['feature_bounding_box'])}"),
+        *quality_rows(report, units),
+        ("network", f"{report['parameters']:,} parameters, {report['epochs']} epochs, {report['profile']}"),
+        ("time", f"{number(report['seconds'], 's', digits=3)} on {report['device']}"),
+    ]

@@ -1,0 +1,104 @@
+"""`fhash`: finds the command, runs it, and turns whatever goes wrong into one line on stderr and an exit code.
+
+0 success; 1 failure; 2 usage or unsuitable input; 3 a quality gate missed; 4 damaged or unsupported file; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import traceback
+import warnings
+from typing import Any, cast
+
+import click
+
+from fhash_cli.output import describe_error, say, warn
+from fhash_formats.errors import InterruptedEncodingError
+
+COMMANDS = {
+    "encode": "fit a series and write it as RUN.fhz",
+    "decode": "rebuild a region of RUN.fhz, at any time",
+    "info": "say what RUN.fhz holds and how good it is",
+    "verify": "read and check every part of RUN.fhz",
+    "diff": "measure RUN.fhz against the data it was made from",
+    "demo": "simulate, encode, decode, compare, draw",
+    "bench": "measure speed on this machine",
+}
+"""Each command's line of help. Its module `fhash_cli.NAME` is imported when it is used, so that `--help` is quick."""
+
+
+class Program(click.Group):
+    """The commands of COMMANDS, imported when used; `main` ends the process with the exit codes above and never with a traceback."""
+
+    def list_commands(self, context: click.Context) -> list[str]:
+        """Names in the order of COMMANDS."""
+        return list(COMMANDS)
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        """The click command of a name; None for a name that is unknown."""
+        if name not in COMMANDS:
+            return None
+        return cast(click.Command, importlib.import_module(f"fhash_cli.{name}").command)
+
+    def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        """The list of commands for `--help`, without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+    def invoke(self, context: click.Context) -> Any:
+        """Run the command; warnings go to stderr as one line, Ctrl-C becomes an error before click prints lines of its own about it."""
+        with warnings.catch_warnings():
+            warnings.showwarning = warn
+            try:
+                return super().invoke(context)
+            except KeyboardInterrupt:
+                raise InterruptedEncodingError("interrupted") from None
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """Run the command line and raise SystemExit."""
+        try:
+            result = super().main(*args, **{**extra, "standalone_mode": False})
+        except Exception as error:
+            if os.environ.get("FHASH_DEBUG"):
+                traceback.print_exc(file=sys.stderr)
+            line, code = describe_error(error)
+            say(f"error: {line}")
+            sys.exit(code)
+        # Of a command that ends early (--help, --version) click returns the exit code; the commands themselves return None.
+        sys.exit(result if isinstance(result, int) else 0)
+
+
+@click.group(cls=Program, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.version_option(package_name="fhash", message="%(prog)s %(version)s")
+@click.pass_context
+def program(context: click.Context) -> None:
+    """A codec for time-varying volumes: keeps the features you name, reads back any region at any time.
+
+    Results go to stdout (one JSON object with --json), log and progress to stderr.
+    Exit codes: 0 success, 1 failure, 2 usage or unsuitable input, 3 quality gate missed, 4 damaged or unsupported file, 130 interrupted.
+    """
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help(), err=True)
+        context.exit(2)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    try:
+        program(prog_name="fhash")
+    finally:
+        _settle_stdout()
+
+
+def _settle_stdout() -> None:
+    """Flush stdout; where it is full or closed, drop what is left, or the interpreter prints a traceback of its own while it ends."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+
+if __name__ == "__main__":
+    main()

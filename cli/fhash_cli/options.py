@@ -1,0 +1,170 @@
+"""Options that several commands share, and the values they are written in: slices, regions, and every setting of an encoding."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fhash_formats.errors import InputError, OutputError
+
+Command = Callable[..., None]
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+force_option = click.option("--force", is_flag=True, help="Replace an output that exists.")
+quiet_option = click.option("-q", "--quiet", is_flag=True, help="No progress on stderr.")
+run_argument = click.argument("run", metavar="RUN.fhz", type=click.Path())
+
+
+def check_writable(path: str | Path, force: bool, *, region: bool = False) -> None:
+    """Refuse an output (of `save_region` with `region`) before any work: it exists, its folder is missing, it cannot be replaced.
+
+    Raises InputError throughout (exit code 2), since nothing has failed yet but the command as it was written.
+    """
+    from fhash_formats import save_check
+    from fhash_formats.writers.atomic import check_output
+
+    try:
+        (save_check if region else check_output)(Path(path), force)
+    except OutputError as error:
+        raise InputError(str(error)) from error
+
+
+class SliceType(click.ParamType[slice]):
+    """Indices as in Python, `A:B:S` with any part left out, or a single one; a step is positive."""
+
+    name = "A:B:S"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> slice:
+        """The slice that a text stands for; `-1` is `slice(-1, None)`, the last."""
+        if isinstance(value, slice):
+            return value
+        try:
+            return parse_slice(str(value))
+        except ValueError:
+            self.fail(f"'{value}' is not an index or a half-open range A:B or A:B:S of indices, such as 4, 40:50, 10: or ::2", param, ctx)
+
+
+class IntervalsType(click.ParamType[tuple[Any, ...]]):
+    """Three intervals `z0:z1,y0:y1,x0:x1`; an end left out is the end of the domain. Of indices, or of positions (`number=float`)."""
+
+    def __init__(self, number: type[int] | type[float]) -> None:
+        self.number = number
+        self.name = "z0:z1,y0:y1,x0:x1"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
+        """((z0, z1), (y0, y1), (x0, x1)), None for an end left out."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            intervals = tuple(tuple(self.number(end) if end.strip() else None for end in part.split(":")) for part in str(value).split(","))
+        except ValueError:
+            intervals = ()
+        if [len(interval) for interval in intervals] != [2, 2, 2]:
+            example = "0:16,:,8:24" if self.number is int else "0:0.5,:,1.5:2"
+            self.fail(f"'{value}' is not z0:z1,y0:y1,x0:x1, where an end may be left out, such as {example}", param, ctx)
+        return intervals
+
+
+def parse_slice(text: str) -> slice:
+    """`A:B:S` or one index as a slice; raises ValueError."""
+    parts = [int(part) if part.strip() else None for part in text.split(":")]
+    if len(parts) == 1 and parts[0] is not None:
+        index = parts[0]
+        return slice(index, index + 1 if index != -1 else None)
+    if len(parts) not in (2, 3) or (len(parts) == 3 and parts[2] is not None and parts[2] < 1):
+        raise ValueError(text)
+    return slice(*parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions:
+    """How to read the data: the options that `series_options` adds."""
+
+    var: str | None
+    axes: str | None
+    t: slice | None
+    shape: str | None
+    dtype: str | None
+    endian: str | None
+
+    def open(self, path: str) -> Any:
+        """The Series at a path; the caller closes it."""
+        from fhash_formats import RawLayout, open_series, parse_shape
+
+        raw = RawLayout(shape=None if self.shape is None else parse_shape(self.shape), dtype=self.dtype, endian=self.endian)
+        return open_series(path, var=self.var, axes=self.axes, steps=self.t, raw=raw)
+
+
+def series_options(command: Command) -> Command:
+    """Add the options of SourceOptions; the command gets them as `source`."""
+
+    @click.option("--var", metavar="NAME", help="Which variable or dataset of the file.")
+    @click.option("--axes", metavar="t,z,y,x", help="What the file's dimensions are, in its own order; letters left out have length 1.")
+    @click.option("--t", "t", type=SliceType(), help="Only these steps, half-open as in Python: 40:50, ::2.")
+    @click.option("--shape", metavar="x=64,y=64,z=32,t=10", help="Lengths of a raw file, the fastest axis first.")
+    @click.option("--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8.")
+    @click.option("--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file.")
+    @functools.wraps(command)
+    def collected(**values: Any) -> None:
+        names = [field.name for field in dataclasses.fields(SourceOptions)]
+        command(source=SourceOptions(**{name: values.pop(name) for name in names}), **values)
+
+    return collected
+
+
+def config_options(*names: str) -> Callable[[Command], Command]:
+    """Add an option for every field of EncodeConfig, or for those named, from the field's own help, choices and range.
+
+    The command gets an EncodeConfig as `config`.
+    """
+    from fhash_codec.config import EncodeConfig
+
+    fields = [field for field in dataclasses.fields(EncodeConfig) if not names or field.name in names]
+    hints = typing.get_type_hints(EncodeConfig)
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def collected(**values: Any) -> None:
+            config = EncodeConfig.from_dict({field.name: values.pop(field.name) for field in fields})
+            command(config=config, **values)
+
+        decorated: Command = collected
+        for field in reversed(fields):
+            decorated = _setting(field, hints[field.name])(decorated)
+        return decorated
+
+    return decorate
+
+
+def _setting(field: dataclasses.Field[Any], hint: Any) -> Callable[[Command], Command]:
+    """The click option of one field of EncodeConfig."""
+    limits = field.metadata
+    flag = "--" + (limits["option"] or field.name).replace("_", "-")
+    text = limits["help"][0].upper() + limits["help"][1:] + "."
+    if hint is bool:
+        return click.option(f"{flag}/--no-{flag[2:]}", field.name, default=field.default, show_default=True, help=text)
+    multiple = typing.get_origin(hint) is tuple
+    kind: Any = next(inner for inner in (typing.get_args(hint) or (hint,)) if inner is not type(None))
+    metavar = None
+    if limits["choices"]:
+        kind = click.Choice(limits["choices"])
+    elif limits["low"] is not None:
+        metavar = "N" if kind is int else "X"
+        kind = click.IntRange(int(limits["low"]), int(limits["high"])) if kind is int else click.FloatRange(limits["low"], limits["high"])
+    return click.option(
+        flag,
+        field.name,
+        type=kind,
+        default=field.default,
+        show_default=field.default is not None,
+        multiple=multiple,
+        metavar=metavar,
+        help=text,
+    )

@@ -1,0 +1,162 @@
+"""What the command line prints: results on stdout (a table, or one JSON object), log, progress and errors on stderr."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, TextIO
+
+import click
+
+from fhash_formats.errors import FhashError
+
+QUIET_SECONDS = 2.0
+"""Stages shorter than this show no progress."""
+
+
+def say(message: str) -> None:
+    """One line on stderr."""
+    click.echo(f"fhash: {message}", err=True)
+
+
+def warn(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None, line: str | None = None
+) -> None:
+    """A Python warning as one line on stderr; the signature is that of `warnings.showwarning`."""
+    say(f"warning: {' '.join(str(message).split())}")
+
+
+def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
+    """The result on stdout: one JSON object in one line, or the text for people."""
+    click.echo(json.dumps(result, allow_nan=False) if as_json else text)
+
+
+def table(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of equal length as aligned columns: the first to the left; others to the right where there are more than two."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+
+    def line(row: Sequence[str]) -> str:
+        first, *rest = row
+        others = rest if len(row) == 2 else [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
+        return "  ".join([first.ljust(widths[0]), *others]).rstrip()
+
+    return "\n".join(line(row) for row in rows)
+
+
+def size(count: float) -> str:
+    """Bytes for people, in decimal units."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 999.5:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} TB"
+
+
+def number(value: float | None, unit: str = "", *, digits: int = 4) -> str:
+    """A measured value with its unit, where it has one ("1" stands for none); None (not defined) as a dash."""
+    return "-" if value is None else f"{value:.{digits}g} {'' if unit == '1' else unit}".rstrip()
+
+
+def extent(shape: Sequence[int]) -> str:
+    """A shape such as 16 x 32 x 48 x 48."""
+    return " x ".join(map(str, shape))
+
+
+def spans(region: Sequence[Sequence[int]]) -> str:
+    """A region in space such as z 0:32, y 4:40, x 0:48."""
+    return ", ".join(f"{axis} {low}:{high}" for axis, (low, high) in zip("zyx", region, strict=True))
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in a row, those in the middle left out where there are many."""
+    return ", ".join(names if len(names) <= 8 else [*names[:6], "...", names[-1]])
+
+
+def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, str]]:
+    """Rows of the quality that `encode`, `diff` and `demo` share."""
+    exact = report["rmse"] == 0
+    return [
+        ("PSNR, coreset", "exact" if exact else number(report["psnr"], "dB")),
+        ("PSNR, domain", number(report["psnr_domain"], "dB")),
+        ("RMSE", number(report["rmse"], units)),
+        ("largest error", number(report["max_abs_error"], units)),
+        ("SSIM", number(report["ssim"])),
+    ]
+
+
+def describe_error(error: Exception) -> tuple[str, int]:
+    """One line that says what went wrong, and the exit code."""
+    if isinstance(error, FhashError):
+        line, code = str(error), error.exit_code
+    elif isinstance(error, click.ClickException):
+        context = getattr(error, "ctx", None)
+        hint = f" (see '{context.command_path} --help')" if context is not None else ""
+        line, code = error.format_message().rstrip(".") + hint, error.exit_code
+    elif isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # torch has its own
+        line, code = "out of memory; take fewer steps (--t), a smaller region or a smaller network", 1
+    elif isinstance(error, OSError) and error.strerror:
+        line, code = f"{error.strerror}: {error.filename}" if error.filename else error.strerror, 1
+    else:
+        line, code = f"unexpected {type(error).__name__}: {error}; please report this (FHASH_DEBUG=1 shows where it came from)", 1
+    return " ".join(line.split()), code
+
+
+class Progress:
+    """The progress callback (stage, done, total, note) of the codec: a bar on a terminal, else one line every 10 %.
+
+    Nothing is shown of the first QUIET_SECONDS of a stage, nor at all with `quiet`. A context manager: leaving it removes the bar.
+    """
+
+    def __init__(self, *, quiet: bool) -> None:
+        self.quiet = quiet
+        self.terminal = sys.stderr.isatty()
+        self.stage = ""
+        self.start = self.last = time.monotonic()
+        self.shown = 0.0
+        self.tenth = 0
+        self.drawn = False
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._erase()
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """Take note of `done` parts of `total` of a stage, with a remark such as "41.2 dB"."""
+        if self.quiet:
+            return
+        now = time.monotonic()
+        if stage != self.stage:
+            # The first report of a stage comes when its first part is done: it began with the end of the stage before.
+            self._erase()
+            self.stage, self.start, self.tenth = stage, self.last, 0
+        self.last = now
+        share = done / total if total else 1.0
+        passed = now - self.start
+        if passed < QUIET_SECONDS:
+            self.tenth = math.floor(10 * share)
+            return
+        left = f", {_clock(passed / share - passed)} left" if 0 < share < 1 else ""
+        remark = f", {note}" if note else ""
+        if self.terminal and (now - self.shown > 0.1 or share == 1):
+            filled = round(24 * share)
+            click.echo(f"\r{stage:10} {'#' * filled}{'-' * (24 - filled)} {share:4.0%}{remark}{left}\x1b[K", err=True, nl=False)
+            self.drawn, self.shown = True, now
+        elif not self.terminal and math.floor(10 * share) > self.tenth:
+            self.tenth = math.floor(10 * share)
+            say(f"{stage} {share:.0%}{remark}{left}")
+
+    def _erase(self) -> None:
+        if self.drawn:
+            click.echo("\r\x1b[K", err=True, nl=False)
+            self.drawn = False
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"

@@ -1,0 +1,76 @@
+"""What `--t`, `--time`, `--roi` and `--box` mean for one open container: steps, vertices, and the coordinates cut to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from fhash_formats.errors import RegionError
+
+if TYPE_CHECKING:
+    from fhash_codec import Volume
+    from fhash_formats.series import Coordinate
+
+Span = tuple[int, int]
+
+
+def steps_of(volume: Volume, chosen: slice | None) -> list[float]:
+    """Indices of the steps of a slice, all of them for None; raises RegionError for a slice that leaves the series or holds nothing."""
+    count = volume.shape[0]
+    chosen = chosen if chosen is not None else slice(None)
+    low, high = _span("--t", chosen.start, chosen.stop, count, f"the series has steps 0 to {count - 1}")
+    return [float(step) for step in range(low, high, chosen.step or 1)]
+
+
+def region_of(volume: Volume, roi: Sequence[Sequence[int | None]] | None) -> tuple[Span, Span, Span]:
+    """Vertices ((z0, z1), (y0, y1), (x0, x1)) of `--roi`, all of them for None; raises RegionError where it leaves the domain."""
+    roi = roi if roi is not None else ((None, None),) * 3
+    z, y, x = (
+        _span(f"--roi along {axis}", low, high, count, f"the domain has {count} vertices along {axis}")
+        for axis, (low, high), count in zip("zyx", roi, volume.shape[1:], strict=True)
+    )
+    return z, y, x
+
+
+def region_of_box(volume: Volume, box: Sequence[Sequence[float | None]]) -> tuple[Span, Span, Span]:
+    """The vertices whose positions lie in `--box`, ends included; raises RegionError where it leaves the domain or holds no vertex."""
+    z, y, x = (_vertices(volume, axis, *ends) for axis, ends in zip("zyx", box, strict=True))
+    return z, y, x
+
+
+def _vertices(volume: Volume, axis: str, low: float | None, high: float | None) -> Span:
+    import numpy as np
+
+    positions = volume.coords[axis].values
+    first, last = float(positions.min()), float(positions.max())
+    start, end = first if low is None else low, last if high is None else high
+    if not first <= start <= last or not first <= end <= last:
+        raise RegionError(f"--box along {axis} is {start:g}:{end:g}; the domain has positions {first:g} to {last:g}")
+    inside = np.flatnonzero((positions >= start) & (positions <= end))
+    if not inside.size:
+        raise RegionError(
+            f"--box along {axis} is {start:g}:{end:g}, which holds no vertex; the {positions.size} vertices lie further apart"
+        )
+    return int(inside[0]), int(inside[-1]) + 1
+
+
+def coordinates(volume: Volume, steps: Sequence[float], region: Sequence[Span]) -> dict[str, Coordinate]:
+    """The Coordinate of each axis cut to some (fractional) steps and a region."""
+    import numpy as np
+
+    from fhash_formats.series import Coordinate
+
+    whole = volume.coords
+    times = np.interp(steps, np.arange(volume.shape[0]), whole["t"].values)
+    values = {"t": times} | {axis: whole[axis].values[low:high] for axis, (low, high) in zip("zyx", region, strict=True)}
+    return {axis: Coordinate(name=whole[axis].name, values=cut, attributes=whole[axis].attributes) for axis, cut in values.items()}
+
+
+def _span(what: str, low: int | None, high: int | None, count: int, allowed: str) -> Span:
+    """Python's meaning of low:high among `count`, without its clipping."""
+    first = 0 if low is None else low + count if low < 0 else low
+    last = count if high is None else high + count if high < 0 else high
+    if not 0 <= first < last <= count:
+        written = f"{'' if low is None else low}:{'' if high is None else high}"
+        raise RegionError(f"{what} is {written}; {allowed}, and at least one must be chosen")
+    return first, last

@@ -1,0 +1,21 @@
+"""`fhash verify`: reads every part of a container and compares it with its checksums."""
+
+from __future__ import annotations
+
+import click
+
+from fhash_cli.options import json_option, quiet_option, run_argument
+from fhash_cli.output import Progress, emit
+
+
+@click.command("verify")
+@run_argument
+@json_option
+@quiet_option
+def command(run: str, as_json: bool, quiet: bool) -> None:
+    """Read and check every part of RUN.fhz; exit code 4 if it is damaged."""
+    import fhash_codec
+
+    with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
+        arrays = volume.verify(progress=progress)
+    emit({"path": run, "sound": True, "arrays": arrays}, f"{run}: sound, {arrays} arrays checked", as_json)

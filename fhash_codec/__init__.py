@@ -1,0 +1,82 @@
+"""fhash: a codec for time-varying volumes by feature-based tesseract grids (F-Hash).
+
+    import fhash_codec
+
+    fhash_codec.encode("run.h5", "run.fhz", fhash_codec.EncodeConfig(features=("interval:0.5:1",)))
+    with fhash_codec.open("run.fhz") as volume:
+        frame = volume[42]
+
+Names load on first use, so that importing the package is cheap; torch loads only when a model is trained.
+"""
+
+from __future__ import annotations
+
+import importlib
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+from fhash_formats.errors import (
+    DamagedFileError,
+    FhashError,
+    InputError,
+    InterruptedEncodingError,
+    MissingDependencyError,
+    MissingInputError,
+    OutputError,
+    OutputExistsError,
+    QualityError,
+    RegionError,
+    TrainingError,
+    UnsupportedFileError,
+)
+
+if TYPE_CHECKING:
+    from fhash_codec.comparison import diff
+    from fhash_codec.config import EncodeConfig
+    from fhash_codec.encoding import encode
+    from fhash_codec.selection import FhashWarning
+    from fhash_codec.volume import Volume, open
+
+__version__ = version("fhash")
+
+_HOMES = {
+    "EncodeConfig": "config",
+    "FhashWarning": "selection",
+    "Volume": "volume",
+    "diff": "comparison",
+    "encode": "encoding",
+    "open": "volume",
+}
+
+__all__ = [
+    "DamagedFileError",
+    "EncodeConfig",
+    "FhashError",
+    "FhashWarning",
+    "InputError",
+    "InterruptedEncodingError",
+    "MissingDependencyError",
+    "MissingInputError",
+    "OutputError",
+    "OutputExistsError",
+    "QualityError",
+    "RegionError",
+    "TrainingError",
+    "UnsupportedFileError",
+    "Volume",
+    "diff",
+    "encode",
+    "open",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'fhash_codec' has no attribute '{name}'")
+    value = getattr(importlib.import_module(f"fhash_codec.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

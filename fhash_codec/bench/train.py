@@ -1,0 +1,163 @@
+"""`fhash bench train`: the engines side by side on one series, in turns, so that a busy machine treats them alike."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+
+from fhash_codec.architecture import Architecture
+from fhash_codec.config import ENGINES, EncodeConfig
+from fhash_codec.coreset import Coreset
+from fhash_codec.engines import choose_device, make_engine
+from fhash_codec.progress import Progress, silent
+from fhash_codec.selection import Source, as_series, select
+from fhash_codec.train import Plan, plan_training, probe_psnr
+from fhash_formats.errors import InputError
+
+TURNS = 3
+INFER_SECONDS = 1.0
+
+
+def bench_train(
+    source: Source,
+    config: EncodeConfig | None = None,
+    *,
+    engines: Sequence[str] = ENGINES,
+    seconds: float = 12.0,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Measure engines on the coreset of a series; each trains for `seconds` in three turns, then evaluates lattice vertices.
+
+    Returns {"engines": [{engine, train_msamples_s, infer_msamples_s, fraction_of_peak, train_ratio, infer_ratio, psnr, epochs,
+    seconds}], "machine": {...}, "series", "samples", "batch_samples"}. Samples are coreset vertices; speeds are medians over the turns,
+    in 10^6 a second; ratios are to the naive engine of the same run. psnr: on the coreset after those seconds (dB, normalised values;
+    the learning rate falls to zero over each engine's own seconds). fraction_of_peak: arithmetic of the MLP alone over the rate of a
+    large float32 matrix product measured here.
+    Raises InputError for an unknown engine or seconds that are not positive.
+    """
+    config = config or EncodeConfig()
+    if seconds <= 0 or not engines:
+        raise InputError(f"seconds is {seconds:g} for {len(engines)} engines; a positive time and at least one engine are needed")
+    device = choose_device(config.device)
+    with as_series(source) as series:
+        selected = select(series, config, progress)
+        coreset, architecture = selected.coreset, selected.architecture
+        name = f"{series.source} {series.name}"
+    runs = [_Run(engine, architecture, coreset, config, seconds, device) for engine in engines]
+    for turn in range(TURNS):
+        for number, run in enumerate(runs):
+            run.train(seconds / TURNS)
+            run.infer(INFER_SECONDS)
+            progress("measuring", turn * len(runs) + number + 1, TURNS * len(runs), run.name)
+    peak = matrix_product_rate(device)
+    flops = 3 * 2 * sum(outputs * inputs for outputs, inputs in architecture.layer_shapes)
+    results = [run.result(flops, peak) for run in runs]
+    naive = next((result for result in results if result["engine"] == "naive"), None)
+    for result in results:
+        for kind in ("train", "infer"):
+            result[f"{kind}_ratio"] = result[f"{kind}_msamples_s"] / naive[f"{kind}_msamples_s"] if naive else None
+    return {
+        "engines": results,
+        "machine": machine(device) | {"matrix_product_gflops": peak / 1e9},
+        "series": name,
+        "samples": len(coreset.values),
+        "batch_samples": len(coreset.values) / runs[0].plan.batches,
+    }
+
+
+class _Run:
+    """One engine under measurement."""
+
+    def __init__(
+        self, name: str, architecture: Architecture, coreset: Coreset, config: EncodeConfig, seconds: float, device: torch.device
+    ) -> None:
+        self.name, self.coreset, self.device = name, coreset, device
+        self.counts = np.diff(coreset.offsets)
+        self.plan: Plan = plan_training(
+            coreset, epochs=1, learning_rate=config.learning_rate, schedule="constant", batch=config.batch, seed=config.seed
+        )
+        # A first step, not counted, says how many fit in the seconds; the cosine over them is set then.
+        rates = np.full(3, config.learning_rate)
+        engine = make_engine(name, architecture, coreset, rates, seed=config.seed, device=device)
+        for chosen in self.plan.order(0)[:2]:
+            begun = time.perf_counter()
+            engine.train(chosen)
+            self._wait()
+        steps = max(1, round(seconds / (time.perf_counter() - begun)))
+        # Longer than that, so that turns that run faster than the first step find a rate as well.
+        self.rates = np.full(8 * steps + 1, 0.0)
+        self.rates[: steps + 1] = config.learning_rate * (0.5 + 0.5 * np.cos(np.pi * np.arange(steps + 1) / steps))
+        self.engine = make_engine(name, architecture, coreset, self.rates, seed=config.seed, device=device)
+        self.train_speeds: list[float] = []
+        self.infer_speeds: list[float] = []
+        self.seconds = 0.0
+
+    def train(self, seconds: float) -> None:
+        """Go on with the training for some seconds."""
+        samples, begun = 0, time.perf_counter()
+        while (spent := time.perf_counter() - begun) < seconds and self.engine.step < len(self.rates) - 1:
+            epoch, batch = divmod(self.engine.step, self.plan.batches)
+            if batch == 0 or samples == 0:
+                batches = self.plan.order(epoch)
+            self.engine.train(batches[batch])
+            self._wait()
+            samples += int(self.counts[batches[batch]].sum())
+        self.seconds += spent
+        self.train_speeds.append(samples / spent)
+
+    def infer(self, seconds: float) -> None:
+        """Evaluate batches of bricks for some seconds."""
+        samples, begun, batches = 0, time.perf_counter(), self.plan.order(0)
+        number = 0
+        while (spent := time.perf_counter() - begun) < seconds or number == 0:
+            chosen = batches[number % len(batches)]
+            self.engine.infer(chosen)
+            self._wait()
+            samples, number = samples + int(self.counts[chosen].sum()), number + 1
+        self.infer_speeds.append(samples / spent)
+
+    def result(self, flops: int, peak: float) -> dict[str, Any]:
+        train = median(self.train_speeds)
+        probe = np.sort(np.random.default_rng(0).permutation(self.plan.bricks)[:256])
+        return {
+            "engine": self.name,
+            "train_msamples_s": train / 1e6,
+            "infer_msamples_s": median(self.infer_speeds) / 1e6,
+            "fraction_of_peak": train * flops / peak,
+            "psnr": probe_psnr(self.engine, self.coreset, probe),
+            "epochs": self.engine.step / self.plan.batches,
+            "seconds": self.seconds,
+        }
+
+    def _wait(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+
+
+def matrix_product_rate(device: torch.device, size: int = 1536) -> float:
+    """Arithmetic operations a second of a float32 matrix product of `size`, the best of five."""
+    a, b = torch.rand(size, size, device=device), torch.rand(size, size, device=device)
+    best = float("inf")
+    for _ in range(6):
+        begun = time.perf_counter()
+        float((a @ b)[0, 0])
+        best = min(best, time.perf_counter() - begun)
+    return 2 * size**3 / best
+
+
+def machine(device: torch.device) -> dict[str, Any]:
+    """What the figures were taken on."""
+    return {
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+        "processor": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+    }

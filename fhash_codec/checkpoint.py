@@ -1,0 +1,51 @@
+"""Interrupted training on disk: beside the output, named after what is being trained, so that only the same command goes on from it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.config import EncodeConfig
+from fhash_codec.coreset import Coreset
+from fhash_codec.train import Course
+from fhash_formats.errors import InputError
+from fhash_formats.writers.atomic import replacing
+
+# Settings that change neither the model nor the course of its training.
+UNRELATED = ("psnr", "tables", "timings")
+
+
+def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Path:
+    """Where the checkpoint of this training stands: `OUTPUT.<digest of coreset and settings>.checkpoint`."""
+    settings = {name: value for name, value in config.to_dict().items() if name not in UNRELATED}
+    digest = hashlib.sha256(json.dumps([settings, coreset.box, coreset.key_frames], sort_keys=True).encode())
+    for array in (coreset.values, coreset.bricks, coreset.mask_bits):
+        digest.update(array.data)
+    return output.with_name(f"{output.name}.{digest.hexdigest()[:12]}.checkpoint")
+
+
+def save_checkpoint(path: Path, state: Mapping[str, npt.NDArray[Any]], course: Course) -> None:
+    """Replace the checkpoint by this state; the old one stays until the new one is complete."""
+    text = np.frombuffer(json.dumps(asdict(course)).encode(), dtype=np.uint8)
+    with replacing(path, force=True) as temporary, temporary.open("wb") as file:
+        np.savez(file, course=text, **state)  # type: ignore[arg-type]
+
+
+def load_checkpoint(path: Path) -> tuple[dict[str, npt.NDArray[Any]], Course] | None:
+    """The state and course saved at `path`, or None where there is none; InputError for one that cannot be read."""
+    if not path.exists():
+        return None
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            state = {name: file[name] for name in file.files}
+        return state, Course(**json.loads(state.pop("course").tobytes()))
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise InputError(f"checkpoint {path} cannot be read; delete it to train from the start") from error

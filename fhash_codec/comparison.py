@@ -1,0 +1,31 @@
+"""Comparing a container with the series it stands for."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from fhash_codec.metrics import measure_quality
+from fhash_codec.progress import Progress, silent
+from fhash_codec.report import report
+from fhash_codec.selection import Source, as_series
+from fhash_codec.volume import open as open_volume
+from fhash_formats.errors import InputError
+
+
+def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> dict[str, Any]:
+    """Decode every step of the container `path` and measure it against the data; the figures of `report`.
+
+    Raises InputError if the shapes differ, DamagedFileError for a damaged container.
+    """
+    begun = time.perf_counter()
+    with as_series(source) as series, open_volume(path) as volume:
+        if series.shape != volume.shape:
+            raise InputError(
+                f"{series.source} has shape {series.shape}, {path} has {volume.shape} in (t, z, y, x); give the same --var, --axes, --t"
+            )
+        quality = measure_quality(
+            series.read, volume.read, series.shape[0], volume.value_range.high - volume.value_range.low, volume.background, progress
+        )
+        return report(volume, quality.to_dict(), seconds=time.perf_counter() - begun)

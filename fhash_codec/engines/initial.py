@@ -1,0 +1,55 @@
+"""Where training starts, the same for every engine and device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import prod
+
+import torch
+from torch import Tensor
+
+from fhash_codec.architecture import Architecture
+from fhash_codec.coreset import Coreset
+
+SPREAD = 1e-4  # of the initial embeddings, uniform in -SPREAD .. SPREAD (Mueller et al. 2022, section 4)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The trained numbers of a model.
+
+    fine: embeddings of the finest level (bricks, E, vertices of a brick), only for bricks that hold coreset vertices.
+    flat: coarse tables level by level, each (buckets, E), then each layer's weight (out, in) and bias (out,), all in one vector.
+    """
+
+    fine: Tensor
+    flat: Tensor
+
+    def dense(self, architecture: Architecture) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
+        """The coarse tables (buckets, E) and the layers (weight (out, in), bias (out,)), views into `flat`."""
+        size = architecture.embedding_size
+        tables, layers = split(architecture, self.flat)
+        return [table.view(-1, size) for table in tables], layers
+
+
+def split(architecture: Architecture, flat: Tensor) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
+    """Views of the coarse tables (flat, level by level) and of the layers (weight, bias) inside one vector."""
+    tables = [prod(level) * architecture.embedding_size for level in architecture.levels[1:]]
+    layers = [n for outputs, inputs in architecture.layer_shapes for n in (outputs * inputs, outputs)]
+    parts = list(torch.split(flat, [*tables, *layers]))
+    weights, biases = parts[len(tables) :: 2], parts[len(tables) + 1 :: 2]
+    shapes = architecture.layer_shapes
+    return parts[: len(tables)], [(w.view(shape), b) for w, b, shape in zip(weights, biases, shapes, strict=True)]
+
+
+def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) -> Parameters:
+    """Uniform embeddings and layers (uniform in +-1/sqrt(inputs), torch's own start), float32 on the CPU."""
+    random = torch.Generator().manual_seed(seed)
+    fine = torch.empty(len(coreset.bricks), architecture.embedding_size, prod(coreset.brick_shape))
+    fine.uniform_(-SPREAD, SPREAD, generator=random)
+    coarse = sum(prod(level) for level in architecture.levels[1:]) * architecture.embedding_size
+    parts = [torch.empty(coarse).uniform_(-SPREAD, SPREAD, generator=random)]
+    for outputs, inputs in architecture.layer_shapes:
+        bound = inputs**-0.5
+        parts.append(torch.empty(outputs * (inputs + 1)).uniform_(-bound, bound, generator=random))
+    return Parameters(fine=fine, flat=torch.cat(parts))

@@ -1,0 +1,35 @@
+"""The figures of a container, the same from `encode` and from `diff`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fhash_codec.volume import Volume
+
+
+def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[str, Any]:
+    """JSON values: sizes in bytes, quality in dB and data units (None where the error or the range is 0), how it was trained.
+
+    ratio: raw bytes / bytes of the whole file. psnr, rmse, max_abs_error, ssim: over the coreset of all steps, also those between key
+    frames; *_domain: over every finite vertex, the background standing outside the coreset. curve: the training history.
+    seconds: of the whole job that was reported on.
+    """
+    info = volume.info
+    return {
+        "path": str(volume.path),
+        "bytes": info["bytes"],
+        "raw_bytes": info["raw_bytes"],
+        "ratio": info["ratio"],
+        **{name: quality[name] for name in ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain")},
+        "seconds": seconds,
+        "epochs": info["training"]["epochs"],
+        "curve": info["history"],
+        "shape": info["domain"]["shape"],
+        "key_frames": info["key_frames"],
+        "feature_bounding_box": info["feature_bounding_box"],
+        "coreset_fraction": info["coreset_fraction"],
+        "parameters": info["model"]["parameters"],
+        "profile": info["model"]["profile"],
+        "device": info["training"]["device"],
+        "quality": quality,
+    }

@@ -1,0 +1,138 @@
+"""A trained model and its coreset as arrays of a container, and back. numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import prod
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.architecture import Architecture
+from fhash_codec.coreset import Coreset
+from fhash_codec.network import Network
+from fhash_formats.container import Container, ContainerWriter, StoredArray
+from fhash_formats.errors import InputError
+
+CHUNK_BYTES = 2 << 20  # a time node in one chunk up to this size, in bricks above: each chunk has a fixed cost, each read a whole chunk
+TABLE_AXES = ("t", "z", "y", "x", "embedding")
+Floats = npt.NDArray[np.float32]
+
+
+def write_model(
+    writer: ContainerWriter,
+    architecture: Architecture,
+    coreset: Coreset,
+    fine: Floats,
+    tables: list[Floats],
+    layers: list[tuple[Floats, Floats]],
+    kind: str,
+) -> None:
+    """Write tables (as number type `kind`), MLP and occupancy.
+
+    fine: the finest embeddings (bricks, E, vertices of a brick); tables: the coarser ones (buckets, E);
+    layers: (weight (out, in), bias (out,)).
+    Raises InputError where the numbers do not fit in `kind`.
+    """
+    size = architecture.embedding_size
+    _write_table(
+        writer, 1, (*architecture.levels[0], size), fine, (finest_frame(coreset, fine, k) for k in range(architecture.key_frames)), kind
+    )
+    for number, (level, table) in enumerate(zip(architecture.levels[1:], tables, strict=True), start=2):
+        _write_table(writer, number, (*level, size), table, iter(table.reshape(*level, size)), kind)
+    for number, (weight, bias) in enumerate(layers, start=1):
+        writer.add_whole(f"mlp/weight_{number}", weight)
+        writer.add_whole(f"mlp/bias_{number}", bias)
+    bits = np.stack(coreset.occupancy)
+    writer.add_whole("occupancy/bits", bits, chunk_shape=(1, bits.shape[1]))
+
+
+def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
+    """The finest table (z, y, x, E) of one key frame from its bricks; 0 where no brick lies."""
+    size = fine.shape[1]
+    grid, shape = coreset.brick_grid, coreset.brick_shape
+    blocks = np.zeros((*grid, *shape, size), dtype=np.float32)
+    chosen = np.flatnonzero(coreset.bricks[:, 0] == key)
+    z, y, x = coreset.bricks[chosen, 1:].T
+    blocks[z, y, x] = np.moveaxis(fine[chosen].reshape(-1, size, *shape), 1, -1)
+    padded = blocks.transpose(0, 3, 1, 4, 2, 5, 6).reshape(*(g * s for g, s in zip(grid, shape, strict=True)), size)
+    return np.ascontiguousarray(padded[tuple(slice(high - low) for low, high in coreset.box)])
+
+
+def load_network(container: Container) -> Network:
+    """The model in a container, its tables read on demand."""
+    header = container.header
+    model = header["model"]
+    levels = tuple(tuple(level) for level in model["levels"])
+    layers = tuple(
+        (container.arrays[f"mlp/weight_{n}"].read(), container.arrays[f"mlp/bias_{n}"].read()) for n in range(1, model["hidden_layers"] + 2)
+    )
+    return Network(
+        levels=levels,
+        embedding_size=model["embedding_size"],
+        tables=[StoredTable(container.arrays[f"tables/level_{n}"]) for n in range(1, len(levels) + 1)],
+        layers=layers,
+        box_size=tuple(high - low for low, high in header["feature_bounding_box"]),
+        key_frames=levels[0][0],
+    )
+
+
+class StoredTable:
+    """A level's table in a container, as the decoder reads it."""
+
+    def __init__(self, array: StoredArray) -> None:
+        self.array = array
+        self.shape = array.shape
+        self.scale = np.float32(array.attributes.get("scale", 1.0))
+        self.offset = np.float32(array.attributes.get("offset", 0.0))
+
+    def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """Embeddings of a region: quantised ones as offset + scale * number, float32; others as they are stored."""
+        values = self.array.read(region)
+        return values if self.array.dtype.kind == "f" else values * self.scale + self.offset
+
+
+def table_chunk(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
+    """Chunk of a table (t, z, y, x, E): one time node, halved along its longest axis until it takes at most 2 MiB."""
+    chunk = [1, *shape[1:]]
+    while prod(chunk) * itemsize > CHUNK_BYTES and max(chunk[1:4]) > 1:
+        axis = 1 + int(np.argmax(chunk[1:4]))
+        chunk[axis] = -(-chunk[axis] // 2)
+    return tuple(chunk)
+
+
+def _write_table(writer: ContainerWriter, number: int, shape: tuple[int, ...], values: Floats, frames: Iterator[Floats], kind: str) -> None:
+    """Write one level from its frames (z, y, x, E), one time node at a time."""
+    dtype = np.dtype(kind)
+    attributes: dict[str, Any] = {}
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+    if dtype.kind == "u":
+        # Zero, which stands wherever nothing was trained, is within the range, so that it costs little.
+        low, high = min(low, 0.0), max(high, 0.0)
+        scale = (high - low) / np.iinfo(dtype).max or 1.0
+        attributes = {"offset": low, "scale": scale}
+        low, high = low / scale, high / scale
+    elif max(-low, high) > np.finfo(dtype).max:
+        raise InputError(f"embeddings reach {max(-low, high):g}, more than {kind} holds; use --tables float32")
+
+    def stored(frame: Floats) -> npt.NDArray[Any]:
+        return frame.astype(dtype) if dtype.kind == "f" else np.rint(frame / attributes["scale"] - low).astype(dtype)
+
+    chunk = table_chunk(shape, dtype.itemsize)
+
+    def chunks() -> Iterator[npt.NDArray[Any]]:
+        for frame in frames:
+            node = stored(frame)[None]
+            for start in np.ndindex(*(-(-n // c) for n, c in zip(node.shape, chunk, strict=True))):
+                yield node[tuple(slice(i * c, (i + 1) * c) for i, c in zip(start, chunk, strict=True))]
+
+    writer.add_array(
+        f"tables/level_{number}",
+        shape=shape,
+        dtype=dtype,
+        chunk_shape=chunk,
+        chunks=chunks(),
+        dimension_names=TABLE_AXES,
+        attributes=attributes or None,
+    )

@@ -1,0 +1,116 @@
+"""The training loop: batches of bricks, a learning rate that falls to zero, history, checkpoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import log10, prod
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.coreset import Coreset
+from fhash_codec.engines import Engine
+from fhash_codec.interrupts import StopRequest
+from fhash_codec.progress import Progress, silent
+from fhash_formats.errors import TrainingError
+
+BATCH_BRICKS = 64  # of 1024 vertices: below 2^16 samples a step, its fixed cost shows; above, each epoch teaches less
+STEPS_AN_EPOCH = (20, 256)
+PROBE_BRICKS = 512  # on which the quality of an epoch is measured
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The course of a training: `epochs` passes over `bricks` bricks in `batches` random batches each.
+
+    rates: learning rate of every step, 1-based, float64 (epochs * batches + 1,).
+    """
+
+    epochs: int
+    bricks: int
+    batches: int
+    seed: int
+    rates: npt.NDArray[np.float64]
+
+    def order(self, epoch: int) -> list[npt.NDArray[np.int64]]:
+        """The batches of an epoch: every brick once; depends on nothing but the seed and the epoch."""
+        return np.array_split(np.random.default_rng([self.seed, epoch]).permutation(self.bricks), self.batches)
+
+
+def plan_training(coreset: Coreset, *, epochs: int, learning_rate: float, schedule: str, batch: int, seed: int) -> Plan:
+    """A plan for a coreset; `batch` in samples, 0 for 64 bricks where that makes 20 to 256 steps an epoch, else the nearest that does."""
+    bricks = len(coreset.bricks)
+    if batch:
+        batches = max(1, round(bricks * prod(coreset.brick_shape) / batch))
+    else:
+        low, high = STEPS_AN_EPOCH
+        batches = min(max(-(-bricks // BATCH_BRICKS), low), high)
+    batches = min(batches, bricks)
+    share = np.arange(epochs * batches + 1) / max(epochs * batches, 1)
+    rates = learning_rate * (0.5 + 0.5 * np.cos(np.pi * share) if schedule == "cosine" else np.ones_like(share))
+    return Plan(epochs=epochs, bricks=bricks, batches=batches, seed=seed, rates=rates)
+
+
+@dataclass(kw_only=True)
+class Course:
+    """How far a training has come: finished epochs, batches within the present one, seconds spent, and the quality after each epoch."""
+
+    epoch: int = 0
+    batch: int = 0
+    seconds: float = 0.0
+    history: list[dict[str, float | None]] = field(default_factory=list)
+
+
+def train(
+    engine: Engine,
+    plan: Plan,
+    coreset: Coreset,
+    course: Course,
+    *,
+    stop: StopRequest | None = None,
+    save: Callable[[Course], None] | None = None,
+    save_seconds: float = 60.0,
+    budget_seconds: float = float("inf"),
+    progress: Progress = silent,
+) -> bool:
+    """Train from where `course` stands to the end of the plan; true if it got there.
+
+    Every epoch adds {seconds, epoch, psnr} to the history; PSNR in dB of the normalised values on a fixed random choice of bricks.
+    `save` is called with the course every `save_seconds`, and when `stop` asks for an end, which comes after the running batch.
+    The loop also ends once `budget_seconds` are spent. Raises TrainingError if the error is no longer finite.
+    """
+    probe = np.sort(np.random.default_rng(plan.seed).permutation(plan.bricks)[:PROBE_BRICKS])
+    begun = saved = time.perf_counter()
+    before, note = course.seconds, ""
+    while course.epoch < plan.epochs:
+        for chosen in plan.order(course.epoch)[course.batch :]:
+            engine.train(chosen)
+            course.batch += 1
+            now = time.perf_counter()
+            course.seconds = before + now - begun
+            asked = stop is not None and stop.asked
+            if save and (asked or now - saved > save_seconds):
+                save(course)
+                # Saving may take long for a large model: never more than a twentieth of the time.
+                saved = time.perf_counter()
+                save_seconds = max(save_seconds, 20 * (saved - now))
+            if asked or course.seconds > budget_seconds:
+                return False
+            progress("training", course.epoch * plan.batches + course.batch, plan.epochs * plan.batches, note)
+        psnr = probe_psnr(engine, coreset, probe)
+        course.epoch, course.batch = course.epoch + 1, 0
+        course.seconds = before + time.perf_counter() - begun
+        course.history.append({"seconds": course.seconds, "epoch": course.epoch, "psnr": psnr})
+        note = "exact" if psnr is None else f"epoch {course.epoch}: {psnr:.1f} dB"
+    return True
+
+
+def probe_psnr(engine: Engine, coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float | None:
+    """PSNR in dB of the normalised values (range 1) over the coreset vertices of `bricks`; None where the error is exactly 0."""
+    samples = int(np.diff(coreset.offsets)[bricks].sum())
+    error = sum(engine.squared_error(part) for part in np.array_split(bricks, -(-len(bricks) // BATCH_BRICKS)))
+    if not np.isfinite(error):
+        raise TrainingError("training diverged: the error is no longer finite; set a lower --learning-rate")
+    return None if error == 0 else -10 * log10(error / samples)

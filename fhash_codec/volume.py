@@ -1,0 +1,341 @@
+"""`Volume`: a `.fhz` file read like an array (t, z, y, x). numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property, lru_cache
+from math import prod
+from pathlib import Path
+from types import EllipsisType, TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.coreset import Box, box_size
+from fhash_codec.decoder import decode_region, sample_points
+from fhash_codec.key_frames import KeyTimes, strictly_monotonic, time_axis
+from fhash_codec.network import Network
+from fhash_codec.normalise import ValueRange
+from fhash_codec.occupancy import unpack
+from fhash_codec.progress import Progress, silent
+from fhash_codec.storage import load_network
+from fhash_formats.container import Container
+from fhash_formats.errors import InputError, RegionError
+from fhash_formats.series import AXES, Coordinate
+
+Index = int | slice | EllipsisType
+OUTSIDE = ("nan", "background")
+
+
+def open(path: str | Path) -> Volume:
+    """Open a `.fhz` file for reading; nothing is decoded yet.
+
+    Raises MissingInputError, DamagedFileError or UnsupportedFileError.
+    """
+    return Volume(Container.open(path))
+
+
+class Volume:
+    """A time-varying volume in a container: reads like a numpy array (t, z, y, x), decoding just what is asked for.
+
+    Values are in data units; vertices outside the coreset, and where the source had no finite value, are NaN.
+
+    Attributes:
+        shape: (t, z, y, x). dims: its names. chunks: what one read decodes at least.
+        dtype: float64 for sources of float64 or of integers above 16 bits, else float32.
+        name, units, attrs: of the variable. coords: a Coordinate for each of "t", "z", "y", "x".
+        path: of the file. info: everything the file says of itself, as JSON values.
+    """
+
+    dims = AXES
+    ndim = 4
+
+    def __init__(self, container: Container) -> None:
+        """Over an open container, which it closes; `fhash_codec.open` is for files."""
+        header = container.header
+        self.container = container
+        self.path = Path(container.path)
+        self.shape: tuple[int, int, int, int] = tuple(header["domain"]["shape"])
+        self.dtype = decoded_type(np.dtype(header["variable"]["dtype"]))
+        self.name: str = header["variable"]["name"]
+        self.units: str = header["variable"]["units"]
+        self.attrs: Mapping[str, Any] = header["variable"]["attributes"]
+        self.box: Box = tuple((low, high) for low, high in header["feature_bounding_box"])  # type: ignore[assignment]
+        self.chunks = (1, *self.shape[1:])
+        self.value_range = ValueRange(*header["value_range"])
+        self.background = float(header["background"])
+        self._occupied = lru_cache(maxsize=4)(self._unpack_occupancy)
+
+    # -- what the file says ------------------------------------------------------------------------------------------------
+
+    @property
+    def size(self) -> int:
+        """Number of vertices."""
+        return prod(self.shape)
+
+    @cached_property
+    def coords(self) -> dict[str, Coordinate]:
+        """Positions along each axis, in the units of the source."""
+        arrays = {"t": "time", "z": "z", "y": "y", "x": "x"}
+        found = {}
+        for axis, stored in arrays.items():
+            array = self.container.arrays[f"coords/{stored}"]
+            attributes = dict(array.attributes)
+            found[axis] = Coordinate(name=attributes.pop("name", stored), values=array.read(), attributes=attributes)
+        return found
+
+    @cached_property
+    def key_times(self) -> KeyTimes:
+        """How steps and times map to the model's time axis."""
+        key_frames = tuple(int(step) for step in self.container.arrays["key_frames"].read())
+        return KeyTimes(times=time_axis(self.coords["t"].values), key_frames=key_frames)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """The container's header with the figures that follow from it: bytes, raw bytes, ratio, key frames, arrays."""
+        header = self.container.header
+        raw = self.size * np.dtype(header["variable"]["dtype"]).itemsize
+        arrays = {
+            name: {"shape": list(array.shape), "dtype": str(array.dtype), "bytes": array.nbytes_stored}
+            for name, array in self.container.arrays.items()
+        }
+        return {
+            **header,
+            "path": str(self.path),
+            "bytes": self.container.size,
+            "overhead_bytes": self.container.overhead(),
+            "raw_bytes": raw,
+            "ratio": raw / self.container.size,
+            "key_frames": list(self.key_times.key_frames),
+            "arrays": arrays,
+        }
+
+    def verify(self, progress: Progress = silent) -> int:
+        """Read and check every array; their number. Raises DamagedFileError."""
+        return self.container.verify(lambda done, total: progress("verifying", done, total, ""))
+
+    # -- reading -----------------------------------------------------------------------------------------------------------
+
+    def read(self, t: float, region: Box | None = None, *, outside: str = "nan") -> npt.NDArray[Any]:
+        """Values (z, y, x) of `self.dtype` of a region (all if None) at step `t`, which may lie between steps.
+
+        Between steps time runs evenly from one to the next. Outside the coreset stands NaN, or with outside='background' the
+        mean of what was left out; where the source had no finite value stands NaN in any case.
+        Raises RegionError for a step or region outside the domain, InputError for another `outside`.
+        """
+        if outside not in OUTSIDE:
+            raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
+        key = self._key_index(t)
+        region = self._checked(region)
+        result = np.full([high - low for low, high in region], np.nan, dtype=self.dtype)
+        inner = tuple((max(low, b0), min(high, b1)) for (low, high), (b0, b1) in zip(region, self.box, strict=True))
+        if all(low < high for low, high in inner):
+            target = tuple(slice(low - r0, high - r0) for (low, high), (r0, _) in zip(inner, region, strict=True))
+            local: Box = tuple((low - b0, high - b0) for (low, high), (b0, _) in zip(inner, self.box, strict=True))  # type: ignore[assignment]
+            wanted = self._occupied_at(key)[tuple(slice(*part) for part in local)]
+            unit = decode_region(self._network, key, local, wanted=wanted)
+            values = self.value_range.from_unit(unit).astype(self.dtype)
+            np.copyto(result[target], values, where=wanted)
+        if outside == "background":
+            result[np.isnan(result)] = self.background
+        missing = self._missing_at(t)
+        if missing is not None:
+            result[missing[tuple(slice(*part) for part in region)]] = np.nan
+        return result
+
+    def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
+        """Values by numpy's basic indexing: integers, slices and `...`, negative as usual; RegionError (an IndexError) outside."""
+        parts = _expanded(index)
+        picked = [_positions(part, length, axis) for part, length, axis in zip(parts, self.shape, AXES, strict=True)]
+        steps, *space = picked
+        result = np.empty([len(p) for p in picked], dtype=self.dtype)
+        if result.size:
+            region: Box = tuple((min(p), max(p) + 1) for p in space)  # type: ignore[assignment]
+            local = np.ix_(*(np.array(p) - low for p, (low, _) in zip(space, region, strict=True)))
+            for number, step in enumerate(steps):
+                result[number] = self.read(step, region)[local]
+        return result[tuple(0 if isinstance(part, int | np.integer) else slice(None) for part in parts)]
+
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """The whole volume."""
+        if copy is False:
+            raise ValueError("a volume cannot become an array without a copy: its values are decoded")
+        values = self[...]
+        return values if dtype is None else values.astype(dtype)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def sample(
+        self,
+        *,
+        z: npt.ArrayLike,
+        y: npt.ArrayLike,
+        x: npt.ArrayLike,
+        t: npt.ArrayLike | None = None,
+        time: npt.ArrayLike | None = None,
+        gradient: bool = False,
+    ) -> npt.NDArray[Any] | tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        """Values at points between vertices, in data units; the arguments broadcast against each other.
+
+        z, y, x: positions in vertices (0 is the first). t: position in steps; or time: in the units of the series' times.
+        gradient: also return derivatives (..., 4) of the value by t, z, y and x, in data units per step and per vertex: analytic,
+        through interpolation and network; on the border of two cells those of the cell after it.
+        A point is NaN where a vertex of its cell that counts is outside the coreset, and outside the domain.
+        Raises InputError unless just one of t and time is given, RegionError for a step or time outside the series.
+        """
+        if (t is None) == (time is None):
+            raise InputError("give either t (in steps) or time (in the units of the series)")
+        if t is None:
+            t = self._checked_times().steps_of_times(np.asarray(time, dtype=np.float64))
+        points = np.broadcast_arrays(*(np.asarray(p, dtype=np.float64) for p in (t, z, y, x)))
+        shape = points[0].shape
+        steps, *space = (p.ravel() for p in points)
+        keys = self.key_times.key_indices(steps)
+        local = [p - low for p, (low, _) in zip(space, self.box, strict=True)]
+        inside = self._interpolable(steps, keys, space)
+        values: npt.NDArray[Any] = np.full(inside.shape, np.nan)
+        slopes = np.full((*inside.shape, 4), np.nan)
+        if inside.any():
+            chosen = [p[inside] for p in (keys, *local)]
+            if gradient:
+                unit, slope = sample_points(self._network, *chosen, gradient=True)
+                # From per key frame to per step: between two steps the key index runs evenly.
+                first = np.minimum(np.floor(steps[inside]), max(self.shape[0] - 2, 0))
+                after = np.minimum(first + 1, self.shape[0] - 1)
+                pace = self.key_times.key_indices(after) - self.key_times.key_indices(first)
+                slopes[inside] = slope.astype(np.float64) * (self.value_range.high - self.value_range.low)
+                slopes[inside, 0] *= pace
+            else:
+                unit = sample_points(self._network, *chosen)
+            values[inside] = self.value_range.from_unit(unit)
+        values = values.reshape(shape).astype(self.dtype)
+        return (values, slopes.reshape(*shape, 4).astype(self.dtype)) if gradient else values
+
+    def occupancy(self, t: float) -> npt.NDArray[np.bool_]:
+        """Which vertices (z, y, x) are in the coreset at step `t`; between key frames, those that are at either of them."""
+        result = np.zeros(self.shape[1:], dtype=bool)
+        result[tuple(slice(*part) for part in self.box)] = self._occupied_at(self._key_index(t))
+        missing = self._missing_at(t)
+        return result if missing is None else result & ~missing
+
+    def step_of_time(self, time: float) -> float:
+        """The step, fractional between steps, at a time in the units of the series; RegionError outside its times.
+
+        Raises InputError if the series' times do not strictly ascend or descend.
+        """
+        return self._checked_times().step_of_time(float(time))
+
+    # -- pieces ------------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _network(self) -> Network:
+        return load_network(self.container)
+
+    def _checked_times(self) -> KeyTimes:
+        if not strictly_monotonic(self.coords["t"].values):
+            raise InputError(f"{self.path}: the times of the series do not strictly ascend or descend; ask for a step instead")
+        return self.key_times
+
+    def _key_index(self, t: float) -> float:
+        last = self.shape[0] - 1
+        if not 0 <= t <= last:
+            raise RegionError(f"{self.path}: step {t:g} is outside 0..{last}")
+        return self.key_times.key_index(float(t))
+
+    def _checked(self, region: Box | None) -> Box:
+        if region is None:
+            return tuple((0, length) for length in self.shape[1:])  # type: ignore[return-value]
+        for axis, (low, high), length in zip(AXES[1:], region, self.shape[1:], strict=True):
+            if not 0 <= low < high <= length:
+                raise RegionError(f"{self.path}: region {low}:{high} of axis {axis} is empty or outside 0:{length}")
+        return region
+
+    def _unpack_occupancy(self, key: int) -> npt.NDArray[np.bool_]:
+        bits = self.container.arrays["occupancy/bits"]
+        return unpack(bits.read((slice(key, key + 1), slice(0, bits.shape[1])))[0], box_size(self.box))
+
+    def _occupied_at(self, key: float) -> npt.NDArray[np.bool_]:
+        before, after = int(np.floor(key)), int(np.ceil(key))
+        return self._occupied(before) if before == after else self._occupied(before) | self._occupied(after)
+
+    def _missing_at(self, t: float) -> npt.NDArray[np.bool_] | None:
+        """Where the source had no finite value at a step, or at either step around; None where the file has no such vertices."""
+        stored = self.container.arrays.get("missing/bits")
+        if stored is None:
+            return None
+        steps = range(int(np.floor(t)), int(np.ceil(t)) + 1)
+        bits = stored.read((slice(steps[0], steps[-1] + 1), slice(0, stored.shape[1])))
+        masks = np.unpackbits(np.bitwise_or.reduce(bits, axis=0), count=prod(self.shape[1:])).reshape(self.shape[1:])
+        return np.asarray(masks, dtype=bool)
+
+    def _interpolable(
+        self, steps: npt.NDArray[np.float64], keys: npt.NDArray[np.float64], space: list[npt.NDArray[np.float64]]
+    ) -> npt.NDArray[np.bool_]:
+        """Points whose every cell vertex of weight above 0 is in the coreset."""
+        inside: npt.NDArray[np.bool_] = np.all(
+            [(p >= low) & (p <= high - 1) for p, (low, high) in zip(space, self.box, strict=True)], axis=0
+        )
+        # Points between the same steps and key frames share one occupancy.
+        between = np.stack([np.floor(steps), np.ceil(steps), np.floor(keys), np.ceil(keys)])
+        _, first, group = np.unique(between, axis=1, return_index=True, return_inverse=True)
+        for number, representative in enumerate(first):
+            chosen = np.flatnonzero(inside & (group == number))
+            if not chosen.size:
+                continue
+            occupied = self.occupancy(steps[representative])
+            low = [np.floor(p[chosen]).astype(np.int64) for p in space]
+            high = [np.ceil(p[chosen]).astype(np.int64) for p in space]
+            for corner in np.ndindex(2, 2, 2):
+                inside[chosen] &= occupied[tuple(h if up else b for up, b, h in zip(corner, low, high, strict=True))]
+        return inside
+
+    # -- life --------------------------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Release the file."""
+        self.container.close()
+
+    def __enter__(self) -> Volume:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def __reduce__(self) -> tuple[Any, tuple[Path]]:
+        return open, (self.path,)
+
+    def __repr__(self) -> str:
+        sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))
+        return f"<fhash Volume '{self.name}' {sizes} {self.dtype} of {self.path}>"
+
+
+def decoded_type(source: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of decoded values: a float wide enough for the source's own precision."""
+    narrow = source.itemsize <= 2 or source == np.float32
+    return np.dtype(np.float32 if narrow else np.float64)
+
+
+def _expanded(index: Index | tuple[Index, ...]) -> list[int | slice]:
+    """One part per axis, `...` and missing axes filled with full slices."""
+    parts = list(index) if isinstance(index, tuple) else [index]
+    for part in parts:
+        if part is not Ellipsis and (isinstance(part, bool) or not isinstance(part, int | np.integer | slice)):
+            raise RegionError(
+                f"a volume is indexed by integers, slices and '...', not by {type(part).__name__}; take np.asarray of it for more"
+            )
+    dots = [number for number, part in enumerate(parts) if part is Ellipsis]
+    if len(dots) > 1 or len(parts) - len(dots) > 4:
+        raise RegionError(f"a volume has 4 axes (t, z, y, x); the index has {len(parts)} parts")
+    at = dots[0] if dots else len(parts)
+    fill = [slice(None)] * (4 - len(parts) + len(dots))
+    return [part for part in [*parts[:at], *fill, *parts[at + len(dots) :]] if part is not Ellipsis]
+
+
+def _positions(part: int | slice, length: int, axis: str) -> range:
+    if isinstance(part, slice):
+        return range(length)[part]
+    if not -length <= part < length:
+        raise RegionError(f"index {part} is outside axis {axis} of {length}")
+    return range(part % length, part % length + 1)

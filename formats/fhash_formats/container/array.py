@@ -1,0 +1,167 @@
+"""Metadata of one array: the part of Zarr v3 that a container uses, checked before it is believed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import prod
+from typing import Any
+
+import numpy as np
+
+from fhash_formats.container.coding import CheckedCoder, chunk_coder
+from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+
+DTYPES = {
+    name: np.dtype(name)
+    for name in ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64")
+}
+MAX_CHUNK_BYTES = 1 << 30
+MAX_DIMENSIONS = 8
+MAX_LENGTH = 1 << 62
+
+_INDEX = re.compile(r"0|[1-9][0-9]{0,18}")
+_KEYS = {"zarr_format", "node_type", "shape", "data_type", "chunk_grid", "chunk_key_encoding", "fill_value", "codecs"}
+_OPTIONAL_KEYS = {"attributes", "dimension_names", "storage_transformers"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayMetadata:
+    """Shape, number type, chunking and codecs of an array.
+
+    Raises DamagedFileError or UnsupportedFileError for what a container cannot hold.
+    Every length is at least 1; the last chunks along an axis are stored in full, padded with 0.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    chunk_shape: tuple[int, ...]
+    codecs: Sequence[Mapping[str, Any]]
+    dimension_names: tuple[str | None, ...] | None = None
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.shape) <= MAX_DIMENSIONS or len(self.chunk_shape) != len(self.shape):
+            raise DamagedFileError(f"shape {self.shape} with chunks {self.chunk_shape}; 1 to {MAX_DIMENSIONS} axes are allowed")
+        if self.dimension_names is not None and len(self.dimension_names) != len(self.shape):
+            raise DamagedFileError(f"{len(self.dimension_names)} dimension names for {len(self.shape)} axes")
+        if self.chunk_bytes > MAX_CHUNK_BYTES:
+            raise DamagedFileError(f"chunks of {self.chunk_bytes} bytes; the limit is {MAX_CHUNK_BYTES}")
+        _ = self.coder
+
+    @cached_property
+    def coder(self) -> CheckedCoder:
+        """Codes full chunks."""
+        return chunk_coder(self.codecs, self.dtype, self.chunk_shape)
+
+    @property
+    def chunk_bytes(self) -> int:
+        """Bytes of a decoded chunk."""
+        return prod(self.chunk_shape) * self.dtype.itemsize
+
+    @property
+    def grid(self) -> tuple[int, ...]:
+        """Chunks along each axis."""
+        return tuple(-(-n // chunk) for n, chunk in zip(self.shape, self.chunk_shape, strict=True))
+
+    def chunk_key(self, index: Sequence[int]) -> str:
+        """Name of a chunk below its array."""
+        return "c/" + "/".join(str(i) for i in index)
+
+    def parse_key(self, key: str) -> tuple[int, ...]:
+        """The index of a chunk from its name; raises DamagedFileError if it is none of this array's."""
+        parts = key.split("/")
+        if parts[0] == "c" and len(parts) == len(self.shape) + 1 and all(_INDEX.fullmatch(part) for part in parts[1:]):
+            index = tuple(int(part) for part in parts[1:])
+            if all(i < n for i, n in zip(index, self.grid, strict=True)):
+                return index
+        raise DamagedFileError(f"no chunk of the array's grid {self.grid}")
+
+    def chunk_region(self, index: Sequence[int]) -> tuple[slice, ...]:
+        """The part of the array that a chunk holds, cut at the array's end."""
+        spans = zip(index, self.chunk_shape, self.shape, strict=True)
+        return tuple(slice(i * chunk, min((i + 1) * chunk, n)) for i, chunk, n in spans)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The array's zarr.json."""
+        values: dict[str, Any] = {
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": list(self.shape),
+            "data_type": self.dtype.name,
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(self.chunk_shape)}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "fill_value": 0.0 if self.dtype.kind == "f" else 0,
+            "codecs": list(self.codecs),
+        }
+        if self.dimension_names is not None:
+            values["dimension_names"] = list(self.dimension_names)
+        if self.attributes:
+            values["attributes"] = dict(self.attributes)
+        return values
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> ArrayMetadata:
+        """The metadata in a zarr.json; raises DamagedFileError or UnsupportedFileError naming the key."""
+        missing = sorted(_KEYS - values.keys())
+        if missing:
+            raise DamagedFileError(f"key {missing[0]} is missing")
+        check_keys(values, _KEYS | _OPTIONAL_KEYS)
+        if values["data_type"] not in list(DTYPES):
+            raise UnsupportedFileError(f"data_type is {_shown(values['data_type'])}; allowed: {', '.join(DTYPES)}")
+        shape = _lengths(values["shape"], "shape")
+        grid, encoding = values["chunk_grid"], values["chunk_key_encoding"]
+        if not isinstance(grid, Mapping) or grid.get("name") != "regular" or not isinstance(grid.get("configuration"), Mapping):
+            raise UnsupportedFileError(f"chunk_grid is {_shown(grid)}; only regular grids are allowed")
+        if encoding not in ({"name": "default", "configuration": {"separator": "/"}}, {"name": "default"}):
+            raise UnsupportedFileError(f"chunk_key_encoding is {_shown(encoding)}; only the default with '/' is allowed")
+        if isinstance(values["fill_value"], bool) or values["fill_value"] != 0:
+            raise UnsupportedFileError(f"fill_value is {_shown(values['fill_value'])}; only 0 is allowed")
+        if values.get("storage_transformers", []) != []:
+            raise UnsupportedFileError("storage_transformers are not allowed")
+        if not isinstance(values["codecs"], list):
+            raise DamagedFileError("codecs is not a list")
+        return cls(
+            shape=shape,
+            dtype=DTYPES[values["data_type"]],
+            chunk_shape=_lengths(grid["configuration"].get("chunk_shape"), "chunk_shape"),
+            codecs=values["codecs"],
+            dimension_names=_dimension_names(values.get("dimension_names")),
+            attributes=attributes_of(values),
+        )
+
+
+def check_keys(values: Mapping[str, Any], known: set[str]) -> None:
+    """Refuse a key of a zarr.json that is not known, unless it says that it need not be understood (Zarr v3, extension points)."""
+    for key in values.keys() - known:
+        extension = values[key]
+        if not isinstance(extension, Mapping) or extension.get("must_understand") is not False:
+            raise UnsupportedFileError(f"key {_shown(key)} is not known")
+
+
+def attributes_of(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The attributes in a zarr.json; raises DamagedFileError."""
+    attributes = values.get("attributes", {})
+    if not isinstance(attributes, dict):
+        raise DamagedFileError("attributes is not an object")
+    return attributes
+
+
+def _lengths(value: object, key: str) -> tuple[int, ...]:
+    if not isinstance(value, list) or not all(type(n) is int and 1 <= n <= MAX_LENGTH for n in value):
+        raise DamagedFileError(f"{key} is {_shown(value)}; a list of whole numbers from 1 to {MAX_LENGTH} is needed")
+    return tuple(value)
+
+
+def _dimension_names(value: object) -> tuple[str | None, ...] | None:
+    if value is None:
+        return None
+    if not isinstance(value, list) or not all(name is None or isinstance(name, str) for name in value):
+        raise DamagedFileError(f"dimension_names is {_shown(value)}; a list of names is needed")
+    return tuple(value)
+
+
+def _shown(value: object) -> str:
+    return ascii(value)[:80]

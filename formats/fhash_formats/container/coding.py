@@ -1,0 +1,152 @@
+"""Values of a chunk to bytes and back: the codecs that a container may name.
+
+Every list of codecs ends in `crc32c`, so that any Zarr reader notices damage. The first codec, the one from an array to bytes, decides
+about what is between: `ARRAY_CODECS` is the one place where another is added.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from math import prod
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import DamagedFileError, MissingDependencyError, UnsupportedFileError
+
+Codec = Mapping[str, Any]
+"""A codec as Zarr v3 names it: {"name": str, "configuration": {...}}."""
+
+ZSTD_LEVEL = 9
+CRC32C: Codec = {"name": "crc32c"}
+
+_CRC = struct.Struct("<I")
+_ZSTD_MARK = 0xFD2FB528
+
+
+class ChunkCoder(Protocol):
+    """Codes chunks of one dtype and full shape; `decode` raises DamagedFileError before it allocates for bytes that do not fit."""
+
+    def encode(self, chunk: npt.NDArray[Any]) -> bytes:
+        """The bytes of a full chunk."""
+
+    def decode(self, data: memoryview) -> npt.NDArray[Any]:
+        """The full chunk, native byte order, read-only or not."""
+
+
+class PlainCoder:
+    """`bytes` (little-endian, C order), then `zstd`."""
+
+    def __init__(self, codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+        """Raises UnsupportedFileError for codecs other than these two."""
+        level = codecs[1].get("configuration", {}).get("level") if len(codecs) == 2 and codecs[1]["name"] == "zstd" else None
+        if isinstance(level, bool) or not isinstance(level, int):
+            raise UnsupportedFileError(f"codecs {_names(codecs)}; a container has bytes, zstd, crc32c")
+        expected = plain_codecs(dtype, level)[:-1]
+        # Zarr lets one-byte types state an endianness, which then means nothing.
+        allowed = [expected[0], _LITTLE] if dtype.itemsize == 1 else [expected[0]]
+        if codecs[0] not in allowed or codecs[1] != expected[1]:
+            raise UnsupportedFileError(f"codecs {_names(codecs)} with settings that a container does not allow; {expected} is allowed")
+        self._level, self._shape = level, shape
+        self._stored, self._native = dtype.newbyteorder("<"), dtype.newbyteorder("=")
+        self._size = prod(shape) * dtype.itemsize
+
+    def encode(self, chunk: npt.NDArray[Any]) -> bytes:
+        """The bytes of a full chunk."""
+        from numcodecs.zstd import compress
+
+        data: bytes = compress(np.ascontiguousarray(chunk, dtype=self._stored), self._level)
+        return data
+
+    def decode(self, data: memoryview) -> npt.NDArray[Any]:
+        """The full chunk; raises DamagedFileError."""
+        from numcodecs.zstd import decompress
+
+        declared = zstd_content_size(data)
+        if declared != self._size:
+            raise DamagedFileError(f"zstd declares {declared} bytes; the chunk has {self._size}")
+        # Into a buffer of exactly the chunk's size, which bounds what a hostile frame can write.
+        values = np.empty(self._shape, dtype=self._stored)
+        try:
+            decompress(data, values)
+        except (RuntimeError, ValueError) as error:
+            raise DamagedFileError(f"zstd data are damaged: {error}") from error
+        return values.astype(self._native, copy=False)
+
+
+ARRAY_CODECS: dict[str, Callable[[Sequence[Codec], np.dtype[Any], tuple[int, ...]], ChunkCoder]] = {"bytes": PlainCoder}
+"""Coder by the name of the first codec; it is given all codecs but the last, `crc32c`."""
+
+
+class CheckedCoder:
+    """Any coder with the CRC-32C of its bytes behind them."""
+
+    def __init__(self, coder: ChunkCoder) -> None:
+        self._coder = coder
+
+    def encode(self, chunk: npt.NDArray[Any]) -> bytes:
+        """The bytes of a full chunk."""
+        data = self._coder.encode(chunk)
+        return data + _CRC.pack(crc32c(data))
+
+    def decode(self, data: memoryview) -> npt.NDArray[Any]:
+        """The full chunk; raises DamagedFileError."""
+        if len(data) < _CRC.size:
+            raise DamagedFileError(f"{len(data)} bytes are too few for a CRC-32C")
+        coded = data[: -_CRC.size]
+        if crc32c(coded) != _CRC.unpack(data[-_CRC.size :])[0]:
+            raise DamagedFileError("its CRC-32C differs, the data are damaged")
+        return self._coder.decode(coded)
+
+
+def chunk_coder(codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]) -> CheckedCoder:
+    """The coder for chunks of this dtype and full shape; raises UnsupportedFileError for codecs that are not known."""
+    for codec in codecs:
+        named = isinstance(codec, Mapping) and isinstance(codec.get("name"), str)
+        if not named or not isinstance(codec.get("configuration", {}), Mapping):
+            raise DamagedFileError("an array's codecs are not a list of {name, configuration}")
+    if len(codecs) < 2 or codecs[-1] != CRC32C or codecs[0]["name"] not in ARRAY_CODECS:
+        raise UnsupportedFileError(f"codecs {_names(codecs)}; known are {', '.join(ARRAY_CODECS)} at the beginning and crc32c at the end")
+    return CheckedCoder(ARRAY_CODECS[codecs[0]["name"]](codecs[:-1], dtype, shape))
+
+
+_LITTLE: Codec = {"name": "bytes", "configuration": {"endian": "little"}}
+
+
+def plain_codecs(dtype: np.dtype[Any], level: int = ZSTD_LEVEL) -> list[Codec]:
+    """The codecs of ordinary arrays, as the zarr library writes them."""
+    first = {"name": "bytes"} if dtype.itemsize == 1 else _LITTLE
+    return [first, {"name": "zstd", "configuration": {"level": level, "checksum": False}}, CRC32C]
+
+
+def zstd_content_size(data: memoryview) -> int | None:
+    """The content size in the header of a zstd frame, None where it has none (RFC 8878, 3.1.1.1); raises DamagedFileError."""
+    if len(data) < 6 or int.from_bytes(data[:4], "little") != _ZSTD_MARK:
+        raise DamagedFileError("not a zstd frame")
+    descriptor = data[4]
+    single_segment = bool(descriptor & 0x20)
+    size_bytes = (1 if single_segment else 0, 2, 4, 8)[descriptor >> 6]
+    at = 5 + (0 if single_segment else 1) + (0, 1, 2, 4)[descriptor & 3]
+    if len(data) < at + size_bytes:
+        raise DamagedFileError("the header of the zstd frame is cut short")
+    if size_bytes == 0:
+        return None
+    return int.from_bytes(data[at : at + size_bytes], "little") + (256 if size_bytes == 2 else 0)
+
+
+def crc32c(data: bytes | memoryview) -> int:
+    """CRC-32C (Castagnoli) of `data`; raises MissingDependencyError."""
+    try:
+        # The implementation that zarr and numcodecs use. Checking cannot be left out where it is missing.
+        import google_crc32c
+    except ImportError as error:
+        raise MissingDependencyError("the CRC-32C of .fhz files needs google-crc32c: pip install google-crc32c") from error
+    # It takes bytes and arrays, but no memoryview.
+    value: int = google_crc32c.value(data if isinstance(data, bytes) else np.frombuffer(data, dtype=np.uint8))
+    return value
+
+
+def _names(codecs: Sequence[Codec]) -> str:
+    return ascii(", ".join(codec["name"] for codec in codecs)[:200])

@@ -1,0 +1,155 @@
+"""What the root of a container says of the volume, checked by itself and against the arrays (FORMAT.md, "Header" and "Arrays").
+
+Keys that are not known are kept and ignored: a minor version may add some. What a reader has to understand is in `required_features`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from math import prod
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.container.array import DTYPES, ArrayMetadata
+from fhash_formats.container.record import MAX_LENGTH, Record
+from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+
+FORMAT = "fhash"
+FORMAT_VERSION = (1, 0)
+KNOWN_FEATURES: frozenset[str] = frozenset()
+KNOWN_PROFILES = ("paper",)
+TABLE_TYPES = ("float32", "float16", "uint8")
+MAX_LEVELS = 64
+MAX_EMBEDDING = 1024
+MAX_HIDDEN_LAYERS = 64
+MAX_WIDTH = 1 << 16
+
+Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
+"""Name, shape and allowed number types of an array."""
+
+
+def validate_header(header: Mapping[str, Any]) -> None:
+    """Raises UnsupportedFileError for a newer format, DamagedFileError naming the first key that is missing or has a wrong value."""
+    top = Record(header, "header key ")
+    _check_format(top)
+    encoder, variable = top.record("encoder"), top.record("variable")
+    encoder.text("version")
+    encoder.whole("seed", -(2**63), 2**64)
+    variable.text("name")
+    variable.text("units")
+    variable.choice("dtype", tuple(DTYPES))
+    variable.record("attributes")
+    shape = top.record("domain").wholes("shape", 4, 1, MAX_LENGTH)
+    low, high = top.numbers("value_range", 2)
+    top.need(low <= high, "value_range", "low <= high")
+    top.number("background")
+    box = _box(top, shape)
+    top.texts("features")
+    top.whole("dilation", 0, MAX_LENGTH)
+    _check_model(top.record("model"), box)
+    top.record("config")
+    top.record("quality")
+    for entry in top.records("history"):
+        for key in ("seconds", "epoch", "psnr"):
+            entry.number_or_null(key)
+
+
+def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]) -> None:
+    """Whether the arrays are those that a valid header speaks of; raises DamagedFileError naming the first that is not."""
+    for name, shape, dtypes in _expected(header):
+        if name not in arrays:
+            raise DamagedFileError(f"array {name} is missing")
+        _check_array(name, arrays[name], shape, dtypes)
+    if "missing/bits" in arrays:
+        steps, *frame = header["domain"]["shape"]
+        _check_array("missing/bits", arrays["missing/bits"], (steps, -(-prod(frame) // 8)), ("uint8",))
+    for name, array in arrays.items():
+        if name.startswith("coords/") and "name" in array.attributes:
+            Record(array.attributes, f"array {name} attribute ").text("name")
+        if name.startswith("tables/") and array.dtype == np.uint8:
+            attributes = Record(array.attributes, f"array {name} attribute ")
+            attributes.number("offset")
+            attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
+
+
+def check_key_frames(header: Mapping[str, Any], key_frames: npt.NDArray[np.int64]) -> None:
+    """Whether the key frames increase within the domain; raises DamagedFileError."""
+    steps = header["domain"]["shape"][0]
+    if key_frames[0] < 0 or key_frames[-1] >= steps or np.any(key_frames[1:] <= key_frames[:-1]):
+        raise DamagedFileError(f"array key_frames does not increase within 0..{steps - 1}")
+
+
+def occupancy_bytes(box: Sequence[Sequence[int]]) -> int:
+    """Bytes of one occupancy grid in ragged Morton order: every axis of the box filled up to a power of two, one bit per voxel."""
+    return -(-prod(1 << (high - low - 1).bit_length() for low, high in box) // 8)
+
+
+def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """(outputs, inputs) of each layer of the network."""
+    widths = [len(model["levels"]) * model["embedding_size"], *[model["width"]] * model["hidden_layers"], 1]
+    return [(outputs, inputs) for inputs, outputs in pairwise(widths)]
+
+
+def _check_format(top: Record) -> None:
+    if top.get("format") != FORMAT:
+        raise DamagedFileError(f"header key format is {ascii(top.get('format'))[:40]}; '{FORMAT}' is needed")
+    major, minor = top.wholes("format_version", 2, 0, 10_000)
+    if major > FORMAT_VERSION[0]:
+        raise UnsupportedFileError(f"written by a newer fhash format {major}.{minor}; this version reads {FORMAT_VERSION[0]}.x; upgrade")
+    top.need(major == FORMAT_VERSION[0], "format_version", f"[{FORMAT_VERSION[0]}, n]")
+    unknown = [name for name in top.texts("required_features") if name not in KNOWN_FEATURES]
+    if unknown:
+        raise UnsupportedFileError(f"the file needs the feature {unknown[0][:80]!a}, which this version does not know; upgrade")
+
+
+def _box(top: Record, shape: Sequence[int]) -> list[int]:
+    """Lengths (z, y, x) of the feature bounding box."""
+    bounds = top.get("feature_bounding_box")
+    top.need(isinstance(bounds, list) and len(bounds) == 3, "feature_bounding_box", "[[z0, z1], [y0, y1], [x0, x1]]")
+    for bound, length in zip(bounds, shape[1:], strict=True):
+        whole = isinstance(bound, list) and len(bound) == 2 and all(type(n) is int for n in bound)
+        top.need(whole and 0 <= bound[0] < bound[1] <= length, "feature_bounding_box", f"within the domain {list(shape)}")
+    return [high - low for low, high in bounds]
+
+
+def _check_model(model: Record, box: Sequence[int]) -> None:
+    profile = model.text("profile")
+    if profile not in KNOWN_PROFILES:
+        known = ", ".join(KNOWN_PROFILES)
+        raise UnsupportedFileError(f"header key model.profile is {profile[:40]!a}; this version knows {known}; upgrade")
+    model.whole("fold", 2, MAX_LENGTH)
+    model.whole("embedding_size", 1, MAX_EMBEDDING)
+    model.whole("hidden_layers", 0, MAX_HIDDEN_LAYERS)
+    model.whole("width", 1, MAX_WIDTH)
+    model.choice("tables", TABLE_TYPES)
+    levels = model.get("levels")
+    model.need(isinstance(levels, list) and 1 <= len(levels) <= MAX_LEVELS, "levels", f"1 to {MAX_LEVELS} of [t, z, y, x]")
+    finer: Sequence[int] = [MAX_LENGTH] * 4
+    for level in levels:
+        whole = isinstance(level, list) and len(level) == 4 and all(type(n) is int for n in level)
+        fits = whole and all(1 <= n <= limit for n, limit in zip(level, finer, strict=True))
+        model.need(fits, "levels", "[t, z, y, x] from finest to coarsest, none longer than the one before")
+        finer = level
+    model.need(levels[0][1:] == list(box), "levels", f"the box {list(box)} at the finest level")
+
+
+def _expected(header: Mapping[str, Any]) -> Iterator[Expected]:
+    model = header["model"]
+    for axis, length in zip(("time", "z", "y", "x"), header["domain"]["shape"], strict=True):
+        yield f"coords/{axis}", (length,), ("float64",)
+    key_frames = model["levels"][0][0]
+    yield "key_frames", (key_frames,), ("int64",)
+    for number, level in enumerate(model["levels"], start=1):
+        yield f"tables/level_{number}", (*level, model["embedding_size"]), (model["tables"],)
+    for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
+        yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
+        yield f"mlp/bias_{number}", (outputs,), ("float32",)
+    yield "occupancy/bits", (key_frames, occupancy_bytes(header["feature_bounding_box"])), ("uint8",)
+
+
+def _check_array(name: str, array: ArrayMetadata, shape: tuple[int, ...], dtypes: tuple[str, ...]) -> None:
+    if array.shape != shape or array.dtype.name not in dtypes:
+        raise DamagedFileError(f"array {name} is {array.dtype.name} {array.shape}; the header asks for {' or '.join(dtypes)} {shape}")

@@ -1,0 +1,110 @@
+"""`Container`: a `.fhz` file, opened only if it is sound."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Any
+
+from fhash_formats.container.cache import ChunkCache
+from fhash_formats.container.header import check_arrays, check_key_frames, validate_header
+from fhash_formats.container.hierarchy import read_hierarchy
+from fhash_formats.container.source import FileSource, Source
+from fhash_formats.container.stored import StoredArray, damage_named
+from fhash_formats.container.zip_checked import find_signature, read_members
+from fhash_formats.errors import FhashError
+
+CACHE_BYTES = 256 << 20
+
+
+def is_container(path: str | Path) -> bool:
+    """Whether a file ends in a container's signature; False for one that cannot be read, and for one that was cut short."""
+    try:
+        source = FileSource(Path(path))
+    except FhashError:
+        return False
+    try:
+        return find_signature(source) is not None
+    except (FhashError, OSError):
+        return False
+    finally:
+        source.close()
+
+
+class Container:
+    """A container for reading; a context manager, safe for several threads.
+
+    Attributes:
+        path: as given.
+        size: bytes of the file.
+        header: the attribute "fhash" of the root (FORMAT.md).
+        arrays: StoredArray by name, in the order of the file.
+    """
+
+    path: Path
+    size: int
+    header: dict[str, Any]
+    arrays: Mapping[str, StoredArray]
+
+    def __init__(self, path: Path, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
+        """Over an open source, which it closes; `open` is for files. Raises as `open` does."""
+        self.path, self.size = path, source.size
+        self._source = source
+        self._cache = ChunkCache(cache_bytes)
+        try:
+            with damage_named(path):
+                members = read_members(source)
+                self._documents = sum(member.name.endswith("zarr.json") for member in members.values())
+                found = read_hierarchy(source, members)
+                validate_header(found.header)
+                check_arrays(found.header, found.arrays)
+            self.header = found.header
+            self.arrays = MappingProxyType(
+                {name: StoredArray(path, name, array, found.chunks[name], source, self._cache) for name, array in found.arrays.items()}
+            )
+            key_frames = self.arrays["key_frames"].read()
+            with damage_named(path):
+                check_key_frames(found.header, key_frames)
+        except BaseException:
+            source.close()
+            raise
+
+    @classmethod
+    def open(cls, path: str | Path, *, cache_bytes: int = CACHE_BYTES) -> Container:
+        """Open a file; `cache_bytes` bounds the decoded chunks that are kept.
+
+        Raises MissingInputError, InputError (a folder, no permission), DamagedFileError, UnsupportedFileError (a newer format).
+        """
+        return cls(Path(path), FileSource(Path(path)), cache_bytes=cache_bytes)
+
+    def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
+        """Read and decode every member (metadata were at opening); the number of arrays.
+
+        `progress(done, total)` counts members. Raises DamagedFileError naming the member.
+        """
+        total = self._documents + sum(len(array.chunks) for array in self.arrays.values())
+        done = self._documents
+        with damage_named(self.path):
+            for array in self.arrays.values():
+                for index in array.chunks:
+                    array.decode_chunk(index)
+                    done += 1
+                    if progress is not None:
+                        progress(done, total)
+        return len(self.arrays)
+
+    def overhead(self) -> int:
+        """Bytes of the file that are not data of chunks: metadata, names, directory."""
+        return self.size - sum(array.nbytes_stored for array in self.arrays.values())
+
+    def close(self) -> None:
+        """Release the file and the cache."""
+        self._source.close()
+        self._cache.clear()
+
+    def __enter__(self) -> Container:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

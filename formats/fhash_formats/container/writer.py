@@ -1,0 +1,217 @@
+"""`ContainerWriter`: arrays streamed to a `.fhz` file that is complete or absent."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from itertools import product
+from math import prod
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.container import strict_json
+from fhash_formats.container.array import ArrayMetadata
+from fhash_formats.container.coding import Codec, plain_codecs
+from fhash_formats.container.header import FORMAT, FORMAT_VERSION
+from fhash_formats.container.hierarchy import DOCUMENT, GROUP
+from fhash_formats.container.layout import Member, ending, local_header
+from fhash_formats.container.reader import Container
+from fhash_formats.container.source import FileSource, PreviewSource
+from fhash_formats.container.zip_checked import MAX_NAME, NAME
+from fhash_formats.errors import DamagedFileError, InputError, OutputError
+from fhash_formats.writers.atomic import replacing
+
+USUAL_CHUNK_BYTES = 2 << 20
+
+
+class _Abandoned(Exception):
+    """Leaving without `commit`: no error, but the way to tell `replacing` that there is nothing to keep."""
+
+
+class ContainerWriter:
+    """Writes a container; a context manager. The file takes its name in `commit`; without it nothing is left behind.
+
+    Members are written as they come and once only: an array's metadata, its chunks, and at the end the groups and the root. Identical
+    calls give identical bytes. Raises OutputExistsError or OutputError on entering.
+    """
+
+    def __init__(self, path: str | Path, *, force: bool = False) -> None:
+        """`force` replaces an existing file."""
+        self.path = Path(path)
+        self._force = force
+        self._stack = ExitStack()
+        self._members: list[Member] = []
+        self._arrays: set[str] = set()
+        self._position = 0
+
+    def __enter__(self) -> ContainerWriter:
+        with ExitStack() as stack:
+            self._temporary = stack.enter_context(replacing(self.path, force=self._force))
+            self._file = stack.enter_context(self._temporary.open("wb"))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        # After `commit` the stack is empty and this does nothing.
+        failure = error if error is not None else _Abandoned()
+        self._stack.__exit__(type(failure), failure, trace)
+
+    def add_array(
+        self,
+        name: str,
+        *,
+        shape: Sequence[int],
+        dtype: npt.DTypeLike,
+        chunk_shape: Sequence[int],
+        chunks: Iterable[npt.NDArray[Any]],
+        dimension_names: Sequence[str | None] | None = None,
+        attributes: Mapping[str, Any] | None = None,
+        codecs: Sequence[Codec] | None = None,
+    ) -> None:
+        """Write an array chunk by chunk; never more than one is held.
+
+        `chunks` come in C order of the chunk grid, each of `dtype`; those at an end of the array are given as far as the array goes.
+        `codecs` as in Zarr's metadata, default bytes, zstd, crc32c. Raises InputError for anything that does not fit together.
+        """
+        number_type = np.dtype(dtype).newbyteorder("=")
+        try:
+            metadata = ArrayMetadata(
+                shape=tuple(int(n) for n in shape),
+                dtype=number_type,
+                chunk_shape=tuple(int(n) for n in chunk_shape),
+                codecs=plain_codecs(number_type) if codecs is None else tuple(codecs),
+                dimension_names=None if dimension_names is None else tuple(dimension_names),
+                attributes=dict(attributes or {}),
+            )
+            # What is written is what a reader accepts: the reader's checks are the writer's.
+            document = strict_json.dumps(metadata.to_dict(), f"the metadata of array {name}")
+            ArrayMetadata.from_dict(strict_json.loads(document))
+        except DamagedFileError as error:
+            raise InputError(f"array {name} cannot be stored: {error}") from error
+        self._check_name(name)
+        self._arrays.add(name)
+        self._add(f"{name}/{DOCUMENT}", document)
+        given = iter(chunks)
+        for index in product(*(range(n) for n in metadata.grid)):
+            chunk = next(given, None)
+            if chunk is None:
+                raise InputError(f"array {name}: chunk {index} was not given; the grid has {metadata.grid}")
+            self._add(f"{name}/{metadata.chunk_key(index)}", metadata.coder.encode(_full_chunk(name, metadata, index, chunk)))
+        if next(given, None) is not None:
+            raise InputError(f"array {name}: more chunks were given than the {prod(metadata.grid)} of the grid {metadata.grid}")
+
+    def add_whole(
+        self,
+        name: str,
+        array: npt.NDArray[Any],
+        *,
+        chunk_shape: Sequence[int] | None = None,
+        dimension_names: Sequence[str | None] | None = None,
+        attributes: Mapping[str, Any] | None = None,
+        codecs: Sequence[Codec] | None = None,
+    ) -> None:
+        """Write an array that is in memory; by default one chunk up to 2 MiB, slabs of the leading axes above. Raises as `add_array`."""
+        chosen = usual_chunk_shape(array.shape, array.dtype.itemsize) if chunk_shape is None else tuple(chunk_shape)
+        self.add_array(
+            name,
+            shape=array.shape,
+            dtype=array.dtype,
+            chunk_shape=chosen,
+            chunks=_cut(array, chosen),
+            dimension_names=dimension_names,
+            attributes=attributes,
+            codecs=codecs,
+        )
+
+    def preview(self, header: Mapping[str, Any]) -> Container:
+        """What has been written so far as a container to read and to close, as if committed with this header.
+
+        `quality` and `history` may be left out of it, because they are what a preview is there to measure.
+        """
+        return self._open(self._tail({"quality": {}, "history": [], **header}))
+
+    def commit(self, header: Mapping[str, Any]) -> int:
+        """Write the groups, the root with its header and the directory, and give the file its name; the bytes of the file.
+
+        `format`, `format_version` and, unless given, `required_features` are added to the header. Raises InputError for a header that
+        does not fit the arrays, OutputError for a full disk.
+        """
+        tail = self._tail(header)
+        # A file that its own reader would refuse is not written.
+        self._open(tail).close()
+        self._file.write(tail)
+        self._position += len(tail)
+        self._stack.close()
+        return self._position
+
+    def _open(self, tail: bytes) -> Container:
+        self._file.flush()
+        try:
+            return Container(self.path, PreviewSource(FileSource(self._temporary), self._position, tail))
+        except DamagedFileError as error:
+            raise InputError(f"the container would not be readable: {error}") from error
+
+    def _tail(self, header: Mapping[str, Any]) -> bytes:
+        """Everything that comes after the arrays."""
+        if self._file.closed:
+            raise OutputError(f"{self.path}: the container is written already")
+        groups = {"/".join(parts[:n]) for parts in (name.split("/") for name in self._arrays) for n in range(1, len(parts))}
+        documents = {f"{group}/{DOCUMENT}": strict_json.dumps(GROUP, "a group") for group in sorted(groups)}
+        complete = {"required_features": [], **header, "format": FORMAT, "format_version": list(FORMAT_VERSION)}
+        documents[DOCUMENT] = strict_json.dumps({**GROUP, "attributes": {"fhash": complete}}, "the header")
+        members, parts, position = list(self._members), [], self._position
+        for name, data in documents.items():
+            member = Member(name=name, offset=position, size=len(data), crc=zlib.crc32(data))
+            members.append(member)
+            parts += [local_header(member), data]
+            position = member.end
+        return b"".join([*parts, ending(members)])
+
+    def _check_name(self, name: str) -> None:
+        if not NAME.fullmatch(name) or len(name) > MAX_NAME // 2 or name.rpartition("/")[2] == DOCUMENT:
+            raise InputError(f"array name {name[:80]!a} is not allowed; allowed: paths of A-Z a-z 0-9 . _ - up to {MAX_NAME // 2} letters")
+        if name in self._arrays:
+            raise InputError(f"array {name} is there already")
+
+    def _add(self, name: str, data: bytes) -> None:
+        if self._file.closed:
+            raise OutputError(f"{self.path}: the container is written already")
+        member = Member(name=name, offset=self._position, size=len(data), crc=zlib.crc32(data))
+        self._file.write(local_header(member))
+        self._file.write(data)
+        self._members.append(member)
+        self._position = member.end
+
+
+def usual_chunk_shape(shape: Sequence[int], itemsize: int) -> tuple[int, ...]:
+    """The whole array up to 2 MiB; otherwise leading axes are cut, the first to single positions before the next is touched."""
+    chunk = list(shape)
+    for axis, length in enumerate(shape):
+        rest = prod(chunk[axis + 1 :]) * itemsize
+        chunk[axis] = max(1, min(length, USUAL_CHUNK_BYTES // max(1, rest)))
+        if chunk[axis] > 1:
+            break
+    return tuple(chunk)
+
+
+def _cut(array: npt.NDArray[Any], chunk_shape: Sequence[int]) -> Iterator[npt.NDArray[Any]]:
+    starts = (range(0, n, max(1, chunk)) for n, chunk in zip(array.shape, chunk_shape, strict=False))
+    for corner in product(*starts):
+        yield array[tuple(slice(start, start + chunk) for start, chunk in zip(corner, chunk_shape, strict=False))]
+
+
+def _full_chunk(name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A chunk padded with 0 to the full shape, as Zarr stores those at an end of the array."""
+    expected = tuple(part.stop - part.start for part in metadata.chunk_region(index))
+    if chunk.shape != expected or chunk.dtype.newbyteorder("=") != metadata.dtype:
+        raise InputError(f"array {name}: chunk {tuple(index)} is {chunk.dtype} {chunk.shape}; {metadata.dtype} {expected} is needed")
+    if expected == metadata.chunk_shape:
+        return chunk
+    full = np.zeros(metadata.chunk_shape, dtype=metadata.dtype)
+    full[tuple(slice(0, n) for n in expected)] = chunk
+    return full

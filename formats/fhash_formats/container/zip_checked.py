@@ -1,0 +1,154 @@
+"""Opening a container's ZIP safely: nothing in it is believed before it is checked, and nothing big is allocated.
+
+The directory is digested, the members lie one after the other from the first byte to the directory, and each field has the value that
+`layout` writes. So every byte of the file is vouched for: the directory by its digest, a member's header by the directory, its data by
+its CRC.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+
+from fhash_formats.container.layout import (
+    COMMENT,
+    END,
+    END_64,
+    END_64_MARK,
+    END_MARK,
+    ENTRY,
+    ENTRY_MARK,
+    LAYOUT_VERSION,
+    LOCATOR_64,
+    MAX_16,
+    MAX_32,
+    OFFSET_64,
+    STORED,
+    Member,
+    comment,
+    directory_entry,
+    end_records,
+    local_header,
+)
+from fhash_formats.container.source import Source
+from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+
+MAX_DIRECTORY = 1 << 28
+MAX_MEMBER = 1 << 31
+MAX_NAME = 512
+
+_PART = r"[A-Za-z0-9_-][A-Za-z0-9._-]*"
+NAME = re.compile(rf"{_PART}(/{_PART})*")
+"""Names of members: relative paths of plain parts, none of which starts with a dot."""
+
+_LONGEST_COMMENT = 128
+
+
+def find_signature(source: Source) -> tuple[int, bytes] | None:
+    """Layout version and comment, or None where the file does not end in a container's signature."""
+    start = max(0, source.size - _LONGEST_COMMENT)
+    end = source.read(start, source.size - start)
+    found = COMMENT.search(end)
+    return (int(found[1]), found[0]) if found else None
+
+
+def read_members(source: Source) -> dict[str, Member]:
+    """Every member by name, in the order of the file; raises DamagedFileError or UnsupportedFileError."""
+    signature = find_signature(source)
+    if signature is None:
+        raise DamagedFileError("not an fhash container, or one that was cut short: no fhash signature at its end")
+    version, signed = signature
+    comment_at = source.size - len(signed)
+    if version > LAYOUT_VERSION:
+        raise UnsupportedFileError(f"written by a newer fhash format {version}; this version reads {LAYOUT_VERSION}.x; upgrade")
+    count, size, offset = _read_end(source, comment_at)
+    directory = source.read(offset, comment_at - offset)
+    if comment(directory) != signed:
+        raise DamagedFileError("the ZIP directory is damaged: its SHA-256 differs from the one in the comment")
+    if directory[size:] != end_records(count, size, offset):
+        raise DamagedFileError("the end record of the ZIP directory contradicts itself")
+    return _parse(directory[:size], count, offset)
+
+
+def read_member(source: Source, member: Member) -> memoryview:
+    """The checked data of a member; raises DamagedFileError naming it."""
+    try:
+        stored = source.read(member.offset, member.header_size + member.size)
+    except DamagedFileError as error:
+        raise DamagedFileError(f"member {member.name}: {error}") from error
+    if stored[: member.header_size] != local_header(member):
+        raise DamagedFileError(f"member {member.name}: its header differs from the directory")
+    data = memoryview(stored)[member.header_size :]
+    if zlib.crc32(data) != member.crc:
+        raise DamagedFileError(f"member {member.name}: its CRC-32 differs, the data are damaged")
+    return data
+
+
+def _read_end(source: Source, comment_at: int) -> tuple[int, int, int]:
+    """Number of entries, bytes and offset of the directory, from the end records before the comment."""
+    end_at = comment_at - END.size
+    if end_at < 0:
+        raise DamagedFileError("the ZIP end record is missing")
+    mark, _, _, _, count, size, offset, comment_size = END.unpack(source.read(end_at, END.size))
+    if mark != END_MARK or comment_size != source.size - comment_at or comment_size != len(comment(b"")):
+        raise DamagedFileError("the ZIP end record is damaged")
+    records_at = end_at
+    if count == MAX_16 or MAX_32 in (size, offset):
+        records_at = end_at - LOCATOR_64.size - END_64.size
+        if records_at < 0:
+            raise DamagedFileError("the ZIP64 end record is missing")
+        mark, _, _, _, _, _, _, count, size, offset = END_64.unpack(source.read(records_at, END_64.size))
+        if mark != END_64_MARK:
+            raise DamagedFileError("the ZIP64 end record is damaged")
+    if size > MAX_DIRECTORY:
+        raise DamagedFileError(f"the ZIP directory declares {size} bytes; the limit is {MAX_DIRECTORY}")
+    if offset + size != records_at:
+        raise DamagedFileError(f"the ZIP directory is declared at {offset} with {size} bytes, but it ends at {records_at}")
+    return count, size, offset
+
+
+def _parse(directory: bytes, count: int, data_end: int) -> dict[str, Member]:
+    members: dict[str, Member] = {}
+    at = position = 0
+    while at < len(directory):
+        member, length = _parse_entry(directory, at)
+        if member.name in members:
+            raise DamagedFileError(f"member {member.name} is there twice")
+        if member.offset != position or member.end > data_end:
+            raise DamagedFileError(f"member {member.name} at {member.offset} overlaps another or leaves a gap; {position} was expected")
+        members[member.name] = member
+        position = member.end
+        at += length
+    if len(members) != count or position != data_end:
+        raise DamagedFileError(f"the ZIP directory has {len(members)} entries that end at {position}; {count} and {data_end} are declared")
+    return members
+
+
+def _parse_entry(directory: bytes, at: int) -> tuple[Member, int]:
+    """The member whose entry starts at `at`, and the bytes of the entry."""
+    if at + ENTRY.size > len(directory):
+        raise DamagedFileError("the ZIP directory ends within an entry")
+    fields = ENTRY.unpack_from(directory, at)
+    mark, flags, method, crc, size, full_size, name_size, extra_size, offset = (fields[i] for i in (0, 5, 6, 9, 10, 11, 12, 13, 18))
+    if mark != ENTRY_MARK:
+        raise DamagedFileError("the ZIP directory has an entry without its mark")
+    name_at = at + ENTRY.size
+    raw_name = directory[name_at : name_at + name_size]
+    name = raw_name.decode("ascii", "replace")
+    if name_size > MAX_NAME or not raw_name.isascii() or not NAME.fullmatch(name):
+        raise DamagedFileError(f"member name {name[:80]!a} is not allowed; names are relative paths of A-Z a-z 0-9 . _ -")
+    if flags & 1:
+        raise DamagedFileError(f"member {name} is encrypted")
+    if method != STORED:
+        raise DamagedFileError(f"member {name} is compressed by ZIP method {method}; only stored members are allowed")
+    if size != full_size or size > MAX_MEMBER:
+        raise DamagedFileError(
+            f"member {name} declares {size} stored and {full_size} full bytes; equal sizes up to {MAX_MEMBER} are allowed"
+        )
+    if offset == MAX_32 and extra_size == OFFSET_64.size and name_at + name_size + extra_size <= len(directory):
+        offset = OFFSET_64.unpack_from(directory, name_at + name_size)[2]
+    member = Member(name=name, offset=offset, size=size, crc=crc)
+    canonical = directory_entry(member)
+    if directory[at : at + len(canonical)] != canonical:
+        raise DamagedFileError(f"member {name} has fields in its directory entry that the format does not allow")
+    return member, len(canonical)

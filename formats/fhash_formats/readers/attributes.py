@@ -1,0 +1,58 @@
+"""Attributes of files as JSON values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+STORAGE_NAMES = """CLASS NAME DIMENSION_LIST REFERENCE_LIST DIMENSION_LABELS _ARRAY_DIMENSIONS
+_Netcdf4Dimid _Netcdf4Coordinates _NCProperties _nc3_strict"""
+PLUMBING = frozenset(STORAGE_NAMES.split())
+"""Attributes by which HDF5, NetCDF and zarr tie datasets together; they say nothing of the values."""
+
+PACKING_NAMES = "_FillValue missing_value scale_factor add_offset _Unsigned valid_min valid_max valid_range"
+PACKING = frozenset(PACKING_NAMES.split())
+"""Attributes that describe stored numbers and are untrue of unpacked ones; a valid range would also hide values that a codec moves."""
+
+
+class _Unknown(Exception):
+    pass
+
+
+def json_attributes(attributes: Mapping[str, Any], *, without: frozenset[str] = PLUMBING) -> dict[str, Any]:
+    """The attributes as JSON values: numbers, text, lists. Bytes are UTF-8; not-a-number and infinities become text, as in zarr metadata.
+
+    References, compound values and whatever else JSON cannot say are dropped, and so are the names in `without`.
+    """
+    result: dict[str, Any] = {}
+    for name in attributes:
+        if name not in without:
+            try:
+                result[str(name)] = _json_value(attributes[name])
+            except (_Unknown, TypeError, OSError):
+                continue  # h5py raises the latter two for types of attributes that it does not know
+    return result
+
+
+def _json_value(value: Any) -> Any:
+    if value is None or isinstance(value, str | bool | int):
+        return str(value) if isinstance(value, np.str_) else value
+    if isinstance(value, bytes):
+        return value.decode("utf-8", errors="replace")
+    if isinstance(value, float):
+        # float() strips numpy's float64, which is a float too
+        return float(value) if math.isfinite(value) else {math.inf: "Infinity", -math.inf: "-Infinity"}.get(value, "NaN")
+    if isinstance(value, np.ndarray | np.generic):
+        if value.dtype.kind in "biufSUTO":
+            return _json_value(value.tolist())
+        if value.dtype.kind in "Mm":
+            return np.asarray(value).astype(str).tolist()
+        raise _Unknown
+    if isinstance(value, Mapping):
+        return {str(name): _json_value(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_value(each) for each in value]
+    raise _Unknown

@@ -1,0 +1,69 @@
+"""Arrays whose values lie in a file one after the other, without chunks or compression: .npy and raw."""
+
+from __future__ import annotations
+
+from math import prod
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+
+BLOCK_BYTES = 8 * 2**20
+"""Bytes read at once where the wanted values are scattered, as with time fastest."""
+
+SHORTEST_RUN = 16 * 2**10
+"""Bytes below which a run is not worth a read of its own."""
+
+
+class FlatArray:
+    """An array of `shape` (slowest dimension first) and `dtype` that starts at byte `offset` of a file.
+
+    Read with seek and read and not through a memory map, which would kill the process if the file were cut meanwhile.
+    """
+
+    def __init__(self, path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], *, offset: int = 0) -> None:
+        self.path, self.shape, self.dtype, self.offset = path, shape, dtype, offset
+
+    @property
+    def end(self) -> int:
+        """The byte after the last value: what the size of the file should be."""
+        return self.offset + prod(self.shape) * self.dtype.itemsize
+
+    def read(self, ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """The values in the ranges, of which at most one is not the whole dimension; raises InputError where the file ends too early."""
+        parts = [place for place, (part, length) in enumerate(zip(ranges, self.shape, strict=True)) if part != slice(0, length)]
+        place = parts[0] if parts else 0
+        part = ranges[place]
+        rows, inner = prod(self.shape[:place]), prod(self.shape[place + 1 :])
+        result = np.empty((rows, (part.stop - part.start) * inner), self.dtype)
+        with self.path.open("rb") as file:
+            self._fill(file, result, self.shape[place] * inner, part.start * inner)
+        return result.reshape(*self.shape[:place], part.stop - part.start, *self.shape[place + 1 :])
+
+    def _fill(self, file: BinaryIO, result: npt.NDArray[Any], stride: int, first: int) -> None:
+        """Each row of the result from `first` in each `stride` values of the file."""
+        rows, run = result.shape
+        item = self.dtype.itemsize
+        if run * item >= SHORTEST_RUN or rows == 1:
+            for row in range(rows):
+                self._read(file, result[row], row * stride + first)
+            return
+        together = max(1, BLOCK_BYTES // (stride * item))
+        for row in range(0, rows, together):
+            count = min(together, rows - row)
+            block = np.empty(count * stride, self.dtype)
+            self._read(file, block, row * stride)
+            result[row : row + count] = block.reshape(count, stride)[:, first : first + run]
+
+    def _read(self, file: BinaryIO, into: npt.NDArray[Any], start: int) -> None:
+        file.seek(self.offset + start * self.dtype.itemsize)
+        view = into.view(np.uint8).data
+        done = 0
+        while done < len(view):
+            count = file.readinto(view[done:])  # type: ignore[attr-defined]
+            if not count:
+                raise InputError(f"{self.path} ends after {file.tell()} bytes, {self.end} are needed")
+            done += count

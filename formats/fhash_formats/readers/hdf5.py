@@ -1,0 +1,124 @@
+"""HDF5 files of any make, walked with h5py; NetCDF files are HDF5 too, but have rules of their own (see netcdf)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from fhash_formats.readers.attributes import json_attributes
+from fhash_formats.readers.failures import Stamp, refusing
+from fhash_formats.readers.hdf5_tree import column, columns, datasets, own_name, require_filters, require_sources, variables
+from fhash_formats.readers.lattice import FileSeries
+from fhash_formats.readers.positions import beside, coordinate, usable
+from fhash_formats.readers.request import Request
+from fhash_formats.readers.roles import assign_axes, role_of_coordinate, role_of_name
+from fhash_formats.readers.variables import choose
+from fhash_formats.series import Coordinate, Series
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+def is_hdf5(head: bytes) -> bool:
+    """Whether a file that begins so is HDF5; a user block of 512, 1024 or 2048 bytes may come before the signature."""
+    return any(head[offset : offset + len(SIGNATURE)] == SIGNATURE for offset in (0, 512, 1024, 2048))
+
+
+def matches(head: bytes, path: Path) -> bool:
+    """Whether this is an HDF5 file."""
+    return is_hdf5(head)
+
+
+def open_hdf5(path: Path, request: Request) -> Series:
+    """The series in an HDF5 file: the only suitable dataset, or the one named.
+
+    Coordinates are the dimension scales, else 1-D datasets of a conventional name beside the dataset or in the root.
+    Values are as stored: fill values and packing mean something in NetCDF files only.
+    """
+    import h5py
+
+    source, stamp = str(path), Stamp.of(path)
+    with refusing(f"{source} cannot be read as HDF5"):
+        file = h5py.File(path, "r")
+    try:
+        with refusing(f"{source} cannot be read as HDF5"):
+            return _series(source, path, stamp, file, request)
+    except BaseException:
+        file.close()
+        raise
+
+
+def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> Series:
+    tree = dict(datasets(file))
+    var = own_name(file, tree, request.var) if request.var else None
+    variable = choose(source, variables(tree), var, booleans=request.booleans)
+    dataset = variable.handle
+    require_filters(source, variable.name, dataset)
+    require_sources(source, path, variable.name, dataset)
+    scales = [_scale(dimension) for dimension in dataset.dims]
+    names = [dimension.label or (scale[0] if scale else None) for dimension, scale in zip(dataset.dims, scales, strict=True)]
+    hints = [_hint(dimension.label, scale) for dimension, scale in zip(dataset.dims, scales, strict=True)]
+    axes = assign_axes(source, dataset.shape, hints, names, request.axes)
+    certain = request.axes is not None or all(hint is not None for hint in hints)
+    group = variable.name.rpartition("/")[0]
+    places = [columns(tree, place) for place in dict.fromkeys([group, ""])]
+    tied = [axis for axis, scale in zip(axes, scales, strict=True) if scale is not None]
+    coords = beside(source, axes, dataset.shape, places, certain=certain, tied=tied)
+    coords |= _scale_coordinates(source, axes, dataset.shape, scales)
+    return FileSeries(
+        source=source,
+        name=variable.name.rpartition("/")[2],
+        shape=dataset.shape,
+        dtype=dataset.dtype,
+        axes=axes,
+        fetch=lambda ranges: dataset[ranges],
+        stamp=stamp,
+        coords=coords,
+        attributes=json_attributes(dataset.attrs),
+        steps_together=steps_together(axes, dataset.shape, dataset.chunks),
+        close=file.close,
+    )
+
+
+def steps_together(axes: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...] | None) -> int:
+    """Steps that are best fetched at once: those of one chunk; without chunks one, or all where time is not the slowest dimension."""
+    if "t" not in axes:
+        return 1
+    place = axes.index("t")
+    if chunks is not None:
+        return chunks[place]
+    return 1 if place == 0 else shape[place]
+
+
+def _scale(dimension: Any) -> tuple[str, Any] | None:
+    """Name and dataset of the dimension scale attached first, if any."""
+    if len(dimension) == 0:
+        return None
+    dataset = dimension[0]
+    return dataset.name.rpartition("/")[2], dataset
+
+
+def _hint(label: str, scale: tuple[str, Any] | None) -> str | None:
+    if scale is not None:
+        role = role_of_coordinate(scale[0], json_attributes(scale[1].attrs))
+        if role is not None:
+            return role
+    return role_of_name(label) if label else None
+
+
+def _scale_coordinates(
+    source: str, axes: tuple[str, ...], shape: tuple[int, ...], scales: list[tuple[str, Any] | None]
+) -> dict[str, Coordinate]:
+    found = {}
+    for axis, length, scale in zip(axes, shape, scales, strict=True):
+        # a NetCDF dimension without values is a scale too, and says so in its NAME
+        if scale is None or scale[1].shape != (length,) or not usable(scale[1].dtype) or _valueless(scale[1]):
+            continue
+        values = column(*scale)
+        found[axis] = coordinate(source, values.name, values.read(), values.attributes)
+    return found
+
+
+def _valueless(scale: Any) -> bool:
+    name = scale.attrs.get("NAME", b"")
+    text = name.decode("utf-8", errors="replace") if isinstance(name, bytes) else str(name)
+    return text.startswith("This is a netCDF dimension but not a netCDF variable")

@@ -1,0 +1,129 @@
+"""Many files, each a step or a few, as one series: "frames_*.raw"."""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError, MissingInputError, RegionError
+from fhash_formats.readers.failures import Stamp
+from fhash_formats.series import Coordinate, Series, index_coordinate
+
+
+def is_pattern(text: str) -> bool:
+    """Whether a path is a pattern of files (*, ?, [..]) and not the name of one."""
+    return glob.has_magic(text) and not os.path.exists(text)
+
+
+def natural_order(text: str) -> list[tuple[int, str]]:
+    """A key that sorts frame_9 before frame_10: runs of digits count as numbers."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text)]
+
+
+def files_of(pattern: str) -> list[Path]:
+    """The files of a pattern in the order of the numbers in their names; raises MissingInputError if there are none."""
+    found = sorted(glob.glob(pattern), key=lambda name: (natural_order(name), name))
+    if not found:
+        raise MissingInputError(f"no file matches {pattern}")
+    return [Path(name) for name in found]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """What was seen of one file when the series was opened."""
+
+    path: Path
+    stamp: Stamp
+    steps: int
+    time: Coordinate | None
+
+
+class JoinedSeries(Series):
+    """The steps of several files one after the other; only the file that was read last is open.
+
+    All files have the same variable, frame shape, type and spatial coordinates. Times are those of the files if they give them, and must
+    then increase from file to file; otherwise they are 0, 1, 2, ... Raises InputError that names the file which differs.
+    """
+
+    def __init__(self, pattern: str, paths: Sequence[Path], open_part: Callable[[Path], Series]) -> None:
+        self.source = pattern
+        self._open_part = open_part
+        self._current: tuple[int, Series] | None = None
+        self._parts: list[_Part] = []
+        names = []
+        first: Series | None = None
+        for path in paths:
+            stamp = Stamp.of(path)
+            with open_part(path) as part:
+                first = first or part
+                _check_alike(part, path, first, paths[0])
+                time = part.coords["t"] if "t" in getattr(part, "given", ()) else None
+                self._parts.append(_Part(path=path, stamp=stamp, steps=part.shape[0], time=time))
+                names.append(part.name)
+        assert first is not None
+        self.name = _common_name(names)
+        self.units, self.dtype, self.attributes = first.units, first.dtype, first.attributes
+        self._ends = list(accumulate(part.steps for part in self._parts))
+        self.shape = (self._ends[-1], *first.shape[1:])
+        self.coords = {**first.coords, "t": self._times()}
+
+    def read(self, step: int) -> npt.NDArray[Any]:
+        if not 0 <= step < self.shape[0]:
+            raise RegionError(f"{self.source}: step {step} is outside 0..{self.shape[0] - 1}")
+        number = bisect_right(self._ends, step)
+        if self._current is None or self._current[0] != number:
+            self.close()
+            self._parts[number].stamp.check()
+            self._current = (number, self._open_part(self._parts[number].path))
+        return self._current[1].read(step - (self._ends[number] - self._parts[number].steps))
+
+    def close(self) -> None:
+        if self._current is not None:
+            self._current[1].close()
+            self._current = None
+
+    def _times(self) -> Coordinate:
+        times = [part.time for part in self._parts if part.time is not None]
+        if not times:
+            return index_coordinate("t", self.shape[0])
+        for part in self._parts:
+            if part.time is None or dict(part.time.attributes) != dict(times[0].attributes):
+                raise InputError(f"{self.source}: the time in {part.path} has not the units of the time in {self._parts[0].path}")
+        for before, after in zip(self._parts[:-1], self._parts[1:], strict=True):
+            last, following = before.time, after.time
+            if last is not None and following is not None and not last.values[-1] < following.values[0]:
+                passed = f"{following.values[0]:g} in {after.path} after {last.values[-1]:g} in {before.path}"
+                raise InputError(f"{self.source}: times do not increase in the order of the file names: {passed}")
+        return Coordinate(name=times[0].name, values=np.concatenate([time.values for time in times]), attributes=times[0].attributes)
+
+
+def _common_name(names: Sequence[str]) -> str:
+    """The name of all, or what their beginnings have in common before the numbers: "frame" of frame_01 and frame_02."""
+    low, high = min(names), max(names)
+    if low == high:
+        return low
+    same = next((place for place, (one, other) in enumerate(zip(low, high, strict=False)) if one != other), len(low))
+    return low[:same].rstrip("0123456789_-. ") or names[0]
+
+
+def _check_alike(part: Series, path: Path, first: Series, first_path: Path) -> None:
+    for what, here, there in (
+        ("a frame (z, y, x) of shape", part.shape[1:], first.shape[1:]),
+        ("values of type", part.dtype, first.dtype),
+        ("the unit", part.units, first.units),
+    ):
+        if here != there:
+            raise InputError(f"{path} has {what} {here}, {first_path} {there}; files of one series must be alike")
+    for axis in ("z", "y", "x"):
+        if not np.array_equal(part.coords[axis].values, first.coords[axis].values):
+            raise InputError(f"{path} has other coordinates along {axis} than {first_path}; files of one series must be alike")

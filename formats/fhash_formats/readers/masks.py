@@ -1,0 +1,45 @@
+"""A user's own feature: a mask in a file, of the series' shape."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.readers.registry import open_whole
+from fhash_formats.readers.request import Request
+from fhash_formats.series import Series
+
+
+class Mask:
+    """A mask over a series: `mask(step)` is the boolean frame (z, y, x). One file frame serves every step if it holds only one."""
+
+    def __init__(self, values: Series) -> None:
+        self._values = values
+
+    def __call__(self, step: int) -> npt.NDArray[np.bool_]:
+        """True where the file's value at this step is neither zero nor NaN; raises InputError if the file cannot be read."""
+        frame = self._values.read(step if self._values.shape[0] > 1 else 0)
+        mask: npt.NDArray[np.bool_] = frame != 0
+        return mask & ~np.isnan(frame) if frame.dtype.kind == "f" else mask
+
+    def close(self) -> None:
+        """Release the file."""
+        self._values.close()
+
+
+def open_mask(path: str | Path, shape: Sequence[int], var: str | None = None) -> Mask:
+    """The mask in a file for a series of `shape` (t, z, y, x): booleans or numbers of that shape, or (z, y, x) for all steps alike.
+
+    Any format that `open_series` reads. Raises InputError where the shape is another.
+    """
+    values = open_whole(path, Request(var=var, booleans=True))
+    if values.shape[1:] != tuple(shape[1:]) or values.shape[0] not in (1, shape[0]):
+        values.close()
+        raise InputError(
+            f"{path}: the mask has shape {values.shape} (t, z, y, x), the series {tuple(shape)}; it must be that, or one step of it"
+        )
+    return Mask(values)

@@ -1,0 +1,228 @@
+"""NetCDF files, read by the CF conventions with xarray: packing undone, fill values turned into NaN, times kept as numbers.
+
+NetCDF4 is HDF5 and goes through h5netcdf, NetCDF3 ("classic") through scipy. Times are not decoded: float64 hours near 347921 tell
+steps apart, calendars of models need no date, and `units` and `calendar` stay beside the numbers. `valid_range` never hides a value:
+files in use have wrong ones.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.readers.attributes import PACKING, PLUMBING, json_attributes
+from fhash_formats.readers.failures import Stamp, condense, refusing
+from fhash_formats.readers.hdf5 import is_hdf5, steps_together
+from fhash_formats.readers.hdf5_tree import require_filters
+from fhash_formats.readers.lattice import FileSeries
+from fhash_formats.readers.positions import Column, beside, coordinate, usable
+from fhash_formats.readers.request import Request
+from fhash_formats.readers.roles import assign_axes, role_of_coordinate, role_of_name
+from fhash_formats.readers.variables import Variable, choose
+from fhash_formats.series import AXES, Coordinate, Series
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
+CLASSIC = (b"CDF\x01", b"CDF\x02")
+MADE_UP = "phony_dim_"
+"""How the dimensions begin that a file does not name."""
+
+CLASSIC_64 = b"CDF\x05"
+
+
+def matches(head: bytes, path: Path) -> bool:
+    """Whether this is NetCDF: classic, or HDF5 that says so by its suffix, by `_NCProperties` or by CF `Conventions`."""
+    if head[:4] in (*CLASSIC, CLASSIC_64):
+        return True
+    return is_hdf5(head) and (path.suffix.lower() in SUFFIXES or _says_netcdf(path))
+
+
+def _says_netcdf(path: Path) -> bool:
+    import h5py
+
+    with refusing(f"{path} cannot be read as HDF5"), h5py.File(path, "r") as file:
+        conventions = file.attrs.get("Conventions", "")
+        text = conventions.decode("utf-8", errors="replace") if isinstance(conventions, bytes) else str(conventions)
+        return "_NCProperties" in file.attrs or text.strip().upper().startswith("CF-")
+
+
+def open_netcdf(path: Path, request: Request) -> Series:
+    """The series in a NetCDF file: the only suitable variable (of the root, or of any group), or the one named."""
+    source, stamp = str(path), Stamp.of(path)
+    with path.open("rb") as file:
+        head = file.read(4)
+    with _quietly(), refusing(f"{source} cannot be read as NetCDF"):
+        groups = _open_groups(source, path, head)
+        try:
+            return _series(source, path, stamp, groups, request)
+        except BaseException:
+            _close(groups)
+            raise
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """xarray warns of every oddity of a file (several fill values, bounds that are missing); none of them changes what is read."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _open_groups(source: str, path: Path, head: bytes) -> Mapping[str, xr.Dataset]:
+    """The datasets of all groups by path, "/" first."""
+    if head == CLASSIC_64:
+        raise InputError(f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with: nccopy -k nc4 IN OUT")
+    try:
+        import xarray as xr
+    except ImportError as error:
+        raise MissingDependencyError(f"{source}: NetCDF needs xarray and h5netcdf; pip install 'fhash[formats]'") from error
+    options: dict[str, Any] = {"decode_times": False, "decode_timedelta": False, "decode_coords": "all", "cache": False, "chunks": None}
+    if head in CLASSIC:
+        try:
+            importlib.import_module("scipy")
+        except ImportError as error:
+            advice = "pip install scipy, or convert it with: nccopy -k nc4 IN OUT"
+            raise InputError(f"{source} is classic NetCDF3, which needs scipy; {advice}") from error
+        return {"/": _open_classic(source, path, options)}
+    try:
+        importlib.import_module("h5netcdf")
+    except ImportError as error:
+        raise MissingDependencyError(f"{source}: NetCDF4 needs h5netcdf; pip install 'fhash[formats]'") from error
+    # dimensions without a scale get a made-up name, so that HDF5 files named .nc open too
+    return xr.open_groups(path, engine="h5netcdf", phony_dims="access", **options)
+
+
+def _open_classic(source: str, path: Path, options: Mapping[str, Any]) -> xr.Dataset:
+    import xarray as xr
+
+    try:
+        return xr.open_dataset(path, engine="scipy", **options)
+    except Exception as error:
+        message = condense(error)
+    # the error is not chained: its traceback holds scipy's half-open file, which warns when it is dropped, and here nobody hears that
+    gc.collect()
+    raise InputError(f"{source} cannot be read as classic NetCDF3: {message}; nccopy -k nc4 IN OUT may convert it")
+
+
+def _close(groups: Mapping[str, xr.Dataset]) -> None:
+    with _quietly():
+        for dataset in groups.values():
+            dataset.close()
+
+
+def _series(source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Dataset], request: Request) -> Series:
+    found = [
+        Variable(
+            name=f"{group}/{name}".lstrip("/"), shape=array.shape, dtype=array.dtype, auxiliary=name in dataset.coords, handle=(group, name)
+        )
+        for group, dataset in groups.items()
+        for name, array in ((str(name), array) for name, array in dataset.variables.items())
+    ]
+    variable = choose(source, found, request.var, booleans=request.booleans)
+    group, name = variable.handle
+    array = groups[group].variables[name]
+    _check_filters(source, path, variable.name)
+    scope = [groups[place] for place in _upwards(group) if place in groups]
+    dimensions = [str(dimension) for dimension in array.dims]
+    hints = [_role(dimension, scope) for dimension in dimensions]
+    axes = assign_axes(source, array.shape, hints, dimensions, request.axes)
+
+    def fetch(ranges: tuple[slice, ...]) -> Any:
+        with _quietly():
+            return array[ranges].to_numpy()
+
+    return FileSeries(
+        source=source,
+        name=name,
+        shape=array.shape,
+        dtype=array.dtype,
+        axes=axes,
+        fetch=fetch,
+        stamp=stamp,
+        coords=_coordinates(source, axes, dimensions, array.shape, scope, groups[group][name], request.axes is not None),
+        attributes=json_attributes(array.attrs, without=PLUMBING | PACKING),
+        steps_together=steps_together(axes, array.shape, array.encoding.get("chunksizes")),
+        close=lambda: _close(groups),
+    )
+
+
+def _check_filters(source: str, path: Path, name: str) -> None:
+    import h5py
+
+    if not h5py.is_hdf5(path):
+        return
+    with h5py.File(path, "r") as file:
+        dataset = file.get(name)
+        if isinstance(dataset, h5py.Dataset):
+            require_filters(source, name, dataset)
+
+
+def _upwards(group: str) -> list[str]:
+    """A group's path and those of the groups around it, the root last: NetCDF4 dimensions and coordinates are inherited."""
+    parts = [part for part in group.split("/") if part]
+    return ["/" + "/".join(parts[:count]) for count in range(len(parts), -1, -1)]
+
+
+def _along(dimension: str, scope: Sequence[xr.Dataset]) -> Iterator[tuple[str, xr.Variable]]:
+    """The number variables along one dimension alone: the one of its name, then coordinates, then the rest.
+
+    None for a made-up dimension: xarray shares those by length, and a length has no meaning.
+    """
+    if dimension.startswith(MADE_UP):
+        return
+    for wanted in ("named", "coordinate", "other"):
+        for dataset in scope:
+            for key, array in dataset.variables.items():
+                kind = "named" if key == dimension else "coordinate" if key in dataset.coords else "other"
+                if kind == wanted and array.dims == (dimension,) and usable(array.dtype):
+                    yield str(key), array
+
+
+def _role(dimension: str, scope: Sequence[xr.Dataset]) -> str | None:
+    for name, array in _along(dimension, scope):
+        role = role_of_coordinate(name, array.attrs)
+        if role is not None:
+            return role
+    return role_of_name(dimension)
+
+
+def _columns(dataset: xr.Dataset) -> dict[str, Column]:
+    """The variables of a dataset that may be coordinates, by lower-case name."""
+    arrays = [(str(key), array) for key, array in dataset.variables.items() if array.ndim < 2 and usable(array.dtype)]
+    return {key.lower(): Column(name=key, length=array.size, read=array.to_numpy, attributes=array.attrs) for key, array in arrays}
+
+
+def _coordinates(
+    source: str,
+    axes: Sequence[str],
+    dimensions: Sequence[str],
+    shape: Sequence[int],
+    scope: Sequence[xr.Dataset],
+    values: xr.DataArray,
+    certain: bool,
+) -> dict[str, Coordinate]:
+    """For each dimension the coordinate of its name, else one along it whose CF role is its axis; scalar coordinates for axes it lacks.
+
+    Where the file names no dimension, by conventional names as in any HDF5 file.
+    """
+    if all(dimension.startswith(MADE_UP) for dimension in dimensions):
+        return beside(source, axes, shape, [_columns(dataset) for dataset in scope], certain=certain)
+    found = {}
+    for axis, dimension, length in zip(axes, dimensions, shape, strict=True):
+        for name, array in _along(dimension, scope):
+            if array.shape == (length,) and (name == dimension or role_of_coordinate(name, array.attrs) == axis):
+                found[axis] = coordinate(source, name, array.to_numpy(), array.attrs)
+                break
+    for key, scalar in values.coords.items():
+        role = role_of_coordinate(str(key), scalar.attrs)
+        if scalar.ndim == 0 and usable(scalar.dtype) and role in AXES and role not in axes and role not in found:
+            found[role] = coordinate(source, str(key), scalar.to_numpy(), scalar.attrs)
+    return found

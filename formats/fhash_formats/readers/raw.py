@@ -1,0 +1,77 @@
+"""Raw bytes without a header: the layout comes from the file's name, as in name_256x256x128x10_float32_be.raw, or from the user."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from fhash_formats.errors import InputError
+from fhash_formats.readers.failures import Stamp
+from fhash_formats.readers.flat import FlatArray
+from fhash_formats.readers.hdf5 import steps_together
+from fhash_formats.readers.lattice import FileSeries
+from fhash_formats.readers.request import ENDIANS, RawLayout, Request, parse_dtype
+from fhash_formats.series import AXES, Series
+
+NAME = re.compile(r"(?:^|_)(?P<shape>\d+x\d+x\d+(?:x\d+)?)_(?P<dtype>[a-z]+\d+)(?:_(?P<endian>be|le))?(?=_|$)", re.IGNORECASE)
+FORM = "name_XxYxZ[xT]_TYPE[_be].raw, such as density_64x64x32x10_float32.raw"
+
+
+def matches(head: bytes, path: Path) -> bool:
+    """Whether this is raw by its suffix: what its bytes begin with is chance."""
+    return path.suffix.lower() == ".raw"
+
+
+def layout_of_name(stem: str) -> tuple[str, RawLayout]:
+    """The variable's name and the layout in a file name without its suffix; everything None where the name does not say."""
+    found = NAME.search(stem)
+    if found is None:
+        return stem, RawLayout()
+    lengths = [int(length) for length in found["shape"].lower().split("x")]
+    endian = {"be": "big", "le": "little"}.get((found["endian"] or "").lower())
+    return stem[: found.start()] or stem, RawLayout(dict(zip("xyzt", lengths, strict=False)), found["dtype"], endian)
+
+
+def open_raw(path: Path, request: Request) -> Series:
+    """The series in a raw file, x fastest, then y, z, t; the request's axes (slowest first) may say another order of the same lengths.
+
+    Raises InputError where the layout is not known, or where the size of the file is not exactly the layout's.
+    """
+    source, stamp = str(path), Stamp.of(path)
+    request.refuse_var(source)
+    name, named = layout_of_name(path.stem)
+    given = request.raw or RawLayout()
+    lengths, dtype_name, endian = given.shape or named.shape, given.dtype or named.dtype, given.endian or named.endian or "little"
+    if lengths is None or dtype_name is None:
+        missing = " and ".join(word for word, value in (("shape", lengths), ("type", dtype_name)) if value is None)
+        raise InputError(
+            f"{source}: the {missing} of the raw values is not known; name the file {FORM}, or give --shape x=..,y=..,z=.. and --dtype"
+        )
+    axes = tuple(axis for axis in AXES if axis in lengths)
+    if request.axes is not None:
+        if set(request.axes) != set(axes):
+            raise InputError(f"{source}: --axes {','.join(request.axes)} does not name the axes of the raw shape, {','.join(axes)}")
+        axes = request.axes
+    dtype = parse_dtype(dtype_name)
+    shape = tuple(lengths[axis] for axis in axes)
+    array = FlatArray(path, shape, dtype.newbyteorder(ENDIANS[endian]))
+    if array.end != stamp.size:
+        layout = "x".join(str(length) for length in shape)
+        needed = f"{layout} ({','.join(axes)}) of {dtype.name} need exactly {array.end}"
+        raise InputError(f"{source} has {stamp.size} bytes; {needed}{_advice(lengths, stamp.size, array.end)}")
+    return FileSeries(
+        source=source,
+        name=name,
+        shape=shape,
+        dtype=array.dtype,
+        axes=axes,
+        fetch=array.read,
+        stamp=stamp,
+        steps_together=steps_together(axes, shape, None),
+    )
+
+
+def _advice(lengths: Mapping[str, int], size: int, needed: int) -> str:
+    frames = "t" not in lengths and size % needed == 0
+    return f"; with t={size // needed} the size would fit" if frames else ""

@@ -1,0 +1,117 @@
+"""All formats that can be read, and how one is recognised: by the bytes a file begins with, then by its suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.readers import hdf5, netcdf, npy, raw, zarr_store
+from fhash_formats.readers.failures import refusing
+from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern
+from fhash_formats.readers.request import RawLayout, Request, parse_axes
+from fhash_formats.series import Series, StepsSeries
+
+HEAD_BYTES = 4096
+"""Bytes that `matches` gets to see; HDF5 may begin at 2048."""
+
+CONTAINER_SUFFIX = ".fhz"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reader:
+    """One format: its name and suffixes, whether a file (its first bytes, or a folder with none) is of it, and how to open it."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    matches: Callable[[bytes, Path], bool]
+    open: Callable[[Path, Request], Series]
+
+    def __str__(self) -> str:
+        return f"{self.name} ({' '.join(self.suffixes)})"
+
+
+RAW = Reader(name="raw", suffixes=(".raw", ".bin", ".dat"), matches=raw.matches, open=raw.open_raw)
+ZARR = Reader(name="Zarr", suffixes=(".zarr", ".zip"), matches=zarr_store.matches, open=zarr_store.open_zarr)
+REGISTRY = (
+    RAW,
+    Reader(name="NetCDF", suffixes=netcdf.SUFFIXES, matches=netcdf.matches, open=netcdf.open_netcdf),
+    Reader(name="HDF5", suffixes=(".h5", ".hdf5", ".hdf", ".he5"), matches=hdf5.matches, open=hdf5.open_hdf5),
+    Reader(name="NumPy", suffixes=(".npy",), matches=npy.matches, open=npy.open_npy),
+    ZARR,
+)
+"""Raw comes first: its suffix says more than bytes that are someone's values. NetCDF comes before HDF5, which its files are too."""
+
+
+def open_series(
+    path: str | Path, *, var: str | None = None, axes: str | None = None, steps: slice | None = None, raw: RawLayout | None = None
+) -> Series:
+    """Open a time-varying volume in any supported format; it is read frame by frame, later.
+
+    Arguments: `path` of a file or zarr folder, or a pattern of files ("frames_*.raw") with one or more steps each, sorted by the numbers
+    in their names; `var` names a variable; `axes` says what the file's dimensions are, in the file's order ("x,y,z,t"; axes left out
+    have length 1); `steps` is a slice of the steps; `raw` is the layout of headerless bytes.
+    Raises MissingInputError, InputError for an unsuitable input, MissingDependencyError that names what to install.
+    """
+    request = Request(var=var, axes=None if axes is None else parse_axes(axes), raw=None if raw == RawLayout() else raw)
+    series = open_whole(path, request)
+    if steps is None:
+        return series
+    try:
+        if steps.step == 0:
+            raise InputError(f"{path}: the steps {steps.start}:{steps.stop}:0 have a stride of 0; it is at least 1, or negative")
+        return StepsSeries(series, range(*steps.indices(series.shape[0])))
+    except BaseException:
+        series.close()
+        raise
+
+
+def open_whole(path: str | Path, request: Request) -> Series:
+    """All steps of the series in a file, folder or pattern of files."""
+    text = str(path)
+    if is_pattern(text):
+        return JoinedSeries(text, files_of(text), lambda part: find_reader(part, request).open(part, request))
+    return find_reader(Path(path), request).open(Path(path), request)
+
+
+def find_reader(path: Path, request: Request) -> Reader:
+    """The format of a file or folder; raises InputError that lists the formats if it is none of them."""
+    if not path.exists():
+        raise MissingInputError(f"{path} does not exist")
+    if path.is_dir():
+        if not ZARR.matches(b"", path):
+            raise InputError(f"{path} is a folder without zarr metadata; give a file, a zarr folder, or a pattern such as '{path}/*.raw'")
+        if request.raw is not None:
+            raise InputError(f"{path} is a zarr folder; shape, type and byte order are given for raw files only")
+        return ZARR
+    if not path.is_file():
+        raise InputError(f"{path} is not a regular file; write its data to a file first")
+    head = _head(path)
+    if request.raw is not None:
+        return RAW
+    if path.suffix.lower() == CONTAINER_SUFFIX or _is_container(path, head):
+        raise InputError(f"{path} is encoded already; use: fhash decode {path.name}")
+    for reader in REGISTRY:
+        if reader.matches(head, path):
+            return reader
+    for reader in REGISTRY:
+        if path.suffix.lower() in reader.suffixes:
+            return reader
+    raise InputError(f"{path} is of no format that can be read: {', '.join(str(reader) for reader in REGISTRY)}")
+
+
+def _head(path: Path) -> bytes:
+    with refusing(f"{path} cannot be read"), path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    if not head:
+        raise InputError(f"{path} is empty (0 bytes)")
+    return head
+
+
+def _is_container(path: Path, head: bytes) -> bool:
+    if not head.startswith(zarr_store.ZIP):
+        return False
+    from fhash_formats.container import is_container
+
+    return is_container(path)

@@ -1,0 +1,200 @@
+"""Zarr of formats 2 and 3, in a folder or a ZIP: an array, or a group with arrays in it."""
+
+from __future__ import annotations
+
+import warnings
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.readers.attributes import PACKING, PLUMBING, json_attributes
+from fhash_formats.readers.cf_packing import packing
+from fhash_formats.readers.failures import Stamp, condense, refusing
+from fhash_formats.readers.hdf5 import steps_together
+from fhash_formats.readers.hdf5_tree import sibling
+from fhash_formats.readers.lattice import FileSeries
+from fhash_formats.readers.positions import Column, beside, coordinate, usable
+from fhash_formats.readers.request import Request
+from fhash_formats.readers.roles import assign_axes, role_of_coordinate, role_of_name
+from fhash_formats.readers.variables import Variable, choose
+from fhash_formats.series import Coordinate, Series
+
+if TYPE_CHECKING:
+    import zarr
+
+ZIP = b"PK\x03\x04"
+METADATA = ("zarr.json", ".zarray", ".zgroup")
+
+
+def matches(head: bytes, path: Path) -> bool:
+    """Whether this is a folder with zarr metadata, or a ZIP."""
+    return _metadata(path) is not None if path.is_dir() else head.startswith(ZIP)
+
+
+def _metadata(path: Path) -> Path | None:
+    return next((path / name for name in METADATA if (path / name).is_file()), None)
+
+
+def open_zarr(path: Path, request: Request) -> Series:
+    """The series in a zarr hierarchy: the only suitable array, or the one named.
+
+    Dimension names (format 3, or xarray's `_ARRAY_DIMENSIONS`) give axes and coordinates. Packing is undone (see cf_packing).
+    Consolidated metadata is not used: a copy that was not renewed would hide what was appended since.
+    """
+    import zarr
+    from zarr.storage import LocalStore, ZipStore
+
+    source = str(path)
+    if path.is_dir():
+        if _metadata(path) is None:
+            raise InputError(f"{source} holds no zarr metadata ({', '.join(METADATA)})")
+        inside, nodes = "", ["", *_nodes_in_folder(path)]
+        store: LocalStore | ZipStore = LocalStore(path, read_only=True)
+    else:
+        inside, nodes = _nodes_in_zip(source, path)
+        store = ZipStore(path, mode="r")
+    try:
+        with warnings.catch_warnings(), refusing(f"{source} cannot be read as zarr"):
+            warnings.simplefilter("ignore")  # zarr warns of codecs and types that are not in the specification
+            arrays, failed = _open_arrays(store, inside, nodes)
+            if "" in arrays and path.is_dir() and request.var is None and _metadata(path.parent) is not None:
+                # an array of a group, named by its folder: its coordinates are beside it
+                store.close()
+                return open_zarr(path.parent, replace(request, var=path.name))
+            return _series(path, store, arrays, failed, request)
+    except BaseException:
+        store.close()
+        raise
+
+
+def _nodes_in_folder(folder: Path, place: str = "") -> Iterator[str]:
+    """The paths of all groups and arrays below a group. The folders of chunks have no metadata and are not entered."""
+    for child in sorted(folder.iterdir()):
+        if child.is_dir() and _metadata(child) is not None:
+            yield f"{place}{child.name}"
+            if not (child / ".zarray").is_file():
+                yield from _nodes_in_folder(child, f"{place}{child.name}/")
+
+
+def _nodes_in_zip(source: str, path: Path) -> tuple[str, list[str]]:
+    """Where in a ZIP the hierarchy begins (at the top, or in the one folder that was zipped), and its groups and arrays from there."""
+    with refusing(f"{source} cannot be read as a ZIP"), zipfile.ZipFile(path) as file:
+        names = file.namelist()
+    nodes = sorted({name.rpartition("/")[0] for name in names if name.rpartition("/")[2] in METADATA})
+    tops = {name.split("/", 1)[0] for name in names}
+    inside = "" if "" in nodes else next(iter(tops)) if len(tops) == 1 else None
+    if inside is None or inside not in nodes:
+        raise InputError(f"{source} is a ZIP that holds no zarr hierarchy ({', '.join(METADATA)} at its top)")
+    return inside, [node.removeprefix(inside).lstrip("/") for node in nodes]
+
+
+def _open_arrays(store: Any, inside: str, nodes: Iterable[str]) -> tuple[dict[str, zarr.Array[Any]], dict[str, str]]:
+    """The arrays by path, and what was wrong with those that cannot be opened; one with an unknown codec does not bar the others."""
+    import zarr
+
+    arrays: dict[str, zarr.Array[Any]] = {}
+    failed: dict[str, str] = {}
+    for node in nodes:
+        try:
+            found = zarr.open(store=store, path=f"{inside}/{node}".strip("/"), mode="r")
+        except Exception as error:  # whatever codecs, types and JSON raise
+            failed[node] = condense(error)
+            continue
+        if isinstance(found, zarr.Array):
+            arrays[node] = found
+    return arrays, failed
+
+
+def _series(root: Path, store: Any, arrays: Mapping[str, zarr.Array[Any]], failed: Mapping[str, str], request: Request) -> Series:
+    source = str(root)
+    bounds = {sibling(name, str(array.attrs["bounds"])) for name, array in arrays.items() if "bounds" in array.attrs}
+    found = [
+        Variable(name=name or root.stem, shape=array.shape, dtype=array.dtype, auxiliary=name in bounds, handle=(name, array))
+        for name, array in arrays.items()
+    ]
+    found += [Variable(name=name or root.stem, shape=(), dtype=np.dtype(object), error=error) for name, error in failed.items()]
+    variable = choose(source, found, request.var, booleans=request.booleans)
+    path, array = variable.handle
+    names = dimension_names(array)
+    group = path.rpartition("/")[0]
+    columns = [_columns(source, arrays, place) for place in dict.fromkeys([group, ""])]
+    own = [next((place[name] for place in columns if name in place), None) if name else None for name in names]
+    hints = [
+        role_of_coordinate(name, column.attributes) if name and column else role_of_name(name) if name else None
+        for name, column in zip(names, own, strict=True)
+    ]
+    axes = assign_axes(source, array.shape, hints, names, request.axes)
+    lower = [{name.lower(): column for name, column in place.items()} for place in columns]
+    certain = request.axes is not None or all(hint is not None for hint in hints)
+    tied = [axis for axis, name in zip(axes, names, strict=True) if name is not None]
+    coords: dict[str, Coordinate] = beside(source, axes, array.shape, lower, certain=certain, tied=tied)
+    for axis, length, name, column in zip(axes, array.shape, names, own, strict=True):
+        chosen = column or _along(columns, axis, name)
+        if chosen is not None and chosen.length == length:
+            coords[axis] = coordinate(source, chosen.name, chosen.read(), chosen.attributes)
+    values = _Values(source, array)
+    return FileSeries(
+        source=source,
+        name=variable.name.rpartition("/")[2],
+        shape=array.shape,
+        dtype=values.dtype,
+        axes=axes,
+        fetch=values.read,
+        # in a folder it is the array's metadata that tells of a change of shape; chunks written anew are not noticed
+        stamp=Stamp.of((_metadata(root / path) or root) if root.is_dir() else root),
+        coords=coords,
+        attributes=json_attributes(dict(array.attrs), without=PLUMBING | PACKING),
+        steps_together=steps_together(axes, array.shape, array.chunks),
+        close=store.close,
+    )
+
+
+def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
+    """The name of each dimension, None where there is none: format 3 has a field for them, xarray an attribute in format 2."""
+    names: Any = array.attrs.get("_ARRAY_DIMENSIONS") or getattr(array.metadata, "dimension_names", None)
+    if not isinstance(names, list | tuple) or len(names) != array.ndim:
+        return [None] * array.ndim
+    return [str(name) if name is not None else None for name in names]
+
+
+def _along(columns: Sequence[Mapping[str, Column]], axis: str, dimension: str | None) -> Column | None:
+    """An array along one named dimension that is no namesake of it, but is by its own name or attributes a coordinate of the axis."""
+    along = [column for place in columns for column in place.values() if dimension is not None and column.along == dimension]
+    return next((column for column in along if role_of_coordinate(column.name.rpartition("/")[2], column.attributes) == axis), None)
+
+
+def _columns(source: str, arrays: Mapping[str, zarr.Array[Any]], group: str) -> dict[str, Column]:
+    """The arrays directly in a group that may be coordinates, by name."""
+    found = {}
+    for path, array in arrays.items():
+        place, _, name = path.rpartition("/")
+        if path and place == group and array.ndim < 2 and usable(array.dtype):
+            along = dimension_names(array)[0] if array.ndim else None
+            found[name] = Column(name=path, length=array.size, along=along, read=_reader(source, array), attributes=dict(array.attrs))
+    return found
+
+
+def _reader(source: str, array: zarr.Array[Any]) -> Callable[[], npt.NDArray[Any]]:
+    return lambda: _Values(source, array).read(())
+
+
+class _Values:
+    """The physical values of a zarr array, and their type."""
+
+    def __init__(self, source: str, array: zarr.Array[Any]) -> None:
+        self.array = array
+        # xarray keeps `_FillValue` as the fill value of zarr's own in format 2, where other writers use that for chunks never written
+        cf_fill = array.fill_value if array.metadata.zarr_format == 2 and "_ARRAY_DIMENSIONS" in array.attrs else None
+        self.packing = packing(source, array.dtype, dict(array.attrs), cf_fill) if array.dtype.kind in "iuf" else None
+        self.dtype = self.packing.dtype if self.packing else array.dtype
+
+    def read(self, ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """The values in some ranges of the array's dimensions."""
+        stored = np.asarray(self.array[ranges])
+        return self.packing.unpack(stored) if self.packing else stored

@@ -1,0 +1,114 @@
+"""Writer of .raw: the bare values, little-endian, x fastest, then y, z and t.
+
+A name `*_XxYxZxT_TYPE.raw`, such as `run_128x64x64x10_float32.raw`, says by itself how to read the file (as `readers.raw`
+understands it, `_be` for big-endian included) and must be true.
+Beside any other name goes a detached NRRD header, `NAME.nhdr`: text that ParaView, 3D Slicer and pynrrd open. It holds the
+grid in space where it is even, and every coordinate exactly as `coordinates_AXIS:=...`. NRRD has no float16, which is
+stored as float32, exactly. Limits of ParaView's NRRD reader (VTK 9.7): it takes the x of several steps, or an x of at most
+9 vertices, for the components of a vector; write .vti or .vtr for it then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fhash_formats.errors import InputError
+from fhash_formats.readers.raw import layout_of_name
+from fhash_formats.readers.request import ENDIANS, parse_dtype
+from fhash_formats.series import AXES
+from fhash_formats.writers.region import Region
+from fhash_formats.writers.spacing import even_spacing
+from fhash_formats.writers.writer import Frame, Put, Writer, little_endian, write_frame
+
+NRRD_TYPES = {"float32": "float", "float64": "double"}  # the integers are called as in numpy
+
+
+def _outputs(path: Path, region: Region) -> list[Path]:
+    named = _named_dtype(path)
+    _, layout = layout_of_name(path.stem)
+    if named is None or layout.shape is None:
+        if not path.name.isprintable():
+            raise InputError(f"{path}: the file name holds control characters, which a .nhdr header cannot name; use another name")
+        return [path, path.with_suffix(".nhdr")]
+    if tuple(layout.shape.get(axis, 1) for axis in AXES) != region.shape or named.name != region.dtype.name:
+        t, z, y, x = region.shape
+        true = f"*_{x}x{y}x{z}x{t}_{region.dtype.name}.raw"
+        raise InputError(f"{path}: the name says another layout than the values have; use {true} or a name that says none")
+    return [path]
+
+
+def _named_dtype(path: Path) -> np.dtype[Any] | None:
+    """The type of the values in the byte order that the name says, little-endian where it says none; None for a name without a layout."""
+    _, layout = layout_of_name(path.stem)
+    if layout.dtype is None:
+        return None
+    return parse_dtype(layout.dtype).newbyteorder(ENDIANS[layout.endian or "little"])
+
+
+@contextmanager
+def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
+    named = _named_dtype(outputs[0])
+    dtype = little_endian(region.dtype) if named is None else named
+    with temporaries[0].open("xb") as handle:
+
+        def put(step: int, frame: Frame) -> None:
+            write_frame(handle, frame, dtype)
+
+        yield put
+    if len(outputs) == 2:
+        temporaries[1].write_text(_header(region, dtype, outputs[0].name), encoding="utf-8")
+
+
+def _header(region: Region, dtype: np.dtype[Any], data_file: str) -> str:
+    """The NRRD header (teem.sourceforge.net/nrrd/format.html): axes fastest first, a single step as a plain volume.
+
+    No `labels`: VTK would call the values by the first of them.
+    """
+    axes = "xyzt" if region.shape[0] > 1 else "xyz"
+    sizes = dict(zip(AXES, region.shape, strict=True))
+    lines = [
+        "NRRD0005",
+        f"content: {_line(region.name)}",
+        f"type: {NRRD_TYPES.get(dtype.name, dtype.name)}",
+        f"dimension: {len(axes)}",
+        f"sizes: {' '.join(str(sizes[axis]) for axis in axes)}",
+        f"kinds: {' '.join('time' if axis == 't' else 'space' for axis in axes)}",
+        *_space(region, axes),
+        "endian: little",
+        "encoding: raw",
+        *([f"sample units: {_line(region.units)}"] if region.units else []),
+        f"data file: {data_file}",
+    ]
+    for axis in AXES:
+        coordinate = region.coords[axis]
+        lines.append(f"name_{axis}:={_line(coordinate.name)}")
+        if "units" in coordinate.attributes:
+            lines.append(f"units_{axis}:={_line(str(coordinate.attributes['units']))}")
+        lines.append(f"coordinates_{axis}:={' '.join(map(repr, coordinate.values.tolist()))}")
+    return "\n".join(lines) + "\n\n"
+
+
+def _space(region: Region, axes: str) -> list[str]:
+    """The lines that place the grid in space, none where an axis is uneven."""
+    steps = [even_spacing(region.coords[axis].values) for axis in "xyz"]
+    if None in steps:
+        return []
+    directions = [f"({','.join(repr(step) if i == j else '0' for j in range(3))})" for i, step in enumerate(steps)]
+    origin = ",".join(repr(float(region.coords[axis].values[0])) for axis in "xyz")
+    return [
+        "space dimension: 3",
+        f"space directions: {' '.join(directions + ['none'] * (len(axes) - 3))}",
+        f"space origin: ({origin})",
+    ]
+
+
+def _line(text: str) -> str:
+    return "".join(char if char.isprintable() else " " for char in text)
+
+
+RAW = Writer(name="raw", suffixes=(".raw",), outputs=_outputs, open=_open)

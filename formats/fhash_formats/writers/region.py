@@ -1,0 +1,52 @@
+"""What a writer is told about the values before the first of them comes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from fhash_formats.errors import InputError
+from fhash_formats.series import AXES, Coordinate, check_values
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Region:
+    """A decoded part of a time-varying volume, without its values.
+
+    Attributes:
+        name: of the variable, e.g. "density".
+        units: of the values, "" where unknown.
+        dtype: of the frames, an integer or float of at most 64 bits; kept in the native byte order.
+        shape: (t, z, y, x), every length at least 1.
+        coords: a Coordinate for each of "t", "z", "y", "x", already cut to the region, as long as the axis.
+        attributes: of the variable, JSON values.
+
+    Raises:
+        InputError: one of these does not hold.
+    """
+
+    name: str
+    dtype: np.dtype[Any]
+    shape: tuple[int, int, int, int]
+    coords: Mapping[str, Coordinate]
+    units: str = ""
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise InputError("region: the variable has no name; give one, such as 'values'")
+        dtype = np.dtype(self.dtype).newbyteorder("=")
+        shape = check_values(f"region {self.name!r}", self.shape, dtype)
+        object.__setattr__(self, "dtype", dtype)
+        object.__setattr__(self, "shape", shape)
+        if set(self.coords) != set(AXES):
+            raise InputError(f"region {self.name!r}: coordinates of {sorted(self.coords)}; exactly those of t, z, y and x are needed")
+        for axis, length in zip(AXES, shape, strict=True):
+            values = self.coords[axis].values
+            if values.shape != (length,) or values.dtype != np.float64:
+                raise InputError(
+                    f"region {self.name!r}: the coordinate of {axis} is {values.dtype} {values.shape}; float64 ({length},) is needed"
+                )

@@ -1,0 +1,101 @@
+"""The formats that can be written, and the one way through them all: check, write to temporaries, take the names."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import FhashError, InputError, MissingDependencyError
+from fhash_formats.writers.atomic import check_output, replacing_all
+from fhash_formats.writers.hdf5 import HDF5
+from fhash_formats.writers.netcdf import NETCDF
+from fhash_formats.writers.npy import NPY
+from fhash_formats.writers.raw import RAW
+from fhash_formats.writers.region import Region
+from fhash_formats.writers.vti import VTK
+from fhash_formats.writers.writer import Frame, Writer
+from fhash_formats.writers.zarr_ import ZARR
+
+WRITERS = (NPY, HDF5, NETCDF, ZARR, RAW, VTK)
+
+
+def save_check(path: str | Path, force: bool = False, region: Region | None = None) -> None:
+    """The checks of `save_region` that can be made before any work; all of them where the region is known.
+
+    Raises:
+        InputError: a suffix that no writer has, or a region that the format cannot hold.
+        MissingDependencyError: the format needs a library that is not installed.
+        OutputExistsError: the path, or with `region` any file that goes with it, is there already and `force` is not given.
+        OutputError: no such folder, no permission, or something there that must not be replaced.
+    """
+    target = Path(path)
+    writer = _writer(target)
+    check_output(target, force, directory=writer.directory)
+    if region is not None:
+        for output in writer.outputs(target, region):
+            check_output(output, force, directory=writer.directory)
+
+
+def save_region(path: str | Path, region: Region, frames: Iterable[npt.NDArray[np.generic]], *, force: bool = False) -> list[Path]:
+    """Write the frames of a region in the format that the suffix of `path` names; complete or absent.
+
+    Args:
+        path: ends in .npy, .h5, .hdf5, .nc, .nc4, .zarr, .raw, .vti, .vtr or .pvd.
+        region: what the frames are.
+        frames: one array (z, y, x) of `region.dtype` for each step, taken one by one: no two are held here.
+        force: replace outputs that are there already; the old ones stay until the new are complete.
+
+    Returns:
+        The paths written: one, or for several steps in VTK's formats and for .raw those of the files that go together.
+
+    Raises:
+        InputError: what `save_check` raises, or frames that are not what the region says.
+        OutputError: it cannot be written, as on a full disk; nothing is left behind, and an old output is as it was.
+    """
+    target = Path(path)
+    save_check(target, force, region)
+    writer = _writer(target)
+    outputs = writer.outputs(target, region)
+    with replacing_all(outputs, force=force, directory=writer.directory) as temporaries, writer.open(region, outputs, temporaries) as put:
+        source = iter(frames)
+        for step in range(region.shape[0]):
+            put(step, _frame(region, source, step))  # no variable: the frame must be gone before the next one is made
+        if _next(region, source) is not None:
+            raise InputError(f"region {region.name!r}: more frames than its {region.shape[0]} steps")
+    return outputs
+
+
+def _writer(path: Path) -> Writer:
+    suffix = path.suffix.lower()
+    for writer in WRITERS:
+        if suffix in writer.suffixes:
+            if writer.module and importlib.util.find_spec(writer.module) is None:
+                raise MissingDependencyError(f"{path}: writing {writer.name} needs {writer.module}: pip install 'fhash[formats]'")
+            return writer
+    known = ", ".join(suffix for writer in WRITERS for suffix in writer.suffixes)
+    raise InputError(f"{path}: cannot write {f'the suffix {path.suffix!r}' if suffix else 'a name without a suffix'}; use one of {known}")
+
+
+def _frame(region: Region, source: Iterator[npt.NDArray[np.generic]], step: int) -> Frame:
+    frame = _next(region, source)
+    if frame is None:
+        raise InputError(f"region {region.name!r}: only {step} frames came for its {region.shape[0]} steps")
+    if frame.shape != region.shape[1:] or frame.dtype.newbyteorder("=") != region.dtype:
+        raise InputError(
+            f"region {region.name!r}: frame {step} is {frame.dtype} {frame.shape}; {region.dtype} {region.shape[1:]} (z, y, x) is needed"
+        )
+    return np.ascontiguousarray(frame, dtype=region.dtype)
+
+
+def _next(region: Region, source: Iterator[npt.NDArray[np.generic]]) -> Frame | None:
+    try:
+        return next(source, None)
+    except OSError as error:
+        if isinstance(error, FhashError):
+            raise
+        # Not the output's failure, and an OSError would be reported as one.
+        raise InputError(f"region {region.name!r}: the values could not be read: {error}") from error

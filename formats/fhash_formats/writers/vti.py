@@ -1,0 +1,147 @@
+"""Writer of VTK's XML grids: .vti (even spacing) and .vtr (any ascending coordinates), and .pvd for several steps.
+
+One step goes to the name given. Several go to NAME_0000.vti, NAME_0001.vti, ... and NAME.pvd, which lists them with their
+physical times and takes its name last; a name .pvd takes .vti files where the grid is even, else .vtr files.
+Values are appended raw, little-endian with 64-bit sizes, as point data. VTK has no descending axis: one is turned round,
+values and coordinates. It has no float16 either, which is stored as float32, exactly. Format: "VTK XML formats",
+docs.vtk.org.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape, quoteattr
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.writers.region import Region
+from fhash_formats.writers.spacing import even_spacing
+from fhash_formats.writers.writer import Frame, Put, Writer, little_endian, write_frame
+
+SPACE = ("z", "y", "x")
+
+
+def _outputs(path: Path, region: Region) -> list[Path]:
+    suffix = path.suffix.lower()
+    _check_grid(path, region, suffix)
+    if suffix == ".pvd":
+        suffix = ".vti" if _is_even(region) else ".vtr"
+    elif region.shape[0] == 1:
+        return [path]
+    if not path.name.isprintable():
+        raise InputError(f"{path}: the file name holds control characters, which a .pvd cannot list; use another name")
+    digits = max(4, len(str(region.shape[0] - 1)))
+    steps = [path.with_name(f"{path.stem}_{step:0{digits}d}{suffix}") for step in range(region.shape[0])]
+    return [*steps, path.with_suffix(".pvd")]
+
+
+def _is_even(region: Region) -> bool:
+    return all(even_spacing(region.coords[axis].values) is not None for axis in SPACE)
+
+
+def _check_grid(path: Path, region: Region, suffix: str) -> None:
+    """InputError where the coordinates do not fit the format."""
+    if not np.all(np.isfinite(region.coords["t"].values)):
+        raise InputError(f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy")
+    for axis in SPACE:
+        values = region.coords[axis].values
+        if suffix == ".vti" and even_spacing(values) is None:
+            raise InputError(f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly spaced, as .vti needs; use .vtr")
+        steps = np.diff(values)
+        if not np.all(np.isfinite(values)) or not (np.all(steps > 0) or np.all(steps < 0)):
+            raise InputError(
+                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} neither ascends nor descends; use .nc, .h5 or .npy"
+            )
+
+
+@contextmanager
+def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
+    ascending = {axis: values[:: _direction(values)] for axis in SPACE for values in [region.coords[axis].values]}
+    turn = tuple(slice(None, None, _direction(region.coords[axis].values)) for axis in SPACE)
+    image = outputs[0].suffix.lower() == ".vti"
+
+    def put(step: int, frame: Frame) -> None:
+        _write_grid(temporaries[step], region, float(region.coords["t"].values[step]), ascending, frame[turn], image=image)
+
+    yield put
+    if len(outputs) > region.shape[0]:
+        temporaries[-1].write_text(_collection(region, outputs[:-1]), encoding="utf-8")
+
+
+def _direction(values: npt.NDArray[np.float64]) -> int:
+    return -1 if values[-1] < values[0] else 1
+
+
+def _write_grid(path: Path, region: Region, time: float, coords: dict[str, npt.NDArray[np.float64]], frame: Frame, *, image: bool) -> None:
+    """One step: `frame` (z, y, x) on ascending `coords`, as ImageData or RectilinearGrid."""
+    dtype = little_endian(region.dtype)
+    extent = " ".join(f"0 {length - 1}" for length in reversed(frame.shape))
+    kind, place = "RectilinearGrid", ""
+    if image:
+        origin = " ".join(repr(float(coords[axis][0])) for axis in "xyz")
+        spacing = " ".join(repr(even_spacing(coords[axis])) for axis in "xyz")
+        kind, place = "ImageData", f' Origin="{origin}" Spacing="{spacing}"'
+    name = quoteattr(_text(region.name))
+    units = (
+        f'<InformationKey name="UNITS_LABEL" location="vtkDataArray">{escape(_text(region.units))}</InformationKey>' if region.units else ""
+    )
+    sizes = [frame.size * dtype.itemsize] if image else [frame.size * dtype.itemsize, *(coords[axis].nbytes for axis in "xyz")]
+    offsets = [sum(sizes[:i]) + 8 * i for i in range(len(sizes))]  # each array follows its 64-bit size
+    grid = (
+        ""
+        if image
+        else f"<Coordinates>{''.join(_axis(axis, offset) for axis, offset in zip('xyz', offsets[1:], strict=True))}</Coordinates>"
+    )
+    text = f"""<?xml version="1.0" encoding="UTF-8"?>
+<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64">
+<{kind} WholeExtent="{extent}"{place}>
+<FieldData><DataArray type="Float64" Name="TimeValue" NumberOfTuples="1" format="ascii">{time!r}</DataArray></FieldData>
+<Piece Extent="{extent}">
+<PointData Scalars={name}>
+<DataArray type="{_vtk_type(dtype)}" Name={name} format="appended" offset="0">{units}</DataArray>
+</PointData>
+<CellData></CellData>
+{grid}
+</Piece>
+</{kind}>
+<AppendedData encoding="raw">
+_"""
+    with path.open("xb") as handle:
+        handle.write(text.encode())
+        handle.write(sizes[0].to_bytes(8, "little"))
+        write_frame(handle, frame, dtype)
+        for axis, size in zip("xyz", sizes[1:], strict=False):
+            handle.write(size.to_bytes(8, "little"))
+            handle.write(coords[axis].astype("<f8").tobytes())
+        handle.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+def _axis(axis: str, offset: int) -> str:
+    return f'<DataArray type="Float64" Name="{axis}" format="appended" offset="{offset}"/>'
+
+
+def _vtk_type(dtype: np.dtype[Any]) -> str:
+    """VTK's name of a type: Float32, UInt8 and so on."""
+    return dtype.name.replace("uint", "UInt").replace("int", "Int").replace("float", "Float")
+
+
+def _collection(region: Region, files: Sequence[Path]) -> str:
+    times = region.coords["t"].values.tolist()
+    rows = [
+        f'<DataSet timestep="{time!r}" group="" part="0" file={quoteattr(file.name)}/>\n' for time, file in zip(times, files, strict=True)
+    ]
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n<Collection>\n'
+    return head + "".join(rows) + "</Collection>\n</VTKFile>\n"
+
+
+def _text(text: str) -> str:
+    """Without the control characters that XML cannot hold."""
+    return "".join(char if char.isprintable() else "_" for char in text)
+
+
+VTK = Writer(name="VTK", suffixes=(".vti", ".vtr", ".pvd"), outputs=_outputs, open=_open)

@@ -1,0 +1,51 @@
+"""Settings: the round trip, and a clear error for each value that is not allowed."""
+
+import json
+
+import pytest
+
+from fhash_codec.config import EncodeConfig
+from fhash_formats.errors import InputError
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        EncodeConfig(),
+        EncodeConfig(features=("interval:0:1", "isosurface:3"), key_frames="0,4,9", psnr=45.0, epochs=0, learning_rate=1e-3),
+    ],
+    ids=["default", "changed"],
+)
+def test_from_dict_of_to_dict_is_the_same_even_through_json(config):
+    assert EncodeConfig.from_dict(config.to_dict()) == config
+    assert EncodeConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_every_field_has_help():
+    for name, field in EncodeConfig.__dataclass_fields__.items():
+        assert field.metadata["help"], name
+
+
+def test_an_unknown_name_is_refused_and_the_nearest_is_offered():
+    with pytest.raises(InputError, match=r"'learning_rat'.*'learning_rate'"):
+        EncodeConfig.from_dict({"learning_rat": 0.1})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"engine": "warp"}, "engine is 'warp'; allowed: auto, slab, naive"),
+        ({"fold": 1}, "fold is 1; allowed: 2 to 64"),
+        ({"fold": 2.5}, "fold is 2.5; a whole number"),
+        ({"epochs": True}, "epochs is True"),
+        ({"epochs": "many"}, "epochs is many"),
+        ({"learning_rate": float("nan")}, "learning-rate is nan"),
+        ({"psnr": -1.0}, "psnr is -1"),
+        ({"features": ()}, "feature is empty"),
+        ({"dilation": -1}, "dilation is -1"),
+    ],
+)
+def test_a_value_that_is_not_allowed_is_named_with_what_is(values, message):
+    with pytest.raises(InputError, match=message) as caught:
+        EncodeConfig.from_dict(values)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,133 @@
+"""A small valid container, and files made from it that are wrong in one way."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_formats.container import ContainerWriter
+from fhash_formats.container.header import layer_shapes, occupancy_bytes
+from fhash_formats.container.layout import END, Member, comment, ending, local_header
+
+Parts = list[tuple[str, bytes]]
+"""Name and data of each member."""
+
+
+def make_header() -> dict[str, Any]:
+    """A header whose arrays are small and of several chunks."""
+    return {
+        "encoder": {"version": "0.1.0", "seed": 7},
+        "variable": {"name": "density", "units": "kg m-3", "dtype": "float32", "attributes": {"long_name": "Dichte \u00fc"}},
+        "domain": {"shape": [4, 3, 5, 6]},
+        "value_range": [-1.5, 2.5],
+        "background": 0.125,
+        "feature_bounding_box": [[0, 3], [1, 5], [0, 6]],
+        "features": ["all"],
+        "dilation": 1,
+        "model": {
+            "profile": "paper",
+            "fold": 2,
+            "embedding_size": 2,
+            "hidden_layers": 1,
+            "width": 5,
+            "tables": "float16",
+            "levels": [[2, 3, 4, 6], [2, 2, 2, 3]],
+        },
+        "config": {"epochs": 1},
+        "quality": {"psnr": 48.5},
+        "history": [{"seconds": None, "epoch": 1, "psnr": 40.0}],
+    }
+
+
+def make_arrays(header: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Random values for every array that a header asks for."""
+    rng = np.random.default_rng(0)
+    model, shape = header["model"], header["domain"]["shape"]
+    arrays: dict[str, np.ndarray] = {f"coords/{a}": np.arange(n) * 0.5 for a, n in zip(("time", "z", "y", "x"), shape, strict=True)}
+    key_frames = model["levels"][0][0]
+    arrays["key_frames"] = np.linspace(0, shape[0] - 1, key_frames).astype(np.int64)
+    for number, level in enumerate(model["levels"], start=1):
+        arrays[f"tables/level_{number}"] = rng.standard_normal((*level, model["embedding_size"])).astype(model["tables"])
+    for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
+        arrays[f"mlp/weight_{number}"] = rng.standard_normal((outputs, inputs)).astype(np.float32)
+        arrays[f"mlp/bias_{number}"] = rng.standard_normal(outputs).astype(np.float32)
+    arrays["occupancy/bits"] = rng.integers(0, 256, (key_frames, occupancy_bytes(header["feature_bounding_box"])), dtype=np.uint8)
+    return arrays
+
+
+def write(path: Path, header: dict[str, Any], arrays: dict[str, np.ndarray], **options: Any) -> int:
+    """A container of whole arrays; the finest table in 2 x 2 x 2 chunks, some of them at an end."""
+    with ContainerWriter(path, **options) as writer:
+        for name, array in arrays.items():
+            chunk = (1, 2, 3, 6, 2) if name == "tables/level_1" and array.shape[1:] == (3, 4, 6, 2) else None
+            attributes = {"offset": 0.5, "scale": 0.25} if name.startswith("tables/") and array.dtype == np.uint8 else None
+            writer.add_whole(name, array, chunk_shape=chunk, attributes=attributes)
+        return writer.commit(header)
+
+
+def unpack(data: bytes) -> Parts:
+    """The members of a sound container."""
+    count, _, offset = _end(data)
+    parts, at = [], offset
+    for _ in range(count):
+        size, name_size = struct.unpack_from("<I", data, at + 20)[0], struct.unpack_from("<H", data, at + 28)[0]
+        begin = struct.unpack_from("<I", data, at + 42)[0] + 30 + name_size
+        parts.append((data[at + 46 : at + 46 + name_size].decode(), data[begin : begin + size]))
+        at += 46 + name_size
+    return parts
+
+
+def pack(parts: Iterable[tuple[str, bytes]]) -> bytes:
+    """A container's ZIP of any members, with sound checksums."""
+    members, chunks, position = [], [], 0
+    for name, data in parts:
+        member = Member(name=name, offset=position, size=len(data), crc=zlib.crc32(data))
+        members.append(member)
+        chunks += [local_header(member), data]
+        position = member.end
+    return b"".join([*chunks, ending(members)])
+
+
+def reseal(data: bytes) -> bytes:
+    """The same file with the digest of its directory made right."""
+    _, _, offset = _end(data)
+    directory = data[offset : -len(comment(b""))]
+    return data[:offset] + directory + comment(directory)
+
+
+def _end(data: bytes) -> tuple[int, int, int]:
+    """Entries, bytes and offset of the directory."""
+    _, _, _, _, count, size, offset, _ = END.unpack_from(data, len(data) - len(comment(b"")) - END.size)
+    return count, size, offset
+
+
+class Samples:
+    """What the tests of this folder share."""
+
+    header = staticmethod(make_header)
+    arrays = staticmethod(make_arrays)
+    write = staticmethod(write)
+    unpack = staticmethod(unpack)
+    pack = staticmethod(pack)
+    reseal = staticmethod(reseal)
+    directory_at: Callable[[bytes], int] = staticmethod(lambda data: _end(data)[2])
+
+
+@pytest.fixture
+def samples() -> type[Samples]:
+    return Samples
+
+
+@pytest.fixture
+def sample(tmp_path: Path) -> Path:
+    """A valid container."""
+    path = tmp_path / "sample.fhz"
+    header = make_header()
+    write(path, header, make_arrays(header))
+    return path

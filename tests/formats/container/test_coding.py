@@ -1,0 +1,74 @@
+"""Chunks to bytes and back, and the one place where another codec is added."""
+
+from __future__ import annotations
+
+import numcodecs.zstd
+import numpy as np
+import pytest
+
+from fhash_formats.container import Container, ContainerWriter, coding
+from fhash_formats.container.coding import chunk_coder, crc32c, plain_codecs, zstd_content_size
+from fhash_formats.errors import DamagedFileError, MissingDependencyError
+
+
+@pytest.mark.parametrize("size", [0, 1, 255, 256, 257, 65535, 65536, 65791, 65792, 2**20])
+def test_content_size_of_what_zstd_writes(size):
+    assert zstd_content_size(memoryview(numcodecs.zstd.compress(bytes(size), 3))) == size
+
+
+def test_crc32c_of_the_check_string():
+    """RFC 3720, appendix B.4, and the usual check value."""
+    assert crc32c(b"123456789") == 0xE3069283
+    assert crc32c(memoryview(bytes(32))) == 0x8A9136AA
+
+
+def test_missing_crc_library_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "google_crc32c", None)
+    with pytest.raises(MissingDependencyError, match="pip install google-crc32c"):
+        crc32c(b"")
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint16", "float16", "float64"])
+def test_decoding_gives_what_was_coded(dtype):
+    chunk = np.arange(24).reshape(2, 3, 4).astype(dtype)
+    coder = chunk_coder(plain_codecs(chunk.dtype), chunk.dtype, chunk.shape)
+    for given in (chunk, np.asfortranarray(chunk), chunk.astype(chunk.dtype.newbyteorder())):
+        decoded = coder.decode(memoryview(coder.encode(given)))
+        np.testing.assert_array_equal(decoded, chunk)
+        assert decoded.dtype == chunk.dtype
+        assert decoded.dtype.isnative
+
+
+class Negative:
+    """A codec of its own: the values with their sign turned, uncompressed."""
+
+    def __init__(self, codecs, dtype, shape):
+        self.dtype, self.shape = dtype, shape
+        assert list(codecs) == [{"name": "test.negative", "configuration": {"a": 1}}]
+
+    def encode(self, chunk):
+        return (-chunk).tobytes()
+
+    def decode(self, data):
+        if len(data) != self.dtype.itemsize * np.prod(self.shape):
+            raise DamagedFileError("size")
+        return -np.frombuffer(data, self.dtype).reshape(self.shape)
+
+
+def test_another_codec_is_added_in_one_place(tmp_path, samples, monkeypatch):
+    monkeypatch.setitem(coding.ARRAY_CODECS, "test.negative", Negative)
+    header = samples.header()
+    values = np.arange(10, dtype=np.float32)
+    path = tmp_path / "a.fhz"
+    codecs = [{"name": "test.negative", "configuration": {"a": 1}}, {"name": "crc32c"}]
+    with ContainerWriter(path) as writer:
+        for name, array in samples.arrays(header).items():
+            writer.add_whole(name, array)
+        writer.add_whole("extra/values", values, chunk_shape=(4,), codecs=codecs)
+        writer.commit(header)
+    with Container.open(path) as container:
+        np.testing.assert_array_equal(container.arrays["extra/values"].read(), values)
+        container.verify()
+    monkeypatch.delitem(coding.ARRAY_CODECS, "test.negative")
+    with pytest.raises(DamagedFileError, match=r"extra/values/zarr[.]json: codecs 'test[.]negative, crc32c'"):
+        Container.open(path)

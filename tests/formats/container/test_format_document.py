@@ -1,0 +1,58 @@
+"""FORMAT.md: its examples are what the code accepts, and it names every key and array that the code asks for."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from fhash_formats.container import Container, validate_header
+from fhash_formats.container.array import DTYPES, ArrayMetadata
+from fhash_formats.container.coding import plain_codecs
+from fhash_formats.container.header import FORMAT_VERSION
+from fhash_formats.errors import DamagedFileError
+
+DOCUMENT = files("fhash_formats").joinpath("FORMAT.md").read_text(encoding="utf-8")
+
+
+def example(name):
+    found = re.findall(rf"^```json {name}\n(.*?)^```", DOCUMENT, re.MULTILINE | re.DOTALL)
+    assert len(found) == 1
+    return json.loads(found[0])
+
+
+def test_header_is_valid_and_can_be_written(tmp_path, samples):
+    header = example("header")
+    validate_header(header)
+    assert tuple(header["format_version"]) == FORMAT_VERSION
+    arrays = samples.arrays(header)
+    samples.write(tmp_path / "a.fhz", header, arrays)
+    with Container.open(tmp_path / "a.fhz") as container:
+        assert container.header == header
+        container.verify()
+    for name in arrays:
+        assert re.sub("_[0-9]$", "_1", name) in DOCUMENT
+
+
+def test_no_key_of_the_example_can_be_left_out():
+    header = example("header")
+    for key in header:
+        with pytest.raises(DamagedFileError, match=key):
+            validate_header({k: v for k, v in header.items() if k != key})
+        assert f"| `{key}` |" in DOCUMENT
+
+
+def test_array_is_what_the_writer_writes():
+    values = example("array")
+    metadata = ArrayMetadata.from_dict(values)
+    assert metadata.to_dict() == values
+    assert metadata.dtype == np.float16
+    assert list(metadata.codecs) == plain_codecs(metadata.dtype)
+
+
+def test_every_data_type_is_named():
+    assert all(name in DOCUMENT for name in DTYPES)
+    assert f"version {FORMAT_VERSION[0]}.{FORMAT_VERSION[1]}" in DOCUMENT.splitlines()[0]

@@ -1,0 +1,299 @@
+"""Zarr of both formats, in folders and ZIPs: arrays, groups, dimension names, what xarray writes; every refusal."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tracemalloc
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+
+from fhash_formats import open_series
+from fhash_formats.errors import InputError
+
+VALUES = np.random.default_rng(0).normal(size=(4, 3, 5, 6)).astype(np.float32)
+DIMS = ["time", "z", "y", "x"]
+
+
+def create(path: Path, values: np.ndarray, *, name: str | None = None, zarr_format: int = 3, **options: Any) -> Any:
+    """An array at a path (or in the group there, if named)."""
+    where: Any = zarr.open_group(path, mode="a", zarr_format=zarr_format) if name else path
+    if name:
+        array = where.create_array(name, shape=values.shape, dtype=values.dtype, **options)
+    else:
+        array = zarr.create_array(where, shape=values.shape, dtype=values.dtype, zarr_format=zarr_format, **options)
+    array[...] = values
+    return array
+
+
+def frames(path: Path, **options: Any) -> np.ndarray:
+    with open_series(path, **options) as series:
+        stacked = np.stack(list(series.frames()))
+        assert stacked.shape == series.shape
+        assert stacked.dtype == series.dtype
+        assert series.dtype.isnative
+        return stacked
+
+
+def zipped(folder: Path, path: Path, *, inside: str = "") -> Path:
+    with zipfile.ZipFile(path, "w") as file:
+        for each in sorted(folder.rglob("*")):
+            if each.is_file():
+                file.write(each, inside + str(each.relative_to(folder)))
+    return path
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+@pytest.mark.parametrize("dtype", ["f4", ">f4", "f8", "f2", "u1", ">i2", "i8"])
+def test_an_array_of_every_type(tmp_path: Path, zarr_format: int, dtype: str) -> None:
+    values = (VALUES * 50).astype(dtype)
+    create(tmp_path / "a.zarr", values, zarr_format=zarr_format, chunks=(2, 3, 2, 4))
+    np.testing.assert_array_equal(frames(tmp_path / "a.zarr"), values)
+    np.testing.assert_array_equal(frames(zipped(tmp_path / "a.zarr", tmp_path / "a.zip")), values)
+
+
+def test_shards(tmp_path: Path) -> None:
+    create(tmp_path / "a.zarr", VALUES, chunks=(1, 3, 5, 6), shards=(4, 3, 5, 6))
+    np.testing.assert_array_equal(frames(tmp_path / "a.zarr"), VALUES)
+
+
+@pytest.mark.parametrize("inside", ["", "run.zarr/"])
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_a_zipped_group(tmp_path: Path, inside: str, zarr_format: int) -> None:
+    create(tmp_path / "a.zarr", VALUES, name="v", zarr_format=zarr_format)
+    np.testing.assert_array_equal(frames(zipped(tmp_path / "a.zarr", tmp_path / "a.zarr.zip", inside=inside)), VALUES)
+
+
+def test_groups_and_choices(tmp_path: Path) -> None:
+    path = tmp_path / "a.zarr"
+    create(path, VALUES, name="gas/density")
+    create(path, VALUES * 2, name="pressure")
+    create(path, np.zeros((3, 4)), name="flat")
+    with pytest.raises(InputError, match=r"holds 2 variables: gas/density \(4, 3, 5, 6\), pressure .*--var"):
+        open_series(path)
+    np.testing.assert_array_equal(frames(path, var="pressure"), VALUES * 2)
+    np.testing.assert_array_equal(frames(path, var="density"), VALUES)
+    np.testing.assert_array_equal(frames(path / "pressure"), VALUES * 2)
+    with pytest.raises(InputError, match="no variable 'pressures'; it holds pressure"):
+        open_series(path, var="pressures")
+    with pytest.raises(InputError, match="variable flat has 2 dimensions"):
+        open_series(path, var="flat")
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_dimension_names_give_axes_and_coordinates(tmp_path: Path, zarr_format: int) -> None:
+    path = tmp_path / "a.zarr"
+    stored = VALUES.transpose(3, 2, 1, 0)
+    named = {"dimension_names": DIMS[::-1]} if zarr_format == 3 else {"attributes": {"_ARRAY_DIMENSIONS": DIMS[::-1]}}
+    create(path, stored, name="v", zarr_format=zarr_format, **named)
+    times = np.array([2.0, 3.0, 30.0, 347921.1666])
+    create(path, times, name="time", zarr_format=zarr_format, attributes={"units": "hours"})
+    create(path, np.arange(6.0) * 3, name="x", zarr_format=zarr_format)
+    with open_series(path) as series:
+        assert series.shape == VALUES.shape
+        np.testing.assert_array_equal(series.coords["t"].values, times)
+        assert series.coords["t"].attributes == {"units": "hours"}
+        np.testing.assert_array_equal(series.coords["x"].values, np.arange(6) * 3)
+    with open_series(path / "v") as series:
+        np.testing.assert_array_equal(series.coords["t"].values, times)
+    np.testing.assert_array_equal(frames(path), VALUES)
+
+
+def test_coordinates_by_cf_and_along_a_dimension_of_another_name(tmp_path: Path) -> None:
+    path = tmp_path / "a.zarr"
+    create(path, VALUES, name="v", dimension_names=["a", "b", "c", "d"])
+    create(path, np.arange(6.0), name="d", dimension_names=["d"], attributes={"axis": "T"})
+    create(path, np.arange(4.0), name="a", dimension_names=["a"], attributes={"standard_name": "longitude"})
+    create(path, np.arange(3.0), name="b", dimension_names=["b"], attributes={"axis": "Y"})
+    create(path, np.arange(5.0) * 100, name="height", dimension_names=["c"])
+    with open_series(path) as series:
+        assert series.shape == (6, 5, 3, 4)
+        np.testing.assert_array_equal(series.coords["z"].values, np.arange(5) * 100)
+        np.testing.assert_array_equal(series.read(4), VALUES[..., 4].transpose(2, 1, 0))
+
+
+def test_conventional_coordinates_where_dimensions_have_no_names(tmp_path: Path) -> None:
+    create(tmp_path / "a.zarr", VALUES, name="v")
+    create(tmp_path / "a.zarr", np.arange(4.0) * 5, name="time")
+    with open_series(tmp_path / "a.zarr") as series:
+        np.testing.assert_array_equal(series.coords["t"].values, [0, 5, 10, 15])
+    create(tmp_path / "b.zarr", VALUES.T, name="v")
+    create(tmp_path / "b.zarr", np.arange(4.0) * 5, name="time")
+    with pytest.raises(InputError, match=r"time has 4 values.*--axes"):
+        open_series(tmp_path / "b.zarr")
+
+
+@pytest.mark.parametrize("unit", ["s", "ns"])
+def test_dates_are_counted_from_the_first(tmp_path: Path, unit: str) -> None:
+    dates = np.array(["2020-01-01T00:00:00", "2020-01-01T06:00:00", "2020-01-02T00:00:00", "2020-01-03T00:00:00"], f"M8[{unit}]")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the type has no specification yet
+        create(tmp_path / "a.zarr", VALUES, name="v", dimension_names=DIMS)
+        create(tmp_path / "a.zarr", dates, name="time", dimension_names=["time"])
+    with open_series(tmp_path / "a.zarr") as series:
+        ticks = 1 if unit == "s" else 10**9
+        np.testing.assert_array_equal(series.coords["t"].values, np.array([0, 6, 24, 48]) * 3600.0 * ticks)
+        assert series.coords["t"].attributes["units"].startswith("seconds since 2020" if unit == "s" else "nanoseconds since 2020")
+
+
+ENCODINGS: list[dict[str, Any]] = [
+    {},
+    {"_FillValue": -99.0},
+    {"dtype": "i2", "_FillValue": -99, "scale_factor": 0.01, "add_offset": 1.0},
+    {"dtype": "i2", "_FillValue": -99, "scale_factor": 0.01},
+    {"dtype": "u1", "_FillValue": 255, "scale_factor": 0.02, "add_offset": -2.0},
+    {"dtype": "i4", "_FillValue": -99},
+    {"dtype": "i2", "_FillValue": -99},
+    {"dtype": "f8", "_FillValue": 1e20},
+]
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_what_xarray_writes_is_read_as_xarray_reads_it(tmp_path: Path, zarr_format: int, encoding: dict[str, Any]) -> None:
+    xr = pytest.importorskip("xarray")
+    values = np.round(np.clip(VALUES, -1.9, 2), 2)
+    values[1, 2, 3, 4] = np.nan
+    dates = np.array(["2020-01-01T00", "2020-01-01T06", "2020-01-02T00", "2020-02-01T00"], "M8[ns]")
+    dataset = xr.Dataset({"q": (DIMS, values, {"units": "kg"})}, coords={"time": dates, "z": [1.5, 2.5, 7.0]})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of consolidated metadata in format 3
+        dataset.to_zarr(tmp_path / "a.zarr", zarr_format=zarr_format, encoding={"q": encoding})
+        expected = xr.open_zarr(tmp_path / "a.zarr", chunks=None)["q"].to_numpy()
+    got = frames(tmp_path / "a.zarr")
+    assert got.dtype == expected.dtype
+    np.testing.assert_array_equal(got, expected)
+    assert np.isnan(got).sum() == 1
+    with open_series(tmp_path / "a.zarr") as series:
+        assert (series.name, series.units, series.attributes) == ("q", "kg", {"units": "kg"})
+        np.testing.assert_array_equal(series.coords["t"].values, [0, 6, 24, 31 * 24])
+        assert series.coords["t"].attributes["units"] == "hours since 2020-01-01 00:00:00"
+        np.testing.assert_array_equal(series.coords["z"].values, [1.5, 2.5, 7.0])
+
+
+def test_zarrs_own_fill_value_hides_nothing_unless_xarray_wrote_it(tmp_path: Path) -> None:
+    values = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
+    create(tmp_path / "a.zarr", values, zarr_format=2, fill_value=0)
+    np.testing.assert_array_equal(frames(tmp_path / "a.zarr")[0], values)
+    create(tmp_path / "b.zarr", values, zarr_format=3, fill_value=0, dimension_names=["z", "y", "x"])
+    np.testing.assert_array_equal(frames(tmp_path / "b.zarr")[0], values)
+    create(tmp_path / "c.zarr", values, zarr_format=2, fill_value=0, attributes={"_ARRAY_DIMENSIONS": ["z", "y", "x"]})
+    np.testing.assert_array_equal(frames(tmp_path / "c.zarr")[0], np.where(values == 0, np.nan, values.astype("f4")))
+
+
+def test_chunks_never_written_are_the_fill_value(tmp_path: Path) -> None:
+    array = zarr.create_array(tmp_path / "a.zarr", shape=VALUES.shape, dtype="f4", chunks=(1, 3, 5, 6), fill_value=np.nan)
+    array[2] = VALUES[2]
+    got = frames(tmp_path / "a.zarr")
+    np.testing.assert_array_equal(got[2], VALUES[2])
+    assert np.isnan(got[[0, 1, 3]]).all()
+
+
+@pytest.mark.parametrize(
+    ("array", "words"),
+    [
+        (np.zeros(3), "1 dimensions"),
+        (np.zeros((1, 2, 3, 4, 5)), "5 dimensions"),
+        (np.zeros((2, 2, 2), complex), "complex128"),
+        (np.zeros((2, 2, 2), bool), "boolean"),
+        (np.zeros((2, 0, 2)), "length 0"),
+    ],
+)
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_unsuitable_arrays_are_described(tmp_path: Path, array: np.ndarray, words: str, zarr_format: int) -> None:
+    create(tmp_path / "a.zarr", array, name="odd", zarr_format=zarr_format)
+    with pytest.raises(InputError, match=f"odd: .*{words}"):
+        open_series(tmp_path / "a.zarr")
+
+
+def test_empty_and_broken_hierarchies(tmp_path: Path) -> None:
+    zarr.open_group(tmp_path / "a.zarr", mode="w")
+    with pytest.raises(InputError, match="holds no array at all"):
+        open_series(tmp_path / "a.zarr")
+    (tmp_path / "b.zarr").mkdir()
+    with pytest.raises(InputError, match="folder without zarr metadata"):
+        open_series(tmp_path / "b.zarr")
+    create(tmp_path / "c.zarr", VALUES)
+    (tmp_path / "c.zarr" / "zarr.json").write_text('{"zarr_format": 3, "node_')
+    with pytest.raises(InputError, match="cannot be read as zarr") as caught:
+        open_series(tmp_path / "c.zarr")
+    assert "\n" not in str(caught.value)
+    with zipfile.ZipFile(tmp_path / "d.zip", "w") as file:
+        file.writestr("notes.txt", "nothing")
+    with pytest.raises(InputError, match="a ZIP that holds no zarr hierarchy"):
+        open_series(tmp_path / "d.zip")
+    zipped(tmp_path / "a.zarr", tmp_path / "e.zip")
+    os.truncate(tmp_path / "e.zip", 40)
+    with pytest.raises(InputError, match="cannot be read as a ZIP"):
+        open_series(tmp_path / "e.zip")
+
+
+def test_bad_packing_attributes_are_refused(tmp_path: Path) -> None:
+    create(tmp_path / "a.zarr", VALUES, attributes={"scale_factor": "two"})
+    with pytest.raises(InputError, match="scale_factor is 'two', not a number"):
+        open_series(tmp_path / "a.zarr")
+    create(tmp_path / "b.zarr", VALUES, attributes={"_FillValue": "?"})
+    with pytest.raises(InputError, match=r"fill value '\?' is not a number"):
+        open_series(tmp_path / "b.zarr")
+
+
+def test_a_damaged_chunk_names_the_step(tmp_path: Path) -> None:
+    create(tmp_path / "a.zarr", VALUES, chunks=(1, 3, 5, 6))
+    (tmp_path / "a.zarr" / "c" / "2" / "0" / "0" / "0").write_bytes(b"nonsense")
+    with open_series(tmp_path / "a.zarr") as series:
+        np.testing.assert_array_equal(series.read(1), VALUES[1])
+        with pytest.raises(InputError, match="step 2 of a cannot be read") as caught:
+            series.read(2)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_hierarchy_that_changes_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.zarr"
+    create(path, VALUES, name="v", chunks=(1, 3, 5, 6))
+    with open_series(path) as series:
+        series.read(0)
+        zarr.open_group(path, mode="a")["v"].resize((9, 3, 5, 6))
+        with pytest.raises(InputError, match="changed while it was being read"):
+            series.read(1)
+    with open_series(path) as series:
+        shutil.rmtree(path)
+        with pytest.raises(InputError, match="cannot be read"):
+            series.read(0)
+
+
+def test_stale_consolidated_metadata_is_not_believed(tmp_path: Path) -> None:
+    path = tmp_path / "a.zarr"
+    array = create(path, VALUES, name="v", zarr_format=2, chunks=(1, 3, 5, 6))
+    zarr.consolidate_metadata(path)
+    array.resize((5, 3, 5, 6))
+    array[4] = 7
+    got = frames(path)
+    assert got.shape == (5, 3, 5, 6)
+    assert (got[4] == 7).all()
+
+
+def test_one_frame_is_read_at_a_time(tmp_path: Path) -> None:
+    create(tmp_path / "a.zarr", np.ones((40, 16, 32, 32), np.float32), chunks=(1, 16, 32, 32))
+    with open_series(tmp_path / "a.zarr") as series:
+        series.read(0)
+        tracemalloc.start()
+        for step in (3, 30):
+            series.read(step)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < 5 * 16 * 32 * 32 * 4
+
+
+def test_a_chunk_of_many_steps_is_kept(tmp_path: Path) -> None:
+    create(tmp_path / "a.zarr", VALUES, chunks=(3, 3, 5, 6))
+    with open_series(tmp_path / "a.zarr") as series:
+        series.read(1)
+        assert series._slab is not None
+        assert series._slab[1].shape[0] == 3
+    np.testing.assert_array_equal(frames(tmp_path / "a.zarr"), VALUES)

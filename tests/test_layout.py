@@ -1,0 +1,137 @@
+"""The house rules that no single module can hold: who may import whom, what loads what, and that the documents name what exists."""
+
+from __future__ import annotations
+
+import ast
+import importlib.metadata
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = {
+    "fhash_formats": ROOT / "formats" / "fhash_formats",
+    "fhash_codec": ROOT / "fhash_codec",
+    "fhash_cli": ROOT / "cli" / "fhash_cli",
+}
+ALLOWED = {
+    "fhash_formats": {"fhash_formats"},
+    "fhash_codec": {"fhash_codec", "fhash_formats"},
+    "fhash_cli": {"fhash_cli", "fhash_codec", "fhash_formats"},
+}
+TORCH_FILES = re.compile(r"(model|tesseract|train)\.py|(engines|bench)/.+\.py")
+"""Modules of fhash_codec in which tensors are trained or evaluated, or that start a training."""
+SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy")
+
+
+def modules(package: str) -> list[Path]:
+    return sorted(PACKAGES[package].rglob("*.py"))
+
+
+def imports(path: Path) -> Iterator[str]:
+    """Every module that a file imports, wherever in it."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module or ""
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_dependencies_point_one_way(package: str) -> None:
+    files = modules(package)
+    assert files
+    for path in files:
+        own = {name.split(".")[0] for name in imports(path)}
+        wrong = {name for name in own if name.startswith("fhash")} - ALLOWED[package]
+        assert not wrong, f"{path} imports {wrong}"
+        assert not own & {"cli", "formats", "fhash"}, f"{path} imports a source root"
+
+
+def test_torch_stays_where_tensors_are_trained() -> None:
+    for package in PACKAGES:
+        for path in modules(package):
+            if any(name.split(".")[0] in ("torch", "triton") for name in imports(path)):
+                inside = path.relative_to(PACKAGES[package]).as_posix()
+                assert package == "fhash_codec", f"{path} imports torch"
+                assert TORCH_FILES.fullmatch(inside), f"{path} imports torch"
+
+
+@pytest.mark.parametrize("folder", ["cli", "formats"])
+def test_source_roots_are_no_packages(folder: str) -> None:
+    assert not (ROOT / folder / "__init__.py").exists()
+
+
+def test_every_package_folder_is_installed_and_typed() -> None:
+    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    found = {".".join([package, *path.parent.relative_to(PACKAGES[package]).parts]) for package in PACKAGES for path in modules(package)}
+    assert listed == found
+    assert all((folder / "py.typed").exists() for folder in PACKAGES.values())
+
+
+def test_version_is_the_same_everywhere() -> None:
+    import fhash_codec
+
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert declared == importlib.metadata.version("fhash") == fhash_codec.__version__
+    assert f"## [{declared}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import fhash_codec",
+        "import fhash_formats",
+        "import fhash_codec.volume",
+        "import fhash_cli.main",
+        "from fhash_cli.main import program; program(['--help'])",
+        "from fhash_cli.main import program; program(['encode', '--help'])",
+        "from fhash_cli.main import program; program(['render', 'x'])",
+        "import os; os.environ.update(_FHASH_COMPLETE='bash_complete', COMP_WORDS='fhash enc', COMP_CWORD='1');"
+        "from fhash_cli.main import program; program(prog_name='fhash')",
+    ],
+)
+def test_nothing_slow_is_loaded_before_it_is_needed(statement: str) -> None:
+    code = f"import sys\ntry:\n    {statement}\nexcept SystemExit:\n    pass\nprint([m for m in {SLOW} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_constraints_pin_every_requirement_and_name_no_place() -> None:
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    assert all(re.fullmatch(r"[a-z0-9._-]+==[0-9][0-9a-z.]*", line) for line in lines), (
+        "only name==version, without path, URL or local build"
+    )
+    pinned = {re.sub(r"[-_.]+", "-", line.split("==")[0]) for line in lines}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required = [*project["dependencies"], *(name for extra in project["optional-dependencies"].values() for name in extra)]
+    names = {re.sub(r"[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", line)[0].lower()) for line in required} - {"fhash"}  # type: ignore[index]
+    assert names <= pinned
+
+
+def readme_commands() -> list[str]:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```\w*\n(.*?)```", text, flags=re.DOTALL)
+    lines = [line.strip().removeprefix("$ ") for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    return [line for line in lines if line.startswith("fhash ")]
+
+
+def test_readme_shows_commands() -> None:
+    assert readme_commands()
+
+
+@pytest.mark.parametrize("line", readme_commands())
+def test_readme_commands_exist(line: str) -> None:
+    from fhash_cli.main import program
+
+    words = shlex.split(line.split("|")[0].split(">")[0], comments=True)[1:]
+    result = CliRunner().invoke(program, [*words, "--help"])
+    assert result.exit_code == 0, result.stderr
