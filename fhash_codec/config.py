@@ -41,7 +41,7 @@ class EncodeConfig:
     embedding_size: int = setting(2, "numbers trained at each grid corner", low=1, high=16)
     hidden_layers: int = setting(1, "hidden layers of the network", low=0, high=8)
     width: int = setting(64, "neurons of each hidden layer", low=1, high=1024)
-    epochs: int = setting(20, "passes over the coreset", low=0, high=100_000)
+    epochs: int = setting(0, "passes over the coreset, 0 for 20 or as many as make 1000 training steps", low=0, high=100_000)
     learning_rate: float = setting(0.01, "Adam's learning rate at the start", low=1e-8, high=1.0)
     schedule: str = setting("cosine", "course of the learning rate over the training", choices=("cosine", "constant"))
     batch: int = setting(0, "samples per training step, 0 for a size that suits the data", low=0, high=2**31)

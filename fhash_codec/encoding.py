@@ -75,6 +75,7 @@ class Trained:
     fine: npt.NDArray[np.float32]
     tables: list[npt.NDArray[np.float32]]
     layers: list[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]
+    epochs: int
     history: list[dict[str, float | None]]
     device: str
     checkpoint: Path
@@ -113,6 +114,7 @@ def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConf
         fine=parameters.fine.numpy(),
         tables=[table.numpy() for table in tables],
         layers=[(weight.numpy(), bias.numpy()) for weight, bias in layers],
+        epochs=plan.epochs,
         history=course.history,
         device=device.type,
         checkpoint=checkpoint,
@@ -162,7 +164,7 @@ def _header(series: Series, selected: Selection, trained: Trained, config: Encod
             "parameters": architecture.parameters,
         },
         "config": config.to_dict(),
-        "training": {"seconds": seconds if config.timings else None, "epochs": len(trained.history), "device": trained.device},
+        "training": {"seconds": seconds if config.timings else None, "epochs": trained.epochs, "device": trained.device},
         "quality": {},
         "history": history,
     }

@@ -13,7 +13,7 @@ from fhash_codec.architecture import Architecture
 from fhash_codec.coreset import Coreset
 from fhash_codec.network import Network
 from fhash_formats.container import Container, ContainerWriter, StoredArray
-from fhash_formats.errors import InputError
+from fhash_formats.errors import DamagedFileError, InputError
 
 CHUNK_BYTES = 2 << 20  # a time node in one chunk up to this size, in bricks above: each chunk has a fixed cost, each read a whole chunk
 TABLE_AXES = ("t", "z", "y", "x", "embedding")
@@ -61,21 +61,24 @@ def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
 
 
 def load_network(container: Container) -> Network:
-    """The model in a container, its tables read on demand."""
+    """The model in a container, its tables read on demand; DamagedFileError if its parts do not fit together."""
     header = container.header
     model = header["model"]
     levels = tuple(tuple(level) for level in model["levels"])
     layers = tuple(
         (container.arrays[f"mlp/weight_{n}"].read(), container.arrays[f"mlp/bias_{n}"].read()) for n in range(1, model["hidden_layers"] + 2)
     )
-    return Network(
-        levels=levels,
-        embedding_size=model["embedding_size"],
-        tables=[StoredTable(container.arrays[f"tables/level_{n}"]) for n in range(1, len(levels) + 1)],
-        layers=layers,
-        box_size=tuple(high - low for low, high in header["feature_bounding_box"]),
-        key_frames=levels[0][0],
-    )
+    try:
+        return Network(
+            levels=levels,
+            embedding_size=model["embedding_size"],
+            tables=[StoredTable(container.arrays[f"tables/level_{n}"]) for n in range(1, len(levels) + 1)],
+            layers=layers,
+            box_size=tuple(high - low for low, high in header["feature_bounding_box"]),
+            key_frames=levels[0][0],
+        )
+    except InputError as error:
+        raise DamagedFileError(f"{container.path}: {error}") from error
 
 
 class StoredTable:

@@ -18,6 +18,8 @@ from fhash_formats.errors import TrainingError
 
 BATCH_BRICKS = 64  # of 1024 vertices: below 2^16 samples a step, its fixed cost shows; above, each epoch teaches less
 STEPS_AN_EPOCH = (20, 256)
+USUAL_EPOCHS, USUAL_STEPS = 20, 1000
+HISTORY_POINTS = 100
 PROBE_BRICKS = 512  # on which the quality of an epoch is measured
 
 
@@ -40,7 +42,11 @@ class Plan:
 
 
 def plan_training(coreset: Coreset, *, epochs: int, learning_rate: float, schedule: str, batch: int, seed: int) -> Plan:
-    """A plan for a coreset; `batch` in samples, 0 for 64 bricks where that makes 20 to 256 steps an epoch, else the nearest that does."""
+    """A plan for a coreset.
+
+    epochs: 0 for 20 of them, or as many as make 1000 steps. batch: in samples, 0 for 64 bricks where that makes 20 to 256 steps an
+    epoch, else the nearest size that does.
+    """
     bricks = len(coreset.bricks)
     if batch:
         batches = max(1, round(bricks * prod(coreset.brick_shape) / batch))
@@ -48,6 +54,7 @@ def plan_training(coreset: Coreset, *, epochs: int, learning_rate: float, schedu
         low, high = STEPS_AN_EPOCH
         batches = min(max(-(-bricks // BATCH_BRICKS), low), high)
     batches = min(batches, bricks)
+    epochs = epochs or max(USUAL_EPOCHS, -(-USUAL_STEPS // batches))
     share = np.arange(epochs * batches + 1) / max(epochs * batches, 1)
     rates = learning_rate * (0.5 + 0.5 * np.cos(np.pi * share) if schedule == "cosine" else np.ones_like(share))
     return Plan(epochs=epochs, bricks=bricks, batches=batches, seed=seed, rates=rates)
@@ -77,13 +84,14 @@ def train(
 ) -> bool:
     """Train from where `course` stands to the end of the plan; true if it got there.
 
-    Every epoch adds {seconds, epoch, psnr} to the history; PSNR in dB of the normalised values on a fixed random choice of bricks.
+    Every epoch (of more than 100, every 2nd, 3rd, ...) adds {seconds, epoch, psnr} to the history; PSNR in dB of the normalised values on a fixed random choice of bricks.
     `save` is called with the course every `save_seconds`, and when `stop` asks for an end, which comes after the running batch.
     The loop also ends once `budget_seconds` are spent. Raises TrainingError if the error is no longer finite.
     """
     probe = np.sort(np.random.default_rng(plan.seed).permutation(plan.bricks)[:PROBE_BRICKS])
     begun = saved = time.perf_counter()
     before, note = course.seconds, ""
+    every = -(-plan.epochs // HISTORY_POINTS)
     while course.epoch < plan.epochs:
         for chosen in plan.order(course.epoch)[course.batch :]:
             engine.train(chosen)
@@ -99,11 +107,12 @@ def train(
             if asked or course.seconds > budget_seconds:
                 return False
             progress("training", course.epoch * plan.batches + course.batch, plan.epochs * plan.batches, note)
-        psnr = probe_psnr(engine, coreset, probe)
         course.epoch, course.batch = course.epoch + 1, 0
-        course.seconds = before + time.perf_counter() - begun
-        course.history.append({"seconds": course.seconds, "epoch": course.epoch, "psnr": psnr})
-        note = "exact" if psnr is None else f"epoch {course.epoch}: {psnr:.1f} dB"
+        if course.epoch % every == 0 or course.epoch == plan.epochs:
+            psnr = probe_psnr(engine, coreset, probe)
+            course.seconds = before + time.perf_counter() - begun
+            course.history.append({"seconds": course.seconds, "epoch": course.epoch, "psnr": psnr})
+            note = "exact" if psnr is None else f"epoch {course.epoch}: {psnr:.1f} dB"
     return True
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.options import check_writable, force_option, json_option, quiet_option
-from fhash_cli.output import Progress, emit, extent, number, quality_rows, say, size, table
+from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, say, size, table
 from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
 
     import fhash_codec
 
-    config = EncodeConfig(features=(synthetic.SCENES[scene].feature,))
+    config = EncodeConfig(features=(synthetic.SCENES[scene].feature,), embedding_size=1, tables="uint8")
     with Progress(quiet=quiet) as progress:
         encoded = fhash_codec.encode(data, run, config, force=force, progress=progress)
         start = time.perf_counter()
@@ -65,7 +65,8 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
         seconds = time.perf_counter() - start
     with open_series(data) as series, fhash_codec.open(run) as volume:
         _draw(scene, series, volume, report).save(picture, optimize=True)
-    made = {"scene": scene, "feature": config.features[0], "data": str(data), "path": str(run), "picture": str(picture)}
+    settings = f"--feature {config.features[0]} --embedding-size {config.embedding_size} --tables {config.tables}"
+    made = {"scene": scene, "data": str(data), "path": str(run), "picture": str(picture), "settings": settings}
     result = {**report, "seconds": encoded["seconds"], "diff_seconds": seconds, **made}
     emit(result, table(_rows(result, series)), as_json)
 
@@ -92,7 +93,7 @@ def _draw(scene: str, series: Series, volume: Volume, report: dict[str, Any]) ->
         pairs,
         title=f"fhash demo: {scene}",
         subtitle=f"{extent(series.shape)} values, {saved}, {quality}",
-        quantity=f"{series.name} ({series.units})",
+        quantity=series.name if series.units == "1" else f"{series.name} ({series.units})",
         footer=f"outside the coreset, not kept.   Slice z = {heights[layer]:.2g} m; error = decoded - original",
     )
 
@@ -100,9 +101,9 @@ def _draw(scene: str, series: Series, volume: Volume, report: dict[str, Any]) ->
 def _rows(result: dict[str, Any], series: Series) -> list[tuple[str, str]]:
     return [
         ("data", f"{result['data']}, {extent(series.shape)} {series.dtype}"),
-        ("container", f"{result['path']}, feature {result['feature']}"),
+        ("container", f"{result['path']}, by fhash encode {result['settings']}"),
         ("picture", result["picture"]),
-        ("size", f"{size(result['bytes'])} of {size(result['raw_bytes'])}, {number(result['ratio'], digits=3)}x smaller"),
+        ("size", compared(result)),
         ("coreset", f"{result['coreset_fraction']:.3%} of the domain"),
         *quality_rows(result),
         ("encoding", f"{number(result['seconds'], 's', digits=3)}, {result['epochs']} epochs on {result['device']}"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from fhash_cli.options import SourceOptions, json_option, quiet_option, run_argument, series_options
-from fhash_cli.output import Progress, emit, extent, number, quality_rows, size, table
+from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, table
 
 
 @click.command("diff")
@@ -26,7 +26,7 @@ def command(
     with source.open(data) as series, Progress(quiet=quiet) as progress:
         report = fhash_codec.diff(series, run, progress=progress)
     rows = [
-        ("size", f"{size(report['bytes'])} of {size(report['raw_bytes'])}, {number(report['ratio'])}x smaller"),
+        ("size", compared(report)),
         ("steps, z, y, x", extent(report["shape"])),
         *quality_rows(report, series.units),
     ]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.options import SourceOptions, check_writable, config_options, force_option, json_option, quiet_option, series_options
-from fhash_cli.output import Progress, emit, extent, number, quality_rows, size, spans, table
+from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, spans, table
 from fhash_formats.errors import QualityError
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
     """An encoding's report as a table."""
     return [
         ("written", str(report["path"])),
-        ("size", f"{size(report['bytes'])} of {size(report['raw_bytes'])}, {number(report['ratio'])}x smaller"),
+        ("size", compared(report)),
         ("steps, z, y, x", extent(report["shape"])),
         ("key frames", str(len(report["key_frames"]))),
         ("coreset", f"{report['coreset_fraction']:.3%} of the domain, in {spans(report['feature_bounding_box'])}"),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.options import json_option, run_argument
-from fhash_cli.output import emit, extent, listed, number, quality_rows, size, spans, table
+from fhash_cli.output import compared, emit, extent, listed, number, quality_rows, spans, table
 
 if TYPE_CHECKING:
     from fhash_codec import Volume
@@ -31,7 +31,7 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
     seconds = "" if training["seconds"] is None else f" in {number(training['seconds'], 's', digits=3)}"
     return [
         ("file", f"{info['path']}, format {'.'.join(map(str, info['format_version']))}, by fhash {info['encoder']['version']}"),
-        ("size", f"{size(info['bytes'])} of {size(info['raw_bytes'])}, {number(info['ratio'])}x smaller"),
+        ("size", compared(info)),
         ("variable", f"{volume.name}, {dtype}" + (f", in {volume.units}" if volume.units not in ("", "1") else "")),
         ("t, z, y, x", extent(volume.shape)),
         *((f"  {axis}", _positions(volume, axis)) for axis in "tzyx"),

@@ -56,6 +56,13 @@ def size(count: float) -> str:
     return f"{count:.3g} TB"
 
 
+def compared(report: Mapping[str, Any]) -> str:
+    """The size of a container beside that of the data."""
+    ratio = report["ratio"]
+    word = f"{number(ratio, digits=3)}x smaller" if ratio >= 1 else f"{number(1 / ratio, digits=3)}x larger"
+    return f"{size(report['bytes'])} of {size(report['raw_bytes'])}, {word}"
+
+
 def number(value: float | None, unit: str = "", *, digits: int = 4) -> str:
     """A measured value with its unit, where it has one ("1" stands for none); None (not defined) as a dash."""
     return "-" if value is None else f"{value:.{digits}g} {'' if unit == '1' else unit}".rstrip()
@@ -84,7 +91,7 @@ def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, 
         ("PSNR, domain", number(report["psnr_domain"], "dB")),
         ("RMSE", number(report["rmse"], units)),
         ("largest error", number(report["max_abs_error"], units)),
-        ("SSIM", number(report["ssim"])),
+        ("SSIM", number(report["ssim"], digits=5)),
     ]
 
 

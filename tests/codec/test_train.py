@@ -61,6 +61,11 @@ def test_batches_of_an_epoch(coreset, batch, batches):
     assert len(plan.rates) == 4 * plan.batches + 1
 
 
+@pytest.mark.parametrize(("batch", "epochs"), [(0, 50), (1, 20), (2**20, 1000)])
+def test_epochs_that_suit_the_data(coreset, batch, epochs):
+    assert setup(coreset, epochs=0, batch=batch)[0].epochs == epochs
+
+
 def test_rates_fall_to_zero_or_stay(coreset):
     cosine, constant = setup(coreset)[0].rates, setup(coreset, schedule="constant")[0].rates
     assert cosine[0] == 0.01

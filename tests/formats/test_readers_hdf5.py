@@ -56,7 +56,9 @@ def test_any_order_of_axes(tmp_path: Path, order: tuple[str, ...], chunked: bool
     assert_frames(tmp_path / "a.h5", VALUES, axes=",".join(order))
 
 
-@pytest.mark.parametrize(("axes", "shape"), [("t,y,x", (4, 1, 5, 6)), ("x,y,t", (6, 1, 5, 4)), ("z,y,x", (1, 4, 5, 6)), ("t,z,x", (4, 5, 1, 6))])
+@pytest.mark.parametrize(
+    ("axes", "shape"), [("t,y,x", (4, 1, 5, 6)), ("x,y,t", (6, 1, 5, 4)), ("z,y,x", (1, 4, 5, 6)), ("t,z,x", (4, 5, 1, 6))]
+)
 def test_axes_left_out_have_length_1(tmp_path: Path, axes: str, shape: tuple[int, ...]) -> None:
     path = write(tmp_path / "a.h5", v=VALUES[:, 0])
     with open_series(path, axes=axes) as series:
@@ -106,7 +108,9 @@ def test_coordinates_from_dimension_scales(tmp_path: Path) -> None:
 
 def test_coordinates_beside_the_dataset_then_in_the_root(tmp_path: Path) -> None:
     times = np.array([347921.1, 347921.2, 347921.3, 347999.0])
-    path = write(tmp_path / "a.h5", run__v=VALUES, time=times, run__x1v=np.arange(6.0) * 2, x2v=np.zeros(9), lev=np.arange(3), x=np.arange(5))
+    path = write(
+        tmp_path / "a.h5", run__v=VALUES, time=times, run__x1v=np.arange(6.0) * 2, x2v=np.zeros(9), lev=np.arange(3), x=np.arange(5)
+    )
     with open_series(path) as series:
         np.testing.assert_array_equal(series.coords["t"].values, times)
         assert series.coords["x"].name == "x1v"
@@ -253,7 +257,7 @@ def test_a_file_that_changes_is_refused(tmp_path: Path) -> None:
             series.read(1)
     with open_series(path) as series:
         os.truncate(path, path.stat().st_size - 10)
-        with pytest.raises(InputError, match="changed while it was being read.*bytes before"):
+        with pytest.raises(InputError, match=r"changed while it was being read.*bytes before"):
             series.read(0)
 
 
@@ -279,7 +283,8 @@ def test_a_missing_filter_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_filters_of_hdf5plugin_are_loaded_when_needed(tmp_path: Path) -> None:
     pytest.importorskip("hdf5plugin")
-    write_it = "import h5py, hdf5plugin, numpy, sys; h5py.File(sys.argv[1], 'w').create_dataset('v', data=numpy.ones((2,2,2)), **hdf5plugin.Zstd())"
+    imports = "import h5py, hdf5plugin, numpy, sys"
+    write_it = f"{imports}; h5py.File(sys.argv[1], 'w').create_dataset('v', data=numpy.ones((2,2,2)), **hdf5plugin.Zstd())"
     read_it = "import sys; from fhash_formats import open_series; assert open_series(sys.argv[1]).read(0).sum() == 8"
     for script in (write_it, read_it):
         subprocess.run([sys.executable, "-c", script, str(tmp_path / "a.h5")], check=True)
@@ -293,7 +298,7 @@ def test_a_virtual_dataset_without_its_source_is_refused(tmp_path: Path) -> None
         file.create_virtual_dataset("v", layout)
     assert_frames(tmp_path / "a.h5", VALUES)
     (tmp_path / "part.h5").unlink()
-    with pytest.raises(InputError, match="draws on part.h5, which is not there"):
+    with pytest.raises(InputError, match=r"draws on part.h5, which is not there"):
         open_series(tmp_path / "a.h5")
 
 

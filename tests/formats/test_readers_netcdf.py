@@ -147,7 +147,7 @@ def along(dimension: str, **attributes: str) -> tuple[str, np.ndarray, dict[str,
 )
 def test_axes_by_cf_attributes(tmp_path: Path, coords: dict[str, Any], expected: str | None) -> None:
     if expected is None:
-        with pytest.raises(InputError, match="not clear.*--axes"):
+        with pytest.raises(InputError, match=r"not clear.*--axes"):
             roles(tmp_path / "a.nc", "abcd", **coords)
     else:
         assert roles(tmp_path / "a.nc", "abcd", **coords) == expected
@@ -240,7 +240,7 @@ def test_plain_hdf5_named_nc_keeps_the_order_of_its_axes(tmp_path: Path) -> None
 
 def test_one_dimension_only(tmp_path: Path) -> None:
     path = save(tmp_path / "a.nc", xr.Dataset({"v": ("time", np.zeros(4))}))
-    with pytest.raises(InputError, match="no variable of 3 or 4 dimensions.*v: 1 dimensions"):
+    with pytest.raises(InputError, match=r"no variable of 3 or 4 dimensions.*v: 1 dimensions"):
         open_series(path)
 
 
@@ -259,7 +259,7 @@ def test_classic_netcdf3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         np.testing.assert_array_equal(series.coords["t"].values, np.arange(4) / 3 + 347921)
     np.testing.assert_array_equal(frames(tmp_path / "a.nc"), VALUES)
     monkeypatch.setitem(sys.modules, "scipy", None)
-    with pytest.raises(InputError, match="needs scipy.*nccopy -k nc4"):
+    with pytest.raises(InputError, match=r"needs scipy.*nccopy -k nc4"):
         open_series(tmp_path / "a.nc")
     monkeypatch.undo()
     os.truncate(tmp_path / "a.nc", 300)
@@ -270,7 +270,7 @@ def test_classic_netcdf3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_cdf5_says_how_to_convert(tmp_path: Path) -> None:
     (tmp_path / "a.nc").write_bytes(b"CDF\x05" + bytes(100))
-    with pytest.raises(InputError, match="CDF-5.*nccopy -k nc4"):
+    with pytest.raises(InputError, match=r"CDF-5.*nccopy -k nc4"):
         open_series(tmp_path / "a.nc")
 
 

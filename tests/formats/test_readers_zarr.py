@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import tracemalloc
@@ -232,6 +233,33 @@ def test_empty_and_broken_hierarchies(tmp_path: Path) -> None:
     os.truncate(tmp_path / "e.zip", 40)
     with pytest.raises(InputError, match="cannot be read as a ZIP"):
         open_series(tmp_path / "e.zip")
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_neighbours_that_cannot_be_opened_bar_nothing(tmp_path: Path, zarr_format: int) -> None:
+    path = tmp_path / "a.zarr"
+    create(path, VALUES, name="v", zarr_format=zarr_format)
+    create(path, VALUES, name="odd", zarr_format=zarr_format)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # text has no specification yet
+        zarr.open_group(path, mode="a").create_array("names", shape=(3,), dtype=str)
+    (path / "notes.txt").write_text("stray")
+    metadata = path / "odd" / ("zarr.json" if zarr_format == 3 else ".zarray")
+    content = json.loads(metadata.read_text())
+    content |= {"codecs": [{"name": "mycodec"}]} if zarr_format == 3 else {"compressor": {"id": "mycodec"}}
+    metadata.write_text(json.dumps(content))
+    np.testing.assert_array_equal(frames(path), VALUES)
+    with pytest.raises(InputError, match=r"odd has what cannot be opened.*mycodec"):
+        open_series(path, var="odd")
+    with pytest.raises(InputError, match=r"cannot be read as zarr.*mycodec"):
+        open_series(path / "odd")
+
+
+def test_unsigned_values_stored_as_signed(tmp_path: Path) -> None:
+    values = np.array([0, 1, 127, 128, 254, 255], np.uint8).reshape(1, 2, 3)
+    attributes = {"_Unsigned": "true", "_FillValue": -1, "missing_value": 300}
+    create(tmp_path / "a.zarr", values.view(np.int8), attributes=attributes)
+    np.testing.assert_array_equal(frames(tmp_path / "a.zarr")[0], np.where(values == 255, np.nan, values.astype("f4")))
 
 
 def test_bad_packing_attributes_are_refused(tmp_path: Path) -> None:

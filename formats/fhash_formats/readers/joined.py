@@ -27,7 +27,7 @@ def is_pattern(text: str) -> bool:
 
 def natural_order(text: str) -> list[tuple[int, str]]:
     """A key that sorts frame_9 before frame_10: runs of digits count as numbers."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", text)]
+    return [(int(part), "") if part[:1].isdecimal() and part.isascii() else (-1, part) for part in re.split(r"([0-9]+)", text)]
 
 
 def files_of(pattern: str) -> list[Path]:

@@ -40,12 +40,11 @@ CLASSIC_64 = b"CDF\x05"
 
 def matches(head: bytes, path: Path) -> bool:
     """Whether this is NetCDF: classic, or HDF5 that says so by its suffix, by `_NCProperties` or by CF `Conventions`."""
-    if head[:4] in (*CLASSIC, CLASSIC_64):
-        return True
-    return is_hdf5(head) and (path.suffix.lower() in SUFFIXES or _says_netcdf(path))
+    return head[:4] in (*CLASSIC, CLASSIC_64) or (is_hdf5(head) and (_says_netcdf(path) or path.suffix.lower() in SUFFIXES))
 
 
 def _says_netcdf(path: Path) -> bool:
+    """Whether an HDF5 file says that it is NetCDF; raises InputError if it cannot be opened."""
     import h5py
 
     with refusing(f"{path} cannot be read as HDF5"), h5py.File(path, "r") as file:

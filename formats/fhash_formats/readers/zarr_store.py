@@ -47,7 +47,6 @@ def open_zarr(path: Path, request: Request) -> Series:
     Dimension names (format 3, or xarray's `_ARRAY_DIMENSIONS`) give axes and coordinates. Packing is undone (see cf_packing).
     Consolidated metadata is not used: a copy that was not renewed would hide what was appended since.
     """
-    import zarr
     from zarr.storage import LocalStore, ZipStore
 
     source = str(path)
@@ -63,6 +62,8 @@ def open_zarr(path: Path, request: Request) -> Series:
         with warnings.catch_warnings(), refusing(f"{source} cannot be read as zarr"):
             warnings.simplefilter("ignore")  # zarr warns of codecs and types that are not in the specification
             arrays, failed = _open_arrays(store, inside, nodes)
+            if "" in failed:
+                raise InputError(f"{source} cannot be read as zarr: {failed['']}")
             if "" in arrays and path.is_dir() and request.var is None and _metadata(path.parent) is not None:
                 # an array of a group, named by its folder: its coordinates are beside it
                 store.close()

@@ -1,0 +1,253 @@
+"""Everything that a user can get wrong: an exit code, one line that says what is wrong, and not a file more or less than before."""
+
+from __future__ import annotations
+
+import errno
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import Result
+
+from fhash_formats.container import ContainerWriter
+
+Fhash = Callable[..., Result]
+Refused = Callable[..., str]
+SMALL = ["--epochs", "1", "--width", "4", "--quiet"]
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> Path:
+    """A folder of unsuitable inputs."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    with h5py.File(folder / "many.h5", "w") as file:
+        file["line"] = np.zeros(9)
+        file["sheet"] = np.zeros((9, 9))
+        file["five"] = np.zeros((2, 2, 3, 3, 3))
+        file["complex"] = np.zeros((3, 3, 3, 3), dtype=complex)
+        file["text"] = np.full((2, 3, 3, 3), b"abc")
+        file["words"] = np.full((2, 3, 3, 3), "abc", dtype=h5py.string_dtype())
+        file["pairs"] = np.zeros((2, 3, 3, 3), dtype=[("a", "f4"), ("b", "f4")])
+        file["empty"] = np.zeros((0, 3, 3, 3))
+        file["hollow"] = np.zeros((2, 3, 0, 3))
+        file["nowhere"] = np.full((2, 3, 3, 3), np.nan)
+        file["endless"] = np.full((2, 3, 3, 3), np.inf)
+        file["good"] = np.arange(2 * 3 * 4 * 5, dtype=float).reshape(2, 3, 4, 5)
+        file.create_group("group")
+    whole = (folder / "many.h5").read_bytes()
+    (folder / "cut.h5").write_bytes(whole[: len(whole) // 2])
+    (folder / "text.h5").write_text("this is no HDF5 file")
+    (folder / "text.xyz").write_text("of no format at all")
+    (folder / "nothing.npy").write_bytes(b"")
+    (folder / "bytes.bin").write_bytes(bytes(100))
+    np.save(folder / "complex.npy", np.zeros((2, 3, 3, 3), dtype=complex))
+    np.save(folder / "objects.npy", np.array([[[["a"]]]], dtype=object))
+    np.save(folder / "five.npy", np.zeros((1, 2, 3, 3, 3)))
+    np.save(folder / "good.npy", np.arange(2 * 3 * 4 * 5, dtype=np.float32).reshape(2, 3, 4, 5))
+    (folder / "plain").mkdir()
+    return folder
+
+
+INPUTS = [
+    ("missing.h5", [], "does not exist"),
+    ("plain", [], "is a folder"),
+    ("text.h5", [], "text.h5"),
+    ("cut.h5", ["--var", "good"], "cut.h5"),
+    ("text.xyz", [], "HDF5"),
+    ("nothing.npy", [], "empty"),
+    ("complex.npy", [], "complex128"),
+    ("objects.npy", [], "objects.npy"),
+    ("five.npy", [], "5"),
+    ("good.npy", ["--axes", "t,z,y"], "axes"),
+    ("good.npy", ["--axes", "a,b,c,d"], "such as t,z,y,x"),
+    ("good.npy", ["--axes", "t,z,y,y"], "each once"),
+    ("good.npy", ["--var", "v"], "--var"),
+    ("good.npy", ["--t", "5:9"], "2 steps"),
+    ("good.npy", ["--t", "1:1"], "2 steps"),
+    ("bytes.bin", [], "bytes.bin"),
+    ("bytes.bin", ["--shape", "x=2,y=2,z=2,t=2", "--dtype", "float32"], "100"),
+    ("bytes.bin", ["--shape", "x=5,y=5,z=4", "--dtype", "float99"], "float99"),
+    ("bytes.bin", ["--shape", "5x5x4", "--dtype", "uint8"], "such as x=64"),
+    ("bytes.bin", ["--shape", "x=5,y=0,z=4", "--dtype", "uint8"], "y=0"),
+    ("many.h5", [], "--var"),
+    ("many.h5", ["--var", "good?"], "good"),
+    ("many.h5", ["--var", "group"], "group"),
+    *(("many.h5", ["--var", name], name) for name in ("line", "sheet", "five", "complex", "text", "words", "pairs", "empty", "hollow")),
+    ("many.h5", ["--var", "nowhere"], "nowhere"),
+    ("many.h5", ["--var", "endless"], "endless"),
+]
+
+
+@pytest.mark.parametrize("command", ["encode", "diff", "bench"])
+@pytest.mark.parametrize(("name", "words", "message"), INPUTS, ids=lambda value: "-".join(value) if isinstance(value, list) else str(value))
+def test_unsuitable_input(refused: Refused, inputs: Path, run: Path, command: str, name: str, words: list[str], message: str) -> None:
+    match command:
+        case "encode":
+            line = refused(2, "encode", inputs / name, "-o", inputs.parent / "out.fhz", *words, *SMALL)
+        case "diff":
+            line = refused(2, "diff", inputs / name, run, *words)
+            if name == "many.h5" and words in (["--var", "nowhere"], ["--var", "endless"]):
+                return  # of another shape than the container, which is said first
+        case _:
+            line = refused(2, "bench", "train", inputs / name, "--seconds", "0.1", "-q", *words)
+    assert message in line
+
+
+SETTINGS = [
+    (["--feature", "interval:1e9:2e9"], "select"),
+    (["--feature", "isosurface:1e9"], "select"),
+    (["--feature", "segmentation:1e9"], "select"),
+    (["--feature", "interval:2:1"], "interval"),
+    (["--feature", "interval:a:b"], "interval:LO:HI"),
+    (["--feature", "interval:nan:1"], "interval"),
+    (["--feature", "blob"], "blob"),
+    (["--feature", ""], "feature"),
+    (["--feature", "mask:missing.npy"], "missing.npy"),
+    (["--key-frames", "every:0"], "every"),
+    (["--key-frames", "every:x"], "every"),
+    (["--key-frames", "auto:0"], "auto"),
+    (["--key-frames", "5,9"], "9"),
+    (["--key-frames", ""], "key"),
+    (["--key-frames", "some"], "every:K"),
+    (["--fold", "1"], "--fold"),
+    (["--width", "0"], "--width"),
+    (["--width", "many"], "--width"),
+    (["--epochs", "-1"], "--epochs"),
+    (["--dilation", "1000"], "--dilation"),
+    (["--learning-rate", "0"], "--learning-rate"),
+    (["--learning-rate", "nan"], "learning-rate"),
+    (["--psnr", "-1"], "--psnr"),
+    (["--profile", "huge"], "--profile"),
+    (["--engine", "warp"], "--engine"),
+    (["--device", "tpu"], "--device"),
+    (["--tables", "int3"], "--tables"),
+    (["--seed", "-1"], "--seed"),
+    (["--t", "a"], "half-open range"),
+    (["--endian", "middle"], "--endian"),
+    (["--unknown"], "--unknown"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), SETTINGS, ids=lambda value: "-".join(value) if isinstance(value, list) else None)
+def test_unsuitable_setting(refused: Refused, inputs: Path, words: list[str], message: str) -> None:
+    line = refused(2, "encode", inputs / "good.npy", "-o", inputs.parent / "out.fhz", *SMALL, *words)
+    assert message in line
+
+
+def test_container_is_no_input(refused: Refused, run: Path, tmp_path: Path) -> None:
+    assert "fhash decode" in refused(2, "encode", run, "-o", tmp_path / "out.fhz")
+
+
+REGIONS = [
+    (["--t", "3"], "steps 0 to 2"),
+    (["--t", "-4"], "steps 0 to 2"),
+    (["--t", "1:9"], "steps 0 to 2"),
+    (["--t", "2:1"], "steps 0 to 2"),
+    (["--t", "x"], "--t"),
+    (["--time", "-0.1"], "time"),
+    (["--time", "4.01"], "time"),
+    (["--time", "nan"], "time"),
+    (["--time", "soon"], "--time"),
+    (["--t", "1", "--time", "1"], "exclude"),
+    (["--roi", "0:7,:,:"], "6 vertices along z"),
+    (["--roi", ":,-8:,:"], "7 vertices along y"),
+    (["--roi", ":,:,5:5"], "8 vertices along x"),
+    (["--roi", "1:2"], "z0:z1,y0:y1,x0:x1"),
+    (["--roi", ":,:,:", "--box", ":,:,:"], "exclude"),
+    (["--box", "0:2.6,:,:"], "positions 0 to 2.5"),
+    (["--box", ":,:,2:"], "positions 3 to 10"),
+    (["--box", "0.6:0.9,:,:"], "no vertex"),
+    (["--box", "nan:1,:,:"], "--box"),
+    (["--outside", "zero"], "--outside"),
+    (["--dtype", "complex64"], "--dtype"),
+    (["--dtype", "uint8"], "--outside background"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), REGIONS, ids=lambda value: "-".join(value) if isinstance(value, list) else None)
+def test_unsuitable_region(refused: Refused, run: Path, tmp_path: Path, words: list[str], message: str) -> None:
+    assert message in refused(2, "decode", run, "-o", tmp_path / "out.npy", *words)
+
+
+def outputs(data: Path, run: Path, folder: Path) -> dict[str, list[object]]:
+    """Command lines that write OUT in a folder."""
+    return {
+        "encode": ["encode", data, *SMALL, "-o", folder / "out.fhz"],
+        "decode": ["decode", run, "-o", folder / "out.npy"],
+        "zarr": ["decode", run, "-o", folder / "out.zarr"],
+        "steps": ["decode", run, "-o", folder / "out.pvd"],
+    }
+
+
+@pytest.mark.parametrize("kind", ["encode", "decode", "zarr", "steps"])
+def test_output_in_a_missing_folder(refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str) -> None:
+    assert "does not exist" in refused(2, *outputs(data, run, tmp_path / "missing")[kind])
+
+
+@pytest.mark.parametrize("kind", ["encode", "decode", "zarr", "steps"])
+def test_output_in_a_folder_that_is_a_file(refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str) -> None:
+    (tmp_path / "file").write_text("")
+    refused(2, *outputs(data, run, tmp_path / "file")[kind])
+
+
+@pytest.mark.parametrize("kind", ["encode", "decode", "zarr", "steps"])
+def test_existing_output(refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str) -> None:
+    words = outputs(data, run, tmp_path)[kind]
+    Path(str(words[-1])).write_text("old")
+    assert "--force" in refused(2, *words)
+
+
+@pytest.mark.parametrize("kind", ["encode", "decode", "steps"])
+def test_output_that_is_a_folder_is_refused_with_force(refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str) -> None:
+    words = outputs(data, run, tmp_path)[kind]
+    Path(str(words[-1])).mkdir()
+    assert "directory" in refused(2, *words, "--force")
+
+
+def test_output_is_checked_before_the_input_is_read(refused: Refused, tmp_path: Path) -> None:
+    assert "missing-folder" in refused(2, "encode", tmp_path / "no.h5", "-o", tmp_path / "missing-folder" / "out.fhz")
+    assert "missing-folder" in refused(2, "decode", tmp_path / "no.fhz", "-o", tmp_path / "missing-folder" / "out.npy")
+
+
+@pytest.mark.parametrize("name", ["out", "out.xyz"])
+def test_output_of_an_unknown_format_lists_the_formats(refused: Refused, run: Path, tmp_path: Path, name: str) -> None:
+    assert ".npy" in refused(2, "decode", run, "-o", tmp_path / name)
+
+
+def test_full_disk_while_encoding(refused: Refused, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(self: ContainerWriter, *_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(ContainerWriter, "add_array", full)
+    assert "no space left" in refused(1, "encode", data, "-o", tmp_path / "out.fhz", *SMALL)
+
+
+@contextmanager
+def small_files(limit: int) -> Iterator[None]:
+    """No file may grow beyond `limit` bytes: the system itself fails a write half-way, as it does on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("suffix", ["fhz", "npy", "h5", "raw", "vti", "zarr"])
+def test_a_write_that_fails_half_way_leaves_nothing(refused: Refused, data: Path, run: Path, tmp_path: Path, suffix: str) -> None:
+    output = tmp_path / f"out.{suffix}"
+    words = ["encode", data, "-o", output, *SMALL] if suffix == "fhz" else ["decode", run, "--t", "0", "-o", output]
+    with small_files(200 if suffix == "zarr" else 1000):
+        assert str(output) in refused(1, *words)
+    old = b"the old file"
+    if suffix != "zarr":
+        output.write_bytes(old)
+        with small_files(1000):
+            refused(1, *words, "--force")
+        assert output.read_bytes() == old

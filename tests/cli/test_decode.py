@@ -1,0 +1,132 @@
+"""`fhash decode`: what comes out of any region, time and format is what the volume itself gives."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import Result
+
+import fhash_codec
+from fhash_cli.decode import TYPES, convert
+from fhash_formats.errors import InputError
+
+Fhash = Callable[..., Result]
+
+
+@pytest.fixture(scope="module")
+def whole(run: Path) -> np.ndarray:
+    with fhash_codec.open(run) as volume:
+        return np.asarray(volume)
+
+
+def saved(fhash: Fhash, run: Path, output: Path, *words: object) -> np.ndarray:
+    result = fhash("decode", run, "-o", output, *words)
+    assert (result.exit_code, result.stderr) == (0, "")
+    return np.load(output)
+
+
+@pytest.mark.parametrize(
+    ("words", "index"),
+    [
+        ([], np.s_[:]),
+        (["--t", "1"], np.s_[1:2]),
+        (["--t", "-1"], np.s_[-1:]),
+        (["--t", "::2"], np.s_[::2]),
+        (["--t", "-2:"], np.s_[-2:]),
+        (["--roi", "1:3,:,-4:-1"], np.s_[:, 1:3, :, -4:-1]),
+        (["--t", "0:2", "--roi", ":4,2:3,5:"], np.s_[0:2, :4, 2:3, 5:]),
+        (["--box", "0.5:1.25,:,4:9"], np.s_[:, 1:3, :, 1:7]),
+        (["--box", ":,2:2,:"], np.s_[:, :, 2:3, :]),
+        (["--box", ":,:,6.5:"], np.s_[:, :, :, 0:4]),
+        (["--time", "4", "--time", "0"], np.s_[[2, 0]]),
+    ],
+)
+def test_a_region_is_that_part_of_the_whole(
+    fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path, words: list[str], index: object
+) -> None:
+    np.testing.assert_array_equal(saved(fhash, run, tmp_path / "out.npy", *words), whole[index])
+
+
+def test_a_time_between_steps_is_the_volume_at_that_step(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    with fhash_codec.open(run) as volume:
+        expected = volume.read(1.5)
+    np.testing.assert_array_equal(saved(fhash, run, tmp_path / "out.npy", "--time", "2.5"), expected[None])
+
+
+def test_outside_background_leaves_no_nan(fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path) -> None:
+    filled = saved(fhash, run, tmp_path / "out.npy", "--outside", "background")
+    assert np.isnan(whole).any()
+    assert not np.isnan(filled).any()
+    np.testing.assert_array_equal(filled[~np.isnan(whole)], whole[~np.isnan(whole)])
+
+
+def test_coordinates_and_attributes_travel_with_the_region(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    assert fhash("decode", run, "-o", tmp_path / "out.h5", "--time", "0.5", "--time", "2.5", "--roi", "1:3,:,2:5").exit_code == 0
+    with h5py.File(tmp_path / "out.h5") as file:
+        values = file["density"]
+        assert values.shape == (2, 2, 7, 3)
+        assert values.attrs["units"] == "kg m-3"
+        got = [values.dims[axis][0][...].tolist() for axis in range(4)]
+    assert got == [[0.5, 2.5], [0.5, 1.0], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [8.0, 7.0, 6.0]]
+
+
+@pytest.mark.parametrize("name", ["out.npy", "out.h5", "out.nc", "out.zarr", "out.raw", "out.vti", "out.pvd"])
+def test_every_format_is_written_and_named(fhash: Fhash, run: Path, tmp_path: Path, name: str) -> None:
+    result = fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3", "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    paths = [Path(path) for path in json.loads(result.stdout)["paths"]]
+    assert paths
+    assert all(path.exists() for path in paths)
+    assert fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3").exit_code == 2
+    assert fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3", "--force").exit_code == 0
+
+
+def test_statistics_are_those_of_the_region(fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path) -> None:
+    report = json.loads(fhash("decode", run, "--t", "1", "--roi", "2:5,:,:", "--json").stdout)
+    part = whole[1:2, 2:5]
+    assert report["min"] == np.nanmin(part)
+    assert report["max"] == np.nanmax(part)
+    assert report["mean"] == pytest.approx(np.nanmean(part, dtype=float))
+    assert report["coreset_fraction"] == (~np.isnan(part)).mean()
+    assert (report["shape"], report["steps"], report["region"]) == ([1, 3, 7, 8], [1.0], [[2, 5], [0, 7], [0, 8]])
+    filled = json.loads(fhash("decode", run, "--t", "1", "--roi", "2:5,:,:", "--outside", "background", "--json").stdout)
+    assert filled["coreset_fraction"] == report["coreset_fraction"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_statistics_of_nothing_have_no_numbers(fhash: Fhash, run: Path) -> None:
+    result = fhash("decode", run, "--t", "0", "--roi", ":1,:1,-1:", "--json")
+    report = json.loads(result.stdout)
+    assert (report["min"], report["mean"], report["coreset_fraction"]) == (None, None, 0.0)
+    assert "smallest        -\n" in fhash("decode", run, "--t", "0", "--roi", ":1,:1,-1:").stdout
+
+
+def test_dtype_rounds_to_integers(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    exact = saved(fhash, run, tmp_path / "exact.npy", "--outside", "background")
+    rounded = saved(fhash, run, tmp_path / "rounded.npy", "--outside", "background", "--dtype", "uint8")
+    assert rounded.dtype == np.uint8
+    np.testing.assert_array_equal(rounded, np.rint(exact))
+
+
+@pytest.mark.parametrize("name", [name for name in TYPES if "int" in name])
+def test_integers_are_clipped_to_the_limits_of_their_type(name: str) -> None:
+    kind = np.dtype(name)
+    limits = np.iinfo(kind)
+    wide = convert(np.array([-1e30, 1e30, 0.5, 1.5, 2.4]), kind)
+    assert wide.dtype == kind
+    assert wide.tolist() == [limits.min, limits.max, 0, 2, 2]
+    narrow = convert(np.array([-1e30, 1e30], dtype=np.float32), kind)
+    assert narrow.tolist() == [limits.min, limits.max]
+
+
+def test_conversions_that_would_lose_a_value_are_refused() -> None:
+    with pytest.raises(InputError, match="add --outside background"):
+        convert(np.array([1.0, np.nan]), np.dtype(np.int16))
+    with pytest.raises(InputError, match="does not fit float16"):
+        convert(np.array([1.0, 1e6]), np.dtype(np.float16))
+    assert np.isnan(convert(np.array([np.nan]), np.dtype(np.float16))).all()

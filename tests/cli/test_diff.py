@@ -1,0 +1,55 @@
+"""`fhash diff`: the figures of the encoding again, measured on the file, and the gates."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import Result
+
+Fhash = Callable[..., Result]
+SMALL = ["--epochs", "2", "--width", "4", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def report(data: Path, run: Path) -> dict[str, float]:
+    from click.testing import CliRunner
+
+    from fhash_cli.main import program
+
+    result = CliRunner().invoke(program, ["diff", str(data), str(run), "--json"])
+    assert result.exit_code == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def test_diff_agrees_with_what_the_encoder_measured(fhash: Fhash, run: Path, report: dict[str, float]) -> None:
+    stored = json.loads(fhash("info", run, "--json").stdout)["quality"]
+    for name in ("psnr", "rmse", "max_abs_error", "psnr_domain"):
+        assert report[name] == pytest.approx(stored[name], rel=1e-9)
+
+
+@pytest.mark.parametrize(("gate", "figure", "sign"), [("--min-psnr", "psnr", 1), ("--max-error", "max_abs_error", -1)])
+def test_a_gate_closes_just_beyond_the_figure(
+    fhash: Fhash, data: Path, run: Path, report: dict[str, float], gate: str, figure: str, sign: int
+) -> None:
+    assert fhash("diff", data, run, gate, report[figure] - sign * 1e-6).exit_code == 0
+    missed = fhash("diff", data, run, gate, report[figure] + sign * 1e-6, "--json")
+    assert missed.exit_code == 3
+    assert json.loads(missed.stdout)[figure] == report[figure]
+    assert len(missed.stderr.splitlines()) == 1
+
+
+def test_an_exact_file_passes_every_gate(fhash: Fhash, tmp_path: Path) -> None:
+    np.save(tmp_path / "flat.npy", np.full((2, 3, 4, 5), 7.0, dtype=np.float32))
+    assert fhash("encode", tmp_path / "flat.npy", "-o", tmp_path / "run.fhz", *SMALL).exit_code == 0
+    result = fhash("diff", tmp_path / "flat.npy", tmp_path / "run.fhz", "--min-psnr", "200", "--max-error", "0")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "PSNR, coreset   exact" in result.stdout
+
+
+def test_other_data_are_refused(refused: Callable[..., str], run: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "other.npy", np.zeros((3, 6, 7, 9), dtype=np.float32))
+    assert "(3, 6, 7, 9)" in refused(2, "diff", tmp_path / "other.npy", run)

@@ -1,0 +1,130 @@
+"""`fhash encode`: the report, determinism, what happens to promises, warnings and Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import Result
+
+import fhash_codec
+from fhash_cli.output import Progress
+
+Fhash = Callable[..., Result]
+SMALL = ["--epochs", "2", "--width", "4", "--quiet"]
+KEYS = {
+    "bytes", "raw_bytes", "ratio", "psnr", "rmse", "max_abs_error", "psnr_domain", "seconds", "epochs", "curve", "shape", "key_frames",
+    "feature_bounding_box", "coreset_fraction", "parameters", "profile", "device",
+}  # fmt: skip
+
+
+def test_json_is_one_object_with_the_figures_of_the_file(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    result = fhash("encode", data, "-o", tmp_path / "run.fhz", "--feature", "interval:6:99", "--json", *SMALL)
+    assert (result.exit_code, result.stderr) == (0, "")
+    report = json.loads(result.stdout)
+    assert set(report) >= KEYS
+    assert report["bytes"] == (tmp_path / "run.fhz").stat().st_size
+    assert report["raw_bytes"] == 3 * 6 * 7 * 8 * 4
+    assert report["shape"] == [3, 6, 7, 8]
+    assert report["epochs"] == 2
+    assert [set(point) for point in report["curve"]] == [{"seconds", "epoch", "psnr"}] * 2
+
+
+def test_table_says_what_was_written(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    result = fhash("encode", data, "-o", tmp_path / "run.fhz", *SMALL)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert str(tmp_path / "run.fhz") in result.stdout
+    assert "3 x 6 x 7 x 8" in result.stdout
+    assert "100.000% of the domain, in z 0:6, y 0:7, x 0:8" in result.stdout
+
+
+def test_same_command_gives_the_same_bytes_without_timings(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        assert fhash("encode", data, "-o", tmp_path / name, "--no-timings", *SMALL).exit_code == 0
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_series_options_reach_the_reader(fhash: Fhash, tmp_path: Path) -> None:
+    values = np.arange(4 * 5 * 6 * 7, dtype=">u2").reshape(4, 5, 6, 7)
+    (tmp_path / "values.bin").write_bytes(values.tobytes())
+    layout = ["--shape", "x=7,y=6,z=5,t=4", "--dtype", "uint16", "--endian", "big"]
+    words = ["encode", tmp_path / "values.bin", "-o", tmp_path / "run.fhz", *layout, "--t", "1:4:2", *SMALL]
+    assert fhash(*words).exit_code == 0
+    with fhash_codec.open(tmp_path / "run.fhz") as volume:
+        assert volume.shape == (2, 5, 6, 7)
+        assert (volume.value_range.low, volume.value_range.high) == (values[1].min(), values[3].max())
+
+
+def test_force_replaces(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    output = tmp_path / "run.fhz"
+    output.write_bytes(b"old")
+    assert fhash("encode", data, "-o", output, *SMALL).exit_code == 2
+    assert output.read_bytes() == b"old"
+    assert fhash("encode", data, "-o", output, "--force", *SMALL).exit_code == 0
+    assert output.read_bytes() != b"old"
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_missed_promise_writes_the_file_prints_the_figures_and_exits_with_3(
+    fhash: Fhash, data: Path, tmp_path: Path, as_json: bool
+) -> None:
+    output = tmp_path / "run.fhz"
+    result = fhash("encode", data, "-o", output, "--psnr", "300", *(["--json"] if as_json else []), *SMALL)
+    assert result.exit_code == 3
+    assert len(result.stderr.splitlines()) == 1
+    assert "300 dB" in result.stderr
+    assert fhash("verify", output).exit_code == 0
+    if as_json:
+        report = json.loads(result.stdout)
+        assert set(report) >= KEYS
+        assert report["psnr"] < 300
+    else:
+        assert str(output) in result.stdout
+
+
+def test_kept_promise_exits_with_0(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    assert fhash("encode", data, "-o", tmp_path / "run.fhz", "--psnr", "1", *SMALL).exit_code == 0
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_warning_is_one_line_on_stderr(fhash: Fhash, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "in.h5", "w") as file:
+        values = file.create_dataset("v", data=np.random.default_rng(0).random((3, 4, 5, 6)))
+        time = file.create_dataset("time", data=[0.0, 2.0, 1.0])
+        time.make_scale("time")
+        values.dims[0].attach_scale(time)
+    result = fhash("encode", tmp_path / "in.h5", "-o", tmp_path / "run.fhz", *SMALL)
+    assert result.exit_code == 0
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith("fhash: warning: ")
+
+
+def test_ctrl_c_saves_a_checkpoint_and_the_same_command_ends_as_if_nothing_had_been(
+    fhash: Fhash, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["encode", data, "--no-timings", "--feature", "interval:2:99", "--epochs", "6", "--width", "4", "-q", "-o"]
+    assert fhash(*words, tmp_path / "whole.fhz").exit_code == 0
+    listen = Progress.__call__
+
+    def stop(self: Progress, stage: str, done: int, *rest: Any) -> None:
+        listen(self, stage, done, *rest)
+        if (stage, done) == ("training", 3):
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Progress, "__call__", stop)
+        result = fhash(*words, tmp_path / "run.fhz")
+    assert (result.exit_code, result.stdout) == (130, "")
+    assert len(result.stderr.splitlines()) == 1
+    assert "the same command goes on from there" in result.stderr
+    assert not (tmp_path / "run.fhz").exists()
+    assert list(tmp_path.glob("*.checkpoint"))
+    assert fhash(*words, tmp_path / "run.fhz").exit_code == 0
+    assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
+    assert not list(tmp_path.glob("*.checkpoint"))

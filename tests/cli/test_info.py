@@ -1,0 +1,64 @@
+"""`fhash info` and `fhash verify`: what a sound file says, and that a damaged one is found out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+
+Fhash = Callable[..., Result]
+
+
+def test_info_says_what_the_file_holds(fhash: Fhash, run: Path) -> None:
+    result = fhash("info", run)
+    assert (result.exit_code, result.stderr) == (0, "")
+    for text in (
+        str(run),
+        "density, float32, in kg m-3",
+        "3 x 6 x 7 x 8",
+        "time 0 to 4",
+        "x 10 to 3",
+        "interval:6:99",
+        "paper",
+        "1 epochs",
+    ):
+        assert text in result.stdout
+
+
+def test_info_as_json_is_one_object(fhash: Fhash, run: Path) -> None:
+    info = json.loads(fhash("info", run, "--json").stdout)
+    assert info["domain"]["shape"] == [3, 6, 7, 8]
+    assert info["bytes"] == run.stat().st_size
+    assert info["quality"]["rmse"] > 0
+
+
+def test_verify_counts_the_arrays(fhash: Fhash, run: Path) -> None:
+    result = fhash("verify", run, "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    arrays = json.loads(fhash("info", run, "--json").stdout)["arrays"]
+    assert json.loads(result.stdout) == {"path": str(run), "sound": True, "arrays": len(arrays)}
+    assert fhash("verify", run).stdout == f"{run}: sound, {len(arrays)} arrays checked\n"
+
+
+@pytest.mark.parametrize("place", [0.02, 0.3, 0.5, 0.7, 0.9])
+def test_a_flipped_bit_is_found(refused: Callable[..., str], run: Path, tmp_path: Path, place: float) -> None:
+    damaged = bytearray(run.read_bytes())
+    damaged[int(len(damaged) * place)] ^= 16
+    (tmp_path / "bad.fhz").write_bytes(damaged)
+    assert str(tmp_path / "bad.fhz") in refused(4, "verify", tmp_path / "bad.fhz")
+
+
+@pytest.mark.parametrize("command", ["info", "verify", "decode"])
+@pytest.mark.parametrize("kept", [0, 1, 30, 1000, -1])
+def test_a_cut_file_is_found(refused: Callable[..., str], run: Path, tmp_path: Path, command: str, kept: int) -> None:
+    (tmp_path / "cut.fhz").write_bytes(run.read_bytes()[:kept])
+    refused(4, command, tmp_path / "cut.fhz")
+
+
+@pytest.mark.parametrize("command", ["info", "verify", "decode"])
+def test_what_is_no_container_is_refused(refused: Callable[..., str], data: Path, tmp_path: Path, command: str) -> None:
+    refused(4, command, data)
+    refused(2, command, tmp_path / "missing.fhz")

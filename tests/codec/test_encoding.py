@@ -1,0 +1,245 @@
+"""Encoding end to end: every kind of data comes back, quality is what the decoder returns, and nothing is lost on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec import (
+    EncodeConfig,
+    InputError,
+    InterruptedEncodingError,
+    OutputError,
+    OutputExistsError,
+    QualityError,
+)
+from fhash_codec.model import FHash
+from fhash_formats.container import Container
+from fhash_formats.series import ArraySeries
+
+QUICK = EncodeConfig(epochs=6, width=16)
+
+
+def field(shape=(4, 8, 10, 18), dtype=np.float32) -> np.ndarray:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
+    return (100 * (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z)).astype(dtype)
+
+
+def decoded(path) -> np.ndarray:
+    with fhash_codec.open(path) as volume:
+        return volume[...]
+
+
+@pytest.mark.parametrize(
+    "dtype", ["uint8", "int16", "uint16", "int32", "int64", "uint64", "float16", "float32", "float64", ">f4", ">i2", ">f8"]
+)
+def test_every_number_type_comes_back(tmp_path, dtype):
+    source = ((field() + 110) * 0.7).astype(dtype)
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", QUICK)
+    back = decoded(tmp_path / "a.fhz")
+    assert back.dtype.kind == "f"
+    assert figures["psnr"] > 20
+    error = np.abs(back.astype(np.float64) - source.astype(np.float64))
+    assert figures["max_abs_error"] == pytest.approx(error.max(), rel=1e-6)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert volume.info["variable"]["dtype"] == np.dtype(dtype).newbyteorder("=").name
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [(1, 8, 10, 18), (4, 1, 10, 18), (4, 8, 1, 18), (4, 8, 10, 1), (2, 2, 2, 2), (1, 1, 1, 7), (3, 1, 1, 1), (1, 1, 1, 1), (7, 3, 5, 11)],
+)
+def test_every_shape_comes_back(tmp_path, shape):
+    source = np.random.default_rng(0).random(shape, dtype=np.float32)
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", QUICK)
+    back = decoded(tmp_path / "a.fhz")
+    assert back.shape == shape
+    assert np.isfinite(back).all()
+    assert figures["max_abs_error"] == pytest.approx(np.abs(back - source).max(), rel=1e-5)
+
+
+@pytest.mark.parametrize("value", [0.0, 7.25, -1e30, 1e8])
+def test_a_constant_series_comes_back_exactly(tmp_path, value):
+    figures = fhash_codec.encode(np.full((3, 4, 5, 6), value), tmp_path / "a.fhz", QUICK)
+    assert (decoded(tmp_path / "a.fhz") == value).all()
+    assert figures["rmse"] == 0
+    assert figures["psnr"] is None
+
+
+def test_missing_values_stay_out_of_range_coreset_and_figures(tmp_path):
+    source = field()
+    holes = np.random.default_rng(0).random(source.shape) < 0.1
+    holes[1] = True
+    source[holes] = np.random.default_rng(1).choice([np.nan, np.inf, -np.inf], holes.sum())
+    for settings in ({}, {"key_frames": "0,3"}, {"features": ("interval:50:300",)}):
+        config = EncodeConfig(epochs=30, width=16, **settings)
+        figures = fhash_codec.encode(source, tmp_path / "a.fhz", config, force=True)
+        assert np.isfinite(figures["rmse"])
+        assert figures["psnr"] > 15
+        with fhash_codec.open(tmp_path / "a.fhz") as volume:
+            assert volume.info["value_range"] == [float(source[~holes].min()), float(source[~holes].max())]
+            whole = volume[...]
+            assert np.isnan(whole[holes]).all()
+            filled = np.stack([volume.read(t, outside="background") for t in range(4)])
+            np.testing.assert_array_equal(np.isnan(filled), holes)
+            if not settings:
+                np.testing.assert_array_equal(np.isnan(whole), holes)
+
+
+def test_the_figures_are_those_of_the_file(tmp_path):
+    source = field()
+    config = EncodeConfig(features=("interval:50:200",), epochs=8, width=16)
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
+    back = decoded(tmp_path / "a.fhz").astype(np.float64)
+    inside = np.isfinite(back)
+    error = (back - source)[inside]
+    span = float(source.max()) - float(source.min())
+    assert figures["rmse"] == pytest.approx(np.sqrt((error**2).mean()), rel=1e-6)
+    assert figures["psnr"] == pytest.approx(20 * np.log10(span / np.sqrt((error**2).mean())), abs=1e-4)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        everywhere = np.where(inside, back, volume.background) - source
+        assert volume.background == pytest.approx(source[~inside].mean(), rel=1e-5)
+        assert volume.info["quality"]["psnr"] == figures["psnr"]
+    assert figures["psnr_domain"] == pytest.approx(20 * np.log10(span / np.sqrt((everywhere**2).mean())), abs=1e-4)
+    assert figures["bytes"] == (tmp_path / "a.fhz").stat().st_size
+    assert figures["ratio"] == source.nbytes / figures["bytes"]
+    assert figures["coreset_fraction"] == pytest.approx(inside.mean())
+    assert [point["epoch"] for point in figures["curve"]] == list(range(1, 9))
+    json.dumps(figures, allow_nan=False)
+    again = fhash_codec.diff(source, tmp_path / "a.fhz")
+    for name in ("psnr", "rmse", "max_abs_error", "psnr_domain", "ssim", "bytes", "key_frames"):
+        assert again[name] == figures[name], name
+
+
+def test_figures_count_the_steps_between_key_frames(tmp_path):
+    source = field((5, 6, 8, 10))
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(key_frames="every:2", epochs=30, width=16))
+    steps = {point["step"]: point["psnr"] for point in figures["quality"]["per_step"]}
+    assert sorted(steps) == [0, 1, 2, 3, 4]
+    assert figures["key_frames"] == [0, 2, 4]
+    assert min(steps[0], steps[2], steps[4]) > max(steps[1], steps[3])
+
+
+@pytest.mark.parametrize(("tables", "loss"), [("float32", 0), ("float16", 1e-3), ("uint8", 0.05)])
+def test_tables_are_stored_as_asked_and_cost_what_they_cost(tmp_path, tables, loss):
+    source = field()
+    exact = fhash_codec.encode(source, tmp_path / "exact.fhz", EncodeConfig(epochs=6, width=16, tables="float32"))
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(epochs=6, width=16, tables=tables))
+    span = float(np.ptp(source))
+    assert np.abs(decoded(tmp_path / "a.fhz") - decoded(tmp_path / "exact.fhz")).max() <= loss * span
+    with Container.open(tmp_path / "a.fhz") as container:
+        assert container.arrays["tables/level_1"].dtype == np.dtype(tables)
+    assert (figures["bytes"] < 0.75 * exact["bytes"]) == (tables != "float32")
+
+
+def test_the_file_decodes_to_what_the_torch_model_gives(tmp_path):
+    import torch
+
+    source = field()
+    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(epochs=6, width=16, tables="float32", key_frames="0,1,3"))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        network = volume._network
+        from fhash_codec.architecture import Architecture
+
+        architecture = Architecture.for_box((8, 10, 18), 3, width=16)
+        assert network.levels == architecture.levels
+        tables = [torch.from_numpy(table.array.read().reshape(-1, 2)).double() for table in network.tables]
+        layers = [(torch.from_numpy(w).double(), torch.from_numpy(b).double()) for w, b in network.layers]
+        model = FHash(architecture, tables, layers)
+        points = np.stack(np.meshgrid([0.0, 0.5, 1.0, 1.75, 2.0], range(8), range(10), range(18), indexing="ij"), axis=-1)
+        with torch.no_grad():
+            unit = model(torch.from_numpy(points.reshape(-1, 4))).numpy().reshape(points.shape[:-1])
+        low, high = volume.info["value_range"]
+        expected = low + np.clip(unit, 0, 1) * (high - low)
+        # Steps 0, 0.5, 1, 2.5 and 3: key indices 0, 0.5, 1, 1.75 and 2 with key frames 0, 1 and 3.
+        for number, step in enumerate((0, 0.5, 1, 2.5, 3)):
+            assert np.abs(volume.read(step) - expected[number]).max() <= 1e-5 * (high - low)
+
+
+def test_the_same_input_gives_the_same_bytes_without_timings(tmp_path):
+    config = EncodeConfig(epochs=3, width=16, timings=False)
+    for name in ("a.fhz", "b.fhz"):
+        fhash_codec.encode(field(), tmp_path / name, config)
+    assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
+    fhash_codec.encode(field(), tmp_path / "c.fhz", EncodeConfig(epochs=3, width=16, timings=False, seed=1))
+    assert (tmp_path / "a.fhz").read_bytes() != (tmp_path / "c.fhz").read_bytes()
+
+
+@pytest.mark.parametrize("moment", [1, 30, 41])
+def test_ctrl_c_saves_and_the_same_call_goes_on_to_the_same_bytes(tmp_path, moment):
+    config = EncodeConfig(epochs=3, width=16, timings=False)
+    fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
+    path = tmp_path / "run.fhz"
+
+    def interrupt(stage, done, total, note):
+        if stage == "training" and done == moment:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(InterruptedEncodingError, match="the same command goes on"):
+        fhash_codec.encode(field(), path, config, progress=interrupt)
+    assert not path.exists()
+    assert len(list(tmp_path.glob("run.fhz.*.checkpoint"))) == 1
+    fhash_codec.encode(field(), path, config)
+    assert path.read_bytes() == (tmp_path / "whole.fhz").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.fhz", "whole.fhz"]
+
+
+def test_ctrl_c_before_the_training_leaves_nothing(tmp_path):
+    def interrupt(stage, done, total, note):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fhash_codec.encode(field(), tmp_path / "run.fhz", QUICK, progress=interrupt)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_that_is_there_is_kept(tmp_path):
+    path = tmp_path / "a.fhz"
+    path.write_bytes(b"precious")
+    with pytest.raises(OutputExistsError, match="--force"):
+        fhash_codec.encode(field(), path, QUICK)
+    # A failure on the way leaves it alone even with force.
+    with pytest.raises(InputError, match="selects nothing"):
+        fhash_codec.encode(field(), path, EncodeConfig(features=("interval:1e6:2e6",)), force=True)
+    assert path.read_bytes() == b"precious"
+    fhash_codec.encode(field(), path, QUICK, force=True)
+    assert decoded(path).shape == field().shape
+
+
+def test_a_missing_folder_is_named_before_any_work(tmp_path):
+    with pytest.raises(OutputError, match="folder"):
+        fhash_codec.encode(field(), tmp_path / "none" / "a.fhz", QUICK)
+
+
+def test_a_promise_that_is_missed_is_an_error_but_the_file_is_there(tmp_path):
+    with pytest.raises(QualityError, match="150 dB were asked for; the file is written"):
+        fhash_codec.encode(field(), tmp_path / "a.fhz", EncodeConfig(epochs=1, width=16, psnr=150.0))
+    assert decoded(tmp_path / "a.fhz").shape == field().shape
+    figures = fhash_codec.encode(field(), tmp_path / "b.fhz", EncodeConfig(epochs=1, width=16, psnr=5.0))
+    assert figures["psnr"] > 5
+
+
+def test_quality_improves_with_training(tmp_path):
+    psnr = [fhash_codec.encode(field(), tmp_path / f"{n}.fhz", EncodeConfig(epochs=n))["psnr"] for n in (1, 5, 25)]
+    assert psnr[0] < psnr[1] < psnr[2]
+    assert psnr[2] > 40
+
+
+def test_diff_refuses_another_shape(encoded):
+    with pytest.raises(InputError, match=r"shape \(4, 8, 10, 18\)"):
+        fhash_codec.diff(ArraySeries(field()), encoded[1])
+
+
+def test_settings_that_diverge_are_reported(tmp_path):
+    config = EncodeConfig(epochs=20, learning_rate=1.0, schedule="constant", hidden_layers=8, width=64)
+    try:
+        figures = fhash_codec.encode(field(), tmp_path / "a.fhz", config)
+    except fhash_codec.TrainingError as error:
+        assert "learning-rate" in str(error)  # noqa: PT017
+    else:
+        assert np.isfinite(figures["rmse"])

@@ -1,0 +1,159 @@
+"""open_series whatever the format: recognition, refusals, steps, and what an import costs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import fhash_formats
+from fhash_formats import RawLayout, open_series
+from fhash_formats.container.layout import ending
+from fhash_formats.errors import FhashError, InputError, MissingInputError, RegionError
+from fhash_formats.readers import REGISTRY
+
+VALUES = np.random.default_rng(0).normal(size=(7, 2, 3, 4)).astype(np.float32)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    np.save(tmp_path / "a.npy", VALUES)
+    return tmp_path / "a.npy"
+
+
+def test_formats_are_told_by_their_first_bytes(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.npy", "w") as file:
+        file["v"] = VALUES
+    np.save(tmp_path / "b.npy", VALUES)
+    os.rename(tmp_path / "b.npy", tmp_path / "b.h5")
+    for name in ("a.npy", "b.h5"):
+        with open_series(str(tmp_path / name)) as series:
+            np.testing.assert_array_equal(series.read(3), VALUES[3])
+
+
+@pytest.mark.parametrize(("name", "words"), [("a.h5", "HDF5"), ("a.nc", "NetCDF"), ("a.npy", r"\.npy"), ("a.zip", "ZIP")])
+def test_a_suffix_without_the_bytes_is_a_damaged_file(tmp_path: Path, name: str, words: str) -> None:
+    (tmp_path / name).write_bytes(b"nothing of the kind " * 100)
+    with pytest.raises(InputError, match=f"cannot be read as (a )?{words}") as caught:
+        open_series(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_format_lists_what_is_known(tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_bytes(b"nothing of the kind")
+    with pytest.raises(InputError, match="of no format that can be read") as caught:
+        open_series(tmp_path / "a.xyz")
+    for reader in REGISTRY:
+        assert reader.name in str(caught.value)
+        assert all(suffix in str(caught.value) for suffix in reader.suffixes)
+
+
+def test_names_and_suffixes_are_unique() -> None:
+    suffixes = [suffix for reader in REGISTRY for suffix in reader.suffixes]
+    assert len(set(suffixes)) == len(suffixes)
+    assert len({reader.name for reader in REGISTRY}) == len(REGISTRY)
+
+
+def test_inputs_that_are_no_files(tmp_path: Path) -> None:
+    with pytest.raises(MissingInputError, match="does not exist") as caught:
+        open_series(tmp_path / "none.h5")
+    assert isinstance(caught.value, FileNotFoundError)
+    (tmp_path / "link.h5").symlink_to(tmp_path / "nowhere.h5")
+    with pytest.raises(MissingInputError):
+        open_series(tmp_path / "link.h5")
+    with pytest.raises(InputError, match="folder without zarr metadata"):
+        open_series(tmp_path)
+    (tmp_path / "empty.h5").touch()
+    with pytest.raises(InputError, match=r"empty \(0 bytes\)"):
+        open_series(tmp_path / "empty.h5")
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe.raw")
+        with pytest.raises(InputError, match="not a regular file"):
+            open_series(tmp_path / "pipe.raw")
+
+
+def test_a_container_is_to_be_decoded(tmp_path: Path) -> None:
+    (tmp_path / "a.fhz").write_bytes(b"PK\x03\x04" + bytes(100))
+    with pytest.raises(InputError, match=r"fhash decode a.fhz"):
+        open_series(tmp_path / "a.fhz")
+    (tmp_path / "renamed.zip").write_bytes(b"PK\x03\x04" + ending([]))
+    with pytest.raises(InputError, match=r"encoded already; use: fhash decode renamed\.zip"):
+        open_series(tmp_path / "renamed.zip")
+
+
+def test_a_raw_layout_is_for_files(tmp_path: Path) -> None:
+    import zarr
+
+    zarr.create_array(tmp_path / "a.zarr", shape=(2, 2, 2), dtype="f4")
+    with pytest.raises(InputError, match="given for raw files only"):
+        open_series(tmp_path / "a.zarr", raw=RawLayout(dtype="f4"))
+
+
+@pytest.mark.parametrize(
+    "steps", [slice(None), slice(2, 5), slice(None, None, 3), slice(None, None, -1), slice(-2, None), slice(5, 100), slice(6, 1, -2)]
+)
+def test_steps_are_a_slice(path: Path, steps: slice) -> None:
+    with open_series(path, steps=steps) as series:
+        np.testing.assert_array_equal(np.stack(list(series.frames())), VALUES[steps])
+        np.testing.assert_array_equal(series.coords["t"].values, np.arange(7)[steps])
+
+
+@pytest.mark.parametrize(("steps", "words"), [(slice(0, 5, 0), "stride of 0"), (slice(3, 3), "empty"), (slice(10, 20), "empty")])
+def test_steps_that_select_nothing(path: Path, steps: slice, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        open_series(path, steps=steps)
+
+
+@pytest.mark.parametrize("step", [-1, 7])
+def test_a_step_outside_the_series(path: Path, step: int) -> None:
+    with open_series(path) as series, pytest.raises(RegionError, match=r"outside 0\.\.6"):
+        series.read(step)
+
+
+@pytest.mark.parametrize("axes", ["", "t,z,y,w", "t,z,y,y", "tzyx", "time,z,y,x"])
+def test_axes_that_mean_nothing(path: Path, axes: str) -> None:
+    with pytest.raises(InputError, match="name the file's dimensions in their order"):
+        open_series(path, axes=axes)
+
+
+@pytest.mark.parametrize("axes", ["z,y,x", "x", "t,y"])
+def test_axes_of_another_number(path: Path, axes: str) -> None:
+    with pytest.raises(InputError, match="the array has 4 dimensions"):
+        open_series(path, axes=axes)
+
+
+def refusal(path: Path) -> str:
+    """What an attempt to read a whole series was answered with, "" if it went well; anything but a FhashError is raised."""
+    try:
+        with open_series(path) as series:
+            list(series.frames())
+    except FhashError as error:
+        return str(error)
+    return ""
+
+
+def test_every_refusal_is_of_the_one_tree(tmp_path: Path) -> None:
+    chance = np.random.default_rng(0)
+    for size in (1, 7, 8, 30, 4096):
+        for head in (b"", b"\x89HDF\r\n\x1a\n", b"PK\x03\x04", b"\x93NUMPY", b"CDF\x01", b"CDF\x02"):
+            for name in ("a", "a.nc", "a.zip", "a_2x2x2_u1.raw"):
+                (tmp_path / name).write_bytes((head + chance.bytes(size))[: max(size, len(head))])
+                message = refusal(tmp_path / name)
+                assert "\n" not in message
+                assert len(message) < 700
+
+
+def test_the_public_names() -> None:
+    assert {"open_series", "open_mask", "RawLayout", "parse_shape"} <= set(fhash_formats.__all__)
+
+
+def test_an_import_is_cheap() -> None:
+    script = (
+        "import fhash_formats.readers, sys; print([name for name in ('h5py', 'zarr', 'xarray', 'torch', 'scipy') if name in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout.strip() == "[]"

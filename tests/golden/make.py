@@ -1,0 +1,51 @@
+"""Writes the golden containers of the present format version: `python tests/golden/make.py`. Tests only ever read them.
+
+A golden is made once, when its format version is new, and kept for ever: whatever comes later must decode it to the values beside it.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import fhash_codec
+from fhash_codec import EncodeConfig
+from fhash_formats.series import ArraySeries, Coordinate
+
+HERE = Path(__file__).parent
+TOLERANCE = 1e-5  # of the range: float32 arithmetic in another order
+
+GOLDENS = {
+    "paper-1.0-plain": EncodeConfig(width=8, timings=False, tables="float32"),
+    "paper-1.0-feature": EncodeConfig(
+        width=8, timings=False, features=("interval:0.5:2", "isosurface:0"), key_frames="0,1,4", tables="float16"
+    ),
+    "paper-1.0-linear-uint8": EncodeConfig(hidden_layers=0, embedding_size=1, fold=3, timings=False, key_frames="every:2", tables="uint8"),
+}
+
+
+def series() -> ArraySeries:
+    """A small moving field with a hole that wanders, and uneven times."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (5, 6, 7, 9)), indexing="ij")
+    values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
+    for step in range(5):
+        values[step, 2, 3, step : step + 2] = np.nan
+    time = Coordinate(name="time", values=np.array([0.0, 0.5, 2.0, 2.25, 9.0]), attributes={"units": "hours since 2000-01-01"})
+    return ArraySeries(values, name="density", units="kg m-3", coords={"t": time})
+
+
+def main() -> None:
+    for name, config in GOLDENS.items():
+        path = HERE / f"{name}.fhz"
+        if path.exists():
+            sys.exit(f"{path} exists; goldens are never replaced")
+        fhash_codec.encode(series(), path, config)
+        with fhash_codec.open(path) as volume:
+            between = np.stack([volume.read(t) for t in (0.5, 3.75)])
+            np.savez_compressed(HERE / f"{name}.npz", whole=volume[...], between=between, tolerance=TOLERANCE)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,41 @@
+"""Containers of every format version, kept for ever, decode to the values beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from zarr.storage import ZipStore
+
+import fhash_codec
+
+HERE = Path(__file__).parent
+NAMES = ["paper-1.0-plain", "paper-1.0-feature", "paper-1.0-linear-uint8"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_golden_containers_decode_to_their_values(name):
+    with np.load(HERE / f"{name}.npz") as expected, fhash_codec.open(HERE / f"{name}.fhz") as volume:
+        low, high = volume.info["value_range"]
+        tolerance = float(expected["tolerance"]) * (high - low)
+        np.testing.assert_allclose(volume[...], expected["whole"], atol=tolerance, rtol=0)
+        between = np.stack([volume.read(t) for t in (0.5, 3.75)])
+        np.testing.assert_allclose(between, expected["between"], atol=tolerance, rtol=0)
+        assert (volume.name, volume.units) == ("density", "kg m-3")
+        assert volume.step_of_time(2.25) == 3
+        volume.verify()
+
+
+def test_no_golden_is_left_untested():
+    assert sorted(path.stem for path in HERE.glob("*.fhz")) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_zarr_reader_opens_them(name):
+    with fhash_codec.open(HERE / f"{name}.fhz") as volume:
+        group = zarr.open_group(ZipStore(HERE / f"{name}.fhz", mode="r"), mode="r", zarr_format=3)
+        assert group.attrs["fhash"]["format"] == "fhash"
+        for array in volume.container.arrays.values():
+            np.testing.assert_array_equal(group[array.name][...], array.read())
