@@ -81,7 +81,8 @@ def test_outside_the_coreset_stands_nan_or_the_background(encoded, volume):
         filled = volume.read(step, outside="background")
         assert (filled[~occupied] == np.float32(volume.background)).all()
         np.testing.assert_array_equal(filled[occupied], volume.read(step)[occupied])
-        assert np.abs(filled - field[step])[occupied].mean() < 0.3
+        if step in (0, 2, 4):
+            assert np.abs(filled - field[step])[occupied].mean() < 0.15
     with pytest.raises(InputError, match="outside is 'zero'; allowed: nan, background"):
         volume.read(0, outside="zero")
 
