@@ -19,7 +19,8 @@ class Parameters:
     """The trained numbers of a model.
 
     fine: embeddings of the finest level (bricks, E, vertices of a brick), only for bricks that hold coreset vertices.
-    flat: coarse tables level by level, each (buckets, E), then each layer's weight (out, in) and bias (out,), all in one vector.
+    flat: coarse tables level by level, each (buckets, E), then each layer as a matrix (out, in + 1) whose last column is the bias,
+        all in one vector.
     """
 
     fine: Tensor
@@ -27,19 +28,16 @@ class Parameters:
 
     def dense(self, architecture: Architecture) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
         """The coarse tables (buckets, E) and the layers (weight (out, in), bias (out,)), views into `flat`."""
-        size = architecture.embedding_size
         tables, layers = split(architecture, self.flat)
-        return [table.view(-1, size) for table in tables], layers
+        return [table.view(-1, architecture.embedding_size) for table in tables], [(layer[:, :-1], layer[:, -1]) for layer in layers]
 
 
-def split(architecture: Architecture, flat: Tensor) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
-    """Views of the coarse tables (flat, level by level) and of the layers (weight, bias) inside one vector."""
+def split(architecture: Architecture, flat: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+    """Views of the coarse tables (flat, level by level) and of the layers (out, in + 1) inside one vector."""
     tables = [prod(level) * architecture.embedding_size for level in architecture.levels[1:]]
-    layers = [n for outputs, inputs in architecture.layer_shapes for n in (outputs * inputs, outputs)]
-    parts = list(torch.split(flat, [*tables, *layers]))
-    weights, biases = parts[len(tables) :: 2], parts[len(tables) + 1 :: 2]
-    shapes = architecture.layer_shapes
-    return parts[: len(tables)], [(w.view(shape), b) for w, b, shape in zip(weights, biases, shapes, strict=True)]
+    shapes = [(outputs, inputs + 1) for outputs, inputs in architecture.layer_shapes]
+    parts = list(torch.split(flat, [*tables, *(prod(shape) for shape in shapes)]))
+    return parts[: len(tables)], [part.view(shape) for part, shape in zip(parts[len(tables) :], shapes, strict=True)]
 
 
 def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) -> Parameters:

@@ -52,6 +52,9 @@ class NaiveEngine:
         self.adam.step()
         return error.detach().double()
 
+    def settle(self) -> None:
+        """Nothing is ever behind: every parameter takes every step."""
+
     @torch.no_grad()
     def infer(self, chosen: npt.NDArray[np.int64]) -> Tensor:
         """Values (bricks, vertices) of the bricks `chosen` at all their vertices."""
@@ -70,7 +73,7 @@ class NaiveEngine:
         finest = finest * torch.from_numpy(self.mask).unsqueeze(1)
         rest = [table.detach().flatten() for table in list(self.model.tables)[1:]]
         for weight, bias in zip(self.model.weights, self.model.biases, strict=True):
-            rest += [weight.detach().flatten(), bias.detach()]
+            rest.append(torch.column_stack([weight.detach(), bias.detach()]).flatten())
         return Parameters(fine=finest.float().contiguous(), flat=torch.cat([part.cpu() for part in rest]).float())
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
@@ -123,4 +126,6 @@ def _model(architecture: Architecture, start: Parameters, buckets: Tensor, mask:
     finest = torch.zeros(prod(architecture.levels[0]), architecture.embedding_size)
     finest[buckets[mask]] = start.fine.transpose(1, 2)[mask]
     tables, layers = start.dense(architecture)
-    return FHash(architecture, [finest.to(dtype), *(t.to(dtype) for t in tables)], [(w.to(dtype), b.to(dtype)) for w, b in layers])
+    return FHash(
+        architecture, [finest.to(dtype), *(t.to(dtype) for t in tables)], [(w.to(dtype).clone(), b.to(dtype).clone()) for w, b in layers]
+    )
