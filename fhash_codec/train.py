@@ -84,7 +84,8 @@ def train(
 ) -> bool:
     """Train from where `course` stands to the end of the plan; true if it got there.
 
-    Every epoch (of more than 100, every 2nd, 3rd, ...) adds {seconds, epoch, psnr} to the history; PSNR in dB of the normalised values on a fixed random choice of bricks.
+    Every epoch (of more than 100: every 2nd, 3rd, ...) adds {seconds, epoch, psnr} to the history; PSNR in dB of the normalised
+    values on a fixed random choice of bricks.
     `save` is called with the course every `save_seconds`, and when `stop` asks for an end, which comes after the running batch.
     The loop also ends once `budget_seconds` are spent. Raises TrainingError if the error is no longer finite.
     """

@@ -114,6 +114,7 @@ class _Run:
 
     def infer(self, seconds: float) -> None:
         """Evaluate batches of bricks for some seconds."""
+        self.engine.settle()
         samples, begun, batches = 0, time.perf_counter(), self.plan.order(0)
         number = 0
         while (spent := time.perf_counter() - begun) < seconds or number == 0:

@@ -126,6 +126,5 @@ def _model(architecture: Architecture, start: Parameters, buckets: Tensor, mask:
     finest = torch.zeros(prod(architecture.levels[0]), architecture.embedding_size)
     finest[buckets[mask]] = start.fine.transpose(1, 2)[mask]
     tables, layers = start.dense(architecture)
-    return FHash(
-        architecture, [finest.to(dtype), *(t.to(dtype) for t in tables)], [(w.to(dtype).clone(), b.to(dtype).clone()) for w, b in layers]
-    )
+    own = [(weight.to(dtype).clone(), bias.to(dtype).clone()) for weight, bias in layers]
+    return FHash(architecture, [finest.to(dtype), *(table.to(dtype) for table in tables)], own)

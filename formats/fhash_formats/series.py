@@ -3,7 +3,7 @@
 The contract of every reader:
 
 - axes are always (t, z, y, x), whatever the file's order; a frame is (z, y, x);
-- `read(step)` touches one frame and keeps nothing of it, so that no series is ever held whole;
+- `read(step)` reads one frame, and keeps of the file at most a slab of bounded size, so that no series is ever held whole;
 - values are physical (packing undone, fill values turned into NaN) in the native byte order;
 - coordinates are float64, one per axis, the plain index where the file has none.
 """
@@ -64,7 +64,7 @@ class Series(ABC):
     def read(self, step: int) -> npt.NDArray[Any]:
         """One frame (z, y, x), C-contiguous, of `self.dtype`; raises InputError if the file cannot be read."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - a series in memory has nothing to release
         """Release the file."""
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:
@@ -107,7 +107,9 @@ class StepsSeries(Series):
 class ArraySeries(Series):
     """An array in memory (t, z, y, x) or (z, y, x) as a series."""
 
-    def __init__(self, array: npt.ArrayLike, *, name: str = "values", units: str = "", coords: Mapping[str, Coordinate] | None = None) -> None:
+    def __init__(
+        self, array: npt.ArrayLike, *, name: str = "values", units: str = "", coords: Mapping[str, Coordinate] | None = None
+    ) -> None:
         values = np.asarray(array)
         self.source, self.name, self.units, self.attributes = "array", name, units, {}
         if values.ndim == 3:
