@@ -65,5 +65,6 @@ def _text(result: dict[str, Any]) -> str:
     header = ("engine", "train M/s", "x naive", "infer M/s", "x naive", "of peak", "epochs", "PSNR dB")
     figures = ("train_msamples_s", "train_ratio", "infer_msamples_s", "infer_ratio", "fraction_of_peak", "epochs", "psnr")
     rows = [(entry["engine"], *(number(entry[name], digits=3) for name in figures)) for entry in result["engines"]]
-    machine = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in result["machine"].items())
+    facts = {name.replace("_", " "): number(fact) if isinstance(fact, float) else fact for name, fact in result["machine"].items()}
+    machine = ", ".join(f"{name} {fact}" for name, fact in facts.items())
     return f"{table([header, *rows])}\n{result['samples']:,} samples; {machine}"

@@ -10,6 +10,7 @@ import click
 
 from fhash_cli.options import check_writable, force_option, json_option, quiet_option
 from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, say, size, table
+from fhash_codec.synthetic import SCENES, simulate
 from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,20 +19,17 @@ if TYPE_CHECKING:
     from fhash_codec import Volume
     from fhash_formats.series import Series
 
-SCENES = ("vortex", "front")
-"""Names of fhash_codec.synthetic.SCENES, here so that `--help` does without numpy."""
 COLUMNS = 4
 
 
 @click.command("demo")
-@click.option("--scene", type=click.Choice(SCENES), default="vortex", show_default=True, help="What to simulate.")
+@click.option("--scene", type=click.Choice(tuple(SCENES)), default="vortex", show_default=True, help="What to simulate.")
 @click.option("-o", "folder", metavar="DIR", type=click.Path(), default="demo", show_default=True, help="Folder for the three files.")
 @force_option
 @json_option
 @quiet_option
 def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) -> None:
     """Simulate a small series, encode it, decode it, compare and draw: DIR/SCENE.h5, .fhz and .png."""
-    from fhash_codec import synthetic
     from fhash_codec.config import EncodeConfig
     from fhash_formats import Region, open_series, save_region
 
@@ -43,8 +41,8 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
     for output in (data, run, picture):
         check_writable(output, force)
     if not quiet:
-        say(f"simulating '{scene}', {synthetic.SCENES[scene].help}")
-    simulated = synthetic.simulate(scene)
+        say(f"simulating '{scene}', {SCENES[scene].help}")
+    simulated = simulate(scene)
     region = Region(
         name=simulated.name,
         units=simulated.units,
@@ -57,7 +55,7 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
 
     import fhash_codec
 
-    config = EncodeConfig(features=(synthetic.SCENES[scene].feature,), embedding_size=1, tables="uint8")
+    config = EncodeConfig(features=(SCENES[scene].feature,), embedding_size=1, tables="uint8")
     with Progress(quiet=quiet) as progress:
         encoded = fhash_codec.encode(data, run, config, force=force, progress=progress)
         start = time.perf_counter()

@@ -10,8 +10,8 @@ import pytest
 from click.testing import Result
 from PIL import Image
 
-from fhash_cli.demo import SCENES
-from fhash_codec import synthetic
+from fhash_cli import demo
+from fhash_codec.synthetic import SCENES
 
 Fhash = Callable[..., Result]
 
@@ -19,12 +19,8 @@ Fhash = Callable[..., Result]
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The scenes at a shape that takes no time."""
-    simulate = synthetic.simulate
-    monkeypatch.setattr(synthetic, "simulate", lambda name: simulate(name, (5, 8, 10, 12)))
-
-
-def test_scenes_of_the_option_are_those_of_the_package() -> None:
-    assert tuple(synthetic.SCENES) == SCENES
+    simulate = demo.simulate
+    monkeypatch.setattr(demo, "simulate", lambda name: simulate(name, (5, 8, 10, 12)))
 
 
 @pytest.mark.usefixtures("small")
