@@ -19,7 +19,7 @@ from fhash_codec.metrics import measure_quality
 from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
 from fhash_codec.scan import Scan
-from fhash_codec.selection import Selection, Source, as_series, select
+from fhash_codec.selection import Selection, Source, opened, select
 from fhash_codec.storage import write_model
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
@@ -36,12 +36,13 @@ def encode(
 
     source: a file (opened by `fhash_formats.open_series`), a Series, or an array (t, z, y, x) or (z, y, x).
     Ctrl-C during the training saves a checkpoint beside `path` and raises InterruptedEncodingError; the same call goes on from it to
-    the same result. Raises QualityError, with the file written, if `config.psnr` was not reached; InputError for what cannot be encoded.
+    the same result. Raises QualityError, with the file written and its figures in the error, if `config.psnr` was not reached, and
+    InputError for what cannot be encoded.
     """
     config, path = config or EncodeConfig(), Path(path)
     begun = time.perf_counter()
     check_output(path, force=force)
-    with as_series(source) as series:
+    with opened(source) as series:
         selected = select(series, config, progress)
         coreset = selected.coreset
         trained = train_model(coreset, selected.architecture, config, path, progress)
@@ -60,7 +61,8 @@ def encode(
     reached = figures["psnr"]
     if config.psnr is not None and reached is not None and reached < config.psnr:
         raise QualityError(
-            f"{path}: {reached:.2f} dB over the coreset, {config.psnr:g} dB were asked for; the file is written. More --epochs may help"
+            f"{path}: {reached:.2f} dB over the coreset, {config.psnr:g} dB were asked for; the file is written. More --epochs may help",
+            figures,
         )
     return figures
 
@@ -86,6 +88,7 @@ def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConf
     # torch takes seconds to import, and nothing that comes before needs it.
     from fhash_codec.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
     from fhash_codec.engines import choose_device, make_engine
+    from fhash_codec.engines.threads import threads_for
     from fhash_codec.interrupts import deferred_interrupts
     from fhash_codec.train import Course, plan_training, train
 
@@ -100,7 +103,7 @@ def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConf
     if saved:
         engine.restore(saved[0])
         course = saved[1]
-    with deferred_interrupts() as stop:
+    with deferred_interrupts() as stop, threads_for(plan.batch_bricks * prod(coreset.brick_shape)):
         done = train(
             engine, plan, coreset, course, stop=stop, save=lambda now: save_checkpoint(checkpoint, engine.state(), now), progress=progress
         )

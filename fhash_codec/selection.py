@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,11 +27,14 @@ class FhashWarning(UserWarning):
     """Something that a user should know and that is no error."""
 
 
-def as_series(source: Source) -> Series:
-    """A file opened by `fhash_formats.open_series`, a Series as it is, or an array (t, z, y, x) or (z, y, x) as a series."""
-    if isinstance(source, Series):
-        return source
-    return open_series(source) if isinstance(source, str | Path) else ArraySeries(source)
+@contextmanager
+def opened(source: Source) -> Iterator[Series]:
+    """A file opened by `fhash_formats.open_series` for as long as it is used, a Series as it is, or an array as a series."""
+    if isinstance(source, str | Path):
+        with open_series(source) as series:
+            yield series
+    else:
+        yield source if isinstance(source, Series) else ArraySeries(source)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,6 +36,11 @@ class Plan:
     seed: int
     rates: npt.NDArray[np.float64]
 
+    @property
+    def batch_bricks(self) -> int:
+        """Bricks of the largest batch."""
+        return -(-self.bricks // self.batches)
+
     def order(self, epoch: int) -> list[npt.NDArray[np.int64]]:
         """The batches of an epoch: every brick once; depends on nothing but the seed and the epoch."""
         return np.array_split(np.random.default_rng([self.seed, epoch]).permutation(self.bricks), self.batches)

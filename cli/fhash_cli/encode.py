@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -30,18 +29,15 @@ def command(data: str, output: str, source: SourceOptions, config: EncodeConfig,
     Ctrl-C saves a checkpoint beside RUN.fhz; the same command goes on from it.
     """
     import fhash_codec
-    from fhash_codec.report import report as figures
 
     check_writable(output, force)
     with source.open(data) as series, Progress(quiet=quiet) as progress:
-        missed, begun = None, time.perf_counter()
+        missed = None
         try:
             report = fhash_codec.encode(series, output, config, force=force, progress=progress)
         except QualityError as error:
             # The file is written, and how far it is from the promise is a result all the same.
-            missed = error
-            with fhash_codec.open(output) as volume:
-                report = figures(volume, volume.info["quality"], seconds=time.perf_counter() - begun)
+            missed, report = error, error.figures
     emit(report, table(report_rows(report, series.units)), as_json)
     if missed is not None:
         raise missed

@@ -1,1 +1,4 @@
 """Measurements that stay in the product."""
+
+# Its modules import torch at once; how torch's threads wait must be set before.
+import fhash_codec.engines.threads  # noqa: F401

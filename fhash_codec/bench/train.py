@@ -6,6 +6,7 @@ import os
 import platform
 import time
 from collections.abc import Sequence
+from math import prod
 from statistics import median
 from typing import Any
 
@@ -16,8 +17,9 @@ from fhash_codec.architecture import Architecture
 from fhash_codec.config import ENGINES, EncodeConfig
 from fhash_codec.coreset import Coreset
 from fhash_codec.engines import choose_device, make_engine
+from fhash_codec.engines.threads import threads_for
 from fhash_codec.progress import Progress, silent
-from fhash_codec.selection import Source, as_series, select
+from fhash_codec.selection import Source, opened, select
 from fhash_codec.train import Plan, plan_training, probe_psnr
 from fhash_formats.errors import InputError
 
@@ -46,46 +48,44 @@ def bench_train(
     if seconds <= 0 or not engines:
         raise InputError(f"seconds is {seconds:g} for {len(engines)} engines; a positive time and at least one engine are needed")
     device = choose_device(config.device)
-    with as_series(source) as series:
+    with opened(source) as series:
         selected = select(series, config, progress)
         coreset, architecture = selected.coreset, selected.architecture
         name = f"{series.source} {series.name}"
-    runs = [_Run(engine, architecture, coreset, config, seconds, device) for engine in engines]
-    for turn in range(TURNS):
-        for number, run in enumerate(runs):
-            run.train(seconds / TURNS)
-            run.infer(INFER_SECONDS)
-            progress("measuring", turn * len(runs) + number + 1, TURNS * len(runs), run.name)
-    peak = matrix_product_rate(device)
-    flops = 3 * 2 * sum(outputs * inputs for outputs, inputs in architecture.layer_shapes)
-    results = [run.result(flops, peak) for run in runs]
+    plan = plan_training(coreset, epochs=1, learning_rate=config.learning_rate, schedule="constant", batch=config.batch, seed=config.seed)
+    with threads_for(plan.batch_bricks * prod(coreset.brick_shape)):
+        runs = [_Run(engine, architecture, coreset, plan, seconds, device) for engine in engines]
+        for turn in range(TURNS):
+            for number, run in enumerate(runs):
+                run.train(seconds / TURNS)
+                run.infer(INFER_SECONDS)
+                progress("measuring", turn * len(runs) + number + 1, TURNS * len(runs), run.name)
+        peak = matrix_product_rate(device)
+        flops = 3 * 2 * sum(outputs * inputs for outputs, inputs in architecture.layer_shapes)
+        results = [run.result(flops, peak) for run in runs]
+        used = machine(device) | {"matrix_product_gflops": peak / 1e9}
     naive = next((result for result in results if result["engine"] == "naive"), None)
     for result in results:
         for kind in ("train", "infer"):
             result[f"{kind}_ratio"] = result[f"{kind}_msamples_s"] / naive[f"{kind}_msamples_s"] if naive else None
     return {
         "engines": results,
-        "machine": machine(device) | {"matrix_product_gflops": peak / 1e9},
+        "machine": used,
         "series": name,
         "samples": len(coreset.values),
-        "batch_samples": len(coreset.values) / runs[0].plan.batches,
+        "batch_samples": len(coreset.values) / plan.batches,
     }
 
 
 class _Run:
     """One engine under measurement."""
 
-    def __init__(
-        self, name: str, architecture: Architecture, coreset: Coreset, config: EncodeConfig, seconds: float, device: torch.device
-    ) -> None:
-        self.name, self.coreset, self.device = name, coreset, device
+    def __init__(self, name: str, architecture: Architecture, coreset: Coreset, plan: Plan, seconds: float, device: torch.device) -> None:
+        self.name, self.coreset, self.plan, self.device = name, coreset, plan, device
         self.counts = np.diff(coreset.offsets)
-        self.plan: Plan = plan_training(
-            coreset, epochs=1, learning_rate=config.learning_rate, schedule="constant", batch=config.batch, seed=config.seed
-        )
         # A first step, not counted, says how many fit in the seconds; the cosine over them is set then.
-        rates = np.full(3, config.learning_rate)
-        engine = make_engine(name, architecture, coreset, rates, seed=config.seed, device=device)
+        rate = float(plan.rates[-1])
+        engine = make_engine(name, architecture, coreset, np.full(3, rate), seed=plan.seed, device=device)
         for chosen in self.plan.order(0)[:2]:
             begun = time.perf_counter()
             engine.train(chosen)
@@ -93,8 +93,8 @@ class _Run:
         steps = max(1, round(seconds / (time.perf_counter() - begun)))
         # Longer than that, so that turns that run faster than the first step find a rate as well.
         self.rates = np.full(8 * steps + 1, 0.0)
-        self.rates[: steps + 1] = config.learning_rate * (0.5 + 0.5 * np.cos(np.pi * np.arange(steps + 1) / steps))
-        self.engine = make_engine(name, architecture, coreset, self.rates, seed=config.seed, device=device)
+        self.rates[: steps + 1] = rate * (0.5 + 0.5 * np.cos(np.pi * np.arange(steps + 1) / steps))
+        self.engine = make_engine(name, architecture, coreset, self.rates, seed=plan.seed, device=device)
         self.train_speeds: list[float] = []
         self.infer_speeds: list[float] = []
         self.seconds = 0.0

@@ -4,6 +4,10 @@ The tree has built-in bases, so that `except FileNotFoundError` works as it does
 A message says what is wrong, the value that was given, what is allowed and what to do about it.
 """
 
+from __future__ import annotations
+
+from typing import Any
+
 
 class FhashError(Exception):
     """Anything that fhash refuses or fails at. The command line exits with `exit_code`."""
@@ -36,9 +40,13 @@ class OutputError(FhashError, OSError):
 
 
 class QualityError(FhashError):
-    """A promised quality that was not reached."""
+    """A promised quality that was not reached; `figures` holds what was, as JSON values."""
 
     exit_code = 3
+
+    def __init__(self, message: str, figures: dict[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.figures = figures or {}
 
 
 class DamagedFileError(FhashError, ValueError):
