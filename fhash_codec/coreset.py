@@ -38,7 +38,7 @@ class Coreset:
     Attributes:
         box: the feature bounding box, fused over the key frames.
         key_frames: steps that the samples are from.
-        brick_shape: vertices of a brick (z, y, x), powers of two, 1024 or fewer in all by default.
+        brick_shape: vertices of a brick (z, y, x), 1024 or fewer in all by default.
         brick_grid: bricks along each axis of the box (z, y, x); the last of an axis may reach beyond the box.
         bricks: int32 (n, 4), (key index, z, y, x) in the brick grid, of the bricks that hold a sample, ascending.
         mask_bits: uint8 (n, ceil(vertices of a brick / 8)), np.packbits of each brick in C order, 1 = sample.
@@ -144,7 +144,8 @@ def unpack_frame(coreset: Coreset, key: int) -> npt.NDArray[np.float32]:
 def brick_shape(size: Sizes) -> Sizes:
     """Vertices of a brick (z, y, x) for a box of that size: 8 x 8 x 16, and where an axis is shorter the factors of two go to the others.
 
-    No axis gets more than the power of two that covers it; the product is 1024, or less where the whole box is smaller.
+    No axis gets more than the power of two that covers it; the product is 1024, or less where the whole box is smaller. Then the
+    bricks of an axis are made as short as their number allows, so that few of their vertices lie beyond the box.
     """
     room = [(axis - 1).bit_length() for axis in size]
     bits = [min(usual, most) for usual, most in zip(BRICK_BITS, room, strict=True)]
@@ -152,7 +153,9 @@ def brick_shape(size: Sizes) -> Sizes:
         # The thinnest axis that has room; x before y before z where equal, since x is contiguous.
         axis = min((axis for axis in (2, 1, 0) if bits[axis] < room[axis]), key=lambda axis: bits[axis])
         bits[axis] += 1
-    return 2 ** bits[0], 2 ** bits[1], 2 ** bits[2]
+    counts = [-(-axis // 2**bit) for axis, bit in zip(size, bits, strict=True)]
+    z, y, x = (-(-axis // count) for axis, count in zip(size, counts, strict=True))
+    return z, y, x
 
 
 def bounding_box(mask: npt.NDArray[np.bool_]) -> Box | None:

@@ -213,7 +213,7 @@ class SlabEngine:
         """Sum of squared errors, and the gradient of `scale`/2 times it by the inputs; the MLP's gradients are added to theirs."""
         gradient = self._scratch("gradient", self.architecture.inputs, inputs.shape[1])
         error = torch.zeros((), dtype=torch.float64, device=self.device)
-        flat_target, flat_mask = target.view(-1), mask.view(-1)
+        flat_target, flat_mask = target.reshape(-1), mask.reshape(-1)
         for first in range(0, inputs.shape[1], CHUNK):
             part = slice(first, first + CHUNK)
             activations = self._forward(inputs[:, part])

@@ -72,7 +72,8 @@ def test_slab_trains_like_a_dense_adam_though_it_visits_few_bricks_a_step(shape,
     # Median and count, not maximum: near a ReLU's kink float32 may take the other side, in torch's own Adam as well.
     for a, b in ((ours.fine, theirs.fine), (ours.flat, theirs.flat)):
         apart = (a - b).abs()
-        assert float(apart.median()) < 1e-6
+        # A thousandth of one Adam step, after 40 of them.
+        assert float(apart.median()) < 1e-3 * 0.01
         assert float((apart > 1e-3).double().mean()) < 0.01
 
 
