@@ -228,3 +228,22 @@ def test_a_missing_file_is_named(tmp_path):
 )
 def test_decoded_values_are_floats_as_wide_as_the_source_needs(source, decoded):
     assert decoded_type(np.dtype(source)) == np.dtype(decoded)
+
+
+def test_decoding_a_frame_takes_no_more_memory_for_more_frames(tmp_path):
+    import tracemalloc
+
+    peaks = []
+    for steps in (4, 32):
+        path = tmp_path / f"{steps}.fhz"
+        field = np.random.default_rng(0).random((steps, 16, 24, 24), dtype=np.float32)
+        fhash_codec.encode(field, path, EncodeConfig(epochs=1, width=8))
+        with fhash_codec.open(path) as volume:
+            volume.read(1)
+            tracemalloc.start()
+            with fhash_codec.open(path) as fresh:
+                fresh.read(steps - 1)
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+    # The directory grows by about a kilobyte a frame; a frame's finest table alone would be 37.
+    assert peaks[1] - peaks[0] < 28 * 4_000
