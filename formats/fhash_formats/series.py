@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -62,7 +62,15 @@ class Series(ABC):
 
     @abstractmethod
     def read(self, step: int) -> npt.NDArray[Any]:
-        """One frame (z, y, x), C-contiguous, of `self.dtype`; raises InputError if the file cannot be read."""
+        """One frame (z, y, x), C-contiguous, of `self.dtype`, not to be written to.
+
+        Raises RegionError for a step outside 0 .. shape[0] - 1, InputError if the file cannot be read.
+        """
+
+    def require_step(self, step: int) -> None:
+        """Raise RegionError for a step that the series has not; negative ones do not count from the end."""
+        if not 0 <= step < self.shape[0]:
+            raise RegionError(f"{self.source}: step {step} is outside 0..{self.shape[0] - 1}")
 
     def close(self) -> None:  # noqa: B027 - a series in memory has nothing to release
         """Release the file."""
@@ -72,7 +80,7 @@ class Series(ABC):
         for step in range(self.shape[0]):
             yield self.read(step)
 
-    def __enter__(self) -> Series:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -85,9 +93,8 @@ class StepsSeries(Series):
     def __init__(self, whole: Series, steps: Sequence[int]) -> None:
         if not steps:
             raise InputError(f"{whole.source}: the selection of steps is empty; the series has {whole.shape[0]} steps")
-        outside = [step for step in steps if not 0 <= step < whole.shape[0]]
-        if outside:
-            raise RegionError(f"{whole.source}: step {outside[0]} is outside 0..{whole.shape[0] - 1}")
+        for step in steps:
+            whole.require_step(step)
         time = whole.coords["t"]
         self.whole = whole
         self.steps = tuple(steps)
@@ -98,6 +105,7 @@ class StepsSeries(Series):
         self.coords = {**whole.coords, "t": chosen}
 
     def read(self, step: int) -> npt.NDArray[Any]:
+        self.require_step(step)
         return self.whole.read(self.steps[step])
 
     def close(self) -> None:
@@ -105,12 +113,15 @@ class StepsSeries(Series):
 
 
 class ArraySeries(Series):
-    """An array in memory (t, z, y, x) or (z, y, x) as a series."""
+    """An array in memory (t, z, y, x) or (z, y, x) as a series; masked values of floats are NaN.
+
+    Raises InputError for an array that cannot be a series, and for coordinates that do not fit it.
+    """
 
     def __init__(
         self, array: npt.ArrayLike, *, name: str = "values", units: str = "", coords: Mapping[str, Coordinate] | None = None
     ) -> None:
-        values = np.asarray(array)
+        values = _unmasked(array)
         self.source, self.name, self.units, self.attributes = "array", name, units, {}
         if values.ndim == 3:
             values = values[None]
@@ -118,8 +129,10 @@ class ArraySeries(Series):
         self.dtype = values.dtype.newbyteorder("=")
         self.values = values
         self.coords = {axis: index_coordinate(axis, n) for axis, n in zip(AXES, self.shape, strict=True)} | dict(coords or {})
+        check_coords(self.source, self.coords, self.shape)
 
     def read(self, step: int) -> npt.NDArray[Any]:
+        self.require_step(step)
         return np.ascontiguousarray(self.values[step], dtype=self.dtype)
 
 
@@ -133,3 +146,24 @@ def check_values(what: str, shape: Sequence[int], dtype: np.dtype[Any]) -> tuple
         raise InputError(f"{what}: an axis is empty, shape {tuple(shape)} in (t, z, y, x)")
     t, z, y, x = (int(n) for n in shape)
     return t, z, y, x
+
+
+def check_coords(what: str, coords: Mapping[str, Coordinate], shape: tuple[int, int, int, int]) -> None:
+    """Raise InputError unless there is a coordinate for each of t, z, y, x, float64 and as long as its axis."""
+    if set(coords) != set(AXES):
+        raise InputError(f"{what}: coordinates of {sorted(coords)}; exactly those of t, z, y and x are needed")
+    for axis, length in zip(AXES, shape, strict=True):
+        values = coords[axis].values
+        if values.shape != (length,) or values.dtype != np.float64:
+            raise InputError(f"{what}: the coordinate of {axis} is {values.dtype} {values.shape}; float64 ({length},) is needed")
+
+
+def _unmasked(array: npt.ArrayLike) -> npt.NDArray[Any]:
+    """The values; masked ones must not pass for what happens to stand under the mask."""
+    if not np.ma.is_masked(array):
+        return np.asarray(array)
+    masked: np.ma.MaskedArray[Any, Any] = np.ma.asarray(array)
+    if masked.dtype.kind != "f":
+        raise InputError(f"array: masked values of type {masked.dtype}, which has no NaN; convert it to float32 or float64 first")
+    filled: npt.NDArray[Any] = masked.filled(np.nan)
+    return filled

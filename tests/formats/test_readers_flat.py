@@ -280,6 +280,20 @@ def test_one_frame_is_read_at_a_time(tmp_path: Path, order: str, monkeypatch: py
     assert peak < 3 * values[0].nbytes
 
 
+def test_a_short_run_among_many_others_is_read_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    values = np.random.default_rng(0).integers(0, 9, (2, 5000, 4, 4), np.uint8)  # (z, t, y, x)
+    monkeypatch.setattr(flat, "BLOCK_BYTES", 1000)
+    np.save(tmp_path / "a.npy", values)
+    with open_series(tmp_path / "a.npy", axes="z,t,y,x") as series:
+        series._together = 1  # as for frames above the bound of a slab
+        series.read(0)
+        tracemalloc.start()
+        np.testing.assert_array_equal(series.read(4000), values[:, 4000])
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < values[0].nbytes
+
+
 def test_time_as_the_fastest_axis_reads_many_steps_at_once(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.ascontiguousarray(VALUES.transpose(1, 2, 3, 0)))
     with open_series(tmp_path / "a.npy", axes="z,y,x,t") as series:

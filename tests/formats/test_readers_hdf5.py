@@ -282,7 +282,6 @@ def test_a_missing_filter_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_filters_of_hdf5plugin_are_loaded_when_needed(tmp_path: Path) -> None:
-    pytest.importorskip("hdf5plugin")
     imports = "import h5py, hdf5plugin, numpy, sys"
     write_it = f"{imports}; h5py.File(sys.argv[1], 'w').create_dataset('v', data=numpy.ones((2,2,2)), **hdf5plugin.Zstd())"
     read_it = "import sys; from fhash_formats import open_series; assert open_series(sys.argv[1]).read(0).sum() == 8"

@@ -12,7 +12,8 @@ import pytest
 
 from fhash_formats import RawLayout, open_series
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.joined import natural_order
+from fhash_formats.readers.joined import JoinedSeries, natural_order
+from fhash_formats.readers.lattice import FileSeries
 
 VALUES = np.random.default_rng(0).normal(size=(12, 3, 5, 6)).astype(np.float32)
 
@@ -113,6 +114,24 @@ def test_a_file_that_changes_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"f1.npy changed while it was being read"):
             series.read(1)
         np.testing.assert_array_equal(series.read(2), VALUES[2])
+
+
+def test_a_file_that_changes_while_it_is_opened_is_refused(tmp_path: Path) -> None:
+    for step in range(2):
+        np.save(tmp_path / f"f{step}.npy", VALUES[step])
+    with open_series(tmp_path / "f*.npy") as series:
+        assert isinstance(series, JoinedSeries)
+        open_part = series._open_part
+
+        def written_meanwhile(path: Path) -> FileSeries:
+            np.save(path, VALUES[7])
+            os.utime(path, ns=(1, 1))
+            return open_part(path)
+
+        series._open_part = written_meanwhile
+        for _ in range(2):
+            with pytest.raises(InputError, match=r"f1.npy changed while it was being read"):
+                series.read(1)
 
 
 def test_one_file_is_open_at_a_time(tmp_path: Path) -> None:

@@ -11,12 +11,10 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 
 from fhash_formats import open_series
 from fhash_formats.errors import InputError, MissingDependencyError
-
-xr = pytest.importorskip("xarray")
-pytest.importorskip("h5netcdf")
 
 VALUES = np.random.default_rng(0).normal(size=(4, 3, 5, 6)).astype(np.float32)
 DIMS = ("time", "lev", "lat", "lon")
@@ -251,7 +249,6 @@ def test_boolean_variables_are_refused(tmp_path: Path) -> None:
 
 
 def test_classic_netcdf3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("scipy")
     dataset = xr.Dataset({"v": (DIMS, VALUES)}, coords={"time": ("time", np.arange(4) / 3 + 347921)})
     dataset.to_netcdf(tmp_path / "a.nc", engine="scipy", format="NETCDF3_64BIT")
     with open_series(tmp_path / "a.nc") as series:

@@ -158,7 +158,8 @@ ENCODINGS: list[dict[str, Any]] = [
 @pytest.mark.parametrize("zarr_format", [2, 3])
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_what_xarray_writes_is_read_as_xarray_reads_it(tmp_path: Path, zarr_format: int, encoding: dict[str, Any]) -> None:
-    xr = pytest.importorskip("xarray")
+    import xarray as xr
+
     values = np.round(np.clip(VALUES, -1.9, 2), 2)
     values[1, 2, 3, 4] = np.nan
     dates = np.array(["2020-01-01T00", "2020-01-01T06", "2020-01-02T00", "2020-02-01T00"], "M8[ns]")

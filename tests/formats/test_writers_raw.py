@@ -110,7 +110,8 @@ def test_text_cannot_break_the_header(tmp_path: Path) -> None:
 
 
 def test_pynrrd_reads_it(tmp_path: Path) -> None:
-    nrrd = pytest.importorskip("nrrd")
+    import nrrd
+
     paths = save_region(tmp_path / "out.raw", region(), DATA)
     data, _ = nrrd.read(str(paths[1]))
     np.testing.assert_array_equal(data.T, DATA)

@@ -24,6 +24,7 @@ from fhash_formats.container.reader import Container
 from fhash_formats.container.source import FileSource, PreviewSource
 from fhash_formats.container.zip_checked import MAX_NAME, NAME
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
+from fhash_formats.slabs import slab_shape
 from fhash_formats.writers.atomic import replacing
 
 USUAL_CHUNK_BYTES = 2 << 20
@@ -116,7 +117,7 @@ class ContainerWriter:
         codecs: Sequence[Codec] | None = None,
     ) -> None:
         """Write an array that is in memory; by default one chunk up to 2 MiB, slabs of the leading axes above. Raises as `add_array`."""
-        chosen = usual_chunk_shape(array.shape, array.dtype.itemsize) if chunk_shape is None else tuple(chunk_shape)
+        chosen = slab_shape(array.shape, array.dtype.itemsize, USUAL_CHUNK_BYTES) if chunk_shape is None else tuple(chunk_shape)
         self.add_array(
             name,
             shape=array.shape,
@@ -186,17 +187,6 @@ class ContainerWriter:
         self._file.write(data)
         self._members.append(member)
         self._position = member.end
-
-
-def usual_chunk_shape(shape: Sequence[int], itemsize: int) -> tuple[int, ...]:
-    """The whole array up to 2 MiB; otherwise leading axes are cut, the first to single positions before the next is touched."""
-    chunk = list(shape)
-    for axis, length in enumerate(shape):
-        rest = prod(chunk[axis + 1 :]) * itemsize
-        chunk[axis] = max(1, min(length, USUAL_CHUNK_BYTES // max(1, rest)))
-        if chunk[axis] > 1:
-            break
-    return tuple(chunk)
 
 
 def _cut(array: npt.NDArray[Any], chunk_shape: Sequence[int]) -> Iterator[npt.NDArray[Any]]:

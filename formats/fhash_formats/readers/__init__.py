@@ -4,9 +4,9 @@ registry     formats, open_series             hdf5 netcdf zarr_store npy raw   t
 request      what the user may say            joined        many files as one series
 variables    which array is meant             masks         a mask over a series
 roles        which dimension is which axis    lattice       frames in (z, y, x) from any order
-positions    coordinates                      attributes    attributes as JSON values
+positions    coordinates                      failures      errors in one line, files that change
 hdf5_tree    the datasets of an HDF5 file     cf_packing    packed values in zarr
-flat         values without chunks            failures      errors in one line, files that change
+flat         values without chunks
 """
 
 from fhash_formats.readers.masks import Mask, open_mask

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError
 
 BLOCK_BYTES = 8 * 2**20
-"""Bytes read at once where the wanted values are scattered, as with time fastest."""
+"""The most that is read at once where the wanted values are scattered, as with time fastest."""
 
 SHORTEST_RUN = 16 * 2**10
 """Bytes below which a run is not worth a read of its own."""
@@ -47,7 +47,7 @@ class FlatArray:
         """Each row of the result from `first` in each `stride` values of the file."""
         rows, run = result.shape
         item = self.dtype.itemsize
-        if run * item >= SHORTEST_RUN or rows == 1:
+        if rows == 1 or run * item >= SHORTEST_RUN or stride * item > BLOCK_BYTES:
             for row in range(rows):
                 self._read(file, result[row], row * stride + first)
             return

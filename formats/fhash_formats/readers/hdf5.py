@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from fhash_formats.readers.attributes import json_attributes
+from fhash_formats.attributes import json_attributes, text_of
 from fhash_formats.readers.failures import Stamp, refusing
 from fhash_formats.readers.hdf5_tree import column, columns, datasets, own_name, require_filters, require_sources, variables
 from fhash_formats.readers.lattice import FileSeries
@@ -13,7 +13,7 @@ from fhash_formats.readers.positions import beside, coordinate, usable
 from fhash_formats.readers.request import Request
 from fhash_formats.readers.roles import assign_axes, role_of_coordinate, role_of_name
 from fhash_formats.readers.variables import choose
-from fhash_formats.series import Coordinate, Series
+from fhash_formats.series import Coordinate
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -28,7 +28,7 @@ def matches(head: bytes, path: Path) -> bool:
     return is_hdf5(head)
 
 
-def open_hdf5(path: Path, request: Request) -> Series:
+def open_hdf5(path: Path, request: Request) -> FileSeries:
     """The series in an HDF5 file: the only suitable dataset, or the one named.
 
     Coordinates are the dimension scales, else 1-D datasets of a conventional name beside the dataset or in the root.
@@ -47,7 +47,7 @@ def open_hdf5(path: Path, request: Request) -> Series:
         raise
 
 
-def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> Series:
+def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> FileSeries:
     tree = dict(datasets(file))
     var = own_name(file, tree, request.var) if request.var else None
     variable = choose(source, variables(tree), var, booleans=request.booleans)
@@ -74,19 +74,9 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         stamp=stamp,
         coords=coords,
         attributes=json_attributes(dataset.attrs),
-        steps_together=steps_together(axes, dataset.shape, dataset.chunks),
+        chunks=dataset.chunks,
         close=file.close,
     )
-
-
-def steps_together(axes: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...] | None) -> int:
-    """Steps that are best fetched at once: those of one chunk; without chunks one, or all where time is not the slowest dimension."""
-    if "t" not in axes:
-        return 1
-    place = axes.index("t")
-    if chunks is not None:
-        return chunks[place]
-    return 1 if place == 0 else shape[place]
 
 
 def _scale(dimension: Any) -> tuple[str, Any] | None:
@@ -119,6 +109,4 @@ def _scale_coordinates(
 
 
 def _valueless(scale: Any) -> bool:
-    name = scale.attrs.get("NAME", b"")
-    text = name.decode("utf-8", errors="replace") if isinstance(name, bytes) else str(name)
-    return text.startswith("This is a netCDF dimension but not a netCDF variable")
+    return text_of(scale.attrs.get("NAME", "")).startswith("This is a netCDF dimension but not a netCDF variable")

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from fhash_formats.attributes import text_of
 from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.readers.positions import Column, usable
 from fhash_formats.readers.variables import Variable
@@ -77,7 +78,7 @@ def variables(tree: Mapping[str, Any]) -> list[Variable]:
     bounds = set()
     for name, dataset in tree.items():
         if isinstance(dataset.attrs.get("bounds"), str | bytes):
-            bounds.add(sibling(name, _text(dataset.attrs["bounds"])))
+            bounds.add(sibling(name, text_of(dataset.attrs["bounds"])))
     return [
         Variable(name=name, shape=dataset.shape, dtype=dataset.dtype, auxiliary=dataset.is_scale or name in bounds, handle=dataset)
         for name, dataset in tree.items()
@@ -105,10 +106,6 @@ def sibling(path: str, name: str) -> str:
     return f"{path.rpartition('/')[0]}/{name}".lstrip("/")
 
 
-def _text(value: str | bytes) -> str:
-    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value
-
-
 def require_filters(source: str, name: str, dataset: Any) -> None:
     """See to it that the filters of a dataset can be undone, with hdf5plugin if need be.
 
@@ -121,7 +118,7 @@ def require_filters(source: str, name: str, dataset: Any) -> None:
         code, _, _, stored = plist.get_filter(place)
         if h5py.h5z.filter_avail(code):
             continue
-        label = f"{FILTER_NAMES.get(code) or stored.decode('utf-8', errors='replace').split(' ')[0] or 'unknown'} (id {code})"
+        label = f"{FILTER_NAMES.get(code) or text_of(stored).split(' ')[0] or 'unknown'} (id {code})"
         try:
             importlib.import_module("hdf5plugin")
         except ImportError as error:

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, MissingInputError, RegionError
+from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.failures import Stamp
+from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.series import Coordinate, Series, index_coordinate
 
 
@@ -55,20 +56,19 @@ class JoinedSeries(Series):
     then increase from file to file; otherwise they are 0, 1, 2, ... Raises InputError that names the file which differs.
     """
 
-    def __init__(self, pattern: str, paths: Sequence[Path], open_part: Callable[[Path], Series]) -> None:
+    def __init__(self, pattern: str, paths: Sequence[Path], open_part: Callable[[Path], FileSeries]) -> None:
         self.source = pattern
         self._open_part = open_part
-        self._current: tuple[int, Series] | None = None
+        self._current: tuple[int, FileSeries] | None = None
         self._parts: list[_Part] = []
         names = []
         first: Series | None = None
         for path in paths:
-            stamp = Stamp.of(path)
             with open_part(path) as part:
                 first = first or part
                 _check_alike(part, path, first, paths[0])
-                time = part.coords["t"] if "t" in getattr(part, "given", ()) else None
-                self._parts.append(_Part(path=path, stamp=stamp, steps=part.shape[0], time=time))
+                time = part.coords["t"] if "t" in part.given else None
+                self._parts.append(_Part(path=path, stamp=part.stamp, steps=part.shape[0], time=time))
                 names.append(part.name)
         assert first is not None
         self.name = _common_name(names)
@@ -78,19 +78,27 @@ class JoinedSeries(Series):
         self.coords = {**first.coords, "t": self._times()}
 
     def read(self, step: int) -> npt.NDArray[Any]:
-        if not 0 <= step < self.shape[0]:
-            raise RegionError(f"{self.source}: step {step} is outside 0..{self.shape[0] - 1}")
+        self.require_step(step)
         number = bisect_right(self._ends, step)
         if self._current is None or self._current[0] != number:
             self.close()
-            self._parts[number].stamp.check()
-            self._current = (number, self._open_part(self._parts[number].path))
+            self._current = (number, self._reopened(self._parts[number]))
         return self._current[1].read(step - (self._ends[number] - self._parts[number].steps))
 
     def close(self) -> None:
         if self._current is not None:
             self._current[1].close()
             self._current = None
+
+    def _reopened(self, part: _Part) -> FileSeries:
+        part.stamp.check()  # before, because a file that is being written may not open at all
+        series = self._open_part(part.path)
+        try:
+            part.stamp.check()  # after, because from here on the series compares with the file that it opened
+        except BaseException:
+            series.close()
+            raise
+        return series
 
     def _times(self) -> Coordinate:
         times = [part.time for part in self._parts if part.time is not None]

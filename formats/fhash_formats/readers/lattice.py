@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from math import prod
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, RegionError
+from fhash_formats.errors import InputError
 from fhash_formats.readers.failures import Stamp, refusing
 from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
 
@@ -28,9 +29,13 @@ class FileSeries(Series):
     """A series whose frames are fetched from a file as slices in the file's own order of dimensions.
 
     Arguments: `shape` and `axes` in the file's order; `fetch(slices)` returns a fresh array of the file's dimensions, in physical values
-    of type `dtype` (any byte order); `steps_together` is how many steps one stored chunk spans: as many of them as fit SLAB_BYTES are
-    fetched at once and kept until the next fetch, a frame alone otherwise; `stamp` is checked before and after every fetch.
-    `given` names the axes whose coordinate the file gives. Raises InputError for a shape or type that cannot be a series.
+    of type `dtype` (any byte order); `chunks` is the shape of a stored chunk, None without chunks: as many steps of one chunk as fit
+    SLAB_BYTES are fetched at once and kept until the next fetch, a frame alone otherwise; `stamp` is checked before and after every
+    fetch. Raises InputError for a shape or type that cannot be a series.
+
+    Attributes:
+        given: the axes whose coordinate the file gives.
+        stamp: of the file when it was opened.
     """
 
     def __init__(
@@ -45,7 +50,7 @@ class FileSeries(Series):
         stamp: Stamp,
         coords: Mapping[str, Coordinate] | None = None,
         attributes: Mapping[str, Any] | None = None,
-        steps_together: int = 1,
+        chunks: Sequence[int] | None = None,
         close: Callable[[], None] = lambda: None,
     ) -> None:
         lengths = dict(zip(axes, shape, strict=True))
@@ -55,14 +60,13 @@ class FileSeries(Series):
         self.units = str(self.attributes.get("units", ""))
         self.given = frozenset(coords or {})
         self.coords = {axis: index_coordinate(axis, length) for axis, length in zip(AXES, self.shape, strict=True)} | dict(coords or {})
-        self._axes, self._fetch, self._stamp, self._close = tuple(axes), fetch, stamp, close
-        frame_bytes = self.dtype.itemsize * self.shape[1] * self.shape[2] * self.shape[3]
-        self._together = max(1, min(steps_together, SLAB_BYTES // frame_bytes))
+        self._axes, self._fetch, self.stamp, self._close = tuple(axes), fetch, stamp, close
+        frame_bytes = self.dtype.itemsize * prod(self.shape[1:])
+        self._together = max(1, min(_steps_of_a_chunk(self._axes, shape, chunks), SLAB_BYTES // frame_bytes))
         self._slab: tuple[int, npt.NDArray[Any]] | None = None
 
     def read(self, step: int) -> npt.NDArray[Any]:
-        if not 0 <= step < self.shape[0]:
-            raise RegionError(f"{self.source}: step {step} is outside 0..{self.shape[0] - 1}")
+        self.require_step(step)
         start = step - step % self._together
         if self._together == 1:
             return np.ascontiguousarray(self._block(step, step + 1)[0], dtype=self.dtype)
@@ -71,7 +75,7 @@ class FileSeries(Series):
             self._slab = None  # before the fetch, so that two slabs are never held
             slab = self._slab = (start, self._block(start, min(start + self._together, self.shape[0])))
         else:
-            self._stamp.check()
+            self.stamp.check()
         return np.array(slab[1][step - start], dtype=self.dtype, order="C")
 
     def close(self) -> None:
@@ -81,14 +85,24 @@ class FileSeries(Series):
     def _block(self, start: int, stop: int) -> npt.NDArray[Any]:
         """Steps start to stop as (t, z, y, x)."""
         steps = f"step {start}" if stop == start + 1 else f"steps {start} to {stop - 1}"
-        self._stamp.check()
+        self.stamp.check()
         with refusing(f"{self.source}: {steps} of {self.name} cannot be read"):
             ranges = {axis: slice(0, length) for axis, length in zip(AXES, self.shape, strict=True)} | {"t": slice(start, stop)}
             values = self._fetch(tuple(ranges[axis] for axis in self._axes))
-        self._stamp.check()
+        self.stamp.check()
         expected = {**dict(zip(AXES, self.shape, strict=True)), "t": stop - start}
         if values.shape != tuple(expected[axis] for axis in self._axes):
             raise InputError(f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed while it was being read")
         present = [axis for axis in AXES if axis in self._axes]
         ordered = values.transpose([self._axes.index(axis) for axis in present])
         return np.expand_dims(ordered, tuple(place for place, axis in enumerate(AXES) if axis not in present))
+
+
+def _steps_of_a_chunk(axes: Sequence[str], shape: Sequence[int], chunks: Sequence[int] | None) -> int:
+    """Steps in one chunk; without chunks one, or all where time is not the slowest dimension."""
+    if "t" not in axes:
+        return 1
+    place = axes.index("t")
+    if chunks is not None:
+        return chunks[place]
+    return 1 if place == 0 else shape[place]

@@ -15,17 +15,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fhash_formats.attributes import PACKING, PLUMBING, json_attributes, text_of
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.attributes import PACKING, PLUMBING, json_attributes
 from fhash_formats.readers.failures import Stamp, condense, refusing
-from fhash_formats.readers.hdf5 import is_hdf5, steps_together
+from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.readers.hdf5_tree import require_filters
 from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.positions import Column, beside, coordinate, usable
 from fhash_formats.readers.request import Request
 from fhash_formats.readers.roles import assign_axes, role_of_coordinate, role_of_name
 from fhash_formats.readers.variables import Variable, choose
-from fhash_formats.series import AXES, Coordinate, Series
+from fhash_formats.series import AXES, Coordinate
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -48,12 +48,10 @@ def _says_netcdf(path: Path) -> bool:
     import h5py
 
     with refusing(f"{path} cannot be read as HDF5"), h5py.File(path, "r") as file:
-        conventions = file.attrs.get("Conventions", "")
-        text = conventions.decode("utf-8", errors="replace") if isinstance(conventions, bytes) else str(conventions)
-        return "_NCProperties" in file.attrs or text.strip().upper().startswith("CF-")
+        return "_NCProperties" in file.attrs or text_of(file.attrs.get("Conventions", "")).strip().upper().startswith("CF-")
 
 
-def open_netcdf(path: Path, request: Request) -> Series:
+def open_netcdf(path: Path, request: Request) -> FileSeries:
     """The series in a NetCDF file: the only suitable variable (of the root, or of any group), or the one named."""
     source, stamp = str(path), Stamp.of(path)
     with path.open("rb") as file:
@@ -117,7 +115,7 @@ def _close(groups: Mapping[str, xr.Dataset]) -> None:
             dataset.close()
 
 
-def _series(source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Dataset], request: Request) -> Series:
+def _series(source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Dataset], request: Request) -> FileSeries:
     found = [
         Variable(
             name=f"{group}/{name}".lstrip("/"), shape=array.shape, dtype=array.dtype, auxiliary=name in dataset.coords, handle=(group, name)
@@ -148,7 +146,7 @@ def _series(source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Datas
         stamp=stamp,
         coords=_coordinates(source, axes, dimensions, array.shape, scope, groups[group][name], request.axes is not None),
         attributes=json_attributes(array.attrs, without=PLUMBING | PACKING),
-        steps_together=steps_together(axes, array.shape, array.encoding.get("chunksizes")),
+        chunks=array.encoding.get("chunksizes"),
         close=lambda: _close(groups),
     )
 

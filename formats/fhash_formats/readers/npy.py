@@ -9,12 +9,10 @@ import numpy as np
 from fhash_formats.errors import InputError
 from fhash_formats.readers.failures import Stamp, refusing
 from fhash_formats.readers.flat import FlatArray
-from fhash_formats.readers.hdf5 import steps_together
 from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.request import Request
 from fhash_formats.readers.roles import assign_axes
 from fhash_formats.readers.variables import Variable, choose
-from fhash_formats.series import Series
 
 MAGIC = b"\x93NUMPY"
 
@@ -24,7 +22,7 @@ def matches(head: bytes, path: Path) -> bool:
     return head.startswith(MAGIC) or path.suffix.lower() == ".npz"
 
 
-def open_npy(path: Path, request: Request) -> Series:
+def open_npy(path: Path, request: Request) -> FileSeries:
     """The series in a .npy file, in file order (t, z, y, x) or (z, y, x) unless the request's axes say otherwise."""
     source, stamp = str(path), Stamp.of(path)
     if path.suffix.lower() == ".npz":
@@ -52,5 +50,4 @@ def open_npy(path: Path, request: Request) -> Series:
         axes=axes,
         fetch=array.read,
         stamp=stamp,
-        steps_together=steps_together(axes, shape, None),
     )

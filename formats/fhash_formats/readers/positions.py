@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.attributes import json_attributes
 from fhash_formats.errors import InputError
-from fhash_formats.readers.attributes import json_attributes
 from fhash_formats.readers.roles import NAMES
 from fhash_formats.series import AXES, Coordinate
 

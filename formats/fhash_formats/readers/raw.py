@@ -9,10 +9,9 @@ from pathlib import Path
 from fhash_formats.errors import InputError
 from fhash_formats.readers.failures import Stamp
 from fhash_formats.readers.flat import FlatArray
-from fhash_formats.readers.hdf5 import steps_together
 from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.request import ENDIANS, RawLayout, Request, parse_dtype
-from fhash_formats.series import AXES, Series
+from fhash_formats.series import AXES
 
 NAME = re.compile(r"(?:^|_)(?P<shape>\d+x\d+x\d+(?:x\d+)?)_(?P<dtype>[a-z]+\d+)(?:_(?P<endian>be|le))?(?=_|$)", re.IGNORECASE)
 FORM = "name_XxYxZ[xT]_TYPE[_be].raw, such as density_64x64x32x10_float32.raw"
@@ -33,7 +32,7 @@ def layout_of_name(stem: str) -> tuple[str, RawLayout]:
     return stem[: found.start()] or stem, RawLayout(dict(zip("xyzt", lengths, strict=False)), found["dtype"], endian)
 
 
-def open_raw(path: Path, request: Request) -> Series:
+def open_raw(path: Path, request: Request) -> FileSeries:
     """The series in a raw file, x fastest, then y, z, t; the request's axes (slowest first) may say another order of the same lengths.
 
     Raises InputError where the layout is not known, or where the size of the file is not exactly the layout's.
@@ -68,7 +67,6 @@ def open_raw(path: Path, request: Request) -> Series:
         axes=axes,
         fetch=array.read,
         stamp=stamp,
-        steps_together=steps_together(axes, shape, None),
     )
 
 

@@ -10,6 +10,7 @@ from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers import hdf5, netcdf, npy, raw, zarr_store
 from fhash_formats.readers.failures import refusing
 from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern
+from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.request import RawLayout, Request, parse_axes
 from fhash_formats.series import Series, StepsSeries
 
@@ -26,7 +27,7 @@ class Reader:
     name: str
     suffixes: tuple[str, ...]
     matches: Callable[[bytes, Path], bool]
-    open: Callable[[Path, Request], Series]
+    open: Callable[[Path, Request], FileSeries]
 
     def __str__(self) -> str:
         return f"{self.name} ({' '.join(self.suffixes)})"

@@ -12,18 +12,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.attributes import PACKING, PLUMBING, json_attributes
 from fhash_formats.errors import InputError
-from fhash_formats.readers.attributes import PACKING, PLUMBING, json_attributes
 from fhash_formats.readers.cf_packing import packing
 from fhash_formats.readers.failures import Stamp, condense, refusing
-from fhash_formats.readers.hdf5 import steps_together
 from fhash_formats.readers.hdf5_tree import sibling
 from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.positions import Column, beside, coordinate, usable
 from fhash_formats.readers.request import Request
 from fhash_formats.readers.roles import assign_axes, role_of_coordinate, role_of_name
 from fhash_formats.readers.variables import Variable, choose
-from fhash_formats.series import Coordinate, Series
+from fhash_formats.series import Coordinate
 
 if TYPE_CHECKING:
     import zarr
@@ -41,7 +40,7 @@ def _metadata(path: Path) -> Path | None:
     return next((path / name for name in METADATA if (path / name).is_file()), None)
 
 
-def open_zarr(path: Path, request: Request) -> Series:
+def open_zarr(path: Path, request: Request) -> FileSeries:
     """The series in a zarr hierarchy: the only suitable array, or the one named.
 
     Dimension names (format 3, or xarray's `_ARRAY_DIMENSIONS`) give axes and coordinates. Packing is undone (see cf_packing).
@@ -112,7 +111,7 @@ def _open_arrays(store: Any, inside: str, nodes: Iterable[str]) -> tuple[dict[st
     return arrays, failed
 
 
-def _series(root: Path, store: Any, arrays: Mapping[str, zarr.Array[Any]], failed: Mapping[str, str], request: Request) -> Series:
+def _series(root: Path, store: Any, arrays: Mapping[str, zarr.Array[Any]], failed: Mapping[str, str], request: Request) -> FileSeries:
     source = str(root)
     bounds = {sibling(name, str(array.attrs["bounds"])) for name, array in arrays.items() if "bounds" in array.attrs}
     found = [
@@ -151,7 +150,7 @@ def _series(root: Path, store: Any, arrays: Mapping[str, zarr.Array[Any]], faile
         stamp=Stamp.of((_metadata(root / path) or root) if root.is_dir() else root),
         coords=coords,
         attributes=json_attributes(dict(array.attrs), without=PLUMBING | PACKING),
-        steps_together=steps_together(axes, array.shape, array.chunks),
+        chunks=array.chunks,
         close=store.close,
     )
 

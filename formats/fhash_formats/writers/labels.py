@@ -3,35 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from fhash_formats.attributes import PACKING, PLUMBING, REFERENCES, json_attributes
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.writers.region import Region
 
-# The values are physical: whoever undid a packing left in the attributes would undo it twice.
-PACKING = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned", "_Encoding", "dtype")
-# A range in packed units, or a wrong one, hides good values in the readers that obey it.
-RANGES = ("valid_range", "valid_min", "valid_max")
-# Names of other variables of the source, which are not in the output.
-REFERENCES = (
-    "coordinates",
-    "grid_mapping",
-    "bounds",
-    "climatology",
-    "cell_measures",
-    "ancillary_variables",
-    "formula_terms",
-    "compress",
-    "geometry",
-)
-# What the file formats themselves keep among the attributes.
-HDF5_OWN = ("CLASS", "NAME", "DIMENSION_LIST", "DIMENSION_LABELS", "REFERENCE_LIST")
-NETCDF_OWN = ("_Netcdf4Dimid", "_Netcdf4Coordinates", "_NCProperties", "_nc3_strict", "_ARRAY_DIMENSIONS")
-DROPPED = frozenset([*PACKING, *RANGES, *REFERENCES, *HDF5_OWN, *NETCDF_OWN])
+DROPPED = PACKING | PLUMBING | REFERENCES | {""}
+"""The values are physical, the other variables of the source are not in the output, and no format has an attribute without a name."""
 
 # HDF5 keeps an attribute of at most 64 KiB in the header; text is not bound by it.
 ATTRIBUTE_BYTES = 32 * 2**10
@@ -63,7 +44,7 @@ def safe_names(region: Region) -> tuple[str, dict[str, str]]:
 
 def variable_attributes(region: Region) -> dict[str, Any]:
     """The attributes of the values, JSON values: the region's own, its units, and its name where it had to be changed."""
-    kept = _kept(region.attributes)
+    kept = json_attributes(region.attributes, without=DROPPED)
     if region.units:
         kept["units"] = region.units
     if safe_name(region.name) != region.name:
@@ -73,7 +54,7 @@ def variable_attributes(region: Region) -> dict[str, Any]:
 
 def coordinate_attributes(axis: str, coordinate: Coordinate) -> dict[str, Any]:
     """The attributes of a coordinate, JSON values, with the CF attribute `axis` ("T", "Z", "Y", "X") where it has none."""
-    return {"axis": axis.upper(), **_kept(coordinate.attributes)}
+    return {"axis": axis.upper(), **json_attributes(coordinate.attributes, without=DROPPED)}
 
 
 def hdf5_value(value: Any) -> Any:
@@ -93,22 +74,3 @@ def hdf5_value(value: Any) -> Any:
         if kinds == {float} or (kinds == {int} and all(-(2**63) <= item < 2**63 for item in value)):
             return np.array(value)
     return json.dumps(value)
-
-
-def _kept(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    return {str(key): _json(value) for key, value in attributes.items() if key and key not in DROPPED}
-
-
-def _json(value: Any) -> Any:
-    """The value in JSON's types; NaN and infinity, which JSON has not, as text."""
-    if isinstance(value, np.generic | np.ndarray):
-        value = value.tolist()
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(key): _json(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json(item) for item in value]
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)

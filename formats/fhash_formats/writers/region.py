@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import InputError
-from fhash_formats.series import AXES, Coordinate, check_values
+from fhash_formats.series import Coordinate, check_coords, check_values
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,11 +42,4 @@ class Region:
         shape = check_values(f"region {self.name!r}", self.shape, dtype)
         object.__setattr__(self, "dtype", dtype)
         object.__setattr__(self, "shape", shape)
-        if set(self.coords) != set(AXES):
-            raise InputError(f"region {self.name!r}: coordinates of {sorted(self.coords)}; exactly those of t, z, y and x are needed")
-        for axis, length in zip(AXES, shape, strict=True):
-            values = self.coords[axis].values
-            if values.shape != (length,) or values.dtype != np.float64:
-                raise InputError(
-                    f"region {self.name!r}: the coordinate of {axis} is {values.dtype} {values.shape}; float64 ({length},) is needed"
-                )
+        check_coords(f"region {self.name!r}", self.coords, shape)

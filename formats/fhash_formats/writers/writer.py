@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.slabs import slab_shape
 from fhash_formats.writers.region import Region
 
 Frame = npt.NDArray[Any]
@@ -70,11 +71,5 @@ def chunk_shape(region: Region) -> tuple[int, int, int, int]:
 
     One step is read with one access, and no reader has to hold a huge chunk for a small region.
     """
-    chunk = [1, *region.shape[1:]]
-    for axis in (1, 2, 3):
-        rest = region.dtype.itemsize * int(np.prod(chunk)) // chunk[axis]
-        allowed = max(1, CHUNK_BYTES // rest)
-        parts = -(-chunk[axis] // allowed)
-        chunk[axis] = -(-chunk[axis] // parts)
-    t, z, y, x = chunk
-    return t, z, y, x
+    z, y, x = slab_shape(region.shape[1:], region.dtype.itemsize, CHUNK_BYTES)
+    return 1, z, y, x

@@ -13,7 +13,6 @@ import zarr
 
 from fhash_formats.container import Container, ContainerWriter, is_container
 from fhash_formats.container.array import DTYPES
-from fhash_formats.container.writer import usual_chunk_shape
 from fhash_formats.errors import RegionError
 
 
@@ -209,20 +208,6 @@ def test_verify_reports_every_member(sample, samples):
         container.verify(lambda done, total: seen.append((done, total)))
     assert seen[-1][0] == seen[-1][1] == len(samples.unpack(sample.read_bytes()))
     assert [done for done, _ in seen] == list(range(seen[0][0], seen[-1][0] + 1))
-
-
-@pytest.mark.parametrize(
-    ("shape", "itemsize", "chunk"),
-    [
-        ((10,), 8, (10,)),
-        ((4, 100, 100, 100), 2, (1, 100, 100, 100)),
-        ((4, 100, 100, 100), 4, (1, 52, 100, 100)),
-        ((1, 1, 2048, 1024), 4, (1, 1, 512, 1024)),
-        ((3, 2**30), 1, (1, 2**21)),
-    ],
-)
-def test_usual_chunks_are_slabs_of_up_to_2_mib(shape, itemsize, chunk):
-    assert usual_chunk_shape(shape, itemsize) == chunk
 
 
 def test_is_container(sample, tmp_path):

@@ -1,4 +1,4 @@
-"""Attributes of files as JSON values."""
+"""Attributes of variables and coordinates as JSON values, and which of them must not go from one file to another."""
 
 from __future__ import annotations
 
@@ -13,9 +13,14 @@ _Netcdf4Dimid _Netcdf4Coordinates _NCProperties _nc3_strict"""
 PLUMBING = frozenset(STORAGE_NAMES.split())
 """Attributes by which HDF5, NetCDF and zarr tie datasets together; they say nothing of the values."""
 
-PACKING_NAMES = "_FillValue missing_value scale_factor add_offset _Unsigned valid_min valid_max valid_range"
+PACKING_NAMES = "_FillValue missing_value scale_factor add_offset _Unsigned _Encoding dtype valid_min valid_max valid_range"
 PACKING = frozenset(PACKING_NAMES.split())
-"""Attributes that describe stored numbers and are untrue of unpacked ones; a valid range would also hide values that a codec moves."""
+"""Attributes that describe stored numbers and are untrue of unpacked ones: whoever undid a packing would undo it twice.
+A valid range, in packed units or wrong, would hide good values from readers that obey it."""
+
+REFERENCE_NAMES = "coordinates grid_mapping bounds climatology cell_measures ancillary_variables formula_terms compress geometry"
+REFERENCES = frozenset(REFERENCE_NAMES.split())
+"""Attributes that name other variables of the same file."""
 
 
 class _Unknown(Exception):
@@ -23,7 +28,7 @@ class _Unknown(Exception):
 
 
 def json_attributes(attributes: Mapping[str, Any], *, without: frozenset[str] = PLUMBING) -> dict[str, Any]:
-    """The attributes as JSON values: numbers, text, lists. Bytes are UTF-8; not-a-number and infinities become text, as in zarr metadata.
+    """The attributes as JSON values: numbers, text, lists. Bytes are UTF-8; not-a-number and infinities become text, as in zarr.
 
     References, compound values and whatever else JSON cannot say are dropped, and so are the names in `without`.
     """
@@ -37,11 +42,19 @@ def json_attributes(attributes: Mapping[str, Any], *, without: frozenset[str] = 
     return result
 
 
+def text_of(value: Any) -> str:
+    """An attribute as text; bytes are UTF-8, and what is none in them becomes U+FFFD."""
+    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)
+
+
 def _json_value(value: Any) -> Any:
-    if value is None or isinstance(value, str | bool | int):
-        return str(value) if isinstance(value, np.str_) else value
+    if isinstance(value, str):
+        # h5py gives bytes that are no UTF-8 as lone surrogates, which neither JSON nor any file can hold
+        return value.encode("utf-8", errors="replace").decode("utf-8")
+    if value is None or isinstance(value, bool | int):
+        return value
     if isinstance(value, bytes):
-        return value.decode("utf-8", errors="replace")
+        return text_of(value)
     if isinstance(value, float):
         # float() strips numpy's float64, which is a float too
         return float(value) if math.isfinite(value) else {math.inf: "Infinity", -math.inf: "-Infinity"}.get(value, "NaN")

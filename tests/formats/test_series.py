@@ -1,0 +1,62 @@
+"""Series in memory and selections of steps: the contract that every reader keeps too."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_formats.errors import InputError, RegionError
+from fhash_formats.series import ArraySeries, Coordinate, StepsSeries
+
+VALUES = np.random.default_rng(0).normal(size=(4, 2, 3, 5)).astype(np.float32)
+
+
+@pytest.mark.parametrize("step", [-1, 4])
+def test_no_step_counts_from_the_end(step: int) -> None:
+    whole = ArraySeries(VALUES)
+    for series in (whole, StepsSeries(whole, [3, 2, 1, 0])):
+        with pytest.raises(RegionError, match=rf"array: step {step} is outside 0\.\.3"):
+            series.read(step)
+    with pytest.raises(RegionError, match=rf"step {step} is outside"):
+        StepsSeries(whole, [0, step])
+
+
+def test_some_steps() -> None:
+    some = StepsSeries(ArraySeries(VALUES), [2, 0])
+    np.testing.assert_array_equal(np.stack(list(some.frames())), VALUES[[2, 0]])
+    np.testing.assert_array_equal(some.coords["t"].values, [2, 0])
+    with pytest.raises(InputError, match="empty"):
+        StepsSeries(ArraySeries(VALUES), [])
+
+
+def test_three_axes_are_one_step() -> None:
+    series = ArraySeries(VALUES[0].astype(">f8"))
+    assert (series.shape, series.dtype) == ((1, 2, 3, 5), np.dtype(np.float64))
+    np.testing.assert_array_equal(series.read(0), VALUES[0])
+
+
+def test_masked_values_are_nan_and_never_what_is_under_the_mask() -> None:
+    masked = np.ma.masked_greater(VALUES, 0)
+    np.testing.assert_array_equal(np.stack(list(ArraySeries(masked).frames())), np.where(VALUES > 0, np.nan, VALUES))
+    whole = (VALUES * 9).astype(np.int16)
+    np.testing.assert_array_equal(ArraySeries(np.ma.asarray(whole)).read(1), whole[1])
+    with pytest.raises(InputError, match="masked values of type int16, which has no NaN"):
+        ArraySeries(np.ma.masked_greater(whole, 0))
+
+
+@pytest.mark.parametrize(
+    ("array", "coords", "message"),
+    [
+        (VALUES[0, 0], {}, "2 dimensions"),
+        (VALUES > 0, {}, "type bool"),
+        (VALUES[:0], {}, "an axis is empty"),
+        (VALUES, {"t": Coordinate(name="t", values=np.zeros(3))}, r"coordinate of t is float64 \(3,\); float64 \(4,\)"),
+        (VALUES, {"x": Coordinate(name="x", values=np.zeros(5, np.float32))}, "coordinate of x is float32"),
+        (VALUES, {"w": Coordinate(name="w", values=np.zeros(5))}, "exactly those of t, z, y and x"),
+    ],
+)
+def test_what_cannot_be_a_series(array: Any, coords: dict[str, Coordinate], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        ArraySeries(array, coords=coords)
