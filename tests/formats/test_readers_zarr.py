@@ -263,6 +263,16 @@ def test_unsigned_values_stored_as_signed(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames(tmp_path / "a.zarr")[0], np.where(values == 255, np.nan, values.astype("f4")))
 
 
+def test_a_packed_coordinate_is_unpacked_and_says_no_more_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.zarr"
+    create(path, VALUES, name="v", dimension_names=DIMS)
+    packed = {"scale_factor": 0.5, "add_offset": 1.0, "_FillValue": -9, "units": "m"}
+    create(path, np.array([0, 2, 4], np.int16), name="z", dimension_names=["z"], attributes=packed)
+    with open_series(path) as series:
+        np.testing.assert_array_equal(series.coords["z"].values, [1, 2, 3])
+        assert series.coords["z"].attributes == {"units": "m"}
+
+
 def test_bad_packing_attributes_are_refused(tmp_path: Path) -> None:
     create(tmp_path / "a.zarr", VALUES, attributes={"scale_factor": "two"})
     with pytest.raises(InputError, match="scale_factor is 'two', not a number"):

@@ -21,6 +21,7 @@ FORMAT = "fhash"
 FORMAT_VERSION = (1, 0)
 KNOWN_FEATURES: frozenset[str] = frozenset()
 KNOWN_PROFILES = ("paper",)
+QUALITY = ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain", "rmse_domain", "max_abs_error_domain")
 TABLE_TYPES = ("float32", "float16", "uint8")
 MAX_LEVELS = 64
 MAX_EMBEDDING = 1024
@@ -37,7 +38,7 @@ def validate_header(header: Mapping[str, Any]) -> None:
     _check_format(top)
     encoder, variable = top.record("encoder"), top.record("variable")
     encoder.text("version")
-    encoder.whole("seed", -(2**63), 2**64)
+    encoder.whole("seed", -(2**63), 2**64 - 1)
     variable.text("name")
     variable.text("units")
     variable.choice("dtype", tuple(DTYPES))
@@ -49,9 +50,16 @@ def validate_header(header: Mapping[str, Any]) -> None:
     box = _box(top, shape)
     top.texts("features")
     top.whole("dilation", 0, MAX_LENGTH)
-    _check_model(top.record("model"), box)
+    top.need(0 <= top.number("coreset_fraction") <= 1, "coreset_fraction", "a number from 0 to 1")
+    _check_model(top.record("model"), shape[0], box)
     top.record("config")
-    top.record("quality")
+    training, quality = top.record("training"), top.record("quality")
+    training.get("seconds")
+    training.number_or_null("seconds")
+    training.whole("epochs", 0, MAX_LENGTH)
+    training.text("device")
+    for key in QUALITY:
+        quality.number_or_null(key)
     for entry in top.records("history"):
         for key in ("seconds", "epoch", "psnr"):
             entry.number_or_null(key)
@@ -63,16 +71,15 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
         if name not in arrays:
             raise DamagedFileError(f"array {name} is missing")
         _check_array(name, arrays[name], shape, dtypes)
+        attributes = Record(arrays[name].attributes, f"array {name} attribute ")
+        if name.startswith("coords/") and "name" in arrays[name].attributes:
+            attributes.text("name")
+        if name.startswith("tables/") and arrays[name].dtype == np.uint8:
+            attributes.number("offset")
+            attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
     if "missing/bits" in arrays:
         steps, *frame = header["domain"]["shape"]
         _check_array("missing/bits", arrays["missing/bits"], (steps, -(-prod(frame) // 8)), ("uint8",))
-    for name, array in arrays.items():
-        if name.startswith("coords/") and "name" in array.attributes:
-            Record(array.attributes, f"array {name} attribute ").text("name")
-        if name.startswith("tables/") and array.dtype == np.uint8:
-            attributes = Record(array.attributes, f"array {name} attribute ")
-            attributes.number("offset")
-            attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
 
 
 def check_key_frames(header: Mapping[str, Any], key_frames: npt.NDArray[np.int64]) -> None:
@@ -115,7 +122,7 @@ def _box(top: Record, shape: Sequence[int]) -> list[int]:
     return [high - low for low, high in bounds]
 
 
-def _check_model(model: Record, box: Sequence[int]) -> None:
+def _check_model(model: Record, steps: int, box: Sequence[int]) -> None:
     profile = model.text("profile")
     if profile not in KNOWN_PROFILES:
         known = ", ".join(KNOWN_PROFILES)
@@ -124,6 +131,7 @@ def _check_model(model: Record, box: Sequence[int]) -> None:
     model.whole("embedding_size", 1, MAX_EMBEDDING)
     model.whole("hidden_layers", 0, MAX_HIDDEN_LAYERS)
     model.whole("width", 1, MAX_WIDTH)
+    model.whole("parameters", 1, 1 << 62)
     model.choice("tables", TABLE_TYPES)
     levels = model.get("levels")
     model.need(isinstance(levels, list) and 1 <= len(levels) <= MAX_LEVELS, "levels", f"1 to {MAX_LEVELS} of [t, z, y, x]")
@@ -134,6 +142,7 @@ def _check_model(model: Record, box: Sequence[int]) -> None:
         model.need(fits, "levels", "[t, z, y, x] from finest to coarsest, none longer than the one before")
         finer = level
     model.need(levels[0][1:] == list(box), "levels", f"the box {list(box)} at the finest level")
+    model.need(levels[0][0] <= steps, "levels", f"at most the {steps} steps of the domain as key frames")
 
 
 def _expected(header: Mapping[str, Any]) -> Iterator[Expected]:

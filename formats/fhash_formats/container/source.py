@@ -42,11 +42,11 @@ class FileSource:
         """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
         if offset < 0 or size < 0 or offset + size > self.size:
             raise DamagedFileError(f"{size} bytes at offset {offset} are outside the file of {self.size} bytes")
-        if self._file.closed:
-            raise InputError("the container is closed")
         parts = []
         # A lock and not os.pread, which Windows lacks; decoding, the greater part of the time, is outside of it.
         with self._lock:
+            if self._file.closed:
+                raise InputError("the container is closed")
             self._file.seek(offset)
             while size > 0:
                 part = self._file.read(size)
@@ -58,8 +58,9 @@ class FileSource:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def close(self) -> None:
-        """Release the file."""
-        self._file.close()
+        """Release the file, once no other thread reads it."""
+        with self._lock:
+            self._file.close()
 
 
 class PreviewSource:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -176,12 +176,9 @@ def _columns(source: str, arrays: Mapping[str, zarr.Array[Any]], group: str) -> 
         place, _, name = path.rpartition("/")
         if path and place == group and array.ndim < 2 and usable(array.dtype):
             along = dimension_names(array)[0] if array.ndim else None
-            found[name] = Column(name=path, length=array.size, along=along, read=_reader(source, array), attributes=dict(array.attrs))
+            attributes = json_attributes(dict(array.attrs), without=PLUMBING | PACKING)
+            found[name] = Column(name=path, length=array.size, along=along, read=_Values(source, array).whole, attributes=attributes)
     return found
-
-
-def _reader(source: str, array: zarr.Array[Any]) -> Callable[[], npt.NDArray[Any]]:
-    return lambda: _Values(source, array).read(())
 
 
 class _Values:
@@ -198,3 +195,7 @@ class _Values:
         """The values in some ranges of the array's dimensions."""
         stored = np.asarray(self.array[ranges])
         return self.packing.unpack(stored) if self.packing else stored
+
+    def whole(self) -> npt.NDArray[Any]:
+        """All values."""
+        return self.read(())

@@ -84,8 +84,20 @@ BAD = [
     ("model.levels", [[2, 3, 4, 6], [2, 0, 2, 2]]),
     ("model.levels", [[2, 3, 5, 6], [2, 2, 2, 3]]),
     ("model.levels", {"a": 1}),
+    ("model.levels", [[5, 3, 4, 6], [2, 2, 2, 3]]),
+    ("model.parameters", ...),
+    ("model.parameters", 1.5),
+    ("coreset_fraction", ...),
+    ("coreset_fraction", 1.5),
+    ("coreset_fraction", None),
+    ("training", ...),
+    ("training.seconds", ...),
+    ("training.seconds", "1"),
+    ("training.epochs", None),
+    ("training.device", 0),
     ("config", None),
     ("quality", ...),
+    ("quality.psnr", "48"),
     ("history", {}),
     ("history", [1]),
     ("history", [{"seconds": "1"}]),
@@ -111,6 +123,9 @@ def test_wrong_key_is_named(samples, path, value):
         ("background", -3),
         ("encoder.seed", 2**63 - 1),
         ("features", []),
+        ("quality", {}),
+        ("quality.psnr", None),
+        ("training.seconds", 0.5),
         ("history", []),
         ("history", [{"epoch": 1}, {"seconds": None, "epoch": 2, "psnr": 1}]),
         ("variable.units", ""),
@@ -179,6 +194,18 @@ def test_quantised_tables_need_offset_and_scale(tmp_path, samples, attributes):
             writer.add_whole(name, array, attributes=attributes)
         with pytest.raises(InputError, match=r"array tables/level_1 attribute (offset|scale)"):
             writer.commit(header)
+
+
+def test_arrays_of_other_names_are_ignored(tmp_path, samples):
+    header = samples.header()
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        for name, array in samples.arrays(header).items():
+            writer.add_whole(name, array)
+        writer.add_whole("tables/novelty", np.zeros(3, dtype=np.uint8))
+        writer.add_whole("coords/novelty", np.zeros(3), attributes={"name": 5})
+        writer.commit(header)
+    with Container.open(tmp_path / "a.fhz") as container:
+        assert container.verify() == len(container.arrays)
 
 
 def test_name_of_a_coordinate_is_text(tmp_path, samples):
