@@ -6,7 +6,6 @@ import itertools
 import os
 import subprocess
 import sys
-import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -299,20 +298,6 @@ def test_a_virtual_dataset_without_its_source_is_refused(tmp_path: Path) -> None
     (tmp_path / "part.h5").unlink()
     with pytest.raises(InputError, match=r"draws on part.h5, which is not there"):
         open_series(tmp_path / "a.h5")
-
-
-def test_one_frame_is_read_at_a_time(tmp_path: Path) -> None:
-    values = np.zeros((40, 16, 32, 32), np.float32)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("v", data=values, chunks=(1, 16, 32, 32))
-    with open_series(tmp_path / "a.h5") as series:
-        series.read(0)
-        tracemalloc.start()
-        for step in (3, 30):
-            series.read(step)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    assert peak < 3 * values[0].nbytes
 
 
 def test_a_chunk_of_many_steps_is_decompressed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -302,25 +301,3 @@ def test_a_missing_filter_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
     with pytest.raises(MissingDependencyError, match=r"v is compressed with the HDF5 filter .*fhash\[formats\]"):
         open_series(path)
-
-
-def test_one_frame_is_read_at_a_time(tmp_path: Path) -> None:
-    values = np.zeros((40, 16, 32, 32), np.float32)
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, values)}), encoding={"v": {"chunksizes": (1, 16, 32, 32)}})
-    with open_series(path) as series:
-        series.read(0)
-        tracemalloc.start()
-        for step in (3, 30):
-            series.read(step)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    assert peak < 4 * values[0].nbytes
-
-
-def test_a_chunk_of_many_steps_is_kept(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}), encoding={"v": {"chunksizes": (3, 3, 5, 6), "zlib": True}})
-    with open_series(path) as series:
-        series.read(1)
-        assert series._slab is not None
-        assert series._slab[1].shape[0] == 3
-    np.testing.assert_array_equal(frames(path), VALUES)

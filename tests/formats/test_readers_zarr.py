@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import tracemalloc
 import warnings
 import zipfile
 from pathlib import Path
@@ -282,6 +281,16 @@ def test_bad_packing_attributes_are_refused(tmp_path: Path) -> None:
         open_series(tmp_path / "b.zarr")
 
 
+def test_the_folder_of_an_array_by_a_dot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    create(tmp_path / "a.zarr", VALUES, name="v", dimension_names=DIMS)
+    create(tmp_path / "a.zarr", np.arange(4.0) * 5, name="time", dimension_names=["time"])
+    monkeypatch.chdir(tmp_path / "a.zarr" / "v")
+    for path in (".", "../v"):
+        with open_series(path) as series:
+            assert series.name == "v"
+            np.testing.assert_array_equal(series.coords["t"].values, [0, 5, 10, 15])
+
+
 def test_a_damaged_chunk_names_the_step(tmp_path: Path) -> None:
     create(tmp_path / "a.zarr", VALUES, chunks=(1, 3, 5, 6))
     (tmp_path / "a.zarr" / "c" / "2" / "0" / "0" / "0").write_bytes(b"nonsense")
@@ -315,24 +324,3 @@ def test_stale_consolidated_metadata_is_not_believed(tmp_path: Path) -> None:
     got = frames(path)
     assert got.shape == (5, 3, 5, 6)
     assert (got[4] == 7).all()
-
-
-def test_one_frame_is_read_at_a_time(tmp_path: Path) -> None:
-    create(tmp_path / "a.zarr", np.ones((40, 16, 32, 32), np.float32), chunks=(1, 16, 32, 32))
-    with open_series(tmp_path / "a.zarr") as series:
-        series.read(0)
-        tracemalloc.start()
-        for step in (3, 30):
-            series.read(step)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    assert peak < 5 * 16 * 32 * 32 * 4
-
-
-def test_a_chunk_of_many_steps_is_kept(tmp_path: Path) -> None:
-    create(tmp_path / "a.zarr", VALUES, chunks=(3, 3, 5, 6))
-    with open_series(tmp_path / "a.zarr") as series:
-        series.read(1)
-        assert series._slab is not None
-        assert series._slab[1].shape[0] == 3
-    np.testing.assert_array_equal(frames(tmp_path / "a.zarr"), VALUES)

@@ -20,7 +20,7 @@ DTYPES = {
 }
 MAX_CHUNK_BYTES = 1 << 30
 MAX_DIMENSIONS = 8
-MAX_LENGTH = 1 << 62
+MAX_AXIS = 1 << 62
 
 _INDEX = re.compile(r"0|[1-9][0-9]{0,18}")
 _KEYS = {"zarr_format", "node_type", "shape", "data_type", "chunk_grid", "chunk_key_encoding", "fill_value", "codecs"}
@@ -150,8 +150,8 @@ def attributes_of(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _lengths(value: object, key: str) -> tuple[int, ...]:
-    if not isinstance(value, list) or not all(type(n) is int and 1 <= n <= MAX_LENGTH for n in value):
-        raise DamagedFileError(f"{key} is {_shown(value)}; a list of whole numbers from 1 to {MAX_LENGTH} is needed")
+    if not isinstance(value, list) or not all(type(n) is int and 1 <= n <= MAX_AXIS for n in value):
+        raise DamagedFileError(f"{key} is {_shown(value)}; a list of whole numbers from 1 to {MAX_AXIS} is needed")
     return tuple(value)
 
 

@@ -63,10 +63,11 @@ def open_zarr(path: Path, request: Request) -> FileSeries:
             arrays, failed = _open_arrays(store, inside, nodes)
             if "" in failed:
                 raise InputError(f"{source} cannot be read as zarr: {failed['']}")
-            if "" in arrays and path.is_dir() and request.var is None and _metadata(path.parent) is not None:
+            place = path if path.name.strip(".") else path.resolve()  # "." and ".." have a name and a folder around them too
+            if "" in arrays and path.is_dir() and request.var is None and _metadata(place.parent) is not None:
                 # an array of a group, named by its folder: its coordinates are beside it
                 store.close()
-                return open_zarr(path.parent, replace(request, var=path.name))
+                return open_zarr(place.parent, replace(request, var=place.name))
             return _series(path, store, arrays, failed, request)
     except BaseException:
         store.close()

@@ -18,9 +18,14 @@ DROPPED = PACKING | PLUMBING | REFERENCES | {""}
 ATTRIBUTE_BYTES = 32 * 2**10
 
 
+def printable(text: str, instead: str = "_") -> str:
+    """The text on one line, with `instead` for each control character."""
+    return "".join(char if char.isprintable() else instead for char in text)
+
+
 def safe_name(name: str) -> str:
     """A name that HDF5, NetCDF and Zarr take as one name: no slash, no control character, not only dots, no leading "__"."""
-    safe = "".join("_" if char in "/\\" or not char.isprintable() else char for char in name).strip()
+    safe = printable(name).replace("/", "_").replace("\\", "_").strip()
     if safe.startswith("__"):
         safe = "_" + safe.lstrip("_")
     return safe if safe.strip("._") else "values"

@@ -21,6 +21,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.readers.raw import layout_of_name
 from fhash_formats.readers.request import ENDIANS, parse_dtype
 from fhash_formats.series import AXES
+from fhash_formats.writers.labels import printable
 from fhash_formats.writers.region import Region
 from fhash_formats.writers.spacing import even_spacing
 from fhash_formats.writers.writer import Frame, Put, Writer, little_endian, write_frame
@@ -29,31 +30,22 @@ NRRD_TYPES = {"float32": "float", "float64": "double"}  # the integers are calle
 
 
 def _outputs(path: Path, region: Region) -> list[Path]:
-    named = _named_dtype(path)
     _, layout = layout_of_name(path.stem)
-    if named is None or layout.shape is None:
+    if layout.shape is None or layout.dtype is None:
         if not path.name.isprintable():
             raise InputError(f"{path}: the file name holds control characters, which a .nhdr header cannot name; use another name")
         return [path, path.with_suffix(".nhdr")]
-    if tuple(layout.shape.get(axis, 1) for axis in AXES) != region.shape or named.name != region.dtype.name:
+    if tuple(layout.shape.get(axis, 1) for axis in AXES) != region.shape or parse_dtype(layout.dtype) != region.dtype:
         t, z, y, x = region.shape
         true = f"*_{x}x{y}x{z}x{t}_{region.dtype.name}.raw"
         raise InputError(f"{path}: the name says another layout than the values have; use {true} or a name that says none")
     return [path]
 
 
-def _named_dtype(path: Path) -> np.dtype[Any] | None:
-    """The type of the values in the byte order that the name says, little-endian where it says none; None for a name without a layout."""
-    _, layout = layout_of_name(path.stem)
-    if layout.dtype is None:
-        return None
-    return parse_dtype(layout.dtype).newbyteorder(ENDIANS[layout.endian or "little"])
-
-
 @contextmanager
 def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
-    named = _named_dtype(outputs[0])
-    dtype = little_endian(region.dtype) if named is None else named
+    _, layout = layout_of_name(outputs[0].stem)
+    dtype = little_endian(region.dtype) if layout.dtype is None else region.dtype.newbyteorder(ENDIANS[layout.endian or "little"])
     with temporaries[0].open("xb") as handle:
 
         def put(step: int, frame: Frame) -> None:
@@ -73,7 +65,7 @@ def _header(region: Region, dtype: np.dtype[Any], data_file: str) -> str:
     sizes = dict(zip(AXES, region.shape, strict=True))
     lines = [
         "NRRD0005",
-        f"content: {_line(region.name)}",
+        f"content: {printable(region.name, ' ')}",
         f"type: {NRRD_TYPES.get(dtype.name, dtype.name)}",
         f"dimension: {len(axes)}",
         f"sizes: {' '.join(str(sizes[axis]) for axis in axes)}",
@@ -81,14 +73,14 @@ def _header(region: Region, dtype: np.dtype[Any], data_file: str) -> str:
         *_space(region, axes),
         "endian: little",
         "encoding: raw",
-        *([f"sample units: {_line(region.units)}"] if region.units else []),
+        *([f"sample units: {printable(region.units, ' ')}"] if region.units else []),
         f"data file: {data_file}",
     ]
     for axis in AXES:
         coordinate = region.coords[axis]
-        lines.append(f"name_{axis}:={_line(coordinate.name)}")
+        lines.append(f"name_{axis}:={printable(coordinate.name, ' ')}")
         if "units" in coordinate.attributes:
-            lines.append(f"units_{axis}:={_line(str(coordinate.attributes['units']))}")
+            lines.append(f"units_{axis}:={printable(str(coordinate.attributes['units']), ' ')}")
         lines.append(f"coordinates_{axis}:={' '.join(map(repr, coordinate.values.tolist()))}")
     return "\n".join(lines) + "\n\n"
 
@@ -105,10 +97,6 @@ def _space(region: Region, axes: str) -> list[str]:
         f"space directions: {' '.join(directions + ['none'] * (len(axes) - 3))}",
         f"space origin: ({origin})",
     ]
-
-
-def _line(text: str) -> str:
-    return "".join(char if char.isprintable() else " " for char in text)
 
 
 RAW = Writer(name="raw", suffixes=(".raw",), outputs=_outputs, open=_open)

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.writers.labels import printable
 from fhash_formats.writers.region import Region
 from fhash_formats.writers.spacing import even_spacing
 from fhash_formats.writers.writer import Frame, Put, Writer, little_endian, write_frame
@@ -86,10 +87,9 @@ def _write_grid(path: Path, region: Region, time: float, coords: dict[str, npt.N
         origin = " ".join(repr(float(coords[axis][0])) for axis in "xyz")
         spacing = " ".join(repr(even_spacing(coords[axis])) for axis in "xyz")
         kind, place = "ImageData", f' Origin="{origin}" Spacing="{spacing}"'
-    name = quoteattr(_text(region.name))
-    units = (
-        f'<InformationKey name="UNITS_LABEL" location="vtkDataArray">{escape(_text(region.units))}</InformationKey>' if region.units else ""
-    )
+    name = quoteattr(printable(region.name))
+    key = '<InformationKey name="UNITS_LABEL" location="vtkDataArray">'
+    units = f"{key}{escape(printable(region.units))}</InformationKey>" if region.units else ""
     sizes = [frame.size * dtype.itemsize] if image else [frame.size * dtype.itemsize, *(coords[axis].nbytes for axis in "xyz")]
     offsets = [sum(sizes[:i]) + 8 * i for i in range(len(sizes))]  # each array follows its 64-bit size
     grid = (
@@ -137,11 +137,6 @@ def _collection(region: Region, files: Sequence[Path]) -> str:
     ]
     head = '<?xml version="1.0" encoding="UTF-8"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n<Collection>\n'
     return head + "".join(rows) + "</Collection>\n</VTKFile>\n"
-
-
-def _text(text: str) -> str:
-    """Without the control characters that XML cannot hold."""
-    return "".join(char if char.isprintable() else "_" for char in text)
 
 
 VTK = Writer(name="VTK", suffixes=(".vti", ".vtr", ".pvd"), outputs=_outputs, open=_open)
