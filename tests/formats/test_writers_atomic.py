@@ -118,6 +118,21 @@ def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path, monkeypatch: pyte
     assert tree(tmp_path) == {"out.npy": b"somebody else's"}
 
 
+@pytest.mark.parametrize("directory", [True, False])
+def test_a_folder_that_appears_meanwhile_is_kept_even_with_force(tmp_path: Path, directory: bool) -> None:
+    path = tmp_path / "out.zarr"
+
+    def save() -> None:
+        with replacing(path, force=True, directory=directory) as temporary:
+            store(temporary) if directory else temporary.write_text("new")
+            path.mkdir()
+            (path / "notes.txt").write_text("somebody else's")
+
+    with pytest.raises(OutputError, match="is a directory"):
+        save()
+    assert tree(tmp_path) == {"out.zarr": None, "out.zarr/notes.txt": b"somebody else's"}
+
+
 @pytest.mark.parametrize("links", [True, False])
 def test_of_several_outputs_all_or_none_take_their_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
     if not links:

@@ -84,7 +84,7 @@ def replacing_all(paths: Sequence[Path], *, force: bool, directory: bool = False
             _sync(output.temporary)
         with signals_held():  # Ctrl-C comes before the first takes its name, or after the last, when all can be undone
             for output in outputs:
-                output.place(force)
+                output.place(force, directory)
         for folder in {output.target.parent for output in outputs}:
             _sync_folder(folder)
     except BaseException as error:
@@ -129,9 +129,11 @@ class _Output:
         self.old = self.target.with_name(f"{stem}.old")
         self.placed = False
 
-    def place(self, force: bool) -> None:
+    def place(self, force: bool, directory: bool) -> None:
         """Give the temporary its own name; an older output stays under another until `forget_old` or `undo`."""
         if force:
+            # Once more, because hours may have passed: a folder that appeared meanwhile is not ours to delete.
+            check_output(self.path, force, directory=directory)
             if os.path.lexists(self.target):
                 self._keep_old()
             os.replace(self.temporary, self.target)
