@@ -19,25 +19,26 @@ class Parameters:
     """The trained numbers of a model.
 
     fine: embeddings of the finest level (bricks, E, vertices of a brick), only for bricks that hold coreset vertices.
-    flat: coarse tables level by level, each (buckets, E), then each layer as a matrix (out, in + 1) whose last column is the bias,
-        all in one vector.
+    coarse: the coarser tables level by level, each (buckets, E), in one vector.
+    network: each layer as a matrix (out, in + 1) whose last column is the bias, in one vector.
     """
 
     fine: Tensor
-    flat: Tensor
+    coarse: Tensor
+    network: Tensor
 
     def dense(self, architecture: Architecture) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
-        """The coarse tables (buckets, E) and the layers (weight (out, in), bias (out,)), views into `flat`."""
-        tables, layers = split(architecture, self.flat)
-        return [table.view(-1, architecture.embedding_size) for table in tables], [(layer[:, :-1], layer[:, -1]) for layer in layers]
+        """The coarse tables (buckets, E) and the layers (weight (out, in), bias (out,)), as views."""
+        size = architecture.embedding_size
+        tables = torch.split(self.coarse, [prod(level) * size for level in architecture.levels[1:]]) if len(self.coarse) else ()
+        layers = layer_matrices(architecture, self.network)
+        return [table.view(-1, size) for table in tables], [(layer[:, :-1], layer[:, -1]) for layer in layers]
 
 
-def split(architecture: Architecture, flat: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-    """Views of the coarse tables (flat, level by level) and of the layers (out, in + 1) inside one vector."""
-    tables = [prod(level) * architecture.embedding_size for level in architecture.levels[1:]]
+def layer_matrices(architecture: Architecture, network: Tensor) -> list[Tensor]:
+    """Views of the layers (out, in + 1) inside one vector."""
     shapes = [(outputs, inputs + 1) for outputs, inputs in architecture.layer_shapes]
-    parts = list(torch.split(flat, [*tables, *(prod(shape) for shape in shapes)]))
-    return parts[: len(tables)], [part.view(shape) for part, shape in zip(parts[len(tables) :], shapes, strict=True)]
+    return [part.view(shape) for part, shape in zip(torch.split(network, [prod(shape) for shape in shapes]), shapes, strict=True)]
 
 
 def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) -> Parameters:
@@ -46,8 +47,9 @@ def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) 
     fine = torch.empty(len(coreset.bricks), architecture.embedding_size, prod(coreset.brick_shape))
     fine.uniform_(-SPREAD, SPREAD, generator=random)
     coarse = sum(prod(level) for level in architecture.levels[1:]) * architecture.embedding_size
-    parts = [torch.empty(coarse).uniform_(-SPREAD, SPREAD, generator=random)]
+    tables = torch.empty(coarse).uniform_(-SPREAD, SPREAD, generator=random)
+    parts = []
     for outputs, inputs in architecture.layer_shapes:
         bound = inputs**-0.5
         parts.append(torch.empty(outputs * (inputs + 1)).uniform_(-bound, bound, generator=random))
-    return Parameters(fine=fine, flat=torch.cat(parts))
+    return Parameters(fine=fine, coarse=tables, network=torch.cat(parts))

@@ -71,10 +71,11 @@ class NaiveEngine:
         """The trained numbers, on the CPU, float32; embeddings outside the coreset are 0."""
         finest = self.model.tables[0].detach().cpu()[self.buckets].transpose(1, 2)
         finest = finest * torch.from_numpy(self.mask).unsqueeze(1)
-        rest = [table.detach().flatten() for table in list(self.model.tables)[1:]]
-        for weight, bias in zip(self.model.weights, self.model.biases, strict=True):
-            rest.append(torch.column_stack([weight.detach(), bias.detach()]).flatten())
-        return Parameters(fine=finest.float().contiguous(), flat=torch.cat([part.cpu() for part in rest]).float())
+        coarse = [table.detach().flatten() for table in list(self.model.tables)[1:]]
+        layers = zip(self.model.weights, self.model.biases, strict=True)
+        network = [torch.column_stack([weight.detach(), bias.detach()]).flatten() for weight, bias in layers]
+        joined = [torch.cat([*parts, finest.new_empty(0, device=self.device)]).cpu().float() for parts in (coarse, network)]
+        return Parameters(fine=finest.float().contiguous(), coarse=joined[0], network=joined[1])
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Everything that the next step depends on, as arrays."""

@@ -21,7 +21,7 @@ from torch import Tensor
 from fhash_codec.architecture import Architecture
 from fhash_codec.coreset import Coreset
 from fhash_codec.engines.adam import BETA1, BETA2, EPSILON, catch_up
-from fhash_codec.engines.initial import Parameters, initial_parameters, split
+from fhash_codec.engines.initial import Parameters, initial_parameters, layer_matrices
 from fhash_codec.engines.upsampling import Lattices, Upsampling
 
 CHUNK = 1 << 13  # columns of the MLP at a time: the hidden activations stay in a core's cache
@@ -51,11 +51,12 @@ class SlabEngine:
         self.fine_mean, self.fine_square = torch.zeros_like(self.fine), torch.zeros_like(self.fine)
         self.visited = torch.zeros(len(self.bricks), dtype=torch.int64, device=device)
         self.step = self.settled = 0
-        # Coarse tables and MLP in one flat vector: one fused Adam call, and each gradient is a view.
-        self.flat = start.flat.to(device)
+        # What is used of the coarse tables, and the MLP, in one flat vector: one fused Adam call, and each gradient is a view.
+        self.coarse = len(self.upsampling.used)
+        self.flat = torch.cat([start.coarse.to(device)[self.upsampling.used], start.network.to(device)])
         self.flat.grad = torch.zeros_like(self.flat)
-        _, self.layers = split(architecture, self.flat.detach())
-        _, self.layer_gradients = split(architecture, self.flat.grad)
+        self.layers = layer_matrices(architecture, self.flat.detach()[self.coarse :])
+        self.layer_gradients = layer_matrices(architecture, self.flat.grad[self.coarse :])
         self.adam = torch.optim.Adam([self.flat], betas=(BETA1, BETA2), eps=EPSILON, fused=True)
 
     @torch.no_grad()
@@ -113,13 +114,15 @@ class SlabEngine:
     def parameters(self) -> Parameters:
         """The trained numbers, on the CPU; embeddings that no sample ever moved are 0."""
         self.settle()
-        fine, flat = self.fine.clone(), self.flat.detach().clone()
+        fine, flat = self.fine.clone(), self.flat.detach()
         fine.masked_fill_(~self._mask(torch.arange(len(fine), device=self.device)).unsqueeze(1).bool(), 0.0)
+        coarse = torch.zeros(sum(prod(level) for level in self.architecture.levels[1:]) * self.architecture.embedding_size)
+        kept = flat[: self.coarse]
         if self.step > 0:
             adam = self.adam.state[self.flat]
-            moved = (adam["exp_avg"] != 0) | (adam["exp_avg_sq"] != 0)
-            flat[: self.upsampling.numbers] *= moved[: self.upsampling.numbers]
-        return Parameters(fine=fine.cpu(), flat=flat.cpu())
+            kept = kept * ((adam["exp_avg"] != 0) | (adam["exp_avg_sq"] != 0))[: self.coarse]
+        coarse[self.upsampling.used.cpu()] = kept.cpu()
+        return Parameters(fine=fine.cpu(), coarse=coarse, network=flat[self.coarse :].cpu().clone())
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Everything that the next step depends on, as arrays."""

@@ -17,21 +17,30 @@ from torch import Tensor
 from fhash_codec.architecture import Architecture
 from fhash_codec.coreset import Coreset
 
+BRICKS_AT_A_TIME = 1024
+
 
 class Upsampling:
-    """What all bricks of a coreset share; `numbers` is the length of the coarse tables, which lie level by level in a flat vector."""
+    """What all bricks of a coreset share.
+
+    Attributes:
+        used: positions, ascending, of the numbers of the coarse tables that some brick needs; the tables lie level by level in a flat
+            vector. Training holds only these: around a sparse feature most of the coarse tables is out of reach.
+    """
+
+    used: Tensor
 
     def __init__(self, architecture: Architecture, coreset: Coreset, device: torch.device) -> None:
         """Tables by brick coordinate: (key frame, z) together, y, and x."""
         lengths, counts = (1, *coreset.brick_shape), (architecture.key_frames, *coreset.brick_grid)
         self.size, self.layers = architecture.embedding_size, coreset.brick_grid[0]
-        self.numbers = 0
+        numbers = 0
         starts, matrices, offsets, self.shapes = [], [], [], []
         for level in architecture.levels[1:]:
             axes = [axis_matrices(s, r, n, c) for s, r, n, c in zip(architecture.sizes, level, lengths, counts, strict=True)]
             stride = [prod(level[axis + 1 :]) * self.size for axis in range(4)]
             (start_t, wt), (start_z, wz), (start_y, wy), (start_x, wx) = axes
-            start_tz = (start_t[:, None] * stride[0] + start_z * stride[1]).reshape(-1) + self.numbers
+            start_tz = (start_t[:, None] * stride[0] + start_z * stride[1]).reshape(-1) + numbers
             # (key frames, coordinates z, vertices z, corners t, corners z)
             wtz = wt[:, None, :, :, None] * wz[None, :, :, None, :]
             starts.append([start_tz, start_y * stride[2], start_x * stride[3]])
@@ -40,34 +49,52 @@ class Upsampling:
             corners = [np.arange(w.shape[2]) * s for (_, w), s in zip(axes, stride, strict=True)]
             t, z, y, e, x = np.ix_(*corners[:3], np.arange(self.size), corners[3])
             offsets.append((t + z + y + e + x).reshape(-1))
-            self.numbers += prod(level) * self.size
+            numbers += prod(level) * self.size
         join = [np.concatenate(parts, axis=1) if parts else np.zeros((1, 0)) for parts in zip(*matrices, strict=True)]
         self.starts = [torch.from_numpy(np.stack(parts, axis=1)).to(device) for parts in zip(*starts, strict=True)]
         self.matrices = [torch.from_numpy(part.astype(np.float32)).to(device) for part in join]
         self.counts = [len(offset) for offset in offsets]
         self.offset = torch.from_numpy(np.concatenate([*offsets, np.zeros(0, dtype=np.int64)])).to(device)
         self.level = torch.from_numpy(np.repeat(np.arange(len(offsets)), self.counts)).to(device)
+        reached = torch.zeros(numbers, dtype=torch.bool, device=device)
+        for part in torch.split(torch.from_numpy(coreset.bricks.astype(np.int64)).to(device), BRICKS_AT_A_TIME):
+            reached[self._positions(self._coordinates(part))] = True
+        self.used = reached.nonzero().squeeze(1)
+        self.rank = (reached.cumsum(0, dtype=torch.int32) - 1) if len(self.used) < numbers else None
+
+    def _coordinates(self, bricks: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        t, z, y, x = bricks.unbind(1)
+        return t * self.layers + z, y, x
+
+    def _positions(self, coordinates: tuple[Tensor, ...]) -> Tensor:
+        """Where the sub-lattices of bricks lie in the flat tables (bricks, numbers)."""
+        if not self.shapes:
+            return self.offset.expand(len(coordinates[0]), 0)
+        base = sum((start[c] for start, c in zip(self.starts, coordinates, strict=True)), torch.zeros((), dtype=torch.int64))
+        return base[:, self.level] + self.offset
 
     def lattices(self, bricks: Tensor) -> Lattices:
         """The sub-lattices and matrices of bricks (n, 4), coordinates (key frame, z, y, x) int64."""
+        coordinates = self._coordinates(bricks)
+        index = self._positions(coordinates)
+        if self.rank is not None:
+            index = self.rank[index].long()
         if not self.shapes:
-            return Lattices(index=self.offset.expand(len(bricks), 0), counts=[], matrices=[], size=self.size)
-        t, z, y, x = bricks.unbind(1)
-        coordinates = (t * self.layers + z, y, x)
-        base = sum((start[c] for start, c in zip(self.starts, coordinates, strict=True)), torch.zeros((), dtype=torch.int64))
+            return Lattices(index=index, counts=[], matrices=[], size=self.size)
         rows = [
             torch.split(matrices[c], [prod(shape[axis]) for shape in self.shapes], dim=1)
             for axis, (matrices, c) in enumerate(zip(self.matrices, coordinates, strict=True))
         ]
         levels = [tuple(row[n].view(-1, *shape[axis]) for axis, row in enumerate(rows)) for n, shape in enumerate(self.shapes)]
-        return Lattices(index=base[:, self.level] + self.offset, counts=self.counts, matrices=levels, size=self.size)
+        return Lattices(index=index, counts=self.counts, matrices=levels, size=self.size)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lattices:
     """The parts of the coarse tables that some bricks need.
 
-    index: positions (bricks, numbers) in the flat tables; counts: numbers of each level, in the order (corners t z y, E, corners x).
+    index: positions (bricks, numbers) among the used numbers of the flat tables; counts: numbers of each level, in the order
+        (corners t z y, E, corners x).
     matrices: per level those of (t, z), y and x, each (bricks, vertices, corners).
     """
 
