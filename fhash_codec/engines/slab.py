@@ -112,17 +112,19 @@ class SlabEngine:
 
     @torch.no_grad()
     def parameters(self) -> Parameters:
-        """The trained numbers, on the CPU; embeddings that no sample ever moved are 0."""
+        """The trained numbers, on the CPU, where the finest are the engine's own; embeddings that no sample ever moved are 0."""
         self.settle()
-        fine, flat = self.fine.clone(), self.flat.detach()
-        fine.masked_fill_(~self._mask(torch.arange(len(fine), device=self.device)).unsqueeze(1).bool(), 0.0)
+        for first in range(0, len(self.fine), FLUSH):
+            part = slice(first, first + FLUSH)
+            self.fine[part].masked_fill_(self._mask(part).unsqueeze(1) == 0, 0.0)
+        flat = self.flat.detach()
         coarse = torch.zeros(sum(prod(level) for level in self.architecture.levels[1:]) * self.architecture.embedding_size)
         kept = flat[: self.coarse]
         if self.step > 0:
             adam = self.adam.state[self.flat]
             kept = kept * ((adam["exp_avg"] != 0) | (adam["exp_avg_sq"] != 0))[: self.coarse]
         coarse[self.upsampling.used.cpu()] = kept.cpu()
-        return Parameters(fine=fine.cpu(), coarse=coarse, network=flat[self.coarse :].cpu().clone())
+        return Parameters(fine=self.fine.cpu(), coarse=coarse, network=flat[self.coarse :].cpu().clone())
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Everything that the next step depends on, as arrays."""
@@ -171,7 +173,7 @@ class SlabEngine:
         rank = mask.cumsum(1, dtype=torch.int64).add_(self.offsets[ids].unsqueeze(1) - 1).clamp_(0)
         return self.values[rank], mask
 
-    def _mask(self, ids: Tensor) -> Tensor:
+    def _mask(self, ids: Tensor | slice) -> Tensor:
         """Coreset vertices (bricks, vertices) as 0 and 1, uint8."""
         bits = torch.arange(7, -1, -1, device=self.device, dtype=torch.uint8)
         return (self.mask_bits[ids].unsqueeze(-1) >> bits & 1).flatten(1)[:, : self.vertices]
