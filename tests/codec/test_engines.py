@@ -145,7 +145,8 @@ def test_embeddings_that_no_sample_moved_are_stored_as_zero():
     mask = inside(coreset)
     outside = np.moveaxis(fine, 1, -1)[~mask]
     # A negative zero would cost bytes.
-    assert not (outside.any() or np.signbit(outside).any())
+    assert not outside.any()
+    assert not np.signbit(outside).any()
     assert (np.moveaxis(fine, 1, -1)[mask] != 0).all()
 
 
