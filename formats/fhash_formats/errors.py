@@ -73,3 +73,7 @@ class InterruptedEncodingError(FhashError):
     """Encoding that a user stopped; its checkpoint is saved and the same command goes on from there."""
 
     exit_code = 130
+
+
+class FhashWarning(UserWarning):
+    """Something that a user should know and that is no error."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -50,6 +51,7 @@ class Series(ABC):
         shape: (t, z, y, x), every length at least 1.
         coords: a Coordinate for each of "t", "z", "y", "x".
         attributes: of the variable, JSON values only.
+        files: what it is read from, files and folders; no output may replace them. None where it is in memory.
     """
 
     source: str
@@ -59,6 +61,7 @@ class Series(ABC):
     shape: tuple[int, int, int, int]
     coords: Mapping[str, Coordinate]
     attributes: Mapping[str, Any]
+    files: tuple[Path, ...] = ()
 
     @abstractmethod
     def read(self, step: int) -> npt.NDArray[Any]:
@@ -99,7 +102,7 @@ class StepsSeries(Series):
         self.whole = whole
         self.steps = tuple(steps)
         self.source, self.name, self.units = whole.source, whole.name, whole.units
-        self.dtype, self.attributes = whole.dtype, whole.attributes
+        self.dtype, self.attributes, self.files = whole.dtype, whole.attributes, whole.files
         self.shape = (len(self.steps), *whole.shape[1:])
         chosen = Coordinate(name=time.name, values=time.values[list(self.steps)], attributes=time.attributes)
         self.coords = {**whole.coords, "t": chosen}

@@ -271,3 +271,60 @@ def test_every_failure_is_one_line(tmp_path: Path, code: int, message: str) -> N
     assert message in str(error)
     assert "\n" not in str(error)
     assert "\n" not in str(atomic.explained(tmp_path / "out", OSError("two\nlines")))
+
+
+def itself(folder: Path) -> tuple[Path, Path]:
+    return file(folder / "a.npy"), folder / "a.npy"
+
+
+def by_link(folder: Path) -> tuple[Path, Path]:
+    (folder / "link.npy").symlink_to(file(folder / "a.npy"))
+    return folder / "a.npy", folder / "link.npy"
+
+
+def link_to_it(folder: Path) -> tuple[Path, Path]:
+    return by_link(folder)[::-1]
+
+
+def by_hard_link(folder: Path) -> tuple[Path, Path]:
+    os.link(file(folder / "a.npy"), folder / "b.npy")
+    return folder / "a.npy", folder / "b.npy"
+
+
+def not_there(folder: Path) -> tuple[Path, Path]:
+    return folder / "x" / ".." / "a.npy", folder / "a.npy"
+
+
+def inside(folder: Path) -> tuple[Path, Path]:
+    return store(folder / "a.zarr"), folder / "a.zarr" / "c" / "0"
+
+
+def new_inside(folder: Path) -> tuple[Path, Path]:
+    return store(folder / "a.zarr"), folder / "a.zarr" / "run.fhz"
+
+
+def around(folder: Path) -> tuple[Path, Path]:
+    return store(folder / "a.zarr") / "c" / "0", folder / "a.zarr"
+
+
+@pytest.mark.parametrize("force", [True, False])
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (itself, "is the input itself; choose another name"),
+        (by_link, "is the input itself"),
+        (link_to_it, "is the input itself"),
+        (by_hard_link, "is the input itself"),
+        (not_there, "is the input itself"),
+        (inside, "lies inside the input"),
+        (new_inside, "lies inside the input"),
+        (around, "contains the input"),
+    ],
+)
+def test_no_output_is_its_own_input(tmp_path: Path, make: Any, words: str, force: bool) -> None:
+    source, path = make(tmp_path)
+    for name in (source, str(source)):
+        with pytest.raises(InputError, match=words) as caught:
+            check_output(path, force, directory=path.is_dir(), sources=[tmp_path / "other", name])
+        assert "--force" not in str(caught.value)
+    check_output(path.with_name("out.npy") if make is not inside else tmp_path / "out", False, sources=[tmp_path / "a.npy"])

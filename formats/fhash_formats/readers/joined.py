@@ -57,7 +57,7 @@ class JoinedSeries(Series):
     """
 
     def __init__(self, pattern: str, paths: Sequence[Path], open_part: Callable[[Path], FileSeries]) -> None:
-        self.source = pattern
+        self.source, self.files = pattern, tuple(paths)
         self._open_part = open_part
         self._current: tuple[int, FileSeries] | None = None
         self._parts: list[_Part] = []

@@ -19,6 +19,7 @@ class Mask:
 
     def __init__(self, values: Series) -> None:
         self._values = values
+        self.files = values.files
 
     def __call__(self, step: int) -> npt.NDArray[np.bool_]:
         """True where the file's value at this step is neither zero nor NaN; raises InputError if the file cannot be read."""

@@ -15,25 +15,29 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from fhash_formats.errors import FhashError, OutputError, OutputExistsError
+from fhash_formats.errors import FhashError, InputError, OutputError, OutputExistsError
 from fhash_formats.writers.signals import signals_held
 
 ZARR_METADATA = ("zarr.json", ".zgroup", ".zarray")
 
 
-def check_output(path: Path, force: bool, *, directory: bool = False) -> None:
+def check_output(path: Path, force: bool, *, directory: bool = False, sources: Sequence[str | Path] = ()) -> None:
     """The checks of an output that can be made before any work.
 
     Args:
         path: of the output; a link is followed.
         force: whether an output that is there already may be replaced.
         directory: whether the output is a directory (a Zarr store) and not a file.
+        sources: files and folders that the output is made from, which not even `force` lets it replace.
 
     Raises:
+        InputError: the output is one of the sources, lies inside one or contains one.
         OutputExistsError: it is there already and `force` is not given.
         OutputError: no such folder, no permission, or something is there that must not be replaced even with `force`.
     """
     target = Path(os.path.realpath(path))
+    for source in sources:
+        _check_source(path, target, source)
     folder = target.parent
     try:
         if not stat.S_ISDIR(os.stat(folder).st_mode):
@@ -55,6 +59,24 @@ def check_output(path: Path, force: bool, *, directory: bool = False) -> None:
         raise OutputError(f"{path} is a directory but no Zarr store: --force does not replace it; give another name")
     if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
         raise OutputError(f"{path} is not an ordinary file and cannot be replaced; give another name")
+
+
+def _check_source(path: Path, target: Path, source: str | Path) -> None:
+    own = Path(os.path.realpath(source))
+    if _same(target, own):
+        raise InputError(f"{path} is the input itself; choose another name")
+    if own.is_dir() and any(_same(folder, own) for folder in target.parents):
+        raise InputError(f"{path} lies inside the input {source}; choose a name outside it")
+    if target in own.parents:
+        raise InputError(f"{path} contains the input {source}; choose another name")
+
+
+def _same(one: Path, other: Path) -> bool:
+    """Whether two resolved paths are one file or folder, by whatever names (hard links, another case)."""
+    try:
+        return os.path.samefile(one, other)
+    except OSError:  # one of them is not there
+        return one == other
 
 
 @contextmanager

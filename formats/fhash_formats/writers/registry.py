@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,24 +23,31 @@ from fhash_formats.writers.zarr_ import ZARR
 WRITERS = (NPY, HDF5, NETCDF, ZARR, RAW, VTK)
 
 
-def save_check(path: str | Path, force: bool = False, region: Region | None = None) -> None:
+def save_check(path: str | Path, force: bool = False, region: Region | None = None, sources: Sequence[str | Path] = ()) -> None:
     """The checks of `save_region` that can be made before any work; all of them where the region is known.
 
     Raises:
-        InputError: a suffix that no writer has, or a region that the format cannot hold.
+        InputError: a suffix that no writer has, a region that the format cannot hold, or an output that is one of the `sources`.
         MissingDependencyError: the format needs a library that is not installed.
         OutputExistsError: the path, or with `region` any file that goes with it, is there already and `force` is not given.
         OutputError: no such folder, no permission, or something there that must not be replaced.
     """
     target = Path(path)
     writer = _writer(target)
-    check_output(target, force, directory=writer.directory)
+    check_output(target, force, directory=writer.directory, sources=sources)
     if region is not None:
         for output in writer.outputs(target, region):
-            check_output(output, force, directory=writer.directory)
+            check_output(output, force, directory=writer.directory, sources=sources)
 
 
-def save_region(path: str | Path, region: Region, frames: Iterable[npt.NDArray[np.generic]], *, force: bool = False) -> list[Path]:
+def save_region(
+    path: str | Path,
+    region: Region,
+    frames: Iterable[npt.NDArray[np.generic]],
+    *,
+    force: bool = False,
+    sources: Sequence[str | Path] = (),
+) -> list[Path]:
     """Write the frames of a region in the format that the suffix of `path` names; complete or absent.
 
     Args:
@@ -48,6 +55,7 @@ def save_region(path: str | Path, region: Region, frames: Iterable[npt.NDArray[n
         region: what the frames are.
         frames: one array (z, y, x) of `region.dtype` for each step, taken one by one: no two are held here.
         force: replace outputs that are there already; the old ones stay until the new are complete.
+        sources: files and folders that the frames come from, which are never replaced.
 
     Returns:
         The paths written: one, or for several steps in VTK's formats and for .raw those of the files that go together.
@@ -57,7 +65,7 @@ def save_region(path: str | Path, region: Region, frames: Iterable[npt.NDArray[n
         OutputError: it cannot be written, as on a full disk; nothing is left behind, and an old output is as it was.
     """
     target = Path(path)
-    save_check(target, force, region)
+    save_check(target, force, region, sources)
     writer = _writer(target)
     outputs = writer.outputs(target, region)
     with replacing_all(outputs, force=force, directory=writer.directory) as temporaries, writer.open(region, outputs, temporaries) as put:
