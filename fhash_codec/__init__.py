@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from fhash_formats.errors import (
     DamagedFileError,
     FhashError,
+    FhashWarning,
     InputError,
     InterruptedEncodingError,
     MissingDependencyError,
@@ -34,14 +35,12 @@ if TYPE_CHECKING:
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
     from fhash_codec.encoding import encode
-    from fhash_codec.selection import FhashWarning
     from fhash_codec.volume import Volume, open
 
 __version__ = version("fhash")
 
 _HOMES = {
     "EncodeConfig": "config",
-    "FhashWarning": "selection",
     "Volume": "volume",
     "diff": "comparison",
     "encode": "encoding",

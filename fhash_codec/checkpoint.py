@@ -7,6 +7,7 @@ import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +21,20 @@ from fhash_formats.errors import InputError
 from fhash_formats.writers.atomic import replacing
 
 # Settings that change neither the model nor the course of its training.
+PARTIAL_BYTES = 24  # what a temporary name adds while the checkpoint is written
 UNRELATED = ("psnr", "tables", "timings")
 
 
 def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Path:
     """Where the checkpoint of this training stands: `OUTPUT.<digest of coreset and settings>.checkpoint`."""
     settings = {name: value for name, value in config.to_dict().items() if name not in UNRELATED}
-    digest = hashlib.sha256(json.dumps([settings, coreset.box, coreset.key_frames], sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps([version("fhash"), settings, coreset.box, coreset.key_frames], sort_keys=True).encode())
     for array in (coreset.values, coreset.bricks, coreset.mask_bits):
         digest.update(array.data)
-    return output.with_name(f"{output.name}.{digest.hexdigest()[:12]}.checkpoint")
+    end = f".{digest.hexdigest()[:12]}.checkpoint"
+    # A name may have 255 bytes; what is cut off of a long one does not matter, since the digest tells checkpoints apart.
+    start = output.name.encode()[: 250 - len(end) - PARTIAL_BYTES].decode(errors="ignore")
+    return output.with_name(start + end)
 
 
 def save_checkpoint(path: Path, state: Mapping[str, npt.NDArray[Any]], course: Course) -> None:
@@ -47,5 +52,5 @@ def load_checkpoint(path: Path) -> tuple[dict[str, npt.NDArray[Any]], Course] | 
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             state = {name: file[name] for name in file.files}
         return state, Course(**json.loads(state.pop("course").tobytes()))
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(f"checkpoint {path} cannot be read; delete it to train from the start") from error

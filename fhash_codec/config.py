@@ -55,6 +55,14 @@ class EncodeConfig:
     timings: bool = setting(True, "store seconds with the training history; without them the same input gives the same bytes")
 
     def __post_init__(self) -> None:
+        # A caller may give one feature as text and key frames as numbers.
+        features, key_frames = cast(Any, self.features), cast(Any, self.key_frames)
+        if isinstance(features, str):
+            object.__setattr__(self, "features", (features,))
+        elif not all(isinstance(feature, str) for feature in features):
+            raise InputError("feature is not text; a mask in memory goes to encode(..., mask=...)")
+        if not isinstance(key_frames, str):
+            object.__setattr__(self, "key_frames", ",".join(str(int(step)) for step in key_frames))
         for field in dataclasses.fields(self):
             _check(field, getattr(self, field.name))
 

@@ -6,6 +6,7 @@ crops, normalises and gathers the values of the selected vertices brick by brick
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
@@ -15,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import occupancy
-from fhash_codec.features import Feature, dilate, merge
+from fhash_codec.features import Feature, dilate
 from fhash_codec.normalise import Mean
 from fhash_codec.progress import Progress
 from fhash_codec.scan import Scan
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import Series
 
 Box = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
@@ -75,13 +76,17 @@ def build_coreset(
     """The coreset of a series: finite vertices of the merged features, dilated, at every key frame.
 
     `features` are resolved, `dilation` is in vertices, `brick` replaces the default brick shape. Raises InputError if the features
-    select nothing at all; single key frames may be empty. Progress stages: "selecting", "gathering".
+    select nothing at all; single key frames may be empty. Warns of a feature
+    that selects nothing while others do. Progress stages: "selecting", "gathering".
     """
     domain = series.shape[1:]
     packed, bounds, outside, samples = [], [], Mean(), 0
+    idle = set(features)
     for done, step in enumerate(key_frames):
         frame = series.read(step)
-        mask, finite = _select(frame, step, scan, features, dilation)
+        selected = [feature.select(frame, step) for feature in features]
+        idle -= {feature for feature, found in zip(features, selected, strict=True) if found.any()}
+        mask, finite = _dilated(np.logical_or.reduce(selected), step, scan, dilation)
         packed.append(np.packbits(mask))
         bounds.append(bounding_box(mask))
         samples += int(np.count_nonzero(mask))
@@ -92,6 +97,9 @@ def build_coreset(
         low, high = scan.value_range.low, scan.value_range.high
         names = ", ".join(str(feature) for feature in features)
         raise InputError(f"feature {names} selects nothing; values range from {low:.9g} to {high:.9g}")
+
+    for feature in sorted(map(str, idle)):
+        warnings.warn(f"feature {feature} selects nothing; the others do", FhashWarning, stacklevel=2)
 
     size = box_size(box)
     shape = brick or brick_shape(size)
@@ -197,11 +205,12 @@ def tile(layer: npt.NDArray[Scalar], shape: Sizes) -> npt.NDArray[Scalar]:
     return whole.reshape(shape[0], rows, shape[1], columns, shape[2]).transpose(1, 3, 0, 2, 4)
 
 
-def _select(
-    frame: npt.NDArray[Any], step: int, scan: Scan, features: Sequence[Feature], dilation: int
+def _dilated(
+    mask: npt.NDArray[np.bool_], step: int, scan: Scan, dilation: int
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_] | None]:
-    mask = dilate(merge(features, frame, step), dilation)
-    z, y, x = frame.shape
+    """The finite vertices of a feature once it has grown, and which vertices are finite at all (None: all)."""
+    mask = dilate(mask, dilation)
+    z, y, x = mask.shape
     finite = scan.finite(step, (z, y, x))
     if finite is not None:
         mask &= finite

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import time
+import warnings
 from dataclasses import dataclass
 from importlib.metadata import version
 from math import prod
@@ -24,26 +26,37 @@ from fhash_codec.storage import write_model
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter
-from fhash_formats.errors import InterruptedEncodingError, QualityError
+from fhash_formats.errors import FhashWarning, InputError, InterruptedEncodingError, OutputError, QualityError
 from fhash_formats.series import Series
 from fhash_formats.writers.atomic import check_output
+from fhash_formats.writers.registry import WRITERS
 
 
 def encode(
-    source: Source, path: str | Path, config: EncodeConfig | None = None, *, force: bool = False, progress: Progress = silent
+    source: Source,
+    path: str | Path,
+    config: EncodeConfig | None = None,
+    *,
+    mask: npt.ArrayLike | None = None,
+    force: bool = False,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Encode a series into the container `path`, complete or not at all; the figures of what was written (see `report`).
 
-    source: a file (opened by `fhash_formats.open_series`), a Series, or an array (t, z, y, x) or (z, y, x).
+    source: a file (opened by `fhash_formats.open_series`), a Series, or an array (t, z, y, x) or (z, y, x), labelled or not.
+    mask: booleans (t, z, y, x) or (z, y, x), one more feature, and the only one where the settings name no other.
     Ctrl-C during the training saves a checkpoint beside `path` and raises InterruptedEncodingError; the same call goes on from it to
     the same result. Raises QualityError, with the file written and its figures in the error, if `config.psnr` was not reached, and
     InputError for what cannot be encoded.
     """
-    config, path = config or EncodeConfig(), Path(path)
+    config, path = config or EncodeConfig(), Path(os.path.normpath(path))
     begun = time.perf_counter()
-    check_output(path, force=force)
+    check_name(path)
+    check_output(path, force)
     with opened(source) as series:
-        selected = select(series, config, progress)
+        masks = [feature.removeprefix("mask:") for feature in config.features if feature.startswith("mask:")]
+        check_output(path, force, sources=[*series.files, *masks])
+        selected = select(series, config, progress, mask)
         coreset = selected.coreset
         trained = train_model(coreset, selected.architecture, config, path, progress)
         with ContainerWriter(path, force=force) as writer:
@@ -59,12 +72,22 @@ def encode(
     with open_volume(path) as volume:
         figures = report(volume, header["quality"], seconds=time.perf_counter() - begun)
     reached = figures["psnr"]
-    if config.psnr is not None and reached is not None and reached < config.psnr:
+    if config.psnr is not None and figures["rmse"] != 0 and (reached is None or reached < config.psnr):
+        found = "an unknown PSNR" if reached is None else f"{reached:.2f} dB"
         raise QualityError(
-            f"{path}: {reached:.2f} dB over the coreset, {config.psnr:g} dB were asked for; the file is written. More --epochs may help",
+            f"{path}: {found} over the coreset, {config.psnr:g} dB were asked for; the file is written. More --epochs may help",
             figures,
         )
     return figures
+
+
+def check_name(path: Path) -> None:
+    """Refuse to give a container the name of another kind of file (InputError): most often it is that of the data."""
+    if path.suffix.lower() in (suffix for writer in WRITERS for suffix in writer.suffixes):
+        raise InputError(f"{path}: a container is not a {path.suffix} file; give it a name that ends in .fhz")
+
+
+KEEP_SECONDS = 5.0  # of training, from which on it is kept until its file is complete
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,12 +124,26 @@ def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConf
     course = Course()
     saved = load_checkpoint(checkpoint)
     if saved:
-        engine.restore(saved[0])
+        try:
+            engine.restore(saved[0])
+        except (KeyError, RuntimeError, ValueError) as error:
+            raise InputError(f"checkpoint {checkpoint} does not fit; delete it to train from the start") from error
         course = saved[1]
+
+    def save(now: Course) -> None:
+        try:
+            save_checkpoint(checkpoint, engine.state(), now)
+        except OutputError as error:
+            if stop.asked:
+                raise
+            # The training itself can go on; only an interruption would cost more.
+            warnings.warn(f"no checkpoint: {error}", FhashWarning, stacklevel=2)
+
     with deferred_interrupts() as stop, threads_for(plan.batch_bricks * prod(coreset.brick_shape)):
-        done = train(
-            engine, plan, coreset, course, stop=stop, save=lambda now: save_checkpoint(checkpoint, engine.state(), now), progress=progress
-        )
+        done = train(engine, plan, coreset, course, stop=stop, save=save, progress=progress)
+        # What follows may fail or be interrupted as well: a training worth keeping is kept until the file is complete.
+        if done and not saved and course.seconds > KEEP_SECONDS:
+            save(course)
     if not done:
         raise InterruptedEncodingError(
             f"interrupted in epoch {course.epoch + 1} of {plan.epochs}; saved in {checkpoint}; the same command goes on from there"

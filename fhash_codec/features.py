@@ -192,14 +192,6 @@ def otsu_threshold(counts: npt.ArrayLike, edges: npt.ArrayLike) -> float:
     return float(bounds[best[best.size // 2] + 1])
 
 
-def merge(features: Sequence[Feature], frame: Frame, step: int) -> Selection:
-    """The union of what the features select in a frame: bool (z, y, x)."""
-    selected = features[0].select(frame, step)
-    for feature in features[1:]:
-        selected |= feature.select(frame, step)
-    return selected
-
-
 def dilate(mask: Selection, vertices: int) -> Selection:
     """A mask (z, y, x) grown by that many vertices in the 26-neighbourhood (paper, Feature Dilation); nothing wraps around an edge.
 

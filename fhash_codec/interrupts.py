@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+SAME_REQUEST_SECONDS = 1.0  # shells, make and batch systems may deliver one request several times
 
 
 class StopRequest:
@@ -14,11 +17,12 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.asked = False
+        self.since = 0.0
 
 
 @contextmanager
 def deferred_interrupts() -> Iterator[StopRequest]:
-    """Within it the first SIGINT or SIGTERM sets `asked`, and a second one raises KeyboardInterrupt at once.
+    """Within it the first SIGINT or SIGTERM sets `asked`, and one more than a second later raises KeyboardInterrupt at once.
 
     SIGTERM counts because batch systems send it before they kill a job. Signals reach only the main thread; elsewhere
     nothing is changed and `asked` stays false.
@@ -29,9 +33,10 @@ def deferred_interrupts() -> Iterator[StopRequest]:
         return
 
     def ask(number: int, frame: FrameType | None) -> None:
-        if request.asked:
+        if request.asked and time.monotonic() > request.since + SAME_REQUEST_SECONDS:
             raise KeyboardInterrupt
-        request.asked = True
+        if not request.asked:
+            request.asked, request.since = True, time.monotonic()
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -91,11 +91,12 @@ class Errors:
         masks = pieces(np.broadcast_to(np.True_, original.shape) if mask is None else mask)
         for one, other, counts in zip(pieces(original), pieces(decoded), masks, strict=True):
             chosen = np.isfinite(one) & counts
-            difference = one[chosen] * self._scale - other[chosen] * self._scale
+            difference = _scaled_difference(one[chosen], other[chosen], self._scale)
             if not np.isfinite(difference).all():
                 raise InputError(f"step {step}: decoded values are not finite where they are compared")
             count += difference.size
-            squares += float(np.square(difference).sum())
+            with np.errstate(over="ignore"):
+                squares += float(np.square(difference).sum())
             largest = max(largest, float(np.abs(difference).max(initial=0.0)))
         self.count += count
         self._squares += squares
@@ -124,8 +125,22 @@ class Errors:
         return self._unscaled(math.sqrt(squares / count) if count else 0.0, count)
 
     def _unscaled(self, value: float, count: int) -> float | None:
-        figure = float(value / self._scale)
+        with np.errstate(over="ignore"):
+            figure = float(value / self._scale)
         return figure if count and math.isfinite(figure) else None
+
+
+def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> npt.NDArray[np.float64]:
+    """(original - decoded) * scale in float64; exact for 64-bit integers too, whose differences float64 would round to 0."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        difference = np.asarray(original * scale - decoded * scale, dtype=np.float64)
+    if original.dtype.kind in "iu" and original.dtype.itemsize == 8:
+        limits = np.iinfo(original.dtype)
+        whole = np.clip(np.rint(decoded.astype(np.float64)), float(limits.min), np.nextafter(float(limits.max), 0.0))
+        # Differences wrap at 2^64; those beyond 2^62 do not need the exactness.
+        exact = (original - whole.astype(original.dtype)).view(np.int64) - (decoded.astype(np.float64) - whole)
+        difference = np.where(np.abs(difference) < 2.0**62 * scale, exact * scale, difference)
+    return difference
 
 
 def psnr(data_range: float, rmse: float | None) -> float | None:

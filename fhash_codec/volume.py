@@ -304,7 +304,7 @@ class Volume:
         self.close()
 
     def __reduce__(self) -> tuple[Any, tuple[Path]]:
-        return open, (self.path,)
+        return open, (self.path.absolute(),)
 
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from fhash_codec.coreset import bounding_box, box_size, brick_shape, build_coreset, crop, fuse, unpack_frame
-from fhash_codec.features import Everything, Interval, Isosurface, Segmentation, dilate, merge
+from fhash_codec.features import Everything, Interval, Isosurface, Segmentation, dilate
 from fhash_codec.occupancy import unpack
 from fhash_codec.progress import silent
 from fhash_codec.scan import scan
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.series import ArraySeries
 
 EVERYTHING = (Everything(),)
@@ -33,7 +33,8 @@ def build(array, features=EVERYTHING, keys=None, dilation=1, **kwargs):
 
 def check_against_direct_crop(array, features, keys, dilation, **kwargs):
     coreset, seen = build(array, features, keys, dilation, **kwargs)
-    masks = [dilate(merge(features, array[step], step), dilation) & np.isfinite(array[step]) for step in keys]
+    selected = [np.any([feature.select(array[step], step) for feature in features], axis=0) for step in keys]
+    masks = [dilate(mask, dilation) & np.isfinite(array[step]) for mask, step in zip(selected, keys, strict=True)]
     everywhere = np.argwhere(np.any(masks, axis=0))
     assert coreset.box == tuple(zip(everywhere.min(axis=0), everywhere.max(axis=0) + 1, strict=True))
     for key, (step, mask) in enumerate(zip(keys, masks, strict=True)):
@@ -64,6 +65,7 @@ def check_structure(coreset):
     assert coreset.brick_grid == grid
 
 
+@pytest.mark.filterwarnings("ignore:feature .* selects nothing")
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(
     "features", [(Everything(),), (Interval(0.3, 0.9),), (Isosurface(0.4), Segmentation(0.44))], ids=["all", "interval", "two"]
@@ -157,3 +159,8 @@ def test_progress_has_two_stages():
     series = ArraySeries(smooth(3, (2, 2, 2)))
     build_coreset(series, scan(series, silent), (0, 2), (Everything(),), 0, lambda *call: calls.append(call[:3]))
     assert calls == [("selecting", 1, 2), ("selecting", 2, 2), ("gathering", 1, 2), ("gathering", 2, 2)]
+
+
+def test_a_feature_that_selects_nothing_beside_others_is_warned_of():
+    with pytest.warns(FhashWarning, match="feature isosurface:99 selects nothing; the others do"):
+        build(smooth(2, (5, 6, 7)), (Interval(0.2, 2.0), Isosurface(99.0)), (0, 1), 1)

@@ -243,3 +243,108 @@ def test_settings_that_diverge_are_reported(tmp_path):
         assert "learning-rate" in str(error)  # noqa: PT017
     else:
         assert np.isfinite(figures["rmse"])
+
+
+def test_the_input_is_never_replaced(tmp_path):
+    np.save(tmp_path / "a.npy", field())
+    kept = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "link.fhz").symlink_to("a.npy")
+    for output in ("a.npy", "link.fhz"):
+        with pytest.raises(InputError, match=r"a container is not a \.npy file|is the input itself"):
+            fhash_codec.encode(tmp_path / "a.npy", tmp_path / output, QUICK, force=True)
+    mask = tmp_path / "mask.fhz"
+    np.save(tmp_path / "mask.npy", field() > 50)
+    mask.symlink_to("mask.npy")
+    with pytest.raises(InputError, match="is the input itself"):
+        fhash_codec.encode(tmp_path / "a.npy", mask, EncodeConfig(features=(f"mask:{tmp_path / 'mask.npy'}",)), force=True)
+    assert (tmp_path / "a.npy").read_bytes() == kept
+
+
+def test_a_mask_in_memory_is_a_feature(tmp_path):
+    source = field()
+    marked = source[0] > 50
+    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(epochs=1, dilation=0), mask=marked)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        np.testing.assert_array_equal(volume.occupancy(3), marked)
+    both = EncodeConfig(epochs=1, dilation=0, features=("interval:-300:-50",))
+    fhash_codec.encode(source, tmp_path / "b.fhz", both, mask=source > 50)
+    with fhash_codec.open(tmp_path / "b.fhz") as volume:
+        np.testing.assert_array_equal(volume.occupancy(2), (source[2] > 50) | (source[2] <= -50))
+    with pytest.raises(InputError, match="mask has shape"):
+        fhash_codec.encode(source, tmp_path / "c.fhz", QUICK, mask=marked[1:])
+
+
+def test_labelled_arrays_keep_their_labels(tmp_path):
+    import xarray
+
+    times = np.array(["2000-01-01", "2000-01-02", "2000-01-04", "2000-01-05"], dtype="datetime64[s]")
+    labelled = xarray.DataArray(
+        field(), dims=("time", "lev", "lat", "lon"), coords={"time": times, "lev": 2.0 * np.arange(8)}, name="theta", attrs={"units": "K"}
+    )
+    fhash_codec.encode(labelled, tmp_path / "a.fhz", QUICK)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert (volume.name, volume.units, volume.coords["z"].name) == ("theta", "K", "lev")
+        assert volume.coords["t"].attributes["units"] == "seconds since 1970-01-01"
+        assert volume.step_of_time(946684800.0 + 2 * 86400) == 1.5
+        np.testing.assert_array_equal(volume.coords["z"].values, 2.0 * np.arange(8))
+
+
+def test_64_bit_integers_are_compared_exactly(tmp_path):
+    source = 2**60 + np.arange(1344).reshape(4, 6, 7, 8)
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", QUICK)
+    back = decoded(tmp_path / "a.fhz")
+    exact = [abs(int(a) - int(b)) for a, b in zip(source.ravel(), back.ravel(), strict=True)]
+    assert figures["max_abs_error"] == max(exact)
+    assert figures["rmse"] == pytest.approx((sum(e * e for e in exact) / len(exact)) ** 0.5)
+
+
+def test_a_promise_cannot_hold_where_the_psnr_is_unknown(tmp_path):
+    source = (2 * np.random.default_rng(0).random((2, 4, 5, 6)) - 1) * 1.7e308
+    with pytest.raises(QualityError, match="an unknown PSNR"):
+        fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(epochs=1, psnr=300.0))
+    figures = fhash_codec.encode(np.zeros((2, 4, 5, 6)), tmp_path / "b.fhz", EncodeConfig(epochs=1, psnr=300.0))
+    assert figures["rmse"] == 0
+
+
+def test_a_failure_after_the_training_leaves_its_checkpoint(tmp_path, monkeypatch):
+    monkeypatch.setattr("fhash_codec.encoding.KEEP_SECONDS", 0.0)
+    config = EncodeConfig(epochs=2, width=16, timings=False)
+    fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
+    trained = []
+
+    def interrupt(stage, done, total, note):
+        trained.append(stage)
+        if stage == "measuring":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fhash_codec.encode(field(), tmp_path / "run.fhz", config, progress=interrupt)
+    trained.clear()
+    fhash_codec.encode(field(), tmp_path / "run.fhz", config, progress=lambda stage, *rest: trained.append(stage))
+    assert "training" not in trained
+    assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.fhz", "whole.fhz"]
+
+
+def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_training(tmp_path, monkeypatch):
+    def full(*args):
+        raise OutputError("no space left")
+
+    monkeypatch.setattr("fhash_codec.encoding.KEEP_SECONDS", 0.0)
+    monkeypatch.setattr("fhash_codec.checkpoint.save_checkpoint", full)
+    with pytest.warns(fhash_codec.FhashWarning, match="no checkpoint: no space left"):
+        fhash_codec.encode(field(), tmp_path / "a.fhz", QUICK)
+    assert decoded(tmp_path / "a.fhz").shape == field().shape
+
+
+def test_long_names_and_detours_in_paths_work(tmp_path):
+    for path in (tmp_path / f"{'a' * 245}.fhz", tmp_path / "none" / ".." / "b.fhz"):
+        fhash_codec.encode(field(), path, EncodeConfig(epochs=1, width=16, timings=False))
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_settings_may_be_given_as_python_values():
+    assert EncodeConfig(features="all").features == ("all",)
+    assert EncodeConfig(key_frames=[0, 3]).key_frames == "0,3"
+    with pytest.raises(InputError, match="mask="):
+        EncodeConfig(features=(np.ones(3, bool),))

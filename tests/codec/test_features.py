@@ -1,7 +1,5 @@
 """Features: their text, what they select, dilation and thresholds, against plain loops."""
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,6 @@ from fhash_codec.features import (
     Mask,
     Segmentation,
     dilate,
-    merge,
     otsu_threshold,
     parse_feature,
     resolve_features,
@@ -124,17 +121,10 @@ def test_the_ends_of_an_interval_belong_to_it_and_a_threshold_does_not():
 def test_selecting_leaves_the_frame_and_the_mask_alone():
     frame, marked = random_frame((3, 3, 3)), np.zeros((3, 3, 3), bool)
     before = frame.copy()
-    merge([Mask("m", lambda step: marked), Everything()], frame, 0)
+    for feature in (Mask("m", lambda step: marked), Everything()):
+        feature.select(frame, 0)[:] = True
     np.testing.assert_array_equal(frame, before)
     assert not marked.any()
-
-
-def test_merge_is_the_union():
-    frame = random_frame((4, 5, 6))
-    features = [Interval(1.0, 3.0), Segmentation(8.0), Isosurface(5.0)]
-    union = np.any([feature.select(frame, 0) for feature in features], axis=0)
-    for order in itertools.permutations(features):
-        np.testing.assert_array_equal(merge(order, frame, 0), union)
 
 
 def test_features_that_are_not_ready_say_so():
