@@ -57,7 +57,7 @@ def command(
     if roi is not None and box is not None:
         raise click.UsageError("--roi and --box exclude each other")
     if output is not None:
-        check_writable(output, force, region=True)
+        check_writable(output, force, region=True, sources=[run])
     with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
         chosen = [volume.step_of_time(time) for time in times] if times else steps_of(volume, steps)
         region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
@@ -86,7 +86,7 @@ def command(
                 coords=coordinates(volume, chosen, region),
                 attributes=volume.attrs,
             )
-            paths = [str(path) for path in save_region(output, whole, frames(), force=force)]
+            paths = [str(path) for path in save_region(output, whole, frames(), force=force, sources=[run])]
         result = {"paths": paths, "shape": shape, "dtype": kind.name, "steps": chosen, "region": region, **statistics.result()}
         emit(result, table(_rows(result, volume.units)), as_json)
 

@@ -32,6 +32,7 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
     """Simulate a small series, encode it, decode it, compare and draw: DIR/SCENE.h5, .fhz and .png."""
     from fhash_codec.config import EncodeConfig
     from fhash_formats import Region, open_series, save_region
+    from fhash_formats.writers.atomic import replacing
 
     data, run, picture = (Path(folder) / f"{scene}.{suffix}" for suffix in ("h5", "fhz", "png"))
     try:
@@ -39,7 +40,7 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
     except OSError as error:
         raise InputError(f"{folder}: {error.strerror}; give a folder that exists or whose parent does") from error
     for output in (data, run, picture):
-        check_writable(output, force)
+        check_writable(output, force, sources=[other for other in (data, run, picture) if other != output])
     if not quiet:
         say(f"simulating '{scene}', {SCENES[scene].help}")
     simulated = simulate(scene)
@@ -61,8 +62,8 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
         start = time.perf_counter()
         report = fhash_codec.diff(data, run, progress=progress)
         seconds = time.perf_counter() - start
-    with open_series(data) as series, fhash_codec.open(run) as volume:
-        _draw(scene, series, volume, report).save(picture, optimize=True)
+    with open_series(data) as series, fhash_codec.open(run) as volume, replacing(picture, force=force) as temporary:
+        _draw(scene, series, volume, report).save(temporary, format="PNG", optimize=True)
     settings = f"--feature {config.features[0]} --embedding-size {config.embedding_size} --tables {config.tables}"
     made = {"scene": scene, "data": str(data), "path": str(run), "picture": str(picture), "settings": settings}
     result = {**report, "seconds": encoded["seconds"], "diff_seconds": seconds, **made}

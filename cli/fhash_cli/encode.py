@@ -30,7 +30,7 @@ def command(data: str, output: str, source: SourceOptions, config: EncodeConfig,
     """
     import fhash_codec
 
-    check_writable(output, force)
+    check_writable(output, force, sources=[data])
     with source.open(data) as series, Progress(quiet=quiet) as progress:
         missed = None
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="No progress on 
 run_argument = click.argument("run", metavar="RUN.fhz", type=click.Path())
 
 
-def check_writable(path: str | Path, force: bool, *, region: bool = False) -> None:
-    """Refuse an output (of `save_region` with `region`) before any work: it exists, its folder is missing, it cannot be replaced.
+def check_writable(path: str | Path, force: bool, *, region: bool = False, sources: Sequence[str | Path] = ()) -> None:
+    """Refuse an output (of `save_region` with `region`) before any work: it exists, cannot be replaced, or is one of the `sources`.
 
     Raises InputError throughout (exit code 2), since nothing has failed yet but the command as it was written.
     """
@@ -31,7 +31,7 @@ def check_writable(path: str | Path, force: bool, *, region: bool = False) -> No
     from fhash_formats.writers.atomic import check_output
 
     try:
-        (save_check if region else check_output)(Path(path), force)
+        (save_check if region else check_output)(Path(path), force, sources=sources)
     except OutputError as error:
         raise InputError(str(error)) from error
 

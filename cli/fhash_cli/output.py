@@ -84,14 +84,14 @@ def listed(names: Sequence[str]) -> str:
 
 
 def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, str]]:
-    """Rows of the quality that `encode`, `diff` and `demo` share."""
-    exact = report["rmse"] == 0
+    """Rows of the quality that `encode`, `diff` and `demo` share; a container of another writer may leave figures out."""
+    exact = report.get("rmse") == 0
     return [
-        ("PSNR, coreset", "exact" if exact else number(report["psnr"], "dB")),
-        ("PSNR, domain", number(report["psnr_domain"], "dB")),
-        ("RMSE", number(report["rmse"], units)),
-        ("largest error", number(report["max_abs_error"], units)),
-        ("SSIM", number(report["ssim"], digits=5)),
+        ("PSNR, coreset", "exact" if exact else number(report.get("psnr"), "dB")),
+        ("PSNR, domain", number(report.get("psnr_domain"), "dB")),
+        ("RMSE", number(report.get("rmse"), units)),
+        ("largest error", number(report.get("max_abs_error"), units)),
+        ("SSIM", number(report.get("ssim"), digits=5)),
     ]
 
 

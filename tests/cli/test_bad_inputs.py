@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import resource
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -251,3 +252,18 @@ def test_a_write_that_fails_half_way_leaves_nothing(refused: Refused, data: Path
         with small_files(1000):
             refused(1, *words, "--force")
         assert output.read_bytes() == old
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_force_never_replaces_the_input(refused: Refused, data: Path, run: Path, tmp_path: Path, link: bool) -> None:
+    series, container = tmp_path / "tiny.h5", tmp_path / "tiny_0000.vti"
+    shutil.copy(data, series)
+    shutil.copy(run, container)
+    output = tmp_path / "link.h5" if link else series
+    if link:
+        output.symlink_to(series)
+    assert "is the input itself" in refused(2, "encode", series, "-o", output, "--force", *SMALL)
+    assert "is the input itself" in refused(2, "encode", series, "-o", output, *SMALL)
+    refused(2, "encode", tmp_path / "tin*.h5", "-o", output, "--force", *SMALL)
+    assert "is the input itself" in refused(2, "decode", container, "-o", container, "--force")
+    assert "is the input itself" in refused(2, "decode", container, "-o", tmp_path / "tiny.vti", "--force")

@@ -43,3 +43,8 @@ def test_demo_in_a_folder_that_cannot_be_is_refused(refused: Callable[..., str],
     assert "No such file or directory" in refused(2, "demo", "-o", tmp_path / "no" / "demo")
     (tmp_path / "file").write_text("")
     refused(2, "demo", "-o", tmp_path / "file")
+
+
+def test_outputs_that_are_one_file_are_refused(refused: Callable[..., str], tmp_path: Path) -> None:
+    (tmp_path / "vortex.png").symlink_to(tmp_path / "vortex.h5")
+    assert "is the input itself" in refused(2, "demo", "-o", tmp_path, "--force")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from fhash_formats import open_mask, open_series
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import ArraySeries, Coordinate, StepsSeries
 
@@ -60,3 +62,35 @@ def test_masked_values_are_nan_and_never_what_is_under_the_mask() -> None:
 def test_what_cannot_be_a_series(array: Any, coords: dict[str, Coordinate], message: str) -> None:
     with pytest.raises(InputError, match=message):
         ArraySeries(array, coords=coords)
+
+
+def test_a_series_knows_its_files(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    zarr = pytest.importorskip("zarr")
+    assert ArraySeries(VALUES).files == ()
+    for step in range(2):
+        np.save(tmp_path / f"f{step}.npy", VALUES[step])
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["v"] = VALUES
+    with h5py.File(tmp_path / "virtual.h5", "w") as file:
+        layout = h5py.VirtualLayout(VALUES.shape, VALUES.dtype)
+        layout[:] = h5py.VirtualSource("a.h5", "v", VALUES.shape)
+        file.create_virtual_dataset("v", layout)
+    with h5py.File(tmp_path / "linked.h5", "w") as file:
+        file["v"] = h5py.ExternalLink("a.h5", "v")
+    zarr.create_array(tmp_path / "a.zarr", data=VALUES)
+    names = {
+        "f0.npy": ["f0.npy"],
+        "f?.npy": ["f0.npy", "f1.npy"],
+        "a.h5": ["a.h5"],
+        "virtual.h5": ["virtual.h5", "a.h5"],
+        "linked.h5": ["linked.h5", "a.h5"],
+        "a.zarr": ["a.zarr"],
+    }
+    for name, files in names.items():
+        for steps in (None, slice(0, 1)):
+            with open_series(tmp_path / name, steps=steps) as series:
+                assert series.files == tuple(tmp_path / each for each in files)
+    mask = open_mask(tmp_path / "f0.npy", VALUES.shape)
+    mask.close()
+    assert mask.files == (tmp_path / "f0.npy",)

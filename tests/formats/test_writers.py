@@ -344,3 +344,17 @@ def test_a_region_that_is_none(changes: dict[str, Any], message: str) -> None:
 
 def test_a_region_keeps_the_native_byte_order() -> None:
     assert region(">f8").dtype.isnative
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_no_file_that_is_written_may_be_a_source(tmp_path: Path, suffix: str) -> None:
+    data = values()
+    paths = save_region(tmp_path / f"out{suffix}", region(), iter(data))
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for path in paths:
+        with pytest.raises(InputError, match="is the input itself"):
+            save_check(tmp_path / f"out{suffix}", True, region(), [path])
+        with pytest.raises(InputError, match="is the input itself"):
+            save_region(tmp_path / f"out{suffix}", region(), iter(data), force=True, sources=[path])
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    save_region(tmp_path / f"out{suffix}", region(), iter(data), force=True, sources=[tmp_path / "other"])

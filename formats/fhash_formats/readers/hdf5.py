@@ -7,7 +7,7 @@ from typing import Any
 
 from fhash_formats.attributes import json_attributes, text_of
 from fhash_formats.readers.failures import Stamp, refusing
-from fhash_formats.readers.hdf5_tree import column, columns, datasets, own_name, require_filters, require_sources, variables
+from fhash_formats.readers.hdf5_tree import column, columns, datasets, files_beside, own_name, require_filters, require_sources, variables
 from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.positions import beside, coordinate, usable
 from fhash_formats.readers.request import Request
@@ -76,6 +76,7 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         attributes=json_attributes(dataset.attrs),
         chunks=dataset.chunks,
         close=file.close,
+        beside=files_beside(path, dataset),
     )
 
 

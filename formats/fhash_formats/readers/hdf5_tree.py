@@ -137,3 +137,13 @@ def require_sources(source: str, path: Path, name: str, dataset: Any) -> None:
         file = mapped.file_name
         if file != "." and "%b" not in file and not (path.parent / file).exists() and not Path(file).exists():
             raise InputError(f"{source}: {name} is a virtual dataset that draws on {file}, which is not there")
+
+
+def files_beside(path: Path, dataset: Any) -> list[Path]:
+    """The other files from which a dataset draws its values: that of an external link, raw ones, those behind a virtual dataset."""
+    names = [] if Path(dataset.file.filename) == path else [dataset.file.filename]
+    names += [name for name, _, _ in dataset.external or ()]
+    if dataset.is_virtual:
+        names += [mapped.file_name for mapped in dataset.virtual_sources() if mapped.file_name != "."]
+    # HDF5 looks for a relative name beside the file, then in the current folder
+    return list(dict.fromkeys(found for name in names for found in (path.parent / name, Path(name)) if found.exists()))

@@ -29,10 +29,10 @@ def native(dtype: np.dtype[Any]) -> np.dtype[Any]:
 class FileSeries(Series):
     """A series whose frames are fetched from a file as slices in the file's own order of dimensions.
 
-    Arguments: `source` is the path; `shape` and `axes` in the file's order; `fetch(slices)` returns a fresh array of the file's dimensions, in physical values
+    Arguments: `shape` and `axes` in the file's order; `fetch(slices)` returns a fresh array of the file's dimensions, in physical values
     of type `dtype` (any byte order); `chunks` is the shape of a stored chunk, None without chunks: as many steps of one chunk as fit
     SLAB_BYTES are fetched at once and kept until the next fetch, a frame alone otherwise; `stamp` is checked before and after every
-    fetch. Raises InputError for a shape or type that cannot be a series.
+    fetch; `beside` are files that hold values of it, other than `source`. Raises InputError for a shape or type that cannot be a series.
 
     Attributes:
         given: the axes whose coordinate the file gives.
@@ -53,10 +53,11 @@ class FileSeries(Series):
         attributes: Mapping[str, Any] | None = None,
         chunks: Sequence[int] | None = None,
         close: Callable[[], None] = lambda: None,
+        beside: Sequence[Path] = (),
     ) -> None:
         lengths = dict(zip(axes, shape, strict=True))
         self.source, self.name, self.dtype = source, name, native(dtype)
-        self.files = (Path(source),)
+        self.files = (Path(source), *beside)
         self.shape = check_values(source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
         self.attributes = dict(attributes or {})
         self.units = str(self.attributes.get("units", ""))
