@@ -47,8 +47,8 @@ class Upsampling:
             matrices.append([wtz.reshape(len(start_tz), -1), wy.reshape(len(wy), -1), wx.reshape(len(wx), -1)])
             self.shapes.append([(wz.shape[1], wt.shape[2] * wz.shape[2]), wy.shape[1:], wx.shape[1:]])
             corners = [np.arange(w.shape[2]) * s for (_, w), s in zip(axes, stride, strict=True)]
-            t, z, y, e, x = np.ix_(*corners[:3], np.arange(self.size), corners[3])
-            offsets.append((t + z + y + e + x).reshape(-1))
+            t, z, x, y, e = np.ix_(corners[0], corners[1], corners[3], corners[2], np.arange(self.size))
+            offsets.append((t + z + x + y + e).reshape(-1))
             numbers += prod(level) * self.size
         join = [np.concatenate(parts, axis=1) if parts else np.zeros((1, 0)) for parts in zip(*matrices, strict=True)]
         self.starts = [torch.from_numpy(np.stack(parts, axis=1)).to(device) for parts in zip(*starts, strict=True)]
@@ -94,7 +94,7 @@ class Lattices:
     """The parts of the coarse tables that some bricks need.
 
     index: positions (bricks, numbers) among the used numbers of the flat tables; counts: numbers of each level, in the order
-        (corners t z y, E, corners x).
+        (corners t z x y, E): in this order each axis is one batched product, without a copy in between.
     matrices: per level those of (t, z), y and x, each (bricks, vertices, corners).
     """
 
@@ -107,21 +107,22 @@ class Lattices:
         """Write the embeddings (levels, E, bricks, z, y, x) at all vertices of the bricks into `out`."""
         parts = torch.split(flat[self.index], self.counts, dim=1) if self.counts else ()
         for level, (numbers, (wtz, wy, wx)) in enumerate(zip(parts, self.matrices, strict=True)):
-            bricks, z, corners = wtz.shape
-            planes = torch.bmm(wtz, numbers.reshape(bricks, corners, -1)).view(bricks, z, wy.shape[2], -1)
-            rows = torch.matmul(wy.unsqueeze(1), planes).view(bricks, -1, wx.shape[2])
-            columns = torch.bmm(rows, wx.transpose(1, 2)).view(bricks, z, wy.shape[1], self.size, -1)
-            out[level].copy_(columns.permute(3, 0, 1, 2, 4))
+            bricks = len(wtz)
+            # (bricks, x y E, t z) by (t z, Z), then (y E Z, x) by (x, X), then (Y, y) by (y, E Z X); capitals are vertices.
+            values = torch.bmm(numbers.reshape(bricks, wtz.shape[2], -1).transpose(1, 2), wtz.transpose(1, 2))
+            values = torch.bmm(values.view(bricks, wx.shape[2], -1).transpose(1, 2), wx.transpose(1, 2))
+            values = torch.bmm(wy, values.view(bricks, wy.shape[2], -1))
+            out[level].copy_(values.view(bricks, wy.shape[1], self.size, wtz.shape[1], -1).permute(2, 0, 3, 1, 4))
 
     def add_transposed(self, flat: Tensor, gradient: Tensor) -> None:
         """Add to the flat tables' gradient what gradients (levels, E, bricks, z, y, x) of the embeddings give."""
         parts = []
         for level, (wtz, wy, wx) in enumerate(self.matrices):
-            bricks, z, _ = wtz.shape
-            columns = gradient[level].permute(1, 2, 3, 0, 4).reshape(bricks, -1, wx.shape[1])
-            rows = torch.bmm(columns, wx).view(bricks, z, wy.shape[1], -1)
-            planes = torch.matmul(wy.transpose(1, 2).unsqueeze(1), rows).view(bricks, z, -1)
-            parts.append(torch.bmm(wtz.transpose(1, 2), planes).view(bricks, -1))
+            bricks = len(wtz)
+            values = gradient[level].permute(1, 3, 0, 2, 4).reshape(bricks, wy.shape[1], -1)
+            values = torch.bmm(wy.transpose(1, 2), values).view(bricks, -1, wx.shape[1])
+            values = torch.bmm(wx.transpose(1, 2), values.transpose(1, 2)).view(bricks, -1, wtz.shape[1])
+            parts.append(torch.bmm(wtz.transpose(1, 2), values.transpose(1, 2)).view(bricks, -1))
         if parts:
             flat.index_add_(0, self.index.reshape(-1), torch.cat(parts, dim=1).view(-1))
 
