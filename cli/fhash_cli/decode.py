@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from fhash_cli.options import IntervalsType, SliceType, check_writable, force_option, json_option, quiet_option, run_argument
-from fhash_cli.output import Progress, emit, extent, listed, number, spans, table
+from fhash_cli.output import Progress, apart, emit, extent, listed, number, spans, table
 from fhash_cli.selection import Span, coordinates, region_of, region_of_box, steps_of
 from fhash_formats.errors import InputError
 
@@ -68,7 +68,7 @@ def command(
             for done, step in enumerate(chosen):
                 frame = volume.read(step, region, outside=outside)
                 statistics.add(frame, _inside(volume, step, region, frame, outside))
-                yield convert(frame, kind)
+                yield convert(frame, kind, filled=outside == "background")
                 progress("decoding", done + 1, len(chosen))
 
         z, y, x = (high - low for low, high in region)
@@ -95,34 +95,41 @@ class Statistics:
     """Smallest, largest and mean value, and the share inside the coreset, of frames that are seen one at a time; NaN is left out."""
 
     def __init__(self) -> None:
-        self.low, self.high, self.sum = float("inf"), float("-inf"), 0.0
-        self.values = self.inside = self.all = 0
+        from fhash_codec.normalise import Mean
+
+        self.low, self.high, self.mean = float("inf"), float("-inf"), Mean()
+        self.inside = self.all = 0
 
     def add(self, frame: npt.NDArray[Any], inside: int) -> None:
         """Take in a frame of any shape, `inside` of whose vertices belong to the coreset."""
         import numpy as np
 
+        from fhash_codec.normalise import pieces
+
         known = frame[~np.isnan(frame)]
         self.all += frame.size
         self.inside += inside
-        self.values += known.size
         if known.size:
             self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
-            self.sum += float(known.sum(dtype=np.float64))
+        for piece in pieces(known):
+            self.mean.add(piece)
 
     def result(self) -> dict[str, float | None]:
         """JSON values; None where no vertex has a value."""
-        found = self.values > 0
+        found = self.mean.count > 0
         return {
             "min": self.low if found else None,
             "max": self.high if found else None,
-            "mean": self.sum / self.values if found else None,
-            "coreset_fraction": self.inside / self.all,
+            "mean": self.mean.value() if found else None,
+            "inside_fraction": self.inside / self.all,
         }
 
 
-def convert(frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any]) -> npt.NDArray[Any]:
-    """A decoded frame in another number type: rounded and clipped for integers; raises InputError where the type cannot hold a value."""
+def convert(frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any], *, filled: bool = False) -> npt.NDArray[Any]:
+    """A decoded frame in another number type: rounded and clipped for integers; raises InputError where the type cannot hold a value.
+
+    `filled`: vertices outside the coreset have the background's value, so that NaN is what the data had none for.
+    """
     import numpy as np
 
     if kind == frame.dtype:
@@ -134,6 +141,8 @@ def convert(frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any]) -> npt.ND
             raise InputError(f"a value of {float(np.nanmax(np.abs(frame))):.6g} does not fit {kind}; choose a wider type")
         return narrow
     if np.isnan(frame).any():
+        if filled:
+            raise InputError(f"the data have no value (NaN) at some vertices of the region, which {kind} cannot hold; take a float type")
         raise InputError(
             f"the region holds vertices without a value (NaN), which {kind} cannot hold; add --outside background, or take a float type"
         )
@@ -158,11 +167,11 @@ def _inside(volume: Volume, step: float, region: Sequence[Span], frame: npt.NDAr
 def _rows(result: dict[str, Any], units: str) -> list[tuple[str, str]]:
     return [
         *(("written", path) for path in result["paths"]),
-        ("steps", listed([f"{step:g}" for step in result["steps"]])),
+        ("steps", listed(apart(*result["steps"]))),
         ("region", spans(result["region"])),
         ("t, z, y, x", f"{extent(result['shape'])}, {result['dtype']}"),
         ("smallest", number(result["min"], units, digits=6)),
         ("largest", number(result["max"], units, digits=6)),
         ("mean", number(result["mean"], units, digits=6)),
-        ("in the coreset", f"{result['coreset_fraction']:.3%}"),
+        ("in the coreset", f"{result['inside_fraction']:.3%}"),
     ]

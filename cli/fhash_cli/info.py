@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.options import json_option, run_argument
-from fhash_cli.output import compared, emit, extent, listed, number, quality_rows, spans, table
+from fhash_cli.output import apart, compared, emit, extent, listed, number, quality_rows, spans, table
 
 if TYPE_CHECKING:
     from fhash_codec import Volume
@@ -48,4 +48,4 @@ def _positions(volume: Volume, axis: str) -> str:
     """The positions of an axis in a few words: name, first, last, units."""
     coordinate = volume.coords[axis]
     units = coordinate.attributes.get("units", "")
-    return f"{coordinate.name} {coordinate.values[0]:g} to {coordinate.values[-1]:g} {units}".rstrip()
+    return f"{coordinate.name} {' to '.join(apart(coordinate.values[0], coordinate.values[-1]))} {units}".rstrip()

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
 import traceback
 import warnings
+from types import FrameType
 from typing import Any, cast
 
 import click
@@ -61,6 +63,8 @@ class Program(click.Group):
         try:
             result = super().main(*args, **{**extra, "standalone_mode": False})
         except Exception as error:
+            if isinstance(error, click.Abort):  # Ctrl-C before the command began
+                error = InterruptedEncodingError("interrupted")
             if os.environ.get("FHASH_DEBUG"):
                 traceback.print_exc(file=sys.stderr)
             line, code = describe_error(error)
@@ -86,14 +90,42 @@ def program(context: click.Context) -> None:
 
 def main() -> None:
     """Entry point of the console script."""
+    _occupy_streams()
+    _heed_signals()
     try:
         program(prog_name="fhash")
+    except KeyboardInterrupt:
+        say("error: interrupted")
+        sys.exit(InterruptedEncodingError.exit_code)
     finally:
         _settle_stdout()
 
 
+def _occupy_streams() -> None:
+    """Open the null device in place of closed standard streams, or an output would take the number of one and what is printed there."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+
+
+def _heed_signals() -> None:
+    """What ends a job or its terminal does it as Ctrl-C does, and nothing half written stays; an ignored signal (nohup) stays ignored."""
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _interrupt)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
 def _settle_stdout() -> None:
     """Flush stdout; where it is full or closed, drop what is left, or the interpreter prints a traceback of its own while it ends."""
+    if sys.stdout is None:
+        return
     try:
         sys.stdout.flush()
     except OSError:

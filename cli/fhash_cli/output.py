@@ -12,7 +12,8 @@ from typing import Any, TextIO
 
 import click
 
-from fhash_formats.errors import FhashError
+from fhash_formats.attributes import plain_text
+from fhash_formats.errors import FhashError, OutputError
 
 QUIET_SECONDS = 2.0
 """Stages shorter than this show no progress."""
@@ -31,8 +32,10 @@ def warn(
 
 
 def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
-    """The result on stdout: one JSON object in one line, or the text for people."""
-    click.echo(json.dumps(result, allow_nan=False) if as_json else text)
+    """The result on stdout: one JSON object in one line, or the text for people; raises OutputError where stdout is closed."""
+    if sys.stdout is None:
+        raise OutputError("the result cannot be printed, stdout is closed; files named as outputs are written")
+    click.echo(json.dumps(result, allow_nan=False) if as_json else plain_text(text))
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
@@ -66,6 +69,15 @@ def compared(report: Mapping[str, Any]) -> str:
 def number(value: float | None, unit: str = "", *, digits: int = 4) -> str:
     """A measured value with its unit, where it has one ("1" stands for none); None (not defined) as a dash."""
     return "-" if value is None else f"{value:.{digits}g} {'' if unit == '1' else unit}".rstrip()
+
+
+def apart(*values: float) -> list[str]:
+    """Numbers with 6 digits, or as many more, up to 12, as it takes to tell those that differ apart."""
+    for digits in range(6, 13):
+        texts = [f"{value:.{digits}g}" for value in values]
+        if len(set(texts)) == len(set(values)):
+            break
+    return texts
 
 
 def extent(shape: Sequence[int]) -> str:
@@ -120,7 +132,7 @@ class Progress:
 
     def __init__(self, *, quiet: bool) -> None:
         self.quiet = quiet
-        self.terminal = sys.stderr.isatty()
+        self.terminal = sys.stderr is not None and sys.stderr.isatty()
         self.stage = ""
         self.start = self.last = time.monotonic()
         self.shown = 0.0

@@ -45,13 +45,19 @@ def _vertices(volume: Volume, axis: str, low: float | None, high: float | None) 
     first, last = float(positions.min()), float(positions.max())
     start, end = first if low is None else low, last if high is None else high
     if not first <= start <= last or not first <= end <= last:
-        raise RegionError(f"--box along {axis} is {start:g}:{end:g}; the domain has positions {first:g} to {last:g}")
+        raise RegionError(f"--box along {axis} is {start:.12g}:{end:.12g}; the domain has positions {first:.12g} to {last:.12g}")
     inside = np.flatnonzero((positions >= start) & (positions <= end))
     if not inside.size:
         raise RegionError(
-            f"--box along {axis} is {start:g}:{end:g}, which holds no vertex; the {positions.size} vertices lie further apart"
+            f"--box along {axis} is {start:.12g}:{end:.12g}, which holds no vertex; the {positions.size} vertices lie further apart"
         )
-    return int(inside[0]), int(inside[-1]) + 1
+    low_index, high_index = int(inside[0]), int(inside[-1]) + 1
+    if high_index - low_index != inside.size:
+        raise RegionError(
+            f"--box along {axis} is {start:.12g}:{end:.12g}; the positions along {axis} neither ascend nor descend, and between vertices "
+            f"{low_index} and {high_index - 1} some lie outside it; give vertices with --roi"
+        )
+    return low_index, high_index
 
 
 def coordinates(volume: Volume, steps: Sequence[float], region: Sequence[Span]) -> dict[str, Coordinate]:

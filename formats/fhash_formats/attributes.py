@@ -47,10 +47,14 @@ def text_of(value: Any) -> str:
     return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)
 
 
+def plain_text(text: str) -> str:
+    """The text with "?" for each lone surrogate, which no file can hold: so Python gives bytes of names that are no UTF-8."""
+    return text.encode("utf-8", errors="replace").decode("utf-8")
+
+
 def _json_value(value: Any) -> Any:
     if isinstance(value, str):
-        # h5py gives bytes that are no UTF-8 as lone surrogates, which neither JSON nor any file can hold
-        return value.encode("utf-8", errors="replace").decode("utf-8")
+        return plain_text(value)
     if value is None or isinstance(value, bool | int):
         return value
     if isinstance(value, bytes):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import h5py
 import numpy as np
@@ -12,8 +14,10 @@ import pytest
 from click.testing import Result
 
 import fhash_codec
-from fhash_cli.decode import TYPES, convert
-from fhash_formats.errors import InputError
+from fhash_cli.decode import TYPES, Statistics, convert
+from fhash_cli.selection import region_of_box
+from fhash_formats.errors import InputError, RegionError
+from fhash_formats.series import Coordinate
 
 Fhash = Callable[..., Result]
 
@@ -92,17 +96,17 @@ def test_statistics_are_those_of_the_region(fhash: Fhash, run: Path, whole: np.n
     assert report["min"] == np.nanmin(part)
     assert report["max"] == np.nanmax(part)
     assert report["mean"] == pytest.approx(np.nanmean(part, dtype=float))
-    assert report["coreset_fraction"] == (~np.isnan(part)).mean()
+    assert report["inside_fraction"] == (~np.isnan(part)).mean()
     assert (report["shape"], report["steps"], report["region"]) == ([1, 3, 7, 8], [1.0], [[2, 5], [0, 7], [0, 8]])
     filled = json.loads(fhash("decode", run, "--t", "1", "--roi", "2:5,:,:", "--outside", "background", "--json").stdout)
-    assert filled["coreset_fraction"] == report["coreset_fraction"]
+    assert filled["inside_fraction"] == report["inside_fraction"]
     assert list(tmp_path.iterdir()) == []
 
 
 def test_statistics_of_nothing_have_no_numbers(fhash: Fhash, run: Path) -> None:
     result = fhash("decode", run, "--t", "0", "--roi", ":1,:1,-1:", "--json")
     report = json.loads(result.stdout)
-    assert (report["min"], report["mean"], report["coreset_fraction"]) == (None, None, 0.0)
+    assert (report["min"], report["mean"], report["inside_fraction"]) == (None, None, 0.0)
     assert "smallest        -\n" in fhash("decode", run, "--t", "0", "--roi", ":1,:1,-1:").stdout
 
 
@@ -130,3 +134,66 @@ def test_conversions_that_would_lose_a_value_are_refused() -> None:
     with pytest.raises(InputError, match="does not fit float16"):
         convert(np.array([1.0, 1e6]), np.dtype(np.float16))
     assert np.isnan(convert(np.array([np.nan]), np.dtype(np.float16))).all()
+
+
+def test_statistics_of_huge_values_do_not_overflow() -> None:
+    statistics = Statistics()
+    for _ in range(3):
+        statistics.add(np.array([[5e307, 1.5e308, np.nan]]), 2)
+    assert statistics.result() == {"min": 5e307, "max": 1.5e308, "mean": 1e308, "inside_fraction": 2 / 3}
+
+
+def test_huge_values_are_decoded_to_valid_json(fhash: Fhash, tmp_path: Path) -> None:
+    np.save(tmp_path / "huge.npy", np.linspace(-5e307, 5e307, 120).reshape(2, 3, 4, 5))
+    assert fhash("encode", tmp_path / "huge.npy", "-o", tmp_path / "run.fhz", "--epochs", "1", "--width", "4").exit_code == 0
+    result = fhash("decode", tmp_path / "run.fhz", "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    report = json.loads(result.stdout)
+    assert report["min"] <= report["mean"] <= report["max"]
+
+
+def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(refused: Callable[..., str], fhash: Fhash, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the data have no value") as caught:
+        convert(np.array([1.0, np.nan]), np.dtype(np.uint8), filled=True)
+    assert "--outside" not in str(caught.value)
+    values = np.arange(120, dtype=np.float32).reshape(2, 3, 4, 5)
+    values[0, 0, 0, 0] = np.nan
+    np.save(tmp_path / "gap.npy", values)
+    assert fhash("encode", tmp_path / "gap.npy", "-o", tmp_path / "run.fhz", "--epochs", "1", "--width", "4").exit_code == 0
+    with fhash_codec.open(tmp_path / "run.fhz") as volume:
+        gap = bool(np.isnan(volume.read(0, outside="background")).any())
+    if gap:
+        assert "the data have no value" in refused(2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8")
+
+
+@pytest.mark.parametrize(
+    ("positions", "box", "expected"),
+    [
+        ([0.0, 5.0, 1.0, 6.0], (0.5, 2.0), (2, 3)),
+        ([0.0, 5.0, 1.0, 6.0], (0.0, 6.0), (0, 4)),
+        ([0.0, 5.0, 1.0, 6.0], (0.0, 1.0), None),
+        ([0.0, 1.0, 1.0, 2.0], (1.0, 1.0), (1, 3)),
+        ([3.0, 2.0, 1.0, 0.0], (1.0, 2.0), (1, 3)),
+    ],
+)
+def test_a_box_never_gives_vertices_outside_it(positions: list[float], box: tuple[float, float], expected: tuple[int, int] | None) -> None:
+    coordinate = Coordinate(name="x", values=np.array(positions))
+    volume = cast(fhash_codec.Volume, SimpleNamespace(coords={"x": coordinate, "y": coordinate, "z": coordinate}))
+    if expected is None:
+        with pytest.raises(RegionError, match=r"neither ascend nor descend.*--roi"):
+            region_of_box(volume, [(None, None), (None, None), box])
+    else:
+        assert region_of_box(volume, [(None, None), (None, None), box])[2] == expected
+
+
+def test_a_box_outside_by_little_says_by_how_much() -> None:
+    coordinate = Coordinate(name="x", values=347921.0 + np.arange(3) / 1000)
+    volume = cast(fhash_codec.Volume, SimpleNamespace(coords=dict.fromkeys("zyx", coordinate)))
+    with pytest.raises(RegionError, match=r"347921:347921\.003; the domain has positions 347921 to 347921\.002"):
+        region_of_box(volume, [(347921.0, 347921.003), (None, None), (None, None)])
+
+
+def test_an_output_name_that_is_no_utf8(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    result = fhash("decode", run, "-o", tmp_path / "\udcff.npy")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert (tmp_path / "\udcff.npy").exists()

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 from click.testing import Result
 
@@ -111,3 +113,69 @@ def test_info_loads_nothing_slow(run: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code, run], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+SLOW_DISK = """
+import os, signal, sys, time
+from fhash_cli import main
+if sys.argv[1] == "decode":
+    from fhash_codec.volume import Volume as Slow
+    name = "read"
+else:
+    from fhash_formats.container import ContainerWriter as Slow
+    name = "add_array"
+def sleeping(*_, **__):
+    print("ready", file=sys.stderr, flush=True)
+    time.sleep(60)
+setattr(Slow, name, sleeping)
+main.main()
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGHUP there")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
+@pytest.mark.parametrize("command", ["encode", "decode"])
+def test_a_signal_leaves_nothing_half_written(data: Path, run: Path, tmp_path: Path, command: str, name: str) -> None:
+    words = {
+        "encode": ["encode", data, "-o", tmp_path / "out.fhz", "--epochs", "1", "--width", "4"],
+        "decode": ["decode", run, "-o", tmp_path / "out.npy"],
+    }[command]
+    with subprocess.Popen([sys.executable, "-c", SLOW_DISK, *words], stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        lines = iter(process.stderr)
+        assert "ready\n" in lines
+        process.send_signal(getattr(signal, name))
+        rest = "".join(lines)
+    assert (process.returncode, rest) == (130, "fhash: error: interrupted\n")
+    assert [path.name for path in tmp_path.iterdir() if not path.name.endswith(".checkpoint")] == []
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGHUP there")
+def test_a_signal_that_is_ignored_stays_ignored(run: Path) -> None:
+    code = "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\nfrom fhash_cli import main\nmain._heed_signals()\n"
+    code += "print(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN, signal.getsignal(signal.SIGTERM) is main._interrupt)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "True True\n"
+
+
+def closed(words: list[object], streams: str) -> subprocess.CompletedProcess[str]:
+    """The program run with some streams closed, as a shell's `>&-` does."""
+    shell = ["sh", "-c", f'exec "$@" {streams}', "sh"]
+    return subprocess.run([*shell, *map(str, [*MAIN, *words])], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("json_or_not", [[], ["--json"]])
+def test_a_closed_stdout_is_one_line(run: Path, tmp_path: Path, json_or_not: list[str]) -> None:
+    done = closed(["info", run, *json_or_not], ">&-")
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1), done.stderr
+    assert "stdout is closed" in done.stderr
+    done = closed(["decode", run, "-o", tmp_path / "out.npy", *json_or_not], ">&-")
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1), done.stderr
+    assert np.load(tmp_path / "out.npy").shape == (3, 6, 7, 8)
+
+
+def test_closed_streams_do_not_end_up_in_outputs(run: Path, tmp_path: Path) -> None:
+    for number, streams in enumerate(["2>&-", ">&- 2>&-", "<&- >&- 2>&-"]):
+        done = closed(["decode", run, "-o", tmp_path / f"{number}.npy"], streams)
+        assert done.returncode == (0 if number == 0 else 1)
+        assert np.load(tmp_path / f"{number}.npy").shape == (3, 6, 7, 8)

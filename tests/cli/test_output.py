@@ -8,7 +8,7 @@ import click
 import pytest
 
 from fhash_cli import output
-from fhash_cli.output import Progress, compared, describe_error, emit, listed, number, size, table
+from fhash_cli.output import Progress, apart, compared, describe_error, emit, listed, number, size, table
 from fhash_formats.errors import DamagedFileError, InputError, QualityError
 
 
@@ -124,3 +124,10 @@ def test_every_error_is_one_line_with_an_exit_code(error: Exception, line: str, 
     assert text.startswith(line)
     assert "\n" not in text
     assert got == code
+
+
+def test_numbers_have_as_many_digits_as_tell_them_apart() -> None:
+    assert apart(0.0, 4.0) == ["0", "4"]
+    assert apart(347921.0, 347921.002) == ["347921", "347921.002"]
+    assert apart(7.0, 7.0) == ["7", "7"]
+    assert apart(1.0, 1.0 + 1e-15) == ["1", "1"]

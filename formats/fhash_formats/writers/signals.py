@@ -8,10 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+HELD = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+"""The last is not everywhere."""
+
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Python's handlers of SIGINT and SIGTERM run after the block and not inside it; only the main thread ever runs them."""
+    """Python's handlers of SIGINT, SIGTERM and SIGHUP run after the block and not inside it; only the main thread ever runs them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -20,7 +23,7 @@ def signals_held() -> Iterator[None]:
     def hold(number: int, frame: FrameType | None) -> None:
         came.append(number)
 
-    handlers = {number: handler for number in (signal.SIGINT, signal.SIGTERM) if callable(handler := signal.getsignal(number))}
+    handlers = {number: handler for number in HELD if callable(handler := signal.getsignal(number))}
     try:
         for number in handlers:
             signal.signal(number, hold)
