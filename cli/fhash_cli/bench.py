@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.options import SourceOptions, config_options, json_option, quiet_option, series_options
+from fhash_cli.options import RealRange, SourceOptions, config_options, json_option, quiet_option, series_options
 from fhash_cli.output import Progress, emit, number, table
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def command() -> None:
 @click.argument("data", type=click.Path())
 @series_options
 @click.option("--engines", type=EnginesType(), help="Which to measure. Default: all there are.")
-@click.option("--seconds", type=click.FloatRange(0.1, 3600), default=12.0, show_default=True, metavar="X", help="Training of each engine.")
+@click.option("--seconds", type=RealRange(0.1, 3600), default=12.0, show_default=True, metavar="X", help="Training of each engine.")
 @config_options(
     "features", "dilation", "key_frames", "embedding_size", "hidden_layers", "width", "learning_rate", "batch", "device", "seed"
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -34,6 +35,17 @@ def check_writable(path: str | Path, force: bool, *, region: bool = False, sourc
         (save_check if region else check_output)(Path(path), force, sources=sources)
     except OutputError as error:
         raise InputError(str(error)) from error
+
+
+class RealRange(click.FloatRange):
+    """A number within limits; click's own lets NaN through, which is neither below nor above anything."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number; refuses NaN and whatever is outside the limits."""
+        number = float(super().convert(value, param, ctx))
+        if math.isnan(number):
+            self.fail(f"'{value}' is not a number", param, ctx)
+        return number
 
 
 class SliceType(click.ParamType[slice]):
@@ -157,7 +169,7 @@ def _setting(field: dataclasses.Field[Any], hint: Any) -> Callable[[Command], Co
         kind = click.Choice(limits["choices"])
     elif limits["low"] is not None:
         metavar = "N" if kind is int else "X"
-        kind = click.IntRange(int(limits["low"]), int(limits["high"])) if kind is int else click.FloatRange(limits["low"], limits["high"])
+        kind = click.IntRange(int(limits["low"]), int(limits["high"])) if kind is int else RealRange(limits["low"], limits["high"])
     return click.option(
         flag,
         field.name,

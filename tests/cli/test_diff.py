@@ -53,3 +53,35 @@ def test_an_exact_file_passes_every_gate(fhash: Fhash, tmp_path: Path) -> None:
 def test_other_data_are_refused(refused: Callable[..., str], run: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "other.npy", np.zeros((3, 6, 7, 9), dtype=np.float32))
     assert "(3, 6, 7, 9)" in refused(2, "diff", tmp_path / "other.npy", run)
+
+
+@pytest.mark.parametrize(
+    ("figures", "words", "missed"),
+    [
+        ({"psnr": None, "rmse": 0.0, "max_abs_error": 0.0}, ["--min-psnr", "200", "--max-error", "0"], ""),
+        ({"psnr": None, "rmse": 0.1, "max_abs_error": 0.1}, ["--min-psnr", "1"], "no PSNR is defined in the coreset; at least 1 dB"),
+        ({"psnr": None, "rmse": None, "max_abs_error": None}, ["--min-psnr", "1"], "no PSNR is defined in the coreset"),
+        ({"psnr": None, "rmse": None, "max_abs_error": None}, ["--max-error", "1"], "no value can be compared in the coreset; at most 1"),
+    ],
+)
+def test_a_figure_that_is_not_defined_meets_no_gate(
+    fhash: Fhash,
+    data: Path,
+    run: Path,
+    report: dict[str, float],
+    monkeypatch: pytest.MonkeyPatch,
+    figures: dict[str, float | None],
+    words: list[str],
+    missed: str,
+) -> None:
+    monkeypatch.setattr("fhash_codec.diff", lambda *_, **__: {**report, **figures})
+    result = fhash("diff", data, run, *words)
+    assert result.exit_code == (3 if missed else 0)
+    assert missed in result.stderr
+    assert len(result.stderr.splitlines()) == bool(missed)
+
+
+@pytest.mark.parametrize("value", ["nan", "-1", "-inf", "x"])
+@pytest.mark.parametrize("gate", ["--min-psnr", "--max-error"])
+def test_a_gate_is_a_number(refused: Callable[..., str], gate: str, value: str) -> None:
+    assert gate in refused(2, "diff", "data", "run", gate, value)

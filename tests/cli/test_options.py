@@ -6,9 +6,10 @@ import dataclasses
 
 import click
 import pytest
+from click.testing import CliRunner
 
 from fhash_cli.encode import command as encode
-from fhash_cli.options import IntervalsType, SliceType, parse_slice
+from fhash_cli.options import IntervalsType, RealRange, SliceType, parse_slice
 from fhash_codec.config import EncodeConfig
 
 
@@ -71,3 +72,16 @@ def test_settings_reach_the_encoding_as_a_config() -> None:
         ["--feature", "all", "--feature", "isosurface:2", "--no-timings", "--psnr", "40", "--key-frames", "0,2"], standalone_mode=False
     )
     assert seen == [EncodeConfig(), EncodeConfig(features=("all", "isosurface:2"), timings=False, psnr=40.0, key_frames="0,2")]
+
+
+@pytest.mark.parametrize("text", ["nan", "NaN", "-1", "0.05", "3601", "-inf", "inf"])
+def test_numbers_are_within_their_limits(text: str) -> None:
+    assert RealRange(0.1, 3600).convert("12", None, None) == 12
+    with pytest.raises(click.BadParameter):
+        RealRange(0.1, 3600).convert(text, None, None)
+
+
+@pytest.mark.parametrize("flag", ["--psnr", "--learning-rate"])
+def test_settings_refuse_nan(flag: str) -> None:
+    result = CliRunner().invoke(encode, ["data", "-o", "out.fhz", flag, "nan"])
+    assert result.exit_code == 2
