@@ -214,7 +214,8 @@ def test_fill_values_and_packing_mean_nothing_in_plain_hdf5(tmp_path: Path) -> N
         file["v"] = VALUES
         file["v"].attrs["_FillValue"] = VALUES[0, 0, 0, 0]
         file["v"].attrs["scale_factor"] = 2.0
-    assert_frames(tmp_path / "a.h5", VALUES)
+    with pytest.warns(UserWarning, match="v has the attributes scale_factor, _FillValue; its values are read as they stand"):
+        assert_frames(tmp_path / "a.h5", VALUES)
 
 
 def test_a_user_block_before_the_signature(tmp_path: Path) -> None:
@@ -323,3 +324,14 @@ def test_what_is_kept_of_a_chunk_is_bounded(tmp_path: Path, monkeypatch: pytest.
         assert series._slab[1].shape[0] == 2
         frame[:] = 0  # a frame is the caller's own
         np.testing.assert_array_equal(np.stack(list(series.frames())), VALUES)
+
+
+def test_packing_in_plain_hdf5_is_warned_of(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["v"] = np.arange(24, dtype="i2").reshape(2, 3, 4)
+        file["v"].attrs.update({"scale_factor": 0.5, "missing_value": np.int16(3), "add_offset": 0.0})
+    with pytest.warns(UserWarning, match=r"^v has the attributes scale_factor, missing_value; .* a file named \.nc is unpacked$"):
+        open_series(tmp_path / "a.h5").close()
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["v"].attrs.update({"scale_factor": 1, "missing_value": np.nan, "_FillValue": np.array([np.nan])})
+    open_series(tmp_path / "a.h5").close()

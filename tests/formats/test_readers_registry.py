@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -157,3 +159,49 @@ def test_an_import_is_cheap() -> None:
         "import fhash_formats.readers, sys; print([name for name in ('h5py', 'zarr', 'xarray', 'torch', 'scipy') if name in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout.strip() == "[]"
+
+
+def test_axes_in_any_case(path: Path) -> None:
+    with open_series(path, axes="T,Z,y,X") as series:
+        np.testing.assert_array_equal(series.read(3), VALUES[3])
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".h5", ".nc", ".zip"])
+def test_a_raw_layout_is_not_for_files_of_another_format(path: Path, tmp_path: Path, suffix: str) -> None:
+    named = tmp_path / f"named{suffix}"
+    named.write_bytes(path.read_bytes())
+    for layout in (RawLayout(dtype="f4"), RawLayout({"x": 1, "y": 1, "z": 1}), RawLayout(endian="big")):
+        with pytest.raises(InputError, match="--shape, --dtype and --endian are for raw files only"):
+            open_series(named, raw=layout)
+
+
+@pytest.mark.parametrize("place", ["exists", "is_dir", "is_file"])
+def test_what_may_not_be_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
+    import zarr
+
+    zarr.create_array(tmp_path / "a.zarr", shape=(2, 2, 2), dtype="f4")
+
+    def denied(*_: Any, **__: Any) -> bool:  # the tests may run as root, whom no mode stops
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "a.zarr"))
+
+    monkeypatch.setattr(Path, place, denied)
+    with pytest.raises(InputError, match=r"a.zarr cannot be read: .*Permission denied"):
+        open_series(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize("name", ["a\udcff.npy", "a\udcff_6x5x3_float32.raw", "a\udcff_*.npy", "a\udcff.zarr"])
+def test_names_are_text_whatever_the_file_is_called(tmp_path: Path, name: str) -> None:
+    frame = np.zeros((3, 5, 6), np.float32)
+    for part in [tmp_path / name.replace("*", str(step)) for step in range(2)] if "*" in name else [tmp_path / name]:
+        if name.endswith(".raw"):
+            part.write_bytes(frame.tobytes())
+        elif name.endswith(".npy"):
+            np.save(part, frame)
+        else:
+            import zarr
+
+            zarr.create_array(tmp_path / "a.zarr", data=frame)
+            (tmp_path / "a.zarr").rename(part)
+    with open_series(tmp_path / name) as series:
+        assert series.name.encode()[:2] == b"a?"
+        np.testing.assert_array_equal(series.read(0), frame)

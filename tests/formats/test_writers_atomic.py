@@ -328,3 +328,21 @@ def test_no_output_is_its_own_input(tmp_path: Path, make: Any, words: str, force
             check_output(path, force, directory=path.is_dir(), sources=[tmp_path / "other", name])
         assert "--force" not in str(caught.value)
     check_output(path.with_name("out.npy") if make is not inside else tmp_path / "out", False, sources=[tmp_path / "a.npy"])
+
+
+def test_a_link_into_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    (tmp_path / "out.npy").symlink_to(tmp_path / "gone" / "out.npy")
+    with pytest.raises(OutputError, match=r"out.npy is a link to .*, and the folder .*gone does not exist; create it"):
+        check_output(tmp_path / "out.npy", True)
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
+@pytest.mark.parametrize("links", [True, False])
+def test_the_permissions_of_what_is_replaced_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int, links: bool) -> None:
+    if not links:
+        monkeypatch.setattr(os, "link", no_links)
+    path = file(tmp_path / "out.npy")
+    path.chmod(mode)
+    with replacing(path, force=True) as temporary:
+        temporary.write_text("new")
+    assert (path.read_text(), path.stat().st_mode & 0o777) == ("new", mode)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
-from fhash_formats.attributes import json_attributes, text_of
+from fhash_formats.attributes import json_attributes, plain_text, text_of
 from fhash_formats.readers.failures import Stamp, refusing
 from fhash_formats.readers.hdf5_tree import column, columns, datasets, files_beside, own_name, require_filters, require_sources, variables
 from fhash_formats.readers.lattice import FileSeries
@@ -14,6 +15,9 @@ from fhash_formats.readers.request import Request
 from fhash_formats.readers.roles import assign_axes, role_of_coordinate, role_of_name
 from fhash_formats.readers.variables import choose
 from fhash_formats.series import Coordinate
+
+PACKED = {"scale_factor": 1, "add_offset": 0, "_FillValue": "NaN", "missing_value": "NaN"}
+"""Attributes by which NetCDF files pack values, and with which value they change none."""
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -54,6 +58,7 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     dataset = variable.handle
     require_filters(source, variable.name, dataset)
     require_sources(source, path, variable.name, dataset)
+    _warn_of_packing(variable.name, dataset)
     scales = [_scale(dimension) for dimension in dataset.dims]
     names = [dimension.label or (scale[0] if scale else None) for dimension, scale in zip(dataset.dims, scales, strict=True)]
     hints = [_hint(dimension.label, scale) for dimension, scale in zip(dataset.dims, scales, strict=True)]
@@ -78,6 +83,15 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         close=file.close,
         beside=files_beside(path, dataset),
     )
+
+
+def _warn_of_packing(name: str, dataset: Any) -> None:
+    """Say that attributes which change the values of a NetCDF file change none here; without the path, so once for many files."""
+    attributes = json_attributes(dataset.attrs)
+    found = [key for key, idle in PACKED.items() if key in attributes and attributes[key] not in (idle, [idle])]
+    if found:
+        text = f"{plain_text(name)} has the attribute{'s' if len(found) > 1 else ''} {', '.join(found)}"
+        warnings.warn(f"{text}; its values are read as they stand in HDF5, a file named .nc is unpacked", UserWarning, stacklevel=2)
 
 
 def _scale(dimension: Any) -> tuple[str, Any] | None:

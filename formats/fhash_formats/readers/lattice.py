@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.attributes import plain_text
 from fhash_formats.errors import InputError
 from fhash_formats.readers.failures import Stamp, refusing
 from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
@@ -56,7 +57,7 @@ class FileSeries(Series):
         beside: Sequence[Path] = (),
     ) -> None:
         lengths = dict(zip(axes, shape, strict=True))
-        self.source, self.name, self.dtype = source, name, native(dtype)
+        self.source, self.name, self.dtype = source, plain_text(name), native(dtype)
         self.files = (Path(source), *beside)
         self.shape = check_values(source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
         self.attributes = dict(attributes or {})

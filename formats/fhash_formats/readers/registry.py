@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.errors import FhashError, InputError, MissingInputError
 from fhash_formats.readers import hdf5, netcdf, npy, raw, zarr_store
-from fhash_formats.readers.failures import refusing
+from fhash_formats.readers.failures import condense, refusing
 from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern
 from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.request import RawLayout, Request, parse_axes
@@ -72,8 +72,17 @@ def open_whole(path: str | Path, request: Request) -> Series:
     """All steps of the series in a file, folder or pattern of files."""
     text = str(path)
     if is_pattern(text):
-        return JoinedSeries(text, files_of(text), lambda part: find_reader(part, request).open(part, request))
-    return find_reader(Path(path), request).open(Path(path), request)
+        return JoinedSeries(text, files_of(text), lambda part: _open_one(part, request))
+    return _open_one(Path(path), request)
+
+
+def _open_one(path: Path, request: Request) -> FileSeries:
+    try:
+        return find_reader(path, request).open(path, request)
+    except OSError as error:  # a folder that may not be entered, wherever somebody looks into it
+        if isinstance(error, FhashError):
+            raise
+        raise InputError(f"{path} cannot be read: {condense(error)}") from error
 
 
 def find_reader(path: Path, request: Request) -> Reader:
@@ -89,15 +98,20 @@ def find_reader(path: Path, request: Request) -> Reader:
     if not path.is_file():
         raise InputError(f"{path} is not a regular file; write its data to a file first")
     head = _head(path)
+    suffix = path.suffix.lower()
     if request.raw is not None:
-        return RAW
-    if path.suffix.lower() == CONTAINER_SUFFIX or _is_container(path, head):
+        other = next((reader for reader in REGISTRY if reader is not RAW and suffix in reader.suffixes), None)
+        if other is not None:
+            raise InputError(f"{path} is a {other.name} file by its name; --shape, --dtype and --endian are for raw files only")
+        if suffix != CONTAINER_SUFFIX:
+            return RAW
+    if suffix == CONTAINER_SUFFIX or _is_container(path, head):
         raise InputError(f"{path} is encoded already; use: fhash decode {path.name}")
     for reader in REGISTRY:
         if reader.matches(head, path):
             return reader
     for reader in REGISTRY:
-        if path.suffix.lower() in reader.suffixes:
+        if suffix in reader.suffixes:
             return reader
     raise InputError(f"{path} is of no format that can be read: {', '.join(str(reader) for reader in REGISTRY)}")
 

@@ -38,8 +38,8 @@ def parse_shape(text: str) -> dict[str, int]:
 
 
 def parse_axes(text: str) -> tuple[str, ...]:
-    """The axis of each dimension of the file from text such as "t,z,y,x"; raises InputError where it is not of that form."""
-    letters = tuple(word.strip() for word in text.split(","))
+    """The axis of each dimension of the file from text such as "t,z,y,x", in any case; raises InputError where it is not of that form."""
+    letters = tuple(word.strip().lower() for word in text.split(","))
     if not set(letters) <= set(AXES) or len(set(letters)) != len(letters):
         raise InputError(f"axes '{text}': name the file's dimensions in their order, each once, by t, z, y and x, such as t,z,y,x")
     return letters

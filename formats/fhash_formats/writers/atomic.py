@@ -48,6 +48,10 @@ def check_output(path: Path, force: bool, *, directory: bool = False, sources: S
     except FileNotFoundError as error:
         if folder.is_dir():
             return
+        if folder != Path(os.path.realpath(path.parent)):
+            raise OutputError(
+                f"{path} is a link to {target}, and the folder {folder} does not exist; create it, or choose another name"
+            ) from error
         raise explained(path, error) from error
     except OSError as error:
         raise explained(path, error) from error
@@ -157,11 +161,18 @@ class _Output:
             # Once more, because hours may have passed: a folder that appeared meanwhile is not ours to delete.
             check_output(self.path, force, directory=directory)
             if os.path.lexists(self.target):
+                self._keep_mode()
                 self._keep_old()
             os.replace(self.temporary, self.target)
         else:
             self._create()
         self.placed = True
+
+    def _keep_mode(self) -> None:
+        """Give the new file the permissions of the old one, which may have been meant for no one else's eyes."""
+        if not self.target.is_dir():
+            with suppress(OSError):  # no permissions here, as on exFAT
+                os.chmod(self.temporary, stat.S_IMODE(os.stat(self.target).st_mode))
 
     def _keep_old(self) -> None:
         if not self.target.is_dir():
