@@ -134,21 +134,6 @@ def build_coreset(
     )
 
 
-def unpack_frame(coreset: Coreset, key: int) -> npt.NDArray[np.float32]:
-    """The samples of one key frame back in the box: float32 (z, y, x), normalised, NaN where there is none."""
-    shape, grid = coreset.brick_shape, coreset.brick_grid
-    first, last = np.searchsorted(coreset.bricks[:, 0], [key, key + 1])
-    mask = np.unpackbits(coreset.mask_bits[first:last], axis=1, count=prod(shape)).view(np.bool_)
-    held = np.full(mask.shape, np.nan, dtype=np.float32)
-    held[mask] = coreset.values[coreset.offsets[first] : coreset.offsets[last]]
-    tiles = np.full((*grid, *shape), np.nan, dtype=np.float32)
-    _, z, y, x = coreset.bricks[first:last].T
-    tiles[z, y, x] = held.reshape(-1, *shape)
-    whole = tiles.transpose(0, 3, 1, 4, 2, 5).reshape([count * step for count, step in zip(grid, shape, strict=True)])
-    z_size, y_size, x_size = box_size(coreset.box)
-    return whole[:z_size, :y_size, :x_size]
-
-
 def brick_shape(size: Sizes) -> Sizes:
     """Vertices of a brick (z, y, x) for a box of that size: 8 x 8 x 16, and where an axis is shorter the factors of two go to the others.
 

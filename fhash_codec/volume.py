@@ -17,7 +17,7 @@ from fhash_codec.decoder import decode_region, sample_points
 from fhash_codec.key_frames import KeyTimes, strictly_monotonic, time_axis
 from fhash_codec.network import Network
 from fhash_codec.normalise import ValueRange
-from fhash_codec.occupancy import unpack
+from fhash_codec.occupancy import between, unpack
 from fhash_codec.progress import Progress, silent
 from fhash_codec.storage import load_network
 from fhash_formats.container import Container
@@ -252,13 +252,13 @@ class Volume:
                 raise RegionError(f"{self.path}: region {low}:{high} of axis {axis} is empty or outside 0:{length}")
         return region
 
-    def _unpack_occupancy(self, key: int) -> npt.NDArray[np.bool_]:
-        bits = self.container.arrays["occupancy/bits"]
-        return unpack(bits.read((slice(key, key + 1), slice(0, bits.shape[1])))[0], box_size(self.box))
+    def _unpack_occupancy(self, first: int, last: int) -> npt.NDArray[np.bool_]:
+        stored = self.container.arrays["occupancy/bits"]
+        bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
+        return unpack(between(bits[0], bits[-1]), box_size(self.box))
 
     def _occupied_at(self, key: float) -> npt.NDArray[np.bool_]:
-        before, after = int(np.floor(key)), int(np.ceil(key))
-        return self._occupied(before) if before == after else self._occupied(before) | self._occupied(after)
+        return self._occupied(int(np.floor(key)), int(np.ceil(key)))
 
     def _missing_at(self, t: float) -> npt.NDArray[np.bool_] | None:
         """Where the source had no finite value at a step, or at either step around; None where the file has no such vertices."""

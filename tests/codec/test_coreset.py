@@ -5,7 +5,7 @@ from math import prod
 import numpy as np
 import pytest
 
-from fhash_codec.coreset import bounding_box, box_size, brick_shape, build_coreset, crop, fuse, unpack_frame
+from fhash_codec.coreset import bounding_box, box_size, brick_shape, build_coreset, crop, fuse
 from fhash_codec.features import Everything, Interval, Isosurface, Segmentation, dilate
 from fhash_codec.occupancy import unpack
 from fhash_codec.progress import silent
@@ -15,6 +15,21 @@ from fhash_formats.series import ArraySeries
 
 EVERYTHING = (Everything(),)
 SHAPES = [(1, 1, 1), (1, 20, 33), (9, 1, 40), (17, 18, 1), (11, 13, 19), (2, 70, 5)]
+
+
+def unpack_frame(coreset, key):
+    """The samples of one key frame back in the box: float32 (z, y, x), normalised, NaN where there is none."""
+    shape, grid = coreset.brick_shape, coreset.brick_grid
+    first, last = np.searchsorted(coreset.bricks[:, 0], [key, key + 1])
+    mask = np.unpackbits(coreset.mask_bits[first:last], axis=1, count=prod(shape)).view(np.bool_)
+    held = np.full(mask.shape, np.nan, dtype=np.float32)
+    held[mask] = coreset.values[coreset.offsets[first] : coreset.offsets[last]]
+    tiles = np.full((*grid, *shape), np.nan, dtype=np.float32)
+    _, z, y, x = coreset.bricks[first:last].T
+    tiles[z, y, x] = held.reshape(-1, *shape)
+    whole = tiles.transpose(0, 3, 1, 4, 2, 5).reshape([count * step for count, step in zip(grid, shape, strict=True)])
+    z_size, y_size, x_size = box_size(coreset.box)
+    return whole[:z_size, :y_size, :x_size]
 
 
 def smooth(steps, shape, dtype=np.float32, low=0.0, span=1.0):

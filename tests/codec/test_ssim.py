@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from skimage import metrics
 
 from fhash_codec import network
 from fhash_codec.metrics import ssim, ssim_steps
@@ -42,7 +43,6 @@ def similarity(a, b, data_range):
 @pytest.mark.parametrize("shape", [(11, 11, 11), (12, 64, 70), (25, 40, 33), (1, 60, 70)], ids=str)
 @pytest.mark.parametrize("offset", [0.0, 300.0])
 def test_agrees_with_scikit_image(shape, offset):
-    metrics = pytest.importorskip("skimage.metrics")
     original, decoded = (field + offset for field in pair(shape))
     expected = metrics.structural_similarity(
         original.squeeze(), decoded.squeeze(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.2
