@@ -160,10 +160,7 @@ def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(refused: Callable
     values[0, 0, 0, 0] = np.nan
     np.save(tmp_path / "gap.npy", values)
     assert fhash("encode", tmp_path / "gap.npy", "-o", tmp_path / "run.fhz", "--epochs", "1", "--width", "4").exit_code == 0
-    with fhash_codec.open(tmp_path / "run.fhz") as volume:
-        gap = bool(np.isnan(volume.read(0, outside="background")).any())
-    if gap:
-        assert "the data have no value" in refused(2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8")
+    assert "the data have no value" in refused(2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8")
 
 
 @pytest.mark.parametrize(

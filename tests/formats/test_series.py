@@ -84,6 +84,7 @@ def test_a_series_knows_its_files(tmp_path: Path) -> None:
         "f?.npy": ["f0.npy", "f1.npy"],
         "a.h5": ["a.h5"],
         "virtual.h5": ["virtual.h5", "a.h5"],
+        "virtual[.]h5": ["virtual.h5", "a.h5"],
         "linked.h5": ["linked.h5", "a.h5"],
         "a.zarr": ["a.zarr"],
     }

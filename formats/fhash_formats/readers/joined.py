@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import re
+import warnings
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -57,11 +58,12 @@ class JoinedSeries(Series):
     """
 
     def __init__(self, pattern: str, paths: Sequence[Path], open_part: Callable[[Path], FileSeries]) -> None:
-        self.source, self.files = pattern, tuple(paths)
+        self.source = pattern
         self._open_part = open_part
         self._current: tuple[int, FileSeries] | None = None
         self._parts: list[_Part] = []
-        names = []
+        names: list[str] = []
+        files: list[Path] = []
         first: Series | None = None
         for path in paths:
             with open_part(path) as part:
@@ -70,8 +72,9 @@ class JoinedSeries(Series):
                 time = part.coords["t"] if "t" in part.given else None
                 self._parts.append(_Part(path=path, stamp=part.stamp, steps=part.shape[0], time=time))
                 names.append(part.name)
+                files += part.files
         assert first is not None
-        self.name = _common_name(names)
+        self.name, self.files = _common_name(names), tuple(dict.fromkeys(files))
         self.units, self.dtype, self.attributes = first.units, first.dtype, first.attributes
         self._ends = list(accumulate(part.steps for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
@@ -92,7 +95,9 @@ class JoinedSeries(Series):
 
     def _reopened(self, part: _Part) -> FileSeries:
         part.stamp.check()  # before, because a file that is being written may not open at all
-        series = self._open_part(part.path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it was said when the series was opened
+            series = self._open_part(part.path)
         try:
             part.stamp.check()  # after, because from here on the series compares with the file that it opened
         except BaseException:

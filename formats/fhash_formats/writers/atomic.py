@@ -59,7 +59,7 @@ def check_output(path: Path, force: bool, *, directory: bool = False, sources: S
         raise OutputError(f"{path} is a directory; give the name of a file")
     if not force:
         raise OutputExistsError(f"{path} exists; use --force (force=True) to replace it, or another name")
-    if stat.S_ISDIR(mode) and not any((target / name).is_file() for name in ZARR_METADATA):
+    if stat.S_ISDIR(mode) and not any(os.path.isfile(target / name) for name in ZARR_METADATA):
         raise OutputError(f"{path} is a directory but no Zarr store: --force does not replace it; give another name")
     if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
         raise OutputError(f"{path} is not an ordinary file and cannot be replaced; give another name")
