@@ -129,6 +129,7 @@ def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConf
         except (KeyError, RuntimeError, ValueError) as error:
             raise InputError(f"checkpoint {checkpoint} does not fit; delete it to train from the start") from error
         course = saved[1]
+    kept = course.epoch == plan.epochs
 
     def save(now: Course) -> None:
         try:
@@ -142,11 +143,11 @@ def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConf
     with deferred_interrupts() as stop, threads_for(plan.batch_bricks * prod(coreset.brick_shape)):
         done = train(engine, plan, coreset, course, stop=stop, save=save, progress=progress)
         # What follows may fail or be interrupted as well: a training worth keeping is kept until the file is complete.
-        if done and not saved and course.seconds > KEEP_SECONDS:
+        if done and not kept and (stop.asked or course.seconds > KEEP_SECONDS):
             save(course)
-    if not done:
+    if stop.asked:
         raise InterruptedEncodingError(
-            f"interrupted in epoch {course.epoch + 1} of {plan.epochs}; saved in {checkpoint}; the same command goes on from there"
+            f"interrupted after {course.epoch} of {plan.epochs} epochs; saved in {checkpoint}; the same command goes on from there"
         )
     parameters = engine.parameters()
     tables, layers = parameters.dense(architecture)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+REQUESTS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 SAME_REQUEST_SECONDS = 1.0  # shells, make and batch systems may deliver one request several times
 
 
@@ -22,10 +23,10 @@ class StopRequest:
 
 @contextmanager
 def deferred_interrupts() -> Iterator[StopRequest]:
-    """Within it the first SIGINT or SIGTERM sets `asked`, and one more than a second later raises KeyboardInterrupt at once.
+    """Within it the first SIGINT, SIGTERM or SIGHUP sets `asked`, and one more than a second later raises KeyboardInterrupt at once.
 
-    SIGTERM counts because batch systems send it before they kill a job. Signals reach only the main thread; elsewhere
-    nothing is changed and `asked` stays false.
+    SIGTERM counts because batch systems send it before they kill a job, SIGHUP because a lost connection does. Signals reach only
+    the main thread; elsewhere nothing is changed and `asked` stays false.
     """
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():
@@ -38,7 +39,9 @@ def deferred_interrupts() -> Iterator[StopRequest]:
         if not request.asked:
             request.asked, request.since = True, time.monotonic()
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    # A signal that is ignored stays ignored: nohup does that with SIGHUP.
+    heeded = [number for number in REQUESTS if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, ask) for number in heeded}
     try:
         yield request
     finally:

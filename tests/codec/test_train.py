@@ -148,7 +148,7 @@ def test_a_budget_ends_the_training(coreset):
     assert course.epoch < 1000
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_first_signal_asks_and_the_second_interrupts(number):
     before = signal.getsignal(number)
     with deferred_interrupts() as stop:
