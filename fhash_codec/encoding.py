@@ -183,7 +183,15 @@ def _header(series: Series, selected: Selection, trained: Trained, config: Encod
     """The container's header (FORMAT.md), its quality still to be measured."""
     architecture, coreset, value_range = selected.architecture, selected.coreset, selected.scanned.value_range
     seconds = trained.history[-1]["seconds"] if trained.history else 0.0
-    history = trained.history if config.timings else [{**point, "seconds": None} for point in trained.history]
+    # Milliseconds and hundredths of a dB: more digits would say nothing and cost bytes.
+    history = [
+        {
+            "seconds": _rounded(point["seconds"], 3) if config.timings else None,
+            "epoch": point["epoch"],
+            "psnr": _rounded(point["psnr"], 2),
+        }
+        for point in trained.history
+    ]
     return {
         "encoder": {"version": version("fhash"), "seed": config.seed},
         "variable": {"name": series.name, "units": series.units, "dtype": series.dtype.name, "attributes": dict(series.attributes)},
@@ -209,3 +217,7 @@ def _header(series: Series, selected: Selection, trained: Trained, config: Encod
         "quality": {},
         "history": history,
     }
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -30,7 +31,8 @@ def command(data: str, output: str, source: SourceOptions, config: EncodeConfig,
     """
     import fhash_codec
 
-    check_writable(output, force, sources=[data])
+    # Whether a folder is data at all is for the reader to say; `encode` then keeps it from being replaced.
+    check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
     with source.open(data) as series, Progress(quiet=quiet) as progress:
         missed = None
         try:
