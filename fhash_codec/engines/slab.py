@@ -122,7 +122,8 @@ class SlabEngine:
         kept = flat[: self.coarse]
         if self.step > 0:
             adam = self.adam.state[self.flat]
-            kept = kept * ((adam["exp_avg"] != 0) | (adam["exp_avg_sq"] != 0))[: self.coarse]
+            moved = (adam["exp_avg"] != 0) | (adam["exp_avg_sq"] != 0)
+            kept = torch.where(moved[: self.coarse], kept, 0.0)
         coarse[self.upsampling.used.cpu()] = kept.cpu()
         return Parameters(fine=self.fine.cpu(), coarse=coarse, network=flat[self.coarse :].cpu().clone())
 
