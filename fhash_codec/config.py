@@ -52,7 +52,10 @@ class EncodeConfig:
     engine: str = setting("auto", "training engine", choices=("auto", *ENGINES))
     device: str = setting("auto", "where to train", choices=("auto", "cpu", "cuda"))
     seed: int = setting(0, "seed of every random choice", low=0, high=2**63 - 1)
-    timings: bool = setting(True, "store seconds with the training history; without them the same input gives the same bytes")
+    timings: bool = setting(
+        True,
+        "store seconds with the training history; without them the same input gives the same bytes on the same machine with as many threads",
+    )
 
     def __post_init__(self) -> None:
         # A caller may give one feature as text and key frames as numbers.
