@@ -54,7 +54,7 @@ class EncodeConfig:
     seed: int = setting(0, "seed of every random choice", low=0, high=2**63 - 1)
     timings: bool = setting(
         True,
-        "store seconds with the training history; without them the same input gives the same bytes on the same machine with as many threads",
+        "store seconds with the training history; without, the same input and number of threads give the same bytes",
     )
 
     def __post_init__(self) -> None:
