@@ -4,9 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from torch import Tensor
 
 BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 WINDOW = 200  # (BETA1 / sqrt(BETA2))**200 is 8e-10: later steps without a gradient no longer move a parameter
+
+
+def adam_step(parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: int, rate: float) -> None:
+    """Step number `step` (from 1 on) of Adam, in place; all tensors of one shape.
+
+    torch.optim.Adam does the same, but loads torch's compiler on its first use, which takes as long as torch itself.
+    """
+    mean.lerp_(gradient, 1 - BETA1)
+    square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
+    root = square.sqrt().mul_(1 / (1 - BETA2**step) ** 0.5).add_(EPSILON)
+    parameter.addcdiv_(mean, root, value=-rate / (1 - BETA1**step))
 
 
 def catch_up(

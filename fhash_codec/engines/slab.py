@@ -20,11 +20,13 @@ from torch import Tensor
 
 from fhash_codec.architecture import Architecture
 from fhash_codec.coreset import Coreset
-from fhash_codec.engines.adam import BETA1, BETA2, EPSILON, catch_up
+from fhash_codec.engines.adam import adam_step, catch_up
 from fhash_codec.engines.initial import Parameters, initial_parameters, layer_matrices
 from fhash_codec.engines.upsampling import Lattices, Upsampling
 
 CHUNK = 1 << 13  # columns of the MLP at a time: the hidden activations stay in a core's cache
+ADAM_PART = 1 << 17  # numbers of the flat vector that Adam moves at a time
+STATE = ("fine", "fine_mean", "fine_square", "visited", "flat", "flat_mean", "flat_square")
 FLUSH = 1024  # bricks that are brought up to date at a time
 
 
@@ -51,13 +53,12 @@ class SlabEngine:
         self.fine_mean, self.fine_square = torch.zeros_like(self.fine), torch.zeros_like(self.fine)
         self.visited = torch.zeros(len(self.bricks), dtype=torch.int64, device=device)
         self.step = self.settled = 0
-        # What is used of the coarse tables, and the MLP, in one flat vector: one fused Adam call, and each gradient is a view.
+        # What is used of the coarse tables, and the MLP, in one flat vector, of which layers and gradients are views.
         self.coarse = len(self.upsampling.used)
         self.flat = torch.cat([start.coarse.to(device)[self.upsampling.used], start.network.to(device)])
-        self.flat.grad = torch.zeros_like(self.flat)
-        self.layers = layer_matrices(architecture, self.flat.detach()[self.coarse :])
-        self.layer_gradients = layer_matrices(architecture, self.flat.grad[self.coarse :])
-        self.adam = torch.optim.Adam([self.flat], betas=(BETA1, BETA2), eps=EPSILON, fused=True)
+        self.flat_mean, self.flat_square, self.gradient = (torch.zeros_like(self.flat) for _ in range(3))
+        self.layers = layer_matrices(architecture, self.flat[self.coarse :])
+        self.layer_gradients = layer_matrices(architecture, self.gradient[self.coarse :])
 
     @torch.no_grad()
     def train(self, chosen: npt.NDArray[np.int64]) -> Tensor:
@@ -69,22 +70,19 @@ class SlabEngine:
         lattices = self.upsampling.lattices(self.bricks[ids])
         inputs = self._inputs(lattices, fine)
         scale = 2.0 / max(int(np.diff(self.coreset.offsets)[chosen].sum()), 1)
-        assert self.flat.grad is not None
-        self.flat.grad.zero_()
+        self.gradient.zero_()
         error, gradient = self._fit(inputs, target, mask, scale)
         levels = gradient.view(-1, self.architecture.embedding_size, len(ids), *self.coreset.brick_shape)
-        lattices.add_transposed(self.flat.grad, levels[1:])
+        lattices.add_transposed(self.gradient, levels[1:])
 
-        own = levels[0].flatten(2).transpose(0, 1)
-        mean.mul_(BETA1).add_(own, alpha=1 - BETA1)
-        square.mul_(BETA2).addcmul_(own, own, value=1 - BETA2)
         rate = float(self.rates[self.step])
-        root = square.sqrt().mul_(1 / (1 - BETA2**self.step) ** 0.5).add_(EPSILON)
-        fine.addcdiv_(mean, root, value=-rate / (1 - BETA1**self.step))
+        adam_step(fine, levels[0].flatten(2).transpose(0, 1), mean, square, self.step, rate)
         self._store(ids, mean, square, fine)
         self.visited[ids] = self.step
-        self.adam.param_groups[0]["lr"] = rate
-        self.adam.step()
+        # In parts, so that what is computed on the way stays in the cache.
+        for first in range(0, len(self.flat), ADAM_PART):
+            held = slice(first, first + ADAM_PART)
+            adam_step(self.flat[held], self.gradient[held], self.flat_mean[held], self.flat_square[held], self.step, rate)
         return error
 
     @torch.no_grad()
@@ -117,42 +115,21 @@ class SlabEngine:
         for first in range(0, len(self.fine), FLUSH):
             part = slice(first, first + FLUSH)
             self.fine[part].masked_fill_(self._mask(part).unsqueeze(1) == 0, 0.0)
-        flat = self.flat.detach()
         coarse = torch.zeros(sum(prod(level) for level in self.architecture.levels[1:]) * self.architecture.embedding_size)
-        kept = flat[: self.coarse]
-        if self.step > 0:
-            adam = self.adam.state[self.flat]
-            moved = (adam["exp_avg"] != 0) | (adam["exp_avg_sq"] != 0)
-            kept = torch.where(moved[: self.coarse], kept, 0.0)
+        moved = (self.flat_mean != 0) | (self.flat_square != 0)
+        kept = torch.where(moved, self.flat, 0.0)[: self.coarse] if self.step else self.flat[: self.coarse]
         coarse[self.upsampling.used.cpu()] = kept.cpu()
-        return Parameters(fine=self.fine.cpu(), coarse=coarse, network=flat[self.coarse :].cpu().clone())
+        return Parameters(fine=self.fine.cpu(), coarse=coarse, network=self.flat[self.coarse :].cpu().clone())
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Everything that the next step depends on, as arrays."""
-        adam = self.adam.state[self.flat]
-        flat_mean = adam["exp_avg"] if adam else torch.zeros_like(self.flat)
-        flat_square = adam["exp_avg_sq"] if adam else torch.zeros_like(self.flat)
-        tensors = {
-            "fine": self.fine,
-            "fine_mean": self.fine_mean,
-            "fine_square": self.fine_square,
-            "visited": self.visited,
-            "flat": self.flat,
-            "flat_mean": flat_mean,
-            "flat_square": flat_square,
-        }
-        return {"step": np.array(self.step)} | {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
+        return {"step": np.array(self.step)} | {name: getattr(self, name).cpu().numpy() for name in STATE}
 
     def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
-        """Go on from `state`."""
+        """Go on from `state`; raises KeyError or RuntimeError for a state of another model."""
         self.step, self.settled = int(state["step"]), -1
-        for name in ("fine", "fine_mean", "fine_square", "visited", "flat"):
+        for name in STATE:
             getattr(self, name).copy_(torch.from_numpy(state[name]))
-        self.adam.state[self.flat] = {
-            "step": torch.tensor(float(self.step), device=self.device),
-            "exp_avg": torch.from_numpy(state["flat_mean"].copy()).to(self.device),
-            "exp_avg_sq": torch.from_numpy(state["flat_square"].copy()).to(self.device),
-        }
 
     def _store(self, ids: Tensor, mean: Tensor, square: Tensor, fine: Tensor) -> None:
         for state, rows in ((self.fine_mean, mean), (self.fine_square, square), (self.fine, fine)):
@@ -189,7 +166,7 @@ class SlabEngine:
         inputs[-1] = 1.0
         levels = inputs[:-1].view(-1, size, len(fine), *shape)
         levels[0].copy_(fine.view(len(fine), size, *shape).transpose(0, 1))
-        lattices.interpolate(self.flat.detach(), levels[1:])
+        lattices.interpolate(self.flat, levels[1:])
         return inputs
 
     def _value(self, inputs: Tensor) -> Tensor:

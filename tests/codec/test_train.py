@@ -136,7 +136,7 @@ def test_a_damaged_checkpoint_is_named_not_ignored(tmp_path):
 
 def test_training_that_diverges_is_an_error(coreset):
     plan, engine = setup(coreset)
-    engine.flat.detach().fill_(float("nan"))
+    engine.flat.fill_(float("nan"))
     with pytest.raises(TrainingError, match="diverged"):
         train(engine, plan, coreset, Course())
 
