@@ -10,8 +10,10 @@ from fhash_codec.metrics import measure_quality
 from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
 from fhash_codec.selection import Source, opened
+from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
+from fhash_formats.series import Series
 
 
 def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> dict[str, Any]:
@@ -25,7 +27,10 @@ def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> di
             raise InputError(
                 f"{series.source} has shape {series.shape}, {path} has {volume.shape} in (t, z, y, x); give the same --var, --axes, --t"
             )
-        quality = measure_quality(
-            series.read, volume.read, series.shape[0], volume.value_range.high - volume.value_range.low, volume.background, progress
-        )
-        return report(volume, quality.to_dict(), seconds=time.perf_counter() - begun)
+        return report(volume, measure(series, volume, progress), seconds=time.perf_counter() - begun)
+
+
+def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any]:
+    """The quality of a volume as it decodes against its series, every step of it: `metrics.Quality` as JSON values."""
+    data_range = volume.value_range.high - volume.value_range.low
+    return measure_quality(series.read, volume.read, series.shape[0], data_range, volume.background, progress).to_dict()

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.architecture import Architecture
+from fhash_codec.comparison import measure
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset import Coreset
-from fhash_codec.metrics import measure_quality
 from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
 from fhash_codec.scan import Scan
@@ -27,7 +27,7 @@ from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter
 from fhash_formats.errors import FhashWarning, InputError, InterruptedEncodingError, OutputError, QualityError
-from fhash_formats.series import Series
+from fhash_formats.series import AXIS_NAMES, Series
 from fhash_formats.writers.atomic import check_output
 from fhash_formats.writers.registry import WRITERS
 
@@ -64,9 +64,7 @@ def encode(
             write_model(writer, selected.architecture, coreset, trained.fine, trained.tables, trained.layers, config.tables)
             header = _header(series, selected, trained, config)
             with Volume(writer.preview(header)) as volume:
-                header["quality"] = measure_quality(
-                    series.read, volume.read, series.shape[0], volume.value_range.high - volume.value_range.low, volume.background, progress
-                ).to_dict()
+                header["quality"] = measure(series, volume, progress)
             writer.commit(header)
         trained.checkpoint.unlink(missing_ok=True)
     with open_volume(path) as volume:
@@ -164,7 +162,7 @@ def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConf
 
 def _write_series(writer: ContainerWriter, series: Series, scanned: Scan, coreset: Coreset) -> None:
     """Coordinates, key frames, and where the source has no finite value."""
-    for axis, stored in {"t": "time", "z": "z", "y": "y", "x": "x"}.items():
+    for axis, stored in AXIS_NAMES.items():
         coordinate = series.coords[axis]
         writer.add_whole(f"coords/{stored}", coordinate.values, attributes={**coordinate.attributes, "name": coordinate.name})
     writer.add_whole("key_frames", np.array(coreset.key_frames, dtype=np.int64))

@@ -53,19 +53,6 @@ def sample_points(
 ) -> tuple[Floats, Floats]: ...
 
 
-@overload
-def sample_points(
-    network: Network,
-    key_index: npt.ArrayLike,
-    z: npt.ArrayLike,
-    y: npt.ArrayLike,
-    x: npt.ArrayLike,
-    *,
-    gradient: bool,
-    threads: int | None = ...,
-) -> Floats | tuple[Floats, Floats]: ...
-
-
 def sample_points(
     network: Network,
     key_index: npt.ArrayLike,

@@ -11,13 +11,12 @@ import numpy.typing as npt
 
 from fhash_codec.architecture import Architecture
 from fhash_codec.coreset import Coreset
-from fhash_codec.network import Network
+from fhash_codec.network import Floats, Network
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.errors import DamagedFileError, InputError
 
 CHUNK_BYTES = 2 << 20  # a time node in one chunk up to this size, in bricks above: each chunk has a fixed cost, each read a whole chunk
 TABLE_AXES = ("t", "z", "y", "x", "embedding")
-Floats = npt.NDArray[np.float32]
 
 
 def write_model(

@@ -22,7 +22,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.storage import load_network
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
-from fhash_formats.series import AXES, Coordinate
+from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 
 Index = int | slice | EllipsisType
 OUTSIDE = ("nan", "background")
@@ -77,9 +77,8 @@ class Volume:
     @cached_property
     def coords(self) -> dict[str, Coordinate]:
         """Positions along each axis, in the units of the source."""
-        arrays = {"t": "time", "z": "z", "y": "y", "x": "x"}
         found = {}
-        for axis, stored in arrays.items():
+        for axis, stored in AXIS_NAMES.items():
             array = self.container.arrays[f"coords/{stored}"]
             attributes = dict(array.attributes)
             found[axis] = Coordinate(name=attributes.pop("name", stored), values=array.read(), attributes=attributes)

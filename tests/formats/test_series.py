@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
+import zarr
 
 from fhash_formats import open_mask, open_series
 from fhash_formats.errors import InputError, RegionError
@@ -65,8 +67,6 @@ def test_what_cannot_be_a_series(array: Any, coords: dict[str, Coordinate], mess
 
 
 def test_a_series_knows_its_files(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py")
-    zarr = pytest.importorskip("zarr")
     assert ArraySeries(VALUES).files == ()
     for step in range(2):
         np.save(tmp_path / f"f{step}.npy", VALUES[step])
