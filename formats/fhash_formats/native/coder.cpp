@@ -1,0 +1,532 @@
+// Entropy coding of quantised transform coefficients: an adaptive binary range coder whose probabilities are mixed from several contexts.
+//
+// Everything that a decoder computes is integer arithmetic, so that encoder and decoder can never part, whatever the machine. The portable
+// coder (transform/coder_portable.py) follows this file step by step and gives the same bytes.
+//
+// A coefficient is coded as a zero flag, its sign, and its magnitude in unary up to 13, beyond that in an Exp-Golomb code. Each binary
+// decision k (0 the zero flag, then "more than k") is predicted by CONTEXTS adaptive estimates, each with a slow and a fast rate, that are
+// mixed in the logistic domain by weights which learn as well (as in the PAQ family of compressors). Contexts see magnitudes that are
+// already known: to the left, above, one step and one layer before, and in the bands that come before.
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <type_traits>
+#include <vector>
+
+#include "core.hpp"
+
+namespace {
+
+using std::int16_t;
+using std::int32_t;
+using std::int64_t;
+using std::max;
+using std::min;
+using std::uint16_t;
+using std::uint32_t;
+using std::uint64_t;
+using std::uint8_t;
+
+const int STRETCH_MAX = 2816;  // logits in units of 1/256, so +-11
+const int CONTEXTS = 6, SIGN_CONTEXTS = 3, LANES = 12;
+const int DECISIONS = 16, UNARY = 14, KINDS = 64, LEVELS = 128;  // LEVELS: buckets of the expected magnitude, quarter octaves
+const int SLOW_LIMIT = 400, SIGN_LIMIT = 255, FAST_LIMIT = 20, SIMPLE_LIMIT = 60, LEARNING_RATE = 6;  // counts; the rate in 1/16
+const int MAX_MAGNITUDE = 4095;  // as contexts see it, so that sums stay in 32 bits
+const int COLUMNS = 29;          // of the table of bands: low[4], high[4], kind, 4 x (band, shift[4])
+const int PADDING = 2;           // zeros beside a row of magnitudes
+// Weights of neighbours in the expected magnitude, in 1/1024: left, second left, above, its neighbours, second above, before (t or z),
+// around it, second before, reference, around it.
+const int LEFT = 184, LEFT2 = 20, ABOVE = 184, DIAGONAL = 61, ABOVE2 = 41, BEFORE = 102, AROUND = 20, BEFORE2 = 31, REFERENCE = 62;
+
+const int SIZES[CONTEXTS] = {LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS};
+const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27};
+const int64_t SECOND = int64_t(KINDS) * DECISIONS * LANES, SIGNS = SECOND + 64 * DECISIONS * LANES;  // where these weights begin
+const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;                                              // where these simple estimates begin
+
+struct Tables {
+    int16_t stretch[65536];
+    uint16_t squash[2 * STRETCH_MAX + 1];
+    uint16_t cost[65537];  // of a decision of this probability, in 1/2048 bit
+    int32_t log[4096];     // 16 log2
+    int32_t rate[SLOW_LIMIT + 1];
+    uint8_t small[38];
+    // No value lies near a rounding boundary (a test sees to it), so any C library gives the same tables.
+    Tables() {
+        for (int i = 0; i < 65536; i++) {
+            double p = (i + .5) / 65536;
+            stretch[i] = (int16_t)min(max((int)std::floor(std::log(p / (1 - p)) * 256 + .5), -STRETCH_MAX), STRETCH_MAX);
+        }
+        for (int i = -STRETCH_MAX; i <= STRETCH_MAX; i++)
+            squash[i + STRETCH_MAX] = (uint16_t)min(max((int)std::floor(65536 / (1 + std::exp(-i / 256.)) + .5), 1), 65535);
+        for (int i = 0; i <= 65536; i++) cost[i] = (uint16_t)std::floor(-std::log2(max(i, 1) / 65536.) * 2048 + .5);
+        log[0] = 0;
+        for (int i = 1; i < 4096; i++) log[i] = (int)std::floor(std::log2((double)i) * 16 + .5);
+        for (int i = 0; i <= SLOW_LIMIT; i++) rate[i] = 655360 / (10 * i + 16);
+        for (int v = 0; v < 38; v++) small[v] = v <= 2 ? v : v <= 4 ? 3 : v <= 6 ? 4 : v <= 9 ? 5 : v <= 14 ? 6 : v <= 22 ? 7 : v <= 36 ? 8 : 9;
+    }
+};
+const Tables tables;
+
+FHASH_INLINE int log16(uint32_t v) {
+    int shift = 0;
+    while ((v >> shift) >= 4096) shift++;
+    return tables.log[v >> shift] + 16 * shift;
+}
+
+FHASH_INLINE int small(int v) { return v < 37 ? tables.small[v] : v <= 64 ? 9 : v <= 140 ? 10 : 11; }
+
+struct Slot {
+    uint16_t slow, fast, count, spare;
+};
+struct Simple {
+    uint16_t p, count;
+};
+
+// What adapts, laid out as the caller's arrays: slots of the contexts (decision-major) and of the signs; weights by kind, by expected
+// magnitude, of the signs; simple estimates of the escape code, of empty rows and of empty bands.
+struct State {
+    std::vector<Slot> slots;
+    std::vector<int32_t> weights;
+    std::vector<Simple> simples;
+};
+
+struct Encoder {
+    std::vector<uint8_t> out;
+    uint32_t low = 0, high = 0xffffffffu;
+    bool failed = false;
+    FHASH_INLINE int code(int bit, uint32_t p) {  // p: probability of a 1, in 1..65535 of 65536
+        uint32_t middle = low + (uint32_t)(((uint64_t)(high - low) * p) >> 16);
+        if (bit) high = middle; else low = middle + 1;
+        while (((low ^ high) & 0xff000000u) == 0) {
+            out.push_back((uint8_t)(high >> 24));
+            low <<= 8;
+            high = (high << 8) | 255;
+        }
+        return bit;
+    }
+    // The fewest bytes that name a number from low to high; the decoder reads zeros past the end.
+    void finish() {
+        for (int keep = 0; keep <= 4; keep++) {
+            uint32_t v = keep == 0 ? 0 : high & ~(uint32_t)((uint64_t)0xffffffffu >> (8 * keep));
+            if (v < low || v > high) continue;
+            for (int i = 0; i < keep; i++) out.push_back((uint8_t)(v >> (24 - 8 * i)));
+            break;
+        }
+        while (!out.empty() && out.back() == 0) out.pop_back();
+    }
+};
+
+struct Decoder {
+    const uint8_t* data;
+    int64_t size, at = 0;
+    uint32_t low = 0, high = 0xffffffffu, value = 0;
+    FHASH_INLINE uint32_t next() { return at < size ? data[at++] : 0; }
+    void start() {
+        for (int i = 0; i < 4; i++) value = (value << 8) | next();
+    }
+    FHASH_INLINE int code(int, uint32_t p) {
+        uint32_t middle = low + (uint32_t)(((uint64_t)(high - low) * p) >> 16);
+        int bit = value <= middle;
+        if (bit) high = middle; else low = middle + 1;
+        while (((low ^ high) & 0xff000000u) == 0) {
+            low <<= 8;
+            high = (high << 8) | 255;
+            value = (value << 8) | next();
+        }
+        return bit;
+    }
+};
+
+// A prediction: the slots of its contexts, the mixer's inputs and its one or two sets of weights.
+struct Prediction {
+    Slot* slots[CONTEXTS];
+    int32_t inputs[LANES];
+    int32_t *first, *second;
+    int p;
+};
+
+template <int N, bool PAIR> FHASH_INLINE int mix(Prediction& now) {
+    for (int i = 0; i < N; i++) {
+        const Slot* s = now.slots[i];
+        int slow = tables.stretch[s->slow], fast = tables.stretch[s->fast];
+        if (s->count < 12) {  // little seen, little said
+            slow = slow * (s->count + 1) / 13;
+            fast = fast * (s->count + 1) / 13;
+        }
+        now.inputs[2 * i] = slow;
+        now.inputs[2 * i + 1] = fast;
+    }
+    int32_t dot = 0;
+    for (int i = 0; i < 2 * N; i++) dot += ((now.first[i] + (PAIR ? now.second[i] : 0)) * now.inputs[i]) >> 2;
+    return now.p = tables.squash[min(max(dot >> 12, -STRETCH_MAX), STRETCH_MAX) + STRETCH_MAX];
+}
+
+FHASH_INLINE int32_t bounded(int32_t weight) { return min(max(weight, -32767), 32767); }
+
+template <int N, bool PAIR> FHASH_INLINE void learn(Prediction& now, int bit, int limit) {
+    const int target = bit ? 65535 : 0, error = ((target - now.p) * LEARNING_RATE) >> 4;
+    for (int i = 0; i < 2 * N; i++) {
+        int32_t step = (error * now.inputs[i] + 32768) >> 16;
+        now.first[i] = bounded(now.first[i] + step);
+        if (PAIR) now.second[i] = bounded(now.second[i] + step);
+    }
+    for (int i = 0; i < N; i++) {
+        Slot* s = now.slots[i];
+        s->slow = (uint16_t)(s->slow + (((target - s->slow) * tables.rate[s->count]) >> 16));
+        s->fast = (uint16_t)(s->fast + (((target - s->fast) * tables.rate[min<int>(s->count, FAST_LIMIT)]) >> 16));
+        if (s->count < limit) s->count++;
+    }
+}
+
+struct Reference {
+    int band, shift[4];
+};
+struct Band {
+    int low[4], size[4], kind;
+    Reference references[4];
+    int64_t stride[3];
+    std::vector<uint16_t> magnitudes;  // rows with PADDING zeros at both ends
+    std::vector<uint8_t> filled;       // by row: is anything in it
+    bool any;
+};
+
+FHASH_INLINE int sign_of(int32_t v) { return v > 0 ? 2 : v < 0 ? 0 : 1; }
+
+// MODE 0 encodes, 1 decodes, 2 encodes magnitudes that it chooses by rate and distortion.
+template <int MODE> struct Coder {
+    typename std::conditional<MODE == 1, Decoder, Encoder>::type range;
+    State* state;
+    double lambda;  // distortion, in squared steps, that 1/2048 bit is worth
+
+    FHASH_INLINE int simple(int bit, int64_t number) {
+        Simple& s = state->simples[number];
+        bit = range.code(bit, min<uint32_t>(max<uint32_t>(s.p, 32), 65504));
+        s.p = (uint16_t)(s.p + ((((bit ? 65535 : 0) - (int)s.p) * tables.rate[s.count]) >> 16));
+        if (s.count < SIMPLE_LIMIT) s.count++;
+        return bit;
+    }
+
+    // The magnitude next to |scaled| that costs least: it, one less, or zero.
+    template <class Predict> FHASH_INLINE int choose(double s, int p, Predict predict) {
+        const int nearest = (int)(s + 0.5);
+        if (nearest == 0 || nearest >= UNARY) return nearest;
+        Prediction other;
+        const double zero = s * s + lambda * tables.cost[p], other_than_zero = lambda * (tables.cost[65536 - p] + 2048);
+        if (nearest == 1) {
+            const int stop = predict(other, 1);
+            return zero <= (s - 1) * (s - 1) + lambda * tables.cost[65536 - stop] + other_than_zero ? 0 : 1;
+        }
+        const int before = predict(other, nearest - 1), stop = predict(other, nearest);
+        const double same = (s - nearest) * (s - nearest) + lambda * (tables.cost[before] + tables.cost[65536 - stop]);
+        const double less = (s - nearest + 1) * (s - nearest + 1) + lambda * tables.cost[65536 - before];
+        if (nearest == 2 && zero < min(same, less) + other_than_zero) return 0;
+        return less < same ? nearest - 1 : nearest;
+    }
+
+    FHASH_INLINE int64_t run(int32_t* q, const float* scaled, const int64_t* shape, const int32_t* table, int64_t count);
+};
+
+template <int MODE>
+FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int64_t* shape, const int32_t* table, int64_t count) {
+    const int64_t S2 = shape[3], S1 = S2 * shape[2], S0 = S1 * shape[1];
+    std::vector<Band> bands(count);
+    int widest = 0;
+    for (int64_t b = 0; b < count; b++) {
+        const int32_t* row = table + b * COLUMNS;
+        for (int a = 0; a < 4; a++) {
+            bands[b].low[a] = row[a];
+            bands[b].size[a] = row[4 + a] - row[a];
+        }
+        bands[b].kind = row[8];
+        for (int r = 0; r < 4; r++) {
+            bands[b].references[r].band = row[9 + 5 * r];
+            for (int a = 0; a < 4; a++) bands[b].references[r].shift[a] = row[10 + 5 * r + a];
+        }
+        bands[b].any = false;
+        widest = max(widest, bands[b].size[3]);
+    }
+    Slot* slots[CONTEXTS];
+    Slot* signs[SIGN_CONTEXTS];
+    Slot* at = state->slots.data();
+    for (int i = 0; i < CONTEXTS; i++) {
+        slots[i] = at;
+        at += (int64_t)SIZES[i] * DECISIONS;
+    }
+    for (int i = 0; i < SIGN_CONTEXTS; i++) {
+        signs[i] = at;
+        at += SIGN_SIZES[i];
+    }
+    int32_t* const weights = state->weights.data();
+    const int W = widest + 2 * PADDING;
+    std::vector<uint16_t> nothing(W, 0);
+    std::vector<int32_t> expected(W), plane(W), before(W), below(W), around(4 * (size_t)W);
+
+    for (int64_t number = 0; number < count; number++) {
+        Band& band = bands[number];
+        const int n0 = band.size[0], n1 = band.size[1], n2 = band.size[2], n3 = band.size[3], kind = band.kind;
+        const int64_t origin = band.low[0] * S0 + band.low[1] * S1 + band.low[2] * S2 + band.low[3];
+        int any = 0;
+        if (MODE != 1)
+            for (int64_t r = 0; r < (int64_t)n0 * n1 * n2 && !any; r++) {
+                const int32_t* row = q + origin + r / n2 / n1 * S0 + r / n2 % n1 * S1 + r % n2 * S2;
+                for (int x = 0; x < n3; x++) any |= row[x] != 0;
+            }
+        any = simple(any, EMPTIES + kind);
+        band.any = any != 0;
+        if (!any) continue;
+        const int64_t M2 = n3 + 2 * PADDING, M1 = M2 * n2, M0 = M1 * n1, R1 = n2, R0 = (int64_t)n1 * n2;
+        band.stride[0] = M0;
+        band.stride[1] = M1;
+        band.stride[2] = M2;
+        band.magnitudes.assign((size_t)M0 * n0, 0);
+        band.filled.assign((size_t)R0 * n0, 0);
+
+        for (int t = 0; t < n0; t++) for (int z = 0; z < n1; z++) for (int y = 0; y < n2; y++) {
+            const int64_t r = t * R0 + z * R1 + y;
+            int32_t* const out = q + origin + t * S0 + z * S1 + y * S2;
+            uint16_t* const M = band.magnitudes.data() + r * M2 + PADDING;
+            const uint8_t* const F = band.filled.data() + r;
+            const bool has_y = y > 0, has_z = z > 0, has_t = t > 0;
+
+            // The row of each reference that stands for this row.
+            const uint16_t* rows[4] = {nullptr, nullptr, nullptr, nullptr};
+            int parent_filled = 0, row_y[4] = {0, 0, 0, 0};
+            for (int k = 0; k < 4; k++) {
+                const Reference& to = band.references[k];
+                if (to.band < 0 || !bands[to.band].any) continue;
+                const Band& other = bands[to.band];
+                const int rt = min(t >> to.shift[0], other.size[0] - 1), rz = min(z >> to.shift[1], other.size[1] - 1);
+                row_y[k] = min(y >> to.shift[2], other.size[2] - 1);
+                rows[k] = other.magnitudes.data() + rt * other.stride[0] + rz * other.stride[1] + row_y[k] * other.stride[2] + PADDING;
+                if (k == 0) parent_filled = other.filled[((int64_t)rt * other.size[1] + rz) * other.size[2] + row_y[k]];
+            }
+            if (!((has_y && F[-1]) || (has_z && F[-R1]) || (has_t && F[-R0]) || parent_filled)) {
+                int filled = 0;
+                if (MODE != 1) for (int x = 0; x < n3; x++) filled |= out[x] != 0;
+                if (!simple(filled, ROWS + (n3 > 24 ? 2 : 0) + (y > 1 && F[-2] ? 1 : 0) + (r == 0 ? 4 : 0))) continue;
+            }
+
+            // What is known of the whole row beforehand: all neighbours but those to the left.
+            std::memset(expected.data(), 0, 4 * (size_t)n3);
+            std::memset(plane.data(), 0, 4 * (size_t)n3);
+            std::memset(before.data(), 0, 4 * (size_t)n3);
+            std::memset(below.data(), 0, 4 * (size_t)n3);
+            int weight = LEFT + LEFT2;
+            if (has_y) {
+                weight += ABOVE + 2 * DIAGONAL;
+                if (F[-1]) {
+                    const uint16_t* p = M - M2;
+                    for (int x = 0; x < n3; x++) {
+                        const int sides = p[x - 1] + p[x + 1];
+                        expected[x] += ABOVE * p[x] + DIAGONAL * sides;
+                        plane[x] += 2 * p[x] + sides;
+                    }
+                }
+                if (y > 1) weight += ABOVE2;
+                if (y > 1 && F[-2]) {
+                    const uint16_t* p = M - 2 * M2;
+                    for (int x = 0; x < n3; x++) {
+                        expected[x] += ABOVE2 * p[x];
+                        plane[x] += p[x];
+                    }
+                }
+            }
+            auto neighbour = [&](std::vector<int32_t>& sum, bool there, int64_t row, const uint16_t* p) FHASH_LAMBDA {
+                if (!there || !F[row]) return;
+                for (int x = 0; x < n3; x++) {
+                    expected[x] += AROUND * p[x];
+                    sum[x] += p[x];
+                }
+            };
+            auto centre = [&](std::vector<int32_t>& sum, int64_t row, const uint16_t* p) FHASH_LAMBDA {
+                if (!F[row]) return;
+                for (int x = 0; x < n3; x++) {
+                    const int sides = p[x - 1] + p[x + 1];
+                    expected[x] += BEFORE * p[x] + AROUND * sides;
+                    sum[x] += 2 * p[x] + sides;
+                }
+            };
+            if (has_t) {
+                weight += BEFORE + 4 * AROUND + (t > 1 ? BEFORE2 : 0);
+                centre(before, -R0, M - M0);
+                neighbour(before, has_y, -R0 - 1, M - M0 - M2);
+                neighbour(before, y + 1 < n2, -R0 + 1, M - M0 + M2);
+                neighbour(before, has_z, -R0 - R1, M - M0 - M1);
+                neighbour(before, z + 1 < n1, -R0 + R1, M - M0 + M1);
+                if (t > 1 && F[-2 * R0]) for (int x = 0; x < n3; x++) expected[x] += BEFORE2 * M[x - 2 * M0];
+            }
+            if (has_z) {
+                weight += BEFORE + 4 * AROUND + (z > 1 ? BEFORE2 : 0);
+                centre(below, -R1, M - M1);
+                neighbour(below, has_y, -R1 - 1, M - M1 - M2);
+                neighbour(below, y + 1 < n2, -R1 + 1, M - M1 + M2);
+                if (z > 1 && F[-2 * R1]) for (int x = 0; x < n3; x++) expected[x] += BEFORE2 * M[x - 2 * M1];
+            }
+            for (int k = 0; k < 4; k++) {
+                int32_t* const sums = around.data() + k * (size_t)W;
+                if (band.references[k].band >= 0) weight += REFERENCE + 2 * AROUND;
+                if (!rows[k]) {
+                    std::memset(sums, 0, 4 * (size_t)n3);
+                    continue;
+                }
+                const Band& other = bands[band.references[k].band];
+                const int shift = band.references[k].shift[3], last = other.size[3] - 1;
+                const uint16_t* const p = rows[k];
+                const uint16_t* const up = row_y[k] > 0 ? p - other.stride[2] : nothing.data() + PADDING;
+                const uint16_t* const down = row_y[k] + 1 < other.size[2] ? p + other.stride[2] : nothing.data() + PADDING;
+                for (int x = 0; x < n3; x++) {
+                    const int i = min(x >> shift, last);
+                    sums[x] = 2 * p[i] + p[i - 1] + p[i + 1] + up[i] + down[i];
+                    expected[x] += REFERENCE * p[i] + AROUND * sums[x];
+                }
+            }
+            const int offset = 160 - log16(weight);
+            const uint16_t* const Y = has_y ? M - M2 : nothing.data() + PADDING;
+            const uint16_t* const Z = has_z ? M - M1 : nothing.data() + PADDING;
+            const uint16_t* const T = has_t ? M - M0 : nothing.data() + PADDING;
+            int filled = 0;
+
+            for (int x = 0; x < n3; x++) {
+                const int left = M[x - 1], left2 = M[x - 2];
+                const uint32_t mu = (uint32_t)(expected[x] + LEFT * left + LEFT2 * left2);
+                const int level = mu ? min(max((log16(mu) + offset) / 4 + 1, 0), LEVELS - 1) : 0, coarse = min(level / 2, 63);
+                const int near = plane[x] + 2 * left + left2, parent = small(around[x]);
+                const int context[CONTEXTS] = {
+                    level,
+                    kind * 64 + coarse,
+                    ((((min(left, 2) * 3 + min<int>(Y[x], 2)) * 3 + min<int>(Y[x - 1], 2)) * 3 + min<int>(Y[x + 1], 2)) * 3 + min<int>(T[x], 2)) * 3 + min<int>(Z[x], 2),
+                    (small(near) * 12 + small(before[x])) * 12 + small(below[x]),
+                    ((min(parent, 6) * 7 + min(small(around[W + x]), 6)) * 7 + min(small(around[2 * W + x]), 6)) * 7 + min(small(around[3 * W + x]), 6),
+                    (small((near + before[x] + below[x]) / 2) * 12 + parent) * KINDS + kind,
+                };
+                auto predict = [&](Prediction& to, int k) FHASH_LAMBDA {
+                    for (int i = 0; i < CONTEXTS; i++) to.slots[i] = slots[i] + (int64_t)k * SIZES[i] + context[i];
+                    to.first = weights + ((int64_t)k * KINDS + kind) * LANES;
+                    to.second = weights + SECOND + ((int64_t)k * 64 + coarse) * LANES;
+                    return mix<CONTEXTS, true>(to);
+                };
+                Prediction now;
+                int p = predict(now, 0), value = MODE == 1 ? 0 : out[x];
+                if (MODE == 2) {
+                    const float s = scaled[out - q + x];
+                    const int best = choose(std::fabs((double)s), p, predict);
+                    out[x] = value = s < 0 ? -best : best;
+                }
+                int magnitude = std::abs(value);
+                const int zero = range.code(magnitude == 0, p);
+                learn<CONTEXTS, true>(now, zero, SLOW_LIMIT);
+                if (zero) continue;
+                filled = 1;
+                const int left_sign = x > 0 ? sign_of(out[x - 1]) : 1, left2_sign = x > 1 ? sign_of(out[x - 2]) : 1;
+                const int y_sign = has_y ? sign_of(out[x - S2]) : 1, y2_sign = y > 1 ? sign_of(out[x - 2 * S2]) : 1;
+                const int z_sign = has_z ? sign_of(out[x - S1]) : 1, t_sign = has_t ? sign_of(out[x - S0]) : 1;
+                Prediction sign;
+                sign.slots[0] = signs[0] + kind * 27 + (left_sign * 3 + y_sign) * 3 + t_sign;
+                sign.slots[1] = signs[1] + kind * 81 + ((left_sign * 3 + left2_sign) * 3 + y_sign) * 3 + y2_sign;
+                sign.slots[2] = signs[2] + kind * 27 + (t_sign * 3 + z_sign) * 3 + left_sign;
+                sign.first = sign.second = weights + SIGNS + kind * LANES;
+                const int negative = range.code(value < 0, mix<SIGN_CONTEXTS, false>(sign));
+                learn<SIGN_CONTEXTS, false>(sign, negative, SIGN_LIMIT);
+                int k = 1;
+                for (; k < UNARY; k++) {
+                    p = predict(now, k);
+                    const int more = range.code(magnitude > k, p);
+                    learn<CONTEXTS, true>(now, more, SLOW_LIMIT);
+                    if (!more) break;
+                }
+                if (k == UNARY) {
+                    const int64_t escape = level * 64;
+                    const uint32_t rest = MODE == 1 ? 0 : (uint32_t)magnitude - UNARY + 1;
+                    int bits = 0;
+                    if (MODE != 1) while (rest >> bits > 1) bits++;
+                    int j = 0;
+                    while (simple(j < bits, escape + min(j, 20))) if (++j > 30) return -1;
+                    uint32_t v = 1;
+                    for (int i = j - 1; i >= 0; i--) v = (v << 1) | (uint32_t)simple((rest >> i) & 1, escape + 21 + min(j, 19) * 2 + (i != j - 1));
+                    k = (int)min<uint32_t>(v + (UNARY - 1), 0x7fffffff);
+                }
+                if (MODE == 1) {
+                    magnitude = k;
+                    out[x] = negative ? -k : k;
+                }
+                M[x] = (uint16_t)min(magnitude, MAX_MAGNITUDE);
+            }
+            band.filled[r] = (uint8_t)filled;
+        }
+    }
+    return 0;
+}
+
+FHASH_CLONES int64_t encode(Coder<0>& coder, int32_t* q, const int64_t* shape, const int32_t* table, int64_t count) {
+    return coder.run(q, nullptr, shape, table, count);
+}
+FHASH_CLONES int64_t encode_chosen(Coder<2>& coder, int32_t* q, const float* scaled, const int64_t* shape, const int32_t* table, int64_t count) {
+    return coder.run(q, scaled, shape, table, count);
+}
+FHASH_CLONES int64_t decode(Coder<1>& coder, int32_t* q, const int64_t* shape, const int32_t* table, int64_t count) {
+    return coder.run(q, nullptr, shape, table, count);
+}
+
+State make_state(const uint16_t* slots, int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples, int64_t simple_count) {
+    State state;
+    state.slots.resize(slot_count);
+    std::memcpy(state.slots.data(), slots, sizeof(Slot) * slot_count);
+    state.weights.assign(weights, weights + weight_count);
+    state.simples.resize(simple_count);
+    std::memcpy(state.simples.data(), simples, sizeof(Simple) * simple_count);
+    return state;
+}
+
+int64_t put(const std::vector<uint8_t>& out, uint8_t* data, int64_t capacity) {
+    if ((int64_t)out.size() <= capacity && !out.empty()) std::memcpy(data, out.data(), out.size());
+    return (int64_t)out.size();
+}
+
+}  // namespace
+
+// Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (bands.py); everything outside the bands counts as 0.
+// scaled: nullptr, or coefficients / step: then the magnitudes are chosen anew (and put into q), lambda being the squared steps a bit is worth.
+// The state is what transform/coder.py describes; it comes back as it was left if `keep`. Bytes needed; data is filled if they fit,
+// and if they do not, the state is as it was: call again with the same q and more room.
+FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda, const int64_t* shape, const int32_t* table, int64_t count,
+                                  uint16_t* slots, int64_t slot_count, int32_t* weights, int64_t weight_count, uint16_t* simples,
+                                  int64_t simple_count, int64_t keep, uint8_t* data, int64_t capacity) {
+    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count);
+    int64_t size;
+    if (scaled) {
+        Coder<2> coder;
+        coder.state = &state;
+        coder.lambda = lambda / 2048;
+        encode_chosen(coder, q, scaled, shape, table, count);
+        coder.range.finish();
+        size = put(coder.range.out, data, capacity);
+    } else {
+        Coder<0> coder;
+        coder.state = &state;
+        coder.lambda = 0;
+        encode(coder, q, shape, table, count);
+        coder.range.finish();
+        size = put(coder.range.out, data, capacity);
+    }
+    if (keep && size <= capacity) {
+        std::memcpy(slots, state.slots.data(), sizeof(Slot) * slot_count);
+        std::memcpy(weights, state.weights.data(), 4 * (size_t)weight_count);
+        std::memcpy(simples, state.simples.data(), sizeof(Simple) * simple_count);
+    }
+    return size;
+}
+
+// Decode into q, which must be zeros. 0, or -1 for bytes that no encoder writes.
+FHASH_EXPORT int64_t fhash_decode(int32_t* q, const int64_t* shape, const int32_t* table, int64_t count, const uint16_t* slots,
+                                  int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
+                                  int64_t simple_count, const uint8_t* data, int64_t size) {
+    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count);
+    Coder<1> coder;
+    coder.state = &state;
+    coder.range.data = data;
+    coder.range.size = size;
+    coder.range.start();
+    return decode(coder, q, shape, table, count);
+}

@@ -1,0 +1,59 @@
+// Coefficients to integers and back, element by element (transform/quantise.py has the portable twins).
+#include <cmath>
+#include <cstdint>
+
+#include "core.hpp"
+
+namespace {
+
+template <class T> FHASH_INLINE void quantise(const T* in, std::int64_t count, T scale, T rounding, T largest, std::int32_t* out, float* scaled) {
+    for (std::int64_t i = 0; i < count; i++) {
+        const T s = in[i] * scale;
+        T magnitude = s < 0 ? -s : s;
+        magnitude = magnitude < largest ? magnitude + rounding : largest;
+        const std::int32_t whole = (std::int32_t)magnitude;
+        out[i] = s < 0 ? -whole : whole;
+        scaled[i] = (float)s;
+    }
+}
+
+template <class T> FHASH_INLINE void dequantise(const std::int32_t* in, std::int64_t count, T step, T one, T two, T more, T* out) {
+    for (std::int64_t i = 0; i < count; i++) {
+        const std::int32_t q = in[i], magnitude = q < 0 ? -q : q;
+        const T offset = magnitude == 0 ? (T)0 : magnitude == 1 ? one : magnitude == 2 ? two : more;
+        const T value = ((T)magnitude + offset) * step;
+        out[i] = q < 0 ? -value : value;
+    }
+}
+
+FHASH_CLONES void quantise_float(const float* in, std::int64_t n, float scale, float rounding, float largest, std::int32_t* out, float* scaled) {
+    quantise<float>(in, n, scale, rounding, largest, out, scaled);
+}
+FHASH_CLONES void quantise_double(const double* in, std::int64_t n, double scale, double rounding, double largest, std::int32_t* out, float* scaled) {
+    quantise<double>(in, n, scale, rounding, largest, out, scaled);
+}
+FHASH_CLONES void dequantise_float(const std::int32_t* in, std::int64_t n, float step, float one, float two, float more, float* out) {
+    dequantise<float>(in, n, step, one, two, more, out);
+}
+FHASH_CLONES void dequantise_double(const std::int32_t* in, std::int64_t n, double step, double one, double two, double more, double* out) {
+    dequantise<double>(in, n, step, one, two, more, out);
+}
+
+}  // namespace
+
+FHASH_EXPORT std::int64_t fhash_quantise_f32(const float* in, std::int64_t n, double scale, double rounding, double largest, std::int32_t* out, float* scaled) {
+    quantise_float(in, n, (float)scale, (float)rounding, (float)largest, out, scaled);
+    return 0;
+}
+FHASH_EXPORT std::int64_t fhash_quantise_f64(const double* in, std::int64_t n, double scale, double rounding, double largest, std::int32_t* out, float* scaled) {
+    quantise_double(in, n, scale, rounding, largest, out, scaled);
+    return 0;
+}
+FHASH_EXPORT std::int64_t fhash_dequantise_f32(const std::int32_t* in, std::int64_t n, double step, double one, double two, double more, float* out) {
+    dequantise_float(in, n, (float)step, (float)one, (float)two, (float)more, out);
+    return 0;
+}
+FHASH_EXPORT std::int64_t fhash_dequantise_f64(const std::int32_t* in, std::int64_t n, double step, double one, double two, double more, double* out) {
+    dequantise_double(in, n, step, one, two, more, out);
+    return 0;
+}

@@ -1,0 +1,44 @@
+"""The array-to-bytes codec `fhash.transform` as containers use it: one chunk, one tile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
+from fhash_formats.transform.settings import Settings
+from fhash_formats.transform.tile import Shape, decode_tile, encode_tile
+
+__all__ = ["TransformCoder"]
+
+
+class TransformCoder:
+    """Codes chunks of one type and shape with the settings in the codec's configuration, or with those in each chunk's stream."""
+
+    def __init__(self, codecs: Sequence[Mapping[str, Any]], dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+        """Raises DamagedFileError for a configuration that is not allowed, UnsupportedFileError for a second codec."""
+        if len(codecs) != 1:
+            raise UnsupportedFileError("nothing may stand between the codecs fhash.transform and crc32c")
+        if len(shape) > 4:
+            raise DamagedFileError(f"fhash.transform codes arrays of at most 4 axes, not {len(shape)}")
+        configuration = codecs[0].get("configuration", {})
+        try:
+            self.settings = Settings.from_dict(configuration) if "transform" in configuration else None
+        except InputError as error:
+            raise DamagedFileError(f"codec fhash.transform: {error}") from error
+        self._shape, self._dtype = shape, dtype.newbyteorder("=")
+        self._four: Shape = (*(1,) * (4 - len(shape)), *shape)  # type: ignore[assignment]
+
+    def encode(self, chunk: npt.NDArray[Any]) -> bytes:
+        """The stream of a full chunk."""
+        if self.settings is None:
+            raise InputError("fhash.transform without settings only decodes here; fhash_formats.transform.zarr_codec chooses them")
+        return encode_tile(chunk.reshape(self._four), self.settings).data
+
+    def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+        """The full chunk; with `lod`, every 2^lod-th vertex along z, y, x. Raises DamagedFileError."""
+        values = decode_tile(data, self._four, self._dtype, self.settings, lod)
+        return values.reshape(values.shape[4 - len(self._shape) :])

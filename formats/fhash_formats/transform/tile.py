@@ -1,0 +1,388 @@
+"""One tile to bytes and back: transform, quantise, code; decode, correct, bound.
+
+A stream is a byte of flags, the CRC-32 of the decoded integers (coefficients, then residual, as little-endian int32; left out if nothing is
+coded), and sections, each behind its length (LEB128): own settings, missing, coefficients, residual, exact. What is not finite in the
+source, and what the caller does not care for, may decode to anything; the former comes back as it was by the section `missing`: the
+CRC-32 of its marks as little-endian int32 (0 for what is finite, 1 NaN, 2 and 3 infinity and its negative), and the coded marks.
+
+Encoding and decoding compute the same values by the same operations in the same order, so that the encoder knows what every decoder gets.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.bands import band_table, single_band
+from fhash_formats.transform.coder import MAX_INTEGER, decode_integers, encode_integers
+from fhash_formats.transform.lifting import Transform
+from fhash_formats.transform.quantise import dequantise, quantise
+from fhash_formats.transform.settings import Settings
+from fhash_formats.transform.spec import TransformSpec
+
+__all__ = ["CodedTile", "Shape", "decode_tile", "encode_tile", "exact_tile", "transform_for", "within"]
+
+Shape = tuple[int, int, int, int]
+Values = npt.NDArray[Any]
+Mask = npt.NDArray[np.bool_]
+
+_OWN, _MISSING, _RESIDUAL, _EXACT, _EMPTY = 1, 2, 4, 8, 16
+_FORMAT = 1 << 5
+"""The upper three bits of the flags are the number of this stream format, 1."""
+_FILLING = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0)
+"""Thresholds, in steps, by which values that do not count are first filled: smooth ones first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CodedTile:
+    """data: the stream. decoded: what it decodes to, in the type of the source. nonzero: coefficients that are not 0."""
+
+    data: bytes
+    decoded: Values
+    nonzero: int
+
+
+def transform_for(settings: Settings, shape: Shape) -> Transform:
+    """The transform of a tile, kept for tiles of the same shape."""
+    return _transform(settings.transform, shape, settings.dtype.name)
+
+
+@lru_cache(maxsize=64)
+def _transform(spec: TransformSpec, shape: Shape, dtype: str) -> Transform:
+    return Transform(spec, shape, np.dtype(dtype))
+
+
+def encode_tile(
+    values: Values,
+    settings: Settings,
+    *,
+    care: Mask | None = None,
+    weight: float = 0.0,
+    error: float | None = None,
+    rounds: int = 0,
+    passes: int = 1,
+    own: bool = False,
+    keep_missing: bool = True,
+) -> CodedTile:
+    """Code values (t, z, y, x) of any real type.
+
+    care: what counts (bool, same shape; None is all). Values that are not finite never count. weight: squared steps that a bit is worth to
+    the rate-distortion optimisation, 0 for none. error: a bound on |decoded - value| wherever it counts, in units of the values: kept
+    strictly, exactly stored if need be. rounds: projections of what does not count. passes: 2 codes the chosen integers once more.
+    own: put the settings into the stream. keep_missing: bring back values that are not finite as they were.
+    """
+    finite = np.isfinite(values) if values.dtype.kind == "f" else np.ones(values.shape, bool)
+    whole = bool(finite.all())
+    counts = finite if care is None else finite & care
+    every = bool(counts.all())
+    missing = b"" if whole or not keep_missing else _pack_missing(values, finite)
+    if not counts.any():
+        decoded = _cast(np.full(values.shape, settings.center), values.dtype)
+        return CodedTile(data=_assemble(settings if own else None, missing, b"", None, None), decoded=_restore(decoded, missing), nonzero=0)
+    transform = transform_for(settings, values.shape)
+    table = band_table(settings.transform, values.shape)
+    target = (values if every else np.where(counts, values, values.dtype.type(0))).astype(settings.dtype)
+    target -= settings.dtype.type(settings.center)
+    if not every:
+        target[~counts] = 0
+        target = _filled(target, counts, transform, settings)
+    coefficients = transform.forward(target)
+    for _ in range(rounds):
+        integers, scaled = quantise(coefficients, settings.step)
+        if weight > 0:
+            integers = encode_integers(integers, table, scaled=scaled, weight=weight).integers
+        rebuilt = transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype))
+        free = _free(target, rebuilt, counts, every, settings)
+        if not free.any():
+            break
+        target = np.where(free, rebuilt, target)
+        coefficients = transform.forward(target)
+    integers, scaled = quantise(coefficients, settings.step)
+    coded = encode_integers(integers, table, scaled=scaled if weight > 0 else None, weight=weight)
+    if passes > 1 and weight > 0:
+        coded = encode_integers(coded.integers, table)
+    base = _reconstruct(coded.integers, transform, settings)
+    residual = None
+    if error is not None:
+        found = _residual(values, base, counts, error, settings.quantum)
+        if found is None:
+            return exact_tile(values, settings if own else None)
+        residual = found if found.any() else None
+    decoded = _finish(base, residual, settings, values.dtype)
+    if error is not None and not within(values, decoded, error, counts):
+        return exact_tile(values, settings if own else None)
+    data = _assemble(settings if own else None, missing, coded.data, coded.integers, residual)
+    return CodedTile(data=data, decoded=_restore(decoded, missing), nonzero=int(np.count_nonzero(coded.integers)))
+
+
+def exact_tile(values: Values, settings: Settings | None = None) -> CodedTile:
+    """A tile stored without loss: its bytes, those of equal weight together, deflated."""
+    plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+    planes = plain.view(np.uint8).reshape(-1, plain.dtype.itemsize).T
+    body = zlib.compress(planes.tobytes(), 6)
+    flags = _FORMAT | _EXACT | (_OWN if settings else 0)
+    return CodedTile(data=bytes([flags]) + b"".join(map(_section, [*_own(settings), body])), decoded=values.copy(), nonzero=0)
+
+
+def decode_tile(data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: Settings | None = None, lod: int = 0) -> Values:
+    """The values (t, z, y, x) of a stream, in the type of the source.
+
+    settings: those shared by all tiles, unless the stream has its own. lod: every 2^lod-th vertex along z, y, x, low-passed, without head,
+    residual and missing values. Raises DamagedFileError for bytes that no encoder writes.
+    """
+    kind = np.dtype(dtype)
+    data = memoryview(data)
+    if not len(data):
+        raise DamagedFileError("a coded tile is empty")
+    flags = data[0]
+    if flags & 0xE0 != _FORMAT:
+        raise DamagedFileError(f"a coded tile begins with {flags:#04x}, which is no known stream format")
+    coded = not flags & (_EXACT | _EMPTY)
+    if len(data) < 5 and coded:
+        raise DamagedFileError("a coded tile is cut short")
+    digest = int.from_bytes(data[1:5], "little") if coded else 0
+    sections = _sections(data[5:] if coded else data[1:])
+    if flags & _OWN:
+        settings = _settings_from(next(sections, b""))
+    missing = bytes(next(sections, b"")) if flags & _MISSING else b""
+    if flags & _MISSING and not missing:
+        raise DamagedFileError("a coded tile has lost its missing values")
+    if flags & _EXACT:
+        values = _exact_values(next(sections, b""), shape, kind)
+        _ended(sections)
+        return values[_every(lod)] if lod else values
+    if settings is None:
+        raise DamagedFileError("a coded tile has no settings")
+    if flags & _EMPTY:
+        _ended(sections)
+        result = _cast(np.full(_lod_shape(shape, lod), settings.center), kind)
+        return result if lod else _restore(result, missing)
+    integers = decode_integers(next(sections, b""), shape, band_table(settings.transform, shape))
+    crc = zlib.crc32(_little(integers))
+    residual = None
+    if flags & _RESIDUAL:
+        residual = decode_integers(next(sections, b""), shape, single_band(shape))
+        crc = zlib.crc32(_little(residual), crc)
+    _ended(sections)
+    if crc != digest:
+        raise DamagedFileError("the decoded integers of a tile differ from their digest")
+    try:
+        transform = transform_for(settings, shape)
+    except InputError as error:
+        raise DamagedFileError(f"the settings of a coded tile do not fit its shape: {error}") from error
+    if lod:
+        coarse = transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype), lod=lod)
+        return _cast(_clipped(coarse, settings), kind)
+    base = _reconstruct(integers, transform, settings)
+    return _restore(_finish(base, residual, settings, kind), missing)
+
+
+def within(values: Values, decoded: Values, error: float, counts: Mask | None = None) -> bool:
+    """Whether |decoded - value| <= error wherever it counts, without rounding in favour of the answer."""
+    one, other = (values, decoded) if counts is None else (values[counts], decoded[counts])
+    if values.dtype.kind in "iu" and values.dtype.itemsize == 8:
+        most = 0 if error < 0 else np.iinfo(np.uint64).max if error >= 2.0**64 else int(error)
+        return bool(np.all(_whole_difference(one, other) <= np.uint64(most)))
+    difference = one.astype(np.float64) - other.astype(np.float64)
+    # A difference of float64 numbers is rounded: the next one up is surely not too small.
+    return bool(
+        np.all(
+            (one == other)
+            | (np.nextafter(np.abs(difference), np.inf) <= error)
+            | (values.dtype.itemsize < 8) & (np.abs(difference) <= error)
+        )
+    )
+
+
+# -- pieces ----------------------------------------------------------------------------------------------------------------------
+
+
+def _reconstruct(integers: npt.NDArray[np.int32], transform: Transform, settings: Settings) -> Values:
+    """Decoded values in the working type, before the residual."""
+    base = _clipped(transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype)), settings)
+    return base if settings.head is None else settings.head.apply(base)
+
+
+def _clipped(values: Values, settings: Settings) -> Values:
+    kind = settings.dtype.type
+    values += kind(settings.center)
+    return np.clip(values, kind(settings.low), kind(settings.high), out=values)
+
+
+def _finish(base: Values, residual: npt.NDArray[np.int32] | None, settings: Settings, dtype: np.dtype[Any]) -> Values:
+    """Add the residual and go to the type of the source."""
+    if residual is not None:
+        with np.errstate(all="ignore"):
+            base = base.astype(np.float64) + residual * np.float64(settings.quantum)
+    return _cast(base, dtype)
+
+
+def _cast(values: Values, dtype: np.dtype[Any]) -> Values:
+    if dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            return values.astype(dtype)
+    limits = np.iinfo(dtype)
+    # float64 cannot hold the largest 64-bit integers; the number below them is inside.
+    low, high = float(limits.min), float(limits.max)
+    high = high if int(high) <= limits.max else float(np.nextafter(high, 0.0))
+    return np.clip(np.rint(np.nan_to_num(values.astype(np.float64))), low, high).astype(dtype)
+
+
+def _residual(values: Values, base: Values, counts: Mask, error: float, quantum: float) -> npt.NDArray[np.int32] | None:
+    """Whole quanta to add where the error is too large; None where they would not fit."""
+    with np.errstate(all="ignore"):
+        rest = np.where(counts, values.astype(np.float64) - base.astype(np.float64), 0.0)
+        whole = np.where(np.abs(rest) > quantum / 2, np.rint(rest / quantum), 0.0)
+    if not np.isfinite(whole).all() or np.abs(whole).max(initial=0) > MAX_INTEGER:
+        return None
+    return whole.astype(np.int32)
+
+
+def _whole_difference(one: Values, other: Values) -> npt.NDArray[np.uint64]:
+    """The distance of 64-bit integers: a signed difference may go round, and as an unsigned number it is right again."""
+    return np.where(one > other, one - other, other - one).astype(np.uint64)
+
+
+def _filled(target: Values, counts: Mask, transform: Transform, settings: Settings) -> Values:
+    """Values that do not count, filled so that the coefficients are few: thresholds fall while what counts is put back each time."""
+    # A running sum has one order on every machine, a mean has not.
+    target[~counts] = np.cumsum(target[counts], dtype=np.float64)[-1] / np.count_nonzero(counts)
+    for threshold in _FILLING:
+        coefficients = transform.forward(target)
+        limit = settings.dtype.type(threshold * settings.step)
+        coefficients[np.abs(coefficients) < limit] = 0
+        target = np.where(counts, target, transform.inverse(coefficients))
+    return target
+
+
+def _free(target: Values, rebuilt: Values, counts: Mask, every: bool, settings: Settings) -> Mask:
+    """Where the decoded value may be anything: what does not count, and what lies at an end of the range and decodes beyond it."""
+    kind = settings.dtype.type
+    low, high, margin = settings.low - settings.center, settings.high - settings.center, (settings.high - settings.low) * 1e-4
+    free: Mask = ((target <= kind(low + margin)) & (rebuilt < target)) | ((target >= kind(high - margin)) & (rebuilt > target))
+    return free if every else free | ~counts
+
+
+def _every(lod: int) -> tuple[slice, ...]:
+    return (slice(None), *[slice(None, None, 1 << lod)] * 3)
+
+
+def _lod_shape(shape: Shape, lod: int) -> tuple[int, ...]:
+    return (shape[0], *(-(-n // (1 << lod)) for n in shape[1:]))
+
+
+_MISSING_VALUES = (np.nan, np.inf, -np.inf)
+
+
+def _pack_missing(values: Values, finite: Mask) -> bytes:
+    marks = np.where(finite, 0, np.where(np.isnan(values), 1, np.where(values > 0, 2, 3))).astype(np.int32)
+    return zlib.crc32(_little(marks)).to_bytes(4, "little") + encode_integers(marks, single_band(values.shape)).data
+
+
+def _restore(decoded: Values, missing: bytes) -> Values:
+    if missing:
+        if decoded.dtype.kind != "f":
+            raise DamagedFileError("a coded tile of integers has missing values")
+        marks = decode_integers(missing[4:], decoded.shape, single_band(decoded.shape))
+        if zlib.crc32(_little(marks)).to_bytes(4, "little") != missing[:4] or marks.min() < 0 or marks.max() > 3:
+            raise DamagedFileError("the missing values of a coded tile are damaged")
+        for mark, value in enumerate(_MISSING_VALUES, start=1):
+            decoded[marks == mark] = value
+    return decoded
+
+
+def _assemble(
+    settings: Settings | None,
+    missing: bytes,
+    coefficients: bytes,
+    integers: npt.NDArray[np.int32] | None,
+    residual: npt.NDArray[np.int32] | None,
+) -> bytes:
+    flags = _FORMAT | (_OWN if settings else 0) | (_MISSING if missing else 0)
+    sections = [*_own(settings), *([missing] if missing else [])]
+    if integers is None:
+        return bytes([flags | _EMPTY]) + b"".join(map(_section, sections))
+    crc = zlib.crc32(_little(integers))
+    sections.append(coefficients)
+    if residual is not None:
+        flags |= _RESIDUAL
+        crc = zlib.crc32(_little(residual), crc)
+        sections.append(encode_integers(residual, single_band(residual.shape)).data)
+    return bytes([flags]) + crc.to_bytes(4, "little") + b"".join(map(_section, sections))
+
+
+def _little(integers: npt.NDArray[np.int32]) -> memoryview:
+    return np.ascontiguousarray(integers, dtype="<i4").data.cast("B")
+
+
+def _own(settings: Settings | None) -> list[bytes]:
+    if settings is None:
+        return []
+    return [zlib.compress(json.dumps(settings.to_dict(), separators=(",", ":")).encode("ascii"), 9)]
+
+
+def _settings_from(data: bytes | memoryview) -> Settings:
+    try:
+        inflate = zlib.decompressobj()
+        text = inflate.decompress(data, 1 << 22)
+        if not inflate.eof or inflate.unused_data:
+            raise DamagedFileError("the settings of a coded tile are damaged")
+        return Settings.from_dict(json.loads(text))
+    except (zlib.error, ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise DamagedFileError(f"the settings of a coded tile are damaged: {error}") from error
+
+
+def _exact_values(data: bytes | memoryview, shape: Shape, dtype: np.dtype[Any]) -> Values:
+    count = int(np.prod(shape)) * dtype.itemsize
+    try:
+        inflate = zlib.decompressobj()
+        plain = inflate.decompress(data, count)
+        if inflate.unconsumed_tail:
+            inflate.decompress(inflate.unconsumed_tail, 1)
+    except zlib.error as error:
+        raise DamagedFileError(f"a coded tile is damaged: {error}") from error
+    if len(plain) != count or not inflate.eof or inflate.unused_data:
+        raise DamagedFileError("a coded tile is damaged: it holds another number of values")
+    planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
+    return np.array(planes.T, order="C").view(dtype.newbyteorder("<")).reshape(shape).astype(dtype, copy=False)
+
+
+def _ended(sections: Iterator[memoryview]) -> None:
+    if next(sections, None) is not None:
+        raise DamagedFileError("a coded tile has more sections than its flags say")
+
+
+def _section(data: bytes) -> bytes:
+    size, head = len(data), bytearray()
+    while True:
+        head.append(size & 127 | (128 if size > 127 else 0))
+        size >>= 7
+        if not size:
+            return bytes(head) + data
+
+
+def _sections(data: memoryview) -> Iterator[memoryview]:
+    """The sections one after the other; DamagedFileError where one reaches beyond the end."""
+    at = 0
+    while at < len(data):
+        size = shift = 0
+        while True:
+            if at >= len(data) or shift > 35:
+                raise DamagedFileError("a coded tile is cut short")
+            size |= (data[at] & 127) << shift
+            shift += 7
+            at += 1
+            if not data[at - 1] & 128:
+                break
+        if size > len(data) - at:
+            raise DamagedFileError("a coded tile is cut short")
+        yield data[at : at + size]
+        at += size

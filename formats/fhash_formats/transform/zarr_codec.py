@@ -1,0 +1,133 @@
+"""The array-to-bytes codec `fhash.transform` for Zarr format 3, found by zarr through its entry point.
+
+    zarr.create_array(store, shape=..., chunks=..., dtype="float32", fill_value=np.nan, serializer=TransformCodec(max_error=0.01))
+
+Each chunk is one tile. Do not compress again: `compressors=None`, or the checksum `crc32c`. Zarr pads chunks that reach beyond the array
+with the fill value: NaN is best, since it takes no part in the range and costs next to nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from zarr.abc.codec import ArrayBytesCodec
+
+from fhash_formats.errors import InputError
+from fhash_formats.transform.chunk import Quality, decode_chunk, encode_chunk, supported, tile_shape
+from fhash_formats.transform.settings import Settings
+from fhash_formats.transform.spec import TransformSpec
+from fhash_formats.transform.tile import decode_tile, encode_tile
+
+if TYPE_CHECKING:
+    from zarr.core.array_spec import ArraySpec
+    from zarr.core.buffer import Buffer, NDBuffer
+    from zarr.core.chunk_grids import ChunkGrid
+    from zarr.core.common import JSON
+    from zarr.core.dtype.wrapper import TBaseDType, TBaseScalar, ZDType
+
+__all__ = ["NAME", "TransformCodec"]
+
+NAME = "fhash.transform"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransformCodec(ArrayBytesCodec):
+    """Chunks by transform, for arrays of float16 to float64 and integers, of any number of axes. Raises InputError.
+
+    max_error, max_error_rel, step: exactly one, as in `Quality`; a relative bound is relative to each chunk's own range. transform: along
+    the last four axes (t, z, y, x), None for what codes each chunk best. settings: instead of all these, those that all chunks share, as
+    containers have them; in the metadata they are a configuration with the key `center`. reading: instead of all these, only decode
+    streams that have their own settings, as in containers whose configuration is empty.
+    """
+
+    is_fixed_size = False
+
+    max_error: float | None = None
+    max_error_rel: float | None = None
+    step: float | None = None
+    transform: TransformSpec | Mapping[str, Any] | None = None
+    settings: Settings | None = None
+    reading: bool = False
+
+    def __post_init__(self) -> None:
+        if self.settings is None and not self.reading:
+            Quality(max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step)
+            if isinstance(self.transform, Mapping):
+                object.__setattr__(self, "transform", TransformSpec.from_dict(self.transform))
+        elif (self.max_error, self.max_error_rel, self.step, self.transform) != (None,) * 4 or (self.reading and self.settings):
+            raise InputError("settings that all chunks share, and reading, leave nothing else to be given")
+
+    @classmethod
+    def from_dict(cls, data: dict[str, JSON]) -> Self:
+        """From the metadata's `{"name": ..., "configuration": ...}`."""
+        configuration = data.get("configuration", {})
+        if data.get("name") != NAME or not isinstance(configuration, Mapping):
+            raise InputError(f"codec {data.get('name')!r:.40} with {configuration!r:.60} is no {NAME}")
+        if "center" in configuration:
+            return cls(settings=Settings.from_dict(configuration))
+        if not configuration:
+            return cls(reading=True)
+        known = ("max_error", "max_error_rel", "step", "transform")
+        unknown = [key for key in configuration if key not in known]
+        if unknown:
+            raise InputError(f"{NAME}: unknown key {unknown[0]!r:.40}; known: {', '.join(known)}")
+        values: dict[str, Any] = dict(configuration)
+        return cls(**values)
+
+    def to_dict(self) -> dict[str, JSON]:
+        """The inverse of `from_dict`."""
+        configuration: dict[str, Any]
+        if self.settings is not None:
+            configuration = self.settings.to_dict()
+        elif self.reading:
+            configuration = {}
+        else:
+            quality = Quality(max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step)
+            configuration = {**quality.to_dict()}
+            if isinstance(self.transform, TransformSpec):
+                configuration["transform"] = self.transform.to_dict()
+        return {"name": NAME, "configuration": configuration}
+
+    def validate(self, *, shape: tuple[int, ...], dtype: ZDType[TBaseDType, TBaseScalar], chunk_grid: ChunkGrid) -> None:
+        """Raises InputError for a type that is not coded."""
+        supported(dtype.to_native_dtype())
+
+    def evolve_from_array_spec(self, array_spec: ArraySpec) -> Self:
+        """Nothing depends on the array; raises InputError for a type that is not coded."""
+        supported(array_spec.dtype.to_native_dtype())
+        return self
+
+    def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> int:
+        """Not known before."""
+        raise NotImplementedError
+
+    def _encode_sync(self, chunk_array: NDBuffer, chunk_spec: ArraySpec) -> Buffer | None:
+        if self.reading:
+            raise InputError(f"{NAME} without a configuration only decodes: give max_error, max_error_rel or step to write")
+        values = np.asarray(chunk_array.as_ndarray_like())
+        if self.settings is None:
+            data = encode_chunk(
+                values, max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step, transform=self.transform
+            )
+        else:
+            tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(tile_shape(values.shape))
+            data = encode_tile(tile, self.settings).data
+        return chunk_spec.prototype.buffer.from_bytes(data)
+
+    def _decode_sync(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
+        data, shape, dtype = chunk_data.to_bytes(), chunk_spec.shape, chunk_spec.dtype.to_native_dtype()
+        if self.settings is None:
+            values = decode_chunk(data, shape, dtype)
+        else:
+            values = decode_tile(data, tile_shape(shape), supported(dtype), self.settings).reshape(shape).astype(dtype, copy=False)
+        return chunk_spec.prototype.nd_buffer.from_numpy_array(values)
+
+    async def _encode_single(self, chunk_data: NDBuffer, chunk_spec: ArraySpec) -> Buffer | None:
+        return await asyncio.to_thread(self._encode_sync, chunk_data, chunk_spec)
+
+    async def _decode_single(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
+        return await asyncio.to_thread(self._decode_sync, chunk_data, chunk_spec)

@@ -1,0 +1,159 @@
+"""Chunks with settings of their own: the bound for every type and range, equal bytes of both engines, arguments."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from fhash_formats import native
+from fhash_formats.errors import InputError
+from fhash_formats.transform.chunk import decode_chunk, encode_chunk
+
+FLOATS = ["f2", "f4", "f8", ">f4"]
+INTEGERS = ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", ">i2"]
+SHAPES: list[tuple[int, ...]] = [(), (1,), (45,), (9, 12), (3, 8, 9), (2, 3, 8, 9), (2, 1, 2, 4, 6)]
+
+
+def field(shape: tuple[int, ...], scale: float, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    grid = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij") if shape else []
+    wave = sum((np.sin(4 * (i + 1) * x) for i, x in enumerate(grid)), start=np.zeros(shape))
+    wave = wave / max(1, len(shape)) + np.random.default_rng(3).uniform(-0.01, 0.01, shape)
+    return (wave * scale if np.dtype(dtype).kind != "u" else np.abs(wave) * scale).astype(dtype)
+
+
+def worst(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> float:
+    if one.dtype.kind == "f":
+        return float(np.abs(one.astype(np.float64) - other.astype(np.float64)).max(initial=0))
+    return max((abs(int(a) - int(b)) for a, b in zip(one.ravel(), other.ravel(), strict=True)), default=0)
+
+
+def check(values: npt.NDArray[Any], error: float, **quality: float) -> bytes:
+    data = encode_chunk(values, **quality)  # type: ignore[arg-type]
+    decoded = decode_chunk(data, values.shape, values.dtype)
+    assert (decoded.shape, decoded.dtype) == (values.shape, values.dtype)
+    finite = np.isfinite(values)
+    assert worst(values[finite], decoded[finite]) <= error
+    if values.dtype.kind == "f":
+        assert np.array_equal(values[~finite], decoded[~finite], equal_nan=True)
+    return data
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", [*FLOATS, *INTEGERS])
+def test_the_bound_holds(dtype: str, shape: tuple[int, ...]) -> None:
+    values = field(shape, 100, dtype)
+    for error in (0, 0.4, 1, 3.7):
+        check(values, error, max_error=error)
+    span = float(values.max()) - float(values.min())
+    for part in (1e-7, 0.01, 0.3):
+        check(values, part * span, max_error_rel=part)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "scale"), [("f2", 1e-6), ("f2", 6e4), ("f4", 1e-42), ("f4", 1e-38), ("f4", 3e38), ("f8", 1e-310), ("f8", 8e307)]
+)
+def test_the_bound_holds_at_the_ends_of_the_types(dtype: str, scale: float) -> None:
+    values = field((6, 7), scale, dtype)
+    values.flat[0], values.flat[1] = 0.0, -0.0
+    values.flat[2:5] = [np.nan, np.inf, -np.inf]
+    span = float(np.ptp(values[np.isfinite(values)].astype(np.float64)))
+    for part in (1e-5, 0.01):
+        check(values, part * span, max_error_rel=part)
+
+
+@pytest.mark.parametrize("dtype", INTEGERS)
+def test_the_ends_of_whole_numbers(dtype: str) -> None:
+    limits = np.iinfo(dtype)
+    values = (
+        np.random.default_rng(1).integers(limits.min, limits.max, (5, 6), np.dtype(dtype).newbyteorder("="), endpoint=True).astype(dtype)
+    )
+    values.flat[:2] = limits.min, limits.max
+    for error in (0, 2, 1e6):
+        check(values, error, max_error=error)
+
+
+def test_whole_numbers_without_loss_are_smaller_than_themselves() -> None:
+    values = field((8, 16, 16), 1000, "i2")
+    assert len(check(values, 0, max_error=0)) < 0.6 * values.nbytes
+
+
+def test_constants_and_nothing_take_a_few_bytes() -> None:
+    for values in (np.full((20, 30), 0.1), np.full((20, 30), 7, "u1"), np.full((20, 30), np.nan, "f4"), np.full((20, 30), 2**63 - 1)):
+        assert len(check(values, 0, max_error=0)) < 130
+    assert encode_chunk(np.empty((0, 3), "f4"), max_error=1) == b""
+    assert decode_chunk(b"", (0, 3), "f4").shape == (0, 3)
+
+
+def test_missing_values_take_no_part_in_range_or_bound() -> None:
+    values = field((12, 16), 1, "f4")
+    values[:, :5] = np.nan
+    values[3, 7] = np.inf
+    check(values, 0.01 * float(np.ptp(values[np.isfinite(values)])), max_error_rel=0.01)
+
+
+def test_a_smaller_step_is_a_smaller_error_and_more_bytes() -> None:
+    values = field((4, 8, 16, 16), 1, "f4")
+    data = [encode_chunk(values, step=step) for step in (0.2, 0.02)]
+    errors = [worst(values, decode_chunk(each, values.shape, "f4")) for each in data]
+    assert errors[1] < 0.1 < errors[0] * 5
+    assert 2 * len(data[0]) < len(data[1])
+
+
+def test_a_step_beyond_the_range_leaves_the_range() -> None:
+    values = field((6, 7), 1, "f4")
+    check(values, float(np.ptp(values)), step=1e308)
+
+
+@pytest.mark.parametrize("step", [1e-9, 1e-200, 5e-324])
+def test_a_step_too_fine_for_the_coder_is_exact(step: float) -> None:
+    values = field((6, 7), 1, "f8")
+    check(values, 4 * step, step=step)
+
+
+def test_a_given_transform_is_taken() -> None:
+    transform = {"t": "none", "z": "none", "y": ["5/3", 1], "x": "none"}
+    values = field((9, 12), 1, "f4")
+    data = encode_chunk(values, max_error=0.01, transform=transform)
+    assert worst(values, decode_chunk(data, values.shape, "f4")) <= 0.01
+    assert data != encode_chunk(values, max_error=0.01)
+
+
+@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
+@pytest.mark.parametrize("quality", [{"max_error": 0.02}, {"step": 0.1}, {"max_error_rel": 1e-6}])
+def test_both_engines_give_the_same_bytes(quality: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    chunks = [field((3, 6, 7), 1, "f4"), field((40,), 1, "f8"), field((5, 8), 50, "i2")]
+    chunks[0][1, 2, 3:] = np.nan
+    data = [encode_chunk(chunk, **quality) for chunk in chunks]  # type: ignore[arg-type]
+    values = [decode_chunk(each, chunk.shape, chunk.dtype) for each, chunk in zip(data, chunks, strict=True)]
+    monkeypatch.setenv("FHASH_NATIVE", "0")
+    assert [encode_chunk(chunk, **quality) for chunk in chunks] == data  # type: ignore[arg-type]
+    for each, chunk, expected in zip(data, chunks, values, strict=True):
+        assert decode_chunk(each, chunk.shape, chunk.dtype).tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize(
+    "quality",
+    [
+        {},
+        {"max_error": 1, "step": 1},
+        {"max_error": -1},
+        {"step": 0},
+        {"max_error_rel": math.nan},
+        {"max_error": True},
+        {"step": math.inf},
+        {"max_error": "1"},
+    ],
+)
+def test_unsuitable_qualities_are_refused(quality: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"max_error|step"):
+        encode_chunk(np.zeros(3), **quality)
+
+
+@pytest.mark.parametrize("dtype", ["?", "c8", "S3", "M8[s]", "O"])
+def test_unsuitable_types_are_refused(dtype: str) -> None:
+    with pytest.raises(InputError, match="not "):
+        encode_chunk(np.zeros(3).astype(dtype), max_error=1)

@@ -1,0 +1,221 @@
+"""The neighbourhood head: equal bits native and portable, the stated arithmetic, and its bytes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from fhash_formats import native
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.head import MAX_WEIGHT, Head, Layer
+from fhash_formats.transform.head_portable import FEATURES, STEPS, compress
+
+LOW, HIGH = float(np.float32(-1.25)), float(np.float32(2.7))
+
+
+def random_head(hidden=(12, 8), seed=0, sigma=0.1, low=LOW, high=HIGH, spread=8.0):
+    random = np.random.default_rng(seed)
+    widths, layers = [FEATURES, *hidden, 1], []
+    for inputs, outputs in pairwise(widths):
+        weights = np.rint(np.clip(random.normal(size=(outputs, inputs)) * spread, -MAX_WEIGHT, MAX_WEIGHT)).astype(np.int8)
+        biases = random.integers(-127, 128, outputs).astype(np.int8)
+        layers.append(Layer(weights=weights, biases=biases, weight_scale=float(np.float16(0.02)), bias_scale=float(np.float16(0.003))))
+    return Head(layers=tuple(layers), sigma=float(np.float32(sigma)), low=low, high=high)
+
+
+def random_tile(shape, seed=1):
+    """Noise with plateaus at both ends of the clip range and constant stretches inside it."""
+    tile = np.random.default_rng(seed).normal(size=shape).astype(np.float32) * 2
+    if shape[1] > 4:
+        tile[:, : shape[1] // 2] = np.float32(0.3)
+        tile[0, -2:] = 0.0
+    return tile
+
+
+def both(head, tile, monkeypatch):
+    if native.library() is None:
+        pytest.skip("the native library is not built")
+    fast = head.apply(tile)
+    with monkeypatch.context() as context:
+        context.setenv("FHASH_NATIVE", "0")
+        return fast, head.apply(tile)
+
+
+def assert_same_bits(first, second):
+    np.testing.assert_array_equal(first.view(np.int32), second.view(np.int32))
+
+
+@pytest.mark.parametrize(
+    "shape", [(1, 1, 1, 1), (2, 1, 3, 2), (1, 2, 1, 65), (3, 2, 1, 64), (5, 4, 3, 70), (1, 9, 9, 130), (4, 12, 5, 63), (2, 3, 300, 260)]
+)
+def test_native_and_portable_give_the_same_bits(shape, monkeypatch):
+    tile = random_tile(shape)
+    fast, slow = both(random_head(), tile, monkeypatch)
+    assert_same_bits(fast, slow)
+
+
+@pytest.mark.parametrize("hidden", [(1,), (13, 7), (64, 64, 64), (5, 3, 1)])
+def test_every_width_gives_the_same_bits(hidden, monkeypatch):
+    assert_same_bits(*both(random_head(hidden, seed=3), random_tile((2, 6, 7, 40)), monkeypatch))
+
+
+def test_the_largest_sums_are_exact(monkeypatch):
+    widths, layers = [FEATURES, 64, 64, 64, 1], []
+    for inputs, outputs in pairwise(widths):
+        weights = np.full((outputs, inputs), MAX_WEIGHT, dtype=np.int8)
+        layers.append(Layer(weights=weights, biases=np.full(outputs, 127, np.int8), weight_scale=1024.0, bias_scale=1024.0))
+    head = Head(layers=tuple(layers), sigma=2.0**-90, low=LOW, high=HIGH)
+    assert_same_bits(*both(head, random_tile((2, 5, 6, 30)), monkeypatch))
+
+
+@pytest.mark.parametrize(("low", "high", "sigma"), [(0.0, 0.0, 1.0), (-3e38, 3e38, 1e-20), (0.0, 1e-44, 1e-20), (-1.0, 1.0, 1e30)])
+def test_extreme_constants_and_values_give_the_same_bits(low, high, sigma, monkeypatch):
+    low, high = float(np.float32(low)), float(np.float32(high))
+    tile = random_tile((2, 6, 4, 20))
+    tile[0, 0, 0, :6] = np.nan, np.inf, -np.inf, -0.0, 3e38, -3e38
+    fast, slow = both(random_head(sigma=sigma, low=low, high=high), tile, monkeypatch)
+    assert_same_bits(fast, slow)
+    assert fast.min() >= low
+    assert fast.max() <= high
+
+
+def test_a_constant_tile_stays_constant_and_costs_no_differences(monkeypatch):
+    head = random_head()
+    tile = np.full((3, 4, 5, 200), 0.5, dtype=np.float32)
+    fast, slow = both(head, tile, monkeypatch)
+    assert_same_bits(fast, slow)
+    assert len(np.unique(fast)) == 1
+    assert fast[0, 0, 0, 0] != tile[0, 0, 0, 0]
+
+
+def test_a_nearly_constant_tile_takes_the_short_way_with_the_same_bits(monkeypatch):
+    random = np.random.default_rng(5)
+    tile = (0.5 + 1e-5 * random.normal(size=(3, 6, 7, 150))).astype(np.float32)
+    fast, slow = both(random_head(sigma=0.3), tile, monkeypatch)
+    assert_same_bits(fast, slow)
+
+
+@pytest.mark.parametrize("environment", ["0", "1"])
+def test_the_arithmetic_is_the_stated_one(environment, monkeypatch):
+    """Voxel by voxel in float64, from the definition: equal up to the rounding of features and activations."""
+    monkeypatch.setenv("FHASH_NATIVE", environment)
+    head = random_head(seed=7, spread=16.0)
+    tile = np.random.default_rng(2).uniform(-1, 2.5, (3, 4, 5, 9)).astype(np.float32)
+    expected = np.empty(tile.shape)
+
+    def logarithm(d):
+        exponent = np.floor(np.log2(1 + abs(d)))
+        return np.copysign(exponent + (1 + abs(d)) / 2**exponent - 1, d)
+
+    for at in np.ndindex(tile.shape):
+        centre = float(tile[at])
+        inputs = []
+        for step in STEPS:
+            neighbour = tuple(min(max(i + s, 0), size - 1) for i, s, size in zip(at, step, tile.shape, strict=True))
+            inputs.append(logarithm((float(tile[neighbour]) - centre) / (2 * head.sigma)))
+        inputs += [2 * (centre - LOW) / (HIGH - LOW) - 1, logarithm((centre - LOW) / (2 * head.sigma))]
+        values = np.array(inputs)
+        for number, layer in enumerate(head.layers):
+            values = layer.weight_scale * (layer.weights.astype(float) @ values) + layer.bias_scale * layer.biases
+            if number < len(head.layers) - 1:
+                values = np.where(values > 0, values, values / 8)
+        expected[at] = np.clip(centre + head.sigma * values[0], LOW, HIGH)
+    np.testing.assert_allclose(head.apply(tile), expected, atol=0.01 * head.sigma)
+    assert np.abs(expected - tile).max() > head.sigma  # the comparison is about something
+
+
+def test_the_logarithm_is_monotone_and_odd():
+    values = np.sort(np.random.default_rng(0).normal(size=4000).astype(np.float32) * 100)
+    compressed = compress(values)
+    assert (np.diff(compressed) >= 0).all()
+    np.testing.assert_array_equal(compress(-values), -compressed)
+    np.testing.assert_array_equal(compress(np.array([1, 3, 1e30, np.inf], np.float32)), [512, 1024, 4095, 4095])
+
+
+def test_neighbours_are_26_and_lie_in_opposite_pairs():
+    assert len(STEPS) == len(set(STEPS)) == 26
+    assert {tuple(-s for s in step) for step in STEPS} == set(STEPS)
+
+
+def test_a_strided_tile_gives_the_same_as_its_copy():
+    tile = random_tile((2, 6, 8, 40))[:, ::2, :, ::3]
+    assert_same_bits(random_head().apply(tile), random_head().apply(tile.copy()))
+
+
+@pytest.mark.parametrize("tile", [np.zeros((2, 2, 2), np.float32), np.zeros((1, 2, 2, 2))])
+def test_other_tiles_are_refused(tile):
+    with pytest.raises(InputError, match="float32 tile"):
+        random_head().apply(tile)
+
+
+@pytest.mark.parametrize("hidden", [(12, 8), (1,), (24, 12), (64, 64, 64)])
+def test_bytes_there_and_back(hidden):
+    head = random_head(hidden)
+    again = Head.from_bytes(head.to_bytes())
+    assert (again.hidden, again.sigma, again.low, again.high) == (head.hidden, head.sigma, head.low, head.high)
+    for first, second in zip(head.layers, again.layers, strict=True):
+        np.testing.assert_array_equal(first.weights, second.weights)
+        np.testing.assert_array_equal(first.biases, second.biases)
+        assert (first.weight_scale, first.bias_scale) == (second.weight_scale, second.bias_scale)
+
+
+def test_the_default_head_is_small():
+    assert len(random_head(spread=12.0).to_bytes()) <= 530
+
+
+def test_damaged_bytes_are_refused_or_are_another_sound_head():
+    data = random_head().to_bytes()
+    for position in range(len(data)):
+        for bit in (0, 7):
+            damaged = bytearray(data)
+            damaged[position] ^= 1 << bit
+            try:
+                head = Head.from_bytes(bytes(damaged))
+            except DamagedFileError:
+                continue
+            assert head.to_bytes() == bytes(damaged)
+    for length in range(len(data)):
+        with pytest.raises(DamagedFileError):
+            Head.from_bytes(data[:length])
+
+
+@pytest.mark.parametrize("tail", [b"\0", b"\1", b"\xff" * 5000])
+def test_longer_bytes_are_refused(tail):
+    with pytest.raises(DamagedFileError):
+        Head.from_bytes(random_head().to_bytes() + tail)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sigma": 0.0}, "sigma"),
+        ({"sigma": float("nan")}, "finite"),
+        ({"sigma": 0.1}, "float32"),
+        ({"low": 3.0}, "low <= high"),
+        ({"high": float("inf")}, "finite"),
+        ({"layers": ()}, "hidden layers"),
+    ],
+)
+def test_bad_heads_are_refused(change, message):
+    head = random_head()
+    with pytest.raises(InputError, match=message):
+        Head(**{"layers": head.layers, "sigma": head.sigma, "low": head.low, "high": head.high, **change})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"weights": np.full((12, FEATURES), 32, np.int8)},
+        {"weights": np.zeros((12, 27), np.int8)},
+        {"weight_scale": 0.1},
+        {"bias_scale": 0.0},
+    ],
+)
+def test_bad_layers_are_refused(change):
+    head = random_head()
+    fields = {**asdict(head.layers[0]), **change}
+    with pytest.raises(InputError):
+        Head(layers=(Layer(**fields), *head.layers[1:]), sigma=head.sigma, low=LOW, high=HIGH)
