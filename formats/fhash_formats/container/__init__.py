@@ -8,12 +8,24 @@ is allocated; and 0.4 ms per chunk are saved. The tests prove that the zarr libr
     zip_checked   opening the ZIP safely              strict_json metadata documents
     array         metadata of one array               coding      values of a chunk to bytes and back
     header        what the root says of the volume    hierarchy   members to arrays and header
+    sharding      many chunks in one member           coordinates positions in the header
     stored        StoredArray, the cache of chunks    reader      Container            writer      ContainerWriter
 """
 
+from fhash_formats.container.coordinates import describe_coordinates
 from fhash_formats.container.header import FORMAT_VERSION, validate_header
 from fhash_formats.container.reader import Container, is_container
+from fhash_formats.container.sharding import shard_order
 from fhash_formats.container.stored import StoredArray
 from fhash_formats.container.writer import ContainerWriter
 
-__all__ = ["FORMAT_VERSION", "Container", "ContainerWriter", "StoredArray", "is_container", "validate_header"]
+__all__ = [
+    "FORMAT_VERSION",
+    "Container",
+    "ContainerWriter",
+    "StoredArray",
+    "describe_coordinates",
+    "is_container",
+    "shard_order",
+    "validate_header",
+]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.container.coding import CheckedCoder, chunk_coder
+from fhash_formats.container.sharding import Sharding, parse_sharding
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 DTYPES = {
@@ -31,8 +32,10 @@ _OPTIONAL_KEYS = {"attributes", "dimension_names", "storage_transformers"}
 class ArrayMetadata:
     """Shape, number type, chunking and codecs of an array.
 
+    A member of the file holds one chunk of `chunk_shape`. Where the codecs say so (`sharding`) that is a shard of many inner chunks, each
+    of which is decoded alone; elsewhere it is its own and only inner chunk.
     Raises DamagedFileError or UnsupportedFileError for what a container cannot hold.
-    Every length is at least 1; the last chunks along an axis are stored in full, padded with 0.
+    Every length is at least 1; the last inner chunks along an axis are stored in full, padded with 0.
     """
 
     shape: tuple[int, ...]
@@ -52,19 +55,35 @@ class ArrayMetadata:
         _ = self.coder
 
     @cached_property
+    def sharding(self) -> Sharding | None:
+        """How inner chunks lie in a member; None where it is one chunk."""
+        return parse_sharding(self.codecs, self.chunk_shape)
+
+    @cached_property
     def coder(self) -> CheckedCoder:
-        """Codes full chunks."""
-        return chunk_coder(self.codecs, self.dtype, self.chunk_shape)
+        """Codes full inner chunks."""
+        codecs = self.codecs if self.sharding is None else self.sharding.codecs
+        return chunk_coder(codecs, self.dtype, self.inner_shape)
+
+    @property
+    def inner_shape(self) -> tuple[int, ...]:
+        """Shape of what is decoded alone."""
+        return self.chunk_shape if self.sharding is None else self.sharding.chunk_shape
 
     @property
     def chunk_bytes(self) -> int:
-        """Bytes of a decoded chunk."""
-        return prod(self.chunk_shape) * self.dtype.itemsize
+        """Bytes of a decoded inner chunk."""
+        return prod(self.inner_shape) * self.dtype.itemsize
 
     @property
     def grid(self) -> tuple[int, ...]:
-        """Chunks along each axis."""
+        """Members along each axis."""
         return tuple(-(-n // chunk) for n, chunk in zip(self.shape, self.chunk_shape, strict=True))
+
+    @property
+    def inner_grid(self) -> tuple[int, ...]:
+        """Inner chunks along each axis."""
+        return tuple(-(-n // chunk) for n, chunk in zip(self.shape, self.inner_shape, strict=True))
 
     def chunk_key(self, index: Sequence[int]) -> str:
         """Name of a chunk below its array."""
@@ -79,9 +98,9 @@ class ArrayMetadata:
                 return index
         raise DamagedFileError(f"no chunk of the array's grid {self.grid}")
 
-    def chunk_region(self, index: Sequence[int]) -> tuple[slice, ...]:
-        """The part of the array that a chunk holds, cut at the array's end."""
-        spans = zip(index, self.chunk_shape, self.shape, strict=True)
+    def inner_region(self, index: Sequence[int]) -> tuple[slice, ...]:
+        """The part of the array that an inner chunk holds, cut at the array's end."""
+        spans = zip(index, self.inner_shape, self.shape, strict=True)
         return tuple(slice(i * chunk, min((i + 1) * chunk, n)) for i, chunk, n in spans)
 
     def to_dict(self) -> dict[str, Any]:

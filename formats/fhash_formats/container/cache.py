@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-Key = tuple[str, tuple[int, ...]]
-"""Name of the array and index of the chunk."""
+Key = tuple[str, tuple[int, ...], int]
+"""Name of the array, index of the chunk and level of detail."""
 
 
 class ChunkCache:

@@ -6,6 +6,7 @@ about what is between: `ARRAY_CODECS` is the one place where another is added.
 
 from __future__ import annotations
 
+import inspect
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from math import prod
@@ -14,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import DamagedFileError, MissingDependencyError, UnsupportedFileError
+from fhash_formats.errors import DamagedFileError, InputError, MissingDependencyError, UnsupportedFileError
 
 Codec = Mapping[str, Any]
 """A codec as Zarr v3 names it: {"name": str, "configuration": {...}}."""
@@ -27,7 +28,10 @@ _ZSTD_MARK = 0xFD2FB528
 
 
 class ChunkCoder(Protocol):
-    """Codes chunks of one dtype and full shape; `decode` raises DamagedFileError before it allocates for bytes that do not fit."""
+    """Codes chunks of one dtype and full shape; `decode` raises DamagedFileError before it allocates for bytes that do not fit.
+
+    One that can decode with less detail takes a level of detail as a further argument: `decode(data, lod)`, 0 for everything.
+    """
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The bytes of a full chunk."""
@@ -76,7 +80,19 @@ class PlainCoder:
         return values.astype(self._native, copy=False)
 
 
-ARRAY_CODECS: dict[str, Callable[[Sequence[Codec], np.dtype[Any], tuple[int, ...]], ChunkCoder]] = {"bytes": PlainCoder}
+def _transform_coder(codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]) -> ChunkCoder:
+    """The coder of `fhash.transform`."""
+    # Containers without it are read without loading it.
+    from fhash_formats.transform.stream import TransformCoder
+
+    return TransformCoder(codecs, dtype, shape)
+
+
+TRANSFORM = "fhash.transform"
+ARRAY_CODECS: dict[str, Callable[[Sequence[Codec], np.dtype[Any], tuple[int, ...]], ChunkCoder]] = {
+    "bytes": PlainCoder,
+    TRANSFORM: _transform_coder,
+}
 """Coder by the name of the first codec; it is given all codecs but the last, `crc32c`."""
 
 
@@ -88,17 +104,23 @@ class CheckedCoder:
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The bytes of a full chunk."""
-        data = self._coder.encode(chunk)
-        return data + _CRC.pack(crc32c(data))
+        return with_crc32c(self._coder.encode(chunk))
 
-    def decode(self, data: memoryview) -> npt.NDArray[Any]:
-        """The full chunk; raises DamagedFileError."""
+    def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+        """The full chunk, at a level of detail where that is not 0.
+
+        Raises DamagedFileError, and InputError for a level of detail of a coder that has none.
+        """
         if len(data) < _CRC.size:
             raise DamagedFileError(f"{len(data)} bytes are too few for a CRC-32C")
         coded = data[: -_CRC.size]
         if crc32c(coded) != _CRC.unpack(data[-_CRC.size :])[0]:
             raise DamagedFileError("its CRC-32C differs, the data are damaged")
-        return self._coder.decode(coded)
+        if lod == 0:
+            return self._coder.decode(coded)
+        if lod < 0 or "lod" not in inspect.signature(self._coder.decode).parameters:
+            raise InputError(f"level of detail {lod}; the array has none but 0")
+        return self._coder.decode(coded, lod)  # type: ignore[call-arg]
 
 
 def chunk_coder(codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]) -> CheckedCoder:
@@ -119,6 +141,11 @@ def plain_codecs(dtype: np.dtype[Any], level: int = ZSTD_LEVEL) -> list[Codec]:
     """The codecs of ordinary arrays, as the zarr library writes them."""
     first = {"name": "bytes"} if dtype.itemsize == 1 else _LITTLE
     return [first, {"name": "zstd", "configuration": {"level": level, "checksum": False}}, CRC32C]
+
+
+def with_crc32c(data: bytes) -> bytes:
+    """`data` and its CRC-32C behind it: the codec `crc32c`."""
+    return data + _CRC.pack(crc32c(data))
 
 
 def zstd_content_size(data: memoryview) -> int | None:

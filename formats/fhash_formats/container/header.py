@@ -14,14 +14,20 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.container.array import DTYPES, ArrayMetadata
+from fhash_formats.container.coding import TRANSFORM
+from fhash_formats.container.coordinates import MAX_RULED, check_positions
 from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 0)
-KNOWN_FEATURES: frozenset[str] = frozenset()
-KNOWN_PROFILES = ("paper",)
+FORMAT_VERSION = (1, 1)
+TRANSFORM_FEATURE = "transform"
+KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE})
+PAPER, COMPACT = "paper", "compact"
+KNOWN_PROFILES = (PAPER, COMPACT)
+POSITIONS = ("time", "z", "y", "x")
 QUALITY = ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain", "rmse_domain", "max_abs_error_domain")
+HISTORY = ("seconds", "epoch", "psnr")
 TABLE_TYPES = ("float32", "float16", "uint8")
 MAX_LEVELS = 64
 MAX_EMBEDDING = 1024
@@ -51,7 +57,10 @@ def validate_header(header: Mapping[str, Any]) -> None:
     top.texts("features")
     top.whole("dilation", 0, MAX_LENGTH)
     top.need(0 <= top.number("coreset_fraction") <= 1, "coreset_fraction", "a number from 0 to 1")
-    _check_model(top.record("model"), shape[0], box)
+    profile = _check_model(top.record("model"), shape[0], box)
+    if profile == COMPACT:
+        top.need(TRANSFORM_FEATURE in header["required_features"], "required_features", f"{TRANSFORM_FEATURE} in the profile {COMPACT}")
+        _check_coordinates(top, shape)
     top.record("config")
     training, quality = top.record("training"), top.record("quality")
     training.get("seconds")
@@ -60,9 +69,14 @@ def validate_header(header: Mapping[str, Any]) -> None:
     training.text("device")
     for key in QUALITY:
         quality.number_or_null(key)
-    for entry in top.records("history"):
-        for key in ("seconds", "epoch", "psnr"):
+    for entry in top.records("history") if profile == PAPER or isinstance(top.get("history"), list) else ():
+        for key in HISTORY:
             entry.number_or_null(key)
+    if profile == COMPACT and not isinstance(top.get("history"), list):
+        columns = top.record("history")
+        for key in HISTORY:
+            if columns.has(key):
+                columns.numbers(key, len(columns.get("epoch")) if isinstance(columns.get("epoch"), list) else 0)
 
 
 def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]) -> None:
@@ -77,9 +91,13 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
         if name.startswith("tables/") and arrays[name].dtype == np.uint8:
             attributes.number("offset")
             attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
-    if "missing/bits" in arrays:
-        steps, *frame = header["domain"]["shape"]
-        _check_array("missing/bits", arrays["missing/bits"], (steps, -(-prod(frame) // 8)), ("uint8",))
+    if TRANSFORM_FEATURE not in header["required_features"]:
+        for name, array in arrays.items():
+            if array.sharding is not None or array.codecs[0]["name"] == TRANSFORM:
+                raise DamagedFileError(f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, which the header does not require")
+    for name, shape, dtypes in _optional(header):
+        if name in arrays:
+            _check_array(name, arrays[name], shape, dtypes)
 
 
 def check_key_frames(header: Mapping[str, Any], key_frames: npt.NDArray[np.int64]) -> None:
@@ -122,17 +140,34 @@ def _box(top: Record, shape: Sequence[int]) -> list[int]:
     return [high - low for low, high in bounds]
 
 
-def _check_model(model: Record, steps: int, box: Sequence[int]) -> None:
+def _check_coordinates(top: Record, shape: Sequence[int]) -> None:
+    """Positions in the header; those of an axis that it does not name are in an array."""
+    if top.has("coordinates"):
+        coordinates = top.record("coordinates")
+        for axis, length in zip(POSITIONS, shape, strict=True):
+            if coordinates.has(axis):
+                coordinates.need(length <= MAX_RULED, axis, f"an array for more than {MAX_RULED} positions")
+                check_positions(coordinates.record(axis), length)
+
+
+def _check_model(model: Record, steps: int, box: Sequence[int]) -> str:
+    """The profile."""
     profile = model.text("profile")
     if profile not in KNOWN_PROFILES:
         known = ", ".join(KNOWN_PROFILES)
         raise UnsupportedFileError(f"header key model.profile is {profile[:40]!a}; this version knows {known}; upgrade")
-    model.whole("fold", 2, MAX_LENGTH)
-    model.whole("embedding_size", 1, MAX_EMBEDDING)
-    model.whole("hidden_layers", 0, MAX_HIDDEN_LAYERS)
-    model.whole("width", 1, MAX_WIDTH)
-    model.whole("parameters", 1, 1 << 62)
-    model.choice("tables", TABLE_TYPES)
+    if profile == PAPER:
+        model.whole("fold", 2, MAX_LENGTH)
+        model.whole("embedding_size", 1, MAX_EMBEDDING)
+        model.whole("hidden_layers", 0, MAX_HIDDEN_LAYERS)
+        model.whole("width", 1, MAX_WIDTH)
+        model.whole("parameters", 1, 1 << 62)
+        model.choice("tables", TABLE_TYPES)
+    else:
+        model.whole("embedding_size", 1, 1)
+        model.whole("parameters", 0, 1 << 62)
+        model.choice("tables", tuple(DTYPES))
+        model.need(model.get("head") is None or isinstance(model.get("head"), Mapping), "head", "an object or null")
     levels = model.get("levels")
     model.need(isinstance(levels, list) and 1 <= len(levels) <= MAX_LEVELS, "levels", f"1 to {MAX_LEVELS} of [t, z, y, x]")
     finer: Sequence[int] = [MAX_LENGTH] * 4
@@ -143,20 +178,40 @@ def _check_model(model: Record, steps: int, box: Sequence[int]) -> None:
         finer = level
     model.need(levels[0][1:] == list(box), "levels", f"the box {list(box)} at the finest level")
     model.need(levels[0][0] <= steps, "levels", f"at most the {steps} steps of the domain as key frames")
+    model.need(profile == PAPER or len(levels) == 1, "levels", f"one level in the profile {COMPACT}")
+    return profile
 
 
 def _expected(header: Mapping[str, Any]) -> Iterator[Expected]:
     model = header["model"]
-    for axis, length in zip(("time", "z", "y", "x"), header["domain"]["shape"], strict=True):
-        yield f"coords/{axis}", (length,), ("float64",)
+    compact = model["profile"] == COMPACT
+    described = header.get("coordinates", {}) if compact else {}
+    for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
+        if axis not in described:
+            yield f"coords/{axis}", (length,), ("float64",)
     key_frames = model["levels"][0][0]
-    yield "key_frames", (key_frames,), ("int64",)
+    if not compact or key_frames < header["domain"]["shape"][0]:
+        yield "key_frames", (key_frames,), ("int64",)
+    if compact:
+        yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
+        return
     for number, level in enumerate(model["levels"], start=1):
         yield f"tables/level_{number}", (*level, model["embedding_size"]), (model["tables"],)
     for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
         yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
         yield f"mlp/bias_{number}", (outputs,), ("float32",)
     yield "occupancy/bits", (key_frames, occupancy_bytes(header["feature_bounding_box"])), ("uint8",)
+
+
+def _optional(header: Mapping[str, Any]) -> Iterator[Expected]:
+    """Arrays that are checked where they are there."""
+    model, steps = header["model"], header["domain"]["shape"][0]
+    if model["profile"] == COMPACT:
+        key_frames, *box = model["levels"][0]
+        yield "key_frames", (key_frames,), ("int64",)
+        yield "occupancy/bits", (key_frames, occupancy_bytes(header["feature_bounding_box"])), ("uint8",)
+        yield "occupancy/mask", (key_frames, *box), ("uint8",)
+    yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 
 
 def _check_array(name: str, array: ArrayMetadata, shape: tuple[int, ...], dtypes: tuple[str, ...]) -> None:

@@ -49,6 +49,11 @@ class Member:
         return LOCAL.size + len(self.name)
 
     @property
+    def data_offset(self) -> int:
+        """Offset of its data."""
+        return self.offset + self.header_size
+
+    @property
     def end(self) -> int:
         """Offset of the byte after the data."""
         return self.offset + self.header_size + self.size

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from math import prod
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any
 
 from fhash_formats.container.cache import ChunkCache
-from fhash_formats.container.header import check_arrays, check_key_frames, validate_header
+from fhash_formats.container.coordinates import described_coordinate
+from fhash_formats.container.header import POSITIONS, check_arrays, check_key_frames, validate_header
 from fhash_formats.container.hierarchy import read_hierarchy
-from fhash_formats.container.source import FileSource, Source
+from fhash_formats.container.source import CountedSource, FileSource, Source
 from fhash_formats.container.stored import StoredArray, damage_named
 from fhash_formats.container.zip_checked import find_signature, read_members
 from fhash_formats.errors import FhashError
+from fhash_formats.series import Coordinate
 
 CACHE_BYTES = 256 << 20
 
@@ -50,7 +53,7 @@ class Container:
     def __init__(self, path: Path, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
         """Over an open source, which it closes; `open` is for files. Raises as `open` does."""
         self.path, self.size = path, source.size
-        self._source = source
+        self._source = source = CountedSource(source)
         self._cache = ChunkCache(cache_bytes)
         try:
             with damage_named(path):
@@ -63,9 +66,10 @@ class Container:
             self.arrays = MappingProxyType(
                 {name: StoredArray(path, name, array, found.chunks[name], source, self._cache) for name, array in found.arrays.items()}
             )
-            key_frames = self.arrays["key_frames"].read()
-            with damage_named(path):
-                check_key_frames(found.header, key_frames)
+            if "key_frames" in self.arrays:
+                key_frames = self.arrays["key_frames"].read()
+                with damage_named(path):
+                    check_key_frames(found.header, key_frames)
         except BaseException:
             source.close()
             raise
@@ -78,20 +82,37 @@ class Container:
         """
         return cls(Path(path), FileSource(Path(path)), cache_bytes=cache_bytes)
 
+    @property
+    def bytes_read(self) -> int:
+        """Bytes of the file that were read so far, since before it was opened."""
+        return self._source.bytes_read
+
+    def coordinate(self, stored: str) -> Coordinate:
+        """Positions along the axis `stored` ("time", "z", "y" or "x"), from the header or from their array."""
+        axis = POSITIONS.index(stored)
+        if f"coords/{stored}" not in self.arrays:
+            return described_coordinate(self.header["coordinates"][stored], stored, self.header["domain"]["shape"][axis])
+        array = self.arrays[f"coords/{stored}"]
+        attributes = dict(array.attributes)
+        return Coordinate(name=attributes.pop("name", stored), values=array.read(), attributes=attributes)
+
     def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
         """Read and decode every member (metadata were at opening); the number of arrays.
 
-        `progress(done, total)` counts members. Raises DamagedFileError naming the member.
+        `progress(done, total)` counts documents and chunks. Raises DamagedFileError naming the member.
         """
-        total = self._documents + sum(len(array.chunks) for array in self.arrays.values())
+        total = self._documents + sum(prod(array.grid) for array in self.arrays.values())
         done = self._documents
+
+        def count() -> None:
+            nonlocal done
+            done += 1
+            if progress is not None:
+                progress(done, total)
+
         with damage_named(self.path):
             for array in self.arrays.values():
-                for index in array.chunks:
-                    array.decode_chunk(index)
-                    done += 1
-                    if progress is not None:
-                        progress(done, total)
+                array.verify(count)
         return len(self.arrays)
 
     def overhead(self) -> int:

@@ -24,6 +24,10 @@ class Record:
             raise DamagedFileError(f"{self._prefix}{key} is missing")
         return self._values[key]
 
+    def has(self, key: str) -> bool:
+        """Whether the key is there."""
+        return key in self._values
+
     def need(self, condition: bool, key: str, allowed: str) -> None:
         """Refuse the value of `key` unless `condition` holds."""
         if not condition:

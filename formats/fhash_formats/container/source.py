@@ -63,6 +63,27 @@ class FileSource:
             self._file.close()
 
 
+class CountedSource:
+    """Any source, and how many bytes were read from it."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._lock = threading.Lock()
+        self.size = source.size
+        self.bytes_read = 0
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
+        data = self._source.read(offset, size)
+        with self._lock:
+            self.bytes_read += size
+        return data
+
+    def close(self) -> None:
+        """Release the file."""
+        self._source.close()
+
+
 class PreviewSource:
     """The first `length` bytes of a file followed by `tail`: a container as it will be once its end is written."""
 

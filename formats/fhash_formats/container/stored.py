@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import product
 from typing import Any
@@ -14,8 +15,10 @@ import numpy.typing as npt
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.layout import Member
+from fhash_formats.container.parallel import in_threads
+from fhash_formats.container.sharding import Sharding, parse_index
 from fhash_formats.container.source import Source
-from fhash_formats.container.zip_checked import read_member
+from fhash_formats.container.zip_checked import check_member, read_member
 from fhash_formats.errors import DamagedFileError, RegionError
 
 
@@ -41,10 +44,12 @@ class StoredArray:
 
     Attributes:
         name: path in the hierarchy, "tables/level_1".
-        shape, chunk_shape: lengths per axis, at least 1; dtype: native byte order.
+        shape: lengths per axis, at least 1; dtype: native byte order.
+        chunk_shape: of a chunk, the least that is decoded; grid: chunks along each axis.
+        shard_shape: of a shard of many chunks; None where each chunk is a member of its own.
         dimension_names, attributes: as stored.
-        chunks: member of the file by chunk index, in the order of the file.
-        nbytes_stored: bytes of its chunks in the file.
+        chunks: member of the file by index of the chunk, or of the shard where there are shards, in the order of the file.
+        nbytes_stored: bytes of its members in the file.
     """
 
     def __init__(
@@ -56,24 +61,29 @@ class StoredArray:
         self.chunks = chunks
         self.shape = metadata.shape
         self.dtype = metadata.dtype
-        self.chunk_shape = metadata.chunk_shape
+        self.chunk_shape = metadata.inner_shape
+        self.grid = metadata.inner_grid
+        self.shard_shape = None if metadata.sharding is None else metadata.chunk_shape
         self.dimension_names = metadata.dimension_names
         self.attributes = metadata.attributes
         self.nbytes_stored = sum(member.size for member in chunks.values())
+        self._indices: dict[tuple[int, ...], npt.NDArray[np.int64]] = {}
+        self._lock = threading.Lock()
 
     def read(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[Any]:
         """The values in `region`, one slice per axis without step, everything if None; a fresh array.
 
-        Touches only the chunks that intersect the region. They are kept in the container's cache, except when everything is read.
+        Touches only the chunks that intersect the region, those of shards in several threads. They are kept in the container's cache,
+        except when everything is read.
         Raises RegionError for a region outside the array, DamagedFileError for a damaged chunk.
         """
         bounds = [self._bounds(axis, part) for axis, part in enumerate(self._full(region))]
         with damage_named(self._path):
-            values = np.empty([stop - start for start, stop in bounds], dtype=self.dtype)
-            if values.size == 0:
-                return values
-            spans = [range(start // chunk, -(-stop // chunk)) for (start, stop), chunk in zip(bounds, self.chunk_shape, strict=True)]
-            for index in product(*spans):
+            lengths = [stop - start for start, stop in bounds]
+            if 0 in lengths:
+                return np.empty(lengths, dtype=self.dtype)
+
+            def fill(index: tuple[int, ...]) -> None:
                 chunk = self._chunk(index, keep=region is not None)
                 target, origin = [], []
                 for i, (start, stop), size in zip(index, bounds, self.chunk_shape, strict=True):
@@ -81,25 +91,93 @@ class StoredArray:
                     target.append(slice(low - start, high - start))
                     origin.append(slice(low - i * size, high - i * size))
                 values[tuple(target)] = chunk[tuple(origin)]
+
+            spans = [range(start // chunk, -(-stop // chunk)) for (start, stop), chunk in zip(bounds, self.chunk_shape, strict=True)]
+            # What finds hostile shards comes before the array that they ask for; the work itself is done as it is asked for.
+            work = self._each(fill, spans)
+            values = np.empty(lengths, dtype=self.dtype)
+            for _ in work:
+                pass
         return values
 
-    def decode_chunk(self, index: tuple[int, ...]) -> npt.NDArray[Any]:
-        """A full chunk, padding included, straight from the file; raises DamagedFileError naming its member."""
-        member = self.chunks[index]
-        data = read_member(self._source, member)
-        try:
-            return self._metadata.coder.decode(data)
-        except DamagedFileError as error:
-            raise type(error)(f"member {member.name}: {error}") from error
+    def decode_chunk(self, index: tuple[int, ...], lod: int = 0) -> npt.NDArray[Any]:
+        """A full chunk, padding included, from the container's cache or else from the file; read-only.
 
-    def _chunk(self, index: tuple[int, ...], *, keep: bool) -> npt.NDArray[Any]:
-        key = (self.name, index)
+        lod: level of detail, 0 for everything; what others give is for the coder of the array to say.
+        Raises RegionError for an index outside `grid`, InputError for a level of detail that there is none of, DamagedFileError naming
+        the member of the file.
+        """
+        if len(index) != len(self.grid) or not all(0 <= i < n for i, n in zip(index, self.grid, strict=True)):
+            raise RegionError(f"{self._path}: {self.name}: chunk {index} is outside the grid {self.grid}")
+        with damage_named(self._path):
+            return self._chunk(tuple(index), lod, keep=True)
+
+    def verify(self, done: Callable[[], None]) -> None:
+        """Read and decode all of it straight from the file; `done()` after each chunk. Raises DamagedFileError naming the member."""
+        if self._metadata.sharding is not None:
+            for member in self.chunks.values():
+                check_member(self._source, member)
+        for _ in self._each(self._decode_and_drop, [range(n) for n in self.grid]):
+            done()
+
+    def _decode_and_drop(self, index: tuple[int, ...]) -> None:
+        self._decode(index)
+
+    def _each(self, work: Callable[[tuple[int, ...]], None], spans: Sequence[range]) -> Iterator[None]:
+        """Do the work for each chunk of `spans`, as the result is iterated; in threads if there are shards and several to decode."""
+        sharding = self._metadata.sharding
+        if sharding is None:
+            return map(work, product(*spans))
+        # Once for all chunks of a shard, before the threads that all need it.
+        shards = (range(span.start // count, (span.stop - 1) // count + 1) for span, count in zip(spans, sharding.counts, strict=True))
+        for shard in product(*shards):
+            self._shard_index(sharding, shard)
+        chosen = list(product(*spans))
+        missing = sum(self._cache.get((self.name, index, 0)) is None for index in chosen)
+        return in_threads(work, chosen) if missing > 1 else map(work, chosen)
+
+    def _chunk(self, index: tuple[int, ...], lod: int = 0, *, keep: bool) -> npt.NDArray[Any]:
+        key = (self.name, index, lod)
         chunk = self._cache.get(key)
         if chunk is None:
-            chunk = self.decode_chunk(index)
+            chunk = self._decode(index, lod)
+            chunk.flags.writeable = False
             if keep:
                 self._cache.put(key, chunk)
         return chunk
+
+    def _decode(self, index: tuple[int, ...], lod: int = 0) -> npt.NDArray[Any]:
+        """A full chunk, straight from the file."""
+        sharding = self._metadata.sharding
+        if sharding is None:
+            member, part = self.chunks[index], ""
+            data = read_member(self._source, member)
+        else:
+            shard, number = sharding.place(index)
+            member, part = self.chunks[shard], f"inner chunk {number}: "
+            offset, size = (int(n) for n in self._shard_index(sharding, shard)[number])
+            data = memoryview(self._source.read(member.data_offset + offset, size))
+        try:
+            return self._metadata.coder.decode(data, lod)
+        except DamagedFileError as error:
+            raise type(error)(f"member {member.name}: {part}{error}") from error
+
+    def _shard_index(self, sharding: Sharding, shard: tuple[int, ...]) -> npt.NDArray[np.int64]:
+        """(offset in the member, bytes) of each inner chunk of a shard; read once."""
+        with self._lock:
+            found = self._indices.get(shard)
+            if found is None:
+                member = self.chunks[shard]
+                data_bytes = member.size - sharding.index_bytes
+                try:
+                    if data_bytes < 0:
+                        raise DamagedFileError(f"{member.size} bytes are too few for the index of a shard, {sharding.index_bytes}")
+                    data = self._source.read(member.data_offset + data_bytes, sharding.index_bytes)
+                    found = parse_index(data, sharding.present(shard, self.shape), data_bytes)
+                except DamagedFileError as error:
+                    raise type(error)(f"member {member.name}: {error}") from error
+                self._indices[shard] = found
+        return found
 
     def _full(self, region: tuple[slice, ...] | None) -> tuple[slice, ...]:
         if region is None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import product
-from math import prod
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -16,13 +15,15 @@ import numpy.typing as npt
 
 from fhash_formats.container import strict_json
 from fhash_formats.container.array import ArrayMetadata
+from fhash_formats.container.chunks import Coded, cut, expect_end, full_chunk, shard_parts
 from fhash_formats.container.coding import Codec, plain_codecs
 from fhash_formats.container.header import FORMAT, FORMAT_VERSION
 from fhash_formats.container.hierarchy import DOCUMENT, GROUP
 from fhash_formats.container.layout import Member, ending, local_header
 from fhash_formats.container.reader import Container
+from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.container.source import FileSource, PreviewSource
-from fhash_formats.container.zip_checked import MAX_NAME, NAME
+from fhash_formats.container.zip_checked import MAX_MEMBER, MAX_NAME, NAME
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
 from fhash_formats.slabs import slab_shape
 from fhash_formats.writers.atomic import replacing
@@ -80,31 +81,43 @@ class ContainerWriter:
         `codecs` as in Zarr's metadata, default bytes, zstd, crc32c. Raises InputError for anything that does not fit together.
         """
         number_type = np.dtype(dtype).newbyteorder("=")
-        try:
-            metadata = ArrayMetadata(
-                shape=tuple(int(n) for n in shape),
-                dtype=number_type,
-                chunk_shape=tuple(int(n) for n in chunk_shape),
-                codecs=plain_codecs(number_type) if codecs is None else tuple(codecs),
-                dimension_names=None if dimension_names is None else tuple(dimension_names),
-                attributes=dict(attributes or {}),
-            )
-            # What is written is what a reader accepts: the reader's checks are the writer's.
-            document = strict_json.dumps(metadata.to_dict(), f"the metadata of array {name}")
-            ArrayMetadata.from_dict(strict_json.loads(document))
-        except DamagedFileError as error:
-            raise InputError(f"array {name} cannot be stored: {error}") from error
-        self._check_name(name)
-        self._arrays.add(name)
-        self._add(f"{name}/{DOCUMENT}", document)
+        coding = plain_codecs(number_type) if codecs is None else codecs
+        metadata = self._begin(name, shape, number_type, chunk_shape, coding, dimension_names, attributes)
         given = iter(chunks)
         for index in product(*(range(n) for n in metadata.grid)):
             chunk = next(given, None)
             if chunk is None:
                 raise InputError(f"array {name}: chunk {index} was not given; the grid has {metadata.grid}")
-            self._add(f"{name}/{metadata.chunk_key(index)}", metadata.coder.encode(_full_chunk(name, metadata, index, chunk)))
-        if next(given, None) is not None:
-            raise InputError(f"array {name}: more chunks were given than the {prod(metadata.grid)} of the grid {metadata.grid}")
+            self._add(f"{name}/{metadata.chunk_key(index)}", [metadata.coder.encode(full_chunk(name, metadata, index, chunk))])
+        expect_end(name, metadata, given)
+
+    def add_sharded(
+        self,
+        name: str,
+        *,
+        shape: Sequence[int],
+        dtype: npt.DTypeLike,
+        chunk_shape: Sequence[int],
+        shard_shape: Sequence[int],
+        chunks: Iterable[Coded | tuple[tuple[int, ...], Coded]],
+        dimension_names: Sequence[str | None] | None = None,
+        attributes: Mapping[str, Any] | None = None,
+        codecs: Sequence[Codec] | None = None,
+    ) -> None:
+        """Write an array whose chunks of `chunk_shape` lie many together in shards; the coded bytes of one shard are held at a time.
+
+        `chunks` come in the order of `shard_order`, or each with its index in the grid of chunks, (index, chunk): then shard by shard
+        in C order, and within a shard in any order. A chunk is an array of `dtype` as for `add_array`, or bytes: what the coder of its
+        first codec gave for the full chunk, without CRC-32C. Raises InputError for anything that does not fit together.
+        """
+        number_type = np.dtype(dtype).newbyteorder("=")
+        coding = sharding_codecs([int(n) for n in chunk_shape], plain_codecs(number_type) if codecs is None else codecs)
+        metadata = self._begin(name, shape, number_type, shard_shape, coding, dimension_names, attributes)
+        assert metadata.sharding is not None
+        given = iter(chunks)
+        for shard in product(*(range(n) for n in metadata.grid)):
+            self._add(f"{name}/{metadata.chunk_key(shard)}", shard_parts(name, metadata, metadata.sharding, shard, given))
+        expect_end(name, metadata, given)
 
     def add_whole(
         self,
@@ -123,11 +136,41 @@ class ContainerWriter:
             shape=array.shape,
             dtype=array.dtype,
             chunk_shape=chosen,
-            chunks=_cut(array, chosen),
+            chunks=cut(array, chosen),
             dimension_names=dimension_names,
             attributes=attributes,
             codecs=codecs,
         )
+
+    def _begin(
+        self,
+        name: str,
+        shape: Sequence[int],
+        dtype: np.dtype[Any],
+        chunk_shape: Sequence[int],
+        codecs: Sequence[Codec],
+        dimension_names: Sequence[str | None] | None,
+        attributes: Mapping[str, Any] | None,
+    ) -> ArrayMetadata:
+        """Write the metadata of an array."""
+        try:
+            metadata = ArrayMetadata(
+                shape=tuple(int(n) for n in shape),
+                dtype=dtype,
+                chunk_shape=tuple(int(n) for n in chunk_shape),
+                codecs=tuple(codecs),
+                dimension_names=None if dimension_names is None else tuple(dimension_names),
+                attributes=dict(attributes or {}),
+            )
+            # What is written is what a reader accepts: the reader's checks are the writer's.
+            document = strict_json.dumps(metadata.to_dict(), f"the metadata of array {name}")
+            ArrayMetadata.from_dict(strict_json.loads(document))
+        except DamagedFileError as error:
+            raise InputError(f"array {name} cannot be stored: {error}") from error
+        self._check_name(name)
+        self._arrays.add(name)
+        self._add(f"{name}/{DOCUMENT}", [document])
+        return metadata
 
     def preview(self, header: Mapping[str, Any]) -> Container:
         """What has been written so far as a container to read and to close, as if committed with this header.
@@ -179,29 +222,18 @@ class ContainerWriter:
         if name in self._arrays:
             raise InputError(f"array {name} is there already")
 
-    def _add(self, name: str, data: bytes) -> None:
+    def _add(self, name: str, parts: Sequence[bytes]) -> None:
+        """Write a member whose data are these parts, one after the other."""
         if self._file.closed:
             raise OutputError(f"{self.path}: the container is written already")
-        member = Member(name=name, offset=self._position, size=len(data), crc=zlib.crc32(data))
+        size, crc = sum(len(part) for part in parts), 0
+        if size > MAX_MEMBER:
+            raise InputError(f"{name} takes {size} bytes; the limit is {MAX_MEMBER}, take smaller chunks or shards")
+        for part in parts:
+            crc = zlib.crc32(part, crc)
+        member = Member(name=name, offset=self._position, size=size, crc=crc)
         self._file.write(local_header(member))
-        self._file.write(data)
+        for part in parts:
+            self._file.write(part)
         self._members.append(member)
         self._position = member.end
-
-
-def _cut(array: npt.NDArray[Any], chunk_shape: Sequence[int]) -> Iterator[npt.NDArray[Any]]:
-    starts = (range(0, n, max(1, chunk)) for n, chunk in zip(array.shape, chunk_shape, strict=False))
-    for corner in product(*starts):
-        yield array[tuple(slice(start, start + chunk) for start, chunk in zip(corner, chunk_shape, strict=False))]
-
-
-def _full_chunk(name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """A chunk padded with 0 to the full shape, as Zarr stores those at an end of the array."""
-    expected = tuple(part.stop - part.start for part in metadata.chunk_region(index))
-    if chunk.shape != expected or chunk.dtype.newbyteorder("=") != metadata.dtype:
-        raise InputError(f"array {name}: chunk {tuple(index)} is {chunk.dtype} {chunk.shape}; {metadata.dtype} {expected} is needed")
-    if expected == metadata.chunk_shape:
-        return chunk
-    full = np.zeros(metadata.chunk_shape, dtype=metadata.dtype)
-    full[tuple(slice(0, n) for n in expected)] = chunk
-    return full

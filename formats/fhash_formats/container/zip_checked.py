@@ -42,6 +42,7 @@ NAME = re.compile(rf"{_PART}(/{_PART})*")
 """Names of members: relative paths of plain parts, none of which starts with a dot."""
 
 _LONGEST_COMMENT = 128
+_PIECE = 1 << 20
 
 
 def find_signature(source: Source) -> tuple[int, bytes] | None:
@@ -82,6 +83,17 @@ def read_member(source: Source, member: Member) -> memoryview:
     if zlib.crc32(data) != member.crc:
         raise DamagedFileError(f"member {member.name}: its CRC-32 differs, the data are damaged")
     return data
+
+
+def check_member(source: Source, member: Member) -> None:
+    """`read_member` for a member that need not be held: piece by piece."""
+    if source.read(member.offset, member.header_size) != local_header(member):
+        raise DamagedFileError(f"member {member.name}: its header differs from the directory")
+    crc = 0
+    for start in range(0, member.size, _PIECE):
+        crc = zlib.crc32(source.read(member.data_offset + start, min(_PIECE, member.size - start)), crc)
+    if crc != member.crc:
+        raise DamagedFileError(f"member {member.name}: its CRC-32 differs, the data are damaged")
 
 
 def _read_end(source: Source, comment_at: int) -> tuple[int, int, int]:

@@ -64,6 +64,27 @@ def make_arrays(header: dict[str, Any]) -> dict[str, np.ndarray]:
     return arrays
 
 
+def make_compact_header() -> dict[str, Any]:
+    """A header of the profile compact, whose only array need be the table."""
+    header = make_header()
+    header["required_features"] = ["transform"]
+    header["model"] = {
+        "profile": "compact",
+        "levels": [[4, 3, 4, 6]],
+        "embedding_size": 1,
+        "tables": "float32",
+        "parameters": 17,
+        "head": None,
+    }
+    header["coordinates"] = {
+        "time": {"values": [0, 0.5, 2, 2.25], "attributes": {"units": "h"}},
+        "z": {},
+        "y": {"start": -1.5, "step": 0.25},
+        "x": {"start": 0.1, "step": 0.3, "last": 1.6, "dtype": "float32", "name": "lon"},
+    }
+    return header
+
+
 def write(path: Path, header: dict[str, Any], arrays: dict[str, np.ndarray], **options: Any) -> int:
     """A container of whole arrays; the finest table in 2 x 2 x 2 chunks, some of them at an end."""
     with ContainerWriter(path, **options) as writer:
@@ -114,6 +135,7 @@ class Samples:
     """What the tests of this folder share."""
 
     header = staticmethod(make_header)
+    compact_header = staticmethod(make_compact_header)
     arrays = staticmethod(make_arrays)
     write = staticmethod(write)
     unpack = staticmethod(unpack)

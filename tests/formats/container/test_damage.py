@@ -116,7 +116,7 @@ def test_disk_error_while_reading(sample, monkeypatch):
 def test_what_does_not_fit_in_memory_is_refused(sample, monkeypatch):
     with Container.open(sample) as container:
         array = container.arrays["mlp/weight_1"]
-        monkeypatch.setattr(array, "decode_chunk", lambda index: (_ for _ in ()).throw(MemoryError()))
+        monkeypatch.setattr(array, "_decode", lambda index, lod: (_ for _ in ()).throw(MemoryError()))
         with pytest.raises(DamagedFileError, match="memory"):
             array.read()
 

@@ -9,10 +9,11 @@ from importlib.resources import files
 import numpy as np
 import pytest
 
-from fhash_formats.container import Container, validate_header
+from fhash_formats.container import Container, ContainerWriter, validate_header
 from fhash_formats.container.array import DTYPES, ArrayMetadata
-from fhash_formats.container.coding import plain_codecs
+from fhash_formats.container.coding import ARRAY_CODECS, PlainCoder, plain_codecs
 from fhash_formats.container.header import FORMAT_VERSION
+from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.errors import DamagedFileError
 
 DOCUMENT = files("fhash_formats").joinpath("FORMAT.md").read_text(encoding="utf-8")
@@ -35,6 +36,32 @@ def test_header_is_valid_and_can_be_written(tmp_path, samples):
         container.verify()
     for name in arrays:
         assert re.sub("_[0-9]$", "_1", name) in DOCUMENT
+
+
+def test_compact_header_is_valid_and_can_be_written(tmp_path, samples):
+    header = example("compact-header")
+    validate_header(header)
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        writer.add_whole("tables/level_1", np.zeros(header["model"]["levels"][0], dtype=np.float32))
+        writer.commit(header)
+    with Container.open(tmp_path / "a.fhz") as container:
+        assert container.header == header
+        assert container.coordinate("x").name == "lon"
+    for key in ("coordinates", *header["model"], *header["coordinates"]["x"], "values", "attributes"):
+        assert f"`{key}`" in DOCUMENT
+    for name in ("occupancy/bits", "occupancy/mask", "tables/level_1"):
+        assert f"`{name}`" in DOCUMENT
+
+
+def test_sharded_array_is_what_the_writer_writes(monkeypatch):
+    monkeypatch.setitem(ARRAY_CODECS, "fhash.transform", lambda codecs, dtype, shape: PlainCoder(plain_codecs(dtype)[:2], dtype, shape))
+    values = example("sharded-array")
+    metadata = ArrayMetadata.from_dict(values)
+    assert metadata.to_dict() == values
+    assert metadata.grid == (1, 1, 1, 1)
+    assert metadata.inner_grid == (2, 2, 2, 2)
+    inner = values["codecs"][0]["configuration"]
+    assert sharding_codecs(inner["chunk_shape"], inner["codecs"]) == values["codecs"]
 
 
 def test_no_key_of_the_example_can_be_left_out():

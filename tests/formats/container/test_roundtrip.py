@@ -76,7 +76,7 @@ def test_zarr_library_reads_every_array_equal(everything):
         assert read[...].tobytes() == array.tobytes()
     assert group["extra/five/int8"].attrs.asdict() == {"of": "five"}
     assert group["extra/plane/int8"].metadata.dimension_names == ("axis_0", "axis_1")
-    assert group.attrs["fhash"]["format_version"] == [1, 0]
+    assert group.attrs["fhash"]["format_version"] == [1, 1]
     assert {name for name, _ in group["extra"].groups()} == set(SHAPES)
     store.close()
 
@@ -91,7 +91,7 @@ def test_zipfile_finds_a_sound_uncompressed_zip(sample):
 
 def test_header_comes_back(sample, samples):
     with Container.open(sample) as container:
-        assert container.header == {**samples.header(), "format": "fhash", "format_version": [1, 0], "required_features": []}
+        assert container.header == {**samples.header(), "format": "fhash", "format_version": [1, 1], "required_features": []}
         assert container.size == sample.stat().st_size
         assert container.path == sample
 

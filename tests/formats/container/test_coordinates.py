@@ -1,0 +1,167 @@
+"""Positions in the header: every bit of them, or an array."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from fhash_formats.container import Container, ContainerWriter, describe_coordinates
+from fhash_formats.container.coordinates import MAX_LISTED, MAX_RULED, describe_positions, positions
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.series import Coordinate, index_coordinate
+
+UNEVEN = np.cumsum(np.random.default_rng(0).random(MAX_LISTED))
+
+RULED = {
+    "plain index": (np.arange(128.0), {}),
+    "one": (np.array([5.5]), {"start": 5.5}),
+    "descending": (np.arange(90, -90.5, -0.5), {"start": 90, "step": -0.5}),
+    "constant": (np.full(7, 2.0), {"start": 2, "step": 0}),
+    "product and sum": (np.arange(128) * 0.1 + 5, {"start": 5, "step": 0.1}),
+    "large": (1e300 + np.arange(5) * 1e299, {"start": 1e300, "step": 1e299}),
+    "two far apart": (np.array([0.0, 3e-320]), {"step": 3e-320}),
+    "float32": (np.linspace(0.1, 9.9, 128, dtype=np.float32).astype(float), {"start": 0.1, "dtype": "float32"}),
+    "last": (np.linspace(-3.3, 7.1, 128), {"start": -3.3, "last": 7.1}),
+}
+LISTED = {
+    "uneven": (UNEVEN, None),
+    "uneven float32": (UNEVEN.astype(np.float32).astype(float), "float32"),
+    "negative zero": (np.array([-0.0, 1.0, 2.0]), "float32"),
+    "repeated": (np.array([0.0, 1.0, 1.0, 1.0]), "float32"),
+    "a range beyond float64": (np.array([-1.7e308, 1.7e308]), None),
+}
+ARRAYS = {
+    "not finite": np.array([0.0, np.nan]),
+    "many uneven": np.append(UNEVEN, 1e3),
+    "very many": np.arange(MAX_RULED + 1.0),
+}
+
+
+def there_and_back(values):
+    """Whether the description, through JSON, gives every bit."""
+    found = describe_positions(values)
+    assert positions(json.loads(json.dumps(found)), values.size).tobytes() == values.tobytes()
+    return found
+
+
+@pytest.mark.parametrize("case", RULED)
+def test_rules(case):
+    values, expected = RULED[case]
+    found = there_and_back(values)
+    assert "values" not in found
+    assert {key: found.get(key) for key in expected} == expected
+    assert len(json.dumps(found)) < 100
+
+
+@pytest.mark.parametrize("case", LISTED)
+def test_lists(case):
+    values, dtype = LISTED[case]
+    found = there_and_back(values)
+    assert len(found["values"]) == values.size
+    assert found.get("dtype") == dtype
+
+
+@pytest.mark.parametrize("case", ARRAYS)
+def test_what_needs_an_array(case):
+    assert describe_positions(ARRAYS[case]) is None
+
+
+def test_random_positions_come_back():
+    rng = np.random.default_rng(1)
+    for _ in range(300):
+        size = int(rng.integers(1, 100))
+        # As people write them: a start of few digits, steps of more.
+        start, step = (float(f"{rng.normal() * 10.0 ** rng.integers(-4, 5):.{rng.integers(1, most)}g}") for most in (6, 12))
+        values = start + step * np.arange(size)
+        if rng.random() < 0.5:
+            values = values.astype(np.float32).astype(np.float64)
+        there_and_back(values)
+
+
+def test_a_rule_that_leaves_float64_gives_infinities():
+    assert positions({"start": 1e308, "step": 1e308}, 3)[1:].tolist() == [np.inf, np.inf]
+
+
+def coords():
+    return {
+        "t": Coordinate(name="time", values=np.array([0, 0.5, 2.0, 2.25]), attributes={"units": "h"}),
+        "z": index_coordinate("z", 3),
+        "y": Coordinate(name="lat", values=np.array([1.0, np.nan, 3, 4, 5]), attributes={"units": "deg"}),
+        "x": Coordinate(name="lon", values=np.arange(6) * 0.25),
+    }
+
+
+def write(path, header, arrays=()):
+    with ContainerWriter(path) as writer:
+        writer.add_whole("tables/level_1", np.zeros(header["model"]["levels"][0], dtype=np.float32))
+        for name, array, attributes in arrays:
+            writer.add_whole(name, array, attributes=attributes)
+        writer.commit(header)
+
+
+def test_coordinates_of_a_series_come_back(tmp_path, samples):
+    given = coords()
+    header = {**samples.compact_header(), "coordinates": describe_coordinates(given)}
+    assert sorted(header["coordinates"]) == ["time", "x", "z"]
+    assert header["coordinates"]["z"] == {}
+    write(tmp_path / "a.fhz", header, [("coords/y", given["y"].values, {**given["y"].attributes, "name": "lat"})])
+    with Container.open(tmp_path / "a.fhz") as container:
+        for axis, stored in (("t", "time"), ("z", "z"), ("y", "y"), ("x", "x")):
+            found = container.coordinate(stored)
+            assert (found.name, dict(found.attributes)) == (given[axis].name, dict(given[axis].attributes))
+            np.testing.assert_array_equal(found.values, given[axis].values)
+
+
+def test_an_axis_without_positions_is_refused(tmp_path, samples):
+    header = samples.compact_header()
+    del header["coordinates"]["y"]
+    with pytest.raises(InputError, match="array coords/y is missing"):
+        write(tmp_path / "a.fhz", header)
+
+
+def test_the_paper_profile_has_arrays(sample, samples):
+    header = samples.header()
+    with Container.open(sample) as container:
+        np.testing.assert_array_equal(container.coordinate("x").values, samples.arrays(header)["coords/x"])
+    header["coordinates"] = samples.compact_header()["coordinates"]
+    arrays = samples.arrays(header)
+    del arrays["coords/x"]
+    with pytest.raises(InputError, match="array coords/x is missing"):
+        samples.write(sample, header, arrays, force=True)
+
+
+@pytest.mark.parametrize(
+    ("description", "key"),
+    [
+        ([], "x"),
+        ({"values": [0, 1]}, "x.values"),
+        ({"values": [0, 1, 2, 3, 4, None]}, "x.values"),
+        ({"start": "0"}, "x.start"),
+        ({"start": 10**400}, "x.start"),
+        ({"step": None}, "x.step"),
+        ({"last": True}, "x.last"),
+        ({"dtype": "float16"}, "x.dtype"),
+        ({"dtype": ["float32"]}, "x.dtype"),
+        ({"name": 5}, "x.name"),
+        ({"attributes": []}, "x.attributes"),
+    ],
+)
+def test_wrong_description_is_named(samples, description, key):
+    from fhash_formats.container import validate_header
+
+    header = {**samples.compact_header(), "format": "fhash", "format_version": [1, 1]}
+    validate_header(header)
+    header["coordinates"] = {"x": description}
+    with pytest.raises(DamagedFileError, match=rf"header key coordinates[.]{key.replace('.', '[.]')}\b"):
+        validate_header(header)
+
+
+def test_few_bytes_do_not_ask_for_much_memory(samples):
+    from fhash_formats.container import validate_header
+
+    header = {**samples.compact_header(), "format": "fhash", "format_version": [1, 1]}
+    header["domain"]["shape"][3] = MAX_RULED + 1
+    with pytest.raises(DamagedFileError, match=r"coordinates[.]x .*an array for more than"):
+        validate_header(header)
