@@ -29,7 +29,11 @@ def setting(
 class EncodeConfig:
     """Settings of `encode`; raises InputError for a value that is not allowed."""
 
-    profile: str = setting("paper", "model and training: 'paper' is the published F-Hash", choices=("paper",))
+    profile: str = setting(
+        "compact",
+        "'compact' is the smallest file at a promised quality; 'paper' is the published F-Hash, trained from a random start",
+        choices=("compact", "paper"),
+    )
     features: tuple[str, ...] = setting(
         ("all",),
         "what to keep: interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE or all; repeat to merge several",
@@ -46,7 +50,19 @@ class EncodeConfig:
     schedule: str = setting("cosine", "course of the learning rate over the training", choices=("cosine", "constant"))
     batch: int = setting(0, "samples per training step, 0 for a size that suits the data", low=0, high=2**31)
     psnr: float | None = setting(
-        None, "promise of quality in dB over the coreset of all steps; missing it ends with exit code 3", low=0.0, high=400.0
+        None,
+        "promise of quality in dB over the coreset of all steps (compact: 50 if nothing is promised); missing it ends with exit code 3",
+        low=0.0,
+        high=400.0,
+    )
+    max_error: float | None = setting(None, "compact: strict bound of the error of each value, in data units", low=0.0, high=1.7e308)
+    max_error_rel: float | None = setting(None, "compact: the same bound as a fraction of the range of the series", low=0.0, high=1.0)
+    ratio: float | None = setting(None, "compact: make the file this many times smaller than the raw data", low=1.0, high=1e9)
+    effort: int = setting(
+        5, "compact: 1 tries and trains nothing, 2 to 4 choose the transform by trial, from 5 on a head is trained", low=1, high=9
+    )
+    tile: str = setting(
+        "auto", "compact: vertices that are decoded together, as TxZxYxX such as 4x32x32x32; 'auto', or 'whole' for one tile"
     )
     tables: str = setting("float16", "number type of the stored tables", choices=TABLE_TYPES)
     engine: str = setting("auto", "training engine", choices=("auto", *ENGINES))

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec import occupancy
-from fhash_codec.features import Feature, dilate
+from fhash_codec.features import Everything, Feature, dilate
 from fhash_codec.normalise import Mean
 from fhash_codec.progress import Progress
 from fhash_codec.scan import Scan
@@ -63,24 +63,55 @@ class Coreset:
     background: float
 
 
-def build_coreset(
-    series: Series,
-    scan: Scan,
-    key_frames: Sequence[int],
-    features: Sequence[Feature],
-    dilation: int,
-    progress: Progress,
-    *,
-    brick: Sizes | None = None,
-) -> Coreset:
-    """The coreset of a series: finite vertices of the merged features, dilated, at every key frame.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Extent:
+    """Where the coreset lies, one bit per vertex of the domain.
 
-    `features` are resolved, `dilation` is in vertices, `brick` replaces the default brick shape. Raises InputError if the features
-    select nothing at all; single key frames may be empty. Warns of a feature
-    that selects nothing while others do. Progress stages: "selecting", "gathering".
+    Attributes:
+        box: the feature bounding box, fused over the key frames.
+        key_frames: steps at which the features were found.
+        packed: np.packbits of the mask (z, y, x) of the domain at each key frame.
+        domain: its shape (z, y, x).
+        samples: vertices of the coreset over all key frames.
+        background: mean of the finite values outside the coreset over the key frames, in data units; of all values if none is outside.
     """
-    domain = series.shape[1:]
-    packed, bounds, outside, samples = [], [], Mean(), 0
+
+    box: Box
+    key_frames: tuple[int, ...]
+    packed: list[npt.NDArray[np.uint8]]
+    domain: Sizes
+    samples: int
+    background: float
+
+    @property
+    def fraction(self) -> float:
+        """samples / (key frames * vertices of the domain)."""
+        return self.samples / (len(self.key_frames) * prod(self.domain))
+
+    def mask(self, key: int) -> npt.NDArray[np.bool_]:
+        """Which vertices (z, y, x) of the box are in the coreset at a key frame."""
+        whole = np.unpackbits(self.packed[key], count=prod(self.domain)).view(np.bool_).reshape(self.domain)
+        return crop(whole, self.box)
+
+
+def find_extent(
+    series: Series, scan: Scan, key_frames: Sequence[int], features: Sequence[Feature], dilation: int, progress: Progress
+) -> Extent:
+    """Where the coreset lies: finite vertices of the merged features, dilated, at every key frame; raises and warns as `build_coreset`."""
+    packed: list[npt.NDArray[np.uint8]] = []
+    bounds, outside, samples = [], Mean(), 0
+    z, y, x = series.shape[1:]
+    if not scan.missing and any(isinstance(feature, Everything) for feature in features):
+        # Nothing to look at: one mask of ones for all.
+        whole = np.packbits(np.ones((z, y, x), dtype=bool))
+        return Extent(
+            box=((0, z), (0, y), (0, x)),
+            key_frames=tuple(key_frames),
+            packed=[whole] * len(key_frames),
+            domain=(z, y, x),
+            samples=len(key_frames) * z * y * x,
+            background=scan.mean,
+        )
     idle = set(features)
     for done, step in enumerate(key_frames):
         frame = series.read(step)
@@ -100,14 +131,41 @@ def build_coreset(
 
     for feature in sorted(map(str, idle)):
         warnings.warn(f"feature {feature} selects nothing; the others do", FhashWarning, stacklevel=2)
+    return Extent(
+        box=box,
+        key_frames=tuple(key_frames),
+        packed=packed,
+        domain=(z, y, x),
+        samples=samples,
+        background=outside.value() if outside.count else scan.mean,
+    )
 
+
+def build_coreset(
+    series: Series,
+    scan: Scan,
+    key_frames: Sequence[int],
+    features: Sequence[Feature],
+    dilation: int,
+    progress: Progress,
+    *,
+    brick: Sizes | None = None,
+) -> Coreset:
+    """The coreset of a series: finite vertices of the merged features, dilated, at every key frame.
+
+    `features` are resolved, `dilation` is in vertices, `brick` replaces the default brick shape. Raises InputError if the features
+    select nothing at all; single key frames may be empty. Warns of a feature
+    that selects nothing while others do. Progress stages: "selecting", "gathering".
+    """
+    extent = find_extent(series, scan, key_frames, features, dilation, progress)
+    box, samples = extent.box, extent.samples
     size = box_size(box)
     shape = brick or brick_shape(size)
     grid = (-(-size[0] // shape[0]), -(-size[1] // shape[1]), -(-size[2] // shape[2]))
     values = np.empty(samples, dtype=np.float32)
     grids, layers, filled = [], [], 0
     for key, step in enumerate(key_frames):
-        mask = crop(np.unpackbits(packed[key], count=prod(domain)).view(np.bool_).reshape(domain), box)
+        mask = extent.mask(key)
         grids.append(occupancy.pack(mask))
         frame = crop(series.read(step), box)
         for layer in range(grid[0]):
@@ -129,8 +187,8 @@ def build_coreset(
         values=values,
         offsets=np.cumsum(np.concatenate([np.zeros(1, dtype=np.int64), *(counts for _, _, counts in layers)])),
         occupancy=tuple(grids),
-        fraction=samples / (len(key_frames) * prod(domain)),
-        background=outside.value() if outside.count else scan.mean,
+        fraction=extent.fraction,
+        background=extent.background,
     )
 
 

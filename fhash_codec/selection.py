@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fhash_codec.architecture import Architecture
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset import Coreset, box_size, build_coreset
+from fhash_codec.coreset import Coreset, Extent, box_size, build_coreset, find_extent
 from fhash_codec.features import Feature, Mask, resolve_features
 from fhash_codec.key_frames import select_key_frames, time_axis
 from fhash_codec.progress import Progress
@@ -62,6 +62,15 @@ def _array_mask(mask: npt.ArrayLike, series: Series) -> Feature:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Found:
+    """What the settings select of a series: its range, the key frames, the features, where they lie."""
+
+    scanned: Scan
+    features: tuple[Feature, ...]
+    extent: Extent
+
+
+@dataclass(frozen=True, kw_only=True)
 class Selection:
     """What the settings select of a series, and the model that is to be fitted to it."""
 
@@ -71,22 +80,23 @@ class Selection:
     architecture: Architecture
 
 
-def select(series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None) -> Selection:
-    """Scan a series, choose its key frames, find its features and gather their coreset, a frame at a time.
+def find(series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None) -> Found:
+    """Scan a series, choose its key frames and find its features, a frame at a time.
 
     mask: booleans (t, z, y, x) or (z, y, x), one more feature; it stands for 'all' where the settings name nothing else.
     Raises InputError for settings that do not fit the series, or that select nothing. Warns of times that cannot serve as an axis.
     """
-    times = time_axis(series.coords["t"].values)
-    if times is not series.coords["t"].values:
-        warnings.warn(
-            f"{series.source}: its times do not strictly ascend or descend; step numbers stand for them", FhashWarning, stacklevel=2
-        )
-    scanned = scan(series, progress)
-    key_frames = select_key_frames(config.key_frames, series, times, progress)
-    features = resolve_features(config.features, series, key_frames, scanned.value_range, progress)
-    if mask is not None:
-        features = (_array_mask(mask, series), *(feature for feature in features if config.features != ("all",)))
+    scanned, key_frames, features = _resolved(series, config, progress, mask)
+    return Found(
+        scanned=scanned,
+        features=features,
+        extent=find_extent(series, scanned, key_frames, features, config.dilation, progress),
+    )
+
+
+def select(series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None) -> Selection:
+    """As `find`, and gather the coreset for training."""
+    scanned, key_frames, features = _resolved(series, config, progress, mask)
     coreset = build_coreset(series, scanned, key_frames, features, config.dilation, progress)
     architecture = Architecture.for_box(
         box_size(coreset.box),
@@ -97,3 +107,19 @@ def select(series: Series, config: EncodeConfig, progress: Progress, mask: npt.A
         width=config.width,
     )
     return Selection(scanned=scanned, features=features, coreset=coreset, architecture=architecture)
+
+
+def _resolved(
+    series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None
+) -> tuple[Scan, tuple[int, ...], tuple[Feature, ...]]:
+    times = time_axis(series.coords["t"].values)
+    if times is not series.coords["t"].values:
+        warnings.warn(
+            f"{series.source}: its times do not strictly ascend or descend; step numbers stand for them", FhashWarning, stacklevel=3
+        )
+    scanned = scan(series, progress)
+    key_frames = select_key_frames(config.key_frames, series, times, progress)
+    features = resolve_features(config.features, series, key_frames, scanned.value_range, progress)
+    if mask is not None:
+        features = (_array_mask(mask, series), *(feature for feature in features if config.features != ("all",)))
+    return scanned, tuple(key_frames), features

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from fhash_codec.coreset import Box, box_size
 from fhash_codec.decoder import decode_region, sample_points
 from fhash_codec.key_frames import KeyTimes, strictly_monotonic, time_axis
+from fhash_codec.lattice import Lattice
 from fhash_codec.network import Network
 from fhash_codec.normalise import ValueRange
 from fhash_codec.occupancy import between, unpack
@@ -62,7 +63,8 @@ class Volume:
         self.units: str = header["variable"]["units"]
         self.attrs: Mapping[str, Any] = header["variable"]["attributes"]
         self.box: Box = tuple((low, high) for low, high in header["feature_bounding_box"])  # type: ignore[assignment]
-        self.chunks = (1, *self.shape[1:])
+        self.profile: str = header["model"]["profile"]
+        self.chunks = (1, *self.shape[1:]) if self.profile == "paper" else container.arrays["tables/level_1"].chunk_shape
         self.value_range = ValueRange(*header["value_range"])
         self.background = float(header["background"])
         self._occupied = lru_cache(maxsize=4)(self._unpack_occupancy)
@@ -77,17 +79,13 @@ class Volume:
     @cached_property
     def coords(self) -> dict[str, Coordinate]:
         """Positions along each axis, in the units of the source."""
-        found = {}
-        for axis, stored in AXIS_NAMES.items():
-            array = self.container.arrays[f"coords/{stored}"]
-            attributes = dict(array.attributes)
-            found[axis] = Coordinate(name=attributes.pop("name", stored), values=array.read(), attributes=attributes)
-        return found
+        return {axis: self.container.coordinate(stored) for axis, stored in AXIS_NAMES.items()}
 
     @cached_property
     def key_times(self) -> KeyTimes:
         """How steps and times map to the model's time axis."""
-        key_frames = tuple(int(step) for step in self.container.arrays["key_frames"].read())
+        stored = self.container.arrays.get("key_frames")
+        key_frames = tuple(range(self.shape[0]) if stored is None else (int(step) for step in stored.read()))
         return KeyTimes(times=time_axis(self.coords["t"].values), key_frames=key_frames)
 
     @property
@@ -133,8 +131,10 @@ class Volume:
             target = tuple(slice(low - r0, high - r0) for (low, high), (r0, _) in zip(inner, region, strict=True))
             local: Box = tuple((low - b0, high - b0) for (low, high), (b0, _) in zip(inner, self.box, strict=True))  # type: ignore[assignment]
             wanted = self._occupied_at(key)[tuple(slice(*part) for part in local)]
-            unit = decode_region(self._network, key, local, wanted=wanted)
-            values = self.value_range.from_unit(unit).astype(self.dtype)
+            if self.profile == "compact":
+                values = self._lattice.region(key, local).astype(self.dtype)
+            else:
+                values = self.value_range.from_unit(decode_region(self._network, key, local, wanted=wanted)).astype(self.dtype)
             np.copyto(result[target], values, where=wanted)
         if outside == "background":
             result[np.isnan(result)] = self.background
@@ -198,7 +198,10 @@ class Volume:
         slopes = np.full((*inside.shape, 4), np.nan)
         if inside.any():
             chosen = [p[inside] for p in (keys, *local)]
-            if gradient:
+            if self.profile == "compact":
+                values[inside], found = self._lattice.slopes(chosen[0], chosen[1:])
+                slopes[inside] = found
+            elif gradient:
                 unit, slope = sample_points(self._network, *chosen, gradient=True)
                 # From per key frame to per step: between two steps the key index runs evenly.
                 first = np.minimum(np.floor(steps[inside]), max(self.shape[0] - 2, 0))
@@ -208,7 +211,8 @@ class Volume:
                 slopes[inside, 0] *= pace
             else:
                 unit = sample_points(self._network, *chosen)
-            values[inside] = self.value_range.from_unit(unit)
+            if self.profile == "paper":
+                values[inside] = self.value_range.from_unit(unit)
         values = values.reshape(shape).astype(self.dtype)
         return (values, slopes.reshape(*shape, 4).astype(self.dtype)) if gradient else values
 
@@ -227,6 +231,10 @@ class Volume:
         return self._checked_times().step_of_time(float(time))
 
     # -- pieces ------------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _lattice(self) -> Lattice:
+        return Lattice(self.container.arrays["tables/level_1"])
 
     @cached_property
     def _network(self) -> Network:
@@ -252,9 +260,15 @@ class Volume:
         return region
 
     def _unpack_occupancy(self, first: int, last: int) -> npt.NDArray[np.bool_]:
-        stored = self.container.arrays["occupancy/bits"]
+        arrays, size = self.container.arrays, box_size(self.box)
+        if "occupancy/mask" in arrays:
+            mask = arrays["occupancy/mask"].read((slice(first, last + 1), *(slice(0, n) for n in size)))
+            return np.asarray((mask[0] | mask[-1]) != 0)
+        if "occupancy/bits" not in arrays:
+            return np.ones(size, dtype=bool)
+        stored = arrays["occupancy/bits"]
         bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
-        return unpack(between(bits[0], bits[-1]), box_size(self.box))
+        return unpack(between(bits[0], bits[-1]), size)
 
     def _occupied_at(self, key: float) -> npt.NDArray[np.bool_]:
         return self._occupied(int(np.floor(key)), int(np.ceil(key)))

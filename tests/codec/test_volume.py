@@ -9,7 +9,9 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, MissingInputError, RegionError
+from fhash_codec.occupancy import pack
 from fhash_codec.volume import decoded_type
+from fhash_formats.container import ContainerWriter
 from fhash_formats.series import ArraySeries, Coordinate
 
 
@@ -192,8 +194,8 @@ def test_decoding_a_frame_reads_only_its_time_nodes(encoded, monkeypatch):
     with fhash_codec.open(encoded[1]) as volume:
         read = []
         array_type = type(volume.container.arrays["tables/level_1"])
-        decode = array_type.decode_chunk
-        monkeypatch.setattr(array_type, "decode_chunk", lambda self, index: read.append((self.name, index[0])) or decode(self, index))
+        decode = array_type._decode
+        monkeypatch.setattr(array_type, "_decode", lambda self, index, lod: read.append((self.name, index[0])) or decode(self, index, lod))
         volume.read(2)
         assert {node for name, node in read if name == "tables/level_1"} == {1}
         assert {node for name, node in read if name == "occupancy/bits"} == {1}
@@ -247,3 +249,51 @@ def test_decoding_a_frame_takes_no_more_memory_for_more_frames(tmp_path):
             tracemalloc.stop()
     # The directory grows by about a kilobyte a frame; a frame's finest table alone would be 37.
     assert peaks[1] - peaks[0] < 28 * 4_000
+
+
+@pytest.mark.parametrize("stored", [None, "mask", "bits"])
+def test_what_a_compact_file_leaves_out(tmp_path, stored):
+    """Coordinates are in the header, every step is a key frame, and without occupancy the whole box is inside."""
+    shape, box = (2, 3, 4, 5), (2, 4, 3)
+    inside = np.random.default_rng(0).random((2, *box)) < 0.5
+    header = {
+        "required_features": ["transform"],
+        "encoder": {"version": "0", "seed": 0},
+        "variable": {"name": "v", "units": "", "dtype": "float32", "attributes": {}},
+        "domain": {"shape": list(shape)},
+        "value_range": [0, 1],
+        "background": 0,
+        "feature_bounding_box": [[1, 3], [0, 4], [2, 5]],
+        "features": ["all"],
+        "dilation": 0,
+        "coreset_fraction": 0.5,
+        "model": {
+            "profile": "compact",
+            "levels": [[2, *box]],
+            "embedding_size": 1,
+            "tables": "float32",
+            "parameters": 0,
+            "head": None,
+        },
+        "coordinates": {"time": {"values": [1, 5]}, "z": {}, "y": {"start": 2}, "x": {"step": 0.5, "name": "lon"}},
+        "config": {},
+        "training": {"seconds": None, "epochs": 0, "device": "cpu"},
+        "quality": {},
+        "history": [],
+    }
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        writer.add_whole("tables/level_1", np.zeros((2, *box), dtype=np.float32))
+        if stored == "mask":
+            writer.add_whole("occupancy/mask", inside.astype(np.uint8))
+        elif stored == "bits":
+            writer.add_whole("occupancy/bits", np.stack([pack(step) for step in inside]))
+        writer.commit(header)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert volume.coords["x"].name == "lon"
+        assert volume.coords["x"].values.tolist() == [0, 0.5, 1, 1.5, 2]
+        assert volume.info["key_frames"] == [0, 1]
+        assert volume.step_of_time(2) == 0.25
+        for t, expected in ((0, inside[0]), (0.5, inside[0] | inside[1])):
+            whole = np.zeros(shape[1:], dtype=bool)
+            whole[1:3, 0:4, 2:5] = True if stored is None else expected
+            np.testing.assert_array_equal(volume.occupancy(t), whole)

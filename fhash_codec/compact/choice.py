@@ -1,0 +1,138 @@
+"""Which transform goes along each axis: by trial on bytes.
+
+Candidates are coded on a sample at one step; what counts is J = bytes + squared error / (0.8 step^2), so that a transform that gives less
+error for the same bytes wins as well. Axes are decided one after the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.compact.sample import Sample, Way
+from fhash_formats.transform.basis import MAX_LENGTH, fit_basis
+from fhash_formats.transform.settings import Settings
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile import Shape
+
+Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
+NONE = AxisTransform(kind="none")
+BASIS_LENGTH = 128
+"""A longer axis gets no basis of its own: its factors would cost too much."""
+
+
+def wavelet(kind: str, depth: int, length: int) -> AxisTransform:
+    """A wavelet of at most this depth, less deep on a short axis; nothing on an axis of one vertex."""
+    depth = min(depth, max(0, (length - 1).bit_length()))
+    return AxisTransform(kind=kind, depth=depth) if depth else NONE
+
+
+def usual_transform(shape: Shape) -> TransformSpec:
+    """A good guess without trial: 9/7 everywhere, deepest in the plane."""
+    t, z, y, x = shape
+    plane = min(4, max(1, max(y, x).bit_length() - 2))
+    return TransformSpec(axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), _plane("9/7", plane, y, x)[0], _plane("9/7", plane, y, x)[1]))
+
+
+def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: bool = False) -> tuple[Settings, float]:
+    """Settings with the transform of the lowest J on the sample, and that J.
+
+    quick: only the kinds that the settings have, the usual ones, and the data's own bases in the plane and along z.
+    """
+    shape: Shape = sample.tiles[0][0].shape  # type: ignore[assignment]
+    bases = _Bases(sample, settings)
+    if quick:
+        usual, own = (
+            usual_transform(shape).axes,
+            tuple(_known(axis, length) for axis, length in zip(settings.transform.axes, shape, strict=True)),
+        )
+        trials = [usual, own]
+        if max(shape[1:]) <= BASIS_LENGTH and min(shape[1:]) > 1:
+            trials.append((usual[0], *(bases.along(axis) for axis in (1, 2, 3))))
+        costs = list(map(lambda axes: _judge(sample, settings, axes, way), trials))  # type: ignore[arg-type]
+        best = min(costs)
+        return replace(settings, transform=TransformSpec(axes=trials[costs.index(best)])), best  # type: ignore[arg-type]
+    axes: Axes = settings.transform.axes
+    best = _judge(sample, settings, axes, way)
+    for candidates in (_planes(shape, bases), _along(0, shape, bases), _along(1, shape, bases)):
+        for change in candidates:
+            trial: Axes = tuple(change.get(axis, axes[axis]) for axis in range(4))  # type: ignore[assignment]
+            if trial == axes:
+                continue
+            cost = _judge(sample, settings, trial, way)
+            if cost < best:
+                best, axes = cost, trial
+    return replace(settings, transform=TransformSpec(axes=axes)), best
+
+
+def _known(axis: AxisTransform, length: int) -> AxisTransform:
+    """The same kind on an axis of another length; 9/7 for a basis, which fits one length alone."""
+    if axis.basis is not None:
+        return wavelet("9/7", 2, length)
+    return wavelet(axis.kind, axis.depth, length) if axis.wavelet else axis
+
+
+def _judge(sample: Sample, settings: Settings, axes: Axes, way: Way) -> float:
+    spec = TransformSpec(axes=axes)
+    outcome = sample.run(replace(settings, transform=spec), way)
+    factors = sum(len(axis.basis.to_bytes()) * 4 / 3 for axis in axes if axis.basis is not None)
+    return outcome.size + factors / sample.share + outcome.squares / (0.8 * settings.step**2)
+
+
+def _plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTransform]:
+    """A wavelet along y and x, coupled where both are longer than one vertex."""
+    if min(y, x) > 1:
+        depth = min(depth, max(1, (max(y, x) - 1).bit_length()))
+        return AxisTransform(kind=kind, depth=depth), AxisTransform(kind=kind, depth=depth)
+    return wavelet(kind, depth, y), wavelet(kind, depth, x)
+
+
+def _planes(shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+    y, x = shape[2:]
+    for kind, depth in (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3)):
+        if 2 ** (depth - 1) < max(y, x):
+            pair = _plane(kind, depth, y, x)
+            yield {2: pair[0], 3: pair[1]}
+    if min(y, x) > 1 and max(y, x) <= BASIS_LENGTH:
+        yield {2: bases.along(2), 3: bases.along(3)}
+
+
+def _along(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+    length = shape[axis]
+    if length == 1:
+        return
+    yield {axis: NONE}
+    for kind, depth in (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3)):
+        if 2 ** (depth - 1) < length:
+            yield {axis: AxisTransform(kind=kind, depth=depth)}
+    if length <= BASIS_LENGTH:
+        yield {axis: bases.along(axis)}
+
+
+class _Bases:
+    """The data's own bases, made when they are asked for."""
+
+    def __init__(self, sample: Sample, settings: Settings) -> None:
+        self._sample, self._settings = sample, settings
+        self._known: dict[int, AxisTransform] = {}
+
+    def along(self, axis: int) -> AxisTransform:
+        if axis not in self._known:
+            # The bases serve all tiles, so that their factors are worth more precision than the sample alone would say.
+            gram = np.add.reduce(self._sample.map(lambda tile: self._gram(tile[0], tile[1], axis))) * self._sample.share
+            self._known[axis] = AxisTransform(kind="klt", basis=fit_basis(gram, self._settings.step))
+        return self._known[axis]
+
+    def _gram(self, values: npt.NDArray[np.generic], care: npt.NDArray[np.bool_] | None, axis: int) -> npt.NDArray[np.float64]:
+        centred = values.astype(np.float64) - self._settings.center
+        centred[~np.isfinite(centred)] = 0.0
+        if care is not None:
+            centred[~care] = 0.0
+        columns = np.moveaxis(centred, axis, 0).reshape(values.shape[axis], -1)
+        return columns @ columns.T
+
+
+assert BASIS_LENGTH <= MAX_LENGTH

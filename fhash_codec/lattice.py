@@ -1,0 +1,93 @@
+"""The compact profile's model: lattice values in a table, linear between vertices and between steps. numpy only."""
+
+from __future__ import annotations
+
+from itertools import product
+from math import prod
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.decoder import Box
+from fhash_formats.container import StoredArray
+
+Positions = npt.NDArray[np.float64]
+
+
+class Lattice:
+    """The table of a compact file: values (t, z, y, x) at the vertices of the feature bounding box, at every step."""
+
+    def __init__(self, array: StoredArray) -> None:
+        self._array = array
+
+    def region(self, step: float, region: Box) -> npt.NDArray[np.float64]:
+        """Values (z, y, x), float64, of a region of the box at a step; between steps, linear in the step."""
+        first = int(np.floor(step))
+        weight = step - first
+        space = tuple(slice(low, high) for low, high in region)
+        steps = self._array.read((slice(first, first + (2 if weight else 1)), *space)).astype(np.float64)
+        return steps[0] if not weight else steps[0] * (1 - weight) + steps[1] * weight
+
+    def coarse(self, step: int, lod: int) -> npt.NDArray[Any]:
+        """Every 2^lod-th vertex (z, y, x) of the box at a step, low-passed by each tile on its own."""
+        tile, shape = self._array.chunk_shape, self._array.shape
+        stride = 1 << lod
+        result = np.empty([-(-n // stride) for n in shape[1:]], dtype=self._array.dtype)
+        grid = [range(-(-n // part)) for n, part in zip(shape[1:], tile[1:], strict=True)]
+        for index in product(*grid):
+            part = self._array.decode_chunk((step // tile[0], *index), lod)[step % tile[0]]
+            # A tile that begins between two coarse vertices gives its own lattice; the nearest of its vertices stand for those.
+            target, source = [], []
+            for i, n, length, size in zip(index, tile[1:], shape[1:], part.shape, strict=True):
+                first, stop = -(-i * n // stride), -(-min((i + 1) * n, length) // stride)
+                target.append(slice(first, stop))
+                source.append(np.minimum((np.arange(first, stop) * stride - i * n + stride // 2) // stride, size - 1))
+            result[tuple(target)] = part[np.ix_(*source)]
+        return result
+
+    def points(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+        """Values at points, quadrilinear: steps and (z, y, x) in vertices of the box, all inside."""
+        return self._interpolated(steps, space)[0]
+
+    def slopes(self, steps: Positions, space: list[Positions]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Values, and derivatives (points, 4) by step, z, y and x; on the border of two cells those of the cell after it."""
+        values, corners, weights = self._interpolated(steps, space)
+        slopes = np.empty((values.size, 4))
+        for axis in range(4):
+            others = [a for a in range(4) if a != axis]
+            factor = np.ones((2, 2, 2, 2, values.size))
+            for other in others:
+                shape = [1, 1, 1, 1, values.size]
+                shape[other] = 2
+                factor = factor * np.stack([1 - weights[other], weights[other]]).reshape(shape)
+            low, high = (np.take(corners * factor, side, axis=axis).reshape(-1, values.size).sum(axis=0) for side in (0, 1))
+            slopes[:, axis] = high - low
+        return values, slopes
+
+    def _interpolated(
+        self, steps: Positions, space: list[Positions]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], list[Positions]]:
+        """Values, the 16 corners (2, 2, 2, 2, points) around each point, and the weights of the upper corner along each axis."""
+        shape = self._array.shape
+        low = [np.clip(np.floor(p).astype(np.int64), 0, max(n - 2, 0)) for p, n in zip([steps, *space], shape, strict=True)]
+        weights = [p - i for p, i in zip([steps, *space], low, strict=True)]
+        high = [np.minimum(i + 1, n - 1) for i, n in zip(low, shape, strict=True)]
+        corners = np.empty((2, 2, 2, 2, steps.size))
+        box = tuple((int(i.min()), int(h.max()) + 1) for i, h in zip(low[1:], high[1:], strict=True))
+        space_slices = tuple(slice(*part) for part in box)
+        for step in np.unique(np.concatenate([low[0], high[0]])):
+            frame = self._array.read((slice(int(step), int(step) + 1), *space_slices))[0]
+            for corner in product((0, 1), repeat=4):
+                at = [(high if up else low)[axis] for axis, up in enumerate(corner)]
+                chosen = at[0] == step
+                if chosen.any():
+                    where = tuple(at[axis + 1][chosen] - box[axis][0] for axis in range(3))
+                    corners[(*corner, chosen)] = frame[where]
+        values = np.zeros(steps.size)
+        for corner in product((0, 1), repeat=4):
+            parts = [weights[axis] if up else 1 - weights[axis] for axis, up in enumerate(corner)]
+            # A corner without weight counts for nothing, also where it is not finite.
+            weight = np.asarray(prod(parts))
+            values += np.where(weight == 0, 0.0, weight * corners[corner])
+        return values, corners, weights
