@@ -18,11 +18,26 @@ TABLE_TYPES = ("float32", "float16", "uint8")
 ENGINES = ("slab", "naive")
 
 
+PROMISES = ("psnr", "max_error", "max_error_rel", "ratio")
+"""Settings of which one at most is given: what the compact profile has to keep."""
+
+
 def setting(
-    default: Any, help: str, *, choices: tuple[str, ...] = (), low: float | None = None, high: float | None = None, option: str = ""
+    default: Any,
+    help: str,
+    *,
+    choices: tuple[str, ...] = (),
+    low: float | None = None,
+    high: float | None = None,
+    option: str = "",
+    profile: str = "",
 ) -> Any:
-    """A dataclass field with its help (unit and range included), its allowed values, and its command-line name where that differs."""
-    return dataclasses.field(default=default, metadata={"help": help, "choices": choices, "low": low, "high": high, "option": option})
+    """A dataclass field with its help (unit and range included), its allowed values, and its command-line name where that differs.
+
+    profile: the only one that takes a value other than the default, where there is one.
+    """
+    limits = {"help": help, "choices": choices, "low": low, "high": high, "option": option, "profile": profile}
+    return dataclasses.field(default=default, metadata=limits)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,32 +55,56 @@ class EncodeConfig:
         option="feature",
     )
     dilation: int = setting(1, "vertices by which features grow in every direction", low=0, high=64)
-    key_frames: str = setting("all", "steps to train on: all, every:K, auto:N (N chosen by interpolation error) or a list such as 0,4,9")
-    fold: int = setting(2, "ratio of resolution from one level to the next", low=2, high=64)
-    embedding_size: int = setting(2, "numbers trained at each grid corner", low=1, high=16)
-    hidden_layers: int = setting(1, "hidden layers of the network", low=0, high=8)
-    width: int = setting(64, "neurons of each hidden layer", low=1, high=1024)
-    epochs: int = setting(0, "passes over the coreset, 0 for 20 or as many as make 1000 training steps", low=0, high=100_000)
-    learning_rate: float = setting(0.01, "Adam's learning rate at the start", low=1e-8, high=1.0)
-    schedule: str = setting("cosine", "course of the learning rate over the training", choices=("cosine", "constant"))
-    batch: int = setting(0, "samples per training step, 0 for a size that suits the data", low=0, high=2**31)
+    key_frames: str = setting(
+        "all",
+        "paper: steps to train on, as all, every:K, auto:N (N chosen by interpolation error) or a list such as 0,4,9",
+        profile="paper",
+    )
+    fold: int = setting(2, "paper: ratio of resolution from one level to the next", low=2, high=64, profile="paper")
+    embedding_size: int = setting(2, "paper: numbers trained at each grid corner", low=1, high=16, profile="paper")
+    hidden_layers: int = setting(1, "paper: hidden layers of the network", low=0, high=8, profile="paper")
+    width: int = setting(64, "paper: neurons of each hidden layer", low=1, high=1024, profile="paper")
+    epochs: int = setting(
+        0, "paper: passes over the coreset, 0 for 20 or as many as make 1000 training steps", low=0, high=100_000, profile="paper"
+    )
+    learning_rate: float = setting(0.01, "paper: Adam's learning rate at the start", low=1e-8, high=1.0, profile="paper")
+    schedule: str = setting(
+        "cosine", "paper: course of the learning rate over the training", choices=("cosine", "constant"), profile="paper"
+    )
+    batch: int = setting(0, "paper: samples per training step, 0 for a size that suits the data", low=0, high=2**31, profile="paper")
     psnr: float | None = setting(
         None,
         "promise of quality in dB over the coreset of all steps (compact: 50 if nothing is promised); missing it ends with exit code 3",
         low=0.0,
         high=400.0,
     )
-    max_error: float | None = setting(None, "compact: strict bound of the error of each value, in data units", low=0.0, high=1.7e308)
-    max_error_rel: float | None = setting(None, "compact: the same bound as a fraction of the range of the series", low=0.0, high=1.0)
-    ratio: float | None = setting(None, "compact: make the file this many times smaller than the raw data", low=1.0, high=1e9)
+    max_error: float | None = setting(
+        None, "compact: strict bound of the error of each value, in data units", low=0.0, high=1.7e308, profile="compact"
+    )
+    max_error_rel: float | None = setting(
+        None,
+        "compact: strict bound of the error of each value, as a fraction of the range of the series",
+        low=0.0,
+        high=1.0,
+        profile="compact",
+    )
+    ratio: float | None = setting(
+        None, "compact: make the file this many times smaller than the raw data", low=1.0, high=1e9, profile="compact"
+    )
     effort: int = setting(
-        5, "compact: 1 tries and trains nothing, 2 to 4 choose the transform by trial, from 5 on a head is trained", low=1, high=9
+        5,
+        "compact: 1 tries and trains nothing, 2 to 4 choose the transform by trial, from 5 on a head is trained",
+        low=1,
+        high=9,
+        profile="compact",
     )
     tile: str = setting(
-        "auto", "compact: vertices that are decoded together, as TxZxYxX such as 4x32x32x32; 'auto', or 'whole' for one tile"
+        "auto",
+        "compact: vertices that are decoded together, as TxZxYxX such as 4x32x32x32; 'auto', or 'whole' for one tile",
+        profile="compact",
     )
-    tables: str = setting("float16", "number type of the stored tables", choices=TABLE_TYPES)
-    engine: str = setting("auto", "training engine", choices=("auto", *ENGINES))
+    tables: str = setting("float16", "paper: number type of the stored tables", choices=TABLE_TYPES, profile="paper")
+    engine: str = setting("auto", "paper: training engine", choices=("auto", *ENGINES), profile="paper")
     device: str = setting("auto", "where to train", choices=("auto", "cpu", "cuda"))
     seed: int = setting(0, "seed of every random choice", low=0, high=2**63 - 1)
     timings: bool = setting(
@@ -84,6 +123,15 @@ class EncodeConfig:
             object.__setattr__(self, "key_frames", ",".join(str(int(step)) for step in key_frames))
         for field in dataclasses.fields(self):
             _check(field, getattr(self, field.name))
+        for field in dataclasses.fields(self):
+            owner = field.metadata["profile"]
+            if owner and owner != self.profile and getattr(self, field.name) != field.default:
+                raise InputError(f"{_option(field)} belongs to --profile {owner}; the profile is {self.profile}")
+        promised = [
+            _option(field) for field in dataclasses.fields(self) if field.name in PROMISES and getattr(self, field.name) is not None
+        ]
+        if len(promised) > 1:
+            raise InputError(f"{' and '.join(promised)} are given; promise one of them")
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name; `from_dict` gives the same record back."""
@@ -101,9 +149,15 @@ class EncodeConfig:
         return cls(**given)
 
 
+def _option(field: dataclasses.Field[Any]) -> str:
+    """The name of a setting on the command line, without dashes."""
+    name: str = field.metadata["option"] or field.name
+    return name.replace("_", "-")
+
+
 def _check(field: dataclasses.Field[Any], value: Any) -> None:
     limits = field.metadata
-    name = (limits["option"] or field.name).replace("_", "-")
+    name = _option(field)
     if limits["choices"] and value not in limits["choices"]:
         raise InputError(f"{name} is '{value}'; allowed: {', '.join(limits['choices'])}")
     if limits["low"] is not None and value is not None:

@@ -90,8 +90,6 @@ def _compact(
     writer: ContainerWriter, series: Series, config: EncodeConfig, mask: npt.ArrayLike | None, path: Path, progress: Progress
 ) -> tuple[dict[str, Any], Path | None]:
     """Code the lattice values and write them; the header without its quality."""
-    if config.key_frames != "all":
-        raise InputError(f"key-frames is '{config.key_frames}'; the profile compact codes all steps, --profile paper takes key frames")
     begun = time.perf_counter()
     found = find(series, config, progress, mask)
     table = code_series(series, found, config, progress)

@@ -27,7 +27,8 @@ class Lattice:
         weight = step - first
         space = tuple(slice(low, high) for low, high in region)
         steps = self._array.read((slice(first, first + (2 if weight else 1)), *space)).astype(np.float64)
-        return steps[0] if not weight else steps[0] * (1 - weight) + steps[1] * weight
+        values: npt.NDArray[np.float64] = steps[0] if not weight else steps[0] * (1 - weight) + steps[1] * weight
+        return values
 
     def coarse(self, step: int, lod: int) -> npt.NDArray[Any]:
         """Every 2^lod-th vertex (z, y, x) of the box at a step, low-passed by each tile on its own."""

@@ -85,19 +85,31 @@ class Errors:
 
         Raises InputError for other shapes and where a decoded value that counts is not finite.
         """
+        return self.take(step, self.compare(step, original, decoded, mask))
+
+    def compare(self, step: int, original: Values, decoded: Values, mask: npt.NDArray[np.bool_] | None = None) -> tuple[int, float, float]:
+        """Count, sum of squares and largest of the scaled differences of a frame, which `take` takes in; raises as `add`."""
         if original.shape != decoded.shape or (mask is not None and mask.shape != original.shape):
             raise InputError(f"step {step}: the original is {original.shape}, the decoded {decoded.shape}; they must be of one shape")
         count, squares, largest = 0, 0.0, 0.0
         masks = pieces(np.broadcast_to(np.True_, original.shape) if mask is None else mask)
         for one, other, counts in zip(pieces(original), pieces(decoded), masks, strict=True):
             chosen = np.isfinite(one) & counts
-            difference = _scaled_difference(one[chosen], other[chosen], self._scale)
+            if not chosen.all():
+                one, other = one[chosen], other[chosen]
+            difference = _scaled_difference(one, other, self._scale)
             if not np.isfinite(difference).all():
                 raise InputError(f"step {step}: decoded values are not finite where they are compared")
             count += difference.size
+            if difference.size:
+                largest = max(largest, float(difference.max()), -float(difference.min()))
             with np.errstate(over="ignore"):
                 squares += float(np.square(difference).sum())
-            largest = max(largest, float(np.abs(difference).max(initial=0.0)))
+        return count, squares, largest
+
+    def take(self, step: int, compared: tuple[int, float, float]) -> StepQuality:
+        """Count what `compare` found; the step's figures."""
+        count, squares, largest = compared
         self.count += count
         self._squares += squares
         self._largest = max(self._largest, largest)
@@ -170,8 +182,10 @@ def measure_quality(
         if step == 0:
             measured = ssim_steps(steps, original.size)
         known = np.isfinite(decoded)
-        figures = coreset.add(step, original, decoded, known)
-        domain.add(step, original, np.where(known, decoded, background))
+        compared = coreset.compare(step, original, decoded, known)
+        figures = coreset.take(step, compared)
+        # Where everything is decoded, both are the same.
+        domain.take(step, compared if known.all() else domain.compare(step, original, np.where(known, decoded, background)))
         if step in measured:
             total, count = ssim(original, decoded, data_range, known)
             similarity, vertices = similarity + total, vertices + count

@@ -27,6 +27,7 @@ from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 
 Index = int | slice | EllipsisType
 OUTSIDE = ("nan", "background")
+MAX_LOD = 10
 
 
 def open(path: str | Path) -> Volume:
@@ -143,6 +144,24 @@ class Volume:
             result[missing[tuple(slice(*part) for part in region)]] = np.nan
         return result
 
+    def read_lod(self, t: float, lod: int) -> npt.NDArray[Any]:
+        """Every 2^lod-th vertex (z, y, x) of the feature bounding box at step `t`, low-passed, of `self.dtype`; compact files only.
+
+        lod: 0 to 10; 0 is the box as `read` gives it. Finer detail is not decoded. NaN outside the coreset of these vertices.
+        Raises RegionError for a step outside the series, InputError for a file of another profile or another lod.
+        """
+        if self.profile != "compact":
+            raise InputError(f"{self.path}: a file of the profile {self.profile} has no levels of detail; decode it whole")
+        if isinstance(lod, bool) or not isinstance(lod, int | np.integer) or not 0 <= lod <= MAX_LOD:
+            raise InputError(f"lod is {lod}; allowed: 0 to {MAX_LOD}")
+        if t != int(t):
+            raise InputError(f"step {t:g} lies between two; levels of detail are of whole steps")
+        step = int(self._key_index(t))
+        values = self._lattice.coarse(step, int(lod)).astype(self.dtype)
+        every = tuple(slice(low, high, 1 << lod) for low, high in self.box)
+        values[~self.occupancy(step)[every]] = np.nan
+        return values
+
     def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
         """Values by numpy's basic indexing: integers, slices and `...`, negative as usual; RegionError (an IndexError) outside."""
         parts = _expanded(index)
@@ -199,8 +218,10 @@ class Volume:
         if inside.any():
             chosen = [p[inside] for p in (keys, *local)]
             if self.profile == "compact":
-                values[inside], found = self._lattice.slopes(chosen[0], chosen[1:])
-                slopes[inside] = found
+                if gradient:
+                    values[inside], slopes[inside] = self._lattice.slopes(chosen[0], chosen[1:])
+                else:
+                    values[inside] = self._lattice.points(chosen[0], chosen[1:])
             elif gradient:
                 unit, slope = sample_points(self._network, *chosen, gradient=True)
                 # From per key frame to per step: between two steps the key index runs evenly.
@@ -217,7 +238,8 @@ class Volume:
         return (values, slopes.reshape(*shape, 4).astype(self.dtype)) if gradient else values
 
     def occupancy(self, t: float) -> npt.NDArray[np.bool_]:
-        """Which vertices (z, y, x) are in the coreset at step `t`; between key frames, those that are at either of them."""
+        """Which vertices (z, y, x) are in the coreset at step `t`; between key frames, those that are at either of
+        them, in the profile compact at both."""
         result = np.zeros(self.shape[1:], dtype=bool)
         result[tuple(slice(*part) for part in self.box)] = self._occupied_at(self._key_index(t))
         missing = self._missing_at(t)
@@ -263,7 +285,8 @@ class Volume:
         arrays, size = self.container.arrays, box_size(self.box)
         if "occupancy/mask" in arrays:
             mask = arrays["occupancy/mask"].read((slice(first, last + 1), *(slice(0, n) for n in size)))
-            return np.asarray((mask[0] | mask[-1]) != 0)
+            # Between steps both count: a value is no better than the two it lies between.
+            return np.asarray((mask[0] & mask[-1]) != 0)
         if "occupancy/bits" not in arrays:
             return np.ones(size, dtype=bool)
         stored = arrays["occupancy/bits"]

@@ -17,6 +17,7 @@ from fhash_cli.options import (
     json_option,
     quiet_option,
     series_options,
+    setting_options,
 )
 from fhash_cli.output import Progress, emit, extent, number, size, table
 
@@ -70,7 +71,17 @@ def command() -> None:
 @click.option("--engines", type=EnginesType(), help="Which to measure. Default: all there are.")
 @click.option("--seconds", type=RealRange(0.1, 3600), default=12.0, show_default=True, metavar="X", help="Training of each engine.")
 @config_options(
-    "features", "dilation", "key_frames", "embedding_size", "hidden_layers", "width", "learning_rate", "batch", "device", "seed"
+    "features",
+    "dilation",
+    "key_frames",
+    "embedding_size",
+    "hidden_layers",
+    "width",
+    "learning_rate",
+    "batch",
+    "device",
+    "seed",
+    profile="paper",
 )
 @json_option
 @quiet_option
@@ -112,7 +123,7 @@ def _text(result: dict[str, Any]) -> str:
 )
 @click.option("--profile", "profiles", type=NamesType("profile"), multiple=True, help="Of fhash, or none; repeat. Default: all.")
 @click.option("--speed/--no-speed", default=True, show_default=True, help="Measure speed and access too, at the target nearest to 50 dB.")
-@config_options("effort", "tile", "epochs", "width", "device", "seed")
+@setting_options("effort", "tile", "epochs", "width", "device", "seed")
 @click.option("--plot", metavar="FILE.png", type=click.Path(), help="Draw bytes against quality.")
 @force_option
 @json_option
@@ -125,7 +136,7 @@ def rate(
     names: tuple[str, ...],
     profiles: tuple[str, ...],
     speed: bool,
-    config: EncodeConfig,
+    settings: dict[str, Any],
     plot: str | None,
     force: bool,
     as_json: bool,
@@ -150,7 +161,7 @@ def rate(
         every = not (targets or bounds)
         result = bench_rate(
             series,
-            config,
+            settings,
             targets=TARGETS if every else targets,
             bounds=BOUNDS if every else bounds,
             names=[name for name in names or PEERS if name != "none"],

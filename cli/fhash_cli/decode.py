@@ -27,6 +27,7 @@ TYPES = ("float16", "float32", "float64", "int8", "int16", "int32", "int64", "ui
 @click.option("--time", "times", metavar="T", type=float, multiple=True, help="A physical time, between steps too; may be repeated.")
 @click.option("--roi", metavar="z0:z1,y0:y1,x0:x1", type=IntervalsType(int), help="Region in vertices, half-open as in Python.")
 @click.option("--box", metavar="z0:z1,y0:y1,x0:x1", type=IntervalsType(float), help="Region in physical positions, both ends included.")
+@click.option("--lod", type=click.IntRange(0, 10), metavar="N", help="Level of detail: every 2^N-th vertex of the feature bounding box.")
 @click.option("-o", "output", metavar="OUT", type=click.Path(), help="File to write: .npy, .h5, .nc, .zarr, .raw, .vti, .vtr or .pvd.")
 @click.option("--outside", type=click.Choice(["nan", "background"]), default="nan", show_default=True, help="Values outside the coreset.")
 @click.option("--dtype", type=click.Choice(TYPES), help="Convert the values; integers are rounded and clipped to the type's range.")
@@ -39,6 +40,7 @@ def command(
     times: tuple[float, ...],
     roi: Sequence[Sequence[int | None]] | None,
     box: Sequence[Sequence[float | None]] | None,
+    lod: int | None,
     output: str | None,
     outside: Literal["nan", "background"],
     dtype: str | None,
@@ -56,22 +58,27 @@ def command(
         raise click.UsageError("--t and --time exclude each other")
     if roi is not None and box is not None:
         raise click.UsageError("--roi and --box exclude each other")
+    if lod is not None and (roi is not None or box is not None):
+        raise click.UsageError("--lod is of the whole feature bounding box; leave out --roi and --box")
+    if lod is not None and outside != "nan":
+        raise click.UsageError("--lod has NaN outside the coreset; leave out --outside")
     if output is not None:
         check_writable(output, force, region=True, sources=[run])
     with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
         chosen = [volume.step_of_time(time) for time in times] if times else steps_of(volume, steps)
-        region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
+        region = region_of_box(volume, box) if box is not None else region_of(volume, roi) if lod is None else volume.box
+        every = 1 << (lod or 0)
         kind = np.dtype(dtype or volume.dtype)
         statistics = Statistics()
 
         def frames() -> Iterator[npt.NDArray[Any]]:
             for done, step in enumerate(chosen):
-                frame = volume.read(step, region, outside=outside)
+                frame = volume.read(step, region, outside=outside) if lod is None else volume.read_lod(step, lod)
                 statistics.add(frame, _inside(volume, step, region, frame, outside))
                 yield convert(frame, kind, filled=outside == "background")
                 progress("decoding", done + 1, len(chosen))
 
-        z, y, x = (high - low for low, high in region)
+        z, y, x = (len(range(low, high, every)) for low, high in region)
         shape = (len(chosen), z, y, x)
         paths = []
         if output is None:
@@ -83,7 +90,7 @@ def command(
                 units=volume.units,
                 dtype=kind,
                 shape=shape,
-                coords=coordinates(volume, chosen, region),
+                coords=coordinates(volume, chosen, region, every),
                 attributes=volume.attrs,
             )
             paths = [str(path) for path in save_region(output, whole, frames(), force=force, sources=[run])]

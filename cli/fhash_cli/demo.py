@@ -56,7 +56,7 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
 
     import fhash_codec
 
-    config = EncodeConfig(features=(SCENES[scene].feature,), embedding_size=1, tables="uint8")
+    config = EncodeConfig(features=(SCENES[scene].feature,))
     with Progress(quiet=quiet) as progress:
         encoded = fhash_codec.encode(data, run, config, force=force, progress=progress)
         start = time.perf_counter()
@@ -64,7 +64,7 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
         seconds = time.perf_counter() - start
     with open_series(data) as series, fhash_codec.open(run) as volume, replacing(picture, force=force) as temporary:
         _draw(scene, series, volume, report).save(temporary, format="PNG", optimize=True)
-    settings = f"--feature {config.features[0]} --embedding-size {config.embedding_size} --tables {config.tables}"
+    settings = f"--feature {config.features[0]}"
     made = {"scene": scene, "data": str(data), "path": str(run), "picture": str(picture), "settings": settings}
     result = {**report, "seconds": encoded["seconds"], "diff_seconds": seconds, **made}
     emit(result, table(_rows(result, series)), as_json)
@@ -105,6 +105,6 @@ def _rows(result: dict[str, Any], series: Series) -> list[tuple[str, str]]:
         ("size", compared(result)),
         ("coreset", f"{result['coreset_fraction']:.3%} of the domain"),
         *quality_rows(result),
-        ("encoding", f"{number(result['seconds'], 's', digits=3)}, {result['epochs']} epochs on {result['device']}"),
+        ("encoding", f"{number(result['seconds'], 's', digits=3)} on {result['device']}"),
         ("comparing", number(result["diff_seconds"], "s", digits=3)),
     ]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from fhash_cli.options import SourceOptions, check_writable, config_options, force_option, json_option, quiet_option, series_options
-from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, spans, table
+from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, size, spans, table
 from fhash_formats.errors import QualityError
 
 if TYPE_CHECKING:
@@ -24,10 +25,10 @@ if TYPE_CHECKING:
 @json_option
 @quiet_option
 def command(data: str, output: str, source: SourceOptions, config: EncodeConfig, force: bool, as_json: bool, quiet: bool) -> None:
-    """Find the features of DATA, fit a network to them and write it as RUN.fhz.
+    """Find the features of DATA, encode them and write them as RUN.fhz.
 
     DATA is a file of HDF5, NetCDF, numpy or raw values, a Zarr folder, or a pattern of such files in quotes ('step_*.raw').
-    Ctrl-C saves a checkpoint beside RUN.fhz; the same command goes on from it.
+    With --profile paper Ctrl-C saves a checkpoint beside RUN.fhz; the same command goes on from it.
     """
     import fhash_codec
 
@@ -47,13 +48,33 @@ def command(data: str, output: str, source: SourceOptions, config: EncodeConfig,
 
 def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
     """An encoding's report as a table."""
+    paper = report["profile"] == "paper"
+    model = (
+        f"{report['parameters']:,} parameters, {report['epochs']} epochs"
+        if paper
+        else f"{report['parameters']:,} numbers that are not zero"
+    )
     return [
         ("written", str(report["path"])),
         ("size", compared(report)),
+        *gain_rows(report),
         ("steps, z, y, x", extent(report["shape"])),
-        ("key frames", str(len(report["key_frames"]))),
+        *([("key frames", str(len(report["key_frames"])))] if paper else []),
         ("coreset", f"{report['coreset_fraction']:.3%} of the domain, in {spans(report['feature_bounding_box'])}"),
         *quality_rows(report, units),
-        ("network", f"{report['parameters']:,} parameters, {report['epochs']} epochs, {report['profile']}"),
+        ("model", f"{model}, {report['profile']}"),
         ("time", f"{number(report['seconds'], 's', digits=3)} on {report['device']}"),
     ]
+
+
+def gain_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What each stage of a compact encoding made of the size, and when it was done; on a sample but for the last."""
+    last = len(report["gains"]) - 1
+    return [
+        ("  " + gain["what"], f"{'' if stage == last else 'about '}{size(gain['bytes'])}{_after(gain)}")
+        for stage, gain in enumerate(report["gains"])
+    ]
+
+
+def _after(gain: Mapping[str, Any]) -> str:
+    return f" after {number(gain['seconds'], 's', digits=2)}" if "seconds" in gain else ""

@@ -26,7 +26,7 @@ def command(run: str, as_json: bool) -> None:
 
 
 def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
-    model, training = info["model"], info["training"]
+    training = info["training"]
     dtype = info["variable"]["dtype"]
     seconds = "" if training["seconds"] is None else f" in {number(training['seconds'], 's', digits=3)}"
     return [
@@ -38,9 +38,25 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
         ("features", f"{', '.join(info['features'])}; grown by {info['dilation']}"),
         ("coreset", f"{info['coreset_fraction']:.3%} of the domain, in {spans(info['feature_bounding_box'])}"),
         ("key frames", f"{len(info['key_frames'])}: {listed([str(step) for step in info['key_frames']])}"),
+        *(_compact(volume, seconds) if volume.profile == "compact" else _network(info, seconds)),
+        *quality_rows(info["quality"], volume.units),
+    ]
+
+
+def _network(info: dict[str, Any], seconds: str) -> list[tuple[str, str]]:
+    model, training = info["model"], info["training"]
+    return [
         ("network", f"{model['profile']}, {len(model['levels'])} levels, {model['parameters']:,} parameters in {model['tables']}"),
         ("training", f"{training['epochs']} epochs{seconds} on {training['device']}, seed {info['encoder']['seed']}"),
-        *quality_rows(info["quality"], volume.units),
+    ]
+
+
+def _compact(volume: Volume, seconds: str) -> list[tuple[str, str]]:
+    model = volume.info["model"]
+    head = "no head" if model["head"] is None else f"head with {' and '.join(map(str, model['head']['hidden']))} neurons"
+    return [
+        ("table", f"compact, {model['parameters']:,} coefficients other than 0, {head}"),
+        ("tiles", f"{extent(volume.chunks)} vertices{', encoded' + seconds if seconds else ''}"),
     ]
 
 

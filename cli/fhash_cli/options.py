@@ -131,11 +131,27 @@ def series_options(command: Command) -> Command:
     return collected
 
 
-def config_options(*names: str) -> Callable[[Command], Command]:
+def config_options(*names: str, profile: str | None = None) -> Callable[[Command], Command]:
     """Add an option for every field of EncodeConfig, or for those named, from the field's own help, choices and range.
 
-    The command gets an EncodeConfig as `config`.
+    The command gets an EncodeConfig as `config`. profile: that of a command which has no option for it.
     """
+    from fhash_codec.config import EncodeConfig
+
+    fixed = {} if profile is None else {"profile": profile}
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def collected(settings: dict[str, Any], **values: Any) -> None:
+            command(config=EncodeConfig.from_dict(settings | fixed), **values)
+
+        return setting_options(*names)(collected)
+
+    return decorate
+
+
+def setting_options(*names: str) -> Callable[[Command], Command]:
+    """As `config_options`, for settings of several profiles: the command gets a dict of them as `settings`."""
     from fhash_codec.config import EncodeConfig
 
     fields = [field for field in dataclasses.fields(EncodeConfig) if not names or field.name in names]
@@ -144,8 +160,8 @@ def config_options(*names: str) -> Callable[[Command], Command]:
     def decorate(command: Command) -> Command:
         @functools.wraps(command)
         def collected(**values: Any) -> None:
-            config = EncodeConfig.from_dict({field.name: values.pop(field.name) for field in fields})
-            command(config=config, **values)
+            settings = {field.name: values.pop(field.name) for field in fields}
+            command(settings=settings, **values)
 
         decorated: Command = collected
         for field in reversed(fields):

@@ -119,17 +119,17 @@ class Bench:
 
         return Search(measure, step=variant.step, fixed=variant.lossless)
 
-    def search_own(self, config: EncodeConfig, profile: str) -> None:
+    def search_own(self, settings: Mapping[str, Any], profile: str) -> None:
         """Encode with a profile for every goal."""
         for goal, asked in self.goals:
-            settings = promised(config, profile, goal, asked)
+            config = promised(settings, profile, goal, asked)
             self.done += 1
             self.progress("comparing", self.done, self.total, f"fhash {profile}")
-            trial = self.own.trial(settings)
+            trial = self.own.trial(config)
             # A bound is kept in data units; dividing by the range may round the share up by its last bit.
             reached = trial.psnr >= asked if goal == "psnr" else trial.max_error <= asked * (1 + 1e-12)
             as_asked = reached if goal == "bound" and profile != "paper" else None
-            found = Found(codec=f"{OWN}{profile}", trial=trial, setting=f"{OWN}{profile}", reached=reached, as_asked=as_asked, how=settings)
+            found = Found(codec=f"{OWN}{profile}", trial=trial, setting=f"{OWN}{profile}", reached=reached, as_asked=as_asked, how=config)
             self._keep((goal, asked), found)
 
     def _keep(self, goal: tuple[str, float], new: Found) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import fhash_codec
 from fhash_codec.bench.search import EXACT, Trial
@@ -18,15 +21,15 @@ PROFILES: tuple[str, ...] = EncodeConfig.__dataclass_fields__["profile"].metadat
 """Every profile there is."""
 
 
-def promised(config: EncodeConfig, profile: str, goal: str, asked: float) -> EncodeConfig:
-    """The settings of a profile for PSNR `asked` (dB), or for "bound" a largest error of `asked` (share of the range).
+def promised(settings: Mapping[str, Any], profile: str, goal: str, asked: float) -> EncodeConfig:
+    """Those of the settings that a profile has, for PSNR `asked` (dB), or for "bound" a largest error of `asked` (share of the range).
 
     The paper profile is not steered by quality: its settings are the same for every goal.
     """
-    promise = {"psnr": asked} if goal == "psnr" else {"psnr": None, "max_error_rel": asked}
-    if profile == "paper":
-        promise = {}
-    return EncodeConfig.from_dict(config.to_dict() | {"profile": profile} | promise)
+    others = {field.name for field in dataclasses.fields(EncodeConfig) if field.metadata["profile"] not in ("", profile)}
+    promise = {} if profile == "paper" else {"psnr" if goal == "psnr" else "max_error_rel": asked}
+    own = {name: value for name, value in settings.items() if name not in others}
+    return EncodeConfig.from_dict(own | {"profile": profile} | promise)
 
 
 class Own:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fhash_codec.bench.measuring import Bench
-from fhash_codec.bench.own import PROFILES
+from fhash_codec.bench.own import PROFILES, promised
 from fhash_codec.bench.peers import peers
 from fhash_codec.bench.results import PEERS, RateBench
 from fhash_codec.bench.train import machine
-from fhash_codec.config import EncodeConfig
 from fhash_codec.engines import choose_device
 from fhash_codec.progress import Progress, silent
 from fhash_codec.scan import scan
@@ -40,7 +40,7 @@ NOTES = (
 
 def bench_rate(
     source: Source,
-    config: EncodeConfig | None = None,
+    settings: Mapping[str, Any] | None = None,
     *,
     targets: Sequence[float] = TARGETS,
     bounds: Sequence[float] = BOUNDS,
@@ -51,13 +51,14 @@ def bench_rate(
 ) -> RateBench:
     """Measure fhash's `profiles` and the peers `names` on a series, which is held in memory whole.
 
-    config: further settings of fhash; all of the domain counts here, so a feature is refused. targets: PSNR in dB over every finite value
-    of all frames, the range being the global one of the series. bounds: largest errors as shares of that range. Everything is measured on
-    what is really decoded. speed: also measure encoding, decoding and access at the target nearest to SPEED_AT, unless there is none.
+    settings: further ones of fhash by name, as `EncodeConfig.from_dict` takes them; each profile takes those it has. All of the domain
+    counts here, so a feature is refused. targets: PSNR in dB over every finite value of all frames, the range being the global one of
+    the series. bounds: largest errors as shares of that range. Everything is measured on what is really decoded. speed: also measure
+    encoding, decoding and access at the target nearest to SPEED_AT, unless there is none.
     Raises InputError for what cannot be measured, MissingDependencyError without hdf5plugin.
     """
-    config = config or EncodeConfig()
-    _check(config, targets, bounds, names, profiles)
+    settings = settings or {}
+    _check(settings, targets, bounds, names, profiles)
     known = peers() if names else {}
     with opened(source) as series, tempfile.TemporaryDirectory(prefix="fhash-bench-") as folder:
         scanned = scan(series, progress)
@@ -74,7 +75,7 @@ def bench_rate(
         for variant in chosen:
             bench.search(variant)
         for profile in profiles:
-            bench.search_own(config, profile)
+            bench.search_own(settings, profile)
         if speed and targets:
             bench.measure_speed(min(targets, key=lambda target: (abs(target - SPEED_AT), target)), known)
         return RateBench(
@@ -93,7 +94,9 @@ def bench_rate(
         )
 
 
-def _check(config: EncodeConfig, targets: Sequence[float], bounds: Sequence[float], names: Sequence[str], profiles: Sequence[str]) -> None:
+def _check(
+    settings: Mapping[str, Any], targets: Sequence[float], bounds: Sequence[float], names: Sequence[str], profiles: Sequence[str]
+) -> None:
     """Raise InputError for arguments of `bench_rate` that are not allowed."""
     for what, given, allowed in (("peer", names, PEERS), ("profile", profiles, PROFILES)):
         for name in given:
@@ -107,5 +110,7 @@ def _check(config: EncodeConfig, targets: Sequence[float], bounds: Sequence[floa
             raise InputError(f"bound is {bound:g} of the range; allowed: 1e-9 to 0.5")
     if not (targets or bounds) or not (names or profiles):
         raise InputError("nothing to measure; give at least one target or bound, and one peer or profile")
-    if config.features != ("all",):
-        raise InputError(f"feature is {', '.join(config.features)}; bench rate compares whole domains, leave it out")
+    if tuple(settings.get("features", ("all",))) != ("all",):
+        raise InputError(f"feature is {', '.join(settings['features'])}; bench rate compares whole domains, leave it out")
+    for profile in profiles:
+        promised(settings, profile, "psnr", SPEED_AT)

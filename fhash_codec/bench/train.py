@@ -44,7 +44,7 @@ def bench_train(
     large float32 matrix product measured here.
     Raises InputError for an unknown engine or seconds that are not positive.
     """
-    config = config or EncodeConfig()
+    config = config or EncodeConfig(profile="paper")
     if seconds <= 0 or not engines:
         raise InputError(f"seconds is {seconds:g} for {len(engines)} engines; a positive time and at least one engine are needed")
     device = choose_device(config.device)

@@ -49,7 +49,7 @@ class Blocks:
 
     def indices(self) -> Iterator[Index]:
         """All tiles in C order."""
-        yield from product(*(range(n) for n in self.grid))  # type: ignore[misc]
+        yield from product(*(range(n) for n in self.grid))
 
     def read(self, index: Index) -> tuple[Values, Care]:
         """A tile's values in the type of the source, its rest beyond the box repeating the border, and what counts (None: everything).

@@ -42,7 +42,7 @@ def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: boo
 
     quick: only the kinds that the settings have, the usual ones, and the data's own bases in the plane and along z.
     """
-    shape: Shape = sample.tiles[0][0].shape  # type: ignore[assignment]
+    shape: Shape = sample.tiles[0][0].shape
     bases = _Bases(sample, settings)
     if quick:
         usual, own = (
@@ -68,6 +68,16 @@ def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: boo
     return replace(settings, transform=TransformSpec(axes=axes)), best
 
 
+def refit(sample: Sample, settings: Settings) -> Settings:
+    """Settings with the data's own bases made anew for the step; the same object where there are none."""
+    axes = settings.transform.axes
+    if not any(axis.basis is not None for axis in axes):
+        return settings
+    bases = _Bases(sample, settings)
+    fresh = tuple(axis if axis.basis is None else bases.along(number) for number, axis in enumerate(axes))
+    return replace(settings, transform=TransformSpec(axes=fresh))  # type: ignore[arg-type]
+
+
 def _known(axis: AxisTransform, length: int) -> AxisTransform:
     """The same kind on an axis of another length; 9/7 for a basis, which fits one length alone."""
     if axis.basis is not None:
@@ -79,7 +89,9 @@ def _judge(sample: Sample, settings: Settings, axes: Axes, way: Way) -> float:
     spec = TransformSpec(axes=axes)
     outcome = sample.run(replace(settings, transform=spec), way)
     factors = sum(len(axis.basis.to_bytes()) * 4 / 3 for axis in axes if axis.basis is not None)
-    return outcome.size + factors / sample.share + outcome.squares / (0.8 * settings.step**2)
+    # Under a bound all that is wrong is mended, in bytes.
+    wrong = 0.0 if way.error is not None else outcome.squares / (0.8 * settings.step**2)
+    return outcome.size + factors / sample.share + wrong
 
 
 def _plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTransform]:

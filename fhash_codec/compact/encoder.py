@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from fhash_codec.compact.blocks import Blocks, Index
+from fhash_codec.compact.blocks import Blocks, Care, Index, Values
+from fhash_codec.compact.choice import refit
 from fhash_codec.compact.plan import DEFAULT_PSNR, Planned, goal_of, plan
-from fhash_codec.compact.sample import SLOPE, Outcome, code, pool, total
+from fhash_codec.compact.sample import SLOPE, SMALLEST_STEP, Outcome, code, pool, total
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset import Extent
 from fhash_codec.network import usable_threads
@@ -59,6 +60,9 @@ def code_series(series: Series, found: Found, config: EncodeConfig, progress: Pr
         data_range = value_range.high - value_range.low
         tries: list[tuple[float, float]] = []
         best: Table | None = None
+        if config.effort == 1 and goal.psnr is not None:
+            # One pass should do: aim a little higher than the sample says.
+            planned = replace(planned, settings=replace(planned.settings, step=planned.settings.step * (1 - EXCEEDED / SLOPE)))
         for attempt in range(PASSES):
             streams, outcome = _code_all(planned, workers, progress)
             table = Table(planned=planned, streams=streams, outcome=outcome)
@@ -69,10 +73,13 @@ def code_series(series: Series, found: Found, config: EncodeConfig, progress: Pr
             missed = reached < goal.psnr + SAFE
             if best is None or best.outcome.psnr(data_range) < goal.psnr + SAFE or (not missed and outcome.size < best.outcome.size):
                 best = table
-            enough = not missed and reached < goal.psnr + EXCEEDED
+            enough = not missed and reached < goal.psnr + (EXCEEDED if config.effort > 1 else 4 * EXCEEDED)
             if enough or math.isinf(reached) or (attempt >= 1 and not missed):
                 break
+            before = planned.settings.step
             planned = replace(planned, settings=_nearer(planned.settings, reached, goal.psnr + SAFE, tries, margin=0.005 * 2**attempt))
+            if planned.sample is not None and planned.settings.step < before / 1.5:
+                planned = replace(planned, settings=refit(planned.sample, planned.settings))
     assert best is not None
     gains = best.planned.gains
     gains.append({"what": "all tiles", "bytes": best.outcome.size + OVERHEAD_BYTES, "seconds": round(time.perf_counter() - begun, 3)})
@@ -108,7 +115,7 @@ def compact_header(found: Found, table: Table, config: EncodeConfig) -> dict[str
         "tables": blocks.dtype.name,
         "parameters": outcome.nonzero + weights,
         "head": head,
-        "gains": table.planned.gains,
+        "gains": [{name: value for name, value in gain.items() if config.timings or name != "seconds"} for gain in table.planned.gains],
     }
 
 
@@ -124,7 +131,8 @@ def _nearer(settings: Settings, reached: float, psnr: float, tries: list[tuple[f
     if tries and abs(tries[-1][0] - log_step) > 1e-9:
         slope = min(max(-(reached - tries[-1][1]) / (log_step - tries[-1][0]), 2.0), 12.0)
     tries.append((log_step, reached))
-    return replace(settings, step=math.exp(log_step + (reached - psnr - margin) / slope))
+    smallest = math.log((settings.high - settings.low) * SMALLEST_STEP)
+    return replace(settings, step=math.exp(max(log_step + (reached - psnr - margin) / slope, smallest)))
 
 
 def _code_all(planned: Planned, workers: ThreadPoolExecutor, progress: Progress) -> tuple[list[bytes], Outcome]:
@@ -135,8 +143,8 @@ def _code_all(planned: Planned, workers: ThreadPoolExecutor, progress: Progress)
     outcomes: list[Outcome] = []
     waiting: deque[Future[tuple[bytes, Outcome]]] = deque()
 
-    def work(index_values: Any) -> tuple[bytes, Outcome]:
-        coded, outcome = code(*index_values, settings, way)
+    def work(tile: tuple[Values, Care]) -> tuple[bytes, Outcome]:
+        coded, outcome = code(tile[0], tile[1], settings, way)
         return coded.data, outcome
 
     def collect() -> None:

@@ -15,7 +15,8 @@ STEPS = {5: 2500, 6: 4000, 7: 4000, 8: 6000, 9: 10000}
 """Training steps by effort."""
 LEAST_GAIN = 0.02
 """dB on held-out samples below which a quick trial says that a head will not pay."""
-SAMPLE_VERTICES = 4 << 20
+LEAST_BYTES = 1000
+"""Of coded tiles: of less, a head could not save what it takes."""
 
 
 def race(
@@ -25,6 +26,8 @@ def race(
 
     The history has `seconds`, `epoch` (training steps) and `psnr` of held-out samples.
     """
+    if outcome.size * sample.share < LEAST_BYTES:
+        return settings, outcome, []
     # Where the file is small, so must be the head.
     hidden = HIDDEN[effort] if outcome.size * sample.share > 20_000 else (12, 8) if outcome.size * sample.share > 4_000 else (8,)
     trial = _train(sample, settings, way, hidden=hidden, steps=500, samples=100_000, seed=seed, device=device)

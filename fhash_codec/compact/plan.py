@@ -13,8 +13,8 @@ import numpy as np
 
 from fhash_codec.compact import heads
 from fhash_codec.compact.blocks import Blocks, even_tile, parse_tile
-from fhash_codec.compact.choice import choose_transform, usual_transform
-from fhash_codec.compact.sample import OFFSETS, SLOPE, Outcome, Sample, Way, solve_step
+from fhash_codec.compact.choice import choose_transform, refit, usual_transform
+from fhash_codec.compact.sample import OFFSETS, SLOPE, SMALLEST_STEP, Outcome, Sample, Way, solve_step
 from fhash_codec.config import EncodeConfig
 from fhash_codec.normalise import ValueRange
 from fhash_codec.progress import Progress
@@ -23,6 +23,8 @@ from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.tile import Shape
 
 DEFAULT_PSNR = 50.0
+LARGEST_VALUE, SMALLEST_RANGE = 1e145, 1e-145
+"""Squared errors of larger values or of a smaller range do not fit float64."""
 SAMPLE_VERTICES = 2 << 20
 QUICK_VERTICES = 1 << 20
 TILE_BYTES, TILE_VERTICES, FEWEST_TILES = 1500, 1 << 19, 27
@@ -32,7 +34,7 @@ PRICE_OF_TILES = 1.3
 """By what factor small tiles may make a file larger."""
 MOST_TILE_VERTICES, SMALL_FILE_BYTES = 12 << 20, 60_000
 """Of a tile chosen for its bytes alone; and only a file that is read in a moment as a whole may have such tiles."""
-STEPS_OF_ERROR = (1.5, 2.5, 4.0)
+STEPS_OF_ERROR = (1.0, 1.6, 2.5, 4.0)
 """Quantiser steps, in units of a strict bound, that are tried."""
 SLACK = 1e-6
 """The quantum of the residual is this part less than twice the bound, for the rounding of what is decoded."""
@@ -57,6 +59,7 @@ class Planned:
     settings: Settings
     way: Way
     goal: Goal
+    sample: Sample | None = None
     gains: list[dict[str, Any]] = field(default_factory=list)
     history: list[dict[str, float | None]] = field(default_factory=list)
 
@@ -90,11 +93,14 @@ def plan(
     data_range = value_range.high - value_range.low
     fixed = parse_tile(config.tile, blocks.shape)
     tile = fixed or even_tile(blocks.shape, max(1, prod(blocks.shape) // TILE_VERTICES), min(blocks.shape[0], 8))
-    way = Way(rounds=0, passes=1)
-    sample = Sample(blocks.retile(tile), QUICK_VERTICES, workers)
+    if max(abs(value_range.low), abs(value_range.high)) > LARGEST_VALUE or 0 < data_range < SMALLEST_RANGE:
+        return _exact(blocks, tile, value_range, goal)
+    way = Way(filled=blocks.complete)
+    # Only a first idea of the size is needed, for the tiles.
+    sample = Sample(blocks.retile(tile), QUICK_VERTICES // 4, workers)
     settings = _first(sample, value_range, goal)
     progress("planning", 0, 4, "")
-    settings, outcome = _solve(sample, settings, way, goal, data_range, overhead, tries=3)
+    settings, outcome = _solve(sample, settings, way, goal, data_range, overhead, tries=2)
     gains: list[dict[str, Any]] = []
 
     def note(what: str, now: Outcome, of: Sample) -> None:
@@ -110,17 +116,25 @@ def plan(
         settings = replace(settings, transform=usual_transform(tiled.tile))
     progress("planning", 1, 4, "")
     if config.effort > 1:
-        settings, cost = choose_transform(sample, settings, way)
+        settings, cost = choose_transform(sample, settings, _bounded(way, goal))
         if fixed is None:
-            tiled, sample, settings = _larger_tiles(tiled, sample, settings, cost, way, workers)
+            tiled, sample, settings = _larger_tiles(tiled, sample, settings, cost, _bounded(way, goal), workers)
     progress("planning", 2, 4, "")
     way = replace(way, passes=2 if config.effort > 2 else 1, rounds=0 if config.effort == 1 else 2 if config.effort < 7 else 4)
     if not tiled.complete:
         way = replace(way, rounds=2 if config.effort == 1 else 6)
-    settings, outcome = _solve(sample, settings, way, goal, data_range, overhead)
+    settings, outcome = _solve(sample, settings, way, goal, data_range, overhead, tries=3 if config.effort == 1 else 5)
+    for _ in range(3):
+        # A basis is as precise as the step it was made for, and leaves out what is smaller: with a finer step comes another.
+        refitted = refit(sample, settings)
+        if refitted is settings:
+            break
+        before = settings.step
+        settings, outcome = _solve(sample, refitted, way, goal, data_range, overhead)
+        if abs(math.log(settings.step / before)) < 0.1:
+            break
     if config.effort > 1:
         note("transform by trial", outcome, sample)
-        # The bases were made for the first step; once more for the one that is used.
     history: list[dict[str, float | None]] = []
     if config.effort >= 5 and goal.psnr is not None and not settings.double:
         settings, outcome, history = heads.race(
@@ -136,7 +150,15 @@ def plan(
         )
         note("head" if settings.head is not None else "head (left out)", outcome, sample)
     progress("planning", 4, 4, "")
-    return Planned(blocks=tiled, settings=settings, way=_bounded(way, goal), goal=goal, gains=gains, history=history)
+    return Planned(blocks=tiled, sample=sample, settings=settings, way=_bounded(way, goal), goal=goal, gains=gains, history=history)
+
+
+def _exact(blocks: Blocks, tile: Shape, value_range: ValueRange, goal: Goal) -> Planned:
+    """Tiles without loss, for values whose squares overflow."""
+    settings = Settings(
+        transform=usual_transform(tile), step=1.0, center=0.0, low=value_range.low, high=value_range.high, offsets=OFFSETS, double=True
+    )
+    return Planned(blocks=blocks.retile(tile), settings=settings, way=Way(exact=True), goal=goal)
 
 
 def _bounded(way: Way, goal: Goal) -> Way:
@@ -159,7 +181,7 @@ def _larger_tiles(
         if prod(tile) > MOST_TILE_VERTICES or tile == tiled.tile:
             continue
         other = tiled.retile(tile)
-        larger = Sample(other, prod(tile), workers)
+        larger = Sample(other, MOST_TILE_VERTICES, workers)
         changed, price = choose_transform(larger, settings, way, quick=True)
         if price * larger.share < best:
             best, tiled, sample, settings = price * larger.share, other, larger, changed
@@ -195,9 +217,9 @@ def _first(sample: Sample, value_range: ValueRange, goal: Goal) -> Settings:
         center = mean if math.isfinite(mean) else center
     return _with_step(
         Settings(
-            transform=usual_transform(values.shape),  # type: ignore[arg-type]
+            transform=usual_transform(values.shape),
             step=1.0,
-            center=float(np.float32(center)) if math.isfinite(float(np.float32(center))) else center,
+            center=float(np.float32(center)) if abs(center) < 3e38 else center,
             low=value_range.low,
             high=value_range.high,
             offsets=OFFSETS,
@@ -211,8 +233,9 @@ def _first(sample: Sample, value_range: ValueRange, goal: Goal) -> Settings:
 def _with_step(settings: Settings, step: float, goal: Goal) -> Settings:
     """The step, and the working type and residual that go with it."""
     data_range = settings.high - settings.low
-    step = max(step, data_range * 2.0**-50, 1e-300)
     largest = max(abs(settings.low), abs(settings.high))
+    # Integers beyond 2^30 cannot be coded. In a constant series the step only has to be small enough for the centre, a float32.
+    step = max(step, data_range * SMALLEST_STEP, largest * 2.0**-30 if data_range == 0 else 0.0, 1e-300)
     double = data_range / step > DOUBLE_STEPS or largest > step * DOUBLE_STEPS or largest > 1e37 or step < 1e-30
     quantum = 0.0 if not goal.error else 2 * goal.error * (1 - SLACK)
     return replace(settings, step=step, double=double, quantum=quantum)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from fhash_codec.compact.blocks import Blocks, Care, Values
 from fhash_codec.network import usable_threads
 from fhash_formats.transform.settings import Settings
-from fhash_formats.transform.tile import CodedTile, encode_tile
+from fhash_formats.transform.tile import CodedTile, encode_tile, exact_tile
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -26,16 +26,20 @@ OFFSETS = (-5, -1, 0)
 """Where magnitudes of 1, 2 and more stand after rate-distortion optimisation, in 1/128 step."""
 SLOPE = 5.5
 """dB by which the PSNR falls when the step grows by a factor of e: to begin a search with."""
+SMALLEST_STEP = 2.0**-26
+"""Of the range: integers beyond 2^30 cannot be coded."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Way:
-    """How tiles are coded besides their settings: see `encode_tile`."""
+    """How tiles are coded besides their settings: see `encode_tile`. exact: without loss, by `exact_tile`."""
 
     weight: float = WEIGHT
     rounds: int = 0
     passes: int = 1
     error: float | None = None
+    filled: bool = False
+    exact: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +61,10 @@ class Outcome:
 
 def code(values: Values, care: Care, settings: Settings, way: Way) -> tuple[CodedTile, Outcome]:
     """Code one tile and measure it."""
+    if way.exact:
+        count = values.size if care is None else int(np.count_nonzero(care))
+        coded = exact_tile(values)
+        return coded, Outcome(size=len(coded.data), squares=0.0, count=count, largest=0.0)
     coded = encode_tile(
         values,
         settings,
@@ -66,16 +74,35 @@ def code(values: Values, care: Care, settings: Settings, way: Way) -> tuple[Code
         rounds=way.rounds,
         passes=way.passes,
         keep_missing=False,
+        filled=way.filled,
     )
-    with np.errstate(over="ignore", invalid="ignore"):
-        difference = coded.decoded.astype(np.float64) - values.astype(np.float64)
-    if care is not None:
-        difference = difference[care]
-    difference = difference.ravel()
-    count = difference.size
-    largest = float(np.abs(difference).max(initial=0.0))
-    outcome = Outcome(size=len(coded.data), squares=float(difference @ difference), count=count, largest=largest, nonzero=coded.nonzero)
+    squares, count, largest = _errors(values, coded.decoded, care)
+    outcome = Outcome(size=len(coded.data), squares=squares, count=count, largest=largest, nonzero=coded.nonzero)
     return coded, outcome
+
+
+FEW_TILES, FEW_VERTICES = 8, 12 << 20
+"""So few tiles differ too much to stand for each other: all are taken, if together they have at most so many vertices."""
+PIECE = 1 << 14
+"""Values whose errors are taken at once: float64 copies of them stay in the cache."""
+
+
+def _errors(values: Values, decoded: Values, care: Care) -> tuple[float, int, float]:
+    """Sum of the squared errors, number and largest of the errors of the values that count."""
+    squares, count, largest = 0.0, 0, 0.0
+    one, other = values.ravel(), decoded.ravel()
+    counts = None if care is None else care.ravel()
+    with np.errstate(over="ignore", invalid="ignore"):
+        for start in range(0, one.size, PIECE):
+            part = slice(start, start + PIECE)
+            difference = np.subtract(other[part], one[part], dtype=np.float64)
+            if counts is not None:
+                difference = difference[counts[part]]
+            if difference.size:
+                count += difference.size
+                largest = max(largest, float(difference.max()), -float(difference.min()))
+                squares += float(np.multiply(difference, difference, out=difference).sum())
+    return squares, count, largest
 
 
 def total(outcomes: Sequence[Outcome]) -> Outcome:
@@ -100,6 +127,8 @@ class Sample:
         """Evenly spread tiles of at most so many vertices together, at least one."""
         indices = list(blocks.indices())
         wanted = min(len(indices), max(1, most_vertices // prod(blocks.tile)))
+        if prod(blocks.shape) <= FEW_VERTICES and len(indices) <= FEW_TILES:
+            wanted = len(indices)
         # An odd stride through the grid, so that no column of it is preferred; in C order, for the reader's sake.
         chosen = sorted({indices[(2 * number + 1) * len(indices) // (2 * wanted)] for number in range(wanted)})
         tiles = [blocks.read(index) for index in chosen]
@@ -123,9 +152,11 @@ class Sample:
 
 def solve_step(sample: Sample, settings: Settings, way: Way, psnr: float, data_range: float, *, tries: int = 5) -> tuple[Settings, Outcome]:
     """Settings with the step at which the sample just reaches a PSNR, within 0.02 dB if that can be had in so many tries."""
-    log_step, points = math.log(settings.step), []
+    log_step = math.log(settings.step)
+    points: list[tuple[float, float]] = []
     best: tuple[float, Settings, Outcome] | None = None
     for _ in range(tries):
+        log_step = max(log_step, math.log(data_range * SMALLEST_STEP))
         settings = replace(settings, step=math.exp(log_step))
         outcome = sample.run(settings, way)
         reached = outcome.psnr(data_range)

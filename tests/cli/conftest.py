@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 SHAPE = (3, 6, 7, 8)
-SMALL = ["--epochs", "1", "--width", "4", "--quiet"]
+SMALL = ["--effort", "1", "--quiet"]
 """Settings that make an encoding of the tiny series a matter of milliseconds."""
 
 Fhash = Callable[..., Result]

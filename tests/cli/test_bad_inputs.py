@@ -19,7 +19,8 @@ from fhash_formats.container import ContainerWriter
 
 Fhash = Callable[..., Result]
 Refused = Callable[..., str]
-SMALL = ["--epochs", "1", "--width", "4", "--quiet"]
+SMALL = ["--effort", "1", "--quiet"]
+PAPER = ["--profile", "paper", "--epochs", "1", "--width", "4", "--quiet"]
 
 
 @pytest.fixture
@@ -110,12 +111,28 @@ SETTINGS = [
     (["--feature", "blob"], "blob"),
     (["--feature", ""], "feature"),
     (["--feature", "mask:missing.npy"], "missing.npy"),
-    (["--key-frames", "every:0"], "every"),
-    (["--key-frames", "every:x"], "every"),
-    (["--key-frames", "auto:0"], "auto"),
-    (["--key-frames", "5,9"], "9"),
-    (["--key-frames", ""], "key"),
-    (["--key-frames", "some"], "every:K"),
+    (["--profile", "paper", "--key-frames", "every:0"], "every"),
+    (["--profile", "paper", "--key-frames", "every:x"], "every"),
+    (["--profile", "paper", "--key-frames", "auto:0"], "auto"),
+    (["--profile", "paper", "--key-frames", "5,9"], "9"),
+    (["--profile", "paper", "--key-frames", ""], "key"),
+    (["--profile", "paper", "--key-frames", "some"], "every:K"),
+    (["--key-frames", "0,1"], "key-frames belongs to --profile paper; the profile is compact"),
+    (["--epochs", "3"], "epochs belongs to --profile paper"),
+    (["--tables", "uint8"], "tables belongs to --profile paper"),
+    (["--engine", "slab"], "engine belongs to --profile paper"),
+    (["--profile", "paper", "--effort", "1"], "effort belongs to --profile compact; the profile is paper"),
+    (["--profile", "paper", "--max-error", "1"], "max-error belongs to --profile compact"),
+    (["--profile", "paper", "--tile", "whole"], "tile belongs to --profile compact"),
+    (["--psnr", "40", "--max-error-rel", "0.1"], "psnr and max-error-rel are given; promise one of them"),
+    (["--ratio", "40", "--max-error", "0.1"], "max-error and ratio are given; promise one of them"),
+    (["--ratio", "0.5"], "--ratio"),
+    (["--ratio", "1e6"], "ratio leaves no room"),
+    (["--max-error", "-1"], "--max-error"),
+    (["--max-error-rel", "2"], "--max-error-rel"),
+    (["--effort", "10"], "--effort"),
+    (["--tile", "4x4"], "as in 4x32x32x32"),
+    (["--tile", "0x4x4x4"], "4x32x32x32"),
     (["--fold", "1"], "--fold"),
     (["--width", "0"], "--width"),
     (["--width", "many"], "--width"),
@@ -137,7 +154,7 @@ SETTINGS = [
 
 @pytest.mark.parametrize(("words", "message"), SETTINGS, ids=lambda value: "-".join(value) if isinstance(value, list) else None)
 def test_unsuitable_setting(refused: Refused, inputs: Path, words: list[str], message: str) -> None:
-    line = refused(2, "encode", inputs / "good.npy", "-o", inputs.parent / "out.fhz", *SMALL, *words)
+    line = refused(2, "encode", inputs / "good.npy", "-o", inputs.parent / "out.fhz", "--quiet", *words)
     assert message in line
 
 
@@ -168,6 +185,11 @@ REGIONS = [
     (["--outside", "zero"], "--outside"),
     (["--dtype", "complex64"], "--dtype"),
     (["--dtype", "uint8"], "--outside background"),
+    (["--lod", "11"], "--lod"),
+    (["--lod", "1", "--roi", "0:2,:,:"], "leave out --roi and --box"),
+    (["--lod", "1", "--box", "0:2,:,:"], "leave out --roi and --box"),
+    (["--lod", "1", "--time", "0.5"], "lies between two"),
+    (["--lod", "1", "--outside", "background"], "leave out --outside"),
 ]
 
 
@@ -226,7 +248,9 @@ def test_full_disk_while_encoding(refused: Refused, data: Path, tmp_path: Path, 
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(ContainerWriter, "add_array", full)
-    assert "no space left" in refused(1, "encode", data, "-o", tmp_path / "out.fhz", *SMALL)
+    monkeypatch.setattr(ContainerWriter, "add_sharded", full)
+    for words in (SMALL, PAPER):
+        assert "no space left" in refused(1, "encode", data, "-o", tmp_path / "out.fhz", *words)
 
 
 @contextmanager

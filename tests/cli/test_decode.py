@@ -14,6 +14,7 @@ import pytest
 from click.testing import Result
 
 import fhash_codec
+import fhash_formats
 from fhash_cli.decode import TYPES, Statistics, convert
 from fhash_cli.selection import region_of_box
 from fhash_formats.errors import InputError, RegionError
@@ -145,7 +146,7 @@ def test_statistics_of_huge_values_do_not_overflow() -> None:
 
 def test_huge_values_are_decoded_to_valid_json(fhash: Fhash, tmp_path: Path) -> None:
     np.save(tmp_path / "huge.npy", np.linspace(-5e307, 5e307, 120).reshape(2, 3, 4, 5))
-    assert fhash("encode", tmp_path / "huge.npy", "-o", tmp_path / "run.fhz", "--epochs", "1", "--width", "4").exit_code == 0
+    assert fhash("encode", tmp_path / "huge.npy", "-o", tmp_path / "run.fhz", "--effort", "1", "-q").exit_code == 0
     result = fhash("decode", tmp_path / "run.fhz", "--json")
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
@@ -159,7 +160,7 @@ def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(refused: Callable
     values = np.arange(120, dtype=np.float32).reshape(2, 3, 4, 5)
     values[0, 0, 0, 0] = np.nan
     np.save(tmp_path / "gap.npy", values)
-    assert fhash("encode", tmp_path / "gap.npy", "-o", tmp_path / "run.fhz", "--epochs", "1", "--width", "4").exit_code == 0
+    assert fhash("encode", tmp_path / "gap.npy", "-o", tmp_path / "run.fhz", "--effort", "1", "-q").exit_code == 0
     assert "the data have no value" in refused(2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8")
 
 
@@ -194,3 +195,19 @@ def test_an_output_name_that_is_no_utf8(fhash: Fhash, run: Path, tmp_path: Path)
     result = fhash("decode", run, "-o", tmp_path / "\udcff.npy")
     assert (result.exit_code, result.stderr) == (0, "")
     assert (tmp_path / "\udcff.npy").exists()
+
+
+def test_a_level_of_detail_has_every_second_position(fhash: Fhash, refused: Callable[..., str], data: Path, tmp_path: Path) -> None:
+    run, out = tmp_path / "run.fhz", tmp_path / "out.h5"
+    assert fhash("encode", data, "-o", run, "--effort", "1", "-q").exit_code == 0
+    result = fhash("decode", run, "--lod", "1", "--t", "1:3", "-o", out, "--json", "-q")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert json.loads(result.stdout)["shape"] == [2, 3, 4, 4]
+    with fhash_formats.open_series(out) as series, fhash_codec.open(run) as volume:
+        assert series.shape == (2, 3, 4, 4)
+        np.testing.assert_array_equal(series.read(0), volume.read_lod(1, 1))
+        for axis in "zyx":
+            np.testing.assert_array_equal(series.coords[axis].values, volume.coords[axis].values[::2])
+    words = ["--profile", "paper", "--epochs", "1", "--width", "4", "-q"]
+    assert fhash("encode", data, "-o", tmp_path / "paper.fhz", *words).exit_code == 0
+    assert "no levels of detail" in refused(2, "decode", tmp_path / "paper.fhz", "--lod", "1")

@@ -11,7 +11,7 @@ import pytest
 from click.testing import Result
 
 Fhash = Callable[..., Result]
-SMALL = ["--epochs", "2", "--width", "4", "--quiet"]
+SMALL = ["--effort", "1", "--quiet"]
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,9 @@ def report(data: Path, run: Path) -> dict[str, float]:
 def test_diff_agrees_with_what_the_encoder_measured(fhash: Fhash, run: Path, report: dict[str, float]) -> None:
     stored = json.loads(fhash("info", run, "--json").stdout)["quality"]
     for name in ("psnr", "rmse", "max_abs_error", "psnr_domain"):
-        assert report[name] == pytest.approx(stored[name], rel=1e-9)
+        # The file has six digits of it, rounded to the worse side.
+        assert report[name] == pytest.approx(stored[name], rel=1e-5)
+        assert (report[name] >= stored[name]) == name.startswith("psnr")
 
 
 @pytest.mark.parametrize(("gate", "figure", "sign"), [("--min-psnr", "psnr", 1), ("--max-error", "max_abs_error", -1)])

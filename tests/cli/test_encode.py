@@ -17,7 +17,8 @@ import fhash_codec
 from fhash_cli.output import Progress
 
 Fhash = Callable[..., Result]
-SMALL = ["--epochs", "2", "--width", "4", "--quiet"]
+SMALL = ["--effort", "1", "--quiet"]
+PAPER = ["--profile", "paper", "--epochs", "2", "--width", "4", "--quiet"]
 KEYS = {
     "bytes", "raw_bytes", "ratio", "psnr", "rmse", "max_abs_error", "psnr_domain", "seconds", "epochs", "curve", "shape", "key_frames",
     "feature_bounding_box", "coreset_fraction", "parameters", "profile", "device",
@@ -25,7 +26,7 @@ KEYS = {
 
 
 def test_json_is_one_object_with_the_figures_of_the_file(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    result = fhash("encode", data, "-o", tmp_path / "run.fhz", "--feature", "interval:6:99", "--json", *SMALL)
+    result = fhash("encode", data, "-o", tmp_path / "run.fhz", "--feature", "interval:6:99", "--json", *PAPER)
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     assert set(report) >= KEYS
@@ -70,12 +71,37 @@ def test_force_replaces(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     assert output.read_bytes() != b"old"
 
 
+def test_what_each_stage_bought_is_in_the_table_and_in_json(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    words = ["encode", data, "-o", tmp_path / "run.fhz", "--effort", "2", "--force", "-q"]
+    report = json.loads(fhash(*words, "--json").stdout)
+    assert set(report) >= {*KEYS, "gains"}
+    assert report["profile"] == "compact"
+    assert [set(gain) for gain in report["gains"]] == [{"what", "bytes", "seconds"}] * len(report["gains"])
+    lines = fhash(*words).stdout.splitlines()
+    for gain in report["gains"]:
+        assert sum(line.startswith(f"  {gain['what']}  ") for line in lines) == 1
+    assert not any("key frames" in line or "epochs" in line for line in lines)
+    bare = json.loads(fhash(*words, "--no-timings", "--json").stdout)
+    assert [set(gain) for gain in bare["gains"]] == [{"what", "bytes"}] * len(report["gains"])
+    assert fhash(*words, "--no-timings").exit_code == 0
+
+
+@pytest.mark.parametrize("words", [["--max-error", "0.125"], ["--max-error-rel", "0.01"], ["--tile", "2x4x4x4", "--psnr", "35"]], ids=str)
+def test_promises_of_the_compact_profile_are_kept(fhash: Fhash, data: Path, tmp_path: Path, words: list[str]) -> None:
+    report = json.loads(fhash("encode", data, "-o", tmp_path / "run.fhz", *words, "--json", *SMALL).stdout)
+    bound = {"--max-error": 0.125, "--max-error-rel": 0.01 * report["data_range"]}.get(words[0], np.inf)
+    assert 0 < report["max_abs_error"] <= bound
+    assert report["psnr"] >= 35
+    with fhash_codec.open(tmp_path / "run.fhz") as volume:
+        assert volume.chunks == ((2, 4, 4, 4) if "--tile" in words else volume.chunks)
+
+
 @pytest.mark.parametrize("as_json", [False, True])
 def test_missed_promise_writes_the_file_prints_the_figures_and_exits_with_3(
     fhash: Fhash, data: Path, tmp_path: Path, as_json: bool
 ) -> None:
     output = tmp_path / "run.fhz"
-    result = fhash("encode", data, "-o", output, "--psnr", "300", *(["--json"] if as_json else []), *SMALL)
+    result = fhash("encode", data, "-o", output, "--psnr", "300", *(["--json"] if as_json else []), *PAPER)
     assert result.exit_code == 3
     assert len(result.stderr.splitlines()) == 1
     assert "300 dB" in result.stderr
@@ -108,7 +134,7 @@ def test_a_warning_is_one_line_on_stderr(fhash: Fhash, tmp_path: Path) -> None:
 def test_ctrl_c_saves_a_checkpoint_and_the_same_command_ends_as_if_nothing_had_been(
     fhash: Fhash, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["encode", data, "--no-timings", "--feature", "interval:2:99", "--epochs", "6", "--width", "4", "-q", "-o"]
+    words = ["encode", data, "--no-timings", "--feature", "interval:2:99", *PAPER, "--epochs", "6", "-o"]
     assert fhash(*words, tmp_path / "whole.fhz").exit_code == 0
     listen = Progress.__call__
 

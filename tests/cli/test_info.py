@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
+PAPER = ["--profile", "paper", "--epochs", "1", "--width", "4", "--quiet"]
 Fhash = Callable[..., Result]
 
 
@@ -22,10 +23,17 @@ def test_info_says_what_the_file_holds(fhash: Fhash, run: Path) -> None:
         "time 0 to 4",
         "x 10 to 3",
         "interval:6:99",
-        "paper",
-        "1 epochs",
+        "compact",
     ):
         assert text in result.stdout
+
+
+def test_info_of_a_paper_file_says_how_it_was_trained(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    assert fhash("encode", data, "-o", tmp_path / "run.fhz", *PAPER).exit_code == 0
+    result = fhash("info", tmp_path / "run.fhz")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "paper" in result.stdout
+    assert "1 epochs" in result.stdout
 
 
 def test_info_as_json_is_one_object(fhash: Fhash, run: Path) -> None:

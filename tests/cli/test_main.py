@@ -123,7 +123,7 @@ if sys.argv[1] == "decode":
     name = "read"
 else:
     from fhash_formats.container import ContainerWriter as Slow
-    name = "add_array"
+    name = "add_array" if "paper" in sys.argv else "add_sharded"
 def sleeping(*_, **__):
     print("ready", file=sys.stderr, flush=True)
     time.sleep(60)
@@ -134,10 +134,11 @@ main.main()
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGHUP there")
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
-@pytest.mark.parametrize("command", ["encode", "decode"])
+@pytest.mark.parametrize("command", ["encode", "encode paper", "decode"])
 def test_a_signal_leaves_nothing_half_written(data: Path, run: Path, tmp_path: Path, command: str, name: str) -> None:
     words = {
-        "encode": ["encode", data, "-o", tmp_path / "out.fhz", "--epochs", "1", "--width", "4"],
+        "encode": ["encode", data, "-o", tmp_path / "out.fhz", "--effort", "1"],
+        "encode paper": ["encode", data, "-o", tmp_path / "out.fhz", "--profile", "paper", "--epochs", "1", "--width", "4"],
         "decode": ["decode", run, "-o", tmp_path / "out.npy"],
     }[command]
     with subprocess.Popen([sys.executable, "-c", SLOW_DISK, *words], stderr=subprocess.PIPE, text=True) as process:

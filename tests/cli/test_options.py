@@ -68,10 +68,8 @@ def test_settings_reach_the_encoding_as_a_config() -> None:
         seen.append(config)
 
     probe.main([], standalone_mode=False)
-    probe.main(
-        ["--feature", "all", "--feature", "isosurface:2", "--no-timings", "--psnr", "40", "--key-frames", "0,2"], standalone_mode=False
-    )
-    assert seen == [EncodeConfig(), EncodeConfig(features=("all", "isosurface:2"), timings=False, psnr=40.0, key_frames="0,2")]
+    probe.main(["--feature", "all", "--feature", "isosurface:2", "--no-timings", "--psnr", "40", "--effort", "2"], standalone_mode=False)
+    assert seen == [EncodeConfig(), EncodeConfig(features=("all", "isosurface:2"), timings=False, psnr=40.0, effort=2)]
 
 
 @pytest.mark.parametrize("text", ["nan", "NaN", "-1", "0.05", "3601", "-inf", "inf"])

@@ -126,7 +126,7 @@ def test_missing_values_are_filled_from_their_row_first() -> None:
 
 @pytest.fixture(scope="module")
 def result() -> RateBench:
-    config = EncodeConfig(epochs=2, width=4, seed=1)
+    config = {"epochs": 2, "width": 4, "seed": 1}
     return bench_rate(field(), config, targets=(35.0, 50.0), bounds=(0.02,), profiles=("paper",))
 
 
@@ -179,7 +179,7 @@ def test_small_chunks_are_measured_where_frames_are_larger() -> None:
 
 def test_own_figures_are_those_of_diff(tmp_path: Path) -> None:
     values = field()
-    config = EncodeConfig(epochs=2, width=4)
+    config = EncodeConfig(profile="paper", epochs=2, width=4)
     data_range = float(values.max()) - float(values.min())
     own = Own(ArraySeries(values), data_range, tmp_path)
     trial = own.trial(config)
@@ -196,9 +196,10 @@ def test_own_figures_are_those_of_diff(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_profiles_are_promised_what_they_can_keep(profile: str) -> None:
-    config = EncodeConfig(seed=7)
-    quality = promised(config, profile, "psnr", 41.0).to_dict()
-    bound = promised(config, profile, "bound", 0.02).to_dict()
+    settings = {"seed": 7, "epochs": 3, "effort": 2}
+    quality = promised(settings, profile, "psnr", 41.0).to_dict()
+    bound = promised(settings, profile, "bound", 0.02).to_dict()
+    assert (quality["epochs"], quality["effort"]) == ((3, 5) if profile == "paper" else (0, 2))
     assert quality["profile"] == bound["profile"] == profile
     assert quality["seed"] == bound["seed"] == 7
     if profile == "paper":
@@ -213,7 +214,7 @@ def test_missing_values_do_not_count() -> None:
     values = field()
     values[1, :, 3:9, 4:11] = np.nan
     values[2, 0, 0, 0] = -np.inf
-    config = EncodeConfig(epochs=1, width=4)
+    config = {"epochs": 1, "width": 4}
     result = bench_rate(values, config, targets=(40.0,), bounds=(0.01,), profiles=("paper",), speed=False)
     assert result.missing == 6 * 6 * 7 + 1
     assert all(point.reached for point in result.points if point.codec in PEERS)
@@ -246,7 +247,8 @@ def test_what_a_filter_refuses_is_said() -> None:
         ({"bounds": (0.0,)}, "bound is 0 of the range"),
         ({"targets": (), "bounds": ()}, "nothing to measure"),
         ({"names": (), "profiles": ()}, "nothing to measure"),
-        ({"config": EncodeConfig(features=("interval:0:1",))}, "feature is interval:0:1"),
+        ({"settings": {"efort": 1}}, "did you mean 'effort'"),
+        ({"settings": {"features": ("interval:0:1",)}}, "feature is interval:0:1"),
     ],
 )
 def test_unsuitable_arguments_are_refused(arguments, message: str) -> None:

@@ -12,9 +12,10 @@ from fhash_formats.errors import InputError
     "config",
     [
         EncodeConfig(),
-        EncodeConfig(features=("interval:0:1", "isosurface:3"), key_frames="0,4,9", psnr=45.0, epochs=0, learning_rate=1e-3),
+        EncodeConfig(features=("interval:0:1", "isosurface:3"), max_error=0.5, effort=3, tile="4x8x8x8"),
+        EncodeConfig(profile="paper", key_frames="0,4,9", psnr=45.0, epochs=0, learning_rate=1e-3),
     ],
-    ids=["default", "changed"],
+    ids=["default", "changed", "paper"],
 )
 def test_from_dict_of_to_dict_is_the_same_even_through_json(config):
     assert EncodeConfig.from_dict(config.to_dict()) == config
@@ -35,6 +36,29 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered():
     ("values", "message"),
     [
         ({"engine": "warp"}, "engine is 'warp'; allowed: auto, slab, naive"),
+        ({"profile": "paper", "max_error": 1.0}, "max-error belongs to --profile compact; the profile is paper"),
+        ({"profile": "paper", "max_error_rel": 0.1}, "max-error-rel belongs to --profile compact"),
+        ({"profile": "paper", "ratio": 9.0}, "ratio belongs to --profile compact"),
+        ({"profile": "paper", "effort": 1}, "effort belongs to --profile compact"),
+        ({"profile": "paper", "tile": "whole"}, "tile belongs to --profile compact"),
+        ({"key_frames": [0, 2]}, "key-frames belongs to --profile paper; the profile is compact"),
+        *(
+            ({name: value}, f"{name.replace('_', '-')} belongs to --profile paper")
+            for name, value in {
+                "fold": 3,
+                "embedding_size": 1,
+                "hidden_layers": 2,
+                "width": 8,
+                "epochs": 1,
+                "learning_rate": 0.1,
+                "schedule": "constant",
+                "batch": 64,
+                "tables": "uint8",
+                "engine": "naive",
+            }.items()
+        ),
+        ({"psnr": 40.0, "max_error": 1.0, "ratio": 3.0}, "psnr and max-error and ratio are given; promise one of them"),
+        ({"effort": 2.5}, "effort is 2.5; a whole number"),
         ({"fold": 1}, "fold is 1; allowed: 2 to 64"),
         ({"fold": 2.5}, "fold is 2.5; a whole number"),
         ({"epochs": True}, "epochs is True"),

@@ -23,7 +23,9 @@ from fhash_codec.report import brief_history, brief_quality, curve
 from fhash_formats.container import Container
 from fhash_formats.series import ArraySeries
 
-QUICK = EncodeConfig(epochs=6, width=16)
+QUICK = EncodeConfig(profile="paper", epochs=6, width=16)
+FAST = EncodeConfig(effort=1)
+BOTH = pytest.mark.parametrize("config", [QUICK, FAST], ids=["paper", "compact"])
 
 
 def field(shape=(4, 8, 10, 18), dtype=np.float32) -> np.ndarray:
@@ -36,12 +38,13 @@ def decoded(path) -> np.ndarray:
         return volume[...]
 
 
+@BOTH
 @pytest.mark.parametrize(
     "dtype", ["uint8", "int16", "uint16", "int32", "int64", "uint64", "float16", "float32", "float64", ">f4", ">i2", ">f8"]
 )
-def test_every_number_type_comes_back(tmp_path, dtype):
+def test_every_number_type_comes_back(tmp_path, dtype, config):
     source = ((field() + 110) * 0.7).astype(dtype)
-    figures = fhash_codec.encode(source, tmp_path / "a.fhz", QUICK)
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
     back = decoded(tmp_path / "a.fhz")
     assert back.dtype.kind == "f"
     assert figures["psnr"] > 20
@@ -51,22 +54,24 @@ def test_every_number_type_comes_back(tmp_path, dtype):
         assert volume.info["variable"]["dtype"] == np.dtype(dtype).newbyteorder("=").name
 
 
+@BOTH
 @pytest.mark.parametrize(
     "shape",
     [(1, 8, 10, 18), (4, 1, 10, 18), (4, 8, 1, 18), (4, 8, 10, 1), (2, 2, 2, 2), (1, 1, 1, 7), (3, 1, 1, 1), (1, 1, 1, 1), (7, 3, 5, 11)],
 )
-def test_every_shape_comes_back(tmp_path, shape):
+def test_every_shape_comes_back(tmp_path, shape, config):
     source = np.random.default_rng(0).random(shape, dtype=np.float32)
-    figures = fhash_codec.encode(source, tmp_path / "a.fhz", QUICK)
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
     back = decoded(tmp_path / "a.fhz")
     assert back.shape == shape
     assert np.isfinite(back).all()
     assert figures["max_abs_error"] == pytest.approx(np.abs(back - source).max(), rel=1e-5)
 
 
+@BOTH
 @pytest.mark.parametrize("value", [0.0, 7.25, -1e30, 1e8])
-def test_a_constant_series_comes_back_exactly(tmp_path, value):
-    figures = fhash_codec.encode(np.full((3, 4, 5, 6), value), tmp_path / "a.fhz", QUICK)
+def test_a_constant_series_comes_back_exactly(tmp_path, value, config):
+    figures = fhash_codec.encode(np.full((3, 4, 5, 6), value), tmp_path / "a.fhz", config)
     assert (decoded(tmp_path / "a.fhz") == value).all()
     assert figures["rmse"] == 0
     assert figures["psnr"] is None
@@ -78,7 +83,7 @@ def test_missing_values_stay_out_of_range_coreset_and_figures(tmp_path):
     holes[1] = True
     source[holes] = np.random.default_rng(1).choice([np.nan, np.inf, -np.inf], holes.sum())
     for settings in ({}, {"key_frames": "0,3"}, {"features": ("interval:50:300",)}):
-        config = EncodeConfig(epochs=30, width=16, **settings)
+        config = EncodeConfig(profile="paper", epochs=30, width=16, **settings)
         figures = fhash_codec.encode(source, tmp_path / "a.fhz", config, force=True)
         assert np.isfinite(figures["rmse"])
         assert figures["psnr"] > 15
@@ -94,7 +99,7 @@ def test_missing_values_stay_out_of_range_coreset_and_figures(tmp_path):
 
 def test_the_figures_are_those_of_the_file(tmp_path):
     source = field()
-    config = EncodeConfig(features=("interval:50:200",), epochs=8, width=16)
+    config = EncodeConfig(profile="paper", features=("interval:50:200",), epochs=8, width=16)
     figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
     back = decoded(tmp_path / "a.fhz").astype(np.float64)
     inside = np.isfinite(back)
@@ -119,7 +124,7 @@ def test_the_figures_are_those_of_the_file(tmp_path):
 
 def test_figures_count_the_steps_between_key_frames(tmp_path):
     source = field((5, 6, 8, 10))
-    figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(key_frames="every:2", epochs=30, width=16))
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(profile="paper", key_frames="every:2", epochs=30, width=16))
     steps = {point["step"]: point["psnr"] for point in figures["quality"]["per_step"]}
     assert sorted(steps) == [0, 1, 2, 3, 4]
     assert figures["key_frames"] == [0, 2, 4]
@@ -129,8 +134,8 @@ def test_figures_count_the_steps_between_key_frames(tmp_path):
 @pytest.mark.parametrize(("tables", "loss"), [("float32", 0), ("float16", 1e-3), ("uint8", 0.05)])
 def test_tables_are_stored_as_asked_and_cost_what_they_cost(tmp_path, tables, loss):
     source = field()
-    exact = fhash_codec.encode(source, tmp_path / "exact.fhz", EncodeConfig(epochs=6, width=16, tables="float32"))
-    figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(epochs=6, width=16, tables=tables))
+    exact = fhash_codec.encode(source, tmp_path / "exact.fhz", EncodeConfig(profile="paper", epochs=6, width=16, tables="float32"))
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=6, width=16, tables=tables))
     span = float(np.ptp(source))
     assert np.abs(decoded(tmp_path / "a.fhz") - decoded(tmp_path / "exact.fhz")).max() <= loss * span
     with Container.open(tmp_path / "a.fhz") as container:
@@ -142,7 +147,7 @@ def test_the_file_decodes_to_what_the_torch_model_gives(tmp_path):
     import torch
 
     source = field()
-    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(epochs=6, width=16, tables="float32", key_frames="0,1,3"))
+    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=6, width=16, tables="float32", key_frames="0,1,3"))
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         network = volume._network
         from fhash_codec.architecture import Architecture
@@ -163,17 +168,17 @@ def test_the_file_decodes_to_what_the_torch_model_gives(tmp_path):
 
 
 def test_the_same_input_gives_the_same_bytes_without_timings(tmp_path):
-    config = EncodeConfig(epochs=3, width=16, timings=False)
+    config = EncodeConfig(profile="paper", epochs=3, width=16, timings=False)
     for name in ("a.fhz", "b.fhz"):
         fhash_codec.encode(field(), tmp_path / name, config)
     assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
-    fhash_codec.encode(field(), tmp_path / "c.fhz", EncodeConfig(epochs=3, width=16, timings=False, seed=1))
+    fhash_codec.encode(field(), tmp_path / "c.fhz", EncodeConfig(profile="paper", epochs=3, width=16, timings=False, seed=1))
     assert (tmp_path / "a.fhz").read_bytes() != (tmp_path / "c.fhz").read_bytes()
 
 
 @pytest.mark.parametrize("moment", [1, 30, 48])
 def test_ctrl_c_saves_and_the_same_call_goes_on_to_the_same_bytes(tmp_path, moment):
-    config = EncodeConfig(epochs=3, width=16, timings=False)
+    config = EncodeConfig(profile="paper", epochs=3, width=16, timings=False)
     fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
     path = tmp_path / "run.fhz"
 
@@ -191,43 +196,46 @@ def test_ctrl_c_saves_and_the_same_call_goes_on_to_the_same_bytes(tmp_path, mome
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.fhz", "whole.fhz"]
 
 
-def test_ctrl_c_before_the_training_leaves_nothing(tmp_path):
+@BOTH
+def test_ctrl_c_before_the_training_leaves_nothing(tmp_path, config):
     def interrupt(stage, done, total, note):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fhash_codec.encode(field(), tmp_path / "run.fhz", QUICK, progress=interrupt)
+        fhash_codec.encode(field(), tmp_path / "run.fhz", config, progress=interrupt)
     assert not list(tmp_path.iterdir())
 
 
-def test_an_output_that_is_there_is_kept(tmp_path):
+@BOTH
+def test_an_output_that_is_there_is_kept(tmp_path, config):
     path = tmp_path / "a.fhz"
     path.write_bytes(b"precious")
     with pytest.raises(OutputExistsError, match="--force"):
-        fhash_codec.encode(field(), path, QUICK)
+        fhash_codec.encode(field(), path, config)
     # A failure on the way leaves it alone even with force.
     with pytest.raises(InputError, match="selects nothing"):
         fhash_codec.encode(field(), path, EncodeConfig(features=("interval:1e6:2e6",)), force=True)
     assert path.read_bytes() == b"precious"
-    fhash_codec.encode(field(), path, QUICK, force=True)
+    fhash_codec.encode(field(), path, config, force=True)
     assert decoded(path).shape == field().shape
 
 
-def test_a_missing_folder_is_named_before_any_work(tmp_path):
+@BOTH
+def test_a_missing_folder_is_named_before_any_work(tmp_path, config):
     with pytest.raises(OutputError, match="folder"):
-        fhash_codec.encode(field(), tmp_path / "none" / "a.fhz", QUICK)
+        fhash_codec.encode(field(), tmp_path / "none" / "a.fhz", config)
 
 
 def test_a_promise_that_is_missed_is_an_error_but_the_file_is_there(tmp_path):
     with pytest.raises(QualityError, match="150 dB were asked for; the file is written"):
-        fhash_codec.encode(field(), tmp_path / "a.fhz", EncodeConfig(epochs=1, width=16, psnr=150.0))
+        fhash_codec.encode(field(), tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=1, width=16, psnr=150.0))
     assert decoded(tmp_path / "a.fhz").shape == field().shape
-    figures = fhash_codec.encode(field(), tmp_path / "b.fhz", EncodeConfig(epochs=1, width=16, psnr=5.0))
+    figures = fhash_codec.encode(field(), tmp_path / "b.fhz", EncodeConfig(profile="paper", epochs=1, width=16, psnr=5.0))
     assert figures["psnr"] > 5
 
 
 def test_quality_improves_with_training(tmp_path):
-    psnr = [fhash_codec.encode(field(), tmp_path / f"{n}.fhz", EncodeConfig(epochs=n))["psnr"] for n in (1, 5, 25)]
+    psnr = [fhash_codec.encode(field(), tmp_path / f"{n}.fhz", EncodeConfig(profile="paper", epochs=n))["psnr"] for n in (1, 5, 25)]
     assert psnr[0] < psnr[1] < psnr[2]
     assert psnr[2] > 40
 
@@ -238,7 +246,7 @@ def test_diff_refuses_another_shape(encoded):
 
 
 def test_settings_that_diverge_are_reported(tmp_path):
-    config = EncodeConfig(epochs=20, learning_rate=1.0, schedule="constant", hidden_layers=8, width=64)
+    config = EncodeConfig(profile="paper", epochs=20, learning_rate=1.0, schedule="constant", hidden_layers=8, width=64)
     try:
         figures = fhash_codec.encode(field(), tmp_path / "a.fhz", config)
     except fhash_codec.TrainingError as error:
@@ -247,13 +255,14 @@ def test_settings_that_diverge_are_reported(tmp_path):
         assert np.isfinite(figures["rmse"])
 
 
-def test_the_input_is_never_replaced(tmp_path):
+@BOTH
+def test_the_input_is_never_replaced(tmp_path, config):
     np.save(tmp_path / "a.npy", field())
     kept = (tmp_path / "a.npy").read_bytes()
     (tmp_path / "link.fhz").symlink_to("a.npy")
     for output in ("a.npy", "link.fhz"):
         with pytest.raises(InputError, match=r"a container is not a \.npy file|is the input itself"):
-            fhash_codec.encode(tmp_path / "a.npy", tmp_path / output, QUICK, force=True)
+            fhash_codec.encode(tmp_path / "a.npy", tmp_path / output, config, force=True)
     mask = tmp_path / "mask.fhz"
     np.save(tmp_path / "mask.npy", field() > 50)
     mask.symlink_to("mask.npy")
@@ -265,10 +274,10 @@ def test_the_input_is_never_replaced(tmp_path):
 def test_a_mask_in_memory_is_a_feature(tmp_path):
     source = field()
     marked = source[0] > 50
-    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(epochs=1, dilation=0), mask=marked)
+    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(effort=1, dilation=0), mask=marked)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         np.testing.assert_array_equal(volume.occupancy(3), marked)
-    both = EncodeConfig(epochs=1, dilation=0, features=("interval:-300:-50",))
+    both = EncodeConfig(effort=1, dilation=0, features=("interval:-300:-50",))
     fhash_codec.encode(source, tmp_path / "b.fhz", both, mask=source > 50)
     with fhash_codec.open(tmp_path / "b.fhz") as volume:
         np.testing.assert_array_equal(volume.occupancy(2), (source[2] > 50) | (source[2] <= -50))
@@ -276,14 +285,15 @@ def test_a_mask_in_memory_is_a_feature(tmp_path):
         fhash_codec.encode(source, tmp_path / "c.fhz", QUICK, mask=marked[1:])
 
 
-def test_labelled_arrays_keep_their_labels(tmp_path):
+@BOTH
+def test_labelled_arrays_keep_their_labels(tmp_path, config):
     import xarray
 
     times = np.array(["2000-01-01", "2000-01-02", "2000-01-04", "2000-01-05"], dtype="datetime64[s]")
     labelled = xarray.DataArray(
         field(), dims=("time", "lev", "lat", "lon"), coords={"time": times, "lev": 2.0 * np.arange(8)}, name="theta", attrs={"units": "K"}
     )
-    fhash_codec.encode(labelled, tmp_path / "a.fhz", QUICK)
+    fhash_codec.encode(labelled, tmp_path / "a.fhz", config)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         assert (volume.name, volume.units, volume.coords["z"].name) == ("theta", "K", "lev")
         assert volume.coords["t"].attributes["units"] == "seconds since 1970-01-01"
@@ -291,9 +301,11 @@ def test_labelled_arrays_keep_their_labels(tmp_path):
         np.testing.assert_array_equal(volume.coords["z"].values, 2.0 * np.arange(8))
 
 
-def test_64_bit_integers_are_compared_exactly(tmp_path):
+# A float64 of that size is a multiple of 256: no decoded value can be nearer.
+@pytest.mark.parametrize("config", [QUICK, EncodeConfig(effort=1, psnr=10.0)], ids=["paper", "compact"])
+def test_64_bit_integers_are_compared_exactly(tmp_path, config):
     source = 2**60 + np.arange(1344).reshape(4, 6, 7, 8)
-    figures = fhash_codec.encode(source, tmp_path / "a.fhz", QUICK)
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
     back = decoded(tmp_path / "a.fhz")
     exact = [abs(int(a) - int(b)) for a, b in zip(source.ravel(), back.ravel(), strict=True)]
     assert figures["max_abs_error"] == max(exact)
@@ -303,14 +315,14 @@ def test_64_bit_integers_are_compared_exactly(tmp_path):
 def test_a_promise_cannot_hold_where_the_psnr_is_unknown(tmp_path):
     source = (2 * np.random.default_rng(0).random((2, 4, 5, 6)) - 1) * 1.7e308
     with pytest.raises(QualityError, match="an unknown PSNR"):
-        fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(epochs=1, psnr=300.0))
-    figures = fhash_codec.encode(np.zeros((2, 4, 5, 6)), tmp_path / "b.fhz", EncodeConfig(epochs=1, psnr=300.0))
+        fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=1, psnr=300.0))
+    figures = fhash_codec.encode(np.zeros((2, 4, 5, 6)), tmp_path / "b.fhz", EncodeConfig(profile="paper", epochs=1, psnr=300.0))
     assert figures["rmse"] == 0
 
 
 def test_a_failure_after_the_training_leaves_its_checkpoint(tmp_path, monkeypatch):
     monkeypatch.setattr("fhash_codec.encoding.KEEP_SECONDS", 0.0)
-    config = EncodeConfig(epochs=2, width=16, timings=False)
+    config = EncodeConfig(profile="paper", epochs=2, width=16, timings=False)
     fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
     trained = []
 
@@ -341,13 +353,13 @@ def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_training(tmp_path
 
 def test_long_names_and_detours_in_paths_work(tmp_path):
     for path in (tmp_path / f"{'a' * 245}.fhz", tmp_path / "none" / ".." / "b.fhz"):
-        fhash_codec.encode(field(), path, EncodeConfig(epochs=1, width=16, timings=False))
+        fhash_codec.encode(field(), path, EncodeConfig(profile="paper", epochs=1, width=16, timings=False))
     assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_settings_may_be_given_as_python_values():
     assert EncodeConfig(features="all").features == ("all",)
-    assert EncodeConfig(key_frames=[0, 3]).key_frames == "0,3"
+    assert EncodeConfig(profile="paper", key_frames=[0, 3]).key_frames == "0,3"
     with pytest.raises(InputError, match="mask="):
         EncodeConfig(features=(np.ones(3, bool),))
 

@@ -116,13 +116,13 @@ def test_checkpoints_come_by_the_clock_too(coreset):
 
 def test_a_checkpoint_belongs_to_its_coreset_and_settings(coreset, tmp_path):
     output = tmp_path / "run.fhz"
-    one = checkpoint_path(output, coreset, EncodeConfig())
+    one = checkpoint_path(output, coreset, EncodeConfig(profile="paper"))
     assert one.parent == tmp_path
-    assert one == checkpoint_path(output, coreset, EncodeConfig(psnr=50.0, tables="float32", timings=False))
-    assert one != checkpoint_path(output, coreset, EncodeConfig(epochs=3))
+    assert one == checkpoint_path(output, coreset, EncodeConfig(profile="paper", psnr=50.0, tables="float32", timings=False))
+    assert one != checkpoint_path(output, coreset, EncodeConfig(profile="paper", epochs=3))
     series = ArraySeries(smooth() + 0.5 * smooth() ** 2)
     other = build_coreset(series, scan(series, silent), range(3), [Everything()], 0, silent)
-    assert one != checkpoint_path(output, other, EncodeConfig())
+    assert one != checkpoint_path(output, other, EncodeConfig(profile="paper"))
 
 
 def test_a_damaged_checkpoint_is_named_not_ignored(tmp_path):

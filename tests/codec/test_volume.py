@@ -163,7 +163,7 @@ def test_gradients_are_per_vertex_and_per_step(volume):
 def test_physical_times_may_be_uneven_and_descend(tmp_path, times):
     field = np.linspace(0, 1, 5, dtype=np.float32)[:, None, None, None] * np.ones((5, 2, 3, 4), np.float32)
     series = ArraySeries(field, coords={"t": Coordinate(name="time", values=np.array(times), attributes={"units": "h"})})
-    fhash_codec.encode(series, tmp_path / "t.fhz", EncodeConfig(epochs=2, width=8))
+    fhash_codec.encode(series, tmp_path / "t.fhz", EncodeConfig(effort=1))
     with fhash_codec.open(tmp_path / "t.fhz") as volume:
         assert volume.coords["t"].attributes == {"units": "h"}
         assert volume.step_of_time(17.0) == pytest.approx(2.5 if times[0] == 2 else 1.5)
@@ -177,7 +177,7 @@ def test_times_that_do_not_ascend_are_warned_of_and_steps_stand_for_them(tmp_pat
         np.random.default_rng(0).random((3, 2, 3, 4)), coords={"t": Coordinate(name="time", values=np.array([0.0, 0.0, 1.0]))}
     )
     with pytest.warns(fhash_codec.FhashWarning, match="do not strictly ascend"):
-        fhash_codec.encode(series, tmp_path / "t.fhz", EncodeConfig(epochs=1, width=8))
+        fhash_codec.encode(series, tmp_path / "t.fhz", EncodeConfig(effort=1))
     with fhash_codec.open(tmp_path / "t.fhz") as volume:
         assert volume.key_times.key_index(1.5) == 1.5
         with pytest.raises(InputError, match="ask for a step"):
@@ -239,7 +239,7 @@ def test_decoding_a_frame_takes_no_more_memory_for_more_frames(tmp_path):
     for steps in (4, 32):
         path = tmp_path / f"{steps}.fhz"
         field = np.random.default_rng(0).random((steps, 16, 24, 24), dtype=np.float32)
-        fhash_codec.encode(field, path, EncodeConfig(epochs=1, width=8))
+        fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=8))
         with fhash_codec.open(path) as volume:
             volume.read(1)
             tracemalloc.start()

@@ -18,11 +18,13 @@ HERE = Path(__file__).parent
 TOLERANCE = 1e-5  # of the range: float32 arithmetic in another order
 
 GOLDENS = {
-    "paper-1.0-plain": EncodeConfig(width=8, timings=False, tables="float32"),
+    "paper-1.0-plain": EncodeConfig(profile="paper", width=8, timings=False, tables="float32"),
     "paper-1.0-feature": EncodeConfig(
-        width=8, timings=False, features=("interval:0.5:2", "isosurface:0"), key_frames="0,1,4", tables="float16"
+        profile="paper", width=8, timings=False, features=("interval:0.5:2", "isosurface:0"), key_frames="0,1,4", tables="float16"
     ),
-    "paper-1.0-linear-uint8": EncodeConfig(hidden_layers=0, embedding_size=1, fold=3, timings=False, key_frames="every:2", tables="uint8"),
+    "paper-1.0-linear-uint8": EncodeConfig(
+        profile="paper", hidden_layers=0, embedding_size=1, fold=3, timings=False, key_frames="every:2", tables="uint8"
+    ),
 }
 
 

@@ -88,7 +88,7 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
         attributes = Record(arrays[name].attributes, f"array {name} attribute ")
         if name.startswith("coords/") and "name" in arrays[name].attributes:
             attributes.text("name")
-        if name.startswith("tables/") and arrays[name].dtype == np.uint8:
+        if name.startswith("tables/") and arrays[name].dtype == np.uint8 and header["model"]["profile"] == "paper":
             attributes.number("offset")
             attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
     if TRANSFORM_FEATURE not in header["required_features"]:

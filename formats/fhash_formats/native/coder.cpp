@@ -210,6 +210,7 @@ template <int MODE> struct Coder {
 
     // The magnitude next to |scaled| that costs least: it, one less, or zero.
     template <class Predict> FHASH_INLINE int choose(double s, int p, Predict predict) {
+        s = s < 1e9 ? s : 1e9;  // also what is no number
         const int nearest = (int)(s + 0.5);
         if (nearest == 0 || nearest >= UNARY) return nearest;
         Prediction other;

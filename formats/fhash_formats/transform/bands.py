@@ -18,7 +18,7 @@ from fhash_formats.transform.spec import AxisTransform, TransformSpec
 __all__ = ["COLUMNS", "Table", "band_table", "single_band"]
 
 Table = npt.NDArray[np.int32]
-"""(bands, COLUMNS): low[4], high[4], kind, then four times (band or -1, shift[4]); a shift says by how many halvings the other is coarser."""
+"""(bands, COLUMNS): low[4], high[4], kind, then four times (band or -1, shift[4]); a shift is the number of halvings in between."""
 COLUMNS = 29
 _NONE = [-1, 0, 0, 0, 0]
 _KLT_PLANE = 13

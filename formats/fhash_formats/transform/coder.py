@@ -54,9 +54,10 @@ def encode_integers(
         return Encoded(data=data, integers=integers)
     library.fhash_encode.restype = ctypes.c_int64
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
-    capacity = max(4096, integers.size // 2)
+    capacity, given = max(4096, integers.size // 2), integers
     while True:
         buffer = np.empty(capacity, dtype=np.uint8)
+        integers = given.copy()
         size = library.fhash_encode(
             _pointer(integers),
             _pointer(chosen),
@@ -69,8 +70,8 @@ def encode_integers(
         )
         if size <= capacity:
             return Encoded(data=buffer[:size].tobytes(), integers=integers)
-        # What was chosen the first time stays chosen: the second time only the room is larger.
-        capacity, chosen = size, None
+        # Once more with the same integers: those chosen would be coded otherwise, as rows that became empty are told apart.
+        capacity = size
 
 
 def decode_integers(data: bytes | memoryview, shape: tuple[int, ...], table: Table) -> Integers:
@@ -98,7 +99,7 @@ def decode_integers(data: bytes | memoryview, shape: tuple[int, ...], table: Tab
 
 def encode_block(integers: Integers) -> bytes:
     """Code a small block of int32 integers (four axes) that stands alone."""
-    return encode_integers(integers, single_band(integers.shape)).data
+    return encode_integers(integers, single_band(integers.shape)).data if integers.size else b""
 
 
 def decode_block(data: bytes | memoryview, shape: tuple[int, ...]) -> Integers:

@@ -280,6 +280,7 @@ def _context_mix(
 
 
 def _choose(s: float, p: int, price: float, first: int, second: int, memory: Memory, tables: Tables, work: Work) -> int:
+    s = s if s < 1e9 else 1e9
     nearest = int(s + 0.5)
     if nearest == 0 or nearest >= UNARY:
         return nearest

@@ -45,13 +45,13 @@ def quantise(coefficients: Values, step: float, rounding: float = ROUNDING) -> t
 
 def dequantise(integers: npt.NDArray[np.int32], step: float, offsets: tuple[int, int, int], dtype: npt.DTypeLike) -> Values:
     """sign(q) (|q| + offset / OFFSET_UNIT) step in a floating type; offsets for |q| of 1, 2 and more; 0 for 0."""
-    kind = np.dtype(dtype)
+    kind: np.dtype[Any] = np.dtype(dtype)
     one, two, more = (offset / OFFSET_UNIT for offset in offsets)
     library = native.library()
     if library is None:
         magnitude = np.abs(integers)
         offset = np.array([0.0, one, two, more], dtype=kind)[np.minimum(magnitude, 3)]
-        value = (magnitude.astype(kind) + offset) * kind.type(step)
+        value: Values = (magnitude.astype(kind) + offset) * np.array(step, dtype=kind)
         return np.where(integers < 0, -value, value)
     result, source = np.empty(integers.shape, kind), np.ascontiguousarray(integers)
     getattr(library, f"fhash_dequantise_f{kind.itemsize * 8}")(

@@ -71,13 +71,15 @@ def encode_tile(
     passes: int = 1,
     own: bool = False,
     keep_missing: bool = True,
+    filled: bool = False,
 ) -> CodedTile:
     """Code values (t, z, y, x) of any real type.
 
     care: what counts (bool, same shape; None is all). Values that are not finite never count. weight: squared steps that a bit is worth to
     the rate-distortion optimisation, 0 for none. error: a bound on |decoded - value| wherever it counts, in units of the values: kept
     strictly, exactly stored if need be. rounds: projections of what does not count. passes: 2 codes the chosen integers once more.
-    own: put the settings into the stream. keep_missing: bring back values that are not finite as they were.
+    own: put the settings into the stream. keep_missing: bring back values that are not finite as they were. filled: values that
+    do not count are sensible already (a border that was repeated), so that nothing better is looked for.
     """
     finite = np.isfinite(values) if values.dtype.kind == "f" else np.ones(values.shape, bool)
     whole = bool(finite.all())
@@ -89,10 +91,12 @@ def encode_tile(
         return CodedTile(data=_assemble(settings if own else None, missing, b"", None, None), decoded=_restore(decoded, missing), nonzero=0)
     transform = transform_for(settings, values.shape)
     table = band_table(settings.transform, values.shape)
-    target = (values if every else np.where(counts, values, values.dtype.type(0))).astype(settings.dtype)
+    target = (values if whole else np.where(finite, values, values.dtype.type(0))).astype(settings.dtype)
     target -= settings.dtype.type(settings.center)
-    if not every:
-        target[~counts] = 0
+    if not every and not (filled and whole):
+        if not whole:
+            # A running sum has one order on every machine, a mean has not.
+            target[~finite] = np.cumsum(target[counts], dtype=np.float64)[-1] / np.count_nonzero(counts)
         target = _filled(target, counts, transform, settings)
     coefficients = transform.forward(target)
     for _ in range(rounds):
@@ -252,9 +256,10 @@ def _whole_difference(one: Values, other: Values) -> npt.NDArray[np.uint64]:
 
 
 def _filled(target: Values, counts: Mask, transform: Transform, settings: Settings) -> Values:
-    """Values that do not count, filled so that the coefficients are few: thresholds fall while what counts is put back each time."""
-    # A running sum has one order on every machine, a mean has not.
-    target[~counts] = np.cumsum(target[counts], dtype=np.float64)[-1] / np.count_nonzero(counts)
+    """Values that do not count, changed so that the coefficients are few: thresholds fall while what counts is put back each time.
+
+    What is large in the source beyond the coreset stays, because it often goes on from what is inside; what is small goes.
+    """
     for threshold in _FILLING:
         coefficients = transform.forward(target)
         limit = settings.dtype.type(threshold * settings.step)

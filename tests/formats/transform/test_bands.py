@@ -88,7 +88,8 @@ def test_every_kind_of_reference_is_made() -> None:
     references = band_table(spec, (8, 8, 32, 32))[:, 9:].reshape(-1, 4, 5)
     assert (references[:, :, 0] >= 0).any(axis=0).all()
     packets = spec_of(("haar", "5/3", "9/7", "5/3"), 3, (8, 8, 32, 32))
-    assert list((band_table(packets, (8, 8, 32, 32))[:, 9:].reshape(-1, 4, 5)[:, :, 0] >= 0).any(axis=0)) == [True, True, True, False]
+    seen = band_table(packets, (8, 8, 32, 32))[:, [9, 14, 19, 24]] >= 0
+    assert seen.any(axis=0).tolist() == [True, True, True, False]
 
 
 @pytest.mark.parametrize(("spec", "shape"), CASES)
