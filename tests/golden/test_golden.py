@@ -12,7 +12,8 @@ from zarr.storage import ZipStore
 import fhash_codec
 
 HERE = Path(__file__).parent
-NAMES = ["paper-1.0-plain", "paper-1.0-feature", "paper-1.0-linear-uint8"]
+COMPACT = ["compact-1.1-bound", "compact-1.1-psnr"]
+NAMES = ["paper-1.0-plain", "paper-1.0-feature", "paper-1.0-linear-uint8", *COMPACT]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -26,6 +27,14 @@ def test_golden_containers_decode_to_their_values(name):
         assert (volume.name, volume.units) == ("density", "kg m-3")
         assert volume.step_of_time(2.25) == 3
         volume.verify()
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize("name", COMPACT)
+def test_compact_goldens_decode_to_the_same_bits_on_every_engine(name, native, monkeypatch):
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    with np.load(HERE / f"{name}.npz") as expected, fhash_codec.open(HERE / f"{name}.fhz") as volume:
+        np.testing.assert_array_equal(volume[...], expected["whole"])
 
 
 def test_no_golden_is_left_untested():

@@ -94,10 +94,7 @@ def encode_tile(
     target = (values if whole else np.where(finite, values, values.dtype.type(0))).astype(settings.dtype)
     target -= settings.dtype.type(settings.center)
     if not every and not (filled and whole):
-        if not whole:
-            # A running sum has one order on every machine, a mean has not.
-            target[~finite] = np.cumsum(target[counts], dtype=np.float64)[-1] / np.count_nonzero(counts)
-        target = _filled(target, counts, transform, settings)
+        target = _filled(target, counts, finite, transform, settings)
     coefficients = transform.forward(target)
     for _ in range(rounds):
         integers, scaled = quantise(coefficients, settings.step)
@@ -255,17 +252,27 @@ def _whole_difference(one: Values, other: Values) -> npt.NDArray[np.uint64]:
     return np.where(one > other, one - other, other - one).astype(np.uint64)
 
 
-def _filled(target: Values, counts: Mask, transform: Transform, settings: Settings) -> Values:
+def _filled(target: Values, counts: Mask, finite: Mask, transform: Transform, settings: Settings) -> Values:
     """Values that do not count, changed so that the coefficients are few: thresholds fall while what counts is put back each time.
 
-    What is large in the source beyond the coreset stays, because it often goes on from what is inside; what is small goes.
+    From two beginnings: the source's own values, of which only what is large remains, because it often goes on from what is inside; and
+    the mean of what counts. That with the fewer bits in its integers is taken.
     """
-    for threshold in _FILLING:
-        coefficients = transform.forward(target)
-        limit = settings.dtype.type(threshold * settings.step)
-        coefficients[np.abs(coefficients) < limit] = 0
-        target = np.where(counts, target, transform.inverse(coefficients))
-    return target
+    # A running sum has one order on every machine, a mean has not.
+    mean = settings.dtype.type(np.cumsum(target[counts], dtype=np.float64)[-1] / np.count_nonzero(counts))
+    best, least = target, -1
+    for start in (np.where(finite, target, mean), np.where(counts, target, mean)):
+        now = start
+        for threshold in _FILLING:
+            coefficients = transform.forward(now)
+            limit = settings.dtype.type(threshold * settings.step)
+            coefficients[np.abs(coefficients) < limit] = 0
+            now = np.where(counts, now, transform.inverse(coefficients))
+        integers = quantise(transform.forward(now), settings.step)[0]
+        bits = int(np.frexp(integers.astype(np.float64))[1].sum(dtype=np.int64))
+        if least < 0 or bits < least:
+            best, least = now, bits
+    return best
 
 
 def _free(target: Values, rebuilt: Values, counts: Mask, every: bool, settings: Settings) -> Mask:
