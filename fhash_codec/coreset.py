@@ -104,6 +104,8 @@ def find_extent(
     if not scan.missing and any(isinstance(feature, Everything) for feature in features):
         # Nothing to look at: one mask of ones for all.
         whole = np.packbits(np.ones((z, y, x), dtype=bool))
+        for done in range(len(key_frames)):
+            progress("selecting", done + 1, len(key_frames), "")
         return Extent(
             box=((0, z), (0, y), (0, x)),
             key_frames=tuple(key_frames),

@@ -291,7 +291,7 @@ class Volume:
             return np.ones(size, dtype=bool)
         stored = arrays["occupancy/bits"]
         bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
-        return unpack(between(bits[0], bits[-1]), size)
+        return unpack(bits[0] & bits[-1] if self.profile == "compact" else between(bits[0], bits[-1]), size)
 
     def _occupied_at(self, key: float) -> npt.NDArray[np.bool_]:
         return self._occupied(int(np.floor(key)), int(np.ceil(key)))

@@ -47,6 +47,11 @@ class Blocks:
         other._whole = self._whole
         return other
 
+    @property
+    def held(self) -> bool:
+        """Whether the whole box is kept in memory."""
+        return prod(self.shape) * self.dtype.itemsize <= HELD_BYTES
+
     def indices(self) -> Iterator[Index]:
         """All tiles in C order."""
         yield from product(*(range(n) for n in self.grid))
@@ -69,7 +74,7 @@ class Blocks:
     def _layer(self, t: int) -> tuple[Values, Care]:
         """Values and mask of one layer of tiles, (up to tile t, z, y, x of the box)."""
         steps = range(t * self.tile[0], min((t + 1) * self.tile[0], self.shape[0]))
-        if prod(self.shape) * self._series.dtype.itemsize <= HELD_BYTES:
+        if self.held:
             if self._whole is None:
                 self._whole = self._load(range(self.shape[0]))
             values, care = self._whole

@@ -21,7 +21,7 @@ from fhash_formats.transform.tile import Shape
 Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
 NONE = AxisTransform(kind="none")
 BASIS_LENGTH = 128
-"""A longer axis gets no basis of its own: its factors would cost too much."""
+"""A longer axis gets no basis of its own: its factors would cost too much. Nor does a series that is not in memory."""
 
 
 def wavelet(kind: str, depth: int, length: int) -> AxisTransform:
@@ -50,7 +50,7 @@ def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: boo
             tuple(_known(axis, length) for axis, length in zip(settings.transform.axes, shape, strict=True)),
         )
         trials = [usual, own]
-        if max(shape[1:]) <= BASIS_LENGTH and min(shape[1:]) > 1:
+        if bases.possible(*shape[1:]):
             trials.append((usual[0], *(bases.along(axis) for axis in (1, 2, 3))))
         costs = list(map(lambda axes: _judge(sample, settings, axes, way), trials))  # type: ignore[arg-type]
         best = min(costs)
@@ -108,7 +108,7 @@ def _planes(shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
         if 2 ** (depth - 1) < max(y, x):
             pair = _plane(kind, depth, y, x)
             yield {2: pair[0], 3: pair[1]}
-    if min(y, x) > 1 and max(y, x) <= BASIS_LENGTH:
+    if bases.possible(y, x):
         yield {2: bases.along(2), 3: bases.along(3)}
 
 
@@ -120,7 +120,7 @@ def _along(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTra
     for kind, depth in (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3)):
         if 2 ** (depth - 1) < length:
             yield {axis: AxisTransform(kind=kind, depth=depth)}
-    if length <= BASIS_LENGTH:
+    if bases.possible(length):
         yield {axis: bases.along(axis)}
 
 
@@ -131,10 +131,16 @@ class _Bases:
         self._sample, self._settings = sample, settings
         self._known: dict[int, AxisTransform] = {}
 
+    def possible(self, *lengths: int) -> bool:
+        """Whether axes of these lengths can have one."""
+        return self._sample.blocks.held and min(lengths) > 1 and max(lengths) <= BASIS_LENGTH
+
     def along(self, axis: int) -> AxisTransform:
         if axis not in self._known:
-            # The bases serve all tiles, so that their factors are worth more precision than the sample alone would say.
-            gram = np.add.reduce(self._sample.map(lambda tile: self._gram(tile[0], tile[1], axis))) * self._sample.share
+            # Of all tiles: what the basis leaves out, no coefficient of any of them could bring back.
+            gram = np.zeros((length := self._sample.tiles[0][0].shape[axis], length))
+            for part in self._sample.map_all(lambda tile: self._gram(tile[0], tile[1], axis)):
+                gram += part
             self._known[axis] = AxisTransform(kind="klt", basis=fit_basis(gram, self._settings.step))
         return self._known[axis]
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fhash_codec.compact.blocks import Blocks, Care, Index, Values
-from fhash_codec.compact.choice import refit
+from fhash_codec.compact.choice import refit, usual_transform
 from fhash_codec.compact.plan import DEFAULT_PSNR, Planned, goal_of, plan
 from fhash_codec.compact.sample import SLOPE, SMALLEST_STEP, Outcome, code, pool, total
 from fhash_codec.config import EncodeConfig
@@ -63,7 +63,7 @@ def code_series(series: Series, found: Found, config: EncodeConfig, progress: Pr
         if config.effort == 1 and goal.psnr is not None:
             # One pass should do: aim a little higher than the sample says.
             planned = replace(planned, settings=replace(planned.settings, step=planned.settings.step * (1 - EXCEEDED / SLOPE)))
-        for attempt in range(PASSES):
+        for attempt in range(2 * PASSES):
             streams, outcome = _code_all(planned, workers, progress)
             table = Table(planned=planned, streams=streams, outcome=outcome)
             if goal.psnr is None or data_range == 0:
@@ -76,6 +76,14 @@ def code_series(series: Series, found: Found, config: EncodeConfig, progress: Pr
             enough = not missed and reached < goal.psnr + (EXCEEDED if config.effort > 1 else 4 * EXCEEDED)
             if enough or math.isinf(reached) or (attempt >= 1 and not missed):
                 break
+            if attempt + 1 == PASSES:
+                if not missed or all(axis.basis is None for axis in planned.settings.transform.axes):
+                    break
+                # The data's own bases do not reach this far; wavelets do.
+                tries.clear()
+                usual = usual_transform(planned.blocks.tile)
+                planned = replace(planned, settings=replace(planned.settings, transform=usual))
+                continue
             before = planned.settings.step
             planned = replace(planned, settings=_nearer(planned.settings, reached, goal.psnr + SAFE, tries, margin=0.005 * 2**attempt))
             if planned.sample is not None and planned.settings.step < before / 1.5:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from math import prod
@@ -83,6 +83,8 @@ def code(values: Values, care: Care, settings: Settings, way: Way) -> tuple[Code
 
 FEW_TILES, FEW_VERTICES = 8, 12 << 20
 """So few tiles differ too much to stand for each other: all are taken, if together they have at most so many vertices."""
+GOLDEN = 0.6180339887498949
+BATCH = 16
 PIECE = 1 << 14
 """Values whose errors are taken at once: float64 copies of them stay in the cache."""
 
@@ -120,7 +122,7 @@ class Sample:
     """Tiles in memory.
 
     Attributes:
-        tiles: (values, what counts). share: how many tiles of the series each stands for.
+        tiles: (values, what counts). share: how many tiles of the series each stands for. blocks: the whole series.
     """
 
     def __init__(self, blocks: Blocks, most_vertices: int, pool: ThreadPoolExecutor) -> None:
@@ -129,17 +131,25 @@ class Sample:
         wanted = min(len(indices), max(1, most_vertices // prod(blocks.tile)))
         if prod(blocks.shape) <= FEW_VERTICES and len(indices) <= FEW_TILES:
             wanted = len(indices)
-        # An odd stride through the grid, so that no column of it is preferred; in C order, for the reader's sake.
-        chosen = sorted({indices[(2 * number + 1) * len(indices) // (2 * wanted)] for number in range(wanted)})
+        # By the golden ratio, so that no row or column of the grid is preferred; then in C order, for the reader's sake.
+        order = sorted(range(len(indices)), key=lambda number: number * GOLDEN % 1.0)
+        chosen = [indices[number] for number in sorted(order[:wanted])]
         tiles = [blocks.read(index) for index in chosen]
         counting = [tile for tile in tiles if tile[1] is None or tile[1].any()]
         self.tiles = counting or tiles[:1]
         self.share = len(indices) / len(chosen)
+        self.blocks = blocks
         self._pool = pool
 
     def map(self, work: Callable[[tuple[Values, Care]], Result]) -> list[Result]:
         """The results for all tiles, in order, by all processors."""
         return list(self._pool.map(work, self.tiles))
+
+    def map_all(self, work: Callable[[tuple[Values, Care]], Result]) -> Iterator[Result]:
+        """The results for all tiles of the series, some at a time."""
+        indices = list(self.blocks.indices())
+        for start in range(0, len(indices), BATCH):
+            yield from self._pool.map(work, [self.blocks.read(index) for index in indices[start : start + BATCH]])
 
     def run(self, settings: Settings, way: Way) -> Outcome:
         """Code all tiles."""
