@@ -300,3 +300,17 @@ def test_more_effort_is_no_larger_and_keeps_the_promise(tmp_path, monkeypatch):
     assert sizes[2] < 1.15 * sizes[1]
     assert [gain["what"] for gain in found[0]["gains"]] == ["start", "all tiles"]
     assert any(gain["what"].startswith("head") for gain in found[2]["gains"])
+
+
+@pytest.mark.parametrize("effort", [1, 2])
+def test_a_series_larger_than_memory_is_coded_layer_by_layer(tmp_path, monkeypatch, effort):
+    """A layer of tiles in time is held at a time; the promise is the same."""
+    monkeypatch.setattr("fhash_codec.compact.blocks.HELD_BYTES", 1000)
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 3, n) for n in (9, 6, 20, 17)), indexing="ij")
+    values = (np.sin(2 * x + t) * np.cos(y * z)).astype(np.float32)
+    figures = fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(psnr=40.0, effort=effort, tile="4x6x10x17"))
+    assert figures["psnr"] >= 40
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert volume.chunks == (4, 6, 10, 17)
+        error = volume[...].astype(np.float64) - values
+    assert 20 * np.log10(np.ptp(values) / np.sqrt(np.mean(error**2))) >= 40 - 1e-3
