@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 
-__all__ = ["OFFSET_UNIT", "ROUNDING", "centroids", "dequantise", "quantise"]
+__all__ = ["OFFSET_UNIT", "ROUNDING", "dequantise", "quantise"]
 
 OFFSET_UNIT = 128
 """Reconstruction offsets are whole numbers of this part of a step."""
@@ -61,15 +61,3 @@ def dequantise(integers: npt.NDArray[np.int32], step: float, offsets: tuple[int,
         ctypes.c_void_p(result.ctypes.data),
     )
     return result
-
-
-def centroids(scaled: npt.NDArray[np.float32], integers: npt.NDArray[np.int32]) -> tuple[int, int, int]:
-    """Mean offsets of |c| / step from its integer, for |q| of 1, 2 and more, in units of 1 / OFFSET_UNIT, within half a step."""
-    chosen = np.flatnonzero(integers)
-    magnitude = np.abs(integers.ravel()[chosen])
-    rest = np.abs(scaled.ravel()[chosen].astype(np.float64)) - magnitude
-    found = []
-    for mask in (magnitude == 1, magnitude == 2, magnitude >= 3):
-        mean = float(rest[mask].mean()) if mask.any() else 0.0
-        found.append(int(np.clip(np.rint(mean * OFFSET_UNIT), -OFFSET_UNIT // 2, OFFSET_UNIT // 2)))
-    return found[0], found[1], found[2]

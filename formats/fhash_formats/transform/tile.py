@@ -113,7 +113,7 @@ def encode_tile(
     base = _reconstruct(coded.integers, transform, settings)
     residual = None
     if error is not None:
-        found = _residual(values, base, counts, error, settings.quantum)
+        found = _residual(values, base, counts, settings.quantum)
         if found is None:
             return exact_tile(values, settings if own else None)
         residual = found if found.any() else None
@@ -237,7 +237,7 @@ def _cast(values: Values, dtype: np.dtype[Any]) -> Values:
     return np.clip(np.rint(np.nan_to_num(values.astype(np.float64))), low, high).astype(dtype)
 
 
-def _residual(values: Values, base: Values, counts: Mask, error: float, quantum: float) -> npt.NDArray[np.int32] | None:
+def _residual(values: Values, base: Values, counts: Mask, quantum: float) -> npt.NDArray[np.int32] | None:
     """Whole quanta to add where the error is too large; None where they would not fit."""
     with np.errstate(all="ignore"):
         rest = np.where(counts, values.astype(np.float64) - base.astype(np.float64), 0.0)
