@@ -116,7 +116,7 @@ def _compact(
         "feature_bounding_box": [list(span) for span in found.extent.box],
         "features": [str(feature) for feature in found.features],
         "coreset_fraction": found.extent.fraction,
-        "model": compact_header(found, table, config),
+        "model": compact_header(table, config),
         "config": {name: value for name, value in config.to_dict().items() if value != defaults[name]} | promise(config),
         "training": training,
         "history": {name: [point.get(name) for point in history] for name in (history[0] if history else ())},

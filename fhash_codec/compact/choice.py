@@ -34,7 +34,7 @@ def usual_transform(shape: Shape) -> TransformSpec:
     """A good guess without trial: 9/7 everywhere, deepest in the plane."""
     t, z, y, x = shape
     plane = min(4, max(1, max(y, x).bit_length() - 2))
-    return TransformSpec(axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), _plane("9/7", plane, y, x)[0], _plane("9/7", plane, y, x)[1]))
+    return TransformSpec(axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), *_plane("9/7", plane, y, x)))
 
 
 def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: bool = False) -> tuple[Settings, float]:
@@ -45,14 +45,12 @@ def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: boo
     shape: Shape = sample.tiles[0][0].shape
     bases = _Bases(sample, settings)
     if quick:
-        usual, own = (
-            usual_transform(shape).axes,
-            tuple(_known(axis, length) for axis, length in zip(settings.transform.axes, shape, strict=True)),
-        )
+        usual = usual_transform(shape).axes
+        own = tuple(_known(axis, length) for axis, length in zip(settings.transform.axes, shape, strict=True))
         trials = [usual, own]
         if bases.possible(*shape[1:]):
             trials.append((usual[0], *(bases.along(axis) for axis in (1, 2, 3))))
-        costs = list(map(lambda axes: _judge(sample, settings, axes, way), trials))  # type: ignore[arg-type]
+        costs = [_judge(sample, settings, trial, way) for trial in trials]  # type: ignore[arg-type]
         best = min(costs)
         return replace(settings, transform=TransformSpec(axes=trials[costs.index(best)])), best  # type: ignore[arg-type]
     axes: Axes = settings.transform.axes

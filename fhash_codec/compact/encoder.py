@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import islice
 from math import prod
 from typing import Any
 
@@ -53,7 +52,7 @@ def code_series(series: Series, found: Found, config: EncodeConfig, progress: Pr
     value_range, extent = found.scanned.value_range, found.extent
     raw_bytes = prod(series.shape) * series.dtype.itemsize
     goal = goal_of(config, value_range, raw_bytes)
-    blocks = Blocks(series, extent, (series.shape[0], *series.shape[1:]))
+    blocks = Blocks(series, extent, series.shape)
     begun = time.perf_counter()
     with pool() as workers:
         planned = plan(blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress)
@@ -111,7 +110,7 @@ def write_table(writer: ContainerWriter, table: Table, extent: Extent, progress:
         _write_occupancy(writer, blocks.shape, extent, progress)
 
 
-def compact_header(found: Found, table: Table, config: EncodeConfig) -> dict[str, Any]:
+def compact_header(table: Table, config: EncodeConfig) -> dict[str, Any]:
     """What a compact file's header says of its model."""
     blocks, settings, outcome = table.planned.blocks, table.planned.settings, table.outcome
     weights = 0 if settings.head is None else sum(layer.weights.size + layer.biases.size for layer in settings.head.layers)
@@ -189,7 +188,7 @@ def _write_occupancy(writer: ContainerWriter, shape: tuple[int, ...], extent: Ex
     def streams() -> Iterator[bytes]:
         for start in range(0, shape[0], steps):
             masks = np.zeros((steps, *shape[1:]), dtype=np.uint8)
-            for number, key in enumerate(islice(range(start, shape[0]), steps)):
+            for number, key in enumerate(range(start, min(start + steps, shape[0]))):
                 masks[number] = extent.mask(key)
             progress("writing occupancy", min(start + steps, shape[0]), shape[0], "")
             yield encode_tile(masks, _MASK).data

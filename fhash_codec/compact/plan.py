@@ -65,11 +65,7 @@ class Planned:
 
 
 def goal_of(config: EncodeConfig, value_range: ValueRange, raw_bytes: int) -> Goal:
-    """The one promise of the settings; InputError for more than one."""
-    given = [name for name in ("psnr", "max_error", "max_error_rel", "ratio") if getattr(config, name) is not None]
-    if len(given) > 1:
-        names = " and ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise InputError(f"{names} are given; promise one of them")
+    """The one promise of the settings (that there is no other, `EncodeConfig` has seen to)."""
     if config.max_error is not None:
         return Goal(error=config.max_error)
     if config.max_error_rel is not None:
@@ -267,7 +263,7 @@ def _solve_size(sample: Sample, settings: Settings, way: Way, size: float, data_
     if size <= 0:
         raise InputError("the ratio leaves no room for values: the rest of the file is larger already; ask for a smaller ratio")
     low, high = math.log(max(data_range, 1e-300) * 2.0**-24), math.log(max(data_range, 1e-300) * 4)
-    log_step, outcome = math.log(settings.step), sample.run(settings, way)
+    log_step = math.log(settings.step)
     for _ in range(2 * tries + 2):
         log_step = min(max(log_step, low), high)
         settings = replace(settings, step=math.exp(log_step))

@@ -45,16 +45,17 @@ def encode_integers(
     """
     kept = state is not None
     state = prior_state() if state is None else state
-    integers = np.array(integers, dtype=np.int32, order="C")
+    given = np.ascontiguousarray(integers, dtype=np.int32)
     library = native.library()
     if library is None:
         from fhash_formats.transform import coder_portable
 
+        integers = given.copy()
         data = coder_portable.encode(integers, table, scaled, weight, state.copy() if not kept else state)
         return Encoded(data=data, integers=integers)
     library.fhash_encode.restype = ctypes.c_int64
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
-    capacity, given = max(4096, integers.size // 2), integers
+    capacity = max(4096, given.size // 2)
     while True:
         buffer = np.empty(capacity, dtype=np.uint8)
         integers = given.copy()
