@@ -153,7 +153,7 @@ def compact_header(table: Table, config: EncodeConfig) -> dict[str, Any]:
 
 def required_features(table: Table) -> list[str]:
     """What a reader of the file must know."""
-    return ["transform"] if table.planned.settings.mask is None else ["transform", "mask"]
+    return ["transform", *table.planned.settings.features]
 
 
 def promise(config: EncodeConfig) -> dict[str, float]:

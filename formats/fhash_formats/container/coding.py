@@ -120,6 +120,11 @@ class CheckedCoder:
         return self._coder.decode(coded, lod)  # type: ignore[call-arg]
 
     @property
+    def features(self) -> tuple[str, ...]:
+        """Required features that the coding of the chunks stands for, besides that of the codec itself."""
+        return tuple(getattr(self._coder, "features", ()))
+
+    @property
     def masked(self) -> bool:
         """Whether the chunks say which of their values are occupied."""
         return bool(getattr(self._coder, "masked", False))

@@ -22,8 +22,7 @@ from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 FORMAT = "fhash"
 FORMAT_VERSION = (1, 1)
 TRANSFORM_FEATURE = "transform"
-MASK_FEATURE = "mask"
-KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, MASK_FEATURE})
+KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, "mask", "predictor"})
 PAPER, COMPACT = "paper", "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
 POSITIONS = ("time", "z", "y", "x")
@@ -101,10 +100,10 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
         for name, array in arrays.items():
             if array.sharding is not None or array.codecs[0]["name"] == TRANSFORM:
                 raise DamagedFileError(f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, which the header does not require")
-    if MASK_FEATURE not in header["required_features"]:
-        for name, array in arrays.items():
-            if array.coder.masked:
-                raise DamagedFileError(f"array {name} has masks, the feature {MASK_FEATURE}, which the header does not require")
+    for name, array in arrays.items():
+        for feature in array.coder.features:
+            if feature not in header["required_features"]:
+                raise DamagedFileError(f"array {name} has the feature {feature}, which the header does not require")
     for name, shape, dtypes in _optional(header):
         if name in arrays:
             _check_array(name, arrays[name], shape, dtypes)

@@ -68,6 +68,12 @@ class Settings:
         """The working type."""
         return np.dtype(np.float64 if self.double else np.float32)
 
+    @property
+    def features(self) -> tuple[str, ...]:
+        """What a reader must know beside the codec itself, by the names that containers require features by."""
+        used = {"mask": self.mask is not None, "predictor": self.predictor is not None}
+        return tuple(name for name, wanted in used.items() if wanted)
+
     def to_dict(self) -> dict[str, Any]:
         """JSON values, without those that are the default."""
         result: dict[str, Any] = {

@@ -18,6 +18,7 @@ __all__ = ["TransformCoder"]
 class TransformCoder:
     """Codes chunks of one type and shape with the settings in the codec's configuration, or with those in each chunk's stream.
 
+    features: that a container with these settings requires beside `transform`.
     masked: whether the chunks say which of their values are occupied.
     """
 
@@ -32,6 +33,7 @@ class TransformCoder:
             self.settings = Settings.from_dict(configuration) if "transform" in configuration else None
         except InputError as error:
             raise DamagedFileError(f"codec fhash.transform: {error}") from error
+        self.features = () if self.settings is None else self.settings.features
         self.masked = self.settings is not None and self.settings.mask is not None
         self._shape, self._dtype = shape, dtype.newbyteorder("=")
         self._four: Shape = (*(1,) * (4 - len(shape)), *shape)  # type: ignore[assignment]
