@@ -139,7 +139,7 @@ def compact_header(table: Table, config: EncodeConfig) -> dict[str, Any]:
     """What a compact file's header says of its model."""
     blocks, settings, outcome = table.planned.blocks, table.planned.settings, table.outcome
     weights = 0 if settings.head is None else sum(layer.weights.size + layer.biases.size for layer in settings.head.layers)
-    head = None if settings.head is None else {"hidden": list(settings.head.hidden)}
+    head = None if settings.head is None else {"hidden": list(settings.head.hidden), "cross": settings.head.cross}
     return {
         "profile": "compact",
         "levels": [list(blocks.shape)],

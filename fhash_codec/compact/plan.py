@@ -132,7 +132,8 @@ def plan(
     way = replace(way, passes=2 if config.effort > 2 else 1, rounds=0 if config.effort == 1 else 2 if config.effort < 7 else 4)
     if not blocks.complete:
         way = replace(way, rounds=2, density=8 if config.effort >= 4 else 4 if config.effort > 1 else 1)
-    settings, outcome = solve(sample, settings, way, goal, tries=3 if config.effort == 1 else 5)
+    outcomes: list[Outcome] = []
+    settings, outcome = solve(sample, settings, way, goal, tries=3 if config.effort == 1 else 5, tried=outcomes)
     if goal.psnr is None and outcome.count:
         settings = masked(settings, math.sqrt(outcome.squares / outcome.count))
     for _ in range(REFITS):
@@ -141,7 +142,7 @@ def plan(
         if refitted is settings:
             break
         before = settings.step
-        settings, outcome = solve(sample, refitted, way, goal)
+        settings, outcome = solve(sample, refitted, way, goal, tried=outcomes)
         if abs(math.log(settings.step / before)) < 0.1:
             break
     if config.effort > 1:
@@ -155,6 +156,7 @@ def plan(
             outcome,
             way,
             lambda now, tried: solve(sample, now, way, goal, tries=4, tried=tried),
+            outcomes,
             strict=goal.error is not None,
             data_range=goal.data_range,
             effort=config.effort,

@@ -19,8 +19,8 @@ SLOPE = 5.5
 """dB by which the PSNR falls when the step grows by a factor of e: to begin a search with."""
 LARGEST_STEP = 16.0
 """Of the range: with a larger one no more than nothing is coded."""
-CLOSE = 0.02
-"""dB from what was asked for at which a search ends."""
+AIM, CLOSE = 0.005, 0.004
+"""dB above what was asked for that a search aims at, and from that aim at which it ends: all tiles should not fall short again."""
 STEPS_TO_OCTAVE, LARGEST_OF_ERROR = 3, 15
 """Quantiser steps that may be tried under a strict bound: from the bound on in so many parts of an octave, and up to which."""
 SLACK = 1e-6
@@ -96,6 +96,7 @@ def solve(
 def _solve_psnr(
     sample: Sample, settings: Settings, way: Way, psnr: float, data_range: float, tries: int, tried: list[Outcome]
 ) -> tuple[Settings, Outcome]:
+    psnr += AIM
     points: list[tuple[float, float]] = []
     best: tuple[float, Settings, Outcome] | None = None
     for _ in range(tries):

@@ -22,7 +22,7 @@ from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 FORMAT = "fhash"
 FORMAT_VERSION = (1, 1)
 TRANSFORM_FEATURE = "transform"
-KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, "mask", "predictor"})
+KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, "cross", "mask", "predictor"})
 PAPER, COMPACT = "paper", "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
 POSITIONS = ("time", "z", "y", "x")

@@ -71,7 +71,8 @@ class Settings:
     @property
     def features(self) -> tuple[str, ...]:
         """What a reader must know beside the codec itself, by the names that containers require features by."""
-        used = {"mask": self.mask is not None, "predictor": self.predictor is not None}
+        cross = self.head is not None and self.head.cross
+        used = {"cross": cross, "mask": self.mask is not None, "predictor": self.predictor is not None}
         return tuple(name for name, wanted in used.items() if wanted)
 
     def to_dict(self) -> dict[str, Any]:
