@@ -31,8 +31,10 @@ from fhash_formats.transform.tile import Shape
 DEFAULT_PSNR = 50.0
 LARGEST_VALUE, SMALLEST_RANGE = 1e145, 1e-145
 """Squared errors of larger values or of a smaller range do not fit float64."""
-LOOK_VERTICES, TRIAL_VERTICES, SAMPLE_VERTICES = 1 << 18, 3 << 20, 12 << 20
+LOOK_VERTICES, TRIAL_VERTICES, SAMPLE_VERTICES = 1 << 18, 3 << 20, 6 << 20
 """Of the tiles that are coded for an idea of the size, for each trial of a transform, and for the search of the step."""
+ALL_VERTICES = 12 << 20
+"""Of a series for which that search has all tiles."""
 PRICE_OF_TILES = 1.3
 """By what factor small tiles may make a file larger."""
 MOST_TILE_VERTICES, SMALL_FILE_BYTES = 12 << 20, 60_000
@@ -127,7 +129,7 @@ def plan(
                 changed, found = _tried(other, replace(settings, transform=usual_transform(tile)), way, goal, quick=tiled.complete)
                 if found.size < outcome.size * (1 / PRICE_OF_TILES if prod(tile[1:]) > prod(tiled.tile[1:]) else PRICE_OF_STEPS):
                     sample, settings, outcome = other, changed, found
-        sample = sample.wider(SAMPLE_VERTICES)
+        sample = sample.wider(ALL_VERTICES if prod(blocks.shape) <= ALL_VERTICES else SAMPLE_VERTICES)
     progress("planning", 2, 4, "")
     way = replace(way, passes=2 if config.effort > 2 else 1, rounds=0 if config.effort == 1 else 2 if config.effort < 7 else 4)
     if not blocks.complete:
