@@ -13,6 +13,8 @@ __all__ = ["even_tile", "first_tile", "parse_tile", "tile_for"]
 
 TILE_BYTES, TILE_VERTICES, FEWEST_TILES = 1500, 1 << 19, 27
 """A tile should take at least so many bytes, and hold at most so many vertices once there are enough tiles for random access."""
+LARGEST = 4 << 20
+"""Vertices of a tile, unless it is asked for or is everything: some are in memory at a time, each several times over."""
 TILE_STEPS = 4
 FIRST_STEPS = 8
 SHORTEST = 24
@@ -59,7 +61,7 @@ def even_tile(shape: Shape, tiles: int, steps: int) -> Shape:
         z, y, x = (n if p == 1 else n + n % 2 for n, p in zip(space, parts[1:], strict=True))
         count = prod(-(-n // length) for n, length in zip(shape, (t, z, y, x), strict=True))
         more = math.log(count / prod(wished))
-        if t > max(steps * 1.5, 1) or not 0.4 <= count / prod(wished) <= 1.5:
+        if t > max(steps * 1.5, 1) or not 0.4 <= count / prod(wished) <= 1.5 or (more < 0 and t * z * y * x > LARGEST):
             continue
         padding = count * t * z * y * x / prod(shape) - 1
         short = sum(p > 1 and length < SHORTEST for p, length in zip(parts[1:], (z, y, x), strict=True))
@@ -76,7 +78,7 @@ def first_tile(shape: Shape) -> Shape:
 
 def tile_for(shape: Shape, size: float) -> Shape:
     """Tiles of a series whose tiles take so many bytes together; more than FEWEST_TILES only where they get too large."""
-    tiles = int(min(size / TILE_BYTES, max(FEWEST_TILES, prod(shape) / TILE_VERTICES)))
+    tiles = max(int(min(size / TILE_BYTES, max(FEWEST_TILES, prod(shape) / TILE_VERTICES))), -(-prod(shape) // LARGEST))
     steps = shape[0]
     if tiles > 1:
         parts = -(-steps // TILE_STEPS) if tiles >= 16 else 1

@@ -13,6 +13,7 @@ from fhash_codec.compact.choice import choose_transform, usual_transform
 from fhash_codec.compact.sample import Sample, Way, strata
 from fhash_codec.compact.search import cheapest, exchange, secant
 from fhash_codec.compact.steps import Goal, with_step
+from fhash_codec.compact.tiling import tile_for
 from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.tile import encode_tile
 
@@ -163,3 +164,16 @@ def test_rounding_to_the_type_of_the_source_stores_no_tile_exactly(rounding, exa
     coded = encode_tile(source, with_step(begun, 4 * error, Goal(error=error, data_range=high - low), rounding), error=error)
     assert np.abs(coded.decoded.astype(np.float64) - source).max() <= error
     assert np.array_equal(coded.decoded, source) == exact
+
+
+@pytest.mark.parametrize("shape", [(64, 128, 256, 256), (1, 512, 512, 512), (500, 3, 100, 400)])
+def test_tiles_of_a_large_series_stay_small_however_few_bytes_it_takes(shape):
+    """Some tiles are in memory at a time: a file of a few kB must not ask for gigabytes."""
+    assert np.prod(tile_for(shape, 1000.0)) <= 4 << 20
+
+
+def test_tiles_hang_little_over_the_border():
+    for shape in ((10, 64, 64, 64), (12, 25, 125, 125), (33, 64, 64, 64)):
+        tile = tile_for(shape, 1e6)
+        covered = np.prod([-(-n // length) * length for n, length in zip(shape, tile, strict=True)])
+        assert covered <= 1.04 * np.prod(shape)
