@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.architecture import Architecture
-from fhash_codec.compact.encoder import code_series, compact_header, promise, write_table
+from fhash_codec.compact.encoder import code_series, compact_header, promise, required_features, write_table
 from fhash_codec.comparison import measure
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset import Coreset
@@ -26,7 +26,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.report import brief_history, brief_quality, report
 from fhash_codec.scan import Scan
 from fhash_codec.selection import Selection, Source, find, opened, select
-from fhash_codec.storage import write_model
+from fhash_codec.storage import write_model, write_tables
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats import native
@@ -82,9 +82,23 @@ def _paper(
     """Train the published model and write it; the header without its quality, and the checkpoint to be removed."""
     selected = select(series, config, progress, mask)
     trained = train_model(selected.coreset, selected.architecture, config, path, progress)
-    write_series(writer, series, selected.scanned, selected.coreset.key_frames)
-    write_model(writer, selected.architecture, selected.coreset, trained.fine, trained.tables, trained.layers, config.tables)
-    return _header(series, selected, trained, config), trained.checkpoint
+    architecture, coreset = selected.architecture, selected.coreset
+    loss = None
+    write_series(writer, series, selected.scanned, coreset.key_frames)
+    if config.tables == "transform":
+        from fhash_codec.coded.search import write_coded
+
+        # A promise counts every step; what is between key frames this search does not see.
+        psnr = config.psnr if len(coreset.key_frames) == series.shape[0] else None
+        loss = write_coded(writer, architecture, coreset, trained.fine, trained.tables, trained.layers, psnr, progress)
+    else:
+        write_tables(writer, architecture, coreset, trained.fine, trained.tables, config.tables)
+    write_model(writer, architecture, coreset, trained.layers)
+    header = _header(series, selected, trained, config)
+    if loss is not None:
+        header["required_features"] = ["transform"]
+        header["model"]["tables_loss_db"] = round(loss, 4)
+    return header, trained.checkpoint
 
 
 def _compact(
@@ -102,7 +116,7 @@ def _compact(
     found = find(series, config, progress, mask)
     table = code_series(series, found, config, progress)
     described = write_series(writer, series, found.scanned, found.extent.key_frames, brief=True)
-    write_table(writer, table, found.extent, progress)
+    write_table(writer, table)
     planned = table.planned
     seconds = round(time.perf_counter() - begun, 3) if config.timings else None
     training = {"seconds": seconds, "epochs": 0, "device": "cpu"}
@@ -111,7 +125,7 @@ def _compact(
     header = {
         **_described(series, found.scanned.value_range, config),
         **described,
-        "required_features": ["transform"],
+        "required_features": required_features(table),
         "background": found.extent.background,
         "feature_bounding_box": [list(span) for span in found.extent.box],
         "features": [str(feature) for feature in found.features],

@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,20 +16,17 @@ from torch import Tensor
 
 from fhash_codec.engines.adam import adam_step
 from fhash_formats.errors import InputError
-from fhash_formats.transform.head import MAX_BIAS, MAX_WEIGHT, Head, Layer
-from fhash_formats.transform.head_portable import FEATURES, STEPS, clip, compress, locate
+from fhash_formats.transform.head import MAX_BIAS, MAX_WEIGHT, Head, Layer, layer_inputs
+from fhash_formats.transform.head_portable import CROSS, FEATURES, STEPS, centre_features, clip, compress
 
-__all__ = ["HIDDEN", "Pair", "TrainedHead", "train_head"]
+__all__ = ["Pair", "TrainedHead", "train_head"]
 
 Floats = npt.NDArray[np.float32]
 Pair = tuple[Floats, Floats, npt.NDArray[np.bool_] | None]
 """A decoded tile (t, z, y, x), its original, and which voxels count (None: all)."""
 
-HIDDEN = ((12, 8), (24, 12), (48, 24))
-"""Hidden widths worth trying, of about 0.35, 0.7 and 1.7 kB: the larger pay in larger files."""
-
-_SEGMENT = 16  # voxels in a row drawn together
 _BATCH = 4096
+_PIECE = 1 << 16  # voxels whose features are found at once
 _RATE = 1e-2
 _WARM_UP = 0.1  # the part of the schedule in which the rate rises
 _ROUNDED_FROM = 0.6  # weights are rounded from this part of the schedule on
@@ -50,15 +47,26 @@ class TrainedHead:
 
 @dataclass(frozen=True, kw_only=True)
 class _Samples:
-    """Network inputs (n, FEATURES), targets (n,) and the least and greatest useful output (n,), in units of sigma."""
+    """Batches of n voxels.
+
+    inputs: features (batches, FEATURES, voxels looked at, n), int16. targets, least and greatest useful output: (batches, n), in sigmas.
+    """
 
     inputs: Tensor
     targets: Tensor
     least: Tensor
     greatest: Tensor
 
-    def __getitem__(self, part: Tensor | slice) -> _Samples:
-        return _Samples(inputs=self.inputs[part], targets=self.targets[part], least=self.least[part], greatest=self.greatest[part])
+    def __len__(self) -> int:
+        return len(self.targets)
+
+
+class _Drawn(NamedTuple):
+    """Voxels of one tile: coordinates (4, n), clipped decoded values (n,), originals (n,)."""
+
+    places: npt.NDArray[np.int64]
+    values: Floats
+    originals: Floats
 
 
 def train_head(
@@ -66,7 +74,8 @@ def train_head(
     *,
     low: float,
     high: float,
-    hidden: Sequence[int] = HIDDEN[0],
+    hidden: Sequence[int] = (12, 8),
+    cross: bool = False,
     steps: int | None = None,
     seconds: float | None = None,
     samples: int = 800_000,
@@ -76,7 +85,7 @@ def train_head(
 ) -> TrainedHead:
     """A head of the given hidden widths that lowers the squared error of the voxels that count.
 
-    pairs: decoded and original float32 tiles (t, z, y, x) in data units; low, high: the clip range.
+    pairs: decoded and original float32 tiles (t, z, y, x) in data units; low, high: the clip range. cross: see `Head`.
     samples: about how many voxels are drawn to learn from; a fifth as many measure the gain.
     steps: length of the training, 4000 if neither it nor seconds is given; with seconds the schedule follows the clock and two runs differ.
     Otherwise the same seed and device give the same head. device: cpu, cuda, or auto. progress gets the part done, 0 to 1.
@@ -90,14 +99,16 @@ def train_head(
     place = torch.device("cuda" if device == "auto" and torch.cuda.is_available() else "cpu" if device == "auto" else device)
     bounds = np.float32(low), np.float32(high)
     random = np.random.default_rng(seed)
-    learnt, tested = (_draw(pairs, count, random, *bounds) for count in (samples, samples // 5))
-    sigma = np.sqrt(np.mean((learnt[2] - learnt[1]).astype(np.float64) ** 2)).astype(np.float32)
+    learnt, tested = (_draw(pairs, max(1, round(count / _BATCH)) * _BATCH, random, *bounds) for count in (samples, samples // 5))
+    errors = np.concatenate([drawn.originals - drawn.values for drawn in learnt])
+    sigma = np.sqrt(np.mean(errors.astype(np.float64) ** 2)).astype(np.float32)
     if not sigma > 0:
         raise InputError("a head has nothing to learn: the decoded values are the original ones")
-    training, held_out = (_samples(*drawn, sigma, *bounds, place) for drawn in (learnt, tested))
+    seen = CROSS if cross else CROSS[:1]
+    training, held_out = (_samples(pairs, drawn, seen, random, sigma, *bounds, place) for drawn in (learnt, tested))
     with _one_thread():
-        layers, history = _optimise(training, held_out, hidden, 4000 if steps is None else steps, seconds, seed, progress)
-    head = Head(layers=layers, sigma=float(sigma), low=float(bounds[0]), high=float(bounds[1]))
+        layers, history = _optimise(training, held_out, hidden, cross, 4000 if steps is None else steps, seconds, seed, progress)
+    head = Head(layers=layers, sigma=float(sigma), low=float(bounds[0]), high=float(bounds[1]), cross=cross)
     return TrainedHead(head=head, gain_db=history[-1][2], history=tuple(history))
 
 
@@ -113,14 +124,13 @@ def _one_thread() -> Iterator[None]:
 
 
 def _optimise(
-    training: _Samples, held_out: _Samples, hidden: Sequence[int], steps: int, seconds: float | None, seed: int,
+    training: _Samples, held_out: _Samples, hidden: Sequence[int], cross: bool, steps: int, seconds: float | None, seed: int,
     progress: Callable[[float], None] | None,
 ) -> tuple[tuple[Layer, ...], list[tuple[float, int, float]]]:  # fmt: skip
     generator = torch.Generator().manual_seed(seed)
-    parameters = _initial((FEATURES, *hidden, 1), generator, training.inputs.device)
+    parameters = _initial(layer_inputs(hidden, cross), [*hidden, 1], generator, training.inputs.device)
     means, squares = ([torch.zeros_like(parameter) for parameter in parameters] for _ in range(2))
-    count, step, part, position = len(training.targets), 0, 0.0, 0
-    order = torch.randperm(count, generator=generator).to(training.inputs.device)
+    step, part = 0, 0.0
     history: list[tuple[float, int, float]] = []
     began = perf_counter()
     while part < 1:
@@ -130,14 +140,10 @@ def _optimise(
         if len(parameters[0]) > 1 and part >= _CHOSEN_AT:
             best = int(_gains(parameters, held_out, rounded=False).argmax())
             parameters, means, squares = ([tensor[best : best + 1].detach() for tensor in held] for held in (parameters, means, squares))
-        if position + _BATCH > count:
-            order, position = torch.randperm(count, generator=generator).to(order.device), 0
-        batch = training[order[position : position + _BATCH]]
-        position += _BATCH
         rate = _RATE * (part / _WARM_UP if part < _WARM_UP else 0.5 + 0.5 * math.cos(math.pi * (part - _WARM_UP) / (1 - _WARM_UP)))
         for parameter in parameters:
             parameter.requires_grad_(True)
-        error = _errors(parameters, batch, rounded=part > _ROUNDED_FROM)
+        error = _errors(parameters, training, step % len(training), rounded=part > _ROUNDED_FROM)
         gradients = torch.autograd.grad(error.square().mean(dim=1).sum(), parameters)
         with torch.no_grad():
             norms = torch.stack([gradient.square().flatten(1).sum(dim=1) for gradient in gradients]).sum(dim=0).sqrt()
@@ -152,66 +158,71 @@ def _optimise(
     return _layers(parameters), history
 
 
-def _draw(
-    pairs: Sequence[Pair], samples: int, random: np.random.Generator, low: np.float32, high: np.float32
-) -> tuple[Floats, Floats, Floats]:
-    """Of about `samples` voxels that count, in segments along x: differences to neighbours (26, n), decoded values (n,), originals (n,)."""
+def _draw(pairs: Sequence[Pair], samples: int, random: np.random.Generator, low: np.float32, high: np.float32) -> list[_Drawn]:
+    """So many voxels that count, of each tile its share."""
     counted = np.array([original.size if care is None else np.count_nonzero(care) for _, original, care in pairs], dtype=np.int64)
     if counted.sum() == 0:
         raise InputError("a head cannot be trained: no voxel counts")
-    parts = []
-    for (decoded, original, care), number in zip(pairs, counted, strict=True):
-        segment = min(_SEGMENT, decoded.shape[3])
-        padded = np.pad(clip(decoded, low, high), ((0, 0), (0, 0), (0, 0), (2, 2)), mode="edge")
-        windows = np.lib.stride_tricks.sliding_window_view(padded, segment + 4, axis=3)
-        originals = np.lib.stride_tricks.sliding_window_view(original, segment, axis=3)
-        segments = math.ceil(samples * number / counted.sum() / segment)
+    ends = np.rint(np.cumsum(counted) / counted.sum() * samples).astype(np.int64)
+    drawn = []
+    for (decoded, original, care), number in zip(pairs, np.diff(ends, prepend=0), strict=True):
         among = original.size if care is None else np.flatnonzero(care)
-        t, z, y, x = np.unravel_index(random.choice(among, segments), original.shape)
-        starts = t, z, y, np.clip(x - random.integers(0, segment, segments), 0, original.shape[3] - segment)
-        counts = None if care is None else np.lib.stride_tricks.sliding_window_view(care, segment, axis=3)[starts].ravel()
-        rows = {}
-        for step in {step[:3] for step in STEPS}:
-            moved = (np.clip(at + move, 0, size - 1) for at, move, size in zip((t, z, y), step, original.shape, strict=False))
-            rows[step] = windows[(*moved, starts[3])]
-        centre = rows[0, 0, 0][:, 2 : 2 + segment]
-        differences = np.stack([(rows[step[:3]][:, 2 + step[3] : 2 + step[3] + segment] - centre).ravel() for step in STEPS])
-        flat = differences, centre.ravel(), originals[starts].ravel()
-        parts.append(flat if counts is None else tuple(values[..., counts] for values in flat))
-    differences, centre, original = (np.concatenate([part[index] for part in parts], axis=-1) for index in range(3))
-    return differences, centre, original
+        chosen = np.sort(random.choice(among, number)) if number else np.empty(0, np.int64)
+        values = clip(decoded.ravel()[chosen], low, high)
+        drawn.append(_Drawn(np.stack(np.unravel_index(chosen, original.shape)), values, original.ravel()[chosen]))
+    return drawn
 
 
 def _samples(
-    differences: Floats, centre: Floats, original: Floats, sigma: np.float32, low: np.float32, high: np.float32, device: torch.device
-) -> _Samples:
-    """The drawn voxels as the network sees them: the head's own features, in octaves."""
-    inverse = np.float32(0.5) / sigma
-    span = high - low
+    pairs: Sequence[Pair], drawn: Sequence[_Drawn], seen: Sequence[tuple[int, ...]], random: np.random.Generator, sigma: np.float32,
+    low: np.float32, high: np.float32, device: torch.device,
+) -> _Samples:  # fmt: skip
+    """The drawn voxels in random order as the network sees them: by the head's own features, of the voxels at the steps of `seen`."""
+    inverse, span = np.float32(0.5) / sigma, high - low
     unit = np.float32(1024) / span if span > 0 else np.float32(0)
-    features = np.empty((FEATURES, len(centre)), dtype=np.float32)
-    features[:-2] = compress(differences * inverse)
-    features[-2] = locate(centre, low, unit)
-    features[-1] = compress((centre - low) * inverse)
+    values, originals = (np.concatenate(parts) for parts in list(zip(*drawn, strict=True))[1:])
+    order = random.permutation(len(values))
+    batches = len(values) // _BATCH
+    inputs = np.empty((batches, FEATURES, len(seen), _BATCH), dtype=np.int16)
+    first = 0
+    for (decoded, _, _), (places, _, _) in zip(pairs, drawn, strict=True):
+        padded = np.pad(clip(decoded, low, high), ((1, 1), (2, 2), (2, 2), (2, 2)), mode="edge")
+        flat, strides = padded.ravel(), np.array(padded.strides) // padded.itemsize
+        origin = int(strides @ np.array((1, 2, 2, 2)))
+        edges = np.array(decoded.shape)[:, None] - 1
+        piece = _PIECE // len(seen)
+        for start in range(0, places.shape[1], piece):
+            part = places[:, start : start + piece]
+            at = np.stack([origin + strides @ np.clip(part + np.array(step)[:, None], 0, edges) for step in seen])
+            centre = flat[at]
+            features = np.empty((FEATURES, *at.shape), dtype=np.int16)
+            for number, step in enumerate(STEPS):
+                features[number] = compress((flat[at + int(strides @ np.array(step))] - centre) * inverse)
+            features[-2:] = centre_features(centre, low, inverse, unit)
+            batch, slot = np.divmod(order[first : first + at.shape[1]], _BATCH)
+            inputs[batch, :, :, slot] = features.transpose(2, 0, 1)
+            first += at.shape[1]
 
-    def tensor(values: Floats) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).to(device)
+    def tensor(one: Floats) -> Tensor:
+        shuffled = np.empty_like(one)
+        shuffled[order] = one
+        return torch.from_numpy((shuffled / sigma).reshape(batches, _BATCH)).to(device)
 
     return _Samples(
-        inputs=tensor(features.T / np.float32(512)),
-        targets=tensor((original - centre) / sigma),
-        least=tensor((low - centre) / sigma),
-        greatest=tensor((high - centre) / sigma),
+        inputs=torch.from_numpy(inputs).to(device),
+        targets=tensor(originals - values),
+        least=tensor(low - values),
+        greatest=tensor(high - values),
     )
 
 
-def _initial(widths: Sequence[int], generator: torch.Generator, device: torch.device) -> list[Tensor]:
-    """Weights (starts, in, out) and biases (starts, 1, out) of each layer in turn; the last layer begins near 0."""
+def _initial(inputs: Sequence[int], outputs: Sequence[int], generator: torch.Generator, device: torch.device) -> list[Tensor]:
+    """Weights (starts, out, in) and biases (starts, out, 1) of each layer in turn; the last layer begins near 0."""
     parameters = []
-    for number, (inputs, outputs) in enumerate(pairwise(widths)):
-        last = number == len(widths) - 2
-        reach = inputs**-0.5
-        for shape, scale in (((_STARTS, inputs, outputs), 0.1 if last else 1.0), ((_STARTS, 1, outputs), 0.0 if last else 1.0)):
+    for number, (columns, rows) in enumerate(zip(inputs, outputs, strict=True)):
+        last = number == len(outputs) - 1
+        reach = columns**-0.5
+        for shape, scale in (((_STARTS, rows, columns), 0.1 if last else 1.0), ((_STARTS, rows, 1), 0.0 if last else 1.0)):
             parameters.append(((torch.rand(shape, generator=generator) * 2 - 1) * reach * scale).to(device))
     return parameters
 
@@ -229,25 +240,27 @@ def _rounded(parameter: Tensor, most: int) -> Tensor:
     return parameter + (steps * scale - parameter).detach()
 
 
-def _errors(parameters: Sequence[Tensor], samples: _Samples, *, rounded: bool) -> Tensor:
-    """Corrected minus original values (starts, n) in units of sigma."""
-    values = samples.inputs.expand(len(parameters[0]), -1, -1)
-    for number in range(0, len(parameters), 2):
-        weights, biases = parameters[number : number + 2]
+def _errors(parameters: Sequence[Tensor], samples: _Samples, batch: int, *, rounded: bool) -> Tensor:
+    """Corrected minus original values of a batch (starts, n) in units of sigma."""
+    inputs = samples.inputs[batch].to(torch.float32).mul_(1 / 512)
+    values = inputs.reshape(1, FEATURES, -1).expand(len(parameters[0]), -1, -1)
+    for layer in range(0, len(parameters), 2):
+        weights, biases = parameters[layer : layer + 2]
         if rounded:
             weights, biases = _rounded(weights, MAX_WEIGHT), _rounded(biases, MAX_BIAS)
-        values = torch.baddbmm(biases, values, weights)
-        if number + 2 < len(parameters):
+        # Before the second layer, the voxels looked at become inputs: those of one output of the first layer after those of another.
+        values = torch.baddbmm(biases, weights, values.reshape(len(values), -1, inputs.shape[2]) if layer == 2 else values)
+        if layer + 2 < len(parameters):
             values = torch.nn.functional.leaky_relu(values, 0.125)
     # Whatever lies beyond the clip range costs nothing more: the decoder clips it.
-    return torch.minimum(torch.maximum(values[..., 0], samples.least), samples.greatest) - samples.targets
+    return torch.minimum(torch.maximum(values[:, 0], samples.least[batch]), samples.greatest[batch]) - samples.targets[batch]
 
 
 def _gains(parameters: Sequence[Tensor], held_out: _Samples, *, rounded: bool) -> Tensor:
     """dB that each of the starts gains on the held-out samples."""
     with torch.no_grad():
-        left = _errors(parameters, held_out, rounded=rounded).square().mean(dim=1)
-        return 10 * torch.log10(held_out.targets.square().mean() / left)
+        errors = [_errors(parameters, held_out, batch, rounded=rounded).square().mean(dim=1) for batch in range(len(held_out))]
+        return 10 * torch.log10(held_out.targets.square().mean() / torch.stack(errors).mean(dim=0))
 
 
 def _layers(parameters: Sequence[Tensor]) -> tuple[Layer, ...]:
@@ -256,7 +269,7 @@ def _layers(parameters: Sequence[Tensor]) -> tuple[Layer, ...]:
         quantised, scales = [], []
         for parameter, most in zip(parameters[number : number + 2], (MAX_WEIGHT, MAX_BIAS), strict=True):
             scale = _scale(parameter, most)
-            quantised.append((parameter.detach() / scale).round().clamp(-most, most)[0].T.to(torch.int8).cpu().numpy())
+            quantised.append((parameter.detach() / scale).round().clamp(-most, most)[0].to(torch.int8).cpu().numpy())
             scales.append(float(scale))
         weights, biases = np.ascontiguousarray(quantised[0]), np.ascontiguousarray(quantised[1][:, 0])
         layers.append(Layer(weights=weights, biases=biases, weight_scale=scales[0], bias_scale=scales[1]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import product
 from math import prod
 from typing import Any
@@ -10,18 +11,36 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.decoder import Box
+from fhash_codec.occupancy import unpack
 from fhash_formats.container import StoredArray
 
 Positions = npt.NDArray[np.float64]
 
 
 class Lattice:
-    """The table of a compact file: values (t, z, y, x) at the vertices of the feature bounding box, at every step."""
+    """A `VolumeModel` (volume_model.py) of a compact file: values (t, z, y, x) at the vertices of the feature bounding box."""
 
-    def __init__(self, array: StoredArray) -> None:
-        self._array = array
+    def __init__(self, arrays: Mapping[str, StoredArray]) -> None:
+        self._arrays = arrays
+        self._array = arrays["tables/level_1"]
+        self.chunks = self._array.chunk_shape
 
-    def region(self, step: float, region: Box) -> npt.NDArray[np.float64]:
+    def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
+        """Which vertices (z, y, x) of a region of the box are in the coreset at step `first` and at step `last`."""
+        # Between steps both count: a value is no better than the two it lies between.
+        space = tuple(slice(low, high) for low, high in region)
+        if "occupancy/mask" in self._arrays:
+            mask = self._arrays["occupancy/mask"].read((slice(first, last + 1), *space))
+            return np.asarray((mask[0] & mask[-1]) != 0)
+        if "occupancy/bits" not in self._arrays:
+            mask = self._array.read_mask((slice(first, last + 1), *space))
+            return np.asarray(mask[0] & mask[-1])
+        stored = self._arrays["occupancy/bits"]
+        bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
+        z, y, x = self._array.shape[1:]
+        return unpack(bits[0] & bits[-1], (z, y, x))[space]
+
+    def region(self, step: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
         """Values (z, y, x), float64, of a region of the box at a step; between steps, linear in the step."""
         first = int(np.floor(step))
         weight = step - first
@@ -30,19 +49,23 @@ class Lattice:
         values: npt.NDArray[np.float64] = steps[0] if not weight else steps[0] * (1 - weight) + steps[1] * weight
         return values
 
-    def coarse(self, step: int, lod: int) -> npt.NDArray[Any]:
-        """Every 2^lod-th vertex (z, y, x) of the box at a step, low-passed by each tile on its own."""
-        tile, shape = self._array.chunk_shape, self._array.shape
-        stride = 1 << lod
-        result = np.empty([-(-n // stride) for n in shape[1:]], dtype=self._array.dtype)
-        grid = [range(-(-n // part)) for n, part in zip(shape[1:], tile[1:], strict=True)]
+    def coarse(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
+        """Every 2^lod-th vertex (z, y, x) of the box at a step, low-passed by each tile on its own; a region of them in coarse vertices."""
+        tile, stride = self._array.chunk_shape, 1 << lod
+        result = np.empty([high - low for low, high in region], dtype=self._array.dtype)
+        grid = [range(low * stride // n, (high - 1) * stride // n + 1) for (low, high), n in zip(region, tile[1:], strict=True)]
         for index in product(*grid):
-            part = self._array.decode_chunk((step // tile[0], *index), lod)[step % tile[0]]
             # A tile that begins between two coarse vertices gives its own lattice; the nearest of its vertices stand for those.
+            ends = [
+                (max(-(-i * n // stride), a), min(-(-(i + 1) * n // stride), b))
+                for i, n, (a, b) in zip(index, tile[1:], region, strict=True)
+            ]
+            if any(first >= stop for first, stop in ends):
+                continue
+            part = self._array.decode_chunk((step // tile[0], *index), lod)[step % tile[0]]
             target, source = [], []
-            for i, n, length, size in zip(index, tile[1:], shape[1:], part.shape, strict=True):
-                first, stop = -(-i * n // stride), -(-min((i + 1) * n, length) // stride)
-                target.append(slice(first, stop))
+            for i, n, (first, stop), (low, _), size in zip(index, tile[1:], ends, region, part.shape, strict=True):
+                target.append(slice(first - low, stop - low))
                 source.append(np.minimum((np.arange(first, stop) * stride - i * n + stride // 2) // stride, size - 1))
             result[tuple(target)] = part[np.ix_(*source)]
         return result
@@ -62,7 +85,9 @@ class Lattice:
                 shape = [1, 1, 1, 1, values.size]
                 shape[other] = 2
                 factor = factor * np.stack([1 - weights[other], weights[other]]).reshape(shape)
-            low, high = (np.take(corners * factor, side, axis=axis).reshape(-1, values.size).sum(axis=0) for side in (0, 1))
+            # A corner without weight counts for nothing, also where it is not finite.
+            weighted = np.where(factor == 0, 0.0, factor * corners)
+            low, high = (np.take(weighted, side, axis=axis).reshape(-1, values.size).sum(axis=0) for side in (0, 1))
             slopes[:, axis] = high - low
         return values, slopes
 

@@ -7,21 +7,26 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.normalise import pieces, power_of_two
+from fhash_codec.network import usable_threads
+from fhash_codec.normalise import power_of_two
 from fhash_codec.progress import Progress, silent
 from fhash_codec.ssim import SIGMA, WINDOW, ssim, ssim_steps
+from fhash_codec.sums import Values, squared_errors
 from fhash_formats.errors import InputError
 
 __all__ = ["Errors", "Quality", "StepQuality", "measure_quality", "psnr", "ssim", "ssim_steps"]
 
-Values = npt.NDArray[Any]
+FRAMES_HELD, VERTICES_HELD = 8, 1 << 24
+"""Frames of each series that may be held while they are compared: at most so many, of at most so many vertices together, at least one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +81,7 @@ class Errors:
         self.data_range = data_range
         self.count = 0
         self.steps: list[StepQuality] = []
-        self._scale = np.float64(power_of_two(min(data_range, sys.float_info.max)))
+        self._scale = power_of_two(min(data_range, sys.float_info.max))
         self._squares = 0.0
         self._largest = 0.0
 
@@ -91,21 +96,10 @@ class Errors:
         """Count, sum of squares and largest of the scaled differences of a frame, which `take` takes in; raises as `add`."""
         if original.shape != decoded.shape or (mask is not None and mask.shape != original.shape):
             raise InputError(f"step {step}: the original is {original.shape}, the decoded {decoded.shape}; they must be of one shape")
-        count, squares, largest = 0, 0.0, 0.0
-        masks = pieces(np.broadcast_to(np.True_, original.shape) if mask is None else mask)
-        for one, other, counts in zip(pieces(original), pieces(decoded), masks, strict=True):
-            chosen = np.isfinite(one) & counts
-            if not chosen.all():
-                one, other = one[chosen], other[chosen]
-            difference = _scaled_difference(one, other, self._scale)
-            if not np.isfinite(difference).all():
-                raise InputError(f"step {step}: decoded values are not finite where they are compared")
-            count += difference.size
-            if difference.size:
-                largest = max(largest, float(difference.max()), -float(difference.min()))
-            with np.errstate(over="ignore"):
-                squares += float(np.square(difference).sum())
-        return count, squares, largest
+        found = squared_errors(original, decoded, mask, self._scale)
+        if found[0] < 0:
+            raise InputError(f"step {step}: decoded values are not finite where they are compared")
+        return found
 
     def take(self, step: int, compared: tuple[int, float, float]) -> StepQuality:
         """Count what `compare` found; the step's figures."""
@@ -138,21 +132,8 @@ class Errors:
 
     def _unscaled(self, value: float, count: int) -> float | None:
         with np.errstate(over="ignore"):
-            figure = float(value / self._scale)
+            figure = float(np.float64(value) / self._scale)
         return figure if count and math.isfinite(figure) else None
-
-
-def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> npt.NDArray[np.float64]:
-    """(original - decoded) * scale in float64; exact for 64-bit integers too, whose differences float64 would round to 0."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        difference = np.asarray(original * scale - decoded * scale, dtype=np.float64)
-    if original.dtype.kind in "iu" and original.dtype.itemsize == 8:
-        limits = np.iinfo(original.dtype)
-        whole = np.clip(np.rint(decoded.astype(np.float64)), float(limits.min), np.nextafter(float(limits.max), 0.0))
-        # Differences wrap at 2^64; those beyond 2^62 do not need the exactness.
-        exact = (original - whole.astype(original.dtype)).view(np.int64) - (decoded.astype(np.float64) - whole)
-        difference = np.where(np.abs(difference) < 2.0**62 * scale, exact * scale, difference)
-    return difference
 
 
 def psnr(data_range: float, rmse: float | None) -> float | None:
@@ -160,6 +141,16 @@ def psnr(data_range: float, rmse: float | None) -> float | None:
     if rmse is None or not (0 < rmse < math.inf and 0 < data_range < math.inf):
         return None
     return 20 * (math.log10(data_range) - math.log10(rmse))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Compared:
+    """A step's errors over the coreset and over everything, as `Errors.compare` gives them, and what `ssim` gives."""
+
+    step: int
+    inside: tuple[int, float, float]
+    everywhere: tuple[int, float, float]
+    similarity: tuple[float, int]
 
 
 def measure_quality(
@@ -170,26 +161,43 @@ def measure_quality(
     background: float,
     progress: Progress = silent,
 ) -> Quality:
-    """Compare all steps of a decoded series with the original, one frame (z, y, x) of each at a time.
+    """Compare all steps of a decoded series with the original, some frames (z, y, x) of each at a time (FRAMES_HELD).
 
     The coreset is where `decode(step)` is finite; elsewhere it stands for `background` (data units). SSIM is measured over the coreset of
     evenly spaced steps (`ssim_steps`). Raises InputError for frames of different shapes.
     """
     coreset, domain = Errors(data_range), Errors(data_range)
     similarity, vertices, measured = 0.0, 0, [-1]
-    for step in range(steps):
-        original, decoded = original_frames(step), decode(step)
-        if step == 0:
-            measured = ssim_steps(steps, original.size)
+    threads, waiting = usable_threads(None), deque[Future[_Compared]]()
+
+    def work(step: int, original: Values, decoded: Values, similar: bool, share: int) -> _Compared:
         known = np.isfinite(decoded)
-        compared = coreset.compare(step, original, decoded, known)
-        figures = coreset.take(step, compared)
+        whole = bool(known.all())
+        inside = coreset.compare(step, original, decoded, None if whole else known)
         # Where everything is decoded, both are the same.
-        domain.take(step, compared if known.all() else domain.compare(step, original, np.where(known, decoded, background)))
-        if step in measured:
-            total, count = ssim(original, decoded, data_range, known)
-            similarity, vertices = similarity + total, vertices + count
-        progress("measuring", step + 1, steps, "" if figures.psnr is None else f"{figures.psnr:.1f} dB")
+        outside = inside if whole else domain.compare(step, original, np.where(known, decoded, decoded.dtype.type(background)))
+        found = ssim(original, decoded, data_range, None if whole else known, threads=share) if similar else (0.0, 0)
+        return _Compared(step=step, inside=inside, everywhere=outside, similarity=found)
+
+    def collect() -> None:
+        nonlocal similarity, vertices
+        compared = waiting.popleft().result()
+        figures = coreset.take(compared.step, compared.inside)
+        domain.take(compared.step, compared.everywhere)
+        similarity, vertices = similarity + compared.similarity[0], vertices + compared.similarity[1]
+        progress("measuring", compared.step + 1, steps, "" if figures.psnr is None else f"{figures.psnr:.1f} dB")
+
+    with ThreadPoolExecutor(threads, thread_name_prefix="fhash-measure") as workers:
+        for step in range(steps):
+            original, decoded = original_frames(step), decode(step)
+            if step == 0:
+                measured = ssim_steps(steps, original.size)
+            at_once = max(1, min(FRAMES_HELD, steps, VERTICES_HELD // max(original.size, 1)))
+            while len(waiting) >= at_once:
+                collect()
+            waiting.append(workers.submit(work, step, original, decoded, step in measured, -(-threads // at_once)))
+        while waiting:
+            collect()
     return Quality(
         psnr=coreset.psnr,
         rmse=coreset.rmse,

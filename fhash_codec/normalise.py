@@ -50,8 +50,12 @@ class Mean:
         wide = values.astype(np.float64)
         scale = power_of_two(max(abs(float(wide.min())), abs(float(wide.max()))))
         wide *= scale
-        self._total += Fraction(float(wide.sum())) / Fraction(scale)
-        self.count += values.size
+        self.add_sum(values.size, float(wide.sum()), scale)
+
+    def add_sum(self, count: int, total: float, scale: float) -> None:
+        """Take in so many values whose sum, times `scale`, is known."""
+        self._total += Fraction(total) / Fraction(scale)
+        self.count += count
 
     def value(self) -> float:
         """The mean of everything taken in; there must be something."""

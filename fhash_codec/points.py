@@ -91,6 +91,27 @@ def sample_points(
     return (values, slopes) if gradient else values
 
 
+def feature_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
+    """Derivatives float32 (features, n) of the normalised value by each interpolated embedding at points (4, n) of the box, in order.
+
+    Points that lie close together are read together: those of one call should.
+    """
+    span = np.stack([points.min(axis=1), points.max(axis=1)], axis=1)
+    patches = [_patch(network, level, span) for level in range(len(network.levels))]
+    slopes = np.empty((network.features, points.shape[1]), np.float32)
+    for start in range(0, points.shape[1], CHUNK_POINTS):
+        chunk = points[:, start : start + CHUNK_POINTS]
+        count = chunk.shape[1]
+        head = Head(network, count)
+        for level, patch in enumerate(patches):
+            before, after, _ = _locate(network, level, chunk)
+            rows = slice(level * network.embedding_size, (level + 1) * network.embedding_size)
+            head.inputs[rows, :count] = _interpolate(_corners(patch, before, network.levels[level]), after, False)[0]
+        head.run()
+        slopes[:, start : start + count] = head.gradient()[:, :count]
+    return slopes
+
+
 def _evaluate(network: Network, patches: Sequence[Patch], points: npt.NDArray[np.float64], gradient: bool) -> tuple[Floats, Floats | None]:
     """Values (n,) at points (4, n) within the patches and, if asked for, derivatives (4, n)."""
     size, count = network.embedding_size, points.shape[1]

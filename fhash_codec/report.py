@@ -14,6 +14,7 @@ def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[s
 
     ratio: raw bytes / bytes of the whole file. psnr, rmse, max_abs_error, ssim: over the coreset of all steps, also those between key
     frames; *_domain: over every finite vertex, the background standing outside the coreset. curve: the training history.
+    tables_loss_db: what coded tables cost at the key frames, None for others.
     seconds: of the whole job that was reported on.
     """
     info = volume.info
@@ -33,6 +34,7 @@ def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[s
         "data_range": volume.value_range.high - volume.value_range.low,
         "parameters": info["model"]["parameters"],
         "profile": info["model"]["profile"],
+        "tables_loss_db": info["model"].get("tables_loss_db"),
         "device": info["training"]["device"],
         "gains": info["model"].get("gains", []),
         "quality": quality,

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.normalise import Mean, ValueRange, pieces
+from fhash_codec.normalise import Mean, ValueRange, pieces, power_of_two
 from fhash_codec.progress import Progress
+from fhash_codec.sums import range_and_sum
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 
@@ -47,12 +48,11 @@ def scan(series: Series, progress: Progress) -> Scan:
     last: npt.NDArray[np.uint8] | None = None
     steps = series.shape[0]
     for step, frame in enumerate(series.frames()):
+        count = 0
         for part in pieces(frame):
-            values = finite_values(part)
-            if values.size:
-                low, high = min(low, float(values.min())), max(high, float(values.max()))
-                mean.add(values)
-        if not is_finite(frame):
+            found = _part(part, mean)
+            count, low, high = count + found[0], min(low, found[1]), max(high, found[2])
+        if count < frame.size:
             bits = np.packbits(~np.isfinite(frame))
             # A land mask is the same at every step: keep one copy of it.
             last = last if last is not None and np.array_equal(bits, last) else bits
@@ -64,9 +64,20 @@ def scan(series: Series, progress: Progress) -> Scan:
     return Scan(value_range=value_range, mean=min(max(mean.value(), low), high), finite_count=mean.count, missing=missing)
 
 
-def is_finite(frame: npt.NDArray[Any]) -> bool:
-    """Whether every value is finite, PIECE values at a time; integers always are."""
-    return frame.dtype.kind != "f" or all(bool(np.isfinite(part).all()) for part in pieces(frame))
+def _part(part: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:
+    """Number, least and greatest of the finite values of a piece, which the mean takes in."""
+    if part.dtype.kind != "f":
+        mean.add(part)
+        return part.size, float(part.min()), float(part.max())
+    wide = part.astype(np.float32 if part.dtype.itemsize <= 4 else np.float64, copy=False)
+    # A sum of float32 values does not overflow, one of float64 values is taken after scaling.
+    count, low, high, total = range_and_sum(wide)
+    scale = 1.0
+    if count and wide.dtype == np.float64:
+        scale = power_of_two(max(abs(low), abs(high)))
+        total = range_and_sum(wide, scale)[3]
+    mean.add_sum(count, total, scale)
+    return count, low, high
 
 
 def finite_values(values: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -1,8 +1,12 @@
-"""A trained model and its coreset as arrays of a container, and back. numpy only."""
+"""A trained model and its coreset as arrays of a container, and back. numpy only.
+
+Tables are arrays of numbers, or with `--tables transform` coded: then each level has an array per component, and an embedding is a mixture
+of the components (`mixed`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import prod
 from typing import Any
 
@@ -11,7 +15,7 @@ import numpy.typing as npt
 
 from fhash_codec.architecture import Architecture
 from fhash_codec.coreset import Coreset
-from fhash_codec.network import Floats, Network
+from fhash_codec.network import Floats, Network, TableSource
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.errors import DamagedFileError, InputError
 
@@ -23,15 +27,22 @@ def write_model(
     writer: ContainerWriter,
     architecture: Architecture,
     coreset: Coreset,
-    fine: Floats,
-    tables: list[Floats],
     layers: list[tuple[Floats, Floats]],
-    kind: str,
 ) -> None:
-    """Write tables (as number type `kind`), MLP and occupancy.
+    """Write MLP and occupancy. layers: (weight (out, in), bias (out,))."""
+    for number, (weight, bias) in enumerate(layers, start=1):
+        writer.add_whole(f"mlp/weight_{number}", weight)
+        writer.add_whole(f"mlp/bias_{number}", bias)
+    bits = np.stack(coreset.occupancy)
+    writer.add_whole("occupancy/bits", bits, chunk_shape=(1, bits.shape[1]))
 
-    fine: the finest embeddings (bricks, E, vertices of a brick); tables: the coarser ones (buckets, E);
-    layers: (weight (out, in), bias (out,)).
+
+def write_tables(
+    writer: ContainerWriter, architecture: Architecture, coreset: Coreset, fine: Floats, tables: list[Floats], kind: str
+) -> None:
+    """Write the tables as numbers of the type `kind`.
+
+    fine: the finest embeddings (bricks, E, vertices of a brick); tables: the coarser ones (buckets, E).
     Raises InputError where the numbers do not fit in `kind`.
     """
     size = architecture.embedding_size
@@ -40,11 +51,6 @@ def write_model(
     )
     for number, (level, table) in enumerate(zip(architecture.levels[1:], tables, strict=True), start=2):
         _write_table(writer, number, (*level, size), table, iter(table.reshape(*level, size)), kind)
-    for number, (weight, bias) in enumerate(layers, start=1):
-        writer.add_whole(f"mlp/weight_{number}", weight)
-        writer.add_whole(f"mlp/bias_{number}", bias)
-    bits = np.stack(coreset.occupancy)
-    writer.add_whole("occupancy/bits", bits, chunk_shape=(1, bits.shape[1]))
 
 
 def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
@@ -71,13 +77,54 @@ def load_network(container: Container) -> Network:
         return Network(
             levels=levels,
             embedding_size=model["embedding_size"],
-            tables=[StoredTable(container.arrays[f"tables/level_{n}"]) for n in range(1, len(levels) + 1)],
+            tables=[_table(container, n, model["embedding_size"]) for n in range(1, len(levels) + 1)],
             layers=layers,
             box_size=tuple(high - low for low, high in header["feature_bounding_box"]),
             key_frames=levels[0][0],
         )
     except InputError as error:
         raise DamagedFileError(f"{container.path}: {error}") from error
+
+
+def _table(container: Container, level: int, size: int) -> TableSource:
+    """The table of a level, in whichever way it is stored."""
+    if container.header["model"]["tables"] == "transform":
+        return CodedTable([container.arrays[component_name(level, number)] for number in range(1, size + 1)])
+    return StoredTable(container.arrays[f"tables/level_{level}"])
+
+
+def component_name(level: int, number: int) -> str:
+    """The array of one component of a coded level, both counted from 1."""
+    return f"tables/level_{level}/component_{number}"
+
+
+def mixed(components: Sequence[Floats], mixing: Floats) -> Floats:
+    """Embeddings float32 (..., E) from E components (...): embedding e is the sum of component j times mixing[j, e].
+
+    In float32, each product and each sum rounded, from the first component on: the same bits on every machine.
+    """
+    result = np.empty((*components[0].shape, mixing.shape[1]), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # of hostile numbers; the network refuses what is not finite
+        for number in range(mixing.shape[1]):
+            total = components[0] * mixing[0, number]
+            for component, weights in zip(components[1:], mixing[1:], strict=True):
+                total = total + component * weights[number]
+            result[..., number] = total
+    return result
+
+
+class CodedTable:
+    """A level's table whose components are coded, as the decoder reads it."""
+
+    def __init__(self, arrays: Sequence[StoredArray]) -> None:
+        self.arrays = arrays
+        self.shape = (*arrays[0].shape, len(arrays))
+        with np.errstate(over="ignore"):
+            self.mixing = np.array([array.attributes["mixing"] for array in arrays], np.float32)
+
+    def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """Embeddings of a region, float32."""
+        return mixed([array.read(region[:4]) for array in self.arrays], self.mixing)[..., region[4]]
 
 
 class StoredTable:

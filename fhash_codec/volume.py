@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property, lru_cache
+from functools import cached_property
 from math import prod
 from pathlib import Path
 from types import EllipsisType, TracebackType
@@ -12,15 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset import Box, box_size
-from fhash_codec.decoder import decode_region, sample_points
+from fhash_codec.coreset import Box, crop
 from fhash_codec.key_frames import KeyTimes, strictly_monotonic, time_axis
-from fhash_codec.lattice import Lattice
-from fhash_codec.network import Network
 from fhash_codec.normalise import ValueRange
-from fhash_codec.occupancy import between, unpack
 from fhash_codec.progress import Progress, silent
-from fhash_codec.storage import load_network
+from fhash_codec.volume_model import open_model
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
@@ -65,10 +61,10 @@ class Volume:
         self.attrs: Mapping[str, Any] = header["variable"]["attributes"]
         self.box: Box = tuple((low, high) for low, high in header["feature_bounding_box"])  # type: ignore[assignment]
         self.profile: str = header["model"]["profile"]
-        self.chunks = (1, *self.shape[1:]) if self.profile == "paper" else container.arrays["tables/level_1"].chunk_shape
         self.value_range = ValueRange(*header["value_range"])
         self.background = float(header["background"])
-        self._occupied = lru_cache(maxsize=4)(self._unpack_occupancy)
+        self._model = open_model(container)
+        self.chunks = self._model.chunks
 
     # -- what the file says ------------------------------------------------------------------------------------------------
 
@@ -127,40 +123,55 @@ class Volume:
         key = self._key_index(t)
         region = self._checked(region)
         result = np.full([high - low for low, high in region], np.nan, dtype=self.dtype)
-        inner = tuple((max(low, b0), min(high, b1)) for (low, high), (b0, b1) in zip(region, self.box, strict=True))
-        if all(low < high for low, high in inner):
-            target = tuple(slice(low - r0, high - r0) for (low, high), (r0, _) in zip(inner, region, strict=True))
-            local: Box = tuple((low - b0, high - b0) for (low, high), (b0, _) in zip(inner, self.box, strict=True))  # type: ignore[assignment]
-            wanted = self._occupied_at(key)[tuple(slice(*part) for part in local)]
-            if self.profile == "compact":
-                values = self._lattice.region(key, local).astype(self.dtype)
-            else:
-                values = self.value_range.from_unit(decode_region(self._network, key, local, wanted=wanted)).astype(self.dtype)
-            np.copyto(result[target], values, where=wanted)
+        found = self._within_box(region)
+        if found is not None:
+            target, local = found
+            wanted = self._occupied(key, local)
+            np.copyto(result[target], self._model.region(key, local, wanted).astype(self.dtype), where=wanted)
         if outside == "background":
             result[np.isnan(result)] = self.background
         missing = self._missing_at(t)
         if missing is not None:
-            result[missing[tuple(slice(*part) for part in region)]] = np.nan
+            result[crop(missing, region)] = np.nan
         return result
 
-    def read_lod(self, t: float, lod: int) -> npt.NDArray[Any]:
+    def read_lod(self, t: float, lod: int, region: Box | None = None) -> npt.NDArray[Any]:
         """Every 2^lod-th vertex (z, y, x) of the feature bounding box at step `t`, low-passed, of `self.dtype`; compact files only.
 
-        lod: 0 to 10; 0 is the box as `read` gives it. Finer detail is not decoded. NaN outside the coreset of these vertices.
-        Raises RegionError for a step outside the series, InputError for a file of another profile or another lod.
+        lod: 0 to 10; 0 is the box as `read` gives it. region: those that lie in it, in vertices of the domain (all if None); see
+        `lod_vertices`. Finer detail, and what lies in other tiles, is not decoded. NaN outside the coreset of these vertices.
+        Raises RegionError for a step outside the series and a region without such a vertex, InputError for a file of another profile or
+        another lod.
         """
-        if self.profile != "compact":
-            raise InputError(f"{self.path}: a file of the profile {self.profile} has no levels of detail; decode it whole")
-        if isinstance(lod, bool) or not isinstance(lod, int | np.integer) or not 0 <= lod <= MAX_LOD:
-            raise InputError(f"lod is {lod}; allowed: 0 to {MAX_LOD}")
-        if t != int(t):
+        vertices = self.lod_vertices(lod, region)
+        if not float(t).is_integer():
             raise InputError(f"step {t:g} lies between two; levels of detail are of whole steps")
         step = int(self._key_index(t))
-        values = self._lattice.coarse(step, int(lod)).astype(self.dtype)
-        every = tuple(slice(low, high, 1 << lod) for low, high in self.box)
-        values[~self.occupancy(step)[every]] = np.nan
+        part: Box = tuple(((v[0] - low) >> lod, ((v[-1] - low) >> lod) + 1) for v, (low, _) in zip(vertices, self.box, strict=True))  # type: ignore[assignment]
+        values = self._model.coarse(step, int(lod), part).astype(self.dtype)
+        surrounding: Box = tuple((v[0], v[-1] + 1) for v in vertices)  # type: ignore[assignment]
+        values[~self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]] = np.nan
         return values
+
+    def lod_vertices(self, lod: int, region: Box | None = None) -> tuple[range, range, range]:
+        """The vertices (z, y, x) of the domain that `read_lod` gives: every 2^lod-th of the feature bounding box, within a region.
+
+        Raises InputError for another lod than 0 to 10, RegionError for a region outside the domain or without such a vertex.
+        """
+        if isinstance(lod, bool) or not isinstance(lod, int | np.integer) or not 0 <= lod <= MAX_LOD:
+            raise InputError(f"lod is {lod}; allowed: 0 to {MAX_LOD}")
+        every = 1 << int(lod)
+        found = []
+        for axis, (first, end), (low, high) in zip(AXES[1:], self.box, self._checked(region), strict=True):
+            inside = range(first + -(-max(low - first, 0) // every) * every, min(high, end), every)
+            if not inside:
+                raise RegionError(
+                    f"{self.path}: region {low}:{high} of axis {axis} holds no vertex of level of detail {lod}, "
+                    f"every {every}. from {first} to {end - 1}"
+                )
+            found.append(inside)
+        z, y, x = found
+        return z, y, x
 
     def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
         """Values by numpy's basic indexing: integers, slices and `...`, negative as usual; RegionError (an IndexError) outside."""
@@ -217,33 +228,31 @@ class Volume:
         slopes = np.full((*inside.shape, 4), np.nan)
         if inside.any():
             chosen = [p[inside] for p in (keys, *local)]
-            if self.profile == "compact":
-                if gradient:
-                    values[inside], slopes[inside] = self._lattice.slopes(chosen[0], chosen[1:])
-                else:
-                    values[inside] = self._lattice.points(chosen[0], chosen[1:])
-            elif gradient:
-                unit, slope = sample_points(self._network, *chosen, gradient=True)
+            if gradient:
+                values[inside], slopes[inside] = self._model.slopes(chosen[0], chosen[1:])
                 # From per key frame to per step: between two steps the key index runs evenly.
                 first = np.minimum(np.floor(steps[inside]), max(self.shape[0] - 2, 0))
                 after = np.minimum(first + 1, self.shape[0] - 1)
-                pace = self.key_times.key_indices(after) - self.key_times.key_indices(first)
-                slopes[inside] = slope.astype(np.float64) * (self.value_range.high - self.value_range.low)
-                slopes[inside, 0] *= pace
+                slopes[inside, 0] *= self.key_times.key_indices(after) - self.key_times.key_indices(first)
             else:
-                unit = sample_points(self._network, *chosen)
-            if self.profile == "paper":
-                values[inside] = self.value_range.from_unit(unit)
+                values[inside] = self._model.points(chosen[0], chosen[1:])
         values = values.reshape(shape).astype(self.dtype)
         return (values, slopes.reshape(*shape, 4).astype(self.dtype)) if gradient else values
 
-    def occupancy(self, t: float) -> npt.NDArray[np.bool_]:
-        """Which vertices (z, y, x) are in the coreset at step `t`; between key frames, those that are at either of
-        them, in the profile compact at both."""
-        result = np.zeros(self.shape[1:], dtype=bool)
-        result[tuple(slice(*part) for part in self.box)] = self._occupied_at(self._key_index(t))
+    def occupancy(self, t: float, region: Box | None = None) -> npt.NDArray[np.bool_]:
+        """Which vertices (z, y, x) of a region (all if None) are in the coreset at step `t`.
+
+        Between key frames those that are at either of them, in the profile compact at both. Raises RegionError.
+        """
+        key = self._key_index(t)
+        region = self._checked(region)
+        result = np.zeros([high - low for low, high in region], dtype=bool)
+        found = self._within_box(region)
+        if found is not None:
+            target, local = found
+            result[target] = self._occupied(key, local)
         missing = self._missing_at(t)
-        return result if missing is None else result & ~missing
+        return result if missing is None else result & ~crop(missing, region)
 
     def step_of_time(self, time: float) -> float:
         """The step, fractional between steps, at a time in the units of the series; RegionError outside its times.
@@ -253,14 +262,6 @@ class Volume:
         return self._checked_times().step_of_time(float(time))
 
     # -- pieces ------------------------------------------------------------------------------------------------------------
-
-    @cached_property
-    def _lattice(self) -> Lattice:
-        return Lattice(self.container.arrays["tables/level_1"])
-
-    @cached_property
-    def _network(self) -> Network:
-        return load_network(self.container)
 
     def _checked_times(self) -> KeyTimes:
         if not strictly_monotonic(self.coords["t"].values):
@@ -281,20 +282,17 @@ class Volume:
                 raise RegionError(f"{self.path}: region {low}:{high} of axis {axis} is empty or outside 0:{length}")
         return region
 
-    def _unpack_occupancy(self, first: int, last: int) -> npt.NDArray[np.bool_]:
-        arrays, size = self.container.arrays, box_size(self.box)
-        if "occupancy/mask" in arrays:
-            mask = arrays["occupancy/mask"].read((slice(first, last + 1), *(slice(0, n) for n in size)))
-            # Between steps both count: a value is no better than the two it lies between.
-            return np.asarray((mask[0] & mask[-1]) != 0)
-        if "occupancy/bits" not in arrays:
-            return np.ones(size, dtype=bool)
-        stored = arrays["occupancy/bits"]
-        bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
-        return unpack(bits[0] & bits[-1] if self.profile == "compact" else between(bits[0], bits[-1]), size)
+    def _within_box(self, region: Box) -> tuple[tuple[slice, ...], Box] | None:
+        """Where a region of the domain and the box meet: as slices of the region, and in vertices of the box; None where they do not."""
+        inner = [(max(low, b0), min(high, b1)) for (low, high), (b0, b1) in zip(region, self.box, strict=True)]
+        if not all(low < high for low, high in inner):
+            return None
+        target = tuple(slice(low - r0, high - r0) for (low, high), (r0, _) in zip(inner, region, strict=True))
+        return target, tuple((low - b0, high - b0) for (low, high), (b0, _) in zip(inner, self.box, strict=True))  # type: ignore[return-value]
 
-    def _occupied_at(self, key: float) -> npt.NDArray[np.bool_]:
-        return self._occupied(int(np.floor(key)), int(np.ceil(key)))
+    def _occupied(self, key: float, local: Box) -> npt.NDArray[np.bool_]:
+        """Which vertices of a part of the box count at a key index."""
+        return self._model.occupied(int(np.floor(key)), int(np.ceil(key)), local)
 
     def _missing_at(self, t: float) -> npt.NDArray[np.bool_] | None:
         """Where the source had no finite value at a step, or at either step around; None where the file has no such vertices."""
@@ -320,11 +318,13 @@ class Volume:
             chosen = np.flatnonzero(inside & (group == number))
             if not chosen.size:
                 continue
-            occupied = self.occupancy(steps[representative])
             low = [np.floor(p[chosen]).astype(np.int64) for p in space]
             high = [np.ceil(p[chosen]).astype(np.int64) for p in space]
+            around: Box = tuple((int(b.min()), int(h.max()) + 1) for b, h in zip(low, high, strict=True))  # type: ignore[assignment]
+            occupied = self.occupancy(steps[representative], around)
             for corner in np.ndindex(2, 2, 2):
-                inside[chosen] &= occupied[tuple(h if up else b for up, b, h in zip(corner, low, high, strict=True))]
+                at = ((h if up else b) - start for up, b, h, (start, _) in zip(corner, low, high, around, strict=True))
+                inside[chosen] &= occupied[tuple(at)]
         return inside
 
     # -- life --------------------------------------------------------------------------------------------------------------

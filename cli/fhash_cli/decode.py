@@ -65,8 +65,6 @@ def command(
         raise click.UsageError("--t and --time exclude each other")
     if roi is not None and box is not None:
         raise click.UsageError("--roi and --box exclude each other")
-    if lod is not None and (roi is not None or box is not None):
-        raise click.UsageError("--lod is of the whole feature bounding box; leave out --roi and --box")
     if lod is not None and outside != "nan":
         raise click.UsageError("--lod has NaN outside the coreset; leave out --outside")
     if isosurface is not None:
@@ -78,20 +76,20 @@ def command(
         check_writable(output, force, region=True, sources=[run])
     with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
         chosen = [volume.step_of_time(time) for time in times] if times else steps_of(volume, steps)
-        region = region_of_box(volume, box) if box is not None else region_of(volume, roi) if lod is None else volume.box
-        every = 1 << (lod or 0)
+        region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
+        # A level of detail has its own vertices, those of the feature bounding box that lie in the region.
+        z, y, x = (range(low, high) for low, high in region) if lod is None else volume.lod_vertices(lod, region)
         kind = np.dtype(dtype or volume.dtype)
         statistics = Statistics()
 
         def frames() -> Iterator[npt.NDArray[Any]]:
             for done, step in enumerate(chosen):
-                frame = volume.read(step, region, outside=outside) if lod is None else volume.read_lod(step, lod)
+                frame = volume.read(step, region, outside=outside) if lod is None else volume.read_lod(step, lod, region)
                 statistics.add(frame, _inside(volume, step, region, frame, outside))
                 yield convert(frame, kind, filled=outside == "background")
                 progress("decoding", done + 1, len(chosen))
 
-        z, y, x = (len(range(low, high, every)) for low, high in region)
-        shape = (len(chosen), z, y, x)
+        shape = (len(chosen), len(z), len(y), len(x))
         paths = []
         if output is not None and isosurface is not None:
             if len(chosen) != 1:
@@ -109,11 +107,12 @@ def command(
                 units=volume.units,
                 dtype=kind,
                 shape=shape,
-                coords=coordinates(volume, chosen, region, every),
+                coords=coordinates(volume, chosen, (z, y, x)),
                 attributes=volume.attrs,
             )
             paths = [str(path) for path in save_region(output, whole, frames(), force=force, sources=[run])]
-        result = {"paths": paths, "shape": shape, "dtype": kind.name, "steps": chosen, "region": region, **statistics.result()}
+        within = [(part.start, part.stop) for part in (z, y, x)]
+        result = {"paths": paths, "shape": shape, "dtype": kind.name, "steps": chosen, "region": within, **statistics.result()}
         emit(result, table(_rows(result, volume.units)), as_json)
 
 
@@ -181,13 +180,13 @@ def convert(frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any], *, filled
     return np.asarray(whole)
 
 
-def _inside(volume: Volume, step: float, region: Sequence[Span], frame: npt.NDArray[Any], outside: str) -> int:
+def _inside(volume: Volume, step: float, region: tuple[Span, Span, Span], frame: npt.NDArray[Any], outside: str) -> int:
     """How many vertices of a decoded frame belong to the coreset."""
     import numpy as np
 
     if outside == "nan":
         return frame.size - int(np.isnan(frame).sum())
-    return int(volume.occupancy(step)[tuple(slice(*span) for span in region)].sum())
+    return int(volume.occupancy(step, region).sum())
 
 
 def _rows(result: dict[str, Any], units: str) -> list[tuple[str, str]]:

@@ -63,8 +63,15 @@ def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
         ("coreset", f"{report['coreset_fraction']:.3%} of the domain, in {spans(report['feature_bounding_box'])}"),
         *quality_rows(report, units),
         ("model", f"{model}, {report['profile']}"),
+        *loss_rows(report),
         ("time", f"{number(report['seconds'], 's', digits=3)} on {report['device']}"),
     ]
+
+
+def loss_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What coded tables cost, where there are any."""
+    loss = model.get("tables_loss_db")
+    return [] if loss is None else [("tables", f"coded, for {loss:.2f} dB of the PSNR")]
 
 
 def gain_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.encode import loss_rows
 from fhash_cli.options import json_option, run_argument
 from fhash_cli.output import apart, compared, emit, extent, listed, number, quality_rows, spans, table
 
@@ -46,6 +47,7 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
 def _network(info: dict[str, Any], seconds: str) -> list[tuple[str, str]]:
     model, training = info["model"], info["training"]
     return [
+        *loss_rows(model),
         ("network", f"{model['profile']}, {len(model['levels'])} levels, {model['parameters']:,} parameters in {model['tables']}"),
         ("training", f"{training['epochs']} epochs{seconds} on {training['device']}, seed {info['encoder']['seed']}"),
     ]

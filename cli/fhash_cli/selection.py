@@ -60,15 +60,15 @@ def _vertices(volume: Volume, axis: str, low: float | None, high: float | None) 
     return low_index, high_index
 
 
-def coordinates(volume: Volume, steps: Sequence[float], region: Sequence[Span], every: int = 1) -> dict[str, Coordinate]:
-    """The Coordinate of each axis cut to some (fractional) steps and every n-th vertex of a region."""
+def coordinates(volume: Volume, steps: Sequence[float], vertices: Sequence[range]) -> dict[str, Coordinate]:
+    """The Coordinate of each axis cut to some (fractional) steps and the vertices along z, y and x."""
     import numpy as np
 
     from fhash_formats.series import Coordinate
 
     whole = volume.coords
     times = np.interp(steps, np.arange(volume.shape[0]), whole["t"].values)
-    values = {"t": times} | {axis: whole[axis].values[low:high:every] for axis, (low, high) in zip("zyx", region, strict=True)}
+    values = {"t": times} | {axis: whole[axis].values[list(part)] for axis, part in zip("zyx", vertices, strict=True)}
     return {axis: Coordinate(name=whole[axis].name, values=cut, attributes=whole[axis].attributes) for axis, cut in values.items()}
 
 

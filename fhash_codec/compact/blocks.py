@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import product
 from math import prod
+from threading import Lock
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset import Extent, box_size, crop
-from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 from fhash_formats.transform.tile import Shape
 
@@ -21,6 +21,14 @@ Index = tuple[int, int, int, int]
 
 HELD_BYTES = 1 << 30
 """A box of at most this size is kept in memory, of a larger one a layer of tiles at a time."""
+
+
+class _Whole:
+    """Values and mask of the whole box once they were read, shared by all its tilings."""
+
+    def __init__(self) -> None:
+        self.lock = Lock()
+        self.content: tuple[Values, Care] | None = None
 
 
 class Blocks:
@@ -39,7 +47,7 @@ class Blocks:
         self.grid: Index = tuple(-(-length // n) for length, n in zip(self.shape, self.tile, strict=True))  # type: ignore[assignment]
         self.complete = extent.samples == prod(self.shape)
         self._held: tuple[int, Values, Care] | None = None
-        self._whole: tuple[Values, Care] | None = None
+        self._whole = _Whole()
 
     def retile(self, tile: Shape) -> Blocks:
         """The same series in other tiles; what is in memory is shared."""
@@ -59,7 +67,7 @@ class Blocks:
     def read(self, index: Index) -> tuple[Values, Care]:
         """A tile's values in the type of the source, its rest beyond the box repeating the border, and what counts (None: everything).
 
-        One thread at a time; ask in C order, since the layer of one t is kept.
+        Any thread where the whole is held, else one at a time and in C order, since the layer of one t is kept.
         """
         values, care = self._layer(index[0])
         spans = [slice(i * n, min((i + 1) * n, length)) for i, n, length in zip(index[1:], self.tile[1:], self.shape[1:], strict=True)]
@@ -75,9 +83,10 @@ class Blocks:
         """Values and mask of one layer of tiles, (up to tile t, z, y, x of the box)."""
         steps = range(t * self.tile[0], min((t + 1) * self.tile[0], self.shape[0]))
         if self.held:
-            if self._whole is None:
-                self._whole = self._load(range(self.shape[0]))
-            values, care = self._whole
+            with self._whole.lock:
+                if self._whole.content is None:
+                    self._whole.content = self._load(range(self.shape[0]))
+            values, care = self._whole.content
             return values[steps[0] : steps[-1] + 1], None if care is None else care[steps[0] : steps[-1] + 1]
         if self._held is None or self._held[0] != t:
             self._held = None
@@ -89,34 +98,3 @@ class Blocks:
         for number, step in enumerate(steps):
             values[number] = crop(self._series.read(step), self._extent.box)
         return values, None if self.complete else np.stack([self._extent.mask(step) for step in steps])
-
-
-def parse_tile(text: str, shape: Shape) -> Shape | None:
-    """The shape that a setting names, cut to the series; None for 'auto'. Raises InputError."""
-    if text == "auto":
-        return None
-    if text == "whole":
-        return shape
-    try:
-        numbers = [int(part) for part in text.split("x")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != 4 or min(numbers) < 1:
-        raise InputError(f"tile is '{text}'; allowed: auto, whole, or four whole numbers as in 4x32x32x32 (t, z, y, x)")
-    t, z, y, x = (min(n, length) for n, length in zip(numbers, shape, strict=True))
-    return t, z, y, x
-
-
-def even_tile(shape: Shape, tiles: int, steps: int) -> Shape:
-    """A tile of at most `steps` steps of which about `tiles` make up a shape: space is cut along its longest part."""
-    parts = [-(-shape[0] // steps), 1, 1, 1]
-    while prod(parts) < tiles:
-        lengths = [-(-n // p) for n, p in zip(shape, parts, strict=True)]
-        axis = max((1, 2, 3), key=lambda a: (lengths[a], a))
-        if lengths[axis] < 24:
-            break
-        parts[axis] += 1
-    t, *space = (-(-n // p) for n, p in zip(shape, parts, strict=True))
-    # Even lengths keep the vertices of the first coarse level on one lattice.
-    z, y, x = (n if p == 1 else n + n % 2 for n, p in zip(space, parts[1:], strict=True))
-    return t, z, y, x

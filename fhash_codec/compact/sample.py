@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import prod
 from typing import TypeVar
 
@@ -14,6 +14,8 @@ import numpy.typing as npt
 
 from fhash_codec.compact.blocks import Blocks, Care, Values
 from fhash_codec.network import usable_threads
+from fhash_codec.normalise import power_of_two
+from fhash_codec.sums import squared_errors
 from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.tile import CodedTile, encode_tile, exact_tile
 
@@ -24,8 +26,6 @@ WEIGHT = 0.09
 """Squared steps that a bit is worth to the quantiser (findings: best between 0.07 and 0.11)."""
 OFFSETS = (-5, -1, 0)
 """Where magnitudes of 1, 2 and more stand after rate-distortion optimisation, in 1/128 step."""
-SLOPE = 5.5
-"""dB by which the PSNR falls when the step grows by a factor of e: to begin a search with."""
 SMALLEST_STEP = 2.0**-26
 """Of the range: integers beyond 2^30 cannot be coded."""
 
@@ -39,6 +39,7 @@ class Way:
     passes: int = 1
     error: float | None = None
     filled: bool = False
+    density: int = 1
     exact: bool = False
 
 
@@ -63,7 +64,7 @@ def code(values: Values, care: Care, settings: Settings, way: Way) -> tuple[Code
     """Code one tile and measure it."""
     if way.exact:
         count = values.size if care is None else int(np.count_nonzero(care))
-        coded = exact_tile(values)
+        coded = exact_tile(values, occupied=None if settings.mask is None else np.ones(values.shape, bool) if care is None else care)
         return coded, Outcome(size=len(coded.data), squares=0.0, count=count, largest=0.0)
     coded = encode_tile(
         values,
@@ -75,71 +76,86 @@ def code(values: Values, care: Care, settings: Settings, way: Way) -> tuple[Code
         passes=way.passes,
         keep_missing=False,
         filled=way.filled,
+        density=way.density,
     )
-    squares, count, largest = _errors(values, coded.decoded, care)
-    outcome = Outcome(size=len(coded.data), squares=squares, count=count, largest=largest, nonzero=coded.nonzero)
+    # Scaled, so that neither huge nor tiny ranges over- or underflow.
+    scale = power_of_two(settings.high - settings.low)
+    count, squares, largest = squared_errors(values, coded.decoded, care, scale)
+    outcome = Outcome(size=len(coded.data), squares=squares / scale**2, count=count, largest=largest / scale, nonzero=coded.nonzero)
     return coded, outcome
 
 
-FEW_TILES, FEW_VERTICES = 8, 12 << 20
-"""So few tiles differ too much to stand for each other: all are taken, if together they have at most so many vertices."""
 GOLDEN = 0.6180339887498949
 BATCH = 16
-PIECE = 1 << 14
-"""Values whose errors are taken at once: float64 copies of them stay in the cache."""
+CHEAPEST = 0.05
+"""What a tile is taken to cost at the least, as a part of the mean: the cheapest must be represented, too."""
 
 
-def _errors(values: Values, decoded: Values, care: Care) -> tuple[float, int, float]:
-    """Sum of the squared errors, number and largest of the errors of the values that count."""
-    squares, count, largest = 0.0, 0, 0.0
-    one, other = values.ravel(), decoded.ravel()
-    counts = None if care is None else care.ravel()
-    with np.errstate(over="ignore", invalid="ignore"):
-        for start in range(0, one.size, PIECE):
-            part = slice(start, start + PIECE)
-            difference = np.subtract(other[part], one[part], dtype=np.float64)
-            if counts is not None:
-                difference = difference[counts[part]]
-            if difference.size:
-                count += difference.size
-                largest = max(largest, float(difference.max()), -float(difference.min()))
-                squares += float(np.multiply(difference, difference, out=difference).sum())
-    return squares, count, largest
-
-
-def total(outcomes: Sequence[Outcome]) -> Outcome:
-    """All of them as one."""
+def total(outcomes: Sequence[Outcome], weights: Sequence[int] | None = None) -> Outcome:
+    """All of them as one. weights: how many tiles each stands for, 1 if left out."""
+    pairs = list(zip(weights or [1] * len(outcomes), outcomes, strict=True))
     return Outcome(
-        size=sum(o.size for o in outcomes),
-        squares=math.fsum(o.squares for o in outcomes),
-        count=sum(o.count for o in outcomes),
+        size=sum(weight * o.size for weight, o in pairs),
+        squares=math.fsum(weight * o.squares for weight, o in pairs),
+        count=sum(weight * o.count for weight, o in pairs),
         largest=max((o.largest for o in outcomes), default=0.0),
-        nonzero=sum(o.nonzero for o in outcomes),
+        nonzero=sum(weight * o.nonzero for weight, o in pairs),
     )
 
 
+def strata(costs: Sequence[float], number: int) -> list[tuple[int, int]]:
+    """At most so many of the tiles, each with the number of tiles that it stands for, in the order of the tiles.
+
+    costs: what each tile costs, roughly. Tiles of similar cost form a stratum, which its middle one stands for; all strata cost about the
+    same, so that a dear tile stands for itself, and a cheap one for many.
+    """
+    order = np.argsort(costs, kind="stable")
+    floor = CHEAPEST * float(np.mean(costs)) or 1.0
+    so_far = np.cumsum(np.asarray(costs, dtype=np.float64)[order] + floor)
+    groups = np.minimum((so_far / so_far[-1] * number * (1 - 1e-12)).astype(int), number - 1)
+    chosen = []
+    for group in np.unique(groups):
+        members = order[groups == group]
+        chosen.append((int(members[len(members) // 2]), len(members)))
+    return sorted(chosen)
+
+
 class Sample:
-    """Tiles in memory.
+    """Tiles in memory that stand for all.
 
     Attributes:
-        tiles: (values, what counts). share: how many tiles of the series each stands for. blocks: the whole series.
+        tiles: (values, what counts). weights: how many tiles of the series each stands for. complete: whether these are all that count.
+        counted: vertices that count, of the whole series, roughly. blocks: the whole series.
     """
 
-    def __init__(self, blocks: Blocks, most_vertices: int, pool: ThreadPoolExecutor) -> None:
-        """Evenly spread tiles of at most so many vertices together, at least one."""
+    def __init__(self, blocks: Blocks, most_vertices: int, pool: ThreadPoolExecutor, costs: Sequence[float] | None = None) -> None:
+        """Tiles of at most so many vertices together, at least one.
+
+        costs: what each tile costs, roughly, in C order; tiles are then chosen by it (`strata`), else spread evenly.
+        """
         indices = list(blocks.indices())
         wanted = min(len(indices), max(1, most_vertices // prod(blocks.tile)))
-        if prod(blocks.shape) <= FEW_VERTICES and len(indices) <= FEW_TILES:
-            wanted = len(indices)
-        # By the golden ratio, so that no row or column of the grid is preferred; then in C order, for the reader's sake.
-        order = sorted(range(len(indices)), key=lambda number: number * GOLDEN % 1.0)
-        chosen = [indices[number] for number in sorted(order[:wanted])]
-        tiles = [blocks.read(index) for index in chosen]
-        counting = [tile for tile in tiles if tile[1] is None or tile[1].any()]
-        self.tiles = counting or tiles[:1]
-        self.share = len(indices) / len(chosen)
+        if wanted == len(indices):
+            chosen = [(number, 1) for number in range(wanted)]
+        elif costs is not None:
+            chosen = strata(costs, wanted)
+        else:
+            # By the golden ratio, so that no row or column of the grid is preferred; then in C order, for the reader's sake.
+            order = sorted(range(len(indices)), key=lambda number: number * GOLDEN % 1.0)
+            weights = [len(indices) * (place + 1) // wanted - len(indices) * place // wanted for place in range(wanted)]
+            chosen = list(zip(sorted(order[:wanted]), weights, strict=True))
+        found = [(blocks.read(indices[number]), weight) for number, weight in chosen]
+        found = [(tile, weight) for tile, weight in found if tile[1] is None or tile[1].any()] or found[:1]
+        self.tiles = [tile for tile, _ in found]
+        self.weights = [weight for _, weight in found]
+        self.complete = wanted == len(indices)
+        self.counted = sum(weight * (values.size if care is None else int(np.count_nonzero(care))) for (values, care), weight in found)
         self.blocks = blocks
-        self._pool = pool
+        self._pool, self._costs = pool, costs
+
+    def wider(self, most_vertices: int) -> Sample:
+        """A sample of more tiles, up to so many vertices together; this one where it has them all."""
+        return self if self.complete else Sample(self.blocks, most_vertices, self._pool, self._costs)
 
     def map(self, work: Callable[[tuple[Values, Care]], Result]) -> list[Result]:
         """The results for all tiles, in order, by all processors."""
@@ -148,39 +164,19 @@ class Sample:
     def map_all(self, work: Callable[[tuple[Values, Care]], Result]) -> Iterator[Result]:
         """The results for all tiles of the series, some at a time."""
         indices = list(self.blocks.indices())
+        if self.blocks.held:
+            yield from self._pool.map(lambda index: work(self.blocks.read(index)), indices)
+            return
         for start in range(0, len(indices), BATCH):
             yield from self._pool.map(work, [self.blocks.read(index) for index in indices[start : start + BATCH]])
 
     def run(self, settings: Settings, way: Way) -> Outcome:
-        """Code all tiles."""
-        return total(self.map(lambda tile: code(tile[0], tile[1], settings, way)[1]))
+        """Code the tiles; what coding the whole series would give."""
+        return total(self.map(lambda tile: code(tile[0], tile[1], settings, way)[1]), self.weights)
 
     def decoded(self, settings: Settings, way: Way) -> list[npt.NDArray[np.float32]]:
         """What the tiles decode to, float32."""
         return self.map(lambda tile: code(tile[0], tile[1], settings, way)[0].decoded.astype(np.float32))
-
-
-def solve_step(sample: Sample, settings: Settings, way: Way, psnr: float, data_range: float, *, tries: int = 5) -> tuple[Settings, Outcome]:
-    """Settings with the step at which the sample just reaches a PSNR, within 0.02 dB if that can be had in so many tries."""
-    log_step = math.log(settings.step)
-    points: list[tuple[float, float]] = []
-    best: tuple[float, Settings, Outcome] | None = None
-    for _ in range(tries):
-        log_step = max(log_step, math.log(data_range * SMALLEST_STEP))
-        settings = replace(settings, step=math.exp(log_step))
-        outcome = sample.run(settings, way)
-        reached = outcome.psnr(data_range)
-        if best is None or abs(reached - psnr) < abs(best[0] - psnr):
-            best = (reached, settings, outcome)
-        if abs(reached - psnr) < 0.02 or math.isinf(reached):
-            break
-        slope = SLOPE
-        if points and abs(points[-1][0] - log_step) > 1e-9:
-            slope = min(max(-(reached - points[-1][1]) / (log_step - points[-1][0]), 2.0), 12.0)
-        points.append((log_step, reached))
-        log_step += (reached - psnr) / slope
-    assert best is not None
-    return best[1], best[2]
 
 
 def pool() -> ThreadPoolExecutor:

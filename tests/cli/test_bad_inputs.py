@@ -186,8 +186,8 @@ REGIONS = [
     (["--dtype", "complex64"], "--dtype"),
     (["--dtype", "uint8"], "--outside background"),
     (["--lod", "11"], "--lod"),
-    (["--lod", "1", "--roi", "0:2,:,:"], "leave out --roi and --box"),
-    (["--lod", "1", "--box", "0:2,:,:"], "leave out --roi and --box"),
+    (["--lod", "3", "--roi", "2:3,:,:"], "holds no vertex of level of detail 3"),
+    (["--lod", "1", "--roi", "0:99,:,:"], "--roi along z is 0:99"),
     (["--lod", "1", "--time", "0.5"], "lies between two"),
     (["--lod", "1", "--outside", "background"], "leave out --outside"),
 ]

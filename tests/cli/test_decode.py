@@ -208,6 +208,15 @@ def test_a_level_of_detail_has_every_second_position(fhash: Fhash, refused: Call
         np.testing.assert_array_equal(series.read(0), volume.read_lod(1, 1))
         for axis in "zyx":
             np.testing.assert_array_equal(series.coords[axis].values, volume.coords[axis].values[::2])
+    part = tmp_path / "part.h5"
+    result = fhash("decode", run, "--lod", "1", "--t", "1", "--roi", "1:5,:,3:7", "-o", part, "--json", "-q")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert json.loads(result.stdout)["shape"] == [1, 2, 4, 2]
+    assert json.loads(result.stdout)["region"][0] == [2, 5]
+    with fhash_formats.open_series(part) as series, fhash_codec.open(run) as volume:
+        np.testing.assert_array_equal(series.read(0), volume.read_lod(1, 1)[1:3, :, 2:4])
+        np.testing.assert_array_equal(series.coords["z"].values, volume.coords["z"].values[2:5:2])
+        np.testing.assert_array_equal(series.coords["x"].values, volume.coords["x"].values[4:7:2])
     words = ["--profile", "paper", "--epochs", "1", "--width", "4", "-q"]
     assert fhash("encode", data, "-o", tmp_path / "paper.fhz", *words).exit_code == 0
     assert "no levels of detail" in refused(2, "decode", tmp_path / "paper.fhz", "--lod", "1")

@@ -45,6 +45,21 @@ def test_table_says_what_was_written(fhash: Fhash, data: Path, tmp_path: Path) -
     assert "100.000% of the domain, in z 0:6, y 0:7, x 0:8" in result.stdout
 
 
+def test_coded_tables_are_reported_with_their_loss(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    for name, tables in {"plain": "float32", "coded": "transform"}.items():
+        result = fhash("encode", data, "-o", tmp_path / name, *PAPER, "--tables", tables)
+        assert (result.exit_code, result.stderr) == (0, "")
+        assert ("coded, for" in result.stdout) == (name == "coded")
+    info = fhash("info", tmp_path / "coded")
+    assert "in transform" in info.stdout
+    assert "of the PSNR" in info.stdout
+    assert "of the PSNR" not in fhash("info", tmp_path / "plain").stdout
+    model = json.loads(fhash("info", tmp_path / "coded", "--json").stdout)["model"]
+    assert model["tables_loss_db"] <= 0.1001
+    assert fhash("verify", tmp_path / "coded").exit_code == 0
+    assert fhash("diff", data, tmp_path / "coded", "--json").exit_code == 0
+
+
 def test_same_command_gives_the_same_bytes_without_timings(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         assert fhash("encode", data, "-o", tmp_path / name, "--no-timings", *SMALL).exit_code == 0

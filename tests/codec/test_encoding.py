@@ -149,7 +149,7 @@ def test_the_file_decodes_to_what_the_torch_model_gives(tmp_path):
     source = field()
     fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=6, width=16, tables="float32", key_frames="0,1,3"))
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        network = volume._network
+        network = volume._model.network
         from fhash_codec.architecture import Architecture
 
         architecture = Architecture.for_box((8, 10, 18), 3, width=16)

@@ -34,6 +34,24 @@ def test_a_front_is_sharpened_by_what_the_gain_says(front):
     assert len(trained.head.to_bytes()) <= 530
 
 
+@pytest.fixture(scope="module")
+def far():
+    """What lies beyond the neighbourhood: the error of a voxel is that of the signal three steps before it along x."""
+    random = np.random.default_rng(0)
+    original = random.normal(size=(2, 10, 12, 40)).astype(np.float32)
+    decoded = original + 0.5 * np.roll(original, 3, axis=3)
+    return decoded.astype(np.float32), original
+
+
+def test_a_cross_sees_farther(far):
+    settings = {"low": -8.0, "high": 8.0, "hidden": (8, 8), "samples": 100_000, "steps": 400, "device": "cpu"}
+    near, cross = (train_head([(*far, None)], cross=cross, **settings) for cross in (False, True))
+    assert cross.gain_db > near.gain_db + 0.3
+    gained = 10 * np.log10(mse(*far) / mse(cross.head.apply(far[0]), far[1]))
+    assert gained == pytest.approx(cross.gain_db, abs=0.3)
+    assert cross.head.cross
+
+
 def test_noise_gains_nothing_much():
     random = np.random.default_rng(0)
     original = random.normal(size=(2, 16, 16, 32)).astype(np.float32)
@@ -42,8 +60,10 @@ def test_noise_gains_nothing_much():
     assert abs(trained.gain_db) < 0.5
 
 
-def test_the_same_seed_gives_the_same_head(front):
-    runs = [train_head([(*front, None)], low=-1.0, high=2.0, steps=60, seed=seed, device="cpu").head.to_bytes() for seed in (4, 4, 5)]
+@pytest.mark.parametrize("cross", [False, True])
+def test_the_same_seed_gives_the_same_head(front, cross):
+    settings = {"low": -1.0, "high": 2.0, "hidden": (4, 4), "cross": cross, "samples": 40_000, "steps": 60, "device": "cpu"}
+    runs = [train_head([(*front, None)], seed=seed, **settings).head.to_bytes() for seed in (4, 4, 5)]
     assert runs[0] == runs[1] != runs[2]
 
 
@@ -63,8 +83,8 @@ def test_several_tiles_of_several_shapes_and_a_tile_that_does_not_count(front):
         (decoded[:1, :5, :, :7], original[:1, :5, :, :7], None),
         (decoded, original * np.float32(np.nan), np.zeros(original.shape, dtype=bool)),
     ]
-    trained = train_head(pairs, low=-1.0, high=2.0, hidden=(6,), steps=200, device="cpu")
-    assert trained.head.hidden == (6,)
+    trained = train_head(pairs, low=-1.0, high=2.0, hidden=(6, 4), cross=True, samples=100_000, steps=200, device="cpu")
+    assert trained.head.hidden == (6, 4)
     assert trained.gain_db > 3
 
 

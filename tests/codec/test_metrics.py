@@ -147,3 +147,14 @@ def test_quality_of_nothing_kept():
     quality = measure_quality(original.__getitem__, lambda step: np.full_like(original[step], np.nan), 2, 1.0, 0.5)
     assert (quality.psnr, quality.rmse, quality.max_abs_error, quality.ssim) == (None, None, None, None)
     assert quality.rmse_domain == pytest.approx(math.sqrt(np.mean((original - 0.5) ** 2)))
+
+
+@pytest.mark.parametrize("held", [1, 8])
+def test_steps_are_counted_in_order_whatever_is_held(monkeypatch, held):
+    monkeypatch.setattr("fhash_codec.metrics.FRAMES_HELD", held)
+    original, decoded = frames(9)
+    calls = []
+    quality = measure_quality(lambda step: original[step], lambda step: decoded[step], 9, 1.0, 0.0, lambda *call: calls.append(call))
+    assert [(call[1], call[2]) for call in calls] == [(step + 1, 9) for step in range(9)]
+    assert [step.step for step in quality.per_step] == list(range(9))
+    assert quality.max_abs_error == pytest.approx(np.abs(original - decoded).max())

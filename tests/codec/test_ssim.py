@@ -10,6 +10,7 @@ from skimage import metrics
 
 from fhash_codec import network
 from fhash_codec.metrics import ssim, ssim_steps
+from fhash_formats import native
 from fhash_formats.errors import InputError
 
 SHAPES = [(11, 11, 11), (12, 64, 70), (25, 40, 33), (1, 60, 70), (1, 1, 90), (5, 30, 2), (3, 4, 5), (1, 1, 1)]
@@ -147,3 +148,30 @@ def test_measured_steps_are_even_within_budget_and_include_the_ends(steps, verti
     gaps = np.diff(chosen)
     assert all(0 <= step < steps for step in chosen)
     assert not len(gaps) or (gaps.min() >= 1 and gaps.max() - gaps.min() <= 1)
+
+
+@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint8])
+@pytest.mark.parametrize("shape", [*SHAPES, (70, 40, 70)], ids=str)
+@pytest.mark.parametrize("holes", [False, True])
+def test_native_and_numpy_agree(monkeypatch, shape, dtype, holes):
+    original, decoded = ((field * 200 + 20).astype(dtype) for field in pair(shape))
+    decoded = decoded.astype(np.float32 if dtype != np.float64 else np.float64)
+    mask = np.random.default_rng(3).random(shape) < 0.8 if holes else None
+    if holes and dtype != np.uint8:
+        original[np.random.default_rng(4).random(shape) < 0.1] = np.nan
+    found = []
+    for choice in ("1", "0"):
+        monkeypatch.setenv("FHASH_NATIVE", choice)
+        found.append(ssim(original, decoded, 200.0, mask))
+    assert found[0][1] == found[1][1]
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-11, abs=1e-11)
+
+
+@pytest.mark.parametrize("choice", ["1", "0"])
+def test_a_decoded_value_that_is_not_finite_is_refused(monkeypatch, choice):
+    monkeypatch.setenv("FHASH_NATIVE", choice)
+    original, decoded = pair((12, 13, 14))
+    decoded[6, 6, 6] = np.inf
+    with pytest.raises(InputError, match="not finite"):
+        ssim(original, decoded, 1.0)

@@ -99,6 +99,22 @@ def test_occupancy_is_the_dilated_feature_and_between_key_frames_that_of_either(
     np.testing.assert_array_equal(volume.occupancy(2.0), volume.occupancy(2))
 
 
+@pytest.mark.parametrize("profile", ["paper", "compact"])
+@pytest.mark.parametrize("t", [0, 2.5, 4])
+def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t):
+    field = np.arange(5 * 6 * 7 * 8, dtype=np.float32).reshape(5, 6, 7, 8) % 317
+    field[2, 3:, 4] = np.nan
+    short = {"epochs": 1, "width": 4} if profile == "paper" else {"effort": 1, "tile": "2x3x4x5"}
+    fhash_codec.encode(field, tmp_path / "a.fhz", EncodeConfig(profile=profile, features=("interval:100:150",), dilation=0, **short))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        whole = volume.occupancy(t)
+        assert 0 < whole.mean() < 0.5
+        for region in (((0, 6), (0, 7), (0, 8)), ((2, 5), (1, 6), (3, 4)), ((5, 6), (6, 7), (7, 8)), ((0, 1), (0, 1), (0, 1))):
+            np.testing.assert_array_equal(volume.occupancy(t, region), whole[tuple(slice(*part) for part in region)])
+        with pytest.raises(RegionError, match="axis x"):
+            volume.occupancy(t, ((0, 6), (0, 7), (0, 9)))
+
+
 @pytest.mark.parametrize(
     ("t", "region", "message"),
     [

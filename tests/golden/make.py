@@ -26,7 +26,14 @@ GOLDENS = {
     ),
     "compact-1.1-psnr": EncodeConfig(psnr=50.0, effort=4, timings=False),
     "compact-1.1-bound": EncodeConfig(max_error=0.01, effort=2, tile="3x4x7x5", timings=False, features=("interval:0.5:2",)),
+    "compact-1.1-mask": EncodeConfig(psnr=50.0, effort=4, timings=False, features=("interval:0.5:2",)),
+    "compact-1.1-predictor": EncodeConfig(max_error=2.0, effort=3, timings=False),
+    "paper-1.1-transform": EncodeConfig(
+        profile="paper", width=8, timings=False, features=("interval:0.5:2",), tables="transform", psnr=60.0
+    ),
 }
+
+TIME = Coordinate(name="time", values=np.array([0.0, 0.5, 2.0, 2.25, 9.0]), attributes={"units": "hours since 2000-01-01"})
 
 
 def series() -> ArraySeries:
@@ -35,8 +42,22 @@ def series() -> ArraySeries:
     values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
     for step in range(5):
         values[step, 2, 3, step : step + 2] = np.nan
-    time = Coordinate(name="time", values=np.array([0.0, 0.5, 2.0, 2.25, 9.0]), attributes={"units": "hours since 2000-01-01"})
-    return ArraySeries(values, name="density", units="kg m-3", coords={"t": time})
+    return ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME})
+
+
+def fronts() -> ArraySeries:
+    """Noise beside a flat part, with a sharp edge that moves, and a hole: what is coded by prediction."""
+    t, z, y, x = np.meshgrid(np.arange(6), np.arange(16), np.arange(24), np.arange(24), indexing="ij")
+    inside = (x - 12) ** 2 + (y - 12) ** 2 + (z - 8) ** 2 < (4 + t) ** 2
+    noise = np.random.default_rng(0).normal(0, 3, t.shape)
+    values = np.where(inside, 800 + 40 * np.sin(x / 3) + noise, 20.0).astype(np.float32)
+    values[1, 2, 3, 4:6] = np.nan
+    times = Coordinate(name="time", values=np.append(TIME.values, 10.0), attributes=TIME.attributes)
+    return ArraySeries(values, name="density", units="kg m-3", coords={"t": times})
+
+
+SERIES = {"compact-1.1-predictor": fronts}
+"""Of the goldens that are not made from `series`."""
 
 
 def main() -> None:
@@ -45,7 +66,7 @@ def main() -> None:
         if path.exists():
             # Goldens are never replaced.
             continue
-        fhash_codec.encode(series(), path, config)
+        fhash_codec.encode(SERIES.get(name, series)(), path, config)
         with fhash_codec.open(path) as volume:
             between = np.stack([volume.read(t) for t in (0.5, 3.75)])
             np.savez_compressed(HERE / f"{name}.npz", whole=volume[...], between=between, tolerance=TOLERANCE)

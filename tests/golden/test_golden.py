@@ -12,8 +12,8 @@ from zarr.storage import ZipStore
 import fhash_codec
 
 HERE = Path(__file__).parent
-COMPACT = ["compact-1.1-bound", "compact-1.1-psnr"]
-NAMES = ["paper-1.0-plain", "paper-1.0-feature", "paper-1.0-linear-uint8", *COMPACT]
+COMPACT = ["compact-1.1-bound", "compact-1.1-mask", "compact-1.1-predictor", "compact-1.1-psnr"]
+NAMES = ["paper-1.0-plain", "paper-1.0-feature", "paper-1.0-linear-uint8", "paper-1.1-transform", *COMPACT]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -30,7 +30,8 @@ _ZSTD_MARK = 0xFD2FB528
 class ChunkCoder(Protocol):
     """Codes chunks of one dtype and full shape; `decode` raises DamagedFileError before it allocates for bytes that do not fit.
 
-    One that can decode with less detail takes a level of detail as a further argument: `decode(data, lod)`, 0 for everything.
+    One that can decode with less detail takes a level of detail as a further argument: `decode(data, lod)`, 0 for everything. One whose
+    chunks say which values are occupied has `masked` True and `decode_masked(data)`, which gives values and mask.
     """
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
@@ -111,16 +112,35 @@ class CheckedCoder:
 
         Raises DamagedFileError, and InputError for a level of detail of a coder that has none.
         """
-        if len(data) < _CRC.size:
-            raise DamagedFileError(f"{len(data)} bytes are too few for a CRC-32C")
-        coded = data[: -_CRC.size]
-        if crc32c(coded) != _CRC.unpack(data[-_CRC.size :])[0]:
-            raise DamagedFileError("its CRC-32C differs, the data are damaged")
+        coded = self._checked(data)
         if lod == 0:
             return self._coder.decode(coded)
         if lod < 0 or "lod" not in inspect.signature(self._coder.decode).parameters:
             raise InputError(f"level of detail {lod}; the array has none but 0")
         return self._coder.decode(coded, lod)  # type: ignore[call-arg]
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Required features that the coding of the chunks stands for, besides that of the codec itself."""
+        return tuple(getattr(self._coder, "features", ()))
+
+    @property
+    def masked(self) -> bool:
+        """Whether the chunks say which of their values are occupied."""
+        return bool(getattr(self._coder, "masked", False))
+
+    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+        """The full chunk and its mask; only where `masked`. Raises DamagedFileError."""
+        values, mask = self._coder.decode_masked(self._checked(data))  # type: ignore[attr-defined]
+        return values, mask
+
+    def _checked(self, data: memoryview) -> memoryview:
+        if len(data) < _CRC.size:
+            raise DamagedFileError(f"{len(data)} bytes are too few for a CRC-32C")
+        coded = data[: -_CRC.size]
+        if crc32c(coded) != _CRC.unpack(data[-_CRC.size :])[0]:
+            raise DamagedFileError("its CRC-32C differs, the data are damaged")
+        return coded
 
 
 def chunk_coder(codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]) -> CheckedCoder:

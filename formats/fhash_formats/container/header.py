@@ -22,13 +22,14 @@ from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 FORMAT = "fhash"
 FORMAT_VERSION = (1, 1)
 TRANSFORM_FEATURE = "transform"
-KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE})
+KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, "cross", "mask", "predictor"})
 PAPER, COMPACT = "paper", "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
 POSITIONS = ("time", "z", "y", "x")
 QUALITY = ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain", "rmse_domain", "max_abs_error_domain")
 HISTORY = ("seconds", "epoch", "psnr")
-TABLE_TYPES = ("float32", "float16", "uint8")
+CODED = "transform"
+TABLE_TYPES = ("float32", "float16", "uint8", CODED)
 MAX_LEVELS = 64
 MAX_EMBEDDING = 1024
 MAX_HIDDEN_LAYERS = 64
@@ -58,8 +59,10 @@ def validate_header(header: Mapping[str, Any]) -> None:
     top.whole("dilation", 0, MAX_LENGTH)
     top.need(0 <= top.number("coreset_fraction") <= 1, "coreset_fraction", "a number from 0 to 1")
     profile = _check_model(top.record("model"), shape[0], box)
+    if profile == COMPACT or header["model"]["tables"] == CODED:
+        needed = f"{TRANSFORM_FEATURE} in the profile {COMPACT} and for tables coded by {CODED}"
+        top.need(TRANSFORM_FEATURE in header["required_features"], "required_features", needed)
     if profile == COMPACT:
-        top.need(TRANSFORM_FEATURE in header["required_features"], "required_features", f"{TRANSFORM_FEATURE} in the profile {COMPACT}")
         _check_coordinates(top, shape)
     top.record("config")
     training, quality = top.record("training"), top.record("quality")
@@ -91,10 +94,16 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
         if name.startswith("tables/") and arrays[name].dtype == np.uint8 and header["model"]["profile"] == "paper":
             attributes.number("offset")
             attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
+        if name.startswith("tables/") and header["model"]["tables"] == CODED:
+            attributes.numbers("mixing", header["model"]["embedding_size"])
     if TRANSFORM_FEATURE not in header["required_features"]:
         for name, array in arrays.items():
             if array.sharding is not None or array.codecs[0]["name"] == TRANSFORM:
                 raise DamagedFileError(f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, which the header does not require")
+    for name, array in arrays.items():
+        for feature in array.coder.features:
+            if feature not in header["required_features"]:
+                raise DamagedFileError(f"array {name} has the feature {feature}, which the header does not require")
     for name, shape, dtypes in _optional(header):
         if name in arrays:
             _check_array(name, arrays[name], shape, dtypes)
@@ -163,6 +172,7 @@ def _check_model(model: Record, steps: int, box: Sequence[int]) -> str:
         model.whole("width", 1, MAX_WIDTH)
         model.whole("parameters", 1, 1 << 62)
         model.choice("tables", TABLE_TYPES)
+        model.number_or_null("tables_loss_db")
     else:
         model.whole("embedding_size", 1, 1)
         model.whole("parameters", 0, 1 << 62)
@@ -196,7 +206,11 @@ def _expected(header: Mapping[str, Any]) -> Iterator[Expected]:
         yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
         return
     for number, level in enumerate(model["levels"], start=1):
-        yield f"tables/level_{number}", (*level, model["embedding_size"]), (model["tables"],)
+        if model["tables"] == CODED:
+            for component in range(1, model["embedding_size"] + 1):
+                yield f"tables/level_{number}/component_{component}", tuple(level), ("float32",)
+        else:
+            yield f"tables/level_{number}", (*level, model["embedding_size"]), (model["tables"],)
     for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
         yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
         yield f"mlp/bias_{number}", (outputs,), ("float32",)

@@ -2,6 +2,9 @@
 
 A shard is the bytes of its inner chunks in C order without gaps, then an index of two uint64 (offset, bytes) for each, then the CRC-32C
 of the index. Inner chunks that lie wholly beyond the end of the array are absent, all others present. So nothing can overlap or hide.
+
+A reader that wants few inner chunks may read their entries alone: each inner chunk has a CRC-32C of its own, so that a wrong entry is
+found without that of the index, as long as it lies within the shard (`parse_entry`).
 """
 
 from __future__ import annotations
@@ -26,7 +29,9 @@ ABSENT = 2**64 - 1
 
 INDEX_CODECS: list[Codec] = [{"name": "bytes", "configuration": {"endian": "little"}}, CRC32C]
 
-_ENTRY_BYTES, _CRC = 16, struct.Struct("<I")
+_ENTRY, _CRC = struct.Struct("<2Q"), struct.Struct("<I")
+ENTRY_BYTES = _ENTRY.size
+"""Of the index, for each inner chunk."""
 
 Index = tuple[int, ...]
 
@@ -47,7 +52,7 @@ class Sharding:
     @property
     def index_bytes(self) -> int:
         """Bytes of the index of a shard with its CRC-32C."""
-        return prod(self.counts) * _ENTRY_BYTES + _CRC.size
+        return prod(self.counts) * ENTRY_BYTES + _CRC.size
 
     def place(self, index: Index) -> tuple[Index, int]:
         """The shard in which the inner chunk `index` of an array lies, and its number there."""
@@ -116,6 +121,19 @@ def pack_index(sizes: Sequence[int], present: npt.NDArray[np.bool_]) -> bytes:
     table[present, 0] = np.concatenate([np.zeros(1, np.uint64), ends[:-1]])
     table[present, 1] = sizes
     return with_crc32c(table.tobytes())
+
+
+def parse_entry(data: bytes, data_bytes: int) -> tuple[int, int]:
+    """(offset, bytes) of one inner chunk that should be present, from its entry alone; `data_bytes`: of the shard before its index.
+
+    Raises DamagedFileError unless it lies in these bytes. Whether it overlaps others, is in order and is the right one, is not seen here.
+    """
+    offset, size = _ENTRY.unpack(data)
+    if ABSENT in (offset, size):
+        raise DamagedFileError("an inner chunk is missing from the shard's index")
+    if size > data_bytes or offset > data_bytes - size:
+        raise DamagedFileError(f"an inner chunk reaches beyond the shard, which has {data_bytes} bytes of them")
+    return offset, size
 
 
 def parse_index(data: bytes, present: npt.NDArray[np.bool_], data_bytes: int) -> npt.NDArray[np.int64]:

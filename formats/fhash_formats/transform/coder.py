@@ -19,7 +19,16 @@ from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.bands import Table, single_band
 from fhash_formats.transform.prior import State, prior_state
 
-__all__ = ["MAX_INTEGER", "Encoded", "decode_block", "decode_integers", "encode_block", "encode_integers"]
+__all__ = [
+    "MAX_INTEGER",
+    "Encoded",
+    "array_arguments",
+    "decode_block",
+    "decode_integers",
+    "encode_block",
+    "encode_integers",
+    "state_arguments",
+]
 
 MAX_INTEGER = 2**30 - 1
 """Largest magnitude that is coded."""
@@ -64,10 +73,10 @@ def encode_integers(
             _pointer(chosen),
             ctypes.c_double(weight),
             (ctypes.c_int64 * 4)(*integers.shape),
-            *_array(table, table.shape[0]),
-            *_state_arguments(state),
+            *array_arguments(table, table.shape[0]),
+            *state_arguments(state),
             ctypes.c_int64(kept),
-            *_array(buffer, capacity),
+            *array_arguments(buffer, capacity),
         )
         if size <= capacity:
             return Encoded(data=buffer[:size].tobytes(), integers=integers)
@@ -89,9 +98,9 @@ def decode_integers(data: bytes | memoryview, shape: tuple[int, ...], table: Tab
     code = library.fhash_decode(
         _pointer(integers),
         (ctypes.c_int64 * 4)(*shape),
-        *_array(table, table.shape[0]),
-        *_state_arguments(prior_state()),
-        *_array(source, source.size),
+        *array_arguments(table, table.shape[0]),
+        *state_arguments(prior_state()),
+        *array_arguments(source, source.size),
     )
     if code < 0:
         raise DamagedFileError("the coded integers are damaged")
@@ -120,9 +129,11 @@ def _pointer(array: npt.NDArray[Any] | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if array is None else array.ctypes.data)
 
 
-def _array(array: npt.NDArray[Any], count: int) -> tuple[ctypes.c_void_p, ctypes.c_int64]:
+def array_arguments(array: npt.NDArray[Any], count: int) -> tuple[ctypes.c_void_p, ctypes.c_int64]:
+    """An array and its length as the native functions take them."""
     return _pointer(array), ctypes.c_int64(count)
 
 
-def _state_arguments(state: State) -> list[Any]:
-    return [part for array in (state.slots, state.weights, state.simples) for part in _array(array, array.shape[0])]
+def state_arguments(state: State) -> list[Any]:
+    """The arrays of a state as the native functions take them."""
+    return [part for array in (state.slots, state.weights, state.simples) for part in array_arguments(array, array.shape[0])]

@@ -143,7 +143,7 @@ def _compiled() -> Callable[..., Any] | None:
 
 
 def _compile(numba: Any, extending: Any) -> Callable[..., Any]:
-    parts: tuple[Callable[..., Any], ...] = (_code, _chance, _log16, _small, _mix, _learn, _context_mix, _choose)
+    parts: tuple[Callable[..., Any], ...] = (_code, _chance, _finish, _log16, _small, _mix, _learn, _context_mix, _choose)
     for part in (*parts, _add_centre, _add_neighbour, _prepare, _sign):
         extending.register_jitable(part)
     try:
@@ -550,18 +550,22 @@ def _run(
                 m[row + x] = min(magnitude, MAX_MAGNITUDE)
 
     if not decoding:
-        # The fewest bytes that name a number from low to high; the decoder reads zeros past the end.
-        low, high = span[0], span[1]
-        for keep in range(5):
-            v = high & ~(0xFFFFFFFF >> (8 * keep)) & 0xFFFFFFFF if keep else 0
-            if v < low:
-                continue
-            for i in range(keep):
-                out.append((v >> (24 - 8 * i)) & 255)
-            break
-        while len(out) > 0 and out[-1] == 0:
-            out.pop()
+        _finish(span, out)
     return 0, out
+
+
+def _finish(span: Sequence, out: Sequence) -> None:
+    # The fewest bytes that name a number from low to high; the decoder reads zeros past the end.
+    low, high = span[0], span[1]
+    for keep in range(5):
+        v = high & ~(0xFFFFFFFF >> (8 * keep)) & 0xFFFFFFFF if keep else 0
+        if v < low:
+            continue
+        for i in range(keep):
+            out.append((v >> (24 - 8 * i)) & 255)
+        break
+    while len(out) > 0 and out[-1] == 0:
+        out.pop()
 
 
 def _sign(v: int) -> int:

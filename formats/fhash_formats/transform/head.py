@@ -5,6 +5,9 @@ Features: log2(1 + |n - c| / (2 sigma)) with the sign of n - c, the place of c i
 the logarithm linear between powers of two. Hidden layers are leaky (slope 1/8). The last output times sigma is added to c and clipped.
 Features are kept as integers of 1/512, activations of 1/128, both of at most 4095 units, and weights are integers times a scale per layer.
 
+The second of two hidden layers may take the first one's outputs at a cross of nine voxels: the voxel itself and those before and after
+it along t, z, y, x (head_portable.CROSS; indices clamped to the tile). Such a head sees a step farther, and it weighs what it sees there.
+
 The head pays on fronts and plateaus, which a linear transform smears; on noise it gains little.
 """
 
@@ -12,9 +15,9 @@ from __future__ import annotations
 
 import ctypes
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -22,15 +25,17 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.head_portable import FEATURES, apply_network
+from fhash_formats.transform.head_portable import CROSS, FEATURES, apply_cross, apply_network
 from fhash_formats.transform.head_weights import MAX_WEIGHT, best_spread, decode_weights, encode_weights
 
-__all__ = ["MAX_BIAS", "MAX_HIDDEN", "MAX_WEIGHT", "MAX_WIDTH", "Head", "Layer"]
+__all__ = ["MAX_BIAS", "MAX_CROSS_WIDTH", "MAX_HIDDEN", "MAX_WEIGHT", "MAX_WIDTH", "Head", "Layer", "layer_inputs"]
 
 MAX_HIDDEN = 3
 """Most hidden layers."""
 MAX_WIDTH = 64
 """Most outputs of a hidden layer; sums stay exact in float32 up to it."""
+MAX_CROSS_WIDTH = 14
+"""Most outputs of the first layer before a cross; sums of nine times as many stay exact."""
 MAX_BIAS = 127
 """Largest magnitude of a quantised bias (8 bits)."""
 
@@ -38,7 +43,14 @@ _FEATURE_UNIT = 512.0
 _ACTIVATION_UNIT = 128.0
 _SIGMA_RANGE = (2.0**-100, 2.0**100)  # its inverse is an ordinary float32 as well
 
+_CROSSED = 0x82  # in place of the number of hidden layers: two, the second over the cross
+
 Floats = npt.NDArray[np.float32]
+
+
+def layer_inputs(hidden: Sequence[int], cross: bool) -> list[int]:
+    """How many inputs each layer has, the last one included."""
+    return [FEATURES, *(width * len(CROSS) if cross and number == 0 else width for number, width in enumerate(hidden))]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,6 +80,9 @@ class _Constants(NamedTuple):
 class Head:
     """A trained head. sigma, low, high: float32 values in data units; sigma > 0 is the decoded RMS error, [low, high] the clip range.
 
+    cross: whether the second of two hidden layers sees the first one's outputs at the nine voxels of the cross; its weights are
+    (out, 9 * in), the nine of each input together.
+
     Raises InputError for layers that do not fit together and constants out of range.
     """
 
@@ -75,14 +90,16 @@ class Head:
     sigma: float
     low: float
     high: float
+    cross: bool = False
 
     def __post_init__(self) -> None:
         if not 2 <= len(self.layers) <= MAX_HIDDEN + 1:
             raise InputError(f"a head has 1 to {MAX_HIDDEN} hidden layers, not {len(self.layers) - 1}")
-        inputs = FEATURES
-        for number, layer in enumerate(self.layers):
+        if self.cross and len(self.layers) != 3:
+            raise InputError(f"a head with a cross has 2 hidden layers, not {len(self.layers) - 1}")
+        for number, (layer, inputs) in enumerate(zip(self.layers, layer_inputs(self.hidden, self.cross), strict=True)):
             width = len(layer.biases)
-            allowed = 1 if number == len(self.layers) - 1 else MAX_WIDTH
+            allowed = 1 if number == len(self.layers) - 1 else MAX_CROSS_WIDTH if self.cross and number == 0 else MAX_WIDTH
             if not 1 <= width <= allowed:
                 raise InputError(f"layer {number} of a head has {width} outputs, 1 to {allowed} are allowed")
             if layer.weights.shape != (width, inputs) or layer.biases.shape != (width,):
@@ -93,7 +110,6 @@ class Head:
             for scale in (layer.weight_scale, layer.bias_scale):
                 if not (np.isfinite(scale) and scale > 0 and float(np.float16(scale)) == scale):
                     raise InputError(f"layer {number} of a head has scale {scale}: a positive float16 value is needed")
-            inputs = width
         if any(not np.isfinite(value) or float(np.float32(value)) != value for value in (self.sigma, self.low, self.high)):
             raise InputError(f"a head's sigma, low and high must be finite float32 values, not {self.sigma}, {self.low}, {self.high}")
         if not _SIGMA_RANGE[0] <= self.sigma <= _SIGMA_RANGE[1] or self.low > self.high:
@@ -136,7 +152,7 @@ class Head:
         library = native.library()
         constants = self._constants
         if library is None:
-            return apply_network(decoded, *constants)
+            return (apply_cross if self.cross else apply_network)(decoded, *constants)
         source = np.ascontiguousarray(decoded)
         out = np.empty(source.shape, dtype=np.float32)
         weights = np.concatenate([weight.ravel() for weight in constants.weights])
@@ -146,7 +162,7 @@ class Head:
         sizes = (ctypes.c_int64(size) for size in (*source.shape, len(self.layers)))
         pointers = (ctypes.c_void_p(array.ctypes.data) for array in (widths, weights, biases, scales))
         numbers = (ctypes.c_float(float(value)) for value in constants[3:])
-        function = library.fhash_head_apply
+        function = library.fhash_head_apply_cross if self.cross else library.fhash_head_apply
         function.restype = ctypes.c_int64
         code = function(ctypes.c_void_p(source.ctypes.data), *sizes, *pointers, *numbers, ctypes.c_void_p(out.ctypes.data))
         if code != 0:
@@ -156,11 +172,12 @@ class Head:
     def to_bytes(self) -> bytes:
         """The head as bytes, all little-endian; `from_bytes` is the inverse.
 
-        u8 number of hidden layers, u8 width of each; float32 sigma, low, high; per layer float16 scales of weights and biases, u8 spread;
-        the biases of all layers as int8; then the weights of all layers, row by row, in one number (head_weights.py).
+        u8 number of hidden layers, or 0x82 for two and a cross between them, u8 width of each; float32 sigma, low, high; per layer
+        float16 scales of weights and biases, u8 spread; the biases of all layers as int8; then the weights of all layers, row by row, in
+        one number (head_weights.py).
         """
         spreads = [best_spread(layer.weights.ravel().tolist()) for layer in self.layers]
-        parts = [bytes([len(self.hidden), *self.hidden]), struct.pack("<3f", self.sigma, self.low, self.high)]
+        parts = [bytes([_CROSSED if self.cross else len(self.hidden), *self.hidden]), struct.pack("<3f", self.sigma, self.low, self.high)]
         for layer, spread in zip(self.layers, spreads, strict=True):
             parts.append(struct.pack("<eeB", layer.weight_scale, layer.bias_scale, spread))
         parts += [layer.biases.tobytes() for layer in self.layers]
@@ -183,30 +200,31 @@ class Head:
 
     @classmethod
     def _read(cls, data: bytes) -> Head:
-        count = data[0]
+        cross = data[0] == _CROSSED
+        count = 2 if cross else data[0]
         if not 1 <= count <= MAX_HIDDEN:
             raise ValueError(f"{count} hidden layers")
-        widths = [FEATURES, *data[1 : 1 + count], 1]
-        if len(widths) != count + 2 or not all(1 <= width <= MAX_WIDTH for width in widths):
-            raise ValueError(f"layers of widths {widths[1:]}")
+        widths = [*data[1 : 1 + count], 1]
+        if len(widths) != count + 1 or not all(1 <= width <= MAX_WIDTH for width in widths) or (cross and widths[0] > MAX_CROSS_WIDTH):
+            raise ValueError(f"layers of widths {widths}")
+        inputs = layer_inputs(widths[:-1], cross)
         sigma, low, high = struct.unpack_from("<3f", data, 1 + count)
         at = 13 + count
         scales = [struct.unpack_from("<eeB", data, at + 5 * layer) for layer in range(count + 1)]
         at += 5 * (count + 1)
         biases = []
-        for width in widths[1:]:
+        for width in widths:
             biases.append(np.frombuffer(data, dtype=np.int8, count=width, offset=at))
             at += width
-        size = sum(first * second for first, second in pairwise(widths))
+        size = sum(first * second for first, second in zip(inputs, widths, strict=True))
         if len(data) - at > 3 * size + 1:  # no weight takes more than 22 bits: bounds the work on hostile bytes
             raise ValueError(f"{len(data)} bytes are too many")
         state = int.from_bytes(data[at:], "little")
         layers = []
-        for number, (inputs, width) in enumerate(pairwise(widths)):
-            weight_scale, bias_scale, spread = scales[number]
-            state, weights = decode_weights(state, width * inputs, spread)
-            matrix = np.array(weights, dtype=np.int8).reshape(width, inputs)
-            layers.append(Layer(weights=matrix, biases=biases[number], weight_scale=weight_scale, bias_scale=bias_scale))
+        for (weight_scale, bias_scale, spread), columns, bias in zip(scales, inputs, biases, strict=True):
+            state, weights = decode_weights(state, len(bias) * columns, spread)
+            matrix = np.array(weights, dtype=np.int8).reshape(len(bias), columns)
+            layers.append(Layer(weights=matrix, biases=bias, weight_scale=weight_scale, bias_scale=bias_scale))
         if state != 1:
             raise ValueError("its weights do not end where their code ends")
-        return cls(layers=tuple(layers), sigma=sigma, low=low, high=high)
+        return cls(layers=tuple(layers), sigma=sigma, low=low, high=high, cross=cross)

@@ -1,15 +1,17 @@
 """The neighbourhood head's arithmetic in numpy: features of a tile's voxels and the network on them. native/head.cpp has the same bits.
 
-Features and activations are integers held in float32, of at most 4095 either way; weights are integers of at most 31. A weighted sum of up
-to 64 of them stays below 2**24: it is exact in whatever order it is formed, by BLAS as well. All else is elementwise, rounded step by step.
+Features and activations are integers held in float32, of at most 4095 either way; weights are integers of at most 31. A weighted sum of
+up to 132 stays below 2**24: it is exact in whatever order it is formed, by BLAS as well. All else is elementwise, rounded step by step.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["FEATURES", "LIMIT", "STEPS", "apply_network", "clip", "compress", "locate"]
+__all__ = ["CROSS", "FEATURES", "LIMIT", "STEPS", "apply_cross", "apply_network", "centre_features", "clip", "compress", "locate"]
 
 Floats = npt.NDArray[np.float32]
 
@@ -26,6 +28,9 @@ STEPS: tuple[tuple[int, int, int, int], ...] = (
     *((0, first, second, 0) for first in (-1, 1) for second in (-1, 1)),
 )
 """Steps along (t, z, y, x) from a voxel to its 26 neighbours, in the order of the features."""
+
+CROSS = ((0, 0, 0, 0), *STEPS[:8])
+"""Steps to the nine voxels whose first-layer outputs a cross takes, in order: the voxel itself, then before and after along each axis."""
 
 FEATURES = len(STEPS) + 2
 """Inputs of the network: one per neighbour, two functions of the voxel's own value."""
@@ -68,35 +73,84 @@ def apply_network(
     weights: (out, in) of each layer; a layer's output is sum * scale + bias. inverse: 1 / (2 sigma), which scales differences.
     """
     values = clip(decoded, low, high)
+    out = np.empty_like(values)
+    with np.errstate(over="ignore", invalid="ignore"):  # extreme constants may overflow on the way: the clip has the last word
+        for step in range(len(values)):
+            for start, features in _features(values, step, low, inverse, unit):
+                centre = values[step, start : start + features.shape[1]]
+                correction = _network(features.reshape(FEATURES, -1), weights, scales, biases)
+                out[step, start : start + len(centre)] = clip(centre + correction.reshape(centre.shape), low, high)
+    return out
+
+
+def apply_cross(
+    decoded: Floats, weights: list[Floats], scales: list[np.float32], biases: list[Floats], low: np.float32, high: np.float32,
+    inverse: np.float32, unit: np.float32,
+) -> Floats:  # fmt: skip
+    """As `apply_network`, with a second layer over the cross: its weights are (out, 9 * in), the nine of each input together."""
+    values = clip(decoded, low, high)
     steps, z, y, x = values.shape
+    width = len(weights[0])
     out = np.empty_like(values)
     planes = max(1, _SLAB // (y * x))
-    with np.errstate(over="ignore", invalid="ignore"):  # extreme constants may overflow on the way: the clip has the last word
+    frames: dict[int, Floats] = {}  # first-layer outputs of a frame, its edges repeated once along z, y, x
+    with np.errstate(over="ignore", invalid="ignore"):
         for step in range(steps):
-            frames = {at: np.pad(values[min(max(step + at, 0), steps - 1)], _HALO, mode="edge") for at in (-1, 0, 1)}
+            for ahead in range(step, min(step + 2, steps)):
+                if ahead not in frames:
+                    first = np.empty((width, z, y, x), dtype=np.float32)
+                    for start, features in _features(values, ahead, low, inverse, unit):
+                        part = first[:, start : start + features.shape[1]]
+                        part[...] = _hidden(features.reshape(FEATURES, -1), weights[0], scales[0], biases[0]).reshape(part.shape)
+                    frames[ahead] = np.pad(first, ((0, 0), (1, 1), (1, 1), (1, 1)), mode="edge")
+            frames.pop(step - 2, None)
             for start in range(0, z, planes):
                 stop = min(start + planes, z)
+                taken = [
+                    frames[min(max(step + dt, 0), steps - 1)][:, 1 + start + dz : 1 + stop + dz, 1 + dy : 1 + dy + y, 1 + dx : 1 + dx + x]
+                    for dt, dz, dy, dx in CROSS
+                ]
+                correction = _network(np.stack(taken, axis=1).reshape(len(CROSS) * width, -1), weights[1:], scales[1:], biases[1:])
                 centre = values[step, start:stop]
-                features = np.empty((FEATURES, *centre.shape), dtype=np.float32)
-                for feature, (dt, dz, dy, dx) in zip(features, STEPS, strict=False):
-                    rows = slice(_HALO + start + dz, _HALO + stop + dz)
-                    neighbour = frames[dt][rows, _HALO + dy : _HALO + dy + y, _HALO + dx : _HALO + dx + x]
-                    feature[...] = compress((neighbour - centre) * inverse)
-                features[-2] = locate(centre, low, unit)
-                features[-1] = compress((centre - low) * inverse)
-                correction = _network(features.reshape(FEATURES, -1), weights, scales, biases)
                 out[step, start:stop] = clip(centre + correction.reshape(centre.shape), low, high)
     return out
 
 
+def _features(values: Floats, step: int, low: np.float32, inverse: np.float32, unit: np.float32) -> Iterator[tuple[int, Floats]]:
+    """Of one frame of the clipped values, some planes at a time: the first plane, and the features (FEATURES, planes, y, x)."""
+    steps, z, y, x = values.shape
+    planes = max(1, _SLAB // (y * x))
+    frames = {at: np.pad(values[min(max(step + at, 0), steps - 1)], _HALO, mode="edge") for at in (-1, 0, 1)}
+    for start in range(0, z, planes):
+        stop = min(start + planes, z)
+        centre = values[step, start:stop]
+        features = np.empty((FEATURES, *centre.shape), dtype=np.float32)
+        for feature, (dt, dz, dy, dx) in zip(features, STEPS, strict=False):
+            rows = slice(_HALO + start + dz, _HALO + stop + dz)
+            neighbour = frames[dt][rows, _HALO + dy : _HALO + dy + y, _HALO + dx : _HALO + dx + x]
+            feature[...] = compress((neighbour - centre) * inverse)
+        features[-2:] = centre_features(centre, low, inverse, unit)
+        yield start, features
+
+
+def centre_features(centre: Floats, low: np.float32, inverse: np.float32, unit: np.float32) -> Floats:
+    """The two features of clipped values themselves, (2, ...)."""
+    return np.stack([locate(centre, low, unit), compress((centre - low) * inverse)])
+
+
 def _network(inputs: Floats, weights: list[Floats], scales: list[np.float32], biases: list[Floats]) -> Floats:
-    last = len(weights) - 1
-    for layer, (weight, scale, bias) in enumerate(zip(weights, scales, biases, strict=True)):
-        sums = weight @ inputs + np.float32(0)  # a sum of zeros is +0, whatever the signs of its terms
-        outputs = sums * scale + bias[:, None]
-        if layer < last:
-            leaky = np.where(outputs > 0, outputs, np.float32(0.125) * outputs)
-            above = np.where(leaky > -LIMIT, leaky, -LIMIT)
-            outputs = np.rint(np.where(above < LIMIT, above, LIMIT))
-        inputs = outputs
-    return inputs
+    for weight, scale, bias in zip(weights[:-1], scales[:-1], biases[:-1], strict=True):
+        inputs = _hidden(inputs, weight, scale, bias)
+    return _layer(inputs, weights[-1], scales[-1], biases[-1])
+
+
+def _hidden(inputs: Floats, weight: Floats, scale: np.float32, bias: Floats) -> Floats:
+    outputs = _layer(inputs, weight, scale, bias)
+    leaky = np.where(outputs > 0, outputs, np.float32(0.125) * outputs)
+    above = np.where(leaky > -LIMIT, leaky, -LIMIT)
+    return np.rint(np.where(above < LIMIT, above, LIMIT))
+
+
+def _layer(inputs: Floats, weight: Floats, scale: np.float32, bias: Floats) -> Floats:
+    sums = weight @ inputs + np.float32(0)  # a sum of zeros is +0, whatever the signs of its terms
+    return sums * scale + bias[:, None]

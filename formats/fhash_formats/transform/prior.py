@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["State", "blank_state", "pack_prior", "prior_state"]
+__all__ = ["State", "blank_state", "pack_prior", "pack_state", "prior_state", "unpack_state"]
 
 DECISIONS, LANES, KINDS, LEVELS = 16, 12, 64, 128
 SIZES = (LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS)
@@ -58,17 +58,22 @@ def blank_state() -> State:
 @cache
 def prior_state() -> State:
     """The prior; its arrays are read-only."""
-    data = np.frombuffer(zlib.decompress(_FILE.read_bytes()), dtype=np.uint8)
-    parts = np.split(data, np.cumsum([SLOTS, SLOTS, 2 * WEIGHTS, 2 * SIMPLES, SIMPLES]))
-    state = blank_state()
+    state = unpack_state(zlib.decompress(_FILE.read_bytes()), blank_state())
+    for array in (state.slots, state.weights, state.simples):
+        array.setflags(write=False)
+    return state
+
+
+def unpack_state(data: bytes, state: State) -> State:
+    """`state`, its arrays filled with what `pack_state` made of one of the same sizes."""
+    slots, weights, simples = len(state.slots), len(state.weights), len(state.simples)
+    parts = np.split(np.frombuffer(data, dtype=np.uint8), np.cumsum([slots, slots, 2 * weights, 2 * simples, simples]))
     # Whole numbers only, so that every machine has the same: 128 is even odds.
     state.slots[:, 0] = state.slots[:, 1] = _PROBABILITIES[parts[0]]
     state.slots[:, 2] = parts[1]
     state.weights[:] = parts[2].view("<i2")
     state.simples[:, 0] = parts[3].view("<u2")
     state.simples[:, 1] = parts[4]
-    for array in (state.slots, state.weights, state.simples):
-        array.setflags(write=False)
     return state
 
 
@@ -82,6 +87,11 @@ _PROBABILITIES = _probabilities()
 
 def pack_prior(state: State) -> bytes:
     """A learned state as the bytes of `prior.bin`."""
+    return zlib.compress(pack_state(state), 9)
+
+
+def pack_state(state: State) -> bytes:
+    """A learned state as bytes, not deflated: rounded, and with little trust."""
     order = np.searchsorted(_PROBABILITIES, state.slots[:, 0]).clip(1, 255)
     below, above = _PROBABILITIES[order - 1].astype(np.int32), _PROBABILITIES[order].astype(np.int32)
     steps = np.where(state.slots[:, 0] - below < above - state.slots[:, 0], order - 1, order).astype(np.uint8)
@@ -94,4 +104,4 @@ def pack_prior(state: State) -> bytes:
         state.simples[:, 0].astype("<u2"),
         np.minimum(state.simples[:, 1], TRUST).astype(np.uint8),
     ]
-    return zlib.compress(b"".join(part.tobytes() for part in parts), 9)
+    return b"".join(part.tobytes() for part in parts)

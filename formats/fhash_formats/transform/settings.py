@@ -13,6 +13,8 @@ import numpy as np
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.head import Head
+from fhash_formats.transform.mask_levels import MaskLevels
+from fhash_formats.transform.predictor import Predictor
 from fhash_formats.transform.quantise import OFFSET_UNIT
 from fhash_formats.transform.spec import TransformSpec
 
@@ -31,6 +33,8 @@ class Settings:
         double: whether arithmetic is in float64 instead of float32.
         quantum: step of the residual that keeps a bound, in units of the values; 0 where there is none.
         head: the trained correction, None for none.
+        mask: what decoded values say of the occupancy, which then stands in every tile; None for tiles without one.
+        predictor: of tiles that are coded by prediction instead of the transform; None where none is.
     """
 
     transform: TransformSpec
@@ -42,6 +46,8 @@ class Settings:
     double: bool = False
     quantum: float = 0.0
     head: Head | None = None
+    mask: MaskLevels | None = None
+    predictor: Predictor | None = None
 
     def __post_init__(self) -> None:
         for name in ("step", "center", "low", "high", "quantum"):
@@ -62,6 +68,13 @@ class Settings:
         """The working type."""
         return np.dtype(np.float64 if self.double else np.float32)
 
+    @property
+    def features(self) -> tuple[str, ...]:
+        """What a reader must know beside the codec itself, by the names that containers require features by."""
+        cross = self.head is not None and self.head.cross
+        used = {"cross": cross, "mask": self.mask is not None, "predictor": self.predictor is not None}
+        return tuple(name for name, wanted in used.items() if wanted)
+
     def to_dict(self) -> dict[str, Any]:
         """JSON values, without those that are the default."""
         result: dict[str, Any] = {
@@ -78,12 +91,16 @@ class Settings:
             result["quantum"] = self.quantum
         if self.head is not None:
             result["head"] = base64.b64encode(self.head.to_bytes()).decode("ascii")
+        if self.mask is not None:
+            result["mask"] = self.mask.to_dict()
+        if self.predictor is not None:
+            result["predictor"] = self.predictor.to_dict()
         return result
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Settings:
         """From `to_dict`'s values; raises InputError or DamagedFileError for anything else."""
-        known = {"transform", "step", "center", "range", "offsets", "double", "quantum", "head"}
+        known = {"transform", "step", "center", "range", "offsets", "double", "quantum", "head", "mask", "predictor"}
         unknown = sorted(str(key)[:40] for key in set(values) - known)
         if unknown:
             raise InputError(f"unknown setting {unknown[0]!a}; known: {', '.join(sorted(known))}")
@@ -110,4 +127,6 @@ class Settings:
             double=values.get("double", False),
             quantum=values.get("quantum", 0.0),
             head=None if packed is None else Head.from_bytes(packed),
+            mask=None if values.get("mask") is None else MaskLevels.from_dict(values["mask"]),
+            predictor=None if values.get("predictor") is None else Predictor.from_dict(values["predictor"]),
         )

@@ -10,13 +10,17 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
 from fhash_formats.transform.settings import Settings
-from fhash_formats.transform.tile import Shape, decode_tile, encode_tile
+from fhash_formats.transform.tile import Shape, decode_tile, decode_tile_mask, encode_tile
 
 __all__ = ["TransformCoder"]
 
 
 class TransformCoder:
-    """Codes chunks of one type and shape with the settings in the codec's configuration, or with those in each chunk's stream."""
+    """Codes chunks of one type and shape with the settings in the codec's configuration, or with those in each chunk's stream.
+
+    features: that a container with these settings requires beside `transform`.
+    masked: whether the chunks say which of their values are occupied.
+    """
 
     def __init__(self, codecs: Sequence[Mapping[str, Any]], dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         """Raises DamagedFileError for a configuration that is not allowed, UnsupportedFileError for a second codec."""
@@ -29,6 +33,8 @@ class TransformCoder:
             self.settings = Settings.from_dict(configuration) if "transform" in configuration else None
         except InputError as error:
             raise DamagedFileError(f"codec fhash.transform: {error}") from error
+        self.features = () if self.settings is None else self.settings.features
+        self.masked = self.settings is not None and self.settings.mask is not None
         self._shape, self._dtype = shape, dtype.newbyteorder("=")
         self._four: Shape = (*(1,) * (4 - len(shape)), *shape)  # type: ignore[assignment]
 
@@ -42,3 +48,8 @@ class TransformCoder:
         """The full chunk; with `lod`, every 2^lod-th vertex along z, y, x. Raises DamagedFileError."""
         values = decode_tile(data, self._four, self._dtype, self.settings, lod)
         return values.reshape(values.shape[4 - len(self._shape) :])
+
+    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+        """The full chunk, and which of its values are occupied. Raises DamagedFileError."""
+        values, mask = decode_tile_mask(data, self._four, self._dtype, self.settings)
+        return values.reshape(self._shape), mask.reshape(self._shape)

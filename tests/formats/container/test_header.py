@@ -196,6 +196,49 @@ def test_quantised_tables_need_offset_and_scale(tmp_path, samples, attributes):
             writer.commit(header)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"model.tables": "transform"}, "required_features"),
+        ({"model.tables": "transform", "required_features": ["transform"]}, "array tables/level_1/component_1 is missing"),
+        ({"model.tables_loss_db": "0.1"}, "tables_loss_db"),
+    ],
+    ids=str,
+)
+def test_coded_tables_need_their_feature_and_their_components(tmp_path, samples, change, message):
+    header = samples.header()
+    arrays = samples.arrays(header)
+    for key, value in change.items():
+        header = changed(header, key, value)
+    with pytest.raises(InputError, match=message):
+        samples.write(tmp_path / "a.fhz", header, arrays)
+
+
+@pytest.mark.parametrize("mixing", [None, 1.0, [1.0], [1.0, "2"], [1.0, 2.0, 3.0]])
+def test_components_need_their_mixing(tmp_path, samples, mixing):
+    header = samples.header()
+    arrays = {name: array for name, array in samples.arrays(header).items() if not name.startswith("tables/")}
+    header["model"]["tables"], header["required_features"] = "transform", ["transform"]
+    for number, level in enumerate(header["model"]["levels"], start=1):
+        arrays |= {f"tables/level_{number}/component_{part}": np.ones(level, np.float32) for part in (1, 2)}
+    for good in (True, False):
+        with ContainerWriter(tmp_path / "a.fhz") as writer:
+            for name, array in arrays.items():
+                attributes = (
+                    {"mixing": [0.5, -1e300]}
+                    if good or not name.endswith("2/component_1")
+                    else {}
+                    if mixing is None
+                    else {"mixing": mixing}
+                )
+                writer.add_whole(name, array, attributes=attributes if name.startswith("tables/") else None)
+            if good:
+                writer.preview(header).close()
+            else:
+                with pytest.raises(InputError, match="array tables/level_2/component_1 attribute mixing"):
+                    writer.commit(header)
+
+
 def test_arrays_of_other_names_are_ignored(tmp_path, samples):
     header = samples.header()
     with ContainerWriter(tmp_path / "a.fhz") as writer:

@@ -121,6 +121,24 @@ def test_region_reads_only_the_index_and_its_inner_chunks(file):
         assert len(reads) == 3
 
 
+def test_of_a_large_index_only_the_entries_that_are_needed_are_read(tmp_path, samples):
+    values = numbers((40, 6))
+    path = write(tmp_path / "a.fhz", samples, values, (2, 3), (40, 6))
+    with Container.open(path) as container:
+        array = container.arrays[NAME]
+        member = array.chunks[0, 0]
+        start, reads, read = member.end - 4 - 40 * 16, [], container._source.read
+        container._source.read = lambda offset, size: reads.append((offset, size)) or read(offset, size)
+        np.testing.assert_array_equal(array.read((slice(3, 5), slice(0, 2))), values[3:5, :2])
+        entries = [at for at in reads if at[0] >= start]
+        assert entries == [(start + 2 * 16, 16), (start + 4 * 16, 16)]
+        before = container.bytes_read
+        np.testing.assert_array_equal(array.read((slice(2, 6), slice(0, 3))), values[2:6, :3])
+        assert container.bytes_read == before
+        np.testing.assert_array_equal(array.read((slice(0, 40), slice(0, 1))), values[:, :1])
+        assert (start, 40 * 16 + 4) in reads
+
+
 def test_several_inner_chunks_are_decoded_at_the_same_time(tmp_path, samples, monkeypatch):
     monkeypatch.setattr(parallel, "usable_threads", lambda: 4)
     together = threading.Barrier(4, timeout=30)
@@ -290,6 +308,44 @@ def test_hostile_index(line, samples, case):
     index = b"".join(struct.pack("<2Q", *entry) for entry in table)
     parts[at] = name, data[:-68] + index + struct.pack("<I", crc32c(index))
     refused(path, samples, parts, f"member {NAME}/c/0: .*{message}")
+
+
+ENTRIES = {
+    "offset outside": ((BIG, None), "reaches beyond the shard"),
+    "size outside": ((None, BIG), "reaches beyond the shard"),
+    "size into the index": ((0, -1), "reaches beyond the shard"),
+    "sum that overflows": ((2**63, 2**63), "reaches beyond the shard"),
+    "missing": ((ABSENT, ABSENT), "missing"),
+    "half missing": ((None, ABSENT), "missing"),
+    "another place": ((1, None), "inner chunk 9: its CRC-32C"),
+    "nothing": ((0, 0), "inner chunk 9: "),
+}
+
+
+@pytest.mark.parametrize("case", ENTRIES)
+def test_hostile_entry_that_is_read_alone(tmp_path, samples, case):
+    (offset, size), message = ENTRIES[case]
+    path = write(tmp_path / "a.fhz", samples, numbers((40,)), (2,), (40,))
+    parts = samples.unpack(path.read_bytes())
+    at = [name for name, _ in parts].index(f"{NAME}/c/0")
+    name, data = parts[at]
+    index = 20 * 16 + 4
+    table = [list(entry) for entry in struct.iter_unpack("<2Q", data[-index:-4])]
+    size = len(data) - index + 1 if size == -1 else size
+    table[9] = [table[9][0] if offset is None else offset, table[9][1] if size is None else size]
+    coded = b"".join(struct.pack("<2Q", *entry) for entry in table)
+    parts[at] = name, data[:-index] + coded + struct.pack("<I", crc32c(coded))
+    path.write_bytes(samples.pack(parts))
+    with Container.open(path) as container:
+        np.testing.assert_array_equal(container.arrays[NAME].read((slice(16, 18),)), numbers((40,))[16:18])
+        tracemalloc.start()
+        with pytest.raises(DamagedFileError, match=f"member {NAME}/c/0: .*{message}"):
+            container.arrays[NAME].read((slice(18, 20),))
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 1 << 20
+        with pytest.raises(DamagedFileError, match=f"member {NAME}/c/0: "):
+            container.verify()
 
 
 def test_index_with_a_wrong_checksum(line, samples):

@@ -1,0 +1,106 @@
+"""How likely each vertex of a tile is occupied, as a level, from the values that are decoded already.
+
+A feature is where values lie in a range, grown by some vertices. So a mask says little that the decoded values do not say, but for the
+error with which they are decoded. Each vertex adds a score to all vertices within `reach`: minus the logarithm of how likely it is that
+it is no reason for them to be occupied. Sums of scores are compared with BOUNDS. Values are only compared and scores are whole numbers, so
+every machine has the same levels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+
+__all__ = ["MAX_EDGES", "MAX_REACH", "MAX_SCORE", "UNIT", "MaskLevels"]
+
+MAX_EDGES, MAX_REACH, MAX_SCORE = 15, 64, 4095
+LARGEST = float(np.finfo(np.float64).max)
+UNIT = 128
+"""Scores are in 1/128 bit."""
+BOUNDS = (
+    *(1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 110, 128, 155, 190, 230, 275, 325),
+    *(385, 455, 540, 640, 760, 900, 1100, 1350, 1700, 2200),
+)
+"""Sums from which on a vertex has the level 1, 2, ...: level 16 from even odds on, one bit."""
+
+Levels = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskLevels:
+    """Scores of the decoded values; raises InputError for values that are not allowed.
+
+    Attributes:
+        edges: at most 15 numbers, ascending; class i is between edges i - 1 and i, the upper one left out.
+        scores: of each class, 0 to 4095, in 1/128 bit.
+        others: the same for the second level, which is summed as well; without them it is that of the vertex alone by `scores`.
+        reach: vertices along z, y and x by which a feature was grown, 0 to 64.
+    """
+
+    edges: tuple[float, ...] = ()
+    scores: tuple[int, ...] = (0,)
+    others: tuple[int, ...] = ()
+    reach: int = 0
+
+    def __post_init__(self) -> None:
+        numbers = all(type(edge) in (int, float) and abs(edge) <= LARGEST for edge in self.edges)
+        if len(self.edges) > MAX_EDGES or not numbers or any(low >= high for low, high in pairwise(self.edges)):
+            raise InputError(f"edges of a mask are {self.edges!r:.80}; at most {MAX_EDGES} ascending numbers are needed")
+        for scores in (self.scores, *([self.others] if self.others else [])):
+            if len(scores) != len(self.edges) + 1 or not all(type(n) is int and 0 <= n <= MAX_SCORE for n in scores):
+                raise InputError(f"scores of a mask are {scores!r:.80}; {len(self.edges) + 1} whole numbers to {MAX_SCORE} are needed")
+        if type(self.reach) is not int or not 0 <= self.reach <= MAX_REACH:
+            raise InputError(f"reach of a mask is {self.reach!r:.40}; a whole number to {MAX_REACH} is needed")
+
+    def levels(self, values: npt.NDArray[Any]) -> tuple[Levels, Levels]:
+        """The level 0 to 31 of each vertex (t, z, y, x), and the second level 0 to 15; values are finite, of the working type."""
+        if not any(self.scores) and not any(self.others):
+            return np.zeros(values.shape, np.uint8), np.zeros(values.shape, np.uint8)
+        classes = np.zeros(values.shape, np.uint8)
+        with np.errstate(over="ignore"):
+            edges = np.array(self.edges, dtype=values.dtype)
+        for edge in edges:
+            classes += values >= edge
+        alone = np.array(self.scores, dtype=np.int32)
+        first = _LEVELS[_summed(alone[classes], self.reach)]
+        if not self.others:
+            return first, _HALVES[alone][classes]
+        return first, _HALVES[_summed(np.array(self.others, dtype=np.int32)[classes], self.reach)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values, without those that are the default."""
+        named = {"edges": list(self.edges), "scores": list(self.scores), "others": list(self.others), "reach": self.reach}
+        return {name: value for name, value in named.items() if value and value != [0]}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> MaskLevels:
+        """From `to_dict`'s values; raises InputError for anything else."""
+        if not isinstance(values, Mapping) or not set(values) <= {"edges", "scores", "others", "reach"}:
+            raise InputError(f"mask is {values!r:.80}; an object of edges, scores, others and reach is needed")
+        lists = {name: values.get(name, default) for name, default in (("edges", []), ("scores", [0]), ("others", []))}
+        if not all(isinstance(numbers, list | tuple) for numbers in lists.values()):
+            raise InputError("edges, scores and others of a mask are lists")
+        return cls(**{name: tuple(numbers) for name, numbers in lists.items()}, reach=values.get("reach", 0))
+
+
+def _summed(scores: npt.NDArray[np.int32], reach: int) -> npt.NDArray[np.int32]:
+    """Sums over the cubes of that reach, along z, y and x, cut at the ends of the tile; at most MAX_SCORE, so that they fit."""
+    for axis in (1, 2, 3) if reach else ():
+        lines, total = np.moveaxis(scores, axis, 0), scores.copy()
+        out = np.moveaxis(total, axis, 0)
+        for shift in range(1, min(reach, scores.shape[axis] - 1) + 1):
+            out[shift:] += lines[:-shift]
+            out[:-shift] += lines[shift:]
+        scores = np.minimum(total, MAX_SCORE, out=total)
+    return scores
+
+
+_LEVELS: Levels = np.searchsorted(BOUNDS, np.arange(MAX_SCORE + 1), side="right").astype(np.uint8)
+_HALVES: Levels = np.floor_divide(_LEVELS, 2, dtype=np.uint8)

@@ -1,0 +1,80 @@
+"""The models of both profiles answer alike to what `Volume` asks."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec import EncodeConfig, InputError
+from fhash_codec.lattice import Lattice
+from fhash_codec.paper import PaperModel
+from fhash_codec.volume_model import VolumeModel, open_model
+from fhash_formats.container import Container
+
+REGIONS = [((0, 5), (0, 6), (0, 7)), ((1, 4), (2, 3), (0, 7)), ((4, 5), (5, 6), (6, 7))]
+SETTINGS = {
+    "compact": {"effort": 1, "tile": "2x3x4x4"},
+    "paper": {"profile": "paper", "epochs": 2, "width": 8, "key_frames": "0,1,3"},
+    "coded": {"profile": "paper", "epochs": 2, "width": 8, "tables": "transform"},
+}
+
+
+@pytest.fixture(scope="module", params=SETTINGS)
+def model(request, tmp_path_factory):
+    """A model whose box is 5 x 6 x 7, with vertices outside the coreset."""
+    field = np.random.default_rng(0).random((4, 7, 8, 9))
+    field[:, [0, -1]], field[:, :, [0, -1]], field[..., [0, -1]] = -1, -1, -1
+    path = tmp_path_factory.mktemp("model") / "a.fhz"
+    fhash_codec.encode(field, path, EncodeConfig(features=("interval:0.2:1",), dilation=0, **SETTINGS[request.param]))
+    with Container.open(path) as container:
+        yield request.param, open_model(container)
+
+
+def test_each_profile_has_its_model(model):
+    name, found = model
+    assert isinstance(found, Lattice if name == "compact" else PaperModel)
+    assert tuple(found.chunks) == ((2, 3, 4, 4) if name == "compact" else (1, 7, 8, 9))
+    for method, wanted in inspect.getmembers(VolumeModel, inspect.isfunction):
+        if not method.startswith("_"):
+            assert len(inspect.signature(getattr(type(found), method)).parameters) == len(inspect.signature(wanted).parameters)
+
+
+@pytest.mark.parametrize("region", REGIONS, ids=str)
+def test_regions_are_parts_of_the_whole(model, region):
+    _, found = model
+    inner = tuple(slice(*span) for span in region)
+    for first, last in ((0, 0), (1, 2)):
+        occupied = found.occupied(first, last, REGIONS[0])
+        assert 0 < occupied.mean() < 1
+        np.testing.assert_array_equal(found.occupied(first, last, region), occupied[inner])
+        key = (first + last) / 2
+        whole = found.region(key, REGIONS[0], occupied)
+        assert whole.dtype == np.float64
+        part = found.region(key, region, occupied[inner])
+        np.testing.assert_array_equal(part[occupied[inner]], whole[inner][occupied[inner]])
+
+
+def test_points_at_vertices_are_the_region_and_slopes_have_the_same_values(model):
+    _, found = model
+    occupied = found.occupied(1, 1, REGIONS[0])
+    places = np.argwhere(occupied).T.astype(np.float64)
+    keys = np.ones(places.shape[1])
+    values = found.points(keys, list(places))
+    np.testing.assert_allclose(values, found.region(1, REGIONS[0], occupied)[occupied], atol=1e-5)
+    again, slopes = found.slopes(keys, list(places))
+    np.testing.assert_allclose(again, values, atol=1e-6)
+    assert slopes.shape == (len(values), 4)
+    assert slopes.dtype == np.float64
+
+
+def test_levels_of_detail_are_given_or_refused(model):
+    name, found = model
+    if name == "compact":
+        whole = found.coarse(1, 1, ((0, 3), (0, 3), (0, 4)))
+        np.testing.assert_array_equal(found.coarse(1, 1, ((1, 3), (2, 3), (0, 2))), whole[1:3, 2:3, 0:2])
+    else:
+        with pytest.raises(InputError, match="no levels of detail"):
+            found.coarse(1, 1, ((0, 3), (0, 3), (0, 4)))
