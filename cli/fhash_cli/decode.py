@@ -94,7 +94,7 @@ def command(
         if output is not None and isosurface is not None:
             if len(chosen) != 1:
                 raise InputError(f"--isosurface is of one step; {len(chosen)} were chosen: give --t N or --time T")
-            coords = coordinates(volume, chosen, region, every)
+            coords = coordinates(volume, chosen, (z, y, x))
             (frame,) = frames()
             mesh = surface(frame, isosurface, coords, name=volume.name, time=float(coords["t"].values[0]))
             paths = [str(save_mesh(output, mesh, force=force, sources=[run]))]
