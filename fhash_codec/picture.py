@@ -9,15 +9,13 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
+from fhash_codec.render.colour_maps import COLOUR_MAPS
+
 Slice = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]
 
-VIRIDIS = (
-    "440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725",
-)  # fmt: skip
-"""Ten even samples of matplotlib's viridis (CC0, perceptually uniform); the colours between them are interpolated."""
-BALANCE = ("1b4f8c", "4a86c0", "9cc3df", "f7f7f5", "f1b08a", "d1604b", "93202c")
-"""Blue, near white, red: an error of nothing is the middle."""
+VIRIDIS, BALANCE = COLOUR_MAPS["viridis"], COLOUR_MAPS["balance"]
+"""What values are drawn in, and errors: blue, near white, red, so that an error of nothing is the middle."""
 OUTSIDE = (208, 209, 212)
 """The grey of vertices that are not in the coreset (NaN)."""
 

@@ -28,7 +28,10 @@ TYPES = ("float16", "float32", "float64", "int8", "int16", "int32", "int64", "ui
 @click.option("--roi", metavar="z0:z1,y0:y1,x0:x1", type=IntervalsType(int), help="Region in vertices, half-open as in Python.")
 @click.option("--box", metavar="z0:z1,y0:y1,x0:x1", type=IntervalsType(float), help="Region in physical positions, both ends included.")
 @click.option("--lod", type=click.IntRange(0, 10), metavar="N", help="Level of detail: every 2^N-th vertex of the feature bounding box.")
-@click.option("-o", "output", metavar="OUT", type=click.Path(), help="File to write: .npy, .h5, .nc, .zarr, .raw, .vti, .vtr or .pvd.")
+@click.option(
+    "-o", "output", metavar="OUT", type=click.Path(), help="File to write: .npy, .h5, .nc, .zarr, .raw, .vti, .vtr, .pvd, .vtkhdf."
+)
+@click.option("--isosurface", type=float, metavar="V", help="Write the surface of this value at one step, as triangles: -o s.vtp or s.ply.")
 @click.option("--outside", type=click.Choice(["nan", "background"]), default="nan", show_default=True, help="Values outside the coreset.")
 @click.option("--dtype", type=click.Choice(TYPES), help="Convert the values; integers are rounded and clipped to the type's range.")
 @force_option
@@ -42,6 +45,7 @@ def command(
     box: Sequence[Sequence[float | None]] | None,
     lod: int | None,
     output: str | None,
+    isosurface: float | None,
     outside: Literal["nan", "background"],
     dtype: str | None,
     force: bool,
@@ -52,7 +56,10 @@ def command(
     import numpy as np
 
     import fhash_codec
+    from fhash_codec.isosurface import isosurface as surface
+    from fhash_codec.isosurface import require_marching_cubes
     from fhash_formats import Region, save_region
+    from fhash_formats.writers.mesh import check_mesh_output, save_mesh
 
     if steps is not None and times:
         raise click.UsageError("--t and --time exclude each other")
@@ -60,7 +67,12 @@ def command(
         raise click.UsageError("--roi and --box exclude each other")
     if lod is not None and outside != "nan":
         raise click.UsageError("--lod has NaN outside the coreset; leave out --outside")
-    if output is not None:
+    if isosurface is not None:
+        if output is None or dtype is not None:
+            raise click.UsageError("--isosurface writes a file of triangles: give -o s.vtp or -o s.ply, and no --dtype")
+        check_mesh_output(output, force, [run])
+        require_marching_cubes()
+    elif output is not None:
         check_writable(output, force, region=True, sources=[run])
     with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
         chosen = [volume.step_of_time(time) for time in times] if times else steps_of(volume, steps)
@@ -79,7 +91,14 @@ def command(
 
         shape = (len(chosen), len(z), len(y), len(x))
         paths = []
-        if output is None:
+        if output is not None and isosurface is not None:
+            if len(chosen) != 1:
+                raise InputError(f"--isosurface is of one step; {len(chosen)} were chosen: give --t N or --time T")
+            coords = coordinates(volume, chosen, (z, y, x))
+            (frame,) = frames()
+            mesh = surface(frame, isosurface, coords, name=volume.name, time=float(coords["t"].values[0]))
+            paths = [str(save_mesh(output, mesh, force=force, sources=[run]))]
+        elif output is None:
             for _ in frames():
                 pass
         else:

@@ -80,7 +80,7 @@ def test_coordinates_and_attributes_travel_with_the_region(fhash: Fhash, run: Pa
     assert got == [[0.5, 2.5], [0.5, 1.0], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [8.0, 7.0, 6.0]]
 
 
-@pytest.mark.parametrize("name", ["out.npy", "out.h5", "out.nc", "out.zarr", "out.raw", "out.vti", "out.pvd"])
+@pytest.mark.parametrize("name", ["out.npy", "out.h5", "out.nc", "out.zarr", "out.raw", "out.vti", "out.pvd", "out.vtkhdf"])
 def test_every_format_is_written_and_named(fhash: Fhash, run: Path, tmp_path: Path, name: str) -> None:
     result = fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3", "--json")
     assert (result.exit_code, result.stderr) == (0, "")
@@ -220,3 +220,42 @@ def test_a_level_of_detail_has_every_second_position(fhash: Fhash, refused: Call
     words = ["--profile", "paper", "--epochs", "1", "--width", "4", "-q"]
     assert fhash("encode", data, "-o", tmp_path / "paper.fhz", *words).exit_code == 0
     assert "no levels of detail" in refused(2, "decode", tmp_path / "paper.fhz", "--lod", "1")
+
+
+@pytest.mark.parametrize("suffix", ["vtp", "ply"])
+def test_an_isosurface_is_written_in_physical_positions(fhash: Fhash, run: Path, tmp_path: Path, suffix: str) -> None:
+    result = fhash("decode", run, "--t", "1", "--isosurface", "8", "-o", tmp_path / f"s.{suffix}", "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert json.loads(result.stdout)["paths"] == [str(tmp_path / f"s.{suffix}")]
+    if suffix == "ply":
+        head, _, body = (tmp_path / "s.ply").read_bytes().partition(b"end_header\n")
+        count = int(head.split(b"element vertex ")[1].split()[0])
+        vertices = np.frombuffer(body[: 24 * count], "<f8").reshape(count, 3)
+        with fhash_codec.open(run) as volume:
+            for column, axis in enumerate("xyz"):
+                ends = np.sort(volume.coords[axis].values[[0, -1]])
+                assert np.all((vertices[:, column] >= ends[0]) & (vertices[:, column] <= ends[1]))
+            z, y, x = (
+                np.interp(vertices[:, column], *(part[:: -1 if axis == "x" else 1] for part in (volume.coords[axis].values, np.arange(n))))
+                for column, axis, n in ((2, "z", 6), (1, "y", 7), (0, "x", 8))
+            )
+            np.testing.assert_allclose(volume.sample(t=1, z=z, y=y, x=x), 8, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--t", "0", "-o", "s.npy"], "cannot write a surface with the suffix '.npy'"),
+        (["-o", "s.ply"], "of one step; 3 were chosen"),
+        (["--t", "0"], "give -o s.vtp or -o s.ply"),
+        (["--t", "0", "-o", "s.ply", "--dtype", "float64"], "no --dtype"),
+        (["--t", "0", "-o", "s.ply", "--roi", ":1,:,:"], "two vertices along each axis"),
+    ],
+)
+def test_isosurfaces_that_cannot_be_written(
+    refused: Callable[..., str], run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(2, "decode", run, "--isosurface", "8", *words)
+    assert "no surface of the value 1000" in refused(2, "decode", run, "--isosurface", "1000", "--t", "0", "-o", "s.ply")
+    assert list(tmp_path.iterdir()) == []

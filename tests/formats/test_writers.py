@@ -76,6 +76,13 @@ def read_raw(paths: list[Path]) -> np.ndarray:
     return read if read.ndim == 4 else read[None]
 
 
+def read_vtkhdf(paths: list[Path]) -> np.ndarray:
+    import h5py
+
+    with h5py.File(paths[0]) as file:
+        return np.asarray(file["VTKHDF/PointData/wind"])
+
+
 READ: dict[str, Callable[[list[Path]], np.ndarray]] = {
     ".npy": lambda paths: np.asarray(np.load(paths[0])),
     ".h5": read_hdf5,
@@ -87,6 +94,7 @@ READ: dict[str, Callable[[list[Path]], np.ndarray]] = {
     ".vti": vtk_frames,
     ".vtr": vtk_frames,
     ".pvd": vtk_frames,
+    ".vtkhdf": read_vtkhdf,
 }
 HALF = {".npy", ".h5", ".hdf5", ".zarr"}
 

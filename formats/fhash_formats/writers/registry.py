@@ -17,10 +17,11 @@ from fhash_formats.writers.npy import NPY
 from fhash_formats.writers.raw import RAW
 from fhash_formats.writers.region import Region
 from fhash_formats.writers.vti import VTK
+from fhash_formats.writers.vtkhdf import VTKHDF
 from fhash_formats.writers.writer import Frame, Writer
 from fhash_formats.writers.zarr_ import ZARR
 
-WRITERS = (NPY, HDF5, NETCDF, ZARR, RAW, VTK)
+WRITERS = (NPY, HDF5, NETCDF, ZARR, RAW, VTK, VTKHDF)
 
 
 def save_check(path: str | Path, force: bool = False, region: Region | None = None, sources: Sequence[str | Path] = ()) -> None:
@@ -51,7 +52,7 @@ def save_region(
     """Write the frames of a region in the format that the suffix of `path` names; complete or absent.
 
     Args:
-        path: ends in .npy, .h5, .hdf5, .nc, .nc4, .zarr, .raw, .vti, .vtr or .pvd.
+        path: ends in .npy, .h5, .hdf5, .nc, .nc4, .zarr, .raw, .vti, .vtr, .pvd or .vtkhdf.
         region: what the frames are.
         frames: one array (z, y, x) of `region.dtype` for each step, taken one by one: no two are held here.
         force: replace outputs that are there already; the old ones stay until the new are complete.

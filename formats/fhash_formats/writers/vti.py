@@ -62,8 +62,8 @@ def _check_grid(path: Path, region: Region, suffix: str) -> None:
 
 @contextmanager
 def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
-    ascending = {axis: values[:: _direction(values)] for axis in SPACE for values in [region.coords[axis].values]}
-    turn = tuple(slice(None, None, _direction(region.coords[axis].values)) for axis in SPACE)
+    ascending = {axis: values[:: direction(values)] for axis in SPACE for values in [region.coords[axis].values]}
+    turn = tuple(slice(None, None, direction(region.coords[axis].values)) for axis in SPACE)
     image = outputs[0].suffix.lower() == ".vti"
 
     def put(step: int, frame: Frame) -> None:
@@ -74,7 +74,8 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
         temporaries[-1].write_text(_collection(region, outputs[:-1]), encoding="utf-8")
 
 
-def _direction(values: npt.NDArray[np.float64]) -> int:
+def direction(values: npt.NDArray[np.float64]) -> int:
+    """1 for coordinates that ascend, -1 for those that descend."""
     return -1 if values[-1] < values[0] else 1
 
 

@@ -1,0 +1,206 @@
+"""The camera: where rays begin and where they go, in vertices of the volume.
+
+Rays live in index space (x, y, z; the first vertex is 0), where the grid is even and a voxel is a cube: a physical length along
+a direction is that of the direction times `spacing`. The camera itself is in the physical coordinates of the series, so that a
+picture is as VTK's of the same camera, uneven voxels and descending axes included.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.render.scene import Camera
+from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.series import Coordinate
+
+__all__ = ["Grid", "Rays"]
+
+Floats = npt.NDArray[np.float64]
+
+TOLERANCE = 1e-3
+"""Of an axis's extent: coordinates further from even ones are drawn as even ones with a warning."""
+VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
+    "iso": ((1, 1, 1), (0, 0, 1)),
+    "xy": ((0, 0, 1), (0, 1, 0)),
+    "yx": ((0, 0, -1), (1, 0, 0)),
+    "xz": ((0, -1, 0), (0, 0, 1)),
+    "zx": ((0, 1, 0), (1, 0, 0)),
+    "yz": ((1, 0, 0), (0, 0, 1)),
+    "zy": ((-1, 0, 0), (0, 1, 0)),
+}
+"""Direction from the volume towards the camera, and what is upwards, as PyVista has them."""
+PARALLEL = 1e-6
+"""Sine of the angle between view and upward direction below which the picture has no upright."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Grid:
+    """Where the vertices are: `counts`, `origin` of the first and `spacing` between two, each (x, y, z).
+
+    Spacings are negative where coordinates descend. An axis of one vertex has the mean of the others' and reaches half of it
+    to both sides.
+    """
+
+    counts: tuple[int, int, int]
+    origin: Floats
+    spacing: Floats
+
+    @classmethod
+    def of(cls, coords: Mapping[str, Coordinate]) -> Grid:
+        """From a volume's coordinates; warns with FhashWarning where they are not even, and then spreads them evenly."""
+        axes = [np.asarray(coords[axis].values, dtype=np.float64) for axis in "xyz"]
+        spacing = np.full(3, np.nan)
+        origin = np.array([values[0] if np.isfinite(values[0]) else 0.0 for values in axes])
+        for number, values in enumerate(axes):
+            if len(values) == 1:
+                continue
+            extent = values[-1] - values[0]
+            if not np.all(np.isfinite(values)) or extent == 0 or not np.isfinite(extent):
+                spacing[number], origin[number] = 1.0, 0.0
+                wrong = "are no positions along a line; vertices are drawn one unit apart"
+            else:
+                spacing[number] = extent / (len(values) - 1)
+                if np.max(np.abs(values - np.linspace(values[0], values[-1], len(values)))) <= TOLERANCE * abs(extent):
+                    continue
+                wrong = "are not evenly spaced; they are drawn as if they were"
+            warnings.warn(f"the coordinates {coords['xyz'[number]].name!r} of {'xyz'[number]} {wrong}", FhashWarning, stacklevel=2)
+        known = np.abs(spacing[~np.isnan(spacing)])
+        spacing[np.isnan(spacing)] = known.mean() if known.size else 1.0
+        return cls(counts=(len(axes[0]), len(axes[1]), len(axes[2])), origin=origin, spacing=spacing)
+
+    @property
+    def vertex_spacing(self) -> float:
+        """One length for the distance between vertices: the geometric mean of those along the axes."""
+        return float(np.exp(np.mean(np.log(np.abs(self.spacing)))))
+
+    @property
+    def bounds(self) -> Floats:
+        """The box that is drawn in index space: float64 (3, 2), x, y, z."""
+        return np.array([[-0.5, 0.5] if count == 1 else [0.0, count - 1.0] for count in self.counts])
+
+    @property
+    def corners(self) -> Floats:
+        """The same box in physical coordinates (3, 2); the second is the smaller on a descending axis."""
+        return self.origin[:, None] + self.bounds * self.spacing[:, None]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rays:
+    """A ray through the middle of every pixel, in index space, float64 (3,) in x, y, z.
+
+    Pixel (i, j), i from the left and j from the top, of `size` (W, H) has u = 2 (i + 0.5) / W - 1 and w = 1 - 2 (j + 0.5) / H.
+    Perspective: origin = eye, direction = forward + u right + w up. Parallel: origin = eye + u right + w up, direction = forward.
+    `forward` has a physical length of 1; u and w of any value, as in the parts of a pixel, are allowed.
+    """
+
+    eye: Floats
+    right: Floats
+    up: Floats
+    forward: Floats
+    parallel: bool
+    size: tuple[int, int]
+    grid: Grid
+
+    @classmethod
+    def of(cls, camera: Camera, grid: Grid, size: tuple[int, int]) -> Rays:
+        """The rays of a camera; raises InputError where it has no direction or no upright."""
+        low, high = grid.corners[:, 0], grid.corners[:, 1]
+        middle = low / 2 + high / 2
+        radius = float(np.linalg.norm(high / 2 - low / 2))
+        focal = middle if camera.focal_point is None else np.array(camera.focal_point)
+        aspect = size[0] / size[1]
+        # Half the picture's height at a distance of 1; VTK narrows the angle by the zoom instead, which is the same for small ones.
+        half = float(np.tan(np.radians(camera.view_angle) / 2))
+        narrow = float(np.sin(np.arctan(half * min(aspect, 1.0))))
+        away, upward = (np.array(part, dtype=np.float64) for part in VIEWS[camera.view])
+        if camera.view_up is not None:
+            upward = np.array(camera.view_up)
+        distance = radius / narrow
+        if camera.position is not None:
+            with np.errstate(over="ignore", invalid="ignore"):
+                away = np.array(camera.position) - focal
+                distance = float(np.linalg.norm(away))
+            if not np.isfinite(distance):
+                raise InputError(f"camera: position {_text(np.array(camera.position))} is too far away to compute with")
+        # Below what float64 tells apart at these coordinates there is no direction either.
+        least = 1e-12 * max(radius, float(np.max(np.abs(focal))))
+        if distance <= least:
+            raise InputError(f"camera: position and focal_point are the same, {_text(focal)}; move one of them")
+        away = away / np.linalg.norm(away)
+        turn, right = _upright(away, upward)
+        away, right = (_turned(part, turn, camera.azimuth) for part in (away, right))
+        # The upward direction rises with the camera, so that no elevation leaves the picture without an upright.
+        away = _turned(away, -right, camera.elevation)
+        up = np.cross(away, right)
+        if camera.projection == "parallel":
+            half = camera.parallel_scale if camera.parallel_scale is not None else radius / min(aspect, 1.0)
+        half /= camera.zoom
+        eye = focal + away * distance
+        spacing = grid.spacing
+        return cls(
+            eye=(eye - grid.origin) / spacing,
+            right=right * half * aspect / spacing,
+            up=up * half / spacing,
+            forward=-away / spacing,
+            parallel=camera.projection == "parallel",
+            size=size,
+            grid=grid,
+        )
+
+    def rays(self, u: npt.ArrayLike, w: npt.ArrayLike) -> tuple[Floats, Floats]:
+        """Origins and directions (..., 3) in index space of places in the picture, -1..1 to the right and upwards."""
+        across = np.asarray(u, dtype=np.float64)[..., None] * self.right + np.asarray(w, dtype=np.float64)[..., None] * self.up
+        if self.parallel:
+            return self.eye + across, np.broadcast_to(self.forward, across.shape)
+        return np.broadcast_to(self.eye, across.shape), self.forward + across
+
+    def pixels(self) -> tuple[Floats, Floats]:
+        """Origins and directions (H, W, 3) of every pixel's middle."""
+        width, height = self.size
+        u = 2 * (np.arange(width) + 0.5) / width - 1
+        w = 1 - 2 * (np.arange(height) + 0.5) / height
+        return self.rays(*np.meshgrid(u, w))
+
+    def project(self, points: Floats) -> tuple[Floats, Floats]:
+        """Where points (..., 3) of index space appear: pixels (..., 2) from the left and from the top, whose first has its middle at
+        0.5, and their distance (...) in front of the camera along the middle of the view in units of the coordinates.
+
+        A point that is not in front of a perspective camera has a distance of at most 0 and pixels that mean nothing.
+        """
+        spacing = self.grid.spacing
+        from_eye = (points - self.eye) * spacing
+        right, up, forward = (part * spacing for part in (self.right, self.up, self.forward))
+        depth = from_eye @ forward
+        scale = np.ones_like(depth) if self.parallel else np.where(depth > 0, depth, 1.0)
+        u = from_eye @ right / (right @ right) / scale
+        w = from_eye @ up / (up @ up) / scale
+        width, height = self.size
+        return np.stack([(u + 1) / 2 * width, (1 - w) / 2 * height], axis=-1), depth
+
+
+def _upright(away: Floats, upward: Floats) -> tuple[Floats, Floats]:
+    """Unit vectors: the upward direction as given, and the one to the right in the picture."""
+    length = float(np.linalg.norm(upward))
+    if not length > 0 or not np.isfinite(length):
+        raise InputError("camera: view_up has no length; give a direction such as 0, 0, 1")
+    right = np.cross(upward / length, away)
+    if np.linalg.norm(right) < PARALLEL:
+        raise InputError(f"camera: view_up {_text(upward)} is parallel to the direction of view; give another")
+    return upward / length, right / np.linalg.norm(right)
+
+
+def _turned(vector: Floats, axis: Floats, degrees: float) -> Floats:
+    """A vector turned about a unit axis, by Rodrigues' formula."""
+    angle = np.radians(degrees)
+    return np.asarray(
+        vector * np.cos(angle) + np.cross(axis, vector) * np.sin(angle) + axis * (axis @ vector) * (1 - np.cos(angle)), dtype=np.float64
+    )
+
+
+def _text(vector: Floats) -> str:
+    return ", ".join(f"{part:g}" for part in vector)

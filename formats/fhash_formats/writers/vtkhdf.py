@@ -1,0 +1,81 @@
+"""Writer of VTK's HDF5 format (.vtkhdf): all steps of an evenly spaced grid in one file, as ParaView 5.12 and newer read it.
+
+VTKHDF 2.0, type ImageData: point data (t, z, y, x) and a group Steps with the physical times, docs.vtk.org ("VTKHDF file
+format"). As in .vti, a descending axis is turned round, values and coordinates, and float16 is stored as float32, exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fhash_formats.errors import InputError
+from fhash_formats.writers.hdf5 import COMPRESSION
+from fhash_formats.writers.held_file import held_hdf5
+from fhash_formats.writers.labels import safe_name
+from fhash_formats.writers.region import Region
+from fhash_formats.writers.spacing import even_spacing
+from fhash_formats.writers.vti import SPACE, direction
+from fhash_formats.writers.writer import Frame, Put, Writer, chunk_shape, little_endian
+
+VERSION = (2, 0)
+
+
+def _outputs(path: Path, region: Region) -> list[Path]:
+    if not np.all(np.isfinite(region.coords["t"].values)):
+        raise InputError(f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy")
+    for axis in SPACE:
+        if not even_spacing(region.coords[axis].values):
+            raise InputError(
+                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly spaced, as .vtkhdf needs; use .vtr or .pvd"
+            )
+    return [path]
+
+
+@contextmanager
+def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
+    import h5py
+
+    turn = tuple(slice(None, None, direction(region.coords[axis].values)) for axis in SPACE)
+    # Links in the order of their creation, as the reader of VTK demands for composite files and takes for all.
+    with held_hdf5(temporaries[0], lambda file: h5py.File(file, "w", track_order=True)) as (file, root):
+        with file.calling():
+            values = _create(root, region)
+
+        def put(step: int, frame: Frame) -> None:
+            with file.calling():
+                values[step] = frame[turn]
+
+        yield put
+
+
+def _create(root: Any, region: Region) -> Any:
+    """The empty dataset in `root`, with all that describes it."""
+    ascending = {axis: values[:: direction(values)] for axis in SPACE for values in [region.coords[axis].values]}
+    steps, *size = region.shape
+    group = root.create_group("VTKHDF", track_order=True)
+    group.attrs["Version"] = np.array(VERSION, dtype="<i8")
+    group.attrs["Type"] = np.bytes_("ImageData")
+    group.attrs["WholeExtent"] = np.array([bound for length in reversed(size) for bound in (0, length - 1)], dtype="<i8")
+    group.attrs["Origin"] = np.array([ascending[axis][0] for axis in "xyz"], dtype="<f8")
+    group.attrs["Spacing"] = np.array([even_spacing(ascending[axis]) for axis in "xyz"], dtype="<f8")
+    group.attrs["Direction"] = np.eye(3, dtype="<f8").ravel()
+    name = safe_name(region.name)
+    points = group.create_group("PointData", track_order=True)
+    points.attrs["Scalars"] = np.bytes_(name.encode())
+    values = points.create_dataset(name, shape=region.shape, dtype=little_endian(region.dtype), chunks=chunk_shape(region), **COMPRESSION)
+    if region.units:
+        values.attrs["units"] = region.units.replace("\0", "")
+    times = group.create_group("Steps", track_order=True)
+    times.attrs["NSteps"] = np.int64(steps)
+    times.create_dataset("Values", data=region.coords["t"].values.astype("<f8"))
+    offsets = times.create_group("PointDataOffsets", track_order=True)
+    offsets.create_dataset(name, data=np.arange(steps, dtype="<i8"))
+    return values
+
+
+VTKHDF = Writer(name="VTKHDF", suffixes=(".vtkhdf",), outputs=_outputs, open=_open)
