@@ -34,12 +34,6 @@ const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27};
 const int64_t SECOND = int64_t(KINDS) * DECISIONS * LANES, SIGNS = SECOND + 64 * DECISIONS * LANES;  // where these weights begin
 const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;                                              // where these simple estimates begin
 
-FHASH_INLINE int log16(uint32_t v) {
-    int shift = 0;
-    while ((v >> shift) >= 4096) shift++;
-    return tables.log[v >> shift] + 16 * shift;
-}
-
 FHASH_INLINE int small(int v) { return v < 37 ? tables.small[v] : v <= 64 ? 9 : v <= 140 ? 10 : 11; }
 
 // The slots of the contexts are decision-major, then those of the signs; the weights go by kind, by expected magnitude, then those of the

@@ -134,6 +134,13 @@ template <int N, bool PAIR, int MOST> FHASH_INLINE int mix(Mixed<MOST>& now) {
     return now.p = tables.squash[min(max(dot >> 12, -STRETCH_MAX), STRETCH_MAX) + STRETCH_MAX];
 }
 
+// 16 log2 of a number, nearly.
+FHASH_INLINE int log16(uint32_t v) {
+    int shift = 0;
+    while ((v >> shift) >= 4096) shift++;
+    return tables.log[v >> shift] + 16 * shift;
+}
+
 FHASH_INLINE int32_t bounded(int32_t weight) { return min(max(weight, -32767), 32767); }
 
 template <int N, bool PAIR, int RATE = LEARNING_RATE, int MOST> FHASH_INLINE void learn(Mixed<MOST>& now, int bit, int limit) {

@@ -37,11 +37,6 @@ struct Grid {
     FHASH_INLINE bool has(int64_t t, int64_t z, int64_t y) const { return t >= 0 && z >= 0 && y >= 0 && t < n[0] && z < n[1] && y < n[2]; }
 };
 
-FHASH_INLINE int log16(uint32_t v) {
-    int shift = 0;
-    while ((v >> shift) >= 4096) shift++;
-    return tables.log[v >> shift] + 16 * shift;
-}
 FHASH_INLINE int half_octaves(uint32_t v, int most) { return v ? min(1 + log16(v) / 8, most) : 0; }
 FHASH_INLINE int32_t clipped(int32_t e) { return min(std::abs(e), CLIP); }
 FHASH_INLINE int few(int v) { return v <= 1 ? v : v <= 3 ? 2 : v <= 8 ? 3 : 4; }
