@@ -126,7 +126,8 @@ def decode_block(data: bytes | memoryview, shape: tuple[int, ...]) -> Integers:
 
 
 def _pointer(array: npt.NDArray[Any] | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if array is None else array.ctypes.data)
+    # It holds the array, too: threads that make a state at once get one each, and of all but one nothing else would.
+    return ctypes.c_void_p(None) if array is None else array.ctypes.data_as(ctypes.c_void_p)
 
 
 def array_arguments(array: npt.NDArray[Any], count: int) -> tuple[ctypes.c_void_p, ctypes.c_int64]:

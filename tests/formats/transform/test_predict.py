@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +11,11 @@ import pytest
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform import predict
+from fhash_formats.transform.coder import state_arguments
 from fhash_formats.transform.predict import LARGEST, decode_predicted, encode_predicted, integers_of, values_of
 from fhash_formats.transform.predictor import Predictor, passes_of
+from fhash_formats.transform.prior import State
 
 SHAPES = [(1, 1, 1, 1), (2, 1, 1, 1), (1, 1, 1, 2), (1, 2, 3, 5), (3, 7, 2, 11), (5, 4, 9, 8), (2, 13, 1, 17)]
 NATIVE = pytest.mark.skipif(native.library() is None, reason="compares with the native library")
@@ -179,3 +184,24 @@ def test_taps_are_known_when_they_are_needed():
             for own, *offset in part.taps:
                 assert not own or tuple(offset) < (0, 0, 0, 0)
                 assert own or part.axis >= 0
+
+
+@NATIVE
+def test_arguments_hold_the_arrays_that_they_point_to():
+    """Of a state that several threads make at once all but one are held by nothing else: what they point to must not go."""
+    arguments = state_arguments(
+        State(slots=np.zeros((8, 4), np.uint16), weights=np.zeros(8, np.int32), simples=np.zeros((8, 2), np.uint16))
+    )
+    held = [part._arr for part in arguments if isinstance(part, ctypes.c_void_p)]
+    assert [array.shape[0] for array in held] == [8, 8, 8]
+
+
+@NATIVE
+def test_threads_that_decode_for_the_first_time_at_once():
+    predictor, integers = _predictor(), _smooth((3, 7, 2, 11))
+    data, coded = encode_predicted(integers, None, predictor)
+    with ThreadPoolExecutor(8) as workers:
+        for _ in range(20):
+            predict._blank.cache_clear()
+            for found in workers.map(lambda _: decode_predicted(data, coded.shape, predictor), range(16)):
+                np.testing.assert_array_equal(found, coded)
