@@ -19,26 +19,51 @@
 
 namespace {
 
-const int CONTEXTS = 6, SIGN_CONTEXTS = 3, LANES = 12;
+const int CONTEXTS = 6, SIGN_CONTEXTS = 3, LANES = 12, SET = padded(LANES);  // SET: of weights, as they are kept here
 const int DECISIONS = 16, UNARY = 14, KINDS = 64, LEVELS = 128;  // LEVELS: buckets of the expected magnitude, quarter octaves
 const int SIGN_LIMIT = 255;
 const int MAX_MAGNITUDE = 4095;  // as contexts see it, so that sums stay in 32 bits
 const int COLUMNS = 29;          // of the table of bands: low[4], high[4], kind, 4 x (band, shift[4])
 const int PADDING = 2;           // zeros beside a row of magnitudes
+const int VECTOR = 16;           // sums over a row are made for a multiple of it: what lies beyond the row is never looked at
 // Weights of neighbours in the expected magnitude, in 1/1024: left, second left, above, its neighbours, second above, before (t or z),
 // around it, second before, reference, around it.
 const int LEFT = 184, LEFT2 = 20, ABOVE = 184, DIAGONAL = 61, ABOVE2 = 41, BEFORE = 102, AROUND = 20, BEFORE2 = 31, REFERENCE = 62;
 
 const int SIZES[CONTEXTS] = {LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS};
 const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27};
-const int64_t SECOND = int64_t(KINDS) * DECISIONS * LANES, SIGNS = SECOND + 64 * DECISIONS * LANES;  // where these weights begin
+const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET, SIGNS = SECOND + 64 * DECISIONS * SET;  // where these weights begin
 const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;                                              // where these simple estimates begin
 
-FHASH_INLINE int small(int v) { return v < 37 ? tables.small[v] : v <= 64 ? 9 : v <= 140 ? 10 : 11; }
+// A magnitude, or a sum of some, in 12 classes; without a table, so that rows of them are vectors.
+FHASH_INLINE int seven(int v) { return (v > 0) + (v > 1) + (v > 2) + (v > 4) + (v > 6) + (v > 9); }
+FHASH_INLINE int twelve(int v) { return seven(v) + (v > 14) + (v > 22) + (v > 36) + (v > 64) + (v > 140); }
 
-// The slots of the contexts are decision-major, then those of the signs; the weights go by kind, by expected magnitude, then those of the
+struct Classes {
+    uint8_t of[142];
+    Classes() {
+        for (int v = 0; v < 142; v++) of[v] = (uint8_t)twelve(v);
+    }
+};
+const Classes classes;
+FHASH_INLINE int small(int v) { return classes.of[min(v, 141)]; }
+
+// The slots go by context, those of a context's decisions together, then those of the signs; the weights go by kind, by expected magnitude, then those of the
 // signs; the simple estimates are those of the escape code, of empty rows and of empty bands.
 using Prediction = Mixed<CONTEXTS>;
+
+// What is known of a whole row beforehand, vertex by vertex: sums over its neighbours but those to the left, and what contexts take of them.
+struct Sums {
+    std::vector<int32_t> room;
+    int32_t *expected, *plane, *before, *below, *both, *nearest, *sides, *others, *parent, *share, *level;
+    explicit Sums(size_t width) : room(11 * width) {
+        int32_t* at = room.data();
+        for (int32_t** part : {&expected, &plane, &before, &below, &both, &nearest, &sides, &others, &parent, &share, &level}) {
+            *part = at;
+            at += width;
+        }
+    }
+};
 
 struct Reference {
     int band, shift[4];
@@ -60,13 +85,7 @@ template <int MODE> struct Coder {
     State* state;
     double lambda;  // distortion, in squared steps, that 1/2048 bit is worth
 
-    FHASH_INLINE int simple(int bit, int64_t number) {
-        Simple& s = state->simples[number];
-        bit = range.code(bit, min<uint32_t>(max<uint32_t>(s.p, 32), 65504));
-        s.p = (uint16_t)(s.p + ((((bit ? 65535 : 0) - (int)s.p) * tables.rate[s.count]) >> 16));
-        if (s.count < SIMPLE_LIMIT) s.count++;
-        return bit;
-    }
+    FHASH_INLINE int simple(int bit, int64_t number) { return code_simple(range, state->simples[number], bit); }
 
     // The magnitude next to |scaled| that costs least: it, one less, or zero.
     template <class Predict> FHASH_INLINE int choose(double s, int p, Predict predict) {
@@ -119,10 +138,10 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
         signs[i] = at;
         at += SIGN_SIZES[i];
     }
-    int32_t* const weights = state->weights.data();
-    const int W = widest + 2 * PADDING;
-    std::vector<uint16_t> nothing(W, 0);
-    std::vector<int32_t> expected(W), plane(W), before(W), below(W), around(4 * (size_t)W);
+    int16_t* const weights = state->weights.data();
+    std::vector<uint16_t> zeros((size_t)widest + 2 * PADDING + VECTOR, 0);
+    const uint16_t* const nothing = zeros.data() + PADDING;
+    Sums sums((size_t)widest + VECTOR);
 
     for (int64_t number = 0; number < count; number++) {
         Band& band = bands[number];
@@ -141,7 +160,7 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
         band.stride[0] = M0;
         band.stride[1] = M1;
         band.stride[2] = M2;
-        band.magnitudes.assign((size_t)M0 * n0, 0);
+        band.magnitudes.assign((size_t)M0 * n0 + VECTOR, 0);
         band.filled.assign((size_t)R0 * n0, 0);
 
         for (int t = 0; t < n0; t++) for (int z = 0; z < n1; z++) for (int y = 0; y < n2; y++) {
@@ -169,17 +188,17 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                 if (!simple(filled, ROWS + (n3 > 24 ? 2 : 0) + (y > 1 && F[-2] ? 1 : 0) + (r == 0 ? 4 : 0))) continue;
             }
 
-            // What is known of the whole row beforehand: all neighbours but those to the left.
-            std::memset(expected.data(), 0, 4 * (size_t)n3);
-            std::memset(plane.data(), 0, 4 * (size_t)n3);
-            std::memset(before.data(), 0, 4 * (size_t)n3);
-            std::memset(below.data(), 0, 4 * (size_t)n3);
+            // What is known of the whole row beforehand.
+            int32_t *FHASH_RESTRICT const expected = sums.expected, *FHASH_RESTRICT const plane = sums.plane;
+            const int lanes = (n3 + VECTOR - 1) / VECTOR * VECTOR;
+            for (int32_t* part : {sums.expected, sums.plane, sums.before, sums.below}) std::memset(part, 0, 4 * (size_t)lanes);
             int weight = LEFT + LEFT2;
             if (has_y) {
                 weight += ABOVE + 2 * DIAGONAL;
                 if (F[-1]) {
                     const uint16_t* p = M - M2;
-                    for (int x = 0; x < n3; x++) {
+                    FHASH_INDEPENDENT
+                    for (int x = 0; x < lanes; x++) {
                         const int sides = p[x - 1] + p[x + 1];
                         expected[x] += ABOVE * p[x] + DIAGONAL * sides;
                         plane[x] += 2 * p[x] + sides;
@@ -188,84 +207,124 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                 if (y > 1) weight += ABOVE2;
                 if (y > 1 && F[-2]) {
                     const uint16_t* p = M - 2 * M2;
-                    for (int x = 0; x < n3; x++) {
+                    FHASH_INDEPENDENT
+                    for (int x = 0; x < lanes; x++) {
                         expected[x] += ABOVE2 * p[x];
                         plane[x] += p[x];
                     }
                 }
             }
-            auto neighbour = [&](std::vector<int32_t>& sum, bool there, int64_t row, const uint16_t* p) FHASH_LAMBDA {
+            auto neighbour = [&](int32_t* FHASH_RESTRICT sum, bool there, int64_t row, const uint16_t* p) FHASH_LAMBDA {
                 if (!there || !F[row]) return;
-                for (int x = 0; x < n3; x++) {
+                FHASH_INDEPENDENT
+                for (int x = 0; x < lanes; x++) {
                     expected[x] += AROUND * p[x];
                     sum[x] += p[x];
                 }
             };
-            auto centre = [&](std::vector<int32_t>& sum, int64_t row, const uint16_t* p) FHASH_LAMBDA {
+            auto centre = [&](int32_t* FHASH_RESTRICT sum, int64_t row, const uint16_t* p) FHASH_LAMBDA {
                 if (!F[row]) return;
-                for (int x = 0; x < n3; x++) {
+                FHASH_INDEPENDENT
+                for (int x = 0; x < lanes; x++) {
                     const int sides = p[x - 1] + p[x + 1];
                     expected[x] += BEFORE * p[x] + AROUND * sides;
                     sum[x] += 2 * p[x] + sides;
                 }
             };
+            auto second = [&](int64_t row, const uint16_t* p) FHASH_LAMBDA {
+                if (!F[row]) return;
+                FHASH_INDEPENDENT
+                for (int x = 0; x < lanes; x++) expected[x] += BEFORE2 * p[x];
+            };
             if (has_t) {
                 weight += BEFORE + 4 * AROUND + (t > 1 ? BEFORE2 : 0);
-                centre(before, -R0, M - M0);
-                neighbour(before, has_y, -R0 - 1, M - M0 - M2);
-                neighbour(before, y + 1 < n2, -R0 + 1, M - M0 + M2);
-                neighbour(before, has_z, -R0 - R1, M - M0 - M1);
-                neighbour(before, z + 1 < n1, -R0 + R1, M - M0 + M1);
-                if (t > 1 && F[-2 * R0]) for (int x = 0; x < n3; x++) expected[x] += BEFORE2 * M[x - 2 * M0];
+                centre(sums.before, -R0, M - M0);
+                neighbour(sums.before, has_y, -R0 - 1, M - M0 - M2);
+                neighbour(sums.before, y + 1 < n2, -R0 + 1, M - M0 + M2);
+                neighbour(sums.before, has_z, -R0 - R1, M - M0 - M1);
+                neighbour(sums.before, z + 1 < n1, -R0 + R1, M - M0 + M1);
+                if (t > 1) second(-2 * R0, M - 2 * M0);
             }
             if (has_z) {
                 weight += BEFORE + 4 * AROUND + (z > 1 ? BEFORE2 : 0);
-                centre(below, -R1, M - M1);
-                neighbour(below, has_y, -R1 - 1, M - M1 - M2);
-                neighbour(below, y + 1 < n2, -R1 + 1, M - M1 + M2);
-                if (z > 1 && F[-2 * R1]) for (int x = 0; x < n3; x++) expected[x] += BEFORE2 * M[x - 2 * M1];
+                centre(sums.below, -R1, M - M1);
+                neighbour(sums.below, has_y, -R1 - 1, M - M1 - M2);
+                neighbour(sums.below, y + 1 < n2, -R1 + 1, M - M1 + M2);
+                if (z > 1) second(-2 * R1, M - 2 * M1);
             }
+            int32_t *FHASH_RESTRICT const others = sums.others, *FHASH_RESTRICT const parent = sums.parent;
+            std::memset(sums.others, 0, 4 * (size_t)lanes);
+            std::memset(sums.parent, 0, 4 * (size_t)lanes);
             for (int k = 0; k < 4; k++) {
-                int32_t* const sums = around.data() + k * (size_t)W;
                 if (band.references[k].band >= 0) weight += REFERENCE + 2 * AROUND;
-                if (!rows[k]) {
-                    std::memset(sums, 0, 4 * (size_t)n3);
+                if (!rows[k]) continue;
+                const Band& other = bands[band.references[k].band];
+                const int shift = band.references[k].shift[3], last = other.size[3] - 1, scale = k == 0 ? 343 : k == 1 ? 49 : k == 2 ? 7 : 1;
+                const uint16_t* const p = rows[k];
+                const uint16_t* const up = row_y[k] > 0 ? p - other.stride[2] : nothing;
+                const uint16_t* const down = row_y[k] + 1 < other.size[2] ? p + other.stride[2] : nothing;
+                auto around = [&](int i) FHASH_LAMBDA { return 2 * p[i] + p[i - 1] + p[i + 1] + up[i] + down[i]; };
+                if (shift == 0 && last >= n3 - 1) {
+                    FHASH_INDEPENDENT
+                    for (int x = 0; x < lanes; x++) {
+                        const int sum = around(x);
+                        expected[x] += REFERENCE * p[x] + AROUND * sum;
+                        others[x] += seven(sum) * scale;
+                    }
+                    if (k == 0) {
+                        FHASH_INDEPENDENT
+                        for (int x = 0; x < lanes; x++) parent[x] = twelve(around(x));
+                    }
                     continue;
                 }
-                const Band& other = bands[band.references[k].band];
-                const int shift = band.references[k].shift[3], last = other.size[3] - 1;
-                const uint16_t* const p = rows[k];
-                const uint16_t* const up = row_y[k] > 0 ? p - other.stride[2] : nothing.data() + PADDING;
-                const uint16_t* const down = row_y[k] + 1 < other.size[2] ? p + other.stride[2] : nothing.data() + PADDING;
+                int32_t *FHASH_RESTRICT const share = sums.share, *FHASH_RESTRICT const level = sums.level;
+                const int needed = min((n3 - 1) >> shift, last) + 1;
+                FHASH_INDEPENDENT
+                for (int i = 0; i < needed; i++) {
+                    const int sum = around(i);
+                    share[i] = REFERENCE * p[i] + AROUND * sum;
+                    level[i] = twelve(sum);
+                }
                 for (int x = 0; x < n3; x++) {
                     const int i = min(x >> shift, last);
-                    sums[x] = 2 * p[i] + p[i - 1] + p[i + 1] + up[i] + down[i];
-                    expected[x] += REFERENCE * p[i] + AROUND * sums[x];
+                    expected[x] += share[i];
+                    others[x] += min(level[i], 6) * scale;
+                    if (k == 0) parent[x] = level[i];
                 }
             }
             const int offset = 160 - log16(weight);
-            const uint16_t* const Y = has_y ? M - M2 : nothing.data() + PADDING;
-            const uint16_t* const Z = has_z ? M - M1 : nothing.data() + PADDING;
-            const uint16_t* const T = has_t ? M - M0 : nothing.data() + PADDING;
-            int filled = 0;
+            const uint16_t* const Y = has_y ? M - M2 : nothing;
+            const uint16_t* const Z = has_z ? M - M1 : nothing;
+            const uint16_t* const T = has_t ? M - M0 : nothing;
+            int32_t *FHASH_RESTRICT const both = sums.both, *FHASH_RESTRICT const nearest = sums.nearest, *FHASH_RESTRICT const sides = sums.sides;
+            FHASH_INDEPENDENT
+            for (int x = 0; x < lanes; x++) {
+                const int before = sums.before[x], below = sums.below[x];
+                nearest[x] = (((min<int>(Y[x], 2) * 3 + min<int>(Y[x - 1], 2)) * 3 + min<int>(Y[x + 1], 2)) * 3 + min<int>(T[x], 2)) * 3 + min<int>(Z[x], 2);
+                sides[x] = twelve(before) * 12 + twelve(below);
+                both[x] = before + below;
+                parent[x] = parent[x] * KINDS + kind;
+            }
+            int filled = 0, left = 0, left2 = 0;
 
             for (int x = 0; x < n3; x++) {
-                const int left = M[x - 1], left2 = M[x - 2];
                 const uint32_t mu = (uint32_t)(expected[x] + LEFT * left + LEFT2 * left2);
-                const int level = mu ? min(max((log16(mu) + offset) / 4 + 1, 0), LEVELS - 1) : 0, coarse = min(level / 2, 63);
-                const int near = plane[x] + 2 * left + left2, parent = small(around[x]);
+                const int level = mu ? min((log16(mu) + offset) / 4 + 1, LEVELS - 1) : 0, coarse = level / 2;
+                const int near = plane[x] + 2 * left + left2;
                 const int context[CONTEXTS] = {
                     level,
                     kind * 64 + coarse,
-                    ((((min(left, 2) * 3 + min<int>(Y[x], 2)) * 3 + min<int>(Y[x - 1], 2)) * 3 + min<int>(Y[x + 1], 2)) * 3 + min<int>(T[x], 2)) * 3 + min<int>(Z[x], 2),
-                    (small(near) * 12 + small(before[x])) * 12 + small(below[x]),
-                    ((min(parent, 6) * 7 + min(small(around[W + x]), 6)) * 7 + min(small(around[2 * W + x]), 6)) * 7 + min(small(around[3 * W + x]), 6),
-                    (small((near + before[x] + below[x]) / 2) * 12 + parent) * KINDS + kind,
+                    min(left, 2) * 243 + nearest[x],
+                    small(near) * 144 + sides[x],
+                    others[x],
+                    small((near + both[x]) / 2) * (12 * KINDS) + parent[x],
                 };
+                Slot* places[CONTEXTS];
+                for (int i = 0; i < CONTEXTS; i++) places[i] = slots[i] + (int64_t)context[i] * DECISIONS;
                 auto predict = [&](Prediction& to, int k) FHASH_LAMBDA {
-                    for (int i = 0; i < CONTEXTS; i++) to.slots[i] = slots[i] + (int64_t)k * SIZES[i] + context[i];
-                    to.first = weights + ((int64_t)k * KINDS + kind) * LANES;
-                    to.second = weights + SECOND + ((int64_t)k * 64 + coarse) * LANES;
+                    for (int i = 0; i < CONTEXTS; i++) to.slots[i] = places[i] + k;
+                    to.first = weights + ((int64_t)k * KINDS + kind) * SET;
+                    to.second = weights + SECOND + ((int64_t)k * 64 + coarse) * SET;
                     return mix<CONTEXTS, true>(to);
                 };
                 Prediction now;
@@ -278,6 +337,8 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                 int magnitude = std::abs(value);
                 const int zero = range.code(magnitude == 0, p);
                 learn<CONTEXTS, true>(now, zero, SLOW_LIMIT);
+                left2 = left;
+                left = 0;
                 if (zero) continue;
                 filled = 1;
                 const int left_sign = x > 0 ? sign_of(out[x - 1]) : 1, left2_sign = x > 1 ? sign_of(out[x - 2]) : 1;
@@ -287,7 +348,7 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                 sign.slots[0] = signs[0] + kind * 27 + (left_sign * 3 + y_sign) * 3 + t_sign;
                 sign.slots[1] = signs[1] + kind * 81 + ((left_sign * 3 + left2_sign) * 3 + y_sign) * 3 + y2_sign;
                 sign.slots[2] = signs[2] + kind * 27 + (t_sign * 3 + z_sign) * 3 + left_sign;
-                sign.first = sign.second = weights + SIGNS + kind * LANES;
+                sign.first = sign.second = weights + SIGNS + kind * SET;
                 const int negative = range.code(value < 0, mix<SIGN_CONTEXTS, false>(sign));
                 learn<SIGN_CONTEXTS, false>(sign, negative, SIGN_LIMIT);
                 int k = 1;
@@ -312,7 +373,8 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                     magnitude = k;
                     out[x] = negative ? -k : k;
                 }
-                M[x] = (uint16_t)min(magnitude, MAX_MAGNITUDE);
+                left = min(magnitude, MAX_MAGNITUDE);
+                M[x] = (uint16_t)left;
             }
             band.filled[r] = (uint8_t)filled;
         }
@@ -320,13 +382,15 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
     return 0;
 }
 
-FHASH_CLONES int64_t encode(Coder<0>& coder, int32_t* q, const int64_t* shape, const int32_t* table, int64_t count) {
-    return coder.run(q, nullptr, shape, table, count);
+FHASH_CLONES Encoder encode(Coder<0> coder, int32_t* q, const int64_t* shape, const int32_t* table, int64_t count) {
+    coder.run(q, nullptr, shape, table, count);
+    return coder.range;
 }
-FHASH_CLONES int64_t encode_chosen(Coder<2>& coder, int32_t* q, const float* scaled, const int64_t* shape, const int32_t* table, int64_t count) {
-    return coder.run(q, scaled, shape, table, count);
+FHASH_CLONES Encoder encode_chosen(Coder<2> coder, int32_t* q, const float* scaled, const int64_t* shape, const int32_t* table, int64_t count) {
+    coder.run(q, scaled, shape, table, count);
+    return coder.range;
 }
-FHASH_CLONES int64_t decode(Coder<1>& coder, int32_t* q, const int64_t* shape, const int32_t* table, int64_t count) {
+FHASH_CLONES int64_t decode(Coder<1> coder, int32_t* q, const int64_t* shape, const int32_t* table, int64_t count) {
     return coder.run(q, nullptr, shape, table, count);
 }
 
@@ -339,28 +403,13 @@ FHASH_CLONES int64_t decode(Coder<1>& coder, int32_t* q, const int64_t* shape, c
 FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda, const int64_t* shape, const int32_t* table, int64_t count,
                                   uint16_t* slots, int64_t slot_count, int32_t* weights, int64_t weight_count, uint16_t* simples,
                                   int64_t simple_count, int64_t keep, uint8_t* data, int64_t capacity) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count);
-    int64_t size;
-    if (scaled) {
-        Coder<2> coder;
-        coder.state = &state;
-        coder.lambda = lambda / 2048;
-        encode_chosen(coder, q, scaled, shape, table, count);
-        coder.range.finish();
-        size = put(coder.range.out, data, capacity);
-    } else {
-        Coder<0> coder;
-        coder.state = &state;
-        coder.lambda = 0;
-        encode(coder, q, shape, table, count);
-        coder.range.finish();
-        size = put(coder.range.out, data, capacity);
-    }
-    if (keep && size <= capacity) {
-        std::memcpy(slots, state.slots.data(), sizeof(Slot) * slot_count);
-        std::memcpy(weights, state.weights.data(), 4 * (size_t)weight_count);
-        std::memcpy(simples, state.simples.data(), sizeof(Simple) * simple_count);
-    }
+    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+    std::vector<uint8_t> out;
+    Encoder range = scaled ? encode_chosen({{&out}, &state, lambda / 2048}, q, scaled, shape, table, count)
+                           : encode({{&out}, &state, 0}, q, shape, table, count);
+    range.finish();
+    const int64_t size = put(out, data, capacity);
+    if (keep && size <= capacity) keep_state(state, slots, weights, simples, LANES);
     return size;
 }
 
@@ -368,11 +417,6 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
 FHASH_EXPORT int64_t fhash_decode(int32_t* q, const int64_t* shape, const int32_t* table, int64_t count, const uint16_t* slots,
                                   int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
                                   int64_t simple_count, const uint8_t* data, int64_t size) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count);
-    Coder<1> coder;
-    coder.state = &state;
-    coder.range.data = data;
-    coder.range.size = size;
-    coder.range.start();
-    return decode(coder, q, shape, table, count);
+    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+    return decode({{data, size}, &state, 0}, q, shape, table, count);
 }

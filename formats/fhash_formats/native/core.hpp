@@ -8,7 +8,7 @@
 #include <cstdint>
 
 // Raise it whenever an exported signature or its meaning changes; native/__init__.py holds the same number.
-constexpr std::int64_t FHASH_ABI = 3;
+constexpr std::int64_t FHASH_ABI = 4;
 
 #if defined(_MSC_VER)
 #define FHASH_EXPORT extern "C" __declspec(dllexport)
@@ -25,6 +25,13 @@ constexpr std::int64_t FHASH_ABI = 3;
 #define FHASH_LAMBDA
 #else
 #define FHASH_LAMBDA __attribute__((always_inline))
+#endif
+
+// Before a loop: what it writes is never what another turn of it reads.
+#if defined(__GNUC__) && !defined(__clang__)
+#define FHASH_INDEPENDENT _Pragma("GCC ivdep")
+#else
+#define FHASH_INDEPENDENT
 #endif
 
 // FHASH_CLONES before a function: compiled for AVX-512, AVX2 and the baseline, chosen when the library is loaded. It works on plain

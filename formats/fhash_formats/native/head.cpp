@@ -242,7 +242,8 @@ public:
         return {level, place, distance};
     }
 
-    void features(std::int64_t own, const std::int64_t* row_of, std::int64_t b, std::int64_t groups, float* inputs) const {
+    // The inputs of the first layer.
+    void gather(std::int64_t own, const std::int64_t* row_of, std::int64_t b, std::int64_t groups, float* inputs) const {
         const float* const centre = block(own, b);
         for (int k = 0; k < FEATURES - 2; ++k)
             neighbour_features(block(row_of[k], b) + STEPS[k][3], centre, range.inverse, groups, inputs + k * BLOCK);
@@ -296,7 +297,7 @@ public:
                             for (std::int64_t i = 0; i < groups * LANES; ++i) row[o * pitch + 1 + b * BLOCK + i] = constant[o];
                         continue;
                     }
-                    frames.features(own, row_of, b, groups, inputs);
+                    frames.gather(own, row_of, b, groups, inputs);
                     accumulate(inputs, FEATURES, first.weights, width, groups, outputs);
                     for (std::int64_t o = 0; o < width; ++o) {
                         activate(outputs + o * BLOCK, first.scales[0], first.biases[o], groups);
@@ -342,6 +343,38 @@ private:
     std::int16_t constant[MAX_CROSS_WIDTH];
 };
 
+// The last correction of a flat block, which the next one may have as well.
+struct Last {
+    Flat flat{false, 0.0F, 0.0F};
+    float correction = 0.0F;
+};
+
+// Correct one time step. source: gathers the inputs of the network, from the rows of so many neighbours.
+template <class Source>
+void correct(const Frames& frames, const Source& source, std::int64_t neighbours, const Network& network, std::int64_t step, float* inputs,
+             float* outputs, Last& last, float* out) {
+    for (std::int64_t zi = 0; zi < frames.z; ++zi)
+        for (std::int64_t yi = 0; yi < frames.y; ++yi) {
+            std::int64_t row_of[FEATURES - 2];
+            frames.neighbours(step, zi, yi, neighbours, row_of);
+            const std::int64_t own = frames.row(step, zi, yi);
+            for (std::int64_t b = 0; b < frames.blocks; ++b) {
+                const float* const centre = frames.block(own, b);
+                float* const target = out + ((step * frames.z + zi) * frames.y + yi) * frames.x + b * BLOCK;
+                const std::int64_t n = frames.length(b), groups = groups_of(n);
+                const Flat flat = source.flatness(own, row_of, b);
+                if (flat.same(last.flat)) {
+                    for (std::int64_t i = 0; i < n; ++i) target[i] = clipped(centre[i] + last.correction, frames.range);
+                    continue;
+                }
+                source.gather(own, row_of, b, groups, inputs);
+                const float* const correction = evaluate(network, groups, inputs, outputs);
+                if (flat.level) last = {flat, correction[0]};
+                for (std::int64_t i = 0; i < n; ++i) target[i] = clipped(centre[i] + correction[i], frames.range);
+            }
+        }
+}
+
 FHASH_INLINE bool sound(std::int64_t t, std::int64_t z, std::int64_t y, std::int64_t x, std::int64_t layers, const std::int64_t* widths) {
     if (t < 1 || z < 1 || y < 1 || x < 1 || layers < 1 || layers > MAX_LAYERS || widths[0] != FEATURES || widths[layers] != 1) return false;
     for (std::int64_t layer = 1; layer <= layers; ++layer)
@@ -360,31 +393,11 @@ FHASH_EXPORT std::int64_t fhash_head_apply(const float* decoded, std::int64_t t,
     Frames frames(decoded, t, z, y, x, {low, high, inverse, unit});
     if (!frames.allocated()) return -2;
     alignas(64) float first[MAX_WIDTH * BLOCK], second[MAX_WIDTH * BLOCK];
-    Flat last{false, 0.0F, 0.0F};
-    float constant = 0.0F;  // the correction there
+    Last last;
     frames.load(0);
     for (std::int64_t step = 0; step < t; ++step) {
         if (step + 1 < t) frames.load(step + 1);
-        for (std::int64_t zi = 0; zi < z; ++zi)
-            for (std::int64_t yi = 0; yi < y; ++yi) {
-                std::int64_t row_of[FEATURES - 2];
-                frames.neighbours(step, zi, yi, FEATURES - 2, row_of);
-                const std::int64_t own = frames.row(step, zi, yi);
-                for (std::int64_t b = 0; b < frames.blocks; ++b) {
-                    const float* const centre = frames.block(own, b);
-                    float* const target = out + ((step * z + zi) * y + yi) * x + b * BLOCK;
-                    const std::int64_t n = frames.length(b), groups = groups_of(n);
-                    const Flat flat = frames.flatness(own, row_of, b);
-                    if (flat.same(last)) {
-                        for (std::int64_t i = 0; i < n; ++i) target[i] = clipped(centre[i] + constant, frames.range);
-                        continue;
-                    }
-                    frames.features(own, row_of, b, groups, first);
-                    const float* const correction = evaluate(network, groups, first, second);
-                    if (flat.level) last = flat, constant = correction[0];
-                    for (std::int64_t i = 0; i < n; ++i) target[i] = clipped(centre[i] + correction[i], frames.range);
-                }
-            }
+        correct(frames, frames, FEATURES - 2, network, step, first, second, last, out);
     }
     return 0;
 }
@@ -401,33 +414,12 @@ FHASH_EXPORT std::int64_t fhash_head_apply_cross(const float* decoded, std::int6
     Hidden hidden(frames, beginning);
     if (!frames.allocated() || !hidden.allocated()) return -2;
     alignas(64) float first[CROSS * MAX_CROSS_WIDTH * BLOCK], second[MAX_WIDTH * BLOCK];
-    Flat last{false, 0.0F, 0.0F};
-    float constant = 0.0F;
+    Last last;
     frames.load(0);
     for (std::int64_t ahead = 0; ahead <= t; ++ahead) {
         if (ahead + 1 < t) frames.load(ahead + 1);
         if (ahead < t) hidden.fill(ahead, first, second);
-        const std::int64_t step = ahead - 1;
-        for (std::int64_t zi = 0; step >= 0 && zi < z; ++zi)
-            for (std::int64_t yi = 0; yi < y; ++yi) {
-                std::int64_t row_of[CROSS - 1];
-                frames.neighbours(step, zi, yi, CROSS - 1, row_of);
-                const std::int64_t own = frames.row(step, zi, yi);
-                for (std::int64_t b = 0; b < frames.blocks; ++b) {
-                    const float* const centre = frames.block(own, b);
-                    float* const target = out + ((step * z + zi) * y + yi) * x + b * BLOCK;
-                    const std::int64_t n = frames.length(b), groups = groups_of(n);
-                    const Flat flat = hidden.flatness(own, row_of, b);
-                    if (flat.same(last)) {
-                        for (std::int64_t i = 0; i < n; ++i) target[i] = clipped(centre[i] + constant, frames.range);
-                        continue;
-                    }
-                    hidden.gather(own, row_of, b, groups, first);
-                    const float* const correction = evaluate(end, groups, first, second);
-                    if (flat.level) last = flat, constant = correction[0];
-                    for (std::int64_t i = 0; i < n; ++i) target[i] = clipped(centre[i] + correction[i], frames.range);
-                }
-            }
+        if (ahead > 0) correct(frames, hidden, CROSS - 1, end, ahead - 1, first, second, last, out);
     }
     return 0;
 }

@@ -11,7 +11,7 @@
 
 namespace {
 
-const int CONTEXTS = 10, LANES = 2 * CONTEXTS, LEVELS = 32, EVEN = 16;  // levels of the vertex; from EVEN on it is rather occupied
+const int CONTEXTS = 10, LANES = 2 * CONTEXTS, SET = padded(LANES), LEVELS = 32, EVEN = 16;  // levels of the vertex; from EVEN on it is rather occupied
 const int SEGMENT = 16, NEAR = 16;                                     // vertices that share a flag; sets of weights by the nearest bits
 const int PADDING = 2;                                                 // zeros beside a row
 const int NOTHING = 3;                                                 // state of a segment that does not exist
@@ -24,13 +24,7 @@ template <int MODE> struct MaskCoder {
     typename std::conditional<MODE == 1, Decoder, Encoder>::type range;
     State* state;
 
-    FHASH_INLINE int simple(int bit, int64_t number) {
-        Simple& s = state->simples[number];
-        bit = range.code(bit, min<uint32_t>(max<uint32_t>(s.p, 32), 65504));
-        s.p = (uint16_t)(s.p + ((((bit ? 65535 : 0) - (int)s.p) * tables.rate[s.count]) >> 16));
-        if (s.count < SIMPLE_LIMIT) s.count++;
-        return bit;
-    }
+    FHASH_INLINE int simple(int bit, int64_t number) { return code_simple(range, state->simples[number], bit); }
 
     FHASH_INLINE void run(uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
         const int n0 = (int)shape[0], n1 = (int)shape[1], n2 = (int)shape[2], n3 = (int)shape[3];
@@ -115,8 +109,8 @@ template <int MODE> struct MaskCoder {
                     };
                     Mixed<CONTEXTS> now;
                     for (int i = 0; i < CONTEXTS; i++) now.slots[i] = slots[i] + context[i];
-                    now.first = state->weights.data() + a * LANES;
-                    now.second = state->weights.data() + (LEVELS + near_bits) * LANES;
+                    now.first = state->weights.data() + a * SET;
+                    now.second = state->weights.data() + (LEVELS + near_bits) * SET;
                     const int probability = mix<CONTEXTS, true>(now);
                     const int bit = range.code(MODE == 1 ? 0 : out[x], probability);
                     learn<CONTEXTS, true, RATE>(now, bit, LIMIT);
@@ -130,10 +124,11 @@ template <int MODE> struct MaskCoder {
     }
 };
 
-FHASH_CLONES void encode(MaskCoder<0>& coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
+FHASH_CLONES Encoder encode(MaskCoder<0> coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
     coder.run(mask, level, other, shape);
+    return coder.range;
 }
-FHASH_CLONES void decode(MaskCoder<1>& coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
+FHASH_CLONES void decode(MaskCoder<1> coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
     coder.run(mask, level, other, shape);
 }
 
@@ -144,18 +139,12 @@ FHASH_CLONES void decode(MaskCoder<1>& coder, uint8_t* mask, const uint8_t* leve
 FHASH_EXPORT int64_t fhash_encode_mask(const uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape, uint16_t* slots,
                                        int64_t slot_count, int32_t* weights, int64_t weight_count, uint16_t* simples, int64_t simple_count,
                                        int64_t keep, uint8_t* data, int64_t capacity) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count);
-    MaskCoder<0> coder;
-    coder.state = &state;
-    std::vector<uint8_t> bits(mask, mask + shape[0] * shape[1] * shape[2] * shape[3]);
-    encode(coder, bits.data(), level, other, shape);
-    coder.range.finish();
-    const int64_t size = put(coder.range.out, data, capacity);
-    if (keep && size <= capacity) {
-        std::memcpy(slots, state.slots.data(), sizeof(Slot) * slot_count);
-        std::memcpy(weights, state.weights.data(), 4 * (size_t)weight_count);
-        std::memcpy(simples, state.simples.data(), sizeof(Simple) * simple_count);
-    }
+    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+    std::vector<uint8_t> out, bits(mask, mask + shape[0] * shape[1] * shape[2] * shape[3]);
+    Encoder range = encode({{&out}, &state}, bits.data(), level, other, shape);
+    range.finish();
+    const int64_t size = put(out, data, capacity);
+    if (keep && size <= capacity) keep_state(state, slots, weights, simples, LANES);
     return size;
 }
 
@@ -163,12 +152,7 @@ FHASH_EXPORT int64_t fhash_encode_mask(const uint8_t* mask, const uint8_t* level
 FHASH_EXPORT int64_t fhash_decode_mask(uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape, const uint16_t* slots,
                                        int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
                                        int64_t simple_count, const uint8_t* data, int64_t size) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count);
-    MaskCoder<1> coder;
-    coder.state = &state;
-    coder.range.data = data;
-    coder.range.size = size;
-    coder.range.start();
-    decode(coder, mask, level, other, shape);
+    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+    decode({{data, size}, &state}, mask, level, other, shape);
     return 0;
 }

@@ -1,5 +1,5 @@
-// What the adaptive coders share: the range coder, the estimates of a decision and their mixing. All of it is integer arithmetic, so that
-// encoder and decoder can never part, whatever the machine.
+// What the adaptive coders share: the estimates of a decision and their mixing. All of it is integer arithmetic, so that encoder and decoder
+// can never part, whatever the machine. Where there is SSE2 it is used; FHASH_PLAIN builds what all other machines use, with the same bits.
 #pragma once
 
 #include <algorithm>
@@ -9,6 +9,12 @@
 #include <vector>
 
 #include "core.hpp"
+#include "range.hpp"
+
+#if (defined(__SSE2__) || defined(_M_X64)) && !defined(FHASH_PLAIN)
+#define FHASH_SSE2 1
+#include <emmintrin.h>
+#endif
 
 namespace {
 
@@ -23,15 +29,20 @@ using std::uint64_t;
 using std::uint8_t;
 
 const int STRETCH_MAX = 2816;  // logits in units of 1/256, so +-11
-const int SLOW_LIMIT = 400, FAST_LIMIT = 20, SIMPLE_LIMIT = 60, LEARNING_RATE = 6;  // counts; the rate in 1/16
+const int SLOW_LIMIT = 400, FAST_LIMIT = 20, SIMPLE_LIMIT = 60, LEARNING_RATE = 6, ALL_TRUST = 13;  // counts; the rate in 1/16
+
+// Of an estimate that was made so often: how fast its two rates follow, and how many 13ths of it are believed.
+struct Pace {
+    uint16_t slow, fast, trust, same;
+};
 
 struct Tables {
     int16_t stretch[65536];
     uint16_t squash[2 * STRETCH_MAX + 1];
     uint16_t cost[65537];  // of a decision of this probability, in 1/2048 bit
-    int32_t log[4096];     // 16 log2
+    uint8_t log[4096];     // 16 log2
     int32_t rate[SLOW_LIMIT + 1];
-    uint8_t small[38];
+    Pace pace[SLOW_LIMIT + 1];
     // No value lies near a rounding boundary (a test sees to it), so any C library gives the same tables.
     Tables() {
         for (int i = 0; i < 65536; i++) {
@@ -42,9 +53,12 @@ struct Tables {
             squash[i + STRETCH_MAX] = (uint16_t)min(max((int)std::floor(65536 / (1 + std::exp(-i / 256.)) + .5), 1), 65535);
         for (int i = 0; i <= 65536; i++) cost[i] = (uint16_t)std::floor(-std::log2(max(i, 1) / 65536.) * 2048 + .5);
         log[0] = 0;
-        for (int i = 1; i < 4096; i++) log[i] = (int)std::floor(std::log2((double)i) * 16 + .5);
+        for (int i = 1; i < 4096; i++) log[i] = (uint8_t)std::floor(std::log2((double)i) * 16 + .5);
         for (int i = 0; i <= SLOW_LIMIT; i++) rate[i] = 655360 / (10 * i + 16);
-        for (int v = 0; v < 38; v++) small[v] = v <= 2 ? v : v <= 4 ? 3 : v <= 6 ? 4 : v <= 9 ? 5 : v <= 14 ? 6 : v <= 22 ? 7 : v <= 36 ? 8 : 9;
+        for (int i = 0; i <= SLOW_LIMIT; i++) {
+            const uint16_t trust = (uint16_t)min(i + 1, ALL_TRUST);  // little seen, little said
+            pace[i] = {(uint16_t)rate[i], (uint16_t)rate[min(i, FAST_LIMIT)], trust, trust};
+        }
     }
 };
 const Tables tables;
@@ -56,116 +70,193 @@ struct Simple {
     uint16_t p, count;
 };
 
-// What adapts, laid out as the caller's arrays: estimates that are mixed, the weights of the mixing, and simple estimates.
+// What adapts: estimates that are mixed, the weights of the mixing, and simple estimates. The caller's weights are int32, `lanes` to a set;
+// here they are int16, which holds them all, and each set is filled up with zeros to whole vectors.
 struct State {
     std::vector<Slot> slots;
-    std::vector<int32_t> weights;
+    std::vector<int16_t> weights;
     std::vector<Simple> simples;
 };
 
-struct Encoder {
-    std::vector<uint8_t> out;
-    uint32_t low = 0, high = 0xffffffffu;
-    bool failed = false;
-    FHASH_INLINE int code(int bit, uint32_t p) {  // p: probability of a 1, in 1..65535 of 65536
-        uint32_t middle = low + (uint32_t)(((uint64_t)(high - low) * p) >> 16);
-        if (bit) high = middle; else low = middle + 1;
-        while (((low ^ high) & 0xff000000u) == 0) {
-            out.push_back((uint8_t)(high >> 24));
-            low <<= 8;
-            high = (high << 8) | 255;
-        }
-        return bit;
-    }
-    // The fewest bytes that name a number from low to high; the decoder reads zeros past the end.
-    void finish() {
-        for (int keep = 0; keep <= 4; keep++) {
-            uint32_t v = keep == 0 ? 0 : high & ~(uint32_t)((uint64_t)0xffffffffu >> (8 * keep));
-            if (v < low || v > high) continue;
-            for (int i = 0; i < keep; i++) out.push_back((uint8_t)(v >> (24 - 8 * i)));
-            break;
-        }
-        while (!out.empty() && out.back() == 0) out.pop_back();
-    }
-};
+constexpr int padded(int lanes) { return (lanes + 7) & ~7; }
 
-struct Decoder {
-    const uint8_t* data;
-    int64_t size, at = 0;
-    uint32_t low = 0, high = 0xffffffffu, value = 0;
-    FHASH_INLINE uint32_t next() { return at < size ? data[at++] : 0; }
-    void start() {
-        for (int i = 0; i < 4; i++) value = (value << 8) | next();
-    }
-    FHASH_INLINE int code(int, uint32_t p) {
-        uint32_t middle = low + (uint32_t)(((uint64_t)(high - low) * p) >> 16);
-        int bit = value <= middle;
-        if (bit) high = middle; else low = middle + 1;
-        while (((low ^ high) & 0xff000000u) == 0) {
-            low <<= 8;
-            high = (high << 8) | 255;
-            value = (value << 8) | next();
-        }
-        return bit;
-    }
-};
-
-// A prediction from at most MOST estimates: their slots, the mixer's inputs and its one or two sets of weights.
-template <int MOST> struct Mixed {
-    Slot* slots[MOST];
-    int32_t inputs[2 * MOST];
-    int32_t *first, *second;
-    int p;
-};
-
-template <int N, bool PAIR, int MOST> FHASH_INLINE int mix(Mixed<MOST>& now) {
-    for (int i = 0; i < N; i++) {
-        const Slot* s = now.slots[i];
-        int slow = tables.stretch[s->slow], fast = tables.stretch[s->fast];
-        if (s->count < 12) {  // little seen, little said
-            slow = slow * (s->count + 1) / 13;
-            fast = fast * (s->count + 1) / 13;
-        }
-        now.inputs[2 * i] = slow;
-        now.inputs[2 * i + 1] = fast;
-    }
-    int32_t dot = 0;
-    for (int i = 0; i < 2 * N; i++) dot += ((now.first[i] + (PAIR ? now.second[i] : 0)) * now.inputs[i]) >> 2;
-    return now.p = tables.squash[min(max(dot >> 12, -STRETCH_MAX), STRETCH_MAX) + STRETCH_MAX];
+// Bits of a number without zeros in front.
+FHASH_INLINE int significant(uint32_t v) {
+#if defined(__GNUC__)
+    return v ? 32 - __builtin_clz(v) : 0;
+#else
+    int bits = 0;
+    while (v) v >>= 1, bits++;
+    return bits;
+#endif
 }
 
 // 16 log2 of a number, nearly.
 FHASH_INLINE int log16(uint32_t v) {
-    int shift = 0;
-    while ((v >> shift) >= 4096) shift++;
+    const int shift = max(significant(v) - 12, 0);
     return tables.log[v >> shift] + 16 * shift;
 }
 
-FHASH_INLINE int32_t bounded(int32_t weight) { return min(max(weight, -32767), 32767); }
+// A decision that is predicted by one estimate.
+template <class Range> FHASH_INLINE int code_simple(Range& range, Simple& s, int bit) {
+    bit = range.code(bit, min<uint32_t>(max<uint32_t>(s.p, 32), 65504));
+    s.p = (uint16_t)(s.p + ((((bit ? 65535 : 0) - (int)s.p) * tables.rate[s.count]) >> 16));
+    if (s.count < SIMPLE_LIMIT) s.count++;
+    return bit;
+}
+
+// A prediction from at most MOST estimates: their slots, the mixer's one or two sets of weights, and its inputs.
+template <int MOST> struct Mixed {
+    Slot* slots[MOST];
+    int16_t *first, *second;
+    int p;
+#if defined(FHASH_SSE2)
+    __m128i inputs[(MOST + 3) / 4], chances[(MOST + 3) / 4], counts[(MOST + 3) / 4], rates[(MOST + 3) / 4];
+#else
+    int32_t inputs[2 * MOST];
+#endif
+};
+
+FHASH_INLINE int squashed(int32_t dot) { return tables.squash[min(max(dot >> 12, -STRETCH_MAX), STRETCH_MAX) + STRETCH_MAX]; }
+
+#if defined(FHASH_SSE2)
+
+// The same arithmetic as below for eight numbers of 16 bits at a time: slow and fast of four slots.
+FHASH_INLINE __m128i half(const void* from) { return _mm_loadl_epi64(static_cast<const __m128i*>(from)); }
+
+template <int N, bool PAIR, int MOST> FHASH_INLINE int mix(Mixed<MOST>& now) {
+    const __m128i zero = _mm_setzero_si128();
+    __m128i dot = zero;
+    for (int v = 0; 4 * v < N; v++) {
+        const int n = min(N - 4 * v, 4);
+        Slot* const* const s = now.slots + 4 * v;
+        const __m128i one = _mm_unpacklo_epi32(half(s[0]), n > 1 ? half(s[1]) : zero);
+        const __m128i two = n < 3 ? zero : _mm_unpacklo_epi32(half(s[2]), n > 3 ? half(s[3]) : zero);
+        now.chances[v] = _mm_unpacklo_epi64(one, two);
+        now.counts[v] = _mm_unpackhi_epi64(one, two);
+        const __m128i pace = _mm_unpacklo_epi32(half(&tables.pace[s[0]->count]), n > 1 ? half(&tables.pace[s[1]->count]) : zero);
+        const __m128i more = n < 3 ? zero : _mm_unpacklo_epi32(half(&tables.pace[s[2]->count]), n > 3 ? half(&tables.pace[s[3]->count]) : zero);
+        now.rates[v] = _mm_unpacklo_epi64(pace, more);
+        const __m128i trust = _mm_unpackhi_epi64(pace, more);
+        __m128i in = _mm_cvtsi32_si128((uint16_t)tables.stretch[s[0]->slow]);
+        in = _mm_insert_epi16(in, tables.stretch[s[0]->fast], 1);
+        if (n > 1) {
+            in = _mm_insert_epi16(in, tables.stretch[s[1]->slow], 2);
+            in = _mm_insert_epi16(in, tables.stretch[s[1]->fast], 3);
+        }
+        if (n > 2) {
+            in = _mm_insert_epi16(in, tables.stretch[s[2]->slow], 4);
+            in = _mm_insert_epi16(in, tables.stretch[s[2]->fast], 5);
+        }
+        if (n > 3) {
+            in = _mm_insert_epi16(in, tables.stretch[s[3]->slow], 6);
+            in = _mm_insert_epi16(in, tables.stretch[s[3]->fast], 7);
+        }
+        if (_mm_movemask_epi8(_mm_cmplt_epi16(trust, _mm_set1_epi16(ALL_TRUST))) & ((1 << 4 * n) - 1)) {
+            // |in| * trust / 13, rounded down: 20165 / 2^18 is near enough to 1/13 for products below 2^16.
+            const __m128i sign = _mm_srai_epi16(in, 15);
+            in = _mm_mullo_epi16(_mm_sub_epi16(_mm_xor_si128(in, sign), sign), trust);
+            in = _mm_srli_epi16(_mm_mulhi_epu16(in, _mm_set1_epi16(20165)), 2);
+            in = _mm_sub_epi16(_mm_xor_si128(in, sign), sign);
+        }
+        now.inputs[v] = in;
+        // Pairs of weights times pairs of the same input: (first + second) * input, in 32 bits.
+        const __m128i first = _mm_loadu_si128(reinterpret_cast<const __m128i*>(now.first + 8 * v));
+        const __m128i second = PAIR ? _mm_loadu_si128(reinterpret_cast<const __m128i*>(now.second + 8 * v)) : zero;
+        dot = _mm_add_epi32(dot, _mm_srai_epi32(_mm_madd_epi16(_mm_unpacklo_epi16(first, second), _mm_unpacklo_epi16(in, in)), 2));
+        if (n > 2) dot = _mm_add_epi32(dot, _mm_srai_epi32(_mm_madd_epi16(_mm_unpackhi_epi16(first, second), _mm_unpackhi_epi16(in, in)), 2));
+    }
+    dot = _mm_add_epi32(dot, _mm_shuffle_epi32(dot, 0x4e));
+    dot = _mm_add_epi32(dot, _mm_shuffle_epi32(dot, 0xb1));
+    return now.p = squashed(_mm_cvtsi128_si32(dot));
+}
+
+FHASH_INLINE void follow(int16_t* weights, __m128i step) {
+    __m128i* const at = reinterpret_cast<__m128i*>(weights);
+    _mm_storeu_si128(at, _mm_max_epi16(_mm_adds_epi16(_mm_loadu_si128(at), step), _mm_set1_epi16(-32767)));
+}
+
+template <int N, bool PAIR, int RATE, int MOST> FHASH_INLINE void learn_bit(Mixed<MOST>& now, const int bit, int limit) {
+    const __m128i error = _mm_set1_epi16((int16_t)((((bit ? 65535 : 0) - now.p) * RATE) >> 4)), ones = _mm_set1_epi16((int16_t)-bit);
+    for (int v = 0; 4 * v < N; v++) {
+        const int n = min(N - 4 * v, 4);
+        Slot* const* const s = now.slots + 4 * v;
+        // (error * input + 32768) >> 16
+        const __m128i in = now.inputs[v];
+        const __m128i step = _mm_add_epi16(_mm_mulhi_epi16(error, in), _mm_srli_epi16(_mm_mullo_epi16(error, in), 15));
+        follow(now.first + 8 * v, step);
+        if (PAIR) follow(now.second + 8 * v, step);
+        // The distance from a 1, or from a 0, shrinks; rounded so that from a 0 it shrinks a little more.
+        __m128i far = _mm_xor_si128(now.chances[v], ones);
+        const __m128i exact = _mm_cmpeq_epi16(_mm_mullo_epi16(far, now.rates[v]), _mm_setzero_si128());
+        far = _mm_sub_epi16(far, _mm_mulhi_epu16(far, now.rates[v]));
+        far = _mm_add_epi16(far, _mm_andnot_si128(_mm_or_si128(exact, ones), _mm_set1_epi16(-1)));
+        const __m128i chances = _mm_xor_si128(far, ones);
+        const __m128i counts = _mm_sub_epi32(now.counts[v], _mm_cmplt_epi32(now.counts[v], _mm_set1_epi32(limit)));
+        const __m128i one = _mm_unpacklo_epi32(chances, counts), two = _mm_unpackhi_epi32(chances, counts);
+        _mm_storel_epi64(reinterpret_cast<__m128i*>(s[0]), one);
+        if (n > 1) _mm_storeh_pd(reinterpret_cast<double*>(s[1]), _mm_castsi128_pd(one));
+        if (n > 2) _mm_storel_epi64(reinterpret_cast<__m128i*>(s[2]), two);
+        if (n > 3) _mm_storeh_pd(reinterpret_cast<double*>(s[3]), _mm_castsi128_pd(two));
+    }
+}
+
+template <int N, bool PAIR, int RATE = LEARNING_RATE, int MOST> FHASH_INLINE void learn(Mixed<MOST>& now, int bit, int limit) {
+    if (bit) learn_bit<N, PAIR, RATE>(now, 1, limit);
+    else learn_bit<N, PAIR, RATE>(now, 0, limit);
+}
+
+#else
+
+template <int N, bool PAIR, int MOST> FHASH_INLINE int mix(Mixed<MOST>& now) {
+    int32_t dot = 0;
+    for (int i = 0; i < N; i++) {
+        const Slot* s = now.slots[i];
+        const int trust = tables.pace[s->count].trust, slow = tables.stretch[s->slow], fast = tables.stretch[s->fast];
+        now.inputs[2 * i] = trust < ALL_TRUST ? slow * trust / ALL_TRUST : slow;
+        now.inputs[2 * i + 1] = trust < ALL_TRUST ? fast * trust / ALL_TRUST : fast;
+    }
+    for (int i = 0; i < 2 * N; i++) dot += ((now.first[i] + (PAIR ? now.second[i] : 0)) * now.inputs[i]) >> 2;
+    return now.p = squashed(dot);
+}
 
 template <int N, bool PAIR, int RATE = LEARNING_RATE, int MOST> FHASH_INLINE void learn(Mixed<MOST>& now, int bit, int limit) {
     const int target = bit ? 65535 : 0, error = ((target - now.p) * RATE) >> 4;
     for (int i = 0; i < 2 * N; i++) {
-        int32_t step = (error * now.inputs[i] + 32768) >> 16;
-        now.first[i] = bounded(now.first[i] + step);
-        if (PAIR) now.second[i] = bounded(now.second[i] + step);
+        const int32_t step = (error * now.inputs[i] + 32768) >> 16;
+        now.first[i] = (int16_t)min(max(now.first[i] + step, -32767), 32767);
+        if (PAIR) now.second[i] = (int16_t)min(max(now.second[i] + step, -32767), 32767);
     }
     for (int i = 0; i < N; i++) {
         Slot* s = now.slots[i];
-        s->slow = (uint16_t)(s->slow + (((target - s->slow) * tables.rate[s->count]) >> 16));
-        s->fast = (uint16_t)(s->fast + (((target - s->fast) * tables.rate[min<int>(s->count, FAST_LIMIT)]) >> 16));
+        const Pace& pace = tables.pace[s->count];
+        s->slow = (uint16_t)(s->slow + (((target - s->slow) * (int64_t)pace.slow) >> 16));
+        s->fast = (uint16_t)(s->fast + (((target - s->fast) * (int64_t)pace.fast) >> 16));
         if (s->count < limit) s->count++;
     }
 }
 
-inline State make_state(const uint16_t* slots, int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples, int64_t simple_count) {
+#endif
+
+inline State make_state(const uint16_t* slots, int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
+                        int64_t simple_count, int lanes) {
     State state;
     const Slot* const first = reinterpret_cast<const Slot*>(slots);
     state.slots.assign(first, first + slot_count);  // not filled with zeros before
-    state.weights.assign(weights, weights + weight_count);
-    state.simples.resize(simple_count);
-    std::memcpy(state.simples.data(), simples, sizeof(Simple) * simple_count);
+    state.weights.assign((size_t)(weight_count / lanes * padded(lanes)), 0);
+    for (int64_t set = 0; set < weight_count / lanes; set++)
+        for (int i = 0; i < lanes; i++) state.weights[(size_t)(set * padded(lanes) + i)] = (int16_t)weights[set * lanes + i];
+    state.simples.resize((size_t)simple_count);
+    std::memcpy(state.simples.data(), simples, sizeof(Simple) * (size_t)simple_count);
     return state;
+}
+
+// What was learned, for the caller's arrays.
+inline void keep_state(const State& state, uint16_t* slots, int32_t* weights, uint16_t* simples, int lanes) {
+    std::memcpy(slots, state.slots.data(), sizeof(Slot) * state.slots.size());
+    for (size_t set = 0; set < state.weights.size() / padded(lanes); set++)
+        for (int i = 0; i < lanes; i++) weights[set * lanes + i] = state.weights[set * padded(lanes) + i];
+    std::memcpy(simples, state.simples.data(), sizeof(Simple) * state.simples.size());
 }
 
 inline int64_t put(const std::vector<uint8_t>& out, uint8_t* data, int64_t capacity) {

@@ -13,7 +13,7 @@
 
 namespace {
 
-const int CONTEXTS = 7, LANES = 14, DECISIONS = 16, UNARY = 14, CLASSES = 16, LEVELS = 48, HALF_LEVELS = 24, ACTIVITIES = 32, SLOPES = 27;
+const int CONTEXTS = 7, LANES = 14, SET = padded(LANES), DECISIONS = 16, UNARY = 14, CLASSES = 16, LEVELS = 48, HALF_LEVELS = 24, ACTIVITIES = 32, SLOPES = 27;
 const int SIZES[CONTEXTS] = {LEVELS * 5, ACTIVITIES * SLOPES, CLASSES* HALF_LEVELS * 5, 3125, 81 * 5 * 8, 81 * HALF_LEVELS, ACTIVITIES* HALF_LEVELS * 5};
 const int ESCAPES = 160, ROWS = 192;  // where these simple estimates begin: low bits, escapes, empty rows
 const int SIDE = 20, BEFORE = 15, DIAGONAL = 7, COARSE = 4;  // weights of known differences: left and above, in t and z, diagonal, in C
@@ -39,43 +39,39 @@ struct Grid {
 
 FHASH_INLINE int half_octaves(uint32_t v, int most) { return v ? min(1 + log16(v) / 8, most) : 0; }
 FHASH_INLINE int32_t clipped(int32_t e) { return min(std::abs(e), CLIP); }
-FHASH_INLINE int few(int v) { return v <= 1 ? v : v <= 3 ? 2 : v <= 8 ? 3 : 4; }
+FHASH_INLINE int few(int v) { return (v > 0) + (v > 1) + (v > 3) + (v > 8); }
+FHASH_INLINE int sign_of(int32_t v) { return (v > 0) - (v < 0); }
 // How far another prediction lies to which side, in 9 classes.
 FHASH_INLINE int side(int64_t d) {
     const int64_t a = d < 0 ? -d : d;
-    const int r = a < 1229 ? 0 : a < 4096 ? 1 : a < 9830 ? 2 : a < 24576 ? 3 : 4;
+    const int r = (a >= 1229) + (a >= 4096) + (a >= 9830) + (a >= 24576);
     return d < 0 ? 4 - r : 4 + r;
 }
 
 template <bool DECODES> struct Pass {
-    typename std::conditional<DECODES, Decoder, Encoder>::type range;
+    using Range = typename std::conditional<DECODES, Decoder, Encoder>::type;
+    Range range;
     State* state;
     Slot* slots[CONTEXTS];
     Grid C, N;
-    // Of one row: twice the base, the weighted sum, activity, slope, known differences, the prediction by the step before.
-    std::vector<int32_t> base, activity, slope, known, step;
+    // Of one row: twice the base, the weighted sum, activity, slope, known differences, the prediction by the step before, and what contexts
+    // take from the differences above, below, before and in C: their sizes and their signs.
+    std::vector<int32_t> base, activity, slope, known, step, sizes, signs;
     std::vector<int64_t> sum;
 
-    void start(State* from) {
-        state = from;
+    Pass(Range from, State* with) : range(from), state(with) {
         Slot* at = state->slots.data();
         for (int i = 0; i < CONTEXTS; i++) {
             slots[i] = at;
             at += (int64_t)SIZES[i] * DECISIONS;
         }
     }
-    FHASH_INLINE int simple(int bit, int number) {
-        Simple& s = state->simples[number];
-        bit = range.code(bit, min<uint32_t>(max<uint32_t>(s.p, 32), 65504));
-        s.p = (uint16_t)(s.p + ((((bit ? 65535 : 0) - (int)s.p) * tables.rate[s.count]) >> 16));
-        if (s.count < SIMPLE_LIMIT) s.count++;
-        return bit;
-    }
-    FHASH_INLINE int decide(int bit, int k, const int* context, int kind, int level) {
+    FHASH_INLINE int simple(Range& range, int bit, int number) { return code_simple(range, state->simples[number], bit); }
+    FHASH_INLINE int decide(Range& range, int bit, int k, const int* context, int kind, int level) {
         Mixed<CONTEXTS> now;
         for (int i = 0; i < CONTEXTS; i++) now.slots[i] = slots[i] + (int64_t)context[i] * DECISIONS + k;
-        now.first = state->weights.data() + (kind * DECISIONS + k) * LANES;
-        now.second = state->weights.data() + ((CLASSES + level) * DECISIONS + k) * LANES;
+        now.first = state->weights.data() + (kind * DECISIONS + k) * SET;
+        now.second = state->weights.data() + ((CLASSES + level) * DECISIONS + k) * SET;
         bit = range.code(bit, (uint32_t)mix<CONTEXTS, true>(now));
         learn<CONTEXTS, true>(now, bit, SLOW_LIMIT);
         return bit;
@@ -84,8 +80,9 @@ template <bool DECODES> struct Pass {
     // All vertices of N; q, care: of the whole tile; at, stride: where N lies in them. 0 or -1.
     FHASH_INLINE int64_t run(int32_t* q, const uint8_t* care, int64_t at, const int64_t* stride, int axis, int kind, const int32_t* taps,
                              const int16_t* weights, int count) {
+        Range range = this->range;
         const int64_t n3 = N.n[3];
-        for (std::vector<int32_t>* part : {&base, &activity, &slope, &known, &step}) part->assign((size_t)n3, 0);
+        for (std::vector<int32_t>* part : {&base, &activity, &slope, &known, &step, &sizes, &signs}) part->assign((size_t)n3, 0);
         sum.assign((size_t)n3, 0);
         const int64_t along[4] = {axis == 0, axis == 1, axis == 2, axis == 3};
         for (int64_t t = 0; t < N.n[0]; t++) for (int64_t z = 0; z < N.n[1]; z++) for (int64_t y = 0; y < N.n[2]; y++) {
@@ -134,7 +131,8 @@ template <bool DECODES> struct Pass {
             for (int k = 0; k < count; k++) {
                 const int32_t* const tap = taps + k * TAP;
                 const Grid& G = tap[0] ? N : C;
-                const int64_t offset = tap[4], w = weights[k];
+                const int64_t offset = tap[4];
+                const int32_t w = weights[k];
                 if (tap[0] && !tap[1] && !tap[2] && !tap[3]) {
                     own[owned][0] = offset;
                     own[owned++][1] = w;
@@ -146,11 +144,11 @@ template <bool DECODES> struct Pass {
                 if (k < ACTIVE)
                     for (int64_t x = first; x < last; x++) {
                         const int32_t d = 2 * p[x] - B[x];
-                        sum[x] += w * d;
+                        sum[x] += (int64_t)w * d;
                         activity[x] += min(std::abs(d), 1 << 24);
                     }
                 else
-                    for (int64_t x = first; x < last; x++) sum[x] += w * (2 * p[x] - B[x]);
+                    for (int64_t x = first; x < last; x++) sum[x] += (int64_t)w * (2 * p[x] - B[x]);
             }
             if (y > 0) {
                 differences(N, row - N.stride[2], 0, SIDE);
@@ -199,7 +197,7 @@ template <bool DECODES> struct Pass {
                         V[x] = care && !care[i] ? (int32_t)r : q[i];
                         wrong = V[x] != r;
                     }
-                wrong = simple(wrong, ROWS + (moved ? 1 : 0) + (t + z + y ? 2 : 0) + (n3 > 16 ? 4 : 0));
+                wrong = simple(range, wrong, ROWS + (moved ? 1 : 0) + (t + z + y ? 2 : 0) + (n3 > 16 ? 4 : 0));
                 if (!wrong) {
                     for (int64_t x = 0; x < n3; x++) {
                         if (axis < 0) activity[x] = 0;
@@ -214,6 +212,20 @@ template <bool DECODES> struct Pass {
             const int32_t* const Z = z > 0 ? E - N.stride[1] : nullptr;
             const int32_t* const T = t > 0 ? E - N.stride[0] : nullptr;
             const int32_t* const L = axis < 0 ? nullptr : C.errors.data() + C.row(t, z, y);
+            std::memset(sizes.data(), 0, 4 * (size_t)n3);
+            std::memset(signs.data(), 0, 4 * (size_t)n3);
+            auto seen = [&](const int32_t* FHASH_RESTRICT errors, int size, int sign) FHASH_LAMBDA {
+                if (!errors) return;
+                int32_t *FHASH_RESTRICT const to_sizes = sizes.data(), *FHASH_RESTRICT const to_signs = signs.data();
+                for (int64_t x = 0; x < n3; x++) {
+                    to_sizes[x] += few(clipped(errors[x])) * size;
+                    to_signs[x] += sign_of(errors[x]) * sign;
+                }
+            };
+            seen(Y, 125, 9);
+            seen(Z, 25, 3);
+            seen(T, 5, 1);
+            seen(L, 1, 0);
 
             for (int64_t x = 0; x < n3; x++) {
                 const int64_t p = predict(x), r = rounded(p), fraction = p - r * 8192, i = q_row + x * stride[3];
@@ -226,15 +238,13 @@ template <bool DECODES> struct Pass {
                 const int lively_place = half_octaves((uint32_t)activity[x], ACTIVITIES - 1);
                 const int steep = half_octaves((uint32_t)slope[x], SLOPES - 1);
                 const int other = side(((int64_t)B[x] * 4096 - p) * sign), before = side(stepped ? (((int64_t)B[x] + step[x]) * 4096 - p) * sign : 0);
-                auto turned = [&](int e) FHASH_LAMBDA { return e * sign > 0 ? 2 : e * sign < 0 ? 0 : 1; };
-                const int above = Y ? Y[x] : 0, under = Z ? Z[x] : 0, ago = T ? T[x] : 0;
                 const int context[CONTEXTS] = {
                     level * 5 + part,
                     lively_place * SLOPES + steep,
                     (kind * HALF_LEVELS + half) * 5 + part,
-                    (((few(clipped(left)) * 5 + few(clipped(above))) * 5 + few(clipped(under))) * 5 + few(clipped(ago))) * 5 + (L ? few(clipped(L[x])) : 0),
+                    few(clipped(left)) * 625 + sizes[x],
                     ((other * 9 + before) * 5 + part) * 8 + half / 3,
-                    (((turned(left) * 3 + turned(above)) * 3 + turned(under)) * 3 + turned(ago)) * HALF_LEVELS + half,
+                    (40 + sign * (27 * sign_of(left) + signs[x])) * HALF_LEVELS + half,
                     (lively_place * HALF_LEVELS + half) * 5 + part,
                 };
                 int64_t error = 0;
@@ -245,17 +255,17 @@ template <bool DECODES> struct Pass {
                 const int64_t size = error < 0 ? -error : error;
                 int64_t magnitude = size >> low;
                 int positive = error * sign > 0;
-                const int zero = decide(magnitude == 0, 0, context, kind, level);
+                const int zero = decide(range, magnitude == 0, 0, context, kind, level);
                 if (!zero) {
-                    positive = decide(positive, 1, context, kind, level);
+                    positive = decide(range, positive, 1, context, kind, level);
                     int k = 1;
                     for (; k < UNARY + 1; k++)
-                        if (!decide(magnitude > k, k + 1, context, kind, level)) break;
+                        if (!decide(range, magnitude > k, k + 1, context, kind, level)) break;
                     if (k == UNARY + 1) {
                         const uint32_t rest = DECODES ? 0 : (uint32_t)(magnitude - UNARY);
                         int bits = 0, j = 0;
                         if (!DECODES) while (rest >> bits > 1) bits++;
-                        while (simple(j < bits, ESCAPES + min(j, 31))) if (++j > 28) return -1;
+                        while (simple(range, j < bits, ESCAPES + min(j, 31))) if (++j > 28) return -1;
                         uint32_t v = 1;
                         for (int b = j - 1; b >= 0; b--) v = (v << 1) | (uint32_t)range.code((rest >> b) & 1, 32768);
                         if (DECODES) magnitude = (int64_t)v + UNARY;
@@ -266,10 +276,10 @@ template <bool DECODES> struct Pass {
                     int64_t v = DECODES ? (zero ? 0 : magnitude) : 0;
                     for (int b = low - 1; b >= 0; b--) {
                         const int bit = (int)((size >> b) & 1);
-                        v = (v << 1) | (b > low - 3 ? simple(bit, about + (b != low - 1)) : range.code(bit, 32768));
+                        v = (v << 1) | (b > low - 3 ? simple(range, bit, about + (b != low - 1)) : range.code(bit, 32768));
                     }
                     if (DECODES) magnitude = v;
-                    if (zero && (DECODES ? v != 0 : size != 0)) positive = decide(positive, 1, context, kind, level);
+                    if (zero && (DECODES ? v != 0 : size != 0)) positive = decide(range, positive, 1, context, kind, level);
                 } else if (DECODES && zero) magnitude = 0;
                 if (DECODES) error = magnitude * (positive ? sign : -sign);
                 const int64_t value = r + error;
@@ -279,6 +289,7 @@ template <bool DECODES> struct Pass {
                 E[x] = (int32_t)min<int64_t>(max<int64_t>(error, -MOST), MOST);
             }
         }
+        this->range = range;
         return 0;
     }
 
@@ -357,12 +368,12 @@ FHASH_EXPORT int64_t fhash_encode_predicted(int32_t* q, const uint8_t* care, con
                                             int64_t pass_count, const int32_t* taps, const int16_t* tap_weights, const uint16_t* slots,
                                             int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
                                             int64_t simple_count, uint8_t* data, int64_t capacity) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count);
-    Pass<false> pass;
-    pass.start(&state);
+    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+    std::vector<uint8_t> out;
+    Pass<false> pass{{&out}, &state};
     if (encode(pass, q, care, shape, levels, passes, pass_count, taps, tap_weights) < 0) return -1;
     pass.range.finish();
-    return put(pass.range.out, data, capacity);
+    return put(out, data, capacity);
 }
 
 // Decode into q. 0, or -1 for bytes that no encoder writes.
@@ -370,11 +381,7 @@ FHASH_EXPORT int64_t fhash_decode_predicted(int32_t* q, const int64_t* shape, co
                                             const int32_t* taps, const int16_t* tap_weights, const uint16_t* slots, int64_t slot_count,
                                             const int32_t* weights, int64_t weight_count, const uint16_t* simples, int64_t simple_count,
                                             const uint8_t* data, int64_t size) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count);
-    Pass<true> pass;
-    pass.start(&state);
-    pass.range.data = data;
-    pass.range.size = size;
-    pass.range.start();
+    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+    Pass<true> pass{{data, size}, &state};
     return decode(pass, q, shape, levels, passes, pass_count, taps, tap_weights);
 }

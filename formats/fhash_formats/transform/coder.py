@@ -67,7 +67,7 @@ def encode_integers(
     capacity = max(4096, given.size // 2)
     while True:
         buffer = np.empty(capacity, dtype=np.uint8)
-        integers = given.copy()
+        integers = given if chosen is None else given.copy()  # only chosen integers are written
         size = library.fhash_encode(
             _pointer(integers),
             _pointer(chosen),

@@ -275,7 +275,7 @@ def _context_mix(
     k: int, where: Sequence, inputs: Sequence, context: Sequence, first: int, second: int, memory: Memory, tables: Tables
 ) -> int:
     for i in range(CONTEXTS):
-        where[i] = STARTS[i] + k * SIZES[i] + context[i]
+        where[i] = STARTS[i] + context[i] * DECISIONS + k
     return _mix(CONTEXTS, where, inputs, first, second, memory, tables)
 
 

@@ -24,6 +24,8 @@ Mask = npt.NDArray[np.bool_]
 
 HIGHEST, LOWEST = 64.0, 0.4
 """Thresholds, in quantiser steps."""
+NEARBY = 16.0
+"""The first threshold where what is there is a good filling already."""
 RATIOS = {1: 0.5, 2: 0.7071067811865476, 4: 0.8408964152537145, 8: 0.9170040432046712}
 """From one threshold to the next, by how many there are to the factor of two: constants, so that every machine has the same."""
 MOMENTUM = 0.8
@@ -34,13 +36,16 @@ FEW_BITS = 64
 def filled(target: Values, counts: Mask, finite: Mask, transform: Transform, settings: Settings, density: int = 1) -> Values:
     """`target` (t, z, y, x) with other values where it does not count.
 
-    finite: where it has values. density: 1, 2, 4 or 8 thresholds to each factor of two. Begins with the values that are there, because they
+    finite: where it has values. density: 1, 2, 4 or 8 thresholds to each factor of two; 0 goes on from a filling that was made for other
+    settings, by a few thresholds. Begins with the values that are there, because they
     often go on from what counts, or with the mean of what counts: with that which takes fewer bits. Where the values that are there
     take fewer bytes, they stay.
     """
     # A running sum has one order on every machine, a mean has not.
     mean = settings.dtype.type(np.cumsum(target[counts], dtype=np.float64)[-1] / np.count_nonzero(counts))
     t, z, y, x = target.shape
+    if density == 0:
+        return _settled(np.where(finite, target, mean), counts, transform, settings, 1, NEARBY)
     own = np.where(finite, target, mean)
     starts = (own, np.where(counts, target, mean))
     settled = [_settled(start, counts, transform, settings, 1) for start in starts]
@@ -60,8 +65,8 @@ def _bits(values: Values, transform: Transform, settings: Settings) -> int:
     return int(np.frexp(integers.astype(np.float32))[1].sum(dtype=np.int64))
 
 
-def _settled(start: Values, counts: Mask, transform: Transform, settings: Settings, density: int) -> Values:
-    kind, threshold = settings.dtype.type, HIGHEST
+def _settled(start: Values, counts: Mask, transform: Transform, settings: Settings, density: int, threshold: float = HIGHEST) -> Values:
+    kind = settings.dtype.type
     now, guess = start, start
     while threshold > LOWEST:
         coefficients = transform.forward(guess)

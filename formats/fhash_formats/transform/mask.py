@@ -36,22 +36,13 @@ _FILE = Path(__file__).with_name("mask_prior.bin")
 
 def blank_mask_state() -> State:
     """Nothing known: even odds, and weights that take the estimates at their word."""
-    slots = np.zeros((sum(SIZES), 4), dtype=np.uint16)
-    slots[:, :2] = 32768
-    weights = np.zeros((LEVELS + NEAR) * LANES, dtype=np.int32)
-    weights[: LEVELS * LANES] = 3277
-    simples = np.zeros((SIMPLES, 2), dtype=np.uint16)
-    simples[:, 0] = 32768
-    return State(slots=slots, weights=weights, simples=simples)
+    return State.even(slots=sum(SIZES), weights=[(LEVELS * LANES, 3277), (NEAR * LANES, 0)], simples=SIMPLES)
 
 
 @cache
 def mask_prior_state() -> State:
     """The prior; its arrays are read-only."""
-    state = unpack_state(zlib.decompress(_FILE.read_bytes()), blank_mask_state())
-    for array in (state.slots, state.weights, state.simples):
-        array.setflags(write=False)
-    return state
+    return unpack_state(zlib.decompress(_FILE.read_bytes()), blank_mask_state()).frozen()
 
 
 def pack_mask_prior(state: State) -> bytes:

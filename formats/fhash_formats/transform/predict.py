@@ -17,6 +17,7 @@ import numpy.typing as npt
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.coder import array_arguments, state_arguments
+from fhash_formats.transform.elementwise import pieces
 from fhash_formats.transform.predictor import CLASSES, Predictor, pass_arrays
 from fhash_formats.transform.prior import State
 
@@ -43,26 +44,24 @@ Values = npt.NDArray[Any]
 @cache
 def _blank() -> State:
     """Nothing known: even odds, and weights that take the estimates at their word. The arrays are read-only."""
-    slots = np.zeros((sum(SIZES) * DECISIONS, 4), dtype=np.uint16)
-    slots[:, :2] = 32768
-    weights = np.zeros((CLASSES + LEVELS) * DECISIONS * LANES, dtype=np.int32)
-    weights[: CLASSES * DECISIONS * LANES] = 4096
-    simples = np.zeros((SIMPLES, 2), dtype=np.uint16)
-    simples[:, 0] = 32768
-    for array in (slots, weights, simples):
-        array.setflags(write=False)
-    return State(slots=slots, weights=weights, simples=simples)
+    weights = [(CLASSES * DECISIONS * LANES, 4096), (LEVELS * DECISIONS * LANES, 0)]
+    return State.even(slots=sum(SIZES) * DECISIONS, weights=weights, simples=SIMPLES).frozen()
 
 
-def integers_of(values: Values, counts: Mask, predictor: Predictor) -> Integers | None:
+def integers_of(values: Values, counts: Mask | None, predictor: Predictor) -> Integers | None:
     """The integers nearest to values of any real type, 0 where they do not count; None where one would be too large."""
-    with np.errstate(all="ignore"):
-        # Whole numbers of 64 bits are subtracted as float64: near the ends a bound may be missed, which the encoder sees.
-        whole = np.rint((values.astype(np.float64) - predictor.origin) / predictor.step)
-    whole = np.where(counts, whole, 0.0)
-    if not np.all(np.abs(whole) <= LARGEST):
-        return None
-    return whole.astype(np.int32)
+    result = np.empty(values.shape, np.int32)
+    flat, marks, out = values.reshape(-1), None if counts is None else counts.reshape(-1), result.reshape(-1)
+    for piece in pieces(flat.size):
+        with np.errstate(all="ignore"):
+            # Whole numbers of 64 bits are subtracted as float64: near the ends a bound may be missed, which the encoder sees.
+            whole = np.rint((flat[piece].astype(np.float64) - predictor.origin) / predictor.step)
+        if marks is not None:
+            whole = np.where(marks[piece], whole, 0.0)
+        if not np.all(np.abs(whole) <= LARGEST):
+            return None
+        out[piece] = whole
+    return result
 
 
 def values_of(integers: Integers, predictor: Predictor) -> npt.NDArray[np.float64]:

@@ -8,6 +8,7 @@ weights, and the simple estimates.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -38,30 +39,41 @@ class State:
     weights: npt.NDArray[np.int32]
     simples: npt.NDArray[np.uint16]
 
+    @classmethod
+    def even(cls, *, slots: int, weights: Sequence[tuple[int, int]], simples: int) -> State:
+        """Nothing known: so many slots and simple estimates of even odds, and runs of (how many, equal to what) weights."""
+        counts, values = zip(*weights, strict=True)
+        state = cls(
+            slots=np.zeros((slots, 4), dtype=np.uint16),
+            weights=np.repeat(np.array(values, dtype=np.int32), counts),
+            simples=np.zeros((simples, 2), dtype=np.uint16),
+        )
+        state.slots[:, :2] = state.simples[:, 0] = 32768
+        return state
+
     def copy(self) -> State:
         """Arrays of its own."""
         return State(slots=self.slots.copy(), weights=self.weights.copy(), simples=self.simples.copy())
 
+    def frozen(self) -> State:
+        """This state, its arrays read-only from now on."""
+        for array in (self.slots, self.weights, self.simples):
+            array.setflags(write=False)
+        return self
+
 
 def blank_state() -> State:
     """Nothing known: even odds, and weights that take the estimates at their word."""
-    slots = np.zeros((SLOTS, 4), dtype=np.uint16)
-    slots[:, :2] = 32768
-    weights = np.zeros(WEIGHTS, dtype=np.int32)
-    weights[: KINDS * DECISIONS * LANES] = 4423
-    weights[-KINDS * LANES :] = 4096
-    simples = np.zeros((SIMPLES, 2), dtype=np.uint16)
-    simples[:, 0] = 32768
-    return State(slots=slots, weights=weights, simples=simples)
+    weights = [(KINDS * DECISIONS * LANES, 4423), (64 * DECISIONS * LANES, 0), (KINDS * LANES, 4096)]
+    return State.even(slots=SLOTS, weights=weights, simples=SIMPLES)
 
 
 @cache
 def prior_state() -> State:
     """The prior; its arrays are read-only."""
     state = unpack_state(zlib.decompress(_FILE.read_bytes()), blank_state())
-    for array in (state.slots, state.weights, state.simples):
-        array.setflags(write=False)
-    return state
+    state.slots[:] = _turned(state.slots, back=False)
+    return state.frozen()
 
 
 def unpack_state(data: bytes, state: State) -> State:
@@ -87,7 +99,19 @@ _PROBABILITIES = _probabilities()
 
 def pack_prior(state: State) -> bytes:
     """A learned state as the bytes of `prior.bin`."""
-    return zlib.compress(pack_state(state), 9)
+    turned = State(slots=_turned(state.slots, back=True), weights=state.weights, simples=state.simples)
+    return zlib.compress(pack_state(turned), 9)
+
+
+def _turned(slots: npt.NDArray[np.uint16], *, back: bool) -> npt.NDArray[np.uint16]:
+    """Slots in the coder's order, those of a context together, from the order of the file, those of a decision together; or back."""
+    result, at = slots.copy(), 0
+    for size in SIZES:
+        end = at + size * DECISIONS
+        lengths = (size, DECISIONS) if back else (DECISIONS, size)
+        result[at:end] = slots[at:end].reshape(*lengths, 4).swapaxes(0, 1).reshape(-1, 4)
+        at = end
+    return result
 
 
 def pack_state(state: State) -> bytes:

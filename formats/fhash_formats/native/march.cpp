@@ -1,0 +1,554 @@
+// Ray marching on a CPU: packets of 4 x 4 rays through a dense lattice of values.
+//
+// Sample k of a ray lies (k + 0.5) steps, or k steps and a share of its own, behind the place where the ray enters the drawn box; the last
+// step is as long as what is left, so that the path through the box is exactly its length. Values are trilinear in a cell, the gradient is
+// that of the cell, exact and nearly free. A cell with a vertex without a value (NaN) is not seen.
+//
+// Compositing is front to back. Within BLOCK samples opacity (not transparency: 1 - 1e-9 is 1 in float32) is summed in float32; blocks
+// are joined in float64, so that thin fog does not vanish in rounding. Built for speed, not for the same bits everywhere: pictures agree
+// with those of fhash_codec/render/portable_march.py within rounding.
+#include "march.hpp"
+
+namespace {
+
+using std::int32_t;
+using std::int64_t;
+using std::max;
+using std::min;
+
+constexpr int N = 16, SIDE = 4, TILE = 16, BLOCK = 32;
+constexpr int SHADED = 1, LIT = 2, MAXIMUM = 4;
+const float NONE = std::numeric_limits<float>::quiet_NaN(), FAR = std::numeric_limits<float>::infinity();
+
+struct Counters {
+    int64_t rays = 0, passes = 0, samples = 0, gradients = 0, skips = 0;
+};
+
+// A cheap integer hash (lowbias32 by C. Wellons, public domain) for the place of a ray's first sample.
+FHASH_INLINE double random_share(uint32_t x) {
+    x ^= x >> 16; x *= 0x7feb352dU; x ^= x >> 15; x *= 0x846ca68bU; x ^= x >> 16;
+    return (x + 0.5) / 4294967296.0;
+}
+
+// 1 - (1 - opacity)^share, exact for tiny opacities.
+inline double opacity_of_share(double opacity, double share) {
+    if (opacity < 0.01)  // the binomial series: what it leaves out is below 1e-10 of the opacity
+        return share * opacity * (1 + (1 - share) * opacity / 2 * (1 + (2 - share) * opacity / 3 * (1 + (3 - share) * opacity / 4)));
+    return opacity < 1 ? -std::expm1(share * std::log1p(-opacity)) : 1;
+}
+
+// 16 rays, and how far they are. Single precision where vectors work on them, double where single rays do.
+template <int WANTED> struct Packet {
+    const FhashMarch& m;
+    alignas(64) float ox[N], oy[N], oz[N], dx[N], dy[N], dz[N], ix[N], iy[N], iz[N];  // the first sample, a step, steps per vertex
+    alignas(64) float tox[N], toy[N], toz[N], hx[N], hy[N], hz[N];                    // towards the light; halfway between it and the eye
+    alignas(64) float r[N], g[N], b[N], a[N], left[N], depth[N], previous[N];  // colours and opacity of the block; light behind those before
+    alignas(64) float gx[N], gy[N], gz[N], at[N], value[N], alpha[N], px[N], py[N], pz[N], best[N];
+    alignas(64) int k[N], count[N], last[N], on[N], where[N];  // sample, their number, the one of the shorter step, and of the maximum
+    double red[N], green[N], blue[N], clear[N], rest[N], begin[N], entered[N], leaving[N], from[N];
+    double o[3][N], d[3][N], normal[3][N];
+
+    explicit Packet(const FhashMarch& given) : m(given) {}
+
+    void aim(int l, double across, double down, int64_t number);
+    void cross(int l, double to, double now, Counters& counted);
+    void see(int l, double sample, const FhashCell* cell, Counters& counted);
+    void shorten();
+    void mend();
+    void surfaces(Counters& counted);
+    void finish(Counters& counted);
+    FHASH_INLINE int skip(Counters& counted);
+    FHASH_INLINE void sample(Counters& counted, int& seen, int& ending, int& lost);
+    FHASH_INLINE void composite(Counters& counted);
+    FHASH_INLINE void march(Counters& counted);
+    FhashCell cell(int l, double sample) const {
+        return fhash_cell_at(m, o[0][l] + sample * d[0][l], o[1][l] + sample * d[1][l], o[2][l] + sample * d[2][l]);
+    }
+    FHASH_INLINE void flush(int l) {
+        red[l] += clear[l] * r[l];
+        green[l] += clear[l] * g[l];
+        blue[l] += clear[l] * b[l];
+        clear[l] *= 1 - (double)a[l];
+        left[l] = (float)clear[l];
+        r[l] = g[l] = b[l] = a[l] = 0;
+    }
+};
+
+// Where a ray is within a box. An axis along which it does not move needs no division: it is inside or not.
+bool slab(const double (&box)[3][2], const double* eye, const double* direction, double& enter, double& leave) {
+    enter = 0;
+    leave = std::numeric_limits<double>::infinity();
+    for (int c = 0; c < 3; c++) {
+        if (direction[c] == 0) {
+            if (!(eye[c] >= box[c][0] && eye[c] <= box[c][1])) return false;
+            continue;
+        }
+        const double one = (box[c][0] - eye[c]) / direction[c], other = (box[c][1] - eye[c]) / direction[c];
+        enter = max(enter, min(one, other));
+        leave = min(leave, max(one, other));
+    }
+    return leave > enter;
+}
+
+// The ray through a place of the picture: where it enters, how many steps it takes.
+template <int WANTED> void Packet<WANTED>::aim(int l, double across, double down, int64_t number) {
+    const double u = 2 * across / m.width - 1, w = 1 - 2 * down / m.height;
+    double eye[3], direction[3], length = 0;
+    for (int c = 0; c < 3; c++) {
+        const double side = u * m.right[c] + w * m.up[c];
+        eye[c] = m.eye[c] + (m.parallel ? side : 0);
+        direction[c] = m.forward[c] + (m.parallel ? 0 : side);
+        length += direction[c] * m.spacing[c] * direction[c] * m.spacing[c];
+    }
+    length = std::sqrt(length);
+    for (int c = 0; c < 3; c++) direction[c] /= length;
+    double enter, leave, first, stop;
+    const bool hit = slab(m.box, eye, direction, enter, leave) && slab(m.seen, eye, direction, first, stop);
+    const double steps = hit ? (leave - enter) / m.step : 0, share = m.jitter ? random_share((uint32_t)number) : 0.5;
+    const double most = min(std::ceil(steps), 2147483000.0);
+    last[l] = (int)most - 1;
+    rest[l] = steps - (most - 1);
+    // Of those of the box the samples that the frame has values of.
+    k[l] = hit && first > enter ? (int)min(max(std::ceil((first - enter) / m.step - share), 0.0), most) : 0;
+    count[l] = hit && stop < leave ? (int)min(max(std::floor((stop - enter) / m.step - share) + 1, 0.0), most) : (int)most;
+    if (!hit) count[l] = 0;
+    entered[l] = hit ? (max(first, enter) - enter) / m.step - share : 0;
+    leaving[l] = hit ? (min(stop, leave) - enter) / m.step - share : 0;
+    from[l] = entered[l];
+    begin[l] = enter + share * m.step;
+    clear[l] = 1;
+    red[l] = green[l] = blue[l] = 0;
+    r[l] = g[l] = b[l] = a[l] = 0;
+    left[l] = 1;
+    depth[l] = FAR;
+    best[l] = -FAR;
+    where[l] = 0;
+    for (int c = 0; c < 3; c++) {
+        o[c][l] = hit ? eye[c] + begin[l] * direction[c] : 0;
+        d[c][l] = hit ? direction[c] * m.step : 0;
+        normal[c][l] = 0;
+    }
+    ox[l] = (float)o[0][l]; oy[l] = (float)o[1][l]; oz[l] = (float)o[2][l];
+    dx[l] = (float)d[0][l]; dy[l] = (float)d[1][l]; dz[l] = (float)d[2][l];
+    ix[l] = dx[l] == 0 ? 1e30f : 1 / dx[l]; iy[l] = dy[l] == 0 ? 1e30f : 1 / dy[l]; iz[l] = dz[l] == 0 ? 1e30f : 1 / dz[l];
+    previous[l] = NONE;
+    double towards[3], half[3], size = 0;
+    const bool own = m.lamp[0] == 0 && m.lamp[1] == 0 && m.lamp[2] == 0;
+    for (int c = 0; c < 3; c++) {
+        const double back = -direction[c] * m.spacing[c];  // of unit length already
+        towards[c] = own ? back : m.lamp[c];
+        half[c] = back + towards[c];
+        size += half[c] * half[c];
+    }
+    size = size > 1e-12 ? 1 / std::sqrt(size) : 0;  // light from straight behind has no highlight
+    tox[l] = (float)towards[0]; toy[l] = (float)towards[1]; toz[l] = (float)towards[2];
+    hx[l] = (float)(half[0] * size); hy[l] = (float)(half[1] * size); hz[l] = (float)(half[2] * size);
+}
+
+struct Light {
+    float lamp, around;
+};
+
+// Light from the lamp and from around at a place, trilinear in the grid, clamped.
+FHASH_INLINE Light light_at(const FhashMarch& m, float x, float y, float z) {
+    const float scale = (float)m.light_scale;
+    const int nx = (int)m.light_shape[2], ny = (int)m.light_shape[1], nz = (int)m.light_shape[0];
+    x = min(max(x * scale + (float)m.light_offset[0], 0.f), (float)(nx - 1));
+    y = min(max(y * scale + (float)m.light_offset[1], 0.f), (float)(ny - 1));
+    z = min(max(z * scale + (float)m.light_offset[2], 0.f), (float)(nz - 1));
+    const int i = min((int)x, max(nx - 2, 0)), j = min((int)y, max(ny - 2, 0)), h = min((int)z, max(nz - 2, 0));
+    const int sx = nx > 1 ? 2 : 0, sy = ny > 1 ? 2 * nx : 0, sz = nz > 1 ? 2 * nx * ny : 0;
+    const float fx = x - i, fy = y - j, fz = z - h;
+    const float* const v = m.light;
+    float found[2];
+    for (int c = 0; c < 2; c++) {
+        const int q = 2 * ((h * ny + j) * nx + i) + c;
+        const float p0 = v[q] + fx * (v[q + sx] - v[q]), p1 = v[q + sy] + fx * (v[q + sy + sx] - v[q + sy]);
+        const float p2 = v[q + sz] + fx * (v[q + sz + sx] - v[q + sz]);
+        const float p3 = v[q + sz + sy] + fx * (v[q + sz + sy + sx] - v[q + sz + sy]);
+        const float s0 = p0 + fy * (p1 - p0), s1 = p2 + fy * (p3 - p2);
+        found[c] = s0 + fz * (s1 - s0);
+    }
+    return {found[0], found[1]};
+}
+
+struct Shade {
+    float factor, shine;
+};
+
+// Two-sided Phong with the vector halfway between light and eye (Blinn). Where the gradient vanishes only the ambient light is left,
+// and the other fades towards that, so that noise of rounding has no direction.
+template <int WANTED> FHASH_INLINE Shade shade(const Packet<WANTED>& p, int l, float x, float y, float z, Light light) {
+    const FhashMarch& m = p.m;
+    const float one = 1 / std::sqrt(x * x + y * y + z * z + (float)(m.floor * m.floor));
+    const float lit = min(std::fabs(x * p.tox[l] + y * p.toy[l] + z * p.toz[l]) * one, 1.f);
+    const float cosine = std::fabs(x * p.hx[l] + y * p.hy[l] + z * p.hz[l]) * one;
+    const float at = min(max(1 - cosine, 0.f) * (float)m.steep, 1.f) * FHASH_POWERS;
+    const int n = (int)at;
+    const float highlight = m.powers[n] + (at - n) * (m.powers[n + 1] - m.powers[n]);
+    return {(float)m.ambient * light.around + light.lamp * ((float)m.diffuse * lit), light.lamp * ((float)m.specular * highlight)};
+}
+
+// The depth and normal of what is seen: where less than half of the light is left for the first time.
+template <int WANTED> void Packet<WANTED>::see(int l, double sample, const FhashCell* given, Counters& counted) {
+    if (depth[l] < FAR) return;
+    depth[l] = (float)(begin[l] + sample * m.step);
+    if (!m.normal) return;
+    const FhashCell found = given ? *given : cell(l, sample);
+    counted.gradients += !given;
+    const double x = found.gx / m.spacing[0], y = found.gy / m.spacing[1], z = found.gz / m.spacing[2];
+    double size = std::sqrt(x * x + y * y + z * z);
+    if (!(size > 0) || !(size < std::numeric_limits<double>::infinity())) return;
+    if (x * d[0][l] * m.spacing[0] + y * d[1][l] * m.spacing[1] + z * d[2][l] * m.spacing[2] > 0) size = -size;  // towards the eye
+    normal[0][l] = x / size;
+    normal[1][l] = y / size;
+    normal[2][l] = z / size;
+}
+
+// The surfaces between `from` with the value `previous` and `to` with `now`, in the order in which the ray meets them.
+template <int WANTED> void Packet<WANTED>::cross(int l, double to, double now, Counters& counted) {
+    const double before = previous[l];
+    if (!(before == before) || !(now == now)) return;
+    struct Root {
+        double at;
+        int64_t which;
+    } roots[FHASH_SURFACES];
+    int found = 0;
+    for (int64_t s = 0; s < m.surfaces; s++) {
+        const double level = m.surface[s][0];
+        if ((before < level) == (now < level)) continue;
+        // Regula falsi by Illinois, until the root is within 1e-7 of a step or the value as near as rounding lets it be.
+        double low = from[l], high = to, f_low = before - level, f_high = now - level, place = f_high == 0 ? high : low;
+        for (int turn = 0; turn < 60 && f_low != 0 && f_high != 0 && std::fabs(high - low) > 1e-7; turn++) {
+            place = high - f_high * (high - low) / (f_high - f_low);
+            const double f = cell(l, place).value - level;
+            counted.samples++;
+            if (!(f == f)) break;
+            if (f == 0) break;
+            if ((f < 0) == (f_high < 0)) f_low *= 0.5;
+            else low = high, f_low = f_high;
+            if (std::fabs(place - high) < 1e-9) break;
+            high = place;
+            f_high = f;
+        }
+        if (cell(l, place).value == cell(l, place).value) roots[found++] = {place, s};
+    }
+    std::sort(roots, roots + found, [](const Root& one, const Root& other) { return one.at < other.at; });
+    for (int n = 0; n < found; n++) {
+        const FhashCell here = cell(l, roots[n].at);
+        const double* surface = m.surface[roots[n].which];
+        Light light = {1, 1};
+        if (m.light)
+            light = light_at(m, (float)(o[0][l] + roots[n].at * d[0][l]), (float)(o[1][l] + roots[n].at * d[1][l]),
+                             (float)(o[2][l] + roots[n].at * d[2][l]));
+        const bool known = here.gx == here.gx && here.gy == here.gy && here.gz == here.gz;
+        const Shade lit = shade(*this, l, known ? (float)(here.gx * m.gradient[0]) : 0.f, known ? (float)(here.gy * m.gradient[1]) : 0.f,
+                                known ? (float)(here.gz * m.gradient[2]) : 0.f, light);
+        counted.gradients++;
+        const float w = (1 - a[l]) * (float)surface[4];
+        a[l] += w;
+        r[l] += w * ((float)surface[1] * lit.factor + lit.shine);
+        g[l] += w * ((float)surface[2] * lit.factor + lit.shine);
+        b[l] += w * ((float)surface[3] * lit.factor + lit.shine);
+        if (m.depth && clear[l] * (1 - (double)a[l]) < 0.5) see(l, roots[n].at, &here, counted);
+    }
+}
+
+// The opacity of last steps, which are as long as what is left of the path.
+template <int WANTED> void Packet<WANTED>::shorten() {
+    for (int l = 0; l < N; l++)
+        if (on[l] && k[l] == last[l] && alpha[l] > 0) alpha[l] = (float)opacity_of_share(alpha[l], rest[l]);
+}
+
+// Samples that lie on faces of cells, where vertices without a value may have no weight.
+template <int WANTED> void Packet<WANTED>::mend() {
+    for (int l = 0; l < N; l++) {
+        if (!on[l] || value[l] == value[l]) continue;
+        const FhashCell here = fhash_cell_at(m, px[l], py[l], pz[l]);
+        if (!(here.value == here.value)) continue;
+        value[l] = (float)here.value;
+        at[l] = (float)min(max((here.value - m.low) * m.scale, 0.0), (double)(m.entries - 1));
+        const int t = (int)at[l];
+        alpha[l] = m.table[4 * t + 3] + (at[l] - t) * (m.table[4 * t + 7] - m.table[4 * t + 3]);
+        const bool known = here.gx == here.gx && here.gy == here.gy && here.gz == here.gz;
+        gx[l] = known ? (float)(here.gx * m.gradient[0]) : 0.f;
+        gy[l] = known ? (float)(here.gy * m.gradient[1]) : 0.f;
+        gz[l] = known ? (float)(here.gz * m.gradient[2]) : 0.f;
+    }
+}
+
+// Surfaces up to the samples of this pass, and behind the last ones.
+template <int WANTED> void Packet<WANTED>::surfaces(Counters& counted) {
+    for (int l = 0; l < N; l++) {
+        if (!on[l]) continue;
+        if (!(previous[l] == previous[l])) {  // the first, or the first after a gap: from the entry, or the sample before it
+            from[l] = max(k[l] - 1.0, entered[l]);
+            previous[l] = (float)cell(l, from[l]).value;
+            counted.samples++;
+        }
+        const bool beyond = k[l] >= leaving[l];
+        if (beyond) {
+            cross(l, leaving[l], cell(l, leaving[l]).value, counted);
+            previous[l] = NONE;
+            continue;
+        }
+        cross(l, k[l], value[l], counted);
+        previous[l] = value[l];
+        from[l] = k[l];
+    }
+}
+
+// What lies between last samples and the end of the path.
+template <int WANTED> void Packet<WANTED>::finish(Counters& counted) {
+    for (int l = 0; l < N; l++)
+        if (on[l] && k[l] + 1 == count[l] && leaving[l] > k[l]) {
+            counted.samples++;
+            cross(l, leaving[l], cell(l, leaving[l]).value, counted);
+        }
+}
+
+// Over bricks that do not matter; which rays have a sample to take here (1), or are alive at all (2).
+template <int WANTED> FHASH_INLINE int Packet<WANTED>::skip(Counters& counted) {
+    const int bx = (int)m.bricks[2], by = (int)m.bricks[1], lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
+    const float mx = (float)(lx - 1), my = (float)(ly - 1), mz = (float)(lz - 1), side = (float)m.brick, part = 1 / side;
+    const int cx = max(lx - 2, 0), cy = max(ly - 2, 0), cz = max(lz - 2, 0), keeping = m.surfaces > 0;
+    const int32_t* const distance = m.distance;
+    const float* const highest = m.highest;
+    int here = 0, alive = 0, skipped = 0;
+    #pragma omp simd reduction(| : here, alive) reduction(+ : skipped)
+    for (int l = 0; l < N; l++) {
+        const float f = (float)k[l];
+        const int going = k[l] < count[l];
+        const float x = min(max(ox[l] + f * dx[l], 0.f), mx), y = min(max(oy[l] + f * dy[l], 0.f), my), z = min(max(oz[l] + f * dz[l], 0.f), mz);
+        const int jx = (int)((float)min((int)x, cx) * part), jy = (int)((float)min((int)y, cy) * part);
+        const int jz = (int)((float)min((int)z, cz) * part), q = (jz * by + jy) * bx + jx;
+        const int away = WANTED & MAXIMUM ? !(highest[q] > best[l]) : distance[q];
+        const int w = WANTED & MAXIMUM ? 0 : away - 1;
+        const float ex = (float)(dx[l] > 0 ? jx + 1 + w : jx - w) * side, ey = (float)(dy[l] > 0 ? jy + 1 + w : jy - w) * side;
+        const float ez = (float)(dz[l] > 0 ? jz + 1 + w : jz - w) * side;
+        // An axis along which a ray does not move has a huge factor: what rounding leaves of 0 times it must not count.
+        const float tx = dx[l] == 0 ? 1e9f : (ex - ox[l]) * ix[l], ty = dy[l] == 0 ? 1e9f : (ey - oy[l]) * iy[l];
+        const float tz = dz[l] == 0 ? 1e9f : (ez - oz[l]) * iz[l];
+        // Rather a sample short of the brick's end than one beyond it.
+        const float leave = min(min(tx, ty), min(tz, 1e9f)) * (1 - 2e-6f);
+        const int next = min(max((int)leave + 1, k[l] + 1), count[l]);
+        const int over = going & (away > 0) & !(keeping & (previous[l] == previous[l]));
+        k[l] = over ? next : k[l];
+        on[l] = going & !over;
+        skipped += over;
+        alive |= k[l] < count[l];
+        here |= on[l];
+    }
+    counted.skips += skipped;
+    return (here ? 1 : 0) | (alive ? 2 : 0);
+}
+
+// Values, entries of the table and opacities of the samples, and the gradients if they are shaded.
+template <int WANTED> FHASH_INLINE void Packet<WANTED>::sample(Counters& counted, int& seen, int& ending, int& lost) {
+    const float* const v = m.values;
+    const float* const table = m.table;
+    const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
+    const float mx = (float)(lx - 1), my = (float)(ly - 1), mz = (float)(lz - 1), top = (float)(m.entries - 1);
+    const int cx = max(lx - 2, 0), cy = max(ly - 2, 0), cz = max(lz - 2, 0);
+    const int sx = lx > 1, sy = ly > 1 ? lx : 0, sz = lz > 1 ? lx * ly : 0;
+    const float low = (float)m.low, scale = (float)m.scale, wx = (float)m.gradient[0], wy = (float)m.gradient[1], wz = (float)m.gradient[2];
+    int samples = 0, some = 0, end = 0, none = 0;
+    #pragma omp simd reduction(+ : samples) reduction(| : some, end, none)
+    for (int l = 0; l < N; l++) {
+        const float f = (float)k[l];
+        const float x = min(max(ox[l] + f * dx[l], 0.f), mx), y = min(max(oy[l] + f * dy[l], 0.f), my), z = min(max(oz[l] + f * dz[l], 0.f), mz);
+        const int i = min((int)x, cx), j = min((int)y, cy), h = min((int)z, cz);
+        const float fx = x - i, fy = y - j, fz = z - h;
+        const int q = (h * ly + j) * lx + i;
+        const float a0 = v[q], a1 = v[q + sx], a2 = v[q + sy], a3 = v[q + sy + sx];
+        const float b0 = v[q + sz], b1 = v[q + sz + sx], b2 = v[q + sz + sy], b3 = v[q + sz + sy + sx];
+        const float d0 = a1 - a0, d1 = a3 - a2, d2 = b1 - b0, d3 = b3 - b2;
+        const float p0 = a0 + fx * d0, p1 = a2 + fx * d1, p2 = b0 + fx * d2, p3 = b2 + fx * d3;
+        const float s0 = p0 + fy * (p1 - p0), s1 = p2 + fy * (p3 - p2), found = s0 + fz * (s1 - s0);
+        const int known = found == found;
+        value[l] = found;
+        if (WANTED & MAXIMUM) {
+            const int better = on[l] & (found > best[l]);
+            best[l] = better ? found : best[l];
+            where[l] = better ? k[l] : where[l];
+        } else {
+            const float e = min(max((found - low) * scale, 0.f), top);  // NaN becomes an entry, whose opacity is not taken
+            const int t = (int)e;
+            const float one = table[4 * t + 3], other = table[4 * t + 7], opacity = one + (e - t) * (other - one);
+            at[l] = e;
+            alpha[l] = on[l] & known ? opacity : 0.f;
+            some |= alpha[l] > 0;
+        }
+        if (WANTED & SHADED) {
+            const float e0 = d0 + fy * (d1 - d0), e1 = d2 + fy * (d3 - d2);
+            gx[l] = (e0 + fz * (e1 - e0)) * wx;
+            gy[l] = ((p1 - p0) + fz * ((p3 - p2) - (p1 - p0))) * wy;
+            gz[l] = (s1 - s0) * wz;
+        }
+        px[l] = x; py[l] = y; pz[l] = z;
+        samples += on[l];
+        none |= on[l] & !known;
+        end |= on[l] & (k[l] == last[l]);
+    }
+    counted.samples += samples;
+    seen = some;
+    ending = end;
+    lost = none;
+}
+
+template <int WANTED> FHASH_INLINE void Packet<WANTED>::composite(Counters& counted) {
+    const float* const table = m.table;
+    int gradients = 0;
+    #pragma omp simd reduction(+ : gradients)
+    for (int l = 0; l < N; l++) {
+        const int t = 4 * (int)at[l];
+        const float share = at[l] - (int)at[l];
+        float cr = table[t] + share * (table[t + 4] - table[t]), cg = table[t + 1] + share * (table[t + 5] - table[t + 1]);
+        float cb = table[t + 2] + share * (table[t + 6] - table[t + 2]);
+        Light light = {1, 1};
+        if (WANTED & LIT) light = light_at(m, px[l], py[l], pz[l]);
+        if (WANTED & SHADED) {
+            const Shade lit = shade(*this, l, gx[l], gy[l], gz[l], light);
+            cr = cr * lit.factor + lit.shine; cg = cg * lit.factor + lit.shine; cb = cb * lit.factor + lit.shine;
+            gradients += alpha[l] > 0;
+        } else if (WANTED & LIT) {
+            const float share_of_light = light.lamp * light.around;
+            cr *= share_of_light; cg *= share_of_light; cb *= share_of_light;
+        }
+        const float w = (1 - a[l]) * alpha[l];
+        const int visible = alpha[l] > 0;  // not 0 times what a cell without values shades as
+        a[l] += w;
+        r[l] += visible ? w * cr : 0.f;
+        g[l] += visible ? w * cg : 0.f;
+        b[l] += visible ? w * cb : 0.f;
+    }
+    counted.gradients += gradients;
+}
+
+template <int WANTED> FHASH_INLINE void Packet<WANTED>::march(Counters& counted) {
+    const bool skipping = WANTED & MAXIMUM ? m.highest != nullptr : m.distance != nullptr;
+    const float stop = max((float)m.threshold, 1e-37f);
+    for (int since = 0;;) {
+        int here = 0;
+        if (skipping) {
+            const int state = skip(counted);
+            if (!(state & 1)) {
+                if (!state) break;
+                continue;
+            }
+        } else {
+            #pragma omp simd reduction(| : here)
+            for (int l = 0; l < N; l++) {
+                on[l] = k[l] < count[l];
+                here |= on[l];
+            }
+            if (!here) break;
+        }
+        counted.passes++;
+        int seen = 0, ending = 0, lost = 0;
+        sample(counted, seen, ending, lost);
+        if (WANTED & MAXIMUM) {
+            if (lost)
+                for (int l = 0; l < N; l++) {
+                    const float found = on[l] && !(value[l] == value[l]) ? (float)fhash_cell_at(m, px[l], py[l], pz[l]).value : NONE;
+                    if (found > best[l]) best[l] = found, where[l] = k[l];
+                }
+            #pragma omp simd
+            for (int l = 0; l < N; l++) k[l] += on[l];
+            continue;
+        }
+        if (lost) {
+            mend();
+            seen = 1;
+        }
+        if (ending && seen) shorten();
+        if (m.surfaces > 0) surfaces(counted);
+        if (seen) composite(counted);
+        if (m.surfaces > 0) finish(counted);
+        if (m.depth && (seen || m.surfaces > 0))
+            for (int l = 0; l < N; l++)
+                if (on[l] && clear[l] * (1 - (double)a[l]) < 0.5) see(l, k[l], nullptr, counted);
+        #pragma omp simd
+        for (int l = 0; l < N; l++) k[l] += on[l];
+        if (++since == BLOCK) {
+            since = 0;
+            for (int l = 0; l < N; l++) flush(l);
+        }
+        #pragma omp simd
+        for (int l = 0; l < N; l++) k[l] = left[l] * (1 - a[l]) < stop ? count[l] : k[l];
+    }
+    for (int l = 0; l < N; l++) {
+        flush(l);
+        if (!(WANTED & MAXIMUM) || !(best[l] > -FAR)) continue;
+        const double e = min(max((best[l] - m.low) * m.scale, 0.0), (double)(m.entries - 1));
+        const float* entry = m.table + 4 * (int)e;
+        const double share = e - (int)e;
+        red[l] = entry[0] + share * (entry[4] - entry[0]);
+        green[l] = entry[1] + share * (entry[5] - entry[1]);
+        blue[l] = entry[2] + share * (entry[6] - entry[2]);
+        clear[l] = 0;
+        if (m.depth) see(l, where[l], nullptr, counted);
+    }
+}
+
+// Tiles of TILE x TILE pixels from first to stop, in rows.
+template <int WANTED> FHASH_INLINE void tiles(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) {
+    const int64_t across = (m.width + TILE - 1) / TILE, rays = m.rays;
+    const double share = 1.0 / (double)(rays * rays);
+    Packet<WANTED> packet(m);
+    for (int64_t tile = first; tile < stop; tile++)
+        for (int64_t y = tile / across * TILE; y < min(tile / across * TILE + TILE, m.height); y += SIDE)
+            for (int64_t x = tile % across * TILE; x < min(tile % across * TILE + TILE, m.width); x += SIDE)
+                for (int64_t ray = 0; ray < rays * rays; ray++) {
+                    for (int l = 0; l < N; l++) {
+                        const int64_t i = min(x + l % SIDE, m.width - 1), j = min(y + l / SIDE, m.height - 1);
+                        packet.aim(l, i + (ray % rays + 0.5) / rays, j + (ray / rays + 0.5) / rays, (j * m.width + i) * rays * rays + ray);
+                        if (x + l % SIDE >= m.width || y + l / SIDE >= m.height) packet.count[l] = 0;
+                        counted.rays += packet.count[l] > packet.k[l];
+                    }
+                    packet.march(counted);
+                    for (int l = 0; l < N; l++) {
+                        const int64_t i = x + l % SIDE, j = y + l / SIDE, at = j * m.width + i;
+                        if (i >= m.width || j >= m.height) continue;
+                        float* out = m.out + 4 * at;
+                        out[0] += (float)(packet.red[l] * share);
+                        out[1] += (float)(packet.green[l] * share);
+                        out[2] += (float)(packet.blue[l] * share);
+                        out[3] += (float)((1 - packet.clear[l]) * share);
+                        if (!m.depth || !(packet.depth[l] < m.depth[at])) continue;
+                        m.depth[at] = packet.depth[l];  // of several rays the nearest
+                        if (!m.normal) continue;
+                        for (int c = 0; c < 3; c++) m.normal[3 * at + c] = (float)packet.normal[c][l];
+                    }
+                }
+}
+
+#define FHASH_KERNEL(NAME, WANTED) \
+    FHASH_CLONES void NAME(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }
+FHASH_KERNEL(plain, 0)
+FHASH_KERNEL(shaded, SHADED)
+FHASH_KERNEL(lit, LIT)
+FHASH_KERNEL(shaded_lit, SHADED | LIT)
+FHASH_KERNEL(maximum, MAXIMUM)
+#undef FHASH_KERNEL
+
+}  // namespace
+
+// Add the rays of tiles first to stop (of 16 x 16 pixels, in rows) to the pictures of `march`, which begin as zeros (depth: infinity).
+// wanted: 1 shading of the volume, 2 its light grid, 4 the maximum instead of it. counters: rays, passes, samples, gradients, skips, added to.
+FHASH_EXPORT int64_t fhash_march(const FhashMarch* march, int64_t wanted, int64_t first, int64_t stop, int64_t* counters) {
+    const FhashMarch& m = *march;
+    if (m.surfaces < 0 || m.surfaces > FHASH_SURFACES || m.entries < 2 || m.rays < 1 || !(m.step > 0)) return -1;
+    Counters counted;
+    if (wanted & MAXIMUM) maximum(m, first, stop, counted);
+    else if ((wanted & SHADED) && (wanted & LIT)) shaded_lit(m, first, stop, counted);
+    else if (wanted & LIT) lit(m, first, stop, counted);
+    else if (wanted & SHADED) shaded(m, first, stop, counted);
+    else plain(m, first, stop, counted);
+    counters[0] += counted.rays;
+    counters[1] += counted.passes;
+    counters[2] += counted.samples;
+    counters[3] += counted.gradients;
+    counters[4] += counted.skips;
+    return 0;
+}

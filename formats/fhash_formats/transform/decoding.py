@@ -1,0 +1,186 @@
+"""The bytes of a tile to values: decode, undo the transform, correct, bound; and what the encoder shares of it.
+
+The encoder computes the same values by the same operations in the same order, so that it knows what every decoder gets.
+"""
+
+from __future__ import annotations
+
+import zlib
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.bands import band_table, single_band
+from fhash_formats.transform.coder import decode_integers
+from fhash_formats.transform.elementwise import cast, clip_shifted, corrected
+from fhash_formats.transform.lifting import Transform
+from fhash_formats.transform.predict import decode_predicted, values_of
+from fhash_formats.transform.predictor import Predictor
+from fhash_formats.transform.quantise import dequantise
+from fhash_formats.transform.sections import (
+    EMPTY,
+    EXACT,
+    FORMAT,
+    MASKED,
+    MISSING,
+    OWN,
+    PREDICTED,
+    PREDICTED_MASKED,
+    RESIDUAL,
+    Shape,
+    check_ended,
+    exact_values,
+    last_section,
+    little,
+    no_levels,
+    restored,
+    sections_of,
+    settings_from,
+    unpack_mask,
+)
+from fhash_formats.transform.settings import Settings
+from fhash_formats.transform.spec import TransformSpec
+
+__all__ = ["decode_tile", "decode_tile_mask", "linear_values", "outside", "predicted_values", "transform_for"]
+
+Values = npt.NDArray[Any]
+Mask = npt.NDArray[np.bool_]
+
+
+def transform_for(settings: Settings, shape: Shape) -> Transform:
+    """The transform of a tile, kept for tiles of the same shape."""
+    return _transform(settings.transform, shape, settings.dtype.name)
+
+
+@lru_cache(maxsize=64)
+def _transform(spec: TransformSpec, shape: Shape, dtype: str) -> Transform:
+    return Transform(spec, shape, np.dtype(dtype))
+
+
+def decode_tile(data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: Settings | None = None, lod: int = 0) -> Values:
+    """The values (t, z, y, x) of a stream, in the type of the source.
+
+    settings: those shared by all tiles, unless the stream has its own. lod: every 2^lod-th vertex along z, y, x, low-passed, without head,
+    residual, missing values and mask. Raises DamagedFileError for bytes that no encoder writes.
+    """
+    return _decode(data, shape, dtype, settings, lod)[0]
+
+
+def decode_tile_mask(data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: Settings | None = None) -> tuple[Values, Mask]:
+    """The values of a stream as `decode_tile` gives them, and which are occupied: all, where the stream has no mask."""
+    values, mask = _decode(data, shape, dtype, settings, 0)
+    return values, np.ones(shape, bool) if mask is None else mask
+
+
+def _decode(
+    data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: Settings | None, lod: int
+) -> tuple[Values, Mask | None]:
+    kind = np.dtype(dtype)
+    data = memoryview(data)
+    if not len(data):
+        raise DamagedFileError("a coded tile is empty")
+    flags = data[0]
+    if flags & 0xE0 not in (FORMAT, MASKED, PREDICTED, PREDICTED_MASKED):
+        raise DamagedFileError(f"a coded tile begins with {flags:#04x}, which is no known stream format")
+    masked, predicted = flags & 0xE0 in (MASKED, PREDICTED_MASKED), flags & 0xE0 in (PREDICTED, PREDICTED_MASKED)
+    coded = not flags & (EXACT | EMPTY)
+    if predicted and flags & (EXACT | EMPTY | RESIDUAL):
+        raise DamagedFileError("a coded tile is by prediction and something else as well")
+    if len(data) < 5 and coded:
+        raise DamagedFileError("a coded tile is cut short")
+    digest = int.from_bytes(data[1:5], "little") if coded else 0
+    sections = sections_of(data[5:] if coded else data[1:])
+    if flags & OWN:
+        settings = settings_from(next(sections, b""))
+    missing = bytes(next(sections, b"")) if flags & MISSING else b""
+    if flags & MISSING and not missing:
+        raise DamagedFileError("a coded tile has lost its missing values")
+    if flags & EXACT:
+        values = exact_values(next(sections, b""), shape, kind)
+        mask = unpack_mask(last_section(sections), no_levels(shape)) if masked else None
+        check_ended(sections)
+        return values[_every(lod)] if lod else values, mask
+    if settings is None:
+        raise DamagedFileError("a coded tile has no settings")
+    if flags & EMPTY:
+        check_ended(sections)
+        result = cast(np.full(_lod_shape(shape, lod), settings.center), kind)
+        if lod:
+            return result, None
+        mask = np.zeros(shape, bool) if masked else None
+        return restored(outside(result, mask, settings), missing), mask
+    predictor = settings.predictor
+    if not predicted:
+        integers = decode_integers(next(sections, b""), shape, band_table(settings.transform, shape))
+    elif predictor is not None:
+        integers = decode_predicted(next(sections, b""), shape, predictor)
+    else:
+        raise DamagedFileError("a coded tile is by prediction, of which its settings know nothing")
+    crc = zlib.crc32(little(integers))
+    residual = None
+    if flags & RESIDUAL:
+        residual = decode_integers(next(sections, b""), shape, single_band(shape))
+        crc = zlib.crc32(little(residual), crc)
+    packed = last_section(sections) if masked else None
+    check_ended(sections)
+    if crc != digest:
+        raise DamagedFileError("the decoded integers of a tile differ from their digest")
+    if predicted and predictor is not None:
+        found = predicted_values(integers, predictor, settings)
+        if lod:
+            return cast(found[_every(lod)], kind), None
+        mask = None if packed is None else _mask_of(packed, found, settings)
+        return restored(outside(cast(found, kind), mask, settings), missing), mask
+    try:
+        transform = transform_for(settings, shape)
+    except InputError as error:
+        raise DamagedFileError(f"the settings of a coded tile do not fit its shape: {error}") from error
+    if lod:
+        coarse = transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype), lod=lod)
+        return cast(_shifted(coarse, settings), kind), None
+    linear = linear_values(integers, transform, settings)
+    mask = None if packed is None else _mask_of(packed, linear, settings)
+    base = linear if settings.head is None else settings.head.apply(linear)
+    return restored(outside(corrected(base, residual, settings.quantum, kind), mask, settings), missing), mask
+
+
+def linear_values(integers: npt.NDArray[np.int32], transform: Transform, settings: Settings) -> Values:
+    """Decoded values in the working type, before head and residual."""
+    return _shifted(transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype)), settings)
+
+
+def predicted_values(integers: npt.NDArray[np.int32], predictor: Predictor, settings: Settings) -> npt.NDArray[np.float64]:
+    """Values by prediction, within the range."""
+    values = values_of(integers, predictor)
+    return np.clip(values, settings.low, settings.high, out=values)
+
+
+def _shifted(values: Values, settings: Settings) -> Values:
+    """Values about the centre, within the range, in place."""
+    return clip_shifted(values, settings.center, settings.low, settings.high)
+
+
+def outside(decoded: Values, occupied: Mask | None, settings: Settings) -> Values:
+    """Decoded values with NaN, or the centre for whole numbers, where a mask says that nothing is; in place."""
+    if occupied is not None:
+        nothing = np.array(np.nan) if decoded.dtype.kind == "f" else np.array(settings.center)
+        decoded[~occupied] = cast(nothing, decoded.dtype)
+    return decoded
+
+
+def _mask_of(packed: bytes | memoryview, linear: Values, settings: Settings) -> Mask:
+    if settings.mask is None:
+        raise DamagedFileError("a coded tile has a mask, of which its settings know nothing")
+    with np.errstate(over="ignore"):
+        return unpack_mask(packed, settings.mask.levels(linear.astype(settings.dtype, copy=False)))
+
+
+def _every(lod: int) -> tuple[slice, ...]:
+    return (slice(None), *[slice(None, None, 1 << lod)] * 3)
+
+
+def _lod_shape(shape: Shape, lod: int) -> tuple[int, ...]:
+    return (shape[0], *(-(-n // (1 << lod)) for n in shape[1:]))

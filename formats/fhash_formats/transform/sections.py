@@ -1,0 +1,233 @@
+"""The bytes of a coded tile: flags, sections, and what they hold beside the coded values: settings, digests, missing values, masks.
+
+A stream is a byte of flags, the CRC-32 of the decoded integers (coefficients, then residual, as little-endian int32; left out if nothing is
+coded), and sections, each behind its length (LEB128): own settings, missing, coefficients, residual, exact. What is not finite in the
+source, and what the caller does not care for, may decode to anything; the former comes back as it was by the section `missing`: the
+CRC-32 of its marks as little-endian int32 (0 for what is finite, 1 NaN, 2 and 3 infinity and its negative), and the coded marks.
+
+Where the settings ask for a mask, what the caller does not care for decodes to NaN (the centre, for whole numbers), and what is occupied is
+known from the last section: nothing if all is, else the lower 16 bits of the CRC-32 of the mask, packed, and the coded mask (mask.py).
+Such a stream has another number, so that a reader that knows no masks refuses it.
+
+Where the settings have a predictor and a bound is asked for, the coefficients are integers coded by prediction (predict.py) and there is
+no residual: the values are origin + step * integer in float64, within the range. These streams have numbers of their own, too.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import DamagedFileError
+from fhash_formats.transform.bands import single_band
+from fhash_formats.transform.coder import decode_integers, encode_integers
+from fhash_formats.transform.mask import decode_mask, encode_mask
+from fhash_formats.transform.mask_levels import Levels
+from fhash_formats.transform.settings import Settings
+
+__all__ = [
+    "EMPTY",
+    "EXACT",
+    "FORMAT",
+    "MASKED",
+    "MISSING",
+    "OWN",
+    "PREDICTED",
+    "PREDICTED_MASKED",
+    "RESIDUAL",
+    "Shape",
+    "assembled",
+    "check_ended",
+    "exact_bytes",
+    "exact_values",
+    "last_section",
+    "little",
+    "no_levels",
+    "pack_mask",
+    "pack_missing",
+    "restored",
+    "sections_of",
+    "settings_from",
+    "unpack_mask",
+]
+
+Shape = tuple[int, int, int, int]
+Values = npt.NDArray[Any]
+Mask = npt.NDArray[np.bool_]
+
+OWN, MISSING, RESIDUAL, EXACT, EMPTY = 1, 2, 4, 8, 16
+FORMAT, MASKED, PREDICTED, PREDICTED_MASKED = 1 << 5, 2 << 5, 3 << 5, 4 << 5
+"""The upper three bits of the flags are the number of the stream format, 1 or with a mask 2; by prediction 3, or with a mask 4."""
+
+
+def assembled(
+    settings: Settings | None,
+    missing: bytes,
+    coefficients: bytes,
+    integers: npt.NDArray[np.int32] | None,
+    residual: npt.NDArray[np.int32] | None,
+    mask: bytes | None,
+    predicted: bool = False,
+) -> bytes:
+    """The stream of a tile.
+
+    settings: its own, or None. missing, mask: sections. coefficients: coded, and the integers that they are; None where nothing is coded.
+    """
+    numbers = (PREDICTED, PREDICTED_MASKED) if predicted else (FORMAT, MASKED)
+    flags = numbers[mask is not None] | (OWN if settings else 0) | (MISSING if missing else 0)
+    sections = [*_own(settings), *([missing] if missing else [])]
+    if integers is None:
+        return bytes([flags | EMPTY]) + b"".join(map(_section, sections))
+    crc = zlib.crc32(little(integers))
+    sections.append(coefficients)
+    if residual is not None:
+        flags |= RESIDUAL
+        crc = zlib.crc32(little(residual), crc)
+        sections.append(encode_integers(residual, single_band(residual.shape)).data)
+    if mask is not None:
+        sections.append(mask)
+    return bytes([flags]) + crc.to_bytes(4, "little") + b"".join(map(_section, sections))
+
+
+def _section(data: bytes) -> bytes:
+    """A section behind its length."""
+    size, head = len(data), bytearray()
+    while True:
+        head.append(size & 127 | (128 if size > 127 else 0))
+        size >>= 7
+        if not size:
+            return bytes(head) + data
+
+
+def sections_of(data: memoryview) -> Iterator[memoryview]:
+    """The sections one after the other; DamagedFileError where one reaches beyond the end."""
+    at = 0
+    while at < len(data):
+        size = shift = 0
+        while True:
+            if at >= len(data) or shift > 35:
+                raise DamagedFileError("a coded tile is cut short")
+            size |= (data[at] & 127) << shift
+            shift += 7
+            at += 1
+            if not data[at - 1] & 128:
+                break
+        if size > len(data) - at:
+            raise DamagedFileError("a coded tile is cut short")
+        yield data[at : at + size]
+        at += size
+
+
+def last_section(sections: Iterator[memoryview]) -> memoryview:
+    """The section of the mask; DamagedFileError where there is none."""
+    found = next(sections, None)
+    if found is None:
+        raise DamagedFileError("a coded tile has lost its mask")
+    return found
+
+
+def check_ended(sections: Iterator[memoryview]) -> None:
+    """DamagedFileError where there is one more section."""
+    if next(sections, None) is not None:
+        raise DamagedFileError("a coded tile has more sections than its flags say")
+
+
+def _own(settings: Settings | None) -> list[bytes]:
+    if settings is None:
+        return []
+    return [zlib.compress(json.dumps(settings.to_dict(), separators=(",", ":")).encode("ascii"), 9)]
+
+
+def settings_from(data: bytes | memoryview) -> Settings:
+    """A tile's own settings; raises DamagedFileError."""
+    try:
+        inflate = zlib.decompressobj()
+        text = inflate.decompress(data, 1 << 22)
+        if not inflate.eof or inflate.unused_data:
+            raise DamagedFileError("the settings of a coded tile are damaged")
+        return Settings.from_dict(json.loads(text))
+    except (zlib.error, ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise DamagedFileError(f"the settings of a coded tile are damaged: {error}") from error
+
+
+def little(integers: npt.NDArray[np.int32]) -> memoryview:
+    """Integers as the digest takes them."""
+    return np.ascontiguousarray(integers, dtype="<i4").data.cast("B")
+
+
+def exact_bytes(values: Values, settings: Settings | None, occupied: Mask | None) -> bytes:
+    """The stream of a tile stored without loss: the bytes of equal weight together, deflated."""
+    flags = (FORMAT if occupied is None else MASKED) | EXACT | (OWN if settings else 0)
+    plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
+    planes = plain.view(np.uint8).reshape(-1, plain.dtype.itemsize).T
+    body = zlib.compress(planes.tobytes(), 6)
+    sections = [*_own(settings), body, *([] if occupied is None else [pack_mask(occupied, no_levels(values.shape))])]
+    return bytes([flags]) + b"".join(map(_section, sections))
+
+
+def exact_values(data: bytes | memoryview, shape: Shape, dtype: np.dtype[Any]) -> Values:
+    """The values of such a section; raises DamagedFileError."""
+    count = int(np.prod(shape)) * dtype.itemsize
+    try:
+        inflate = zlib.decompressobj()
+        plain = inflate.decompress(data, count)
+        if inflate.unconsumed_tail:
+            inflate.decompress(inflate.unconsumed_tail, 1)
+    except zlib.error as error:
+        raise DamagedFileError(f"a coded tile is damaged: {error}") from error
+    if len(plain) != count or not inflate.eof or inflate.unused_data:
+        raise DamagedFileError("a coded tile is damaged: it holds another number of values")
+    planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
+    return np.array(planes.T, order="C").view(dtype.newbyteorder("<")).reshape(shape).astype(dtype, copy=False)
+
+
+_MISSING_VALUES = (np.nan, np.inf, -np.inf)
+
+
+def pack_missing(values: Values, finite: Mask) -> bytes:
+    """The section of values that are not finite."""
+    marks = np.where(finite, 0, np.where(np.isnan(values), 1, np.where(values > 0, 2, 3))).astype(np.int32)
+    return zlib.crc32(little(marks)).to_bytes(4, "little") + encode_integers(marks, single_band(values.shape)).data
+
+
+def restored(decoded: Values, missing: bytes) -> Values:
+    """Decoded values with what is missing put in, in place; `missing` is empty where nothing is. Raises DamagedFileError."""
+    if missing:
+        if decoded.dtype.kind != "f":
+            raise DamagedFileError("a coded tile of integers has missing values")
+        marks = decode_integers(missing[4:], decoded.shape, single_band(decoded.shape))
+        if zlib.crc32(little(marks)).to_bytes(4, "little") != missing[:4] or marks.min() < 0 or marks.max() > 3:
+            raise DamagedFileError("the missing values of a coded tile are damaged")
+        for mark, value in enumerate(_MISSING_VALUES, start=1):
+            decoded[marks == mark] = value
+    return decoded
+
+
+def no_levels(shape: tuple[int, ...]) -> tuple[Levels, Levels]:
+    """Where nothing is known of how likely a mask is."""
+    return np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+
+
+def pack_mask(occupied: Mask, levels: tuple[Levels, Levels]) -> bytes:
+    """The section of a mask; empty where all is occupied."""
+    # The coder reads zeros past the end: one zero is as good as no byte.
+    return b"" if occupied.all() else _digest(occupied) + (encode_mask(occupied, levels) or b"\0")
+
+
+def unpack_mask(packed: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask:
+    """The mask of a section; raises DamagedFileError."""
+    if not len(packed):
+        return np.ones(levels[0].shape, bool)
+    mask = decode_mask(packed[2:], levels)
+    if _digest(mask) != packed[:2]:
+        raise DamagedFileError("the decoded mask of a tile differs from its digest")
+    return mask
+
+
+def _digest(mask: Mask) -> bytes:
+    return (zlib.crc32(np.packbits(mask).data) & 0xFFFF).to_bytes(2, "little")
