@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from threading import Lock
 from time import perf_counter
 from typing import NamedTuple
 
@@ -106,21 +106,36 @@ def train_head(
         raise InputError("a head has nothing to learn: the decoded values are the original ones")
     seen = CROSS if cross else CROSS[:1]
     training, held_out = (_samples(pairs, drawn, seen, random, sigma, *bounds, place) for drawn in (learnt, tested))
-    with _one_thread():
+    with _one_thread:
         layers, history = _optimise(training, held_out, hidden, cross, 4000 if steps is None else steps, seconds, seed, progress)
     head = Head(layers=layers, sigma=float(sigma), low=float(bounds[0]), high=float(bounds[1]), cross=cross)
     return TrainedHead(head=head, gain_db=history[-1][2], history=tuple(history))
 
 
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch on one thread: batches this small gain little from a second, and wait for ever where another process holds its core."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+class _OneThread:
+    """Torch on one thread: batches this small gain little from a second, and wait for ever where another process holds its core.
+
+    Of the trainings at one time the first sets the number, and the last sets it back: it is one for the process in part.
+    """
+
+    def __init__(self) -> None:
+        self._lock, self._inside, self._before = Lock(), 0, 1
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._before = torch.get_num_threads()
+            self._inside += 1
+            torch.set_num_threads(1)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside:
+                torch.set_num_threads(self._before)
+
+
+_one_thread = _OneThread()
 
 
 def _optimise(

@@ -6,13 +6,14 @@ error for the same bytes wins as well. Axes are decided one after the other.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.sample import Sample, Way
+from fhash_codec.compact.sample import Outcome, Sample, Way
 from fhash_formats.transform.basis import MAX_LENGTH, fit_basis
 from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
@@ -50,19 +51,18 @@ def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: boo
         trials = [usual, own]
         if bases.possible(*shape[1:]):
             trials.append((usual[0], *(bases.along(axis) for axis in (1, 2, 3))))
-        costs = [_judge(sample, settings, trial, way) for trial in trials]  # type: ignore[arg-type]
+        costs = _judge(sample, settings, trials, way)  # type: ignore[arg-type]
         best = min(costs)
         return replace(settings, transform=TransformSpec(axes=trials[costs.index(best)])), best  # type: ignore[arg-type]
     axes: Axes = settings.transform.axes
-    best = _judge(sample, settings, axes, way)
+    best = math.inf
     for candidates in (_planes(shape, bases), _along(0, shape, bases), _along(1, shape, bases)):
-        for change in candidates:
-            trial: Axes = tuple(change.get(axis, axes[axis]) for axis in range(4))  # type: ignore[assignment]
-            if trial == axes:
-                continue
-            cost = _judge(sample, settings, trial, way)
-            if cost < best:
-                best, axes = cost, trial
+        others = [tuple(change.get(axis, axes[axis]) for axis in range(4)) for change in candidates]
+        group: list[Axes] = [*([axes] if math.isinf(best) else []), *(other for other in others if other != axes)]  # type: ignore[list-item]
+        costs = _judge(sample, settings, group, way)
+        if group and min(costs) < best:
+            best = min(costs)
+            axes = group[costs.index(best)]
     return replace(settings, transform=TransformSpec(axes=axes)), best
 
 
@@ -83,13 +83,17 @@ def _known(axis: AxisTransform, length: int) -> AxisTransform:
     return wavelet(axis.kind, axis.depth, length) if axis.wavelet else axis
 
 
-def _judge(sample: Sample, settings: Settings, axes: Axes, way: Way) -> float:
-    spec = TransformSpec(axes=axes)
-    outcome = sample.run(replace(settings, transform=spec), way)
-    factors = sum(len(axis.basis.to_bytes()) * 4 / 3 for axis in axes if axis.basis is not None)
-    # Under a bound all that is wrong is mended, in bytes.
-    wrong = 0.0 if way.error is not None else outcome.squares / (0.8 * settings.step**2)
-    return outcome.size + factors + wrong
+def _judge(sample: Sample, settings: Settings, trials: Sequence[Axes], way: Way) -> list[float]:
+    """J of each."""
+
+    def cost(axes: Axes, outcome: Outcome) -> float:
+        factors = sum(len(axis.basis.to_bytes()) * 4 / 3 for axis in axes if axis.basis is not None)
+        # Under a bound all that is wrong is mended, in bytes.
+        wrong = 0.0 if way.error is not None else outcome.squares / (0.8 * settings.step**2)
+        return outcome.size + factors + wrong
+
+    outcomes = sample.run_all([(replace(settings, transform=TransformSpec(axes=axes)), way) for axes in trials])
+    return [cost(axes, outcome) for axes, outcome in zip(trials, outcomes, strict=True)]
 
 
 def _plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTransform]:

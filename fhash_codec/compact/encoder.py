@@ -170,6 +170,9 @@ def _code_all(planned: Planned, workers: ThreadPoolExecutor, progress: Progress)
     outcomes: list[Outcome] = []
     waiting: deque[Future[tuple[bytes, Outcome]]] = deque()
 
+    # Of what the search filled already, nothing else is looked for.
+    known = {} if planned.sample is None or not way.filled else dict(zip(planned.sample.indices, planned.sample.tiles, strict=True))
+
     def work(tile: Index | tuple[Values, Care]) -> tuple[bytes, Outcome]:
         values, care = blocks.read(tile) if len(tile) == 4 else tile
         coded, outcome = code(values, care, settings, way)
@@ -182,7 +185,7 @@ def _code_all(planned: Planned, workers: ThreadPoolExecutor, progress: Progress)
         progress("coding", len(streams), everything, "")
 
     for index in blocks.indices():
-        waiting.append(workers.submit(work, index if blocks.held else blocks.read(index)))
+        waiting.append(workers.submit(work, known[index] if index in known else index if blocks.held else blocks.read(index)))
         if len(waiting) > 2 * usable_threads(None):
             collect()
     while waiting:

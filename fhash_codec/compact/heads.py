@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ from fhash_formats.transform.head_portable import CROSS, FEATURES
 from fhash_formats.transform.settings import Settings
 
 if TYPE_CHECKING:
-    from fhash_codec.head_training import TrainedHead
+    from fhash_codec.head_training import Pair, TrainedHead
 
 HEADS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
 """Widths of the two hidden layers, the second over the cross, and their part of the gain in dB of the head that is tried first."""
@@ -71,23 +72,29 @@ def race(
     if outcome.size < LEAST_BYTES:
         return settings, outcome, []
     wider = sample.wider(TRAINING_VERTICES)
-    trial = _train(wider, settings, way, hidden=TRIED, cross=True, steps=400, samples=80_000, seed=seed, device=device)
+    trial = _train(_pairs(wider, settings, way), settings, hidden=TRIED, cross=True, steps=400, samples=80_000, seed=seed, device=device)
     if trial is None or trial.gain_db < LEAST_GAIN:
         return settings, outcome, []
     hidden = _widths(outcome.size, GROWTH * trial.gain_db + HOPE, _octave(tried, data_range), effort)
     # The head is trained on what it will meet: coarser data, which it lifts to the quality that was asked for.
     coarser = replace(settings, step=settings.step * math.exp(trial.gain_db / SLOPE))
-    best, least, curve = (settings, outcome), 0.0, list[dict[str, float | None]]()
-    for widths, cross in ((hidden, True), (PERCEPTRON, False)):
-        if widths is None:
-            continue
+    pairs = _pairs(wider, coarser, way)
+
+    def train(widths: tuple[int, int], cross: bool) -> tuple[TrainedHead, tuple[Settings, Outcome], list[Outcome]] | None:
         longer = 1 if cross else LONGER
         steps, samples = STEPS[effort] * longer, SAMPLES[effort] * longer
-        trained = _train(wider, coarser, way, hidden=widths, cross=cross, steps=steps, samples=samples, seed=seed, device=device)
-        if trained is None:
-            continue
+        trained = _train(pairs, coarser, hidden=widths, cross=cross, steps=steps, samples=samples, seed=seed, device=device)
         again: list[Outcome] = []
-        found = solve(replace(coarser, head=trained.head), again)
+        return None if trained is None else (trained, solve(replace(coarser, head=trained.head), again), again)
+
+    # Side by side: a training takes one processor, and so does coding a single tile.
+    with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
+        runs = list(workers.map(lambda head: train(*head), [*([(hidden, True)] if hidden else []), (PERCEPTRON, False)]))
+    best, least, curve = (settings, outcome), 0.0, list[dict[str, float | None]]()
+    for run in runs:
+        if run is None:
+            continue
+        trained, found, again = run
         reached = found[1].psnr(data_range)
         cost = found[1].size - outcome.size + len(trained.head.to_bytes()) * 4 / 3 + COURSE_BYTES
         if not strict:
@@ -121,10 +128,15 @@ def _widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, 
     return best if saved(best) > 0 else None
 
 
+def _pairs(sample: Sample, settings: Settings, way: Way) -> list[Pair]:
+    """The tiles as they decode without a head, as they were, and what counts in them."""
+    decoded = sample.decoded(replace(settings, head=None, mask=None), way)
+    return [(found, values, care) for found, (values, care) in zip(decoded, sample.tiles, strict=True)]
+
+
 def _train(
-    sample: Sample,
+    pairs: Sequence[Pair],
     settings: Settings,
-    way: Way,
     *,
     hidden: tuple[int, int],
     cross: bool,
@@ -136,8 +148,6 @@ def _train(
     # torch takes seconds to import, and an effort without training does not need it.
     from fhash_codec.head_training import train_head
 
-    decoded = sample.decoded(replace(settings, head=None, mask=None), way)
-    pairs = [(found, values, care) for found, (values, care) in zip(decoded, sample.tiles, strict=True)]
     try:
         return train_head(
             pairs,

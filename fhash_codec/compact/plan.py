@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fhash_codec.compact import heads, prediction
+from fhash_codec.compact import heads, prediction, surroundings
 from fhash_codec.compact.blocks import Blocks
 from fhash_codec.compact.choice import choose_transform, refit, usual_transform
 from fhash_codec.compact.foresight import foreseen_size, foreseen_step, tile_costs
@@ -94,13 +94,14 @@ def plan(
     def sampled(tiled: Blocks, settings: Settings, most: int) -> Sample:
         # What a tile costs does not depend much on the transform.
         usual = replace(settings, transform=usual_transform(tiled.tile))
-        return Sample(tiled, most, workers, tile_costs(tiled, usual, workers))
+        return Sample(tiled, most, workers, tile_costs(tiled, usual, workers)).filled(usual, 1)
 
     def masked(settings: Settings, error: float) -> Settings:
         return settings if blocks.complete else replace(settings, mask=mask_levels(features, config.dilation, error, sample.tiles))
 
     progress("planning", 0, 4, "")
-    way = Way(filled=blocks.complete, density=1 if config.effort == 1 else 2)
+    thorough = 8 if config.effort >= 4 else 4 if config.effort > 1 else 1
+    way = Way(filled=blocks.complete, density=0)
     tiled = blocks.retile(first)
     settings = _first(Sample(tiled, LOOK_VERTICES, workers), value_range, goal)
     if config.effort == 1 and goal.psnr is not None and goal.data_range > 0 and tiled.held and tiled.complete and not settings.double:
@@ -126,14 +127,17 @@ def plan(
         if fixed is None:
             for tile in _other_tiles(tiled, outcome.size):
                 other = sampled(blocks.retile(tile), settings, MOST_TILE_VERTICES if tiled.complete else TRIAL_VERTICES)
-                changed, found = _tried(other, replace(settings, transform=usual_transform(tile)), way, goal, quick=tiled.complete)
+                changed, found = _tried(other, settings, way, goal, quick=True)
                 if found.size < outcome.size * (1 / PRICE_OF_TILES if prod(tile[1:]) > prod(tiled.tile[1:]) else PRICE_OF_STEPS):
                     sample, settings, outcome = other, changed, found
+            if not tiled.complete and sample.blocks.tile != tiled.tile:
+                settings, outcome = _tried(sample, settings, way, goal)
         sample = sample.wider(ALL_VERTICES if prod(blocks.shape) <= ALL_VERTICES else SAMPLE_VERTICES)
     progress("planning", 2, 4, "")
     way = replace(way, passes=2 if config.effort > 2 else 1, rounds=0 if config.effort == 1 else 2 if config.effort < 7 else 4)
     if not blocks.complete:
-        way = replace(way, rounds=2, density=8 if config.effort >= 4 else 4 if config.effort > 1 else 1)
+        way = replace(way, rounds=2, filled=True)
+        sample = surroundings.race(sample, settings, way, goal, thorough)
     outcomes: list[Outcome] = []
     settings, outcome = solve(sample, settings, way, goal, tries=3 if config.effort == 1 else 5, tried=outcomes)
     if goal.psnr is None and outcome.count:
@@ -171,6 +175,9 @@ def plan(
         outcome = replace(outcome, size=size)
         note("prediction" if settings.predictor is not None else "prediction (left out)", outcome)
     progress("planning", 4, 4, "")
+    if not blocks.complete and not (sample.complete and blocks.dtype.kind == "f"):
+        # Whole numbers where nothing counts would cost more than what they were rounded from.
+        way = replace(way, filled=False, density=thorough)
     return Planned(blocks=sample.blocks, sample=sample, settings=settings, way=goal.bounded(way), goal=goal, gains=gains, history=history)
 
 
@@ -185,7 +192,7 @@ def _exact(blocks: Blocks, tile: Shape, value_range: ValueRange, goal: Goal) -> 
 
 def _tried(sample: Sample, settings: Settings, way: Way, goal: Goal, *, quick: bool = False) -> tuple[Settings, Outcome]:
     """The transform by trial, and what it gives where the promise is kept, so that tiles are compared at equal quality."""
-    return solve(sample, choose_transform(sample, settings, goal.bounded(way), quick=quick)[0], way, goal, tries=4)
+    return solve(sample, choose_transform(sample, settings, goal.bounded(way), quick=quick)[0], way, goal, tries=3 if quick else 4)
 
 
 def _other_tiles(tiled: Blocks, size: int) -> list[Shape]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from math import prod
 
@@ -18,8 +19,10 @@ from fhash_formats.transform.settings import Settings
 ORDERS = ((0, 1, 2, 3), (0, 3, 2, 1), (3, 2, 1, 0))
 """In which order the axes are refined: what comes last is predicted best, and is half of all."""
 DEPTHS = ((2, 3, 3, 3), (0, 3, 3, 3))
-ROWS = 30_000
-"""Vertices of a pass that its weights are trained on."""
+ROWS, TRIED_ROWS = 30_000, 8_000
+"""Vertices of a pass that its weights are trained on, and for a trial."""
+HOPELESS = 1.3
+"""By what factor the first trial may be larger than what it competes with: the others differ by less."""
 ROUNDS = 4
 MOST_VERTICES, TRIED_VERTICES = 48 << 20, 4 << 20
 """Of a series that the weights are trained on as a whole, and of the tiles that are coded by each trial."""
@@ -39,7 +42,7 @@ def race(sample: Sample, settings: Settings, size: int, *, error: float, effort:
     whole = sample.blocks.dtype.kind in "iu" and error < WHOLE
     # Whole numbers stand at whole distances: those of an odd number keep the whole part of half of it.
     step, origin = (2.0 * int(error) + 1.0, float(round(settings.center))) if whole else (settings.quantum, settings.center)
-    found = choose_predictor(sample, step=step, origin=origin, effort=effort) if step > 0 else None
+    found = choose_predictor(sample, step=step, origin=origin, effort=effort, rival=size) if step > 0 else None
     if found is None or found[1] >= size:
         return settings, size
     # The transform is not used any more: one that needs no bytes.
@@ -47,23 +50,28 @@ def race(sample: Sample, settings: Settings, size: int, *, error: float, effort:
     return replace(settings, predictor=found[0], transform=plain, head=None), found[1]
 
 
-def fit(tiles: list[tuple[Integers, Care]], levels: Four, order: Four, reach: int) -> tuple[int, ...]:
-    """Weights of all taps, by least squares that count large errors little: what they cost grows with their logarithm."""
+def fit(tiles: list[tuple[Integers, Care]], levels: Four, order: Four, reach: int, number: int = ROWS) -> tuple[int, ...]:
+    """Weights of all taps, by least squares that count large errors little: what they cost grows with their logarithm.
+
+    number: vertices of each pass that are learnt from.
+    """
     weights: list[int] = []
     shift = list(levels)
     generator = np.random.default_rng(0)
     for part in passes_of(levels, order, reach):
         if part.axis >= 0:
             shift[part.axis] -= 1
-        share = max(1, ROWS // len(tiles))
+        share = max(1, number // len(tiles))
         rows = [_rows(integers, care, part, tuple(shift), share, generator) for integers, care in tiles]
         found = _solve(np.concatenate(rows))
         weights += np.clip(np.rint(found * WEIGHT_UNIT), -LARGEST_WEIGHT, LARGEST_WEIGHT).astype(int).tolist()
     return tuple(weights)
 
 
-def choose_predictor(sample: Sample, *, step: float, origin: float, effort: int) -> tuple[Predictor, int] | None:
-    """The predictor whose streams are smallest, and the bytes of all tiles by it, roughly; None where the integers would be too large.
+def choose_predictor(sample: Sample, *, step: float, origin: float, effort: int, rival: float = math.inf) -> tuple[Predictor, int] | None:
+    """The predictor whose streams are smallest, and the bytes of all tiles by it, roughly.
+
+    None where the integers would be too large, and where a first trial says that more bytes than those of the rival will be needed.
 
     Order, depth and taps are decided one after the other. Trained on all tiles of a series that is in memory and not too large, and tried
     on some of them: a few tiles are often not like the others.
@@ -78,28 +86,37 @@ def choose_predictor(sample: Sample, *, step: float, origin: float, effort: int)
         return None
     few = counting[:: -(-sum(integers.size for integers, _ in counting) // TRIED_VERTICES)]
 
+    ahead = sample.counted / sum(integers.size if care is None else int(np.count_nonzero(care)) for integers, care in few)
+
     def sizes(tiles: list[tuple[Integers, Care]], predictor: Predictor) -> list[int]:
         with pool() as workers:
             return list(workers.map(lambda tile: len(encode_predicted(tile[0], tile[1], predictor)[0]), tiles))
 
     def trial(levels: Four, order: Four, reach: int) -> tuple[float, Predictor]:
         t, z, y, x = (min(level, (length - 1).bit_length()) for level, length in zip(levels, few[0][0].shape, strict=True))
-        now = _predictor(step, origin, (t, z, y, x), order, reach, counting)
-        return sum(sizes(few, now)) * len(counting) / len(few) + len(now.to_dict()["weights"]), now
+        now = _predictor(step, origin, (t, z, y, x), order, reach, counting, TRIED_ROWS)
+        return sum(sizes(few, now)) * ahead + len(now.to_dict()["weights"]), now
 
-    best = min((trial(DEPTHS[0], order, 1) for order in (ORDERS if effort > 2 else ORDERS[:1])), key=lambda pair: pair[0])
+    best = trial(DEPTHS[0], ORDERS[0], 1)
+    if best[0] > HOPELESS * rival:
+        return None
+    for order in ORDERS[1:] if effort > 2 else ():
+        best = min(best, trial(DEPTHS[0], order, 1), key=lambda pair: pair[0])
     for levels in DEPTHS[1:] if effort > 2 else ():
         best = min(best, trial(levels, best[1].order, 1), key=lambda pair: pair[0])
     for taps in (0, 2) if effort > 3 else ():
         best = min(best, trial(best[1].levels, best[1].order, taps), key=lambda pair: pair[0])
-    coded = sizes([(integers, care) for integers, care in known if integers is not None], best[1])
-    return best[1], sum(w * n for w, n in zip(sample.weights, coded, strict=True)) + len(best[1].to_dict()["weights"])
+    predictor = _predictor(step, origin, best[1].levels, best[1].order, best[1].reach, counting)
+    coded = sizes([(integers, care) for integers, care in known if integers is not None], predictor)
+    return predictor, sum(w * n for w, n in zip(sample.weights, coded, strict=True)) + len(predictor.to_dict()["weights"])
 
 
-def _predictor(step: float, origin: float, levels: Four, order: Four, reach: int, tiles: list[tuple[Integers, Care]] | None) -> Predictor:
+def _predictor(
+    step: float, origin: float, levels: Four, order: Four, reach: int, tiles: list[tuple[Integers, Care]] | None, number: int = ROWS
+) -> Predictor:
     """Trained on tiles, or with weights of 0."""
     count = sum(len(part.taps) for part in passes_of(levels, order, reach))
-    weights = (0,) * count if tiles is None else fit(tiles, levels, order, reach)
+    weights = (0,) * count if tiles is None else fit(tiles, levels, order, reach, number)
     return Predictor(step=step, origin=origin, levels=levels, order=order, reach=reach, weights=weights)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass
 from math import prod
 from typing import TypeVar
@@ -13,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.blocks import Blocks, Care, Values
+from fhash_codec.compact.filling import fill
 from fhash_codec.network import usable_threads
 from fhash_codec.normalise import power_of_two
 from fhash_codec.sums import squared_errors
@@ -124,7 +126,8 @@ class Sample:
     """Tiles in memory that stand for all.
 
     Attributes:
-        tiles: (values, what counts). weights: how many tiles of the series each stands for. complete: whether these are all that count.
+        tiles: (values, what counts). indices: which tiles these are. weights: how many tiles of the series each stands for.
+        complete: whether these are all that count.
         counted: vertices that count, of the whole series, roughly. blocks: the whole series.
     """
 
@@ -144,18 +147,30 @@ class Sample:
             order = sorted(range(len(indices)), key=lambda number: number * GOLDEN % 1.0)
             weights = [len(indices) * (place + 1) // wanted - len(indices) * place // wanted for place in range(wanted)]
             chosen = list(zip(sorted(order[:wanted]), weights, strict=True))
-        found = [(blocks.read(indices[number]), weight) for number, weight in chosen]
-        found = [(tile, weight) for tile, weight in found if tile[1] is None or tile[1].any()] or found[:1]
-        self.tiles = [tile for tile, _ in found]
-        self.weights = [weight for _, weight in found]
+        found = [(indices[number], blocks.read(indices[number]), weight) for number, weight in chosen]
+        found = [one for one in found if one[1][1] is None or one[1][1].any()] or found[:1]
+        self.indices, self.tiles, self.weights = [one[0] for one in found], [one[1] for one in found], [one[2] for one in found]
         self.complete = wanted == len(indices)
-        self.counted = sum(weight * (values.size if care is None else int(np.count_nonzero(care))) for (values, care), weight in found)
+        self.counted = sum(weight * (values.size if care is None else int(np.count_nonzero(care))) for _, (values, care), weight in found)
         self.blocks = blocks
-        self._pool, self._costs = pool, costs
+        self._pool, self._costs, self._source = pool, costs, self.tiles
+        self._filling: tuple[Settings, int] | None = None
 
     def wider(self, most_vertices: int) -> Sample:
-        """A sample of more tiles, up to so many vertices together; this one where it has them all."""
-        return self if self.complete else Sample(self.blocks, most_vertices, self._pool, self._costs)
+        """A sample of more tiles, up to so many vertices together and filled alike; this one where it has them all."""
+        if self.complete:
+            return self
+        other = Sample(self.blocks, most_vertices, self._pool, self._costs)
+        return other if self._filling is None else other.filled(*self._filling)
+
+    def filled(self, settings: Settings, density: int) -> Sample:
+        """The same tiles with values that suit the settings where they do not count, whatever stood there before; see `fill`."""
+        if self.blocks.complete:
+            return self
+        other = copy(self)
+        other._filling = settings, density
+        other.tiles = list(self._pool.map(lambda tile: fill(tile[0], tile[1], settings, density), self._source))
+        return other
 
     def map(self, work: Callable[[tuple[Values, Care]], Result]) -> list[Result]:
         """The results for all tiles, in order, by all processors."""
@@ -172,7 +187,14 @@ class Sample:
 
     def run(self, settings: Settings, way: Way) -> Outcome:
         """Code the tiles; what coding the whole series would give."""
-        return total(self.map(lambda tile: code(tile[0], tile[1], settings, way)[1]), self.weights)
+        return self.run_all([(settings, way)])[0]
+
+    def run_all(self, trials: Sequence[tuple[Settings, Way]]) -> list[Outcome]:
+        """What each of some ways to code the tiles would give: at once, so that a few large tiles keep all processors busy, too."""
+        jobs = [(tile, *trial) for trial in trials for tile in self.tiles]
+        found = list(self._pool.map(lambda job: code(*job[0], *job[1:])[1], jobs))
+        number = len(self.tiles)
+        return [total(found[start : start + number], self.weights) for start in range(0, len(found), number)]
 
     def decoded(self, settings: Settings, way: Way) -> list[npt.NDArray[np.float32]]:
         """What the tiles decode to, float32."""

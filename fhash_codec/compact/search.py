@@ -36,25 +36,26 @@ def exchange(points: Sequence[tuple[float, float]], usual: float) -> float:
     return usual
 
 
-def cheapest(run: Callable[[int], tuple[float, Result] | None], start: int, most: int, *, strides: Sequence[int]) -> Result:
+def cheapest(
+    run: Callable[[Sequence[int]], Sequence[tuple[float, Result] | None]], start: int, most: int, *, strides: Sequence[int]
+) -> Result:
     """The result of the cheapest whole number from 0 to `most`: downhill from `start`, in strides that get smaller.
 
-    run: cost and result at a number, None where there is none (never at `start`).
+    run: cost and result at each of some numbers, None where there is none (never at `start`).
     """
-    known: dict[int, tuple[float, Result] | None] = {start: run(start)}
+    known: dict[int, tuple[float, Result] | None] = {}
     best = start
 
     def cost(number: int) -> float:
-        if not 0 <= number <= most:
-            return float("inf")
-        if number not in known:
-            known[number] = run(number)
-        found = known[number]
+        found = known.get(number)
         return float("inf") if found is None else found[0]
 
     for stride in strides:
         while True:
-            nearest = min((best, best + stride, best - stride), key=cost)
+            near = (best, best + stride, best - stride)
+            new = [number for number in near if number not in known and 0 <= number <= most]
+            known.update(zip(new, run(new), strict=True))
+            nearest = min(near, key=cost)
             if nearest == best:
                 break
             best = nearest

@@ -118,14 +118,16 @@ def _solve_bound(sample: Sample, settings: Settings, way: Way, goal: Goal, error
     """The step at which coefficients and residual together cost least."""
     rounding = float(np.finfo(sample.blocks.dtype).eps) / 2 if sample.blocks.dtype.kind == "f" else 0.0
 
-    def run(number: int) -> tuple[float, tuple[Settings, Outcome]] | None:
-        trial = with_step(replace(settings, head=None), error * 2 ** (number / STEPS_TO_OCTAVE), goal, rounding)
+    def trial(number: int) -> Settings | None:
+        stepped = with_step(replace(settings, head=None), error * 2 ** (number / STEPS_TO_OCTAVE), goal, rounding)
         if settings.head is not None:
-            if trial.double:
-                return None
-            trial = replace(trial, head=settings.head)
-        outcome = sample.run(trial, replace(way, error=error))
-        return outcome.size, (trial, outcome)
+            return None if stepped.double else replace(stepped, head=settings.head)
+        return stepped
+
+    def run(numbers: Sequence[int]) -> list[tuple[float, tuple[Settings, Outcome]] | None]:
+        trials = [trial(number) for number in numbers]
+        outcomes = iter(sample.run_all([(one, replace(way, error=error)) for one in trials if one is not None]))
+        return [None if one is None else ((outcome := next(outcomes)).size, (one, outcome)) for one in trials]
 
     # Upwards: with a head, a smaller step could need float64.
     start = min(max(math.ceil(STEPS_TO_OCTAVE * math.log2(settings.step / error) - 1e-6), 0), LARGEST_OF_ERROR)

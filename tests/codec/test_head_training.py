@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
+import torch
 
 from fhash_codec.head_training import train_head
 from fhash_formats.errors import InputError
@@ -108,3 +111,16 @@ def test_seconds_end_the_training_and_progress_reaches_one(front):
 def test_impossible_trainings_are_refused(front, change, message):
     with pytest.raises(InputError, match=message):
         train_head(**{"pairs": [(*front, None)], "low": -1.0, "high": 2.0, **change})
+
+
+def test_two_trainings_at_once_give_what_each_gives_alone_and_leave_torch_as_it_was(front):
+    decoded, original = front
+    before = torch.get_num_threads()
+
+    def trained(seed):
+        return train_head([(decoded, original, None)], low=-1.0, high=2.0, steps=60, seed=seed, device="cpu").head.to_bytes()
+
+    with ThreadPoolExecutor(2) as workers:
+        together = list(workers.map(trained, (1, 2)))
+    assert together == [trained(1), trained(2)]
+    assert torch.get_num_threads() == before
