@@ -23,7 +23,7 @@ from fhash_codec.selection import Found
 from fhash_formats.container import ContainerWriter
 from fhash_formats.series import Series
 
-OVERHEAD_BYTES = 4000
+OVERHEAD_BYTES = 3000
 """Of a container without its tiles, roughly; only the search for a ratio needs it."""
 MOST_TILES = 4096
 """In one shard; a larger table has a shard for each layer of tiles in time."""

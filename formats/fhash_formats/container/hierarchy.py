@@ -12,10 +12,9 @@ from fhash_formats.container import strict_json
 from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
 from fhash_formats.container.layout import Member
 from fhash_formats.container.source import Source
-from fhash_formats.container.zip_checked import read_member
+from fhash_formats.container.zip_checked import DOCUMENT, read_member
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
-DOCUMENT = "zarr.json"
 GROUP: dict[str, Any] = {"zarr_format": 3, "node_type": "group"}
 
 _CHUNK = re.compile(r"(.+)/(c(?:/[0-9]+)+)")
@@ -60,8 +59,8 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
 def _read_document(source: Source, member: Member) -> ArrayMetadata | Mapping[str, Any]:
     """The metadata of an array or the attributes of a group."""
     # Before reading; the data of a chunk may be that large, metadata may not.
-    if member.size > strict_json.MAX_BYTES:
-        raise DamagedFileError(f"member {member.name}: {member.size} bytes of metadata; the limit is {strict_json.MAX_BYTES}")
+    if max(member.sizes) > strict_json.MAX_BYTES:
+        raise DamagedFileError(f"member {member.name}: {max(member.sizes)} bytes of metadata; the limit is {strict_json.MAX_BYTES}")
     data = read_member(source, member)
     try:
         values = strict_json.loads(data)

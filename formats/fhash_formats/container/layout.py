@@ -9,10 +9,12 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
+"""Of what is written; version 1 has no deflated members."""
 COMMENT = re.compile(rb"fhash ([0-9]{1,4}) sha256=[0-9a-f]{64}\Z")
 
 LOCAL = struct.Struct("<4s5H3I2H")
@@ -29,19 +31,33 @@ VERSION, VERSION_64 = 20, 45
 UNIX = 3
 FILE_MODE = 0o100644 << 16
 TIME, DATE = 0, (1980 - 1980) << 9 | 1 << 5 | 1
-STORED = 0
+STORED, DEFLATED = 0, 8
 MAX_16, MAX_32 = 0xFFFF, 0xFFFFFFFF
 """A field of this value says that the true one is in the 64-bit record."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Member:
-    """One stored file in the ZIP: `offset` of its local header, `size` and CRC-32 of its data. Sizes stay below 4 GiB, offsets need not."""
+    """One file in the ZIP: `offset` of its local header, `size` of its data there. Sizes stay below 4 GiB, offsets need not.
+
+    full_size: of the data once they are inflated; None where they are stored as they are. crc: CRC-32 of the full data.
+    """
 
     name: str
     offset: int
     size: int
     crc: int
+    full_size: int | None = None
+
+    @property
+    def method(self) -> int:
+        """How ZIP calls what was done with the data."""
+        return STORED if self.full_size is None else DEFLATED
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Of the data in the file and in full."""
+        return self.size, self.size if self.full_size is None else self.full_size
 
     @property
     def header_size(self) -> int:
@@ -62,7 +78,21 @@ class Member:
 def local_header(member: Member) -> bytes:
     """The bytes before a member's data."""
     name = member.name.encode("ascii")
-    return LOCAL.pack(LOCAL_MARK, VERSION, 0, STORED, TIME, DATE, member.crc, member.size, member.size, len(name), 0) + name
+    return LOCAL.pack(LOCAL_MARK, VERSION, 0, member.method, TIME, DATE, member.crc, *member.sizes, len(name), 0) + name
+
+
+def deflated(data: bytes) -> bytes:
+    """The raw deflate stream (RFC 1951) of a member's data."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
+    return packer.compress(data) + packer.flush()
+
+
+def document_member(name: str, offset: int, data: bytes) -> tuple[Member, bytes]:
+    """The member of a metadata document, and its data in the file: deflated where that is shorter."""
+    packed = deflated(data)
+    if len(packed) >= len(data):
+        return Member(name=name, offset=offset, size=len(data), crc=zlib.crc32(data)), data
+    return Member(name=name, offset=offset, size=len(packed), crc=zlib.crc32(data), full_size=len(data)), packed
 
 
 def directory_entry(member: Member) -> bytes:
@@ -72,9 +102,11 @@ def directory_entry(member: Member) -> bytes:
     extra = OFFSET_64.pack(1, 8, member.offset) if far else b""
     version = VERSION_64 if far else VERSION
     offset = MAX_32 if far else member.offset
-    sizes = (member.crc, member.size, member.size)
+    sizes = (member.crc, *member.sizes)
     lengths = (len(name), len(extra), 0, 0, 0)
-    return ENTRY.pack(ENTRY_MARK, version, UNIX, version, 0, 0, STORED, TIME, DATE, *sizes, *lengths, FILE_MODE, offset) + name + extra
+    return (
+        ENTRY.pack(ENTRY_MARK, version, UNIX, version, 0, 0, member.method, TIME, DATE, *sizes, *lengths, FILE_MODE, offset) + name + extra
+    )
 
 
 def end_records(count: int, size: int, offset: int) -> bytes:
@@ -88,9 +120,9 @@ def end_records(count: int, size: int, offset: int) -> bytes:
     return end_64 + LOCATOR_64.pack(LOCATOR_64_MARK, 0, offset + size, 1) + end
 
 
-def comment(directory: bytes) -> bytes:
+def comment(directory: bytes, version: int = LAYOUT_VERSION) -> bytes:
     """The signature of a container: its layout version and the SHA-256 of everything from the first directory entry to the comment."""
-    return b"fhash %d sha256=%s" % (LAYOUT_VERSION, hashlib.sha256(directory).hexdigest().encode("ascii"))
+    return b"fhash %d sha256=%s" % (version, hashlib.sha256(directory).hexdigest().encode("ascii"))
 
 
 def ending(members: Sequence[Member]) -> bytes:

@@ -18,12 +18,12 @@ from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.chunks import Coded, cut, expect_end, full_chunk, shard_parts
 from fhash_formats.container.coding import Codec, plain_codecs
 from fhash_formats.container.header import FORMAT, FORMAT_VERSION
-from fhash_formats.container.hierarchy import DOCUMENT, GROUP
-from fhash_formats.container.layout import Member, ending, local_header
+from fhash_formats.container.hierarchy import GROUP
+from fhash_formats.container.layout import Member, document_member, ending, local_header
 from fhash_formats.container.reader import Container
 from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.container.source import FileSource, PreviewSource
-from fhash_formats.container.zip_checked import MAX_MEMBER, MAX_NAME, NAME
+from fhash_formats.container.zip_checked import DOCUMENT, MAX_MEMBER, MAX_NAME, NAME
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
 from fhash_formats.slabs import slab_shape
 from fhash_formats.writers.atomic import replacing
@@ -169,7 +169,8 @@ class ContainerWriter:
             raise InputError(f"array {name} cannot be stored: {error}") from error
         self._check_name(name)
         self._arrays.add(name)
-        self._add(f"{name}/{DOCUMENT}", [document])
+        member, data = document_member(f"{name}/{DOCUMENT}", self._position, document)
+        self._write(member, [data])
         return metadata
 
     def preview(self, header: Mapping[str, Any]) -> Container:
@@ -210,9 +211,9 @@ class ContainerWriter:
         documents[DOCUMENT] = strict_json.dumps({**GROUP, "attributes": {"fhash": complete}}, "the header")
         members, parts, position = list(self._members), [], self._position
         for name, data in documents.items():
-            member = Member(name=name, offset=position, size=len(data), crc=zlib.crc32(data))
+            member, packed = document_member(name, position, data)
             members.append(member)
-            parts += [local_header(member), data]
+            parts += [local_header(member), packed]
             position = member.end
         return b"".join([*parts, ending(members)])
 
@@ -223,15 +224,17 @@ class ContainerWriter:
             raise InputError(f"array {name} is there already")
 
     def _add(self, name: str, parts: Sequence[bytes]) -> None:
-        """Write a member whose data are these parts, one after the other."""
-        if self._file.closed:
-            raise OutputError(f"{self.path}: the container is written already")
+        """Write a chunk whose data are these parts, one after the other."""
         size, crc = sum(len(part) for part in parts), 0
         if size > MAX_MEMBER:
             raise InputError(f"{name} takes {size} bytes; the limit is {MAX_MEMBER}, take smaller chunks or shards")
         for part in parts:
             crc = zlib.crc32(part, crc)
-        member = Member(name=name, offset=self._position, size=size, crc=crc)
+        self._write(Member(name=name, offset=self._position, size=size, crc=crc), parts)
+
+    def _write(self, member: Member, parts: Sequence[bytes]) -> None:
+        if self._file.closed:
+            raise OutputError(f"{self.path}: the container is written already")
         self._file.write(local_header(member))
         for part in parts:
             self._file.write(part)

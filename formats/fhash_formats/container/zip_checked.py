@@ -12,6 +12,7 @@ import zlib
 
 from fhash_formats.container.layout import (
     COMMENT,
+    DEFLATED,
     END,
     END_64,
     END_64_MARK,
@@ -35,6 +36,9 @@ from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 MAX_DIRECTORY = 1 << 28
 MAX_MEMBER = 1 << 31
+MAX_DOCUMENT = 16 << 20
+"""Of a metadata document in full; nothing else is deflated."""
+DOCUMENT = "zarr.json"
 MAX_NAME = 512
 
 _PART = r"[A-Za-z0-9_-][A-Za-z0-9._-]*"
@@ -61,18 +65,18 @@ def read_members(source: Source) -> dict[str, Member]:
     version, signed = signature
     comment_at = source.size - len(signed)
     if version > LAYOUT_VERSION:
-        raise UnsupportedFileError(f"written by a newer fhash format {version}; this version reads {LAYOUT_VERSION}.x; upgrade")
+        raise UnsupportedFileError(f"written by a newer fhash layout {version}; this version reads up to {LAYOUT_VERSION}; upgrade")
     count, size, offset = _read_end(source, comment_at)
     directory = source.read(offset, comment_at - offset)
-    if comment(directory) != signed:
+    if comment(directory, version) != signed:
         raise DamagedFileError("the ZIP directory is damaged: its SHA-256 differs from the one in the comment")
     if directory[size:] != end_records(count, size, offset):
         raise DamagedFileError("the end record of the ZIP directory contradicts itself")
-    return _parse(directory[:size], count, offset)
+    return _parse(directory[:size], count, offset, version)
 
 
 def read_member(source: Source, member: Member) -> memoryview:
-    """The checked data of a member; raises DamagedFileError naming it."""
+    """The checked data of a member in full; raises DamagedFileError naming it."""
     try:
         stored = source.read(member.offset, member.header_size + member.size)
     except DamagedFileError as error:
@@ -80,6 +84,8 @@ def read_member(source: Source, member: Member) -> memoryview:
     if stored[: member.header_size] != local_header(member):
         raise DamagedFileError(f"member {member.name}: its header differs from the directory")
     data = memoryview(stored)[member.header_size :]
+    if member.full_size is not None:
+        data = memoryview(_inflated(member, data, member.full_size))
     if zlib.crc32(data) != member.crc:
         raise DamagedFileError(f"member {member.name}: its CRC-32 differs, the data are damaged")
     return data
@@ -87,6 +93,9 @@ def read_member(source: Source, member: Member) -> memoryview:
 
 def check_member(source: Source, member: Member) -> None:
     """`read_member` for a member that need not be held: piece by piece."""
+    if member.full_size is not None:
+        read_member(source, member)
+        return
     if source.read(member.offset, member.header_size) != local_header(member):
         raise DamagedFileError(f"member {member.name}: its header differs from the directory")
     crc = 0
@@ -94,6 +103,18 @@ def check_member(source: Source, member: Member) -> None:
         crc = zlib.crc32(source.read(member.data_offset + start, min(_PIECE, member.size - start)), crc)
     if crc != member.crc:
         raise DamagedFileError(f"member {member.name}: its CRC-32 differs, the data are damaged")
+
+
+def _inflated(member: Member, data: memoryview, size: int) -> bytes:
+    """No more than the declared bytes are ever made."""
+    inflate = zlib.decompressobj(-zlib.MAX_WBITS)
+    try:
+        full = inflate.decompress(data, size + 1)
+    except zlib.error as error:
+        raise DamagedFileError(f"member {member.name}: its deflated data are damaged: {error}") from error
+    if len(full) != size or not inflate.eof or inflate.unused_data:
+        raise DamagedFileError(f"member {member.name}: it does not inflate to the {size} bytes that are declared")
+    return full
 
 
 def _read_end(source: Source, comment_at: int) -> tuple[int, int, int]:
@@ -119,11 +140,11 @@ def _read_end(source: Source, comment_at: int) -> tuple[int, int, int]:
     return count, size, offset
 
 
-def _parse(directory: bytes, count: int, data_end: int) -> dict[str, Member]:
+def _parse(directory: bytes, count: int, data_end: int, version: int) -> dict[str, Member]:
     members: dict[str, Member] = {}
     at = position = 0
     while at < len(directory):
-        member, length = _parse_entry(directory, at)
+        member, length = _parse_entry(directory, at, version)
         if member.name in members:
             raise DamagedFileError(f"member {member.name} is there twice")
         if member.offset != position or member.end > data_end:
@@ -136,7 +157,7 @@ def _parse(directory: bytes, count: int, data_end: int) -> dict[str, Member]:
     return members
 
 
-def _parse_entry(directory: bytes, at: int) -> tuple[Member, int]:
+def _parse_entry(directory: bytes, at: int, version: int) -> tuple[Member, int]:
     """The member whose entry starts at `at`, and the bytes of the entry."""
     if at + ENTRY.size > len(directory):
         raise DamagedFileError("the ZIP directory ends within an entry")
@@ -151,15 +172,19 @@ def _parse_entry(directory: bytes, at: int) -> tuple[Member, int]:
         raise DamagedFileError(f"member name {name[:80]!a} is not allowed; names are relative paths of A-Z a-z 0-9 . _ -")
     if flags & 1:
         raise DamagedFileError(f"member {name} is encrypted")
-    if method != STORED:
-        raise DamagedFileError(f"member {name} is compressed by ZIP method {method}; only stored members are allowed")
-    if size != full_size or size > MAX_MEMBER:
+    document = version > 1 and name.rpartition("/")[2] == DOCUMENT
+    if method != STORED and not (document and method == DEFLATED):
+        raise DamagedFileError(f"member {name} is compressed by ZIP method {method}; only metadata may be, by 8 from layout version 2 on")
+    if method == DEFLATED:
+        if not size < full_size <= MAX_DOCUMENT:
+            raise DamagedFileError(f"member {name} declares {size} deflated and {full_size} full bytes; the limit is {MAX_DOCUMENT}")
+    elif size != full_size or size > MAX_MEMBER:
         raise DamagedFileError(
             f"member {name} declares {size} stored and {full_size} full bytes; equal sizes up to {MAX_MEMBER} are allowed"
         )
     if offset == MAX_32 and extra_size == OFFSET_64.size and name_at + name_size + extra_size <= len(directory):
         offset = OFFSET_64.unpack_from(directory, name_at + name_size)[2]
-    member = Member(name=name, offset=offset, size=size, crc=crc)
+    member = Member(name=name, offset=offset, size=size, crc=crc, full_size=full_size if method == DEFLATED else None)
     canonical = directory_entry(member)
     if directory[at : at + len(canonical)] != canonical:
         raise DamagedFileError(f"member {name} has fields in its directory entry that the format does not allow")

@@ -102,7 +102,8 @@ def unpack(data: bytes) -> Parts:
     for _ in range(count):
         size, name_size = struct.unpack_from("<I", data, at + 20)[0], struct.unpack_from("<H", data, at + 28)[0]
         begin = struct.unpack_from("<I", data, at + 42)[0] + 30 + name_size
-        parts.append((data[at + 46 : at + 46 + name_size].decode(), data[begin : begin + size]))
+        stored, method = data[begin : begin + size], struct.unpack_from("<H", data, at + 10)[0]
+        parts.append((data[at + 46 : at + 46 + name_size].decode(), zlib.decompress(stored, -15) if method == 8 else stored))
         at += 46 + name_size
     return parts
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import tracemalloc
+import zlib
 
 import numcodecs.zstd
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from fhash_formats.container import Container
 from fhash_formats.container.coding import crc32c
+from fhash_formats.container.layout import Member, comment, deflated, ending, local_header
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 ROOT = "zarr.json"
@@ -43,7 +45,8 @@ def refused(path, data, message, kind=DamagedFileError):
 # -- the ZIP -------------------------------------------------------------------------------------------------------------------
 
 ENTRIES = {
-    "deflated": (METHOD, "<H", 8, "ZIP method 8"),
+    "deflated to nothing less": (METHOD, "<H", 8, "deflated and"),
+    "packed otherwise": (METHOD, "<H", 14, "ZIP method 14"),
     "encrypted": (FLAGS, "<H", 1, "encrypted"),
     "data descriptor": (FLAGS, "<H", 8, "does not allow"),
     "utf-8 names": (FLAGS, "<H", 0x800, "does not allow"),
@@ -64,7 +67,7 @@ ENTRIES = {
 @pytest.mark.parametrize("case", ENTRIES)
 def test_directory_entry(sample, samples, case):
     at, form, value, message = ENTRIES[case]
-    data = bytearray(sample.read_bytes())
+    data = bytearray(samples.pack(samples.unpack(sample.read_bytes())))
     struct.pack_into(form, data, samples.directory_at(bytes(data)) + at, value)
     refused(sample, samples.reseal(bytes(data)), message)
 
@@ -105,8 +108,70 @@ def test_hidden_bytes_between_members_and_directory(sample, samples):
 
 def test_local_header_that_differs(sample):
     data = bytearray(sample.read_bytes())
-    data[8] = 8
+    data[8] ^= 8
     refused(sample, bytes(data), "header differs")
+
+
+DEFLATED = {
+    "bomb": (lambda data: deflated(bytes(15 << 20)), 15 << 20, "not valid JSON|JSON"),
+    "more than declared": (lambda data: deflated(bytes(1 << 26)), 1 << 20, "does not inflate"),
+    "less than declared": (lambda data: deflated(data), 1 << 20, "does not inflate"),
+    "beyond the limit": (lambda data: deflated(data), (16 << 20) + 1, "the limit is 16777216"),
+    "cut": (lambda data: deflated(data)[:-3], None, "does not inflate"),
+    "with a tail": (lambda data: deflated(data) + b"tail", None, "does not inflate"),
+    "no deflate": (lambda data: b"\xff" * 40, None, "deflated data are damaged"),
+}
+
+
+@pytest.mark.parametrize("case", DEFLATED)
+def test_deflated_metadata(sample, samples, case):
+    make, declared, message = DEFLATED[case]
+    parts = samples.unpack(sample.read_bytes())
+    members, chunks, position = [], [], 0
+    for name, data in parts:
+        stored = make(data) if name == ROOT else data
+        full = None if name != ROOT else declared or len(data)
+        # The CRC is right where the content is what is declared.
+        crc = zlib.crc32(bytes(15 << 20) if case == "bomb" and name == ROOT else data)
+        member = Member(name=name, offset=position, size=len(stored), crc=crc, full_size=full)
+        members.append(member)
+        chunks += [local_header(member), stored]
+        position = member.end
+    whole = b"".join([*chunks, ending(members)])
+    sample.write_bytes(whole)
+    tracemalloc.start()
+    with pytest.raises(DamagedFileError, match=message):
+        read_everything(sample)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # Metadata may be as large as they say, up to their limit, and are held as bytes, as text and as values at most.
+    assert peak < 4 * (declared or len(whole)) + (4 << 20)
+
+
+def test_chunks_are_never_deflated(sample, samples):
+    parts = samples.unpack(sample.read_bytes())
+    name = next(name for name, _ in parts if not name.endswith(ROOT))
+    members, chunks, position = [], [], 0
+    for other, content in parts:
+        packed = deflated(content) if other == name else content
+        full = len(content) if other == name else None
+        member = Member(name=other, offset=position, size=len(packed), crc=zlib.crc32(content), full_size=full)
+        members.append(member)
+        chunks += [local_header(member), packed]
+        position = member.end
+    refused(sample, b"".join([*chunks, ending(members)]), "only metadata may be")
+
+
+def test_version_1_has_nothing_deflated(sample, samples):
+    data = sample.read_bytes()
+    start = samples.directory_at(data)
+    directory = data[start : -len(comment(b""))]
+    refused(sample, data[:start] + directory + comment(directory, 1), "from layout version 2 on")
+    stored = samples.pack(samples.unpack(data))
+    start = samples.directory_at(stored)
+    directory = stored[start : -len(comment(b""))]
+    sample.write_bytes(stored[:start] + directory + comment(directory, 1))
+    read_everything(sample)
 
 
 @pytest.mark.parametrize(
@@ -124,8 +189,6 @@ def test_end_record(sample, samples, field, form, value, message):
     struct.pack_into(form, data, len(data) - 79 - 22 + field, value)
     # The digest is made right by hand, because the directory can no longer be found by the end record.
     start = samples.directory_at(sample.read_bytes())
-    from fhash_formats.container.layout import comment
-
     directory = bytes(data[start:-79])
     refused(sample, bytes(data[:start]) + directory + comment(directory), message)
 
@@ -134,8 +197,8 @@ def test_newer_layout(sample):
     data = sample.read_bytes()
     refused(
         sample,
-        data.replace(b"fhash 1 sha256", b"fhash 2 sha256"),
-        "newer fhash format 2; this version reads 1.x; upgrade",
+        data.replace(b"fhash 2 sha256", b"fhash 3 sha256"),
+        "newer fhash layout 3; this version reads up to 2; upgrade",
         UnsupportedFileError,
     )
 

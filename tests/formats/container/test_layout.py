@@ -31,7 +31,7 @@ def test_bytes_of_a_far_directory_entry():
 
 
 def test_comment_is_a_digest():
-    assert comment(b"") == b"fhash 1 sha256=e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+    assert comment(b"") == b"fhash 2 sha256=e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
 
 
 class Sparse(io.RawIOBase):
