@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.bench_render import render
 from fhash_cli.options import (
     RealRange,
     SourceOptions,
@@ -63,6 +64,9 @@ class NamesType(click.ParamType[str]):
 @click.group("bench", short_help="measure speed and size on this machine")
 def command() -> None:
     """Measure speed and size on this machine."""
+
+
+command.add_command(render)
 
 
 @command.command("train", short_help="training and inference speed of each engine")

@@ -22,6 +22,7 @@ from fhash_formats.errors import InterruptedEncodingError
 COMMANDS = {
     "encode": "fit a series and write it as RUN.fhz",
     "decode": "rebuild a region of RUN.fhz, at any time",
+    "render": "draw a picture of RUN.fhz",
     "info": "say what RUN.fhz holds and how good it is",
     "verify": "read and check every part of RUN.fhz",
     "diff": "measure RUN.fhz against the data it was made from",

@@ -109,7 +109,9 @@ def _key(name: str) -> str:
 
 def parse_colour(text: str) -> tuple[float, float, float]:
     """Red, green and blue, 0..1, of '#rrggbb', '#rgb' or a name of CSS; raises InputError, offering the nearest name."""
-    code = str(ImageColor.colormap.get(text.lower(), text))
+    known = ImageColor.colormap.get(text.lower(), text)
+    # pillow replaces the text of a name by numbers once it was asked for it.
+    code = known if isinstance(known, str) else "#" + "".join(f"{part:02x}" for part in known[:3])
     if re.fullmatch(r"#[0-9a-fA-F]{3}", code):
         code = "#" + "".join(2 * digit for digit in code[1:])
     if re.fullmatch(r"#[0-9a-fA-F]{6}", code):

@@ -72,11 +72,13 @@ class LightGrid:
     """Shares 0..1 of the light that reach a place, float32 (z, y, x, 2): from the lamp, and from around; trilinear, clamped.
 
     first: vertex (x, y, z) of the domain that the first point lies at. cell: vertices from one point to the next.
+    secondary_rays: that it took.
     """
 
     shares: Single
     first: Floats
     cell: float
+    secondary_rays: int = 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

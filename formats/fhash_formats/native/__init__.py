@@ -16,7 +16,7 @@ from fhash_formats.errors import InputError
 
 __all__ = ["ABI_VERSION", "library"]
 
-ABI_VERSION = 4
+ABI_VERSION = 5
 """The number that `fhash_abi_version()` must return; `FHASH_ABI` in core.hpp is its twin."""
 
 _HERE = Path(__file__).parent

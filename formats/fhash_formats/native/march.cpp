@@ -7,17 +7,25 @@
 // Compositing is front to back. Within BLOCK samples opacity (not transparency: 1 - 1e-9 is 1 in float32) is summed in float32; blocks
 // are joined in float64, so that thin fog does not vanish in rounding. Built for speed, not for the same bits everywhere: pictures agree
 // with those of fhash_codec/render/portable_march.py within rounding.
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("no-tree-pre")  // which makes branches of the loops below, and those are not vectorised
+#endif
 #include "march.hpp"
 
 namespace {
 
 using std::int32_t;
 using std::int64_t;
-using std::max;
-using std::min;
+
+// By value and always inlined: the standard ones are neither vectorised nor, between functions for different machines, inlined.
+template <class T> FHASH_INLINE T min(T a, T b) { return b < a ? b : a; }
+template <class T> FHASH_INLINE T max(T a, T b) { return a < b ? b : a; }
+// What is not a number becomes the lower end.
+template <class T> FHASH_INLINE T clamp(T x, T low, T high) { const T some = x > low ? x : low; return some < high ? some : high; }
 
 constexpr int N = 16, SIDE = 4, TILE = 16, BLOCK = 32;
 constexpr int SHADED = 1, LIT = 2, MAXIMUM = 4;
+const double ENDLESS = std::numeric_limits<double>::infinity();
 const float NONE = std::numeric_limits<float>::quiet_NaN(), FAR = std::numeric_limits<float>::infinity();
 
 struct Counters {
@@ -30,17 +38,27 @@ FHASH_INLINE double random_share(uint32_t x) {
     return (x + 0.5) / 4294967296.0;
 }
 
-// 1 - (1 - opacity)^share, exact for tiny opacities.
-inline double opacity_of_share(double opacity, double share) {
-    if (opacity < 0.01)  // the binomial series: what it leaves out is below 1e-10 of the opacity
-        return share * opacity * (1 + (1 - share) * opacity / 2 * (1 + (2 - share) * opacity / 3 * (1 + (3 - share) * opacity / 4)));
-    return opacity < 1 ? -std::expm1(share * std::log1p(-opacity)) : 1;
+// 1 - (1 - opacity)^share of an opacity below 0.01 by the binomial series, to 1e-10 of it.
+FHASH_INLINE double opacity_of_share(double opacity, double share) {
+    return share * opacity * (1 + (1 - share) * opacity / 2 * (1 + (2 - share) * opacity / 3 * (1 + (3 - share) * opacity / 4)));
 }
+
+// What shading takes from a march, in single precision.
+struct Phong {
+    float ambient, diffuse, specular, steep, floor;
+    const float* powers;
+    explicit Phong(const FhashMarch& m)
+        : ambient((float)m.ambient), diffuse((float)m.diffuse), specular((float)m.specular), steep((float)m.steep),
+          floor((float)(m.floor * m.floor)), powers(m.powers) {}
+};
 
 // 16 rays, and how far they are. Single precision where vectors work on them, double where single rays do.
 template <int WANTED> struct Packet {
     const FhashMarch& m;
+    const Phong phong;
     alignas(64) float ox[N], oy[N], oz[N], dx[N], dy[N], dz[N], ix[N], iy[N], iz[N];  // the first sample, a step, steps per vertex
+    alignas(64) float farx[N], fary[N], farz[N];  // much where it does not move along an axis
+    alignas(64) int upx[N], upy[N], upz[N];      // whether it ascends
     alignas(64) float tox[N], toy[N], toz[N], hx[N], hy[N], hz[N];                    // towards the light; halfway between it and the eye
     alignas(64) float r[N], g[N], b[N], a[N], left[N], depth[N], previous[N];  // colours and opacity of the block; light behind those before
     alignas(64) float gx[N], gy[N], gz[N], at[N], value[N], alpha[N], px[N], py[N], pz[N], best[N];
@@ -48,9 +66,11 @@ template <int WANTED> struct Packet {
     double red[N], green[N], blue[N], clear[N], rest[N], begin[N], entered[N], leaving[N], from[N];
     double o[3][N], d[3][N], normal[3][N];
 
-    explicit Packet(const FhashMarch& given) : m(given) {}
+    const bool whole;  // whether the frame has values of all that is drawn
 
-    void aim(int l, double across, double down, int64_t number);
+    explicit Packet(const FhashMarch& given) : m(given), phong(given), whole(std::equal(&m.box[0][0], &m.box[0][0] + 6, &m.seen[0][0])) {}
+
+    FHASH_INLINE void aim(int l, double across, double down, int64_t number);
     void cross(int l, double to, double now, Counters& counted);
     void see(int l, double sample, const FhashCell* cell, Counters& counted);
     void shorten();
@@ -75,9 +95,9 @@ template <int WANTED> struct Packet {
 };
 
 // Where a ray is within a box. An axis along which it does not move needs no division: it is inside or not.
-bool slab(const double (&box)[3][2], const double* eye, const double* direction, double& enter, double& leave) {
+FHASH_INLINE bool slab(const double (&box)[3][2], const double* eye, const double* direction, double& enter, double& leave) {
     enter = 0;
-    leave = std::numeric_limits<double>::infinity();
+    leave = ENDLESS;
     for (int c = 0; c < 3; c++) {
         if (direction[c] == 0) {
             if (!(eye[c] >= box[c][0] && eye[c] <= box[c][1])) return false;
@@ -91,7 +111,7 @@ bool slab(const double (&box)[3][2], const double* eye, const double* direction,
 }
 
 // The ray through a place of the picture: where it enters, how many steps it takes.
-template <int WANTED> void Packet<WANTED>::aim(int l, double across, double down, int64_t number) {
+template <int WANTED> FHASH_INLINE void Packet<WANTED>::aim(int l, double across, double down, int64_t number) {
     const double u = 2 * across / m.width - 1, w = 1 - 2 * down / m.height;
     double eye[3], direction[3], length = 0;
     for (int c = 0; c < 3; c++) {
@@ -102,8 +122,8 @@ template <int WANTED> void Packet<WANTED>::aim(int l, double across, double down
     }
     length = std::sqrt(length);
     for (int c = 0; c < 3; c++) direction[c] /= length;
-    double enter, leave, first, stop;
-    const bool hit = slab(m.box, eye, direction, enter, leave) && slab(m.seen, eye, direction, first, stop);
+    double enter = 0, leave = 0, first = 0, stop = ENDLESS;
+    const bool hit = slab(m.box, eye, direction, enter, leave) && (whole || slab(m.seen, eye, direction, first, stop));
     const double steps = hit ? (leave - enter) / m.step : 0, share = m.jitter ? random_share((uint32_t)number) : 0.5;
     const double most = min(std::ceil(steps), 2147483000.0);
     last[l] = (int)most - 1;
@@ -130,7 +150,11 @@ template <int WANTED> void Packet<WANTED>::aim(int l, double across, double down
     }
     ox[l] = (float)o[0][l]; oy[l] = (float)o[1][l]; oz[l] = (float)o[2][l];
     dx[l] = (float)d[0][l]; dy[l] = (float)d[1][l]; dz[l] = (float)d[2][l];
-    ix[l] = dx[l] == 0 ? 1e30f : 1 / dx[l]; iy[l] = dy[l] == 0 ? 1e30f : 1 / dy[l]; iz[l] = dz[l] == 0 ? 1e30f : 1 / dz[l];
+    // An axis along which a ray does not move, or hardly, never ends a brick.
+    ix[l] = fabsf(dx[l]) < 1e-9f ? 0.f : 1 / dx[l]; iy[l] = fabsf(dy[l]) < 1e-9f ? 0.f : 1 / dy[l];
+    iz[l] = fabsf(dz[l]) < 1e-9f ? 0.f : 1 / dz[l];
+    farx[l] = ix[l] == 0 ? 1e9f : 0.f; fary[l] = iy[l] == 0 ? 1e9f : 0.f; farz[l] = iz[l] == 0 ? 1e9f : 0.f;
+    upx[l] = dx[l] > 0; upy[l] = dy[l] > 0; upz[l] = dz[l] > 0;
     previous[l] = NONE;
     double towards[3], half[3], size = 0;
     const bool own = m.lamp[0] == 0 && m.lamp[1] == 0 && m.lamp[2] == 0;
@@ -145,48 +169,37 @@ template <int WANTED> void Packet<WANTED>::aim(int l, double across, double down
     hx[l] = (float)(half[0] * size); hy[l] = (float)(half[1] * size); hz[l] = (float)(half[2] * size);
 }
 
-struct Light {
-    float lamp, around;
-};
-
-// Light from the lamp and from around at a place, trilinear in the grid, clamped.
-FHASH_INLINE Light light_at(const FhashMarch& m, float x, float y, float z) {
-    const float scale = (float)m.light_scale;
-    const int nx = (int)m.light_shape[2], ny = (int)m.light_shape[1], nz = (int)m.light_shape[0];
-    x = min(max(x * scale + (float)m.light_offset[0], 0.f), (float)(nx - 1));
-    y = min(max(y * scale + (float)m.light_offset[1], 0.f), (float)(ny - 1));
-    z = min(max(z * scale + (float)m.light_offset[2], 0.f), (float)(nz - 1));
-    const int i = min((int)x, max(nx - 2, 0)), j = min((int)y, max(ny - 2, 0)), h = min((int)z, max(nz - 2, 0));
-    const int sx = nx > 1 ? 2 : 0, sy = ny > 1 ? 2 * nx : 0, sz = nz > 1 ? 2 * nx * ny : 0;
-    const float fx = x - i, fy = y - j, fz = z - h;
-    const float* const v = m.light;
-    float found[2];
-    for (int c = 0; c < 2; c++) {
-        const int q = 2 * ((h * ny + j) * nx + i) + c;
-        const float p0 = v[q] + fx * (v[q + sx] - v[q]), p1 = v[q + sy] + fx * (v[q + sy + sx] - v[q + sy]);
-        const float p2 = v[q + sz] + fx * (v[q + sz + sx] - v[q + sz]);
-        const float p3 = v[q + sz + sy] + fx * (v[q + sz + sy + sx] - v[q + sz + sy]);
-        const float s0 = p0 + fy * (p1 - p0), s1 = p2 + fy * (p3 - p2);
-        found[c] = s0 + fz * (s1 - s0);
-    }
-    return {found[0], found[1]};
+// Trilinear from eight neighbours.
+FHASH_INLINE float mixed(const float* v, int q, int sx, int sy, int sz, float fx, float fy, float fz) {
+    const float a0 = v[q], a1 = v[q + sx], a2 = v[q + sy], a3 = v[q + sy + sx];
+    const float b0 = v[q + sz], b1 = v[q + sz + sx], b2 = v[q + sz + sy], b3 = v[q + sz + sy + sx];
+    const float p0 = a0 + fx * (a1 - a0), p1 = a2 + fx * (a3 - a2), p2 = b0 + fx * (b1 - b0), p3 = b2 + fx * (b3 - b2);
+    const float s0 = p0 + fy * (p1 - p0), s1 = p2 + fy * (p3 - p2);
+    return s0 + fz * (s1 - s0);
 }
 
-struct Shade {
-    float factor, shine;
-};
+// Light from the lamp (0) or from around (1) at a place, trilinear in the grid, clamped.
+FHASH_INLINE float light_at(const FhashMarch& m, int which, float x, float y, float z) {
+    const float scale = (float)m.light_scale;
+    const int nx = (int)m.light_shape[2], ny = (int)m.light_shape[1], nz = (int)m.light_shape[0];
+    x = clamp(x * scale + (float)m.light_offset[0], 0.f, (float)(nx - 1));
+    y = clamp(y * scale + (float)m.light_offset[1], 0.f, (float)(ny - 1));
+    z = clamp(z * scale + (float)m.light_offset[2], 0.f, (float)(nz - 1));
+    const int i = min((int)x, max(nx - 2, 0)), j = min((int)y, max(ny - 2, 0)), h = min((int)z, max(nz - 2, 0));
+    const int sx = nx > 1 ? 2 : 0, sy = ny > 1 ? 2 * nx : 0, sz = nz > 1 ? 2 * nx * ny : 0, q = 2 * ((h * ny + j) * nx + i);
+    const float fx = x - i, fy = y - j, fz = z - h;
+    return mixed(m.light, q + which, sx, sy, sz, fx, fy, fz);
+}
 
-// Two-sided Phong with the vector halfway between light and eye (Blinn). Where the gradient vanishes only the ambient light is left,
-// and the other fades towards that, so that noise of rounding has no direction.
-template <int WANTED> FHASH_INLINE Shade shade(const Packet<WANTED>& p, int l, float x, float y, float z, Light light) {
-    const FhashMarch& m = p.m;
-    const float one = 1 / std::sqrt(x * x + y * y + z * z + (float)(m.floor * m.floor));
-    const float lit = min(std::fabs(x * p.tox[l] + y * p.toy[l] + z * p.toz[l]) * one, 1.f);
-    const float cosine = std::fabs(x * p.hx[l] + y * p.hy[l] + z * p.hz[l]) * one;
-    const float at = min(max(1 - cosine, 0.f) * (float)m.steep, 1.f) * FHASH_POWERS;
+// Two-sided Phong with the vector halfway between light and eye (Blinn): the shares of a gradient's light that is scattered and mirrored
+// of that from the lamp. `one` is 1 / size of the gradient; where that vanishes both fade, so that noise has no direction.
+FHASH_INLINE float size_of(const Phong& phong, float x, float y, float z) { return 1 / sqrtf(x * x + y * y + z * z + phong.floor); }
+FHASH_INLINE float scattered(const Phong& phong, float towards, float one) { return phong.diffuse * min(fabsf(towards) * one, 1.f); }
+FHASH_INLINE float mirrored(const Phong& phong, float halfway, float one) {
+    const float at = clamp((1 - fabsf(halfway) * one) * phong.steep, 0.f, 1.f) * FHASH_POWERS;
     const int n = (int)at;
-    const float highlight = m.powers[n] + (at - n) * (m.powers[n + 1] - m.powers[n]);
-    return {(float)m.ambient * light.around + light.lamp * ((float)m.diffuse * lit), light.lamp * ((float)m.specular * highlight)};
+    const float low = phong.powers[n], high = phong.powers[n + 1];
+    return phong.specular * (low + (at - (float)n) * (high - low));
 }
 
 // The depth and normal of what is seen: where less than half of the light is left for the first time.
@@ -219,7 +232,7 @@ template <int WANTED> void Packet<WANTED>::cross(int l, double to, double now, C
         if ((before < level) == (now < level)) continue;
         // Regula falsi by Illinois, until the root is within 1e-7 of a step or the value as near as rounding lets it be.
         double low = from[l], high = to, f_low = before - level, f_high = now - level, place = f_high == 0 ? high : low;
-        for (int turn = 0; turn < 60 && f_low != 0 && f_high != 0 && std::fabs(high - low) > 1e-7; turn++) {
+        for (int turn = 0; turn < 60 && f_low != 0 && f_high != 0 && fabs(high - low) > 1e-7; turn++) {
             place = high - f_high * (high - low) / (f_high - f_low);
             const double f = cell(l, place).value - level;
             counted.samples++;
@@ -227,7 +240,7 @@ template <int WANTED> void Packet<WANTED>::cross(int l, double to, double now, C
             if (f == 0) break;
             if ((f < 0) == (f_high < 0)) f_low *= 0.5;
             else low = high, f_low = f_high;
-            if (std::fabs(place - high) < 1e-9) break;
+            if (fabs(place - high) < 1e-9) break;
             high = place;
             f_high = f;
         }
@@ -237,27 +250,38 @@ template <int WANTED> void Packet<WANTED>::cross(int l, double to, double now, C
     for (int n = 0; n < found; n++) {
         const FhashCell here = cell(l, roots[n].at);
         const double* surface = m.surface[roots[n].which];
-        Light light = {1, 1};
-        if (m.light)
-            light = light_at(m, (float)(o[0][l] + roots[n].at * d[0][l]), (float)(o[1][l] + roots[n].at * d[1][l]),
-                             (float)(o[2][l] + roots[n].at * d[2][l]));
+        float lamp = 1, around = 1;
+        if (m.light) {
+            const double at = roots[n].at;
+            const float px = (float)(o[0][l] + at * d[0][l]), py = (float)(o[1][l] + at * d[1][l]), pz = (float)(o[2][l] + at * d[2][l]);
+            lamp = light_at(m, 0, px, py, pz);
+            around = light_at(m, 1, px, py, pz);
+        }
         const bool known = here.gx == here.gx && here.gy == here.gy && here.gz == here.gz;
-        const Shade lit = shade(*this, l, known ? (float)(here.gx * m.gradient[0]) : 0.f, known ? (float)(here.gy * m.gradient[1]) : 0.f,
-                                known ? (float)(here.gz * m.gradient[2]) : 0.f, light);
+        const float x = known ? (float)(here.gx * m.gradient[0]) : 0.f, y = known ? (float)(here.gy * m.gradient[1]) : 0.f;
+        const float z = known ? (float)(here.gz * m.gradient[2]) : 0.f;
+        const float one = size_of(phong, x, y, z);
+        const float factor = phong.ambient * around + lamp * scattered(phong, x * tox[l] + y * toy[l] + z * toz[l], one);
+        const float shine = lamp * mirrored(phong, x * hx[l] + y * hy[l] + z * hz[l], one);
         counted.gradients++;
         const float w = (1 - a[l]) * (float)surface[4];
         a[l] += w;
-        r[l] += w * ((float)surface[1] * lit.factor + lit.shine);
-        g[l] += w * ((float)surface[2] * lit.factor + lit.shine);
-        b[l] += w * ((float)surface[3] * lit.factor + lit.shine);
+        r[l] += w * ((float)surface[1] * factor + shine);
+        g[l] += w * ((float)surface[2] * factor + shine);
+        b[l] += w * ((float)surface[3] * factor + shine);
         if (m.depth && clear[l] * (1 - (double)a[l]) < 0.5) see(l, roots[n].at, &here, counted);
     }
 }
 
 // The opacity of last steps, which are as long as what is left of the path.
 template <int WANTED> void Packet<WANTED>::shorten() {
-    for (int l = 0; l < N; l++)
-        if (on[l] && k[l] == last[l] && alpha[l] > 0) alpha[l] = (float)opacity_of_share(alpha[l], rest[l]);
+    for (int l = 0; l < N; l++) {
+        if (!on[l] || k[l] != last[l] || !(alpha[l] > 0)) continue;
+        const int t = (int)at[l];
+        const double* extinction = m.extinction + t;
+        alpha[l] = (float)(alpha[l] < 0.01 ? opacity_of_share(alpha[l], rest[l])
+                                           : -std::expm1(-rest[l] * (extinction[0] + (at[l] - t) * (extinction[1] - extinction[0]))));
+    }
 }
 
 // Samples that lie on faces of cells, where vertices without a value may have no weight.
@@ -267,7 +291,7 @@ template <int WANTED> void Packet<WANTED>::mend() {
         const FhashCell here = fhash_cell_at(m, px[l], py[l], pz[l]);
         if (!(here.value == here.value)) continue;
         value[l] = (float)here.value;
-        at[l] = (float)min(max((here.value - m.low) * m.scale, 0.0), (double)(m.entries - 1));
+        at[l] = (float)clamp((here.value - m.low) * m.scale, 0.0, (double)(m.entries - 1));
         const int t = (int)at[l];
         alpha[l] = m.table[4 * t + 3] + (at[l] - t) * (m.table[4 * t + 7] - m.table[4 * t + 3]);
         const bool known = here.gx == here.gx && here.gy == here.gy && here.gz == here.gz;
@@ -319,18 +343,17 @@ template <int WANTED> FHASH_INLINE int Packet<WANTED>::skip(Counters& counted) {
     for (int l = 0; l < N; l++) {
         const float f = (float)k[l];
         const int going = k[l] < count[l];
-        const float x = min(max(ox[l] + f * dx[l], 0.f), mx), y = min(max(oy[l] + f * dy[l], 0.f), my), z = min(max(oz[l] + f * dz[l], 0.f), mz);
+        const float x = clamp(ox[l] + f * dx[l], 0.f, mx), y = clamp(oy[l] + f * dy[l], 0.f, my), z = clamp(oz[l] + f * dz[l], 0.f, mz);
         const int jx = (int)((float)min((int)x, cx) * part), jy = (int)((float)min((int)y, cy) * part);
         const int jz = (int)((float)min((int)z, cz) * part), q = (jz * by + jy) * bx + jx;
-        const int away = WANTED & MAXIMUM ? !(highest[q] > best[l]) : distance[q];
-        const int w = WANTED & MAXIMUM ? 0 : away - 1;
-        const float ex = (float)(dx[l] > 0 ? jx + 1 + w : jx - w) * side, ey = (float)(dy[l] > 0 ? jy + 1 + w : jy - w) * side;
-        const float ez = (float)(dz[l] > 0 ? jz + 1 + w : jz - w) * side;
-        // An axis along which a ray does not move has a huge factor: what rounding leaves of 0 times it must not count.
-        const float tx = dx[l] == 0 ? 1e9f : (ex - ox[l]) * ix[l], ty = dy[l] == 0 ? 1e9f : (ey - oy[l]) * iy[l];
-        const float tz = dz[l] == 0 ? 1e9f : (ez - oz[l]) * iz[l];
+        int away, w = 0;
+        if (WANTED & MAXIMUM) away = highest[q] > best[l] ? 0 : 1;
+        else away = distance[q], w = away - 1;
+        const float tx = ((float)(jx - w + upx[l] * (1 + 2 * w)) * side - ox[l]) * ix[l] + farx[l];
+        const float ty = ((float)(jy - w + upy[l] * (1 + 2 * w)) * side - oy[l]) * iy[l] + fary[l];
+        const float tz = ((float)(jz - w + upz[l] * (1 + 2 * w)) * side - oz[l]) * iz[l] + farz[l];
         // Rather a sample short of the brick's end than one beyond it.
-        const float leave = min(min(tx, ty), min(tz, 1e9f)) * (1 - 2e-6f);
+        const float leave = min(min(min(tx, ty), tz), 1e9f) * (1 - 2e-6f);
         const int next = min(max((int)leave + 1, k[l] + 1), count[l]);
         const int over = going & (away > 0) & !(keeping & (previous[l] == previous[l]));
         k[l] = over ? next : k[l];
@@ -356,7 +379,7 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::sample(Counters& counted
     #pragma omp simd reduction(+ : samples) reduction(| : some, end, none)
     for (int l = 0; l < N; l++) {
         const float f = (float)k[l];
-        const float x = min(max(ox[l] + f * dx[l], 0.f), mx), y = min(max(oy[l] + f * dy[l], 0.f), my), z = min(max(oz[l] + f * dz[l], 0.f), mz);
+        const float x = clamp(ox[l] + f * dx[l], 0.f, mx), y = clamp(oy[l] + f * dy[l], 0.f, my), z = clamp(oz[l] + f * dz[l], 0.f, mz);
         const int i = min((int)x, cx), j = min((int)y, cy), h = min((int)z, cz);
         const float fx = x - i, fy = y - j, fz = z - h;
         const int q = (h * ly + j) * lx + i;
@@ -372,18 +395,20 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::sample(Counters& counted
             best[l] = better ? found : best[l];
             where[l] = better ? k[l] : where[l];
         } else {
-            const float e = min(max((found - low) * scale, 0.f), top);  // NaN becomes an entry, whose opacity is not taken
+            const float e = clamp((found - low) * scale, 0.f, top);  // NaN becomes an entry, whose opacity is not taken
             const int t = (int)e;
             const float one = table[4 * t + 3], other = table[4 * t + 7], opacity = one + (e - t) * (other - one);
             at[l] = e;
-            alpha[l] = on[l] & known ? opacity : 0.f;
-            some |= alpha[l] > 0;
+            const float taken = opacity * (float)(on[l] & known);
+            alpha[l] = taken;
+            some |= taken > 0;
         }
         if (WANTED & SHADED) {
             const float e0 = d0 + fy * (d1 - d0), e1 = d2 + fy * (d3 - d2);
-            gx[l] = (e0 + fz * (e1 - e0)) * wx;
-            gy[l] = ((p1 - p0) + fz * ((p3 - p2) - (p1 - p0))) * wy;
-            gz[l] = (s1 - s0) * wz;
+            const float ex = (e0 + fz * (e1 - e0)) * wx, ey = ((p1 - p0) + fz * ((p3 - p2) - (p1 - p0))) * wy, ez = (s1 - s0) * wz;
+            gx[l] = known ? ex : 0.f;  // 0 times what a cell without values shades as would not be 0
+            gy[l] = known ? ey : 0.f;
+            gz[l] = known ? ez : 0.f;
         }
         px[l] = x; py[l] = y; pz[l] = z;
         samples += on[l];
@@ -405,22 +430,23 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::composite(Counters& coun
         const float share = at[l] - (int)at[l];
         float cr = table[t] + share * (table[t + 4] - table[t]), cg = table[t + 1] + share * (table[t + 5] - table[t + 1]);
         float cb = table[t + 2] + share * (table[t + 6] - table[t + 2]);
-        Light light = {1, 1};
-        if (WANTED & LIT) light = light_at(m, px[l], py[l], pz[l]);
+        float lamp = 1, around = 1;
+        if (WANTED & LIT) lamp = light_at(m, 0, px[l], py[l], pz[l]), around = light_at(m, 1, px[l], py[l], pz[l]);
         if (WANTED & SHADED) {
-            const Shade lit = shade(*this, l, gx[l], gy[l], gz[l], light);
-            cr = cr * lit.factor + lit.shine; cg = cg * lit.factor + lit.shine; cb = cb * lit.factor + lit.shine;
+            const float x = gx[l], y = gy[l], z = gz[l], one = size_of(phong, x, y, z);
+            const float factor = phong.ambient * around + lamp * scattered(phong, x * tox[l] + y * toy[l] + z * toz[l], one);
+            const float shine = lamp * mirrored(phong, x * hx[l] + y * hy[l] + z * hz[l], one);
+            cr = cr * factor + shine; cg = cg * factor + shine; cb = cb * factor + shine;
             gradients += alpha[l] > 0;
         } else if (WANTED & LIT) {
-            const float share_of_light = light.lamp * light.around;
-            cr *= share_of_light; cg *= share_of_light; cb *= share_of_light;
+            const float factor = lamp * around;
+            cr *= factor; cg *= factor; cb *= factor;
         }
         const float w = (1 - a[l]) * alpha[l];
-        const int visible = alpha[l] > 0;  // not 0 times what a cell without values shades as
         a[l] += w;
-        r[l] += visible ? w * cr : 0.f;
-        g[l] += visible ? w * cg : 0.f;
-        b[l] += visible ? w * cb : 0.f;
+        r[l] += w * cr;
+        g[l] += w * cg;
+        b[l] += w * cb;
     }
     counted.gradients += gradients;
 }
@@ -480,7 +506,7 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::march(Counters& counted)
     for (int l = 0; l < N; l++) {
         flush(l);
         if (!(WANTED & MAXIMUM) || !(best[l] > -FAR)) continue;
-        const double e = min(max((best[l] - m.low) * m.scale, 0.0), (double)(m.entries - 1));
+        const double e = clamp((best[l] - m.low) * m.scale, 0.0, (double)(m.entries - 1));
         const float* entry = m.table + 4 * (int)e;
         const double share = e - (int)e;
         red[l] = entry[0] + share * (entry[4] - entry[0]);
@@ -523,8 +549,21 @@ template <int WANTED> FHASH_INLINE void tiles(const FhashMarch& m, int64_t first
                 }
 }
 
+// Not FHASH_CLONES: clones cannot be told that gathering from memory is quick on a machine that has all of AVX-512.
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
+#define FHASH_KERNEL(NAME, WANTED)                                                                                                       \
+    __attribute__((target("arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512"))) void NAME##_v4(                               \
+        const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }                \
+    __attribute__((target("arch=x86-64-v3,tune=haswell"))) void NAME##_v3(                                                               \
+        const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }                \
+    void NAME##_v1(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }      \
+    void NAME(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) {                                                    \
+        (__builtin_cpu_supports("x86-64-v4") ? NAME##_v4 : __builtin_cpu_supports("x86-64-v3") ? NAME##_v3 : NAME##_v1)(m, first, stop, counted); \
+    }
+#else
 #define FHASH_KERNEL(NAME, WANTED) \
     FHASH_CLONES void NAME(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }
+#endif
 FHASH_KERNEL(plain, 0)
 FHASH_KERNEL(shaded, SHADED)
 FHASH_KERNEL(lit, LIT)

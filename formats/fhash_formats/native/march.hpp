@@ -18,7 +18,7 @@ extern "C" struct FhashMarch {
     const float* highest;         // (z, y, x) of bricks: largest value, for the maximum along a ray; null: all may hold it
     std::int64_t bricks[3], brick;  // bricks along z, y, x; cells along a brick's side
     const float* table;           // (entries + 1, 4): red, green, blue, opacity of one step; the last entry twice
-    const double* extinction;     // (entries + 1,): of a step
+    const double* extinction;     // (entries + 1,): of one step
     std::int64_t entries;
     double low, scale;            // the entry of a value is (value - low) * scale
     const float* light;           // (z, y, x, 2): light from the lamp and from around that reaches a place; null for all of it

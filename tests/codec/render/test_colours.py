@@ -5,6 +5,7 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 import pytest
+from PIL import ImageColor
 
 from fhash_codec.render.colour_maps import COLOUR_MAPS
 from fhash_codec.render.colour_spaces import hsv_to_rgb, lab_to_rgb, rgb_to_hsv, rgb_to_lab
@@ -99,3 +100,8 @@ def test_a_rescaled_map_reaches_exactly_to_its_ends() -> None:
     assert colours.positions[[0, -1]].tolist() == [-273.15, 1e6]
     huge = named_map("viridis").rescaled(-1.7e308, 1.7e308)
     np.testing.assert_allclose(huge(0.0), named_map("viridis")(0.5), rtol=0, atol=1e-9)
+
+
+def test_a_name_that_pillow_has_looked_up_is_still_known():
+    assert ImageColor.getrgb("tomato") == (255, 99, 71)
+    assert parse_colour("tomato") == (1.0, 99 / 255, 71 / 255)

@@ -1,0 +1,195 @@
+"""Marching in packets of rays by the native library (formats/fhash_formats/native/march.cpp)."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import POINTER, c_double, c_float, c_int32, c_int64
+from itertools import count
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.render.bricks import SIDE, Bricks
+from fhash_codec.render.setting import Setting, empty_table
+from fhash_codec.render.task import Frame, Marched, Table, Task
+from fhash_formats.container.parallel import in_threads, usable_threads
+
+__all__ = ["MOST_SURFACES", "march_native"]
+
+MOST_SURFACES = 64
+"""In one picture: FHASH_SURFACES of march.hpp."""
+MOST_VALUES = 2**31 - 1
+"""Of a frame, for the vectors' indices of 32 bits."""
+ENTRIES = 4000
+"""Of a table, at least."""
+POWERS = 1024
+TILE = 16
+GROUP = 8
+"""Tiles that a thread takes at a time."""
+SHADED, LIT, MAXIMUM = 1, 2, 4
+
+_Three = c_double * 3
+_Pair = c_double * 2
+_Ends = _Pair * 3
+_Five = c_double * 5
+
+
+class _March(ctypes.Structure):
+    """FhashMarch of march.hpp, field by field."""
+
+    _fields_ = (
+        ("values", POINTER(c_float)),
+        ("shape", c_int64 * 3),
+        ("distance", POINTER(c_int32)),
+        ("highest", POINTER(c_float)),
+        ("bricks", c_int64 * 3),
+        ("brick", c_int64),
+        ("table", POINTER(c_float)),
+        ("extinction", POINTER(c_double)),
+        ("entries", c_int64),
+        ("low", c_double),
+        ("scale", c_double),
+        ("light", POINTER(c_float)),
+        ("light_shape", c_int64 * 3),
+        ("light_offset", _Three),
+        ("light_scale", c_double),
+        ("eye", _Three),
+        ("right", _Three),
+        ("up", _Three),
+        ("forward", _Three),
+        ("box", _Ends),
+        ("seen", _Ends),
+        ("spacing", _Three),
+        ("width", c_int64),
+        ("height", c_int64),
+        ("parallel", c_int64),
+        ("rays", c_int64),
+        ("step", c_double),
+        ("threshold", c_double),
+        ("jitter", c_int64),
+        ("lamp", _Three),
+        ("ambient", c_double),
+        ("diffuse", c_double),
+        ("specular", c_double),
+        ("steep", c_double),
+        ("gradient", _Three),
+        ("floor", c_double),
+        ("powers", POINTER(c_float)),
+        ("surfaces", c_int64),
+        ("surface", _Five * MOST_SURFACES),
+        ("out", POINTER(c_float)),
+        ("depth", POINTER(c_float)),
+        ("normal", POINTER(c_float)),
+    )
+
+
+def march_native(library: ctypes.CDLL, frame: Frame, task: Task, bricks: Bricks, threads: int | None = None) -> Marched:
+    """The picture of a task, as `march` describes it."""
+    setting = Setting.of(frame, task, bricks)
+    table = task.table or empty_table(setting.low, setting.high)
+    width, height = task.rays.size
+    rgba = np.zeros((height, width, 4), dtype=np.float32)
+    depth = np.full((height, width), np.inf, dtype=np.float32) if task.depth or task.normal else None
+    normal = np.zeros((height, width, 3), dtype=np.float32) if task.normal else None
+    entries, extinctions = _entries(table, task.step)
+    # A step longer than a brick could pass through one in which a surface lies, from one in which nothing does to another.
+    leap = task.step / float(np.abs(setting.spacing).min()) > SIDE and bool(task.surfaces)
+    distance = bricks.distance(task) if task.skipping and not task.maximum and not leap else None
+    highest = bricks.high if task.skipping and task.maximum and setting.values is bricks.values else None
+    light = None if task.light is None else np.ascontiguousarray(task.light.shares, dtype=np.float32)
+    lighting = task.lighting
+    steep = max(1.0, lighting.specular_power / 16) if lighting is not None else 1.0
+    cosines = np.maximum(1 - np.arange(POWERS + 2) / (POWERS * steep), 0.0)
+    powers = (cosines ** (lighting.specular_power if lighting is not None else 1.0)).astype(np.float32)
+    surfaces = [_Five(level, *surface.colour, surface.opacity) for level, surface in zip(setting.levels, task.surfaces, strict=True)]
+    given = _March(
+        values=_floats(setting.values),
+        shape=setting.values.shape,
+        distance=None if distance is None else distance.ctypes.data_as(POINTER(c_int32)),
+        highest=_floats(highest),
+        bricks=bricks.low.shape,
+        brick=SIDE,
+        table=_floats(entries),
+        extinction=extinctions.ctypes.data_as(POINTER(c_double)),
+        entries=len(entries) - 1,
+        low=setting.low,
+        scale=(len(entries) - 2) / (setting.high - setting.low),
+        light=_floats(light),
+        light_shape=(0, 0, 0) if light is None else light.shape[:3],
+        light_offset=_Three(*setting.light_offset),
+        light_scale=setting.light_scale,
+        eye=_Three(*setting.eye),
+        right=_Three(*setting.right),
+        up=_Three(*setting.up),
+        forward=_Three(*setting.forward),
+        box=_Ends(*(_Pair(*ends) for ends in setting.box)),
+        seen=_Ends(*(_Pair(*ends) for ends in setting.seen)),
+        spacing=_Three(*setting.spacing),
+        width=width,
+        height=height,
+        parallel=task.rays.parallel,
+        rays=task.antialiasing,
+        step=task.step,
+        threshold=task.threshold,
+        jitter=task.jitter,
+        lamp=_Three(*(lighting.lamp if lighting is not None and lighting.lamp is not None else (0.0, 0.0, 0.0))),
+        ambient=lighting.ambient if lighting is not None else 1.0,
+        diffuse=lighting.diffuse if lighting is not None else 0.0,
+        specular=lighting.specular if lighting is not None else 0.0,
+        steep=steep,
+        gradient=_Three(*setting.gradient),
+        floor=setting.floor,
+        powers=_floats(powers),
+        surfaces=0 if task.maximum else len(surfaces),
+        surface=(_Five * MOST_SURFACES)(*surfaces),
+        out=_floats(rgba),
+        depth=_floats(depth),
+        normal=_floats(normal),
+    )
+    wanted = MAXIMUM if task.maximum else SHADED * task.shaded | LIT * (light is not None)
+    tiles = -(-width // TILE) * -(-height // TILE)
+    groups = count()
+
+    def work(_: int) -> npt.NDArray[np.int64]:
+        counters = np.zeros(5, dtype=np.int64)
+        while (first := next(groups) * GROUP) < tiles:
+            failed = library.fhash_march(
+                ctypes.byref(given),
+                c_int64(wanted),
+                c_int64(first),
+                c_int64(min(first + GROUP, tiles)),
+                ctypes.c_void_p(counters.ctypes.data),
+            )
+            assert not failed
+        return counters
+
+    workers = max(1, min(threads or usable_threads(), -(-tiles // GROUP)))
+    found = work(0) if workers == 1 else sum(in_threads(work, range(workers)), np.zeros(5, dtype=np.int64))
+    rays, passes, samples, gradients, skipped = (int(number) for number in found)
+    counters = {
+        "rays": rays,
+        "passes": passes,
+        "samples": samples,
+        "evaluations": 0,
+        "gradients": gradients,
+        "secondary_rays": 0,
+        "skipped_bricks": skipped,
+    }
+    return Marched(rgba=rgba, depth=depth if task.depth else None, normal=normal, counters=counters)
+
+
+def _entries(table: Table, step: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:
+    """Colours and opacities (n + 1, 4), and extinctions (n + 1,), of a step; the last entry twice.
+
+    They lie so close that opacity is linear between them as extinction is.
+    """
+    last = len(table.extinctions) - 1
+    places = np.append(np.linspace(0, last, last * -(-ENTRIES // last) + 1), last)
+    columns = [np.interp(places, np.arange(last + 1), column) for column in table.colours.T]
+    extinctions = np.interp(places, np.arange(last + 1), table.extinctions) * step
+    return np.stack([*columns, -np.expm1(-extinctions)], axis=-1).astype(np.float32), extinctions
+
+
+def _floats(array: npt.NDArray[np.float32] | None) -> object:
+    """A pointer that keeps its array; null for None."""
+    return None if array is None else array.ctypes.data_as(POINTER(c_float))

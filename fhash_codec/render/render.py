@@ -1,0 +1,186 @@
+"""Pictures of a volume: plan, decode, light, march, draw around."""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.coreset import Box
+from fhash_codec.progress import Progress, silent
+from fhash_codec.render.bricks import Bricks
+from fhash_codec.render.camera import Grid
+from fhash_codec.render.counters import complete
+from fhash_codec.render.fields import Field, FrameField, NetworkField
+from fhash_codec.render.image import Image
+from fhash_codec.render.light import light_grid
+from fhash_codec.render.march import march
+from fhash_codec.render.opacity import Histogram
+from fhash_codec.render.overlay import overlay, time_text
+from fhash_codec.render.plan import Plan, Units
+from fhash_codec.render.scene import Scene
+from fhash_codec.render.stream import stream
+from fhash_codec.render.task import Frame, Marched
+from fhash_codec.volume import Volume
+
+__all__ = ["Renderer", "render"]
+
+MEMORY = 2 << 30
+"""Bytes of decoded frames that a renderer keeps."""
+BINS = 512
+COARSE = 2**18
+"""Vertices of a level of detail that is enough for a histogram."""
+
+
+def render(volume: Volume, scene: Scene | None = None, *, progress: Progress = silent) -> Image:
+    """A picture of a volume; the scene's defaults suit the feature of the file.
+
+    Raises InputError for a scene that cannot be drawn, RegionError for a step or time outside the series.
+    """
+    return Renderer(volume).render(Scene() if scene is None else scene, progress=progress)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Decoded:
+    frame: Frame
+    region: Box
+    bricks: Bricks
+
+    @property
+    def nbytes(self) -> int:
+        return self.frame.values.nbytes
+
+
+class Renderer:
+    """Makes pictures of one volume, and keeps what it decoded for the next ones, up to `memory` bytes.
+
+    Not for several threads at once.
+    """
+
+    def __init__(self, volume: Volume, *, memory: int = MEMORY, threads: int | None = None) -> None:
+        self.volume, self.memory, self.threads = volume, memory, threads
+        self.grid = Grid.of(volume.coords)
+        self._decoded: OrderedDict[tuple[float, int], _Decoded] = OrderedDict()
+        self._histogram: Histogram | None = None
+
+    def plan(self, scene: Scene) -> Plan:
+        """What a picture of a scene would take; raises InputError or RegionError as `render` does."""
+        return Plan.of(self.volume, scene, grid=self.grid, histogram=self.histogram)
+
+    def render(self, scene: Scene | None = None, *, plan: Plan | None = None, progress: Progress = silent) -> Image:
+        """A picture of a scene, or of a plan that was made for it."""
+        begin = time.perf_counter()
+        plan = plan if plan is not None else self.plan(Scene() if scene is None else scene)
+        task = plan.task
+        lit: dict[str, int] = {}
+        frame = self._frame(plan, progress) if plan.mode == "cache" or plan.lights or self.volume.profile == "compact" else None
+        if plan.lights:
+            assert frame is not None
+            progress("lighting", 0, 1, "")
+            light = light_grid(frame.frame, self.grid, task.table, shadows=plan.shadows, lamp=plan.lamp, ambient_occlusion=plan.occlusion)
+            task, lit = replace(task, light=light), {"secondary_rays": light.secondary_rays}
+            progress("lighting", 1, 1, "")
+        if plan.mode == "cache":
+            assert frame is not None
+            progress("marching", 0, 1, "")
+            marched = march(frame.frame, task, bricks=frame.bricks, threads=self.threads)
+            progress("marching", 1, 1, "")
+        else:
+            field: Field = (
+                FrameField(frame.frame, self.grid, frame.bricks)
+                if frame is not None and self.volume.profile == "compact"
+                else NetworkField(self.volume, plan.step, plan.units)
+            )
+            marched = stream(field, task, adaptive=plan.mode == "arm", budget=plan.scene.march.samples_per_pass, progress=progress)
+        return self._finished(plan, marched, lit, begin)
+
+    def histogram(self) -> Histogram:
+        """How frequent values are in the series: of its first, middle and last step, coarse where the file has levels of detail."""
+        if self._histogram is None:
+            volume = self.volume
+            last = volume.shape[0] - 1
+            edges = np.linspace(volume.value_range.low, volume.value_range.high, BINS + 1)
+            counts = np.zeros(BINS, dtype=np.int64)
+            if volume.profile == "compact":
+                size = float(np.prod([high - low for low, high in volume.box]))
+                lod = 0
+                while size / 8**lod > COARSE:
+                    lod += 1
+                frames = [volume.read_lod(step, lod) for step in sorted({0, last // 2, last})]
+            else:
+                frames = [volume.read(last // 2)]
+            for frame in frames:
+                counts += np.histogram(np.clip(frame[np.isfinite(frame)], edges[0], edges[-1]), edges)[0]
+            self._histogram = edges, counts
+        return self._histogram
+
+    def _frame(self, plan: Plan, progress: Progress) -> _Decoded:
+        """The decoded frame of a plan, from those that are kept if one of them holds its region."""
+        key = (plan.step, plan.lod)
+        kept = self._decoded.get(key)
+        if kept is not None and all(a <= c and d <= b for (a, b), (c, d) in zip(kept.region, plan.region, strict=True)):
+            self._decoded.move_to_end(key)
+            return kept
+        progress("decoding", 0, 1, "")
+        frame = decoded_frame(self.volume, plan.step, plan.lod, plan.region, plan.units)
+        made = _Decoded(frame=frame, region=plan.region, bricks=Bricks.of(frame))
+        progress("decoding", 1, 1, "")
+        self._decoded.pop(key, None)
+        while self._decoded and sum(each.nbytes for each in self._decoded.values()) + made.nbytes > self.memory:
+            self._decoded.popitem(last=False)
+        if made.nbytes <= self.memory:
+            self._decoded[key] = made
+        return made
+
+    def _finished(self, plan: Plan, marched: Marched, lit: dict[str, int], begin: float) -> Image:
+        volume = self.volume
+        image = Image(
+            rgba=marched.rgba,
+            depth=marched.depth,
+            normal=marched.normal,
+            counters=complete(marched.counters, lit),
+            scene=plan.scene.to_dict(),
+            source=volume.path.name,
+        )
+        units = "" if volume.units in ("", "1") else f" [{volume.units}]"
+        label = time_text(plan.step, plan.time, str(volume.coords["t"].attributes.get("units", "")))
+        drawn = overlay(
+            image,
+            plan.scene.effects,
+            plan.task.rays,
+            colours=plan.function.colours,
+            quantity=f"{volume.name}{units}",
+            coords=volume.coords,
+            label=label,
+        )
+        return replace(drawn, seconds=time.perf_counter() - begin)
+
+
+def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Units) -> Frame:
+    """The values of a region of the feature bounding box at a step, of every 2^lod-th vertex, as a marcher takes them."""
+    inner: Box = tuple(  # type: ignore[assignment]
+        (max(low, first), min(high, last)) for (low, high), (first, last) in zip(region, volume.box, strict=True)
+    )
+    if any(low >= high for low, high in inner):
+        # Nothing of the feature is in the picture.
+        low, _ = zip(*volume.box, strict=True)
+        return Frame(values=np.full((1, 1, 1), np.nan, dtype=np.float32), first=(low[0], low[1], low[2]), stride=1 << lod)
+    if lod == 0:
+        values, first = volume.read(step, inner), [low for low, _ in inner]
+    else:
+        vertices = volume.lod_vertices(lod, inner)
+        first = [part.start for part in vertices]
+        before, after = int(np.floor(step)), int(np.ceil(step))
+        values = volume.read_lod(before, lod, inner)
+        if after != before:
+            share = volume.key_times.key_index(step) - volume.key_times.key_index(before)
+            values = values * (1 - share) + volume.read_lod(after, lod, inner) * share
+    return Frame(values=_single(values, units), first=(first[0], first[1], first[2]), stride=1 << lod)
+
+
+def _single(values: npt.NDArray[np.floating], units: Units) -> npt.NDArray[np.float32]:
+    plain = values if units == Units() else units.to(values)
+    return np.ascontiguousarray(plain, dtype=np.float32)

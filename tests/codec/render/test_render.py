@@ -1,0 +1,180 @@
+"""Pictures of whole files: the function, what a renderer keeps, the counters."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec import Renderer, Scene, Volume
+from fhash_codec.render import render as module
+from fhash_codec.render.counters import COUNTERS, complete, rows
+from fhash_codec.render.image import scene_in_png
+from fhash_codec.render.plan import Units
+from fhash_formats import native
+
+pytestmark = pytest.mark.skipif(native.library() is None, reason="marched natively")
+SMALL = {"size": [40, 32]}
+
+
+def scene(**parts: Any) -> Scene:
+    return Scene.from_dict({**SMALL, **parts})
+
+
+def test_the_package_is_the_function(volume: Volume) -> None:
+    image = fhash_codec.render(volume, scene())
+    assert image.rgba.shape == (32, 40, 4)
+    assert image.rgba[..., 3].max() > 0.1
+    assert image.source == volume.path.name
+    assert image.seconds > 0
+    assert image._repr_png_().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import fhash_codec; f = fhash_codec.render",
+        "import fhash_codec.render.scene; f = fhash_codec.render",
+        "import fhash_codec.render.render; f = fhash_codec.render",
+        "from fhash_codec import render as f; import fhash_codec.render.scene as s; s.Scene()",
+        "from fhash_codec import *; f = render; from fhash_codec.render.scene import Scene",
+    ],
+)
+def test_the_package_is_the_function_whatever_was_imported_before(statement: str) -> None:
+    subprocess.run(
+        [sys.executable, "-c", f"{statement}; assert callable(f); import fhash_codec; assert fhash_codec.render is f"], check=True
+    )
+
+
+def test_a_picture_is_what_its_file_says(volume: Volume, tmp_path: Path) -> None:
+    wanted = scene(effects={"box": True, "colour_bar": True}, step=1)
+    image = fhash_codec.render(volume, wanted)
+    image.save(tmp_path / "view.png")
+    assert scene_in_png(tmp_path / "view.png") == wanted
+    again = fhash_codec.render(volume, scene_in_png(tmp_path / "view.png"))
+    np.testing.assert_array_equal(again.rgba, image.rgba)
+
+
+def test_what_was_decoded_is_kept(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[float] = []
+    original = module.decoded_frame
+
+    def counted(volume: Volume, step: float, *others: Any) -> Any:
+        decoded.append(step)
+        return original(volume, step, *others)
+
+    monkeypatch.setattr(module, "decoded_frame", counted)
+    first = renderer.render(scene())
+    renderer.render(scene(camera={"azimuth": 40}))
+    renderer.render(scene(step=2))
+    last = renderer.render(scene())
+    assert decoded == [0, 2]
+    np.testing.assert_array_equal(first.rgba, last.rgba)
+
+
+def test_what_does_not_fit_is_not_kept(volume: Volume) -> None:
+    frame = int(np.prod(volume.shape[1:])) * 4
+    small = Renderer(volume, memory=frame + 10)
+    for step in (0, 1, 2):
+        small.render(scene(step=step))
+    assert [key[0] for key in small._decoded] == [2]
+    none = Renderer(volume, memory=10)
+    assert none.render(scene()).rgba[..., 3].any()
+    assert not none._decoded
+
+
+def test_a_part_of_the_volume_makes_the_picture_of_all(volume: Volume) -> None:
+    volume.chunks = (1, 4, 4, 4)
+    close = scene(camera={"zoom": 6, "projection": "parallel", "view": "xy"})
+    renderer = Renderer(volume)
+    frame = renderer._frame(renderer.plan(close), lambda *_: None).frame
+    assert frame.values.size < np.prod(volume.shape[1:])
+    part = renderer.render(close)
+    full = Renderer(volume)
+    full.render(scene())
+    np.testing.assert_allclose(full.render(close).rgba, part.rgba, atol=1e-5)
+
+
+def test_nothing_in_the_picture_is_an_empty_picture(volume: Volume) -> None:
+    away = scene(camera={"position": [100, 100, 100], "focal_point": [200, 200, 200]})
+    for mode in ("cache", "arm"):
+        image = fhash_codec.render(volume, scene(camera=away.camera.to_dict(), march={"mode": mode}))
+        assert not image.rgba.any()
+        assert image.counters["samples"] == 0
+
+
+def test_a_step_between_is_the_mean_of_values(volume: Volume) -> None:
+    frame = module.decoded_frame(volume, 0.5, 0, ((0, 20), (0, 24), (0, 28)), Units())
+    np.testing.assert_allclose(frame.values, (volume.read(0) + volume.read(1)) / 2, atol=1e-5)
+    coarse = module.decoded_frame(volume, 0.5, 1, ((0, 20), (0, 24), (0, 28)), Units())
+    np.testing.assert_allclose(coarse.values, (volume.read_lod(0, 1) + volume.read_lod(1, 1)) / 2, atol=1e-5)
+    assert coarse.stride == 2
+
+
+def test_what_lies_outside_the_coreset_is_not_seen(files: dict[str, Path]) -> None:
+    with fhash_codec.open(files["feature"]) as volume:
+        frame = module.decoded_frame(volume, 0.0, 0, ((0, 20), (0, 24), (0, 28)), Units())
+        assert np.isnan(frame.values).any()
+        assert frame.first == tuple(low for low, _ in volume.box)
+        image = fhash_codec.render(volume, scene(transfer_function={"opacity": "opaque"}))
+        assert 0 < (image.rgba[..., 3] > 0.5).mean() < 0.5
+
+
+def test_counters_prove_the_plan(renderer: Renderer) -> None:
+    plain = renderer.render(scene()).counters
+    assert list(plain) == list(COUNTERS)
+    assert plain["gradients"] == plain["secondary_rays"] == plain["evaluations"] == 0
+    assert plain["samples"] > 0
+    shaded = renderer.render(scene(effects={"shading": True})).counters
+    assert {**shaded, "gradients": 0} == plain
+    assert 0 < shaded["gradients"] <= shaded["samples"]
+    assert renderer.render(scene(effects={"box": True, "time_label": True})).counters == plain
+
+
+def test_light_costs_secondary_rays_and_nothing_else(renderer: Renderer) -> None:
+    plain, shaded = (renderer.render(scene(effects=effects)) for effects in ({}, {"shading": True}))
+    for name in ("shadows", "ambient_occlusion"):
+        dark = renderer.render(scene(effects={name: True}))
+        assert dark.counters["secondary_rays"] > 0
+        assert {**dark.counters, "secondary_rays": 0} == plain.counters
+        np.testing.assert_allclose(dark.rgba[..., 3], plain.rgba[..., 3], atol=1e-6)
+        assert dark.rgba[..., :3].sum() < plain.rgba[..., :3].sum()
+        both = renderer.render(scene(effects={name: True, "shading": True}))
+        assert both.counters == {**shaded.counters, "secondary_rays": dark.counters["secondary_rays"]}
+        assert renderer.render(scene(effects={name: {"strength": 0}})).counters == plain.counters
+
+
+def test_where_there_is_no_volume_there_is_no_light_to_take_away(renderer: Renderer) -> None:
+    surface = {"isosurfaces": [{"value": 5}]}
+    alone = {"transfer_function": {"nothing": True}}
+    lit, dark = (renderer.render(scene(effects={**surface, **more}, **alone)) for more in ({}, {"shadows": True}))
+    assert lit.counters["secondary_rays"] == dark.counters["secondary_rays"] == 0
+
+
+def test_the_histogram_does_not_depend_on_the_step(renderer: Renderer) -> None:
+    first, last = (renderer.plan(scene(step=step)).function for step in (0, 2))
+    np.testing.assert_array_equal(first.points, last.points)
+    edges, counts = renderer.histogram()
+    assert counts.sum() > 0
+    assert len(edges) == len(counts) + 1
+
+
+def test_counters_are_complete_and_known() -> None:
+    assert complete({"rays": 2}, {"rays": 3, "samples": 1}) == {**dict.fromkeys(COUNTERS, 0), "rays": 5, "samples": 1}
+    with pytest.raises(KeyError):
+        complete({"raise": 1})
+    assert rows({"samples": 12345})[2][1] == "12,345"
+
+
+def test_progress_is_reported(volume: Volume) -> None:
+    said: list[tuple[str, int, int]] = []
+    Renderer(volume).render(scene(march={"mode": "arm"}), progress=lambda stage, done, total, note: said.append((stage, done, total)))
+    assert said[0][0] == "decoding"
+    assert said[-1][0] == "marching"
+    assert all(0 <= done <= total for _, done, total in said)
+    assert said[-1][1] == said[-1][2]
