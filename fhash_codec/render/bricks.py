@@ -19,7 +19,8 @@ __all__ = ["SIDE", "Bricks"]
 
 Single = npt.NDArray[np.float32]
 
-SIDE = 8
+SIDE = 4
+"""Cells: with twice as many a narrow interval takes up to twice the samples."""
 FARTHEST = 255
 """Bricks that a ray passes over at once, at most."""
 ROUNDING = 2.0**-22

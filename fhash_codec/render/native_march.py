@@ -26,6 +26,8 @@ POWERS = 1024
 TILE = 16
 GROUP = 8
 """Tiles that a thread takes at a time."""
+LEAST_SKIPPED = 0.4
+"""Of the bricks, those of which nothing can be seen: of fewer, looking for them takes longer than marching through them."""
 SHADED, LIT, MAXIMUM = 1, 2, 4
 
 _Three = c_double * 3
@@ -95,6 +97,8 @@ def march_native(library: ctypes.CDLL, frame: Frame, task: Task, bricks: Bricks,
     # A step longer than a brick could pass through one in which a surface lies, from one in which nothing does to another.
     leap = task.step / float(np.abs(setting.spacing).min()) > SIDE and bool(task.surfaces)
     distance = bricks.distance(task) if task.skipping and not task.maximum and not leap else None
+    if distance is not None and np.count_nonzero(distance) < LEAST_SKIPPED * distance.size:
+        distance = None
     highest = bricks.high if task.skipping and task.maximum and setting.values is bricks.values else None
     light = None if task.light is None else np.ascontiguousarray(task.light.shares, dtype=np.float32)
     lighting = task.lighting
