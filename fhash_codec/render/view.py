@@ -71,15 +71,11 @@ def _seen(rays: Rays) -> Floats | None:
             normals.append(normal)
             offsets.append(-float(normal @ place))
     normal, offset = np.array(normals), np.array(offsets)
-    corners = []
     tolerance = 1e-9 * float(np.abs(bounds).max() + np.abs(rays.eye).max())
-    for three in itertools.combinations(range(len(normal)), 3):
-        chosen = normal[list(three)]
-        if abs(np.linalg.det(chosen)) < 1e-12:
-            continue
-        place = np.linalg.solve(chosen, -offset[list(three)])
-        if np.all(normal @ place + offset >= -tolerance):
-            corners.append(place)
+    threes = np.array(list(itertools.combinations(range(len(normal)), 3)))
+    threes = threes[np.abs(np.linalg.det(normal[threes])) >= 1e-12]
+    places = np.linalg.solve(normal[threes], -offset[threes][..., None])[..., 0]
+    corners = list(places[np.all(places @ normal.T + offset >= -tolerance, axis=1)])
     if not rays.parallel and np.all((rays.eye >= bounds[:, 0]) & (rays.eye <= bounds[:, 1])):
         corners.append(rays.eye)
     return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)], axis=-1) if corners else None
