@@ -98,4 +98,5 @@ def _brick_text(plan: Plan) -> str:
     ]
     if plan.task.maximum:
         wanted = ["can hold a larger value than was met", *wanted[1:]]
-    return f"only those that {' or '.join(wanted)}"
+    rare = "" if plan.task.maximum or plan.mode != "cache" else "; all, where few could be passed over"
+    return f"only those that {' or '.join(wanted)}{rare}"

@@ -11,6 +11,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning, Renderer, Volume
+from fhash_formats import native
 
 SHAPE = (3, 20, 24, 28)
 
@@ -21,6 +22,16 @@ def blobs() -> np.ndarray:
     first = 9 * np.exp(-((z - 9) ** 2 + (y - 10) ** 2 + (x - 9 + 2 * t) ** 2) / 14)
     second = 7 * np.exp(-((z - 12) ** 2 + (y - 14) ** 2 + (x - 19 - 2 * t) ** 2) / 10)
     return (first + second + 0.05 * np.sin(x / 3)).astype(np.float32)
+
+
+@pytest.fixture(params=["native", "portable"])
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Each way to compute: by the native library, and without it."""
+    if request.param == "portable":
+        monkeypatch.setenv("FHASH_NATIVE", "0")
+    elif native.library() is None:
+        pytest.skip("no native library")
+    return str(request.param)
 
 
 @pytest.fixture(scope="session")

@@ -7,15 +7,6 @@ from fhash_codec.render.bricks import FARTHEST, SIDE, Bricks
 from fhash_codec.render.camera import Grid, Rays
 from fhash_codec.render.scene import Camera
 from fhash_codec.render.task import Frame, Surface, Table, Task
-from fhash_formats import native
-
-
-@pytest.fixture(params=["native", "portable"])
-def way(request, monkeypatch):
-    if request.param == "portable":
-        monkeypatch.setenv("FHASH_NATIVE", "0")
-    elif native.library() is None:
-        pytest.skip("no native library")
 
 
 def bricks_of(values):

@@ -13,14 +13,6 @@ from fhash_formats.errors import InputError
 UP = np.array([0.0, 0.0, 1.0])
 
 
-@pytest.fixture(params=["native", "portable"])
-def way(request, monkeypatch):
-    if request.param == "portable":
-        monkeypatch.setenv("FHASH_NATIVE", "0")
-    elif native.library() is None:
-        pytest.skip("no native library")
-
-
 def frame_of(values, stride=1):
     return Frame(values=np.asarray(values, dtype=np.float32), first=(0, 0, 0), stride=stride)
 

@@ -20,16 +20,6 @@ FRONT = Camera(view="xy", projection="parallel")
 WHITE = np.ones(3)
 
 
-@pytest.fixture(params=["native", "portable"])
-def way(request, monkeypatch):
-    """Each way to march."""
-    if request.param == "portable":
-        monkeypatch.setenv("FHASH_NATIVE", "0")
-    elif native.library() is None:
-        pytest.skip("no native library")
-    return request.param
-
-
 def frame_of(values):
     return Frame(values=np.asarray(values, dtype=np.float32), first=(0, 0, 0))
 
