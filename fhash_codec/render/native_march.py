@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from ctypes import POINTER, c_double, c_float, c_int32, c_int64
-from itertools import count
+from itertools import count, product
 
 import numpy as np
 import numpy.typing as npt
@@ -151,23 +151,23 @@ def march_native(library: ctypes.CDLL, frame: Frame, task: Task, bricks: Bricks,
         normal=_floats(normal),
     )
     wanted = MAXIMUM if task.maximum else SHADED * task.shaded | LIT * (light is not None)
-    tiles = -(-width // TILE) * -(-height // TILE)
+    spans = _spans(task)
     groups = count()
 
     def work(_: int) -> npt.NDArray[np.int64]:
         counters = np.zeros(5, dtype=np.int64)
-        while (first := next(groups) * GROUP) < tiles:
+        while (group := next(groups)) < len(spans):
             failed = library.fhash_march(
                 ctypes.byref(given),
                 c_int64(wanted),
-                c_int64(first),
-                c_int64(min(first + GROUP, tiles)),
+                c_int64(spans[group][0]),
+                c_int64(spans[group][1]),
                 ctypes.c_void_p(counters.ctypes.data),
             )
             assert not failed
         return counters
 
-    workers = max(1, min(threads or usable_threads(), -(-tiles // GROUP)))
+    workers = max(1, min(threads or usable_threads(), len(spans)))
     found = work(0) if workers == 1 else sum(in_threads(work, range(workers)), np.zeros(5, dtype=np.int64))
     rays, passes, samples, gradients, skipped = (int(number) for number in found)
     counters = {
@@ -180,6 +180,22 @@ def march_native(library: ctypes.CDLL, frame: Frame, task: Task, bricks: Bricks,
         "skipped_bricks": skipped,
     }
     return Marched(rgba=rgba, depth=depth if task.depth else None, normal=normal, counters=counters)
+
+
+def _spans(task: Task) -> list[tuple[int, int]]:
+    """Tiles of the picture, first and stop in rows, of the rectangle around the box: all other rays miss it."""
+    width, height = task.rays.size
+    across, down = -(-width // TILE), -(-height // TILE)
+    with np.errstate(all="ignore"):
+        pixels, depth = task.rays.project(np.array(list(product(*task.rays.grid.bounds))))
+    left, top, right, bottom = 0, 0, across, down
+    if np.isfinite(pixels).all() and (task.rays.parallel or np.all(depth > 1e-6 * depth.max())):
+        # Rounding is far below a pixel.
+        low, high = np.floor((pixels.min(axis=0) - 1) / TILE), np.ceil((pixels.max(axis=0) + 1) / TILE)
+        left, top = (int(min(max(at, 0), most)) for at, most in zip(low, (across, down), strict=True))
+        right, bottom = (int(min(max(at, 0), most)) for at, most in zip(high, (across, down), strict=True))
+    rows = (range(row * across + left, row * across + right, GROUP) for row in range(top, bottom))
+    return [(first, min(first + GROUP, row.stop)) for row in rows for first in row]
 
 
 def _entries(table: Table, step: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:

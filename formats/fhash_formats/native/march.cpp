@@ -526,12 +526,15 @@ template <int WANTED> FHASH_INLINE void tiles(const FhashMarch& m, int64_t first
         for (int64_t y = tile / across * TILE; y < min(tile / across * TILE + TILE, m.height); y += SIDE)
             for (int64_t x = tile % across * TILE; x < min(tile % across * TILE + TILE, m.width); x += SIDE)
                 for (int64_t ray = 0; ray < rays * rays; ray++) {
+                    int met = 0;
                     for (int l = 0; l < N; l++) {
                         const int64_t i = min(x + l % SIDE, m.width - 1), j = min(y + l / SIDE, m.height - 1);
                         packet.aim(l, i + (ray % rays + 0.5) / rays, j + (ray / rays + 0.5) / rays, (j * m.width + i) * rays * rays + ray);
                         if (x + l % SIDE >= m.width || y + l / SIDE >= m.height) packet.count[l] = 0;
-                        counted.rays += packet.count[l] > packet.k[l];
+                        met += packet.count[l] > packet.k[l];
                     }
+                    if (!met) continue;
+                    counted.rays += met;
                     packet.march(counted);
                     for (int l = 0; l < N; l++) {
                         const int64_t i = x + l % SIDE, j = y + l / SIDE, at = j * m.width + i;
