@@ -12,6 +12,13 @@
 #endif
 #include "march.hpp"
 
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
+#define FHASH_AVX512 __attribute__((target("arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512")))
+#pragma GCC diagnostic ignored "-Wuninitialized"  // by the header of GCC 12 itself
+#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
+#include <immintrin.h>
+#endif
+
 namespace {
 
 using std::int32_t;
@@ -24,7 +31,7 @@ template <class T> FHASH_INLINE T max(T a, T b) { return a < b ? b : a; }
 template <class T> FHASH_INLINE T clamp(T x, T low, T high) { const T some = x > low ? x : low; return some < high ? some : high; }
 
 constexpr int N = 16, SIDE = 4, TILE = 16, BLOCK = 32;
-constexpr int SHADED = 1, LIT = 2, MAXIMUM = 4;
+constexpr int SHADED = 1, LIT = 2, MAXIMUM = 4, WIDE = 8;  // WIDE: sampled by AVX-512, in frames of two columns or more
 const double ENDLESS = std::numeric_limits<double>::infinity();
 const float NONE = std::numeric_limits<float>::quiet_NaN(), FAR = std::numeric_limits<float>::infinity();
 
@@ -62,6 +69,7 @@ template <int WANTED> struct Packet {
     alignas(64) float tox[N], toy[N], toz[N], hx[N], hy[N], hz[N];                    // towards the light; halfway between it and the eye
     alignas(64) float r[N], g[N], b[N], a[N], left[N], depth[N], previous[N];  // colours and opacity of the block; light behind those before
     alignas(64) float gx[N], gy[N], gz[N], at[N], value[N], alpha[N], px[N], py[N], pz[N], best[N];
+    alignas(64) float cr[N], cg[N], cb[N];  // colours of the samples, where WIDE
     alignas(64) int k[N], count[N], last[N], on[N], where[N];  // sample, their number, the one of the shorter step, and of the maximum
     double red[N], green[N], blue[N], clear[N], rest[N], begin[N], entered[N], leaving[N], from[N];
     double o[3][N], d[3][N], normal[3][N];
@@ -293,7 +301,12 @@ template <int WANTED> void Packet<WANTED>::mend() {
         value[l] = (float)here.value;
         at[l] = (float)clamp((here.value - m.low) * m.scale, 0.0, (double)(m.entries - 1));
         const int t = (int)at[l];
-        alpha[l] = m.table[4 * t + 3] + (at[l] - t) * (m.table[4 * t + 7] - m.table[4 * t + 3]);
+        const float* const entry = m.table + 4 * t;
+        const float share = at[l] - t;
+        alpha[l] = entry[3] + share * (entry[7] - entry[3]);
+        cr[l] = entry[0] + share * (entry[4] - entry[0]);
+        cg[l] = entry[1] + share * (entry[5] - entry[1]);
+        cb[l] = entry[2] + share * (entry[6] - entry[2]);
         const bool known = here.gx == here.gx && here.gy == here.gy && here.gz == here.gz;
         gx[l] = known ? (float)(here.gx * m.gradient[0]) : 0.f;
         gy[l] = known ? (float)(here.gy * m.gradient[1]) : 0.f;
@@ -338,7 +351,22 @@ template <int WANTED> FHASH_INLINE int Packet<WANTED>::skip(Counters& counted) {
     const int cx = max(lx - 2, 0), cy = max(ly - 2, 0), cz = max(lz - 2, 0), keeping = m.surfaces > 0;
     const int32_t* const distance = m.distance;
     const float* const highest = m.highest;
-    int here = 0, alive = 0, skipped = 0;
+    int here = 0, alive = 0, skipped = 0, any = 0;
+    // Most passes skip nothing: then no more is worked out, and what follows does not wait for the bricks.
+    #pragma omp simd reduction(| : any, here)
+    for (int l = 0; l < N; l++) {
+        const float f = (float)k[l];
+        const int going = k[l] < count[l];
+        const float x = clamp(ox[l] + f * dx[l], 0.f, mx), y = clamp(oy[l] + f * dy[l], 0.f, my), z = clamp(oz[l] + f * dz[l], 0.f, mz);
+        const int jx = (int)((float)min((int)x, cx) * part), jy = (int)((float)min((int)y, cy) * part);
+        const int jz = (int)((float)min((int)z, cz) * part), q = (jz * by + jy) * bx + jx;
+        const int away = WANTED & MAXIMUM ? !(highest[q] > best[l]) : distance[q] > 0;
+        any |= going & away & !(keeping & (previous[l] == previous[l]));
+        on[l] = going;
+        here |= going;
+    }
+    if (!any) return here ? 3 : 0;
+    here = 0;
     #pragma omp simd reduction(| : here, alive) reduction(+ : skipped)
     for (int l = 0; l < N; l++) {
         const float f = (float)k[l];
@@ -421,32 +449,144 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::sample(Counters& counted
     lost = none;
 }
 
+#if defined(FHASH_AVX512)
+// a + share * (b - a)
+FHASH_AVX512 inline __attribute__((always_inline)) __m512 between(__m512 a, __m512 b, __m512 share) {
+    return _mm512_fmadd_ps(share, _mm512_sub_ps(b, a), a);
+}
+
+// A place along an axis, clamped to 0..most; what is not a number becomes 0.
+FHASH_AVX512 inline __attribute__((always_inline)) __m512 place(const float* origin, const float* step, __m512 sample, __m512 most) {
+    const __m512 at = _mm512_add_ps(_mm512_load_ps(origin), _mm512_mul_ps(sample, _mm512_load_ps(step)));
+    return _mm512_min_ps(_mm512_max_ps(at, _mm512_setzero_ps()), most);
+}
+
+// The values of 16 vertices and of those behind them along x. A load for both: gathering counts loads, not bytes.
+FHASH_AVX512 inline __attribute__((always_inline)) void pairs(const float* v, __m512i q, __m512& first, __m512& second) {
+    const __m512 low = _mm512_castpd_ps(_mm512_i32gather_pd(_mm512_castsi512_si256(q), v, 4));
+    const __m512 high = _mm512_castpd_ps(_mm512_i32gather_pd(_mm512_extracti64x4_epi64(q, 1), v, 4));
+    const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+    first = _mm512_permutex2var_ps(low, even, high);
+    second = _mm512_permutex2var_ps(low, _mm512_add_epi32(even, _mm512_set1_epi32(1)), high);
+}
+
+// The entries of 16 lanes, four floats each, as four vectors.
+FHASH_AVX512 inline __attribute__((always_inline)) void entries(const float* table, const int* t, __m512 (&out)[4]) {
+    __m512 row[4];
+    for (int n = 0; n < 4; n++) {
+        row[n] = _mm512_castps128_ps512(_mm_loadu_ps(table + t[n]));
+        row[n] = _mm512_insertf32x4(row[n], _mm_loadu_ps(table + t[n + 4]), 1);
+        row[n] = _mm512_insertf32x4(row[n], _mm_loadu_ps(table + t[n + 8]), 2);
+        row[n] = _mm512_insertf32x4(row[n], _mm_loadu_ps(table + t[n + 12]), 3);
+    }
+    const __m512 a = _mm512_unpacklo_ps(row[0], row[1]), b = _mm512_unpacklo_ps(row[2], row[3]);
+    const __m512 c = _mm512_unpackhi_ps(row[0], row[1]), d = _mm512_unpackhi_ps(row[2], row[3]);
+    out[0] = _mm512_shuffle_ps(a, b, 0x44);
+    out[1] = _mm512_shuffle_ps(a, b, 0xee);
+    out[2] = _mm512_shuffle_ps(c, d, 0x44);
+    out[3] = _mm512_shuffle_ps(c, d, 0xee);
+}
+
+// As `sample`, and the colours.
+template <int WANTED> FHASH_AVX512 __attribute__((noinline))
+void sample_wide(Packet<WANTED>& p, Counters& counted, int& seen, int& ending, int& lost) {
+    const FhashMarch& m = p.m;
+    const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
+    const int sy = ly > 1 ? lx : 0, sz = lz > 1 ? lx * ly : 0;
+    const __m512 zero = _mm512_setzero_ps();
+    const __m512i k = _mm512_load_si512(p.k);
+    const __mmask16 on = _mm512_test_epi32_mask(_mm512_load_si512(p.on), _mm512_load_si512(p.on));
+    const __m512 f = _mm512_cvtepi32_ps(k);
+    const __m512 x = place(p.ox, p.dx, f, _mm512_set1_ps((float)(lx - 1))), y = place(p.oy, p.dy, f, _mm512_set1_ps((float)(ly - 1)));
+    const __m512 z = place(p.oz, p.dz, f, _mm512_set1_ps((float)(lz - 1)));
+    const __m512i i = _mm512_min_epi32(_mm512_cvttps_epi32(x), _mm512_set1_epi32(lx - 2));
+    const __m512i j = _mm512_min_epi32(_mm512_cvttps_epi32(y), _mm512_set1_epi32(max(ly - 2, 0)));
+    const __m512i h = _mm512_min_epi32(_mm512_cvttps_epi32(z), _mm512_set1_epi32(max(lz - 2, 0)));
+    const __m512 fx = _mm512_sub_ps(x, _mm512_cvtepi32_ps(i)), fy = _mm512_sub_ps(y, _mm512_cvtepi32_ps(j));
+    const __m512 fz = _mm512_sub_ps(z, _mm512_cvtepi32_ps(h));
+    const __m512i row = _mm512_add_epi32(_mm512_mullo_epi32(h, _mm512_set1_epi32(ly)), j);
+    const __m512i q = _mm512_add_epi32(_mm512_mullo_epi32(row, _mm512_set1_epi32(lx)), i);
+    __m512 a0, a1, a2, a3, b0, b1, b2, b3;
+    pairs(m.values, q, a0, a1);
+    pairs(m.values + sy, q, a2, a3);
+    pairs(m.values + sz, q, b0, b1);
+    pairs(m.values + sz + sy, q, b2, b3);
+    const __m512 d0 = _mm512_sub_ps(a1, a0), d1 = _mm512_sub_ps(a3, a2), d2 = _mm512_sub_ps(b1, b0), d3 = _mm512_sub_ps(b3, b2);
+    const __m512 p0 = _mm512_fmadd_ps(fx, d0, a0), p1 = _mm512_fmadd_ps(fx, d1, a2);
+    const __m512 p2 = _mm512_fmadd_ps(fx, d2, b0), p3 = _mm512_fmadd_ps(fx, d3, b2);
+    const __m512 s0 = between(p0, p1, fy), s1 = between(p2, p3, fy), found = between(s0, s1, fz);
+    const __mmask16 known = _mm512_cmp_ps_mask(found, found, _CMP_ORD_Q);
+    _mm512_store_ps(p.value, found);
+    if (WANTED & MAXIMUM) {
+        const __mmask16 better = on & _mm512_cmp_ps_mask(found, _mm512_load_ps(p.best), _CMP_GT_OQ);
+        _mm512_mask_store_ps(p.best, better, found);
+        _mm512_mask_store_epi32(p.where, better, k);
+    } else {
+        __m512 e = _mm512_mul_ps(_mm512_sub_ps(found, _mm512_set1_ps((float)m.low)), _mm512_set1_ps((float)m.scale));
+        e = _mm512_min_ps(_mm512_max_ps(e, zero), _mm512_set1_ps((float)(m.entries - 1)));
+        const __m512i t = _mm512_cvttps_epi32(e);
+        const __m512 share = _mm512_sub_ps(e, _mm512_cvtepi32_ps(t));
+        alignas(64) int places[N];
+        _mm512_store_si512(places, _mm512_slli_epi32(t, 2));
+        __m512 one[4], other[4];
+        entries(m.table, places, one);
+        entries(m.table + 4, places, other);
+        const __m512 alpha = _mm512_maskz_mov_ps(on & known, between(one[3], other[3], share));
+        _mm512_store_ps(p.at, e);
+        _mm512_store_ps(p.alpha, alpha);
+        _mm512_store_ps(p.cr, between(one[0], other[0], share));
+        _mm512_store_ps(p.cg, between(one[1], other[1], share));
+        _mm512_store_ps(p.cb, between(one[2], other[2], share));
+        seen = _mm512_cmp_ps_mask(alpha, zero, _CMP_GT_OQ) != 0;
+    }
+    if (WANTED & SHADED) {
+        const __m512 e0 = between(d0, d1, fy), e1 = between(d2, d3, fy);
+        const __m512 ey = between(_mm512_sub_ps(p1, p0), _mm512_sub_ps(p3, p2), fz);
+        _mm512_store_ps(p.gx, _mm512_maskz_mul_ps(known, between(e0, e1, fz), _mm512_set1_ps((float)m.gradient[0])));
+        _mm512_store_ps(p.gy, _mm512_maskz_mul_ps(known, ey, _mm512_set1_ps((float)m.gradient[1])));
+        _mm512_store_ps(p.gz, _mm512_maskz_mul_ps(known, _mm512_sub_ps(s1, s0), _mm512_set1_ps((float)m.gradient[2])));
+    }
+    _mm512_store_ps(p.px, x);
+    _mm512_store_ps(p.py, y);
+    _mm512_store_ps(p.pz, z);
+    counted.samples += __builtin_popcount(on);
+    lost = (on & ~known) != 0;
+    ending = (on & _mm512_cmpeq_epi32_mask(k, _mm512_load_si512(p.last))) != 0;
+}
+#endif
+
 template <int WANTED> FHASH_INLINE void Packet<WANTED>::composite(Counters& counted) {
     const float* const table = m.table;
     int gradients = 0;
     #pragma omp simd reduction(+ : gradients)
     for (int l = 0; l < N; l++) {
-        const int t = 4 * (int)at[l];
-        const float share = at[l] - (int)at[l];
-        float cr = table[t] + share * (table[t + 4] - table[t]), cg = table[t + 1] + share * (table[t + 5] - table[t + 1]);
-        float cb = table[t + 2] + share * (table[t + 6] - table[t + 2]);
+        float red, green, blue;
+        if (WANTED & WIDE) {
+            red = cr[l]; green = cg[l]; blue = cb[l];
+        } else {
+            const int t = 4 * (int)at[l];
+            const float share = at[l] - (int)at[l];
+            red = table[t] + share * (table[t + 4] - table[t]);
+            green = table[t + 1] + share * (table[t + 5] - table[t + 1]);
+            blue = table[t + 2] + share * (table[t + 6] - table[t + 2]);
+        }
         float lamp = 1, around = 1;
         if (WANTED & LIT) lamp = light_at(m, 0, px[l], py[l], pz[l]), around = light_at(m, 1, px[l], py[l], pz[l]);
         if (WANTED & SHADED) {
             const float x = gx[l], y = gy[l], z = gz[l], one = size_of(phong, x, y, z);
             const float factor = phong.ambient * around + lamp * scattered(phong, x * tox[l] + y * toy[l] + z * toz[l], one);
             const float shine = lamp * mirrored(phong, x * hx[l] + y * hy[l] + z * hz[l], one);
-            cr = cr * factor + shine; cg = cg * factor + shine; cb = cb * factor + shine;
+            red = red * factor + shine; green = green * factor + shine; blue = blue * factor + shine;
             gradients += alpha[l] > 0;
         } else if (WANTED & LIT) {
             const float factor = lamp * around;
-            cr *= factor; cg *= factor; cb *= factor;
+            red *= factor; green *= factor; blue *= factor;
         }
         const float w = (1 - a[l]) * alpha[l];
         a[l] += w;
-        r[l] += w * cr;
-        g[l] += w * cg;
-        b[l] += w * cb;
+        r[l] += w * red;
+        g[l] += w * green;
+        b[l] += w * blue;
     }
     counted.gradients += gradients;
 }
@@ -472,7 +612,11 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::march(Counters& counted)
         }
         counted.passes++;
         int seen = 0, ending = 0, lost = 0;
-        sample(counted, seen, ending, lost);
+#if defined(FHASH_AVX512)
+        if constexpr (WANTED & WIDE) sample_wide(*this, counted, seen, ending, lost);
+        else
+#endif
+            sample(counted, seen, ending, lost);
         if (WANTED & MAXIMUM) {
             if (lost)
                 for (int l = 0; l < N; l++) {
@@ -500,8 +644,14 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::march(Counters& counted)
             since = 0;
             for (int l = 0; l < N; l++) flush(l);
         }
-        #pragma omp simd
-        for (int l = 0; l < N; l++) k[l] = left[l] * (1 - a[l]) < stop ? count[l] : k[l];
+        // Branches, so that processors begin the next pass before this one's opacity is known.
+        int ended = 0;
+        #pragma omp simd reduction(| : ended)
+        for (int l = 0; l < N; l++) ended |= (left[l] * (1 - a[l]) < stop) & (k[l] < count[l]);
+        if (ended) {
+            #pragma omp simd
+            for (int l = 0; l < N; l++) k[l] = left[l] * (1 - a[l]) < stop ? count[l] : k[l];
+        }
     }
     for (int l = 0; l < N; l++) {
         flush(l);
@@ -553,15 +703,18 @@ template <int WANTED> FHASH_INLINE void tiles(const FhashMarch& m, int64_t first
 }
 
 // Not FHASH_CLONES: clones cannot be told that gathering from memory is quick on a machine that has all of AVX-512.
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
+#if defined(FHASH_AVX512)
 #define FHASH_KERNEL(NAME, WANTED)                                                                                                       \
-    __attribute__((target("arch=x86-64-v4,tune=icelake-server,prefer-vector-width=512"))) void NAME##_v4(                               \
-        const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }                \
+    FHASH_AVX512 void NAME##_v4(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) {                                   \
+        tiles<(WANTED) | WIDE>(m, first, stop, counted);                                                                                 \
+    }                                                                                                                                    \
     __attribute__((target("arch=x86-64-v3,tune=haswell"))) void NAME##_v3(                                                               \
         const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }                \
     void NAME##_v1(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }      \
     void NAME(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) {                                                    \
-        (__builtin_cpu_supports("x86-64-v4") ? NAME##_v4 : __builtin_cpu_supports("x86-64-v3") ? NAME##_v3 : NAME##_v1)(m, first, stop, counted); \
+        (__builtin_cpu_supports("x86-64-v4") && m.shape[2] > 1 ? NAME##_v4                                                               \
+         : __builtin_cpu_supports("x86-64-v3")                 ? NAME##_v3                                                               \
+                                                               : NAME##_v1)(m, first, stop, counted);                                    \
     }
 #else
 #define FHASH_KERNEL(NAME, WANTED) \
