@@ -19,7 +19,7 @@ import numpy.typing as npt
 from fhash_codec.progress import Progress, silent
 from fhash_codec.render.animation import Animation
 from fhash_codec.render.film import FILMS, check_film, film
-from fhash_codec.render.image import Image, scene_in_png
+from fhash_codec.render.image import Image, digest_in_png, scene_in_png
 from fhash_codec.render.scene import Scene
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
@@ -63,7 +63,7 @@ def animate(
     """Render every picture of an animation: to NAME.0000.png and so on for an output NAME.png, to a film for NAME.mp4 and NAME.gif.
 
     pictures: NAME.png; the numbered pictures of a film are written too, and kept. A numbered picture that is there, complete, of the same
-    scene and no older than the volume's file is not rendered again; any other is replaced only with `force`.
+    scene and the same volume (by its digest) is not rendered again; any other is replaced only with `force`.
     draw: what renders, `Renderer(volume).render` if None.
     Raises InputError for names of other kinds and what `Animation.scenes` refuses, OutputExistsError before anything is rendered,
     OutputError, MissingDependencyError without the package for MP4.
@@ -101,7 +101,7 @@ def animate(
                 assert draw is not None
                 image = draw(each)
                 counters.update(image.counters)
-                image = dataclasses.replace(image, scene=each.to_dict(), source=str(volume.path))
+                image = dataclasses.replace(image, scene=each.to_dict(), source=str(volume.path), digest=volume.container.digest)
                 if paths:
                     image.save(paths[number], force=force)
                 yield image.to_uint8("#ffffff" if image.background == "transparent" else None)
@@ -137,11 +137,9 @@ def _kept(path: Path, scene: Scene, volume: Volume) -> bool:
             file.seek(-len(END), 2)
             if file.read() != END:
                 return False
-        if path.stat().st_mtime < volume.path.stat().st_mtime:
-            return False
         if not all(path.with_name(f"{path.stem}.{name}.npy").is_file() for name in scene.effects.buffers):
             return False
-        return scene_in_png(path) == scene
+        return digest_in_png(path) == volume.container.digest and scene_in_png(path) == scene
     except (OSError, InputError):
         return False
 

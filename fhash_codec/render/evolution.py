@@ -73,4 +73,11 @@ def evolution(
         counters.update(image.counters)
         seconds += image.seconds
         progress("rendering", number + 1, len(scenes), "")
-    return Image(rgba=rgba, counters=dict(counters), scene=scenes[0].to_dict(), source=str(volume.path), seconds=seconds)
+    return Image(
+        rgba=rgba,
+        counters=dict(counters),
+        scene=scenes[0].to_dict(),
+        source=str(volume.path),
+        digest=volume.container.digest,
+        seconds=seconds,
+    )

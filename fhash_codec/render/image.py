@@ -1,6 +1,7 @@
 """A finished picture: its pixels, the buffers beside them, what they cost, and the scene that they show.
 
-A PNG holds the scene as JSON in an iTXt chunk `fhash.scene` and the name of the volume's file in `fhash.source`.
+A PNG holds the scene as JSON in an iTXt chunk `fhash.scene`, the name of the volume's file in `fhash.source` and its digest in
+`fhash.digest`.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from fhash_codec.render.scene import Scene
 from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.writers.atomic import check_output, replacing_all
 
-__all__ = ["Image", "scene_in_png"]
+__all__ = ["Image", "digest_in_png", "scene_in_png"]
 
 Single = npt.NDArray[np.float32]
 
-SCENE_KEY, SOURCE_KEY = "fhash.scene", "fhash.source"
+SCENE_KEY, SOURCE_KEY, DIGEST_KEY = "fhash.scene", "fhash.source", "fhash.digest"
 LARGEST_TEXT = 2**20
 """Bytes of a scene in a PNG, unpacked."""
 MOST_CHUNKS = 100_000
@@ -41,7 +42,8 @@ class Image:
         depth: float32 (H, W), from the eye along the ray in units of the coordinates, infinite where nothing is; or None.
         normal: float32 (H, W, 3), unit vectors in physical x, y, z, 0 where nothing is; or None.
         counters: what the picture took: rays, passes, samples and so on.
-        scene: as `Scene.to_dict` gives it. source: the name of the volume's file. seconds: of rendering.
+        scene: as `Scene.to_dict` gives it. source: the name of the volume's file, digest: `Container.digest` of it.
+        seconds: of rendering.
     """
 
     rgba: Single
@@ -50,6 +52,7 @@ class Image:
     counters: Mapping[str, int] = field(default_factory=dict)
     scene: Mapping[str, Any] = field(default_factory=dict)
     source: str = ""
+    digest: str = ""
     seconds: float = 0.0
 
     @property
@@ -105,6 +108,8 @@ class Image:
         info.add_itxt(SCENE_KEY, json.dumps(dict(self.scene)))
         if self.source:
             info.add_itxt(SOURCE_KEY, Path(self.source).name)
+        if self.digest:
+            info.add_itxt(DIGEST_KEY, self.digest)
         Pictures.fromarray(self.to_uint8()).save(file, format="PNG", pnginfo=info)
 
     def _repr_png_(self) -> bytes:
@@ -134,6 +139,17 @@ def scene_in_png(path: str | Path) -> Scene:
         raise InputError(f"{path}: {error}") from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: its scene is damaged: {' '.join(str(error).split())}") from error
+
+
+def digest_in_png(path: str | Path) -> str:
+    """The digest of the volume that a picture is of; empty where it has none. Raises InputError for a file that is no PNG."""
+    from PIL import Image as Pictures
+
+    try:
+        with Pictures.open(path, formats=("PNG",)) as picture:
+            return str(picture.info.get(DIGEST_KEY, ""))
+    except (OSError, ValueError, SyntaxError) as error:
+        raise InputError(f"{path}: not a PNG: {error}") from error
 
 
 def _scene_text(path: Path, file: BinaryIO) -> bytes:

@@ -144,6 +144,7 @@ class Renderer:
             counters=complete(marched.counters, lit),
             scene=plan.scene.to_dict(),
             source=volume.path.name,
+            digest=volume.container.digest,
         )
         units = "" if volume.units in ("", "1") else f" [{volume.units}]"
         label = time_text(plan.step, plan.time, str(volume.coords["t"].attributes.get("units", "")))

@@ -41,12 +41,14 @@ class Container:
     Attributes:
         path: as given.
         size: bytes of the file.
+        digest: hexadecimal SHA-256 of its directory, which holds a checksum of everything: files of another content have another.
         header: the attribute "fhash" of the root (FORMAT.md).
         arrays: StoredArray by name, in the order of the file.
     """
 
     path: Path
     size: int
+    digest: str
     header: dict[str, Any]
     arrays: Mapping[str, StoredArray]
 
@@ -58,6 +60,9 @@ class Container:
         try:
             with damage_named(path):
                 members = read_members(source)
+                signature = find_signature(source)
+                assert signature is not None
+                self.digest = signature[1].rpartition(b"=")[2].decode("ascii")
                 self._documents = sum(member.name.endswith("zarr.json") for member in members.values())
                 found = read_hierarchy(source, members)
                 validate_header(found.header)
