@@ -135,7 +135,7 @@ def run_animation(
     if Path(output).suffix.lower() != ".png":
         raise InputError(f"{output}: an evolution is one picture and is written as .png; use such a name")
     check_writable(output, force, sources=[volume.path])
-    steps = steps_of(volume, options.evolution)
+    steps = steps_of(volume, options.evolution, "--evolution")
     image = evolution(volume, shown, steps, columns=options.columns, progress=progress)
     paths = [str(path) for path in image.save(output, force=force)]
     followed = follow(volume, tracked, steps) if tracked else []

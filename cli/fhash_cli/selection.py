@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 Span = tuple[int, int]
 
 
-def steps_of(volume: Volume, chosen: slice | None) -> list[float]:
+def steps_of(volume: Volume, chosen: slice | None, option: str = "--t") -> list[float]:
     """Indices of the steps of a slice, all of them for None; raises RegionError for a slice that leaves the series or holds nothing."""
     count = volume.shape[0]
     chosen = chosen if chosen is not None else slice(None)
-    low, high = _span("--t", chosen.start, chosen.stop, count, f"the series has steps 0 to {count - 1}")
+    low, high = _span(option, chosen.start, chosen.stop, count, f"the series has steps 0 to {count - 1}")
     return [float(step) for step in range(low, high, chosen.step or 1)]
 
 
