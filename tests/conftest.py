@@ -6,6 +6,8 @@ import signal
 # The tests' models are tiny: a second thread costs more than it brings, above all where several test runs share a machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# A shell starts a job in the background with Ctrl-C ignored, and some tests press it.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell starts a job in the background with Ctrl-C ignored, nohup one with SIGHUP ignored, and some tests send both.
+for _name, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+    _number = getattr(signal, _name, None)
+    if _number is not None and signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _usual)
