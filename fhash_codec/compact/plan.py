@@ -137,7 +137,7 @@ def plan(
     way = replace(way, passes=2 if config.effort > 2 else 1, rounds=0 if config.effort == 1 else 2 if config.effort < 7 else 4)
     if not blocks.complete:
         way = replace(way, rounds=2, filled=True)
-        sample = surroundings.race(sample, settings, way, goal, thorough)
+        sample = surroundings.race(sample, settings, way, goal, thorough) if config.effort > 1 else sample.filled(settings, thorough)
     outcomes: list[Outcome] = []
     settings, outcome = solve(sample, settings, way, goal, tries=3 if config.effort == 1 else 5, tried=outcomes)
     if goal.psnr is None and outcome.count:
