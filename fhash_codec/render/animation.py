@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +17,7 @@ from fhash_codec.render.poses import CameraPath
 from fhash_codec.render.record import Record, limits
 from fhash_codec.render.scene import Camera, Effects, Scene, TransferFunctionSpec
 from fhash_codec.volume import Volume
-from fhash_formats.errors import InputError, MissingInputError, RegionError
+from fhash_formats.errors import InputError, RegionError
 
 __all__ = ["Animation", "Key", "mixed"]
 
@@ -77,16 +75,7 @@ class Animation(Record):
     @classmethod
     def load(cls, path: str | Path) -> Animation:
         """From a file: TOML by its suffix .toml, else JSON. Raises InputError."""
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-            return cls.from_dict(tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text))
-        except FileNotFoundError as error:
-            raise MissingInputError(f"{path}: no such animation; write a file's name or {FORMS}, separated by commas") from error
-        except (OSError, ValueError, RecursionError) as error:
-            if isinstance(error, InputError):
-                raise InputError(f"{path}: {error}") from error
-            raise InputError(f"{path}: not an animation: {error}") from error
+        return cls.read(Path(path), "an animation", f"no such animation; write a file's name or {FORMS}, separated by commas")
 
     @classmethod
     def parse(cls, text: str, volume: Volume) -> Animation:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from fhash_codec.render.task import Task
 
-__all__ = ["Beams"]
+__all__ = ["Beams", "shares", "slab"]
 
 Floats = npt.NDArray[np.float64]
 Numbers = npt.NDArray[np.int64]
@@ -51,13 +51,13 @@ class Beams:
         w = 1 - 2 * (j + (part // side + 0.5) / side) / height
         eye, direction = rays.rays(u, w)
         direction = direction / np.linalg.norm(direction * rays.grid.spacing, axis=1, keepdims=True)
-        enter, leave = _slab(eye, direction, rays.grid.bounds)
-        first, stop = _slab(eye, direction, within)
+        enter, leave = slab(eye, direction, rays.grid.bounds)
+        first, stop = slab(eye, direction, within)
         hit = (leave > enter) & (stop >= first)
         enter, leave, first, stop = (np.where(hit, end, 0.0) for end in (enter, leave, np.maximum(first, enter), np.minimum(stop, leave)))
         steps = (leave - enter) / task.step
         count = np.ceil(np.minimum(steps, 2.0**62)).astype(np.int64)
-        share = _shares((j * width + i) * side * side + part) if task.jitter else np.full(len(u), 0.5)
+        share = shares((j * width + i) * side * side + part) if task.jitter else np.full(len(u), 0.5)
         depth = enter + share * task.step
         entered, leaving = ((place - enter) / task.step - share for place in (first, stop))
         begin = np.where(first > enter, np.ceil(entered), 0.0)
@@ -84,7 +84,7 @@ class Beams:
         return np.clip(origin + at[..., None] * pace, self.bounds[:, 0], self.bounds[:, 1])
 
 
-def _slab(origin: Floats, direction: Floats, bounds: Floats) -> tuple[Floats, Floats]:
+def slab(origin: Floats, direction: Floats, bounds: Floats) -> tuple[Floats, Floats]:
     """Where rays (n, 3) enter and leave a box (3, 2), in lengths of their direction; leaving is before entering where they miss it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = (bounds[None] - origin[..., None]) / direction[..., None]
@@ -95,7 +95,7 @@ def _slab(origin: Floats, direction: Floats, bounds: Floats) -> tuple[Floats, Fl
     return np.maximum(low.max(axis=1), 0.0), high.min(axis=1)
 
 
-def _shares(numbers: Numbers) -> Floats:
+def shares(numbers: Numbers) -> Floats:
     """A share 0..1 for each number: the hash lowbias32 of C. Wellons (public domain)."""
     x = numbers.astype(np.uint32)
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):

@@ -1,7 +1,4 @@
-"""Marching in numpy, one sample of every ray at a time: the same picture as the native library's, slower; in float64 throughout.
-
-Its parts are what every other way to march computes, too.
-"""
+"""Marching in numpy, one sample of every ray at a time: the same picture as the native library's, slower; in float64 throughout."""
 
 from __future__ import annotations
 
@@ -10,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.render.beams import shares, slab
 from fhash_codec.render.bricks import SIDE, Bricks
 from fhash_codec.render.setting import Setting, empty_table
 from fhash_codec.render.task import Frame, Lighting, Marched, Table, Task
 
-__all__ = ["Path", "light_at", "looked_up", "march_portable", "paths_of", "shaded", "trilinear"]
+__all__ = ["march_portable"]
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -47,14 +45,6 @@ class Path:
     leaving: Floats
 
 
-def random_shares(numbers: Indices) -> Floats:
-    """A share 0..1 for each ray's number, by a cheap integer hash (lowbias32 by C. Wellons, public domain)."""
-    x = numbers.astype(np.uint32)
-    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
-        x = (x ^ (x >> np.uint32(shift))) * np.uint32(factor)
-    return np.asarray(((x ^ (x >> np.uint32(16))) + 0.5) / 2.0**32, dtype=np.float64)
-
-
 def paths_of(setting: Setting, task: Task, pixels: Indices, ray: int) -> Path:
     """The paths of pixels (n,), counted in rows, of one of the `antialiasing`^2 rays of each."""
     width, height = task.rays.size
@@ -64,12 +54,12 @@ def paths_of(setting: Setting, task: Task, pixels: Indices, ray: int) -> Path:
     eye = setting.eye + (side if task.rays.parallel else 0 * side)
     direction = setting.forward + (0 * side if task.rays.parallel else side)
     direction = direction / np.linalg.norm(direction * setting.spacing, axis=1, keepdims=True)
-    enter, leave = _slab(setting.box, eye, direction)
-    first, stop = _slab(setting.seen, eye, direction)
+    enter, leave = slab(eye, direction, setting.box)
+    first, stop = slab(eye, direction, setting.seen)
     hit = (leave > enter) & (stop > first)
     enter, leave, first, stop = (np.where(hit, ends, 0.0) for ends in (enter, leave, first, stop))
     steps = (leave - enter) / task.step
-    share = random_shares(pixels * rays * rays + ray) if task.jitter else np.full(len(pixels), 0.5)
+    share = shares(pixels * rays * rays + ray) if task.jitter else np.full(len(pixels), 0.5)
     most = np.ceil(steps)
     begin = enter + share * task.step
     some = np.where(first > enter, np.clip(np.ceil((first - enter) / task.step - share), 0, most), 0)
@@ -86,17 +76,6 @@ def paths_of(setting: Setting, task: Task, pixels: Indices, ray: int) -> Path:
         entered=(np.maximum(first, enter) - enter) / task.step - share,
         leaving=(np.minimum(stop, leave) - enter) / task.step - share,
     )
-
-
-def _slab(box: Floats, eye: Floats, direction: Floats) -> tuple[Floats, Floats]:
-    """Distances (n,) at which rays enter and leave a box, not behind the eye; leave <= enter where they miss it."""
-    still = direction == 0
-    divisor = np.where(still, 1.0, direction)
-    one, other = (box[:, 0] - eye) / divisor, (box[:, 1] - eye) / divisor
-    inside = (eye >= box[:, 0]) & (eye <= box[:, 1])
-    near = np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(one, other))
-    far = np.where(still, np.where(inside, np.inf, -np.inf), np.maximum(one, other))
-    return np.maximum(near.max(axis=1), 0.0), far.min(axis=1)
 
 
 def trilinear(values: npt.NDArray[np.float32], places: Floats, gradient: bool = False) -> tuple[Floats, Floats | None]:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import math
+import tomllib
 import types
 import typing
 from collections.abc import Mapping
 from dataclasses import field
 from functools import cache
+from pathlib import Path
 from typing import Any, Self
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, MissingInputError
 
 __all__ = ["Record", "limits"]
 
@@ -47,6 +50,19 @@ class Record:
             if each.name not in values and _default(each) is dataclasses.MISSING:
                 raise InputError(f"{each.name} is missing: {_wanted(each)} is needed")
         return cls(**values)
+
+    @classmethod
+    def read(cls, path: Path, what: str, missing: str) -> Self:
+        """From a file: TOML by its suffix .toml, else JSON. what: it is, missing: what is said where there is none. Raises InputError."""
+        try:
+            text = path.read_text(encoding="utf-8")
+            return cls.from_dict(tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text))
+        except FileNotFoundError as error:
+            raise MissingInputError(f"{path}: {missing}") from error
+        except (OSError, ValueError, RecursionError) as error:
+            if isinstance(error, InputError):
+                raise InputError(f"{path}: {error}") from error
+            raise InputError(f"{path}: not {what}: {error}") from error
 
 
 def limits(default: Any, help: str, *, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()) -> Any:

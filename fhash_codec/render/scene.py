@@ -6,13 +6,11 @@ An effect that the scene does not name is off, and costs nothing. Every record r
 from __future__ import annotations
 
 import dataclasses
-import json
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 from fhash_codec.render.record import Record, limits
-from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.errors import InputError
 
 __all__ = [
     "AmbientOcclusion",
@@ -173,12 +171,4 @@ class Scene(Record):
             from fhash_codec.render.image import scene_in_png
 
             return scene_in_png(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-            return cls.from_dict(tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text))
-        except FileNotFoundError as error:
-            raise MissingInputError(f"{path}: no such scene") from error
-        except (OSError, ValueError, RecursionError) as error:
-            if isinstance(error, InputError):
-                raise InputError(f"{path}: {error}") from error
-            raise InputError(f"{path}: not a scene: {error}") from error
+        return cls.read(path, "a scene", "no such scene")
