@@ -245,5 +245,10 @@ def _lamp(rays: Rays, shading: Shading | None, shadows: Shadows | None) -> Float
 
 def _lighting(shading: Shading, lamp: Floats | None) -> Lighting:
     return Lighting(
-        ambient=shading.ambient, diffuse=shading.diffuse, specular=shading.specular, specular_power=shading.specular_power, lamp=lamp
+        ambient=shading.ambient,
+        diffuse=shading.diffuse,
+        specular=shading.specular,
+        specular_power=shading.specular_power,
+        lamp=lamp,
+        central=shading.gradient == "central",
     )

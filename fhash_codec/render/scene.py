@@ -32,6 +32,7 @@ VIEWS = ("iso", "xy", "xz", "yz", "yx", "zx", "zy")
 """Directions a camera looks from by name, as PyVista has them: `xy` has x to the right and y upwards."""
 MARCHES = ("auto", "cache", "arm", "stream")
 BUFFERS = ("depth", "normal")
+GRADIENTS = ("cell", "central")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,6 +84,7 @@ class Shading(Record):
     specular: float = limits(0.2, "mirrored light", low=0, high=10)
     specular_power: float = limits(16.0, "sharpness of the highlights", low=1, high=1000)
     light: Vector | None = limits(None, "direction towards the light (x, y, z); the camera's if left out")
+    gradient: str = limits("cell", "that within the cell, exact, or central differences over two vertices, smoother", choices=GRADIENTS)
 
 
 @dataclass(frozen=True, kw_only=True)

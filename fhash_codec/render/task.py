@@ -37,13 +37,17 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lighting:
-    """Phong, two-sided. lamp: unit vector (x, y, z) of the coordinates towards the light; None: from the camera along each ray."""
+    """Phong, two-sided. lamp: unit vector (x, y, z) of the coordinates towards the light; None: from the camera along each ray.
+
+    central: by differences between the places one vertex of the frame before and behind along each axis, not by the gradient of the cell.
+    """
 
     ambient: float
     diffuse: float
     specular: float
     specular_power: float
     lamp: Floats | None
+    central: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,0 +1,1 @@
+"""Hard cases: data, settings and scenes on which codecs and renderers break, each with the properties that must hold."""
