@@ -78,4 +78,3 @@ class Case:
     checks: tuple[Check, ...] = ()
     quick: bool = True
     refused: str | None = None
-    notes: str = field(default="")
