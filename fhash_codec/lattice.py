@@ -40,13 +40,15 @@ class Lattice:
         z, y, x = self._array.shape[1:]
         return unpack(bits[0] & bits[-1], (z, y, x))[space]
 
-    def region(self, step: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
-        """Values (z, y, x), float64, of a region of the box at a step; between steps, linear in the step."""
+    def region(self, step: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+        """Values (z, y, x) of a region of the box at a step, as they are stored; between steps, linear in the step, float64."""
         first = int(np.floor(step))
         weight = step - first
         space = tuple(slice(low, high) for low, high in region)
-        steps = self._array.read((slice(first, first + (2 if weight else 1)), *space)).astype(np.float64)
-        values: npt.NDArray[np.float64] = steps[0] if not weight else steps[0] * (1 - weight) + steps[1] * weight
+        steps = self._array.read((slice(first, first + (2 if weight else 1)), *space))
+        if not weight:
+            return steps[0]
+        values: npt.NDArray[np.float64] = steps[0].astype(np.float64) * (1 - weight) + steps[1].astype(np.float64) * weight
         return values
 
     def coarse(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:

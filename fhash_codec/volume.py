@@ -127,7 +127,7 @@ class Volume:
         if found is not None:
             target, local = found
             wanted = self._occupied(key, local)
-            np.copyto(result[target], self._model.region(key, local, wanted).astype(self.dtype), where=wanted)
+            np.copyto(result[target], self._model.region(key, local, wanted).astype(self.dtype, copy=False), where=wanted)
         if outside == "background":
             result[np.isnan(result)] = self.background
         missing = self._missing_at(t)

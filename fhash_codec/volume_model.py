@@ -29,8 +29,8 @@ class VolumeModel(Protocol):
         """Which vertices (z, y, x) of a region are in the coreset between two neighbouring key frames, or at one given twice."""
         ...
 
-    def region(self, key: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
-        """Values (z, y, x) of a region; what stands where `wanted` is False is open."""
+    def region(self, key: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+        """Values (z, y, x) of a region, of any number type; what stands where `wanted` is False is open."""
         ...
 
     def coarse(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
-from threading import Thread
+from threading import Lock
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -43,11 +43,8 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
         while one():
             pass
 
-    # Threads of their own for each call: a pool that outlived it would hang in a process that forked meanwhile.
-    helpers = [Thread(target=every, name="fhash", daemon=True) for _ in range(min(usable_threads(), len(work)) - 1)]
+    helpers = [_pool().submit(every) for _ in range(min(usable_threads(), len(work)) - 1)]
     try:
-        for helper in helpers:
-            helper.start()
         for future in found:
             while not future.done() and one():
                 pass
@@ -55,5 +52,27 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
     finally:
         stopped = True
         for helper in helpers:
-            if helper.ident is not None:
-                helper.join()
+            # One that never began, because all of the pool is busy, has nothing left to do.
+            if not helper.cancel():
+                helper.result()
+
+
+def _pool() -> ThreadPoolExecutor:
+    """Threads that wait for work: starting new ones for every call would take longer than small work itself."""
+    global _threads
+    with _lock:
+        if _threads is None:
+            _threads = ThreadPoolExecutor(max(1, usable_threads() - 1), thread_name_prefix="fhash")
+        return _threads
+
+
+def _forked() -> None:
+    """A forked process has none of its parent's threads, and their pool would hang there."""
+    global _threads, _lock
+    _threads, _lock = None, Lock()
+
+
+_threads: ThreadPoolExecutor | None = None
+_lock = Lock()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)

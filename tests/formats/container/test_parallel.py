@@ -1,46 +1,54 @@
-"""Work in threads: order, failures, and what is left undone."""
+"""Work in threads: order, failures, calls within calls, and processes that fork."""
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
-import time
 
 import pytest
-
 from fhash_formats.container import parallel
 from fhash_formats.container.parallel import in_threads
 
 
-@pytest.mark.parametrize("threads", [1, 2, 4])
-@pytest.mark.parametrize("count", [0, 1, 3, 50])
-def test_results_come_in_the_order_of_the_items(monkeypatch, threads, count):
-    monkeypatch.setattr(parallel, "usable_threads", lambda: threads)
-    assert list(in_threads(lambda item: item * item, range(count))) == [item * item for item in range(count)]
-
-
-def test_the_callers_thread_works_as_well(monkeypatch):
+def test_results_come_in_order_and_from_several_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "usable_threads", lambda: 3)
-    together = threading.Barrier(3, timeout=30)
-    names = list(in_threads(lambda _: (together.wait(), threading.current_thread())[1], range(3)))
-    assert len(set(names)) == 3
-    assert threading.current_thread() in names
+    both = threading.Barrier(2, timeout=60)  # passes only where two threads meet
+
+    def work(item: int) -> int:
+        if item < 2:
+            both.wait()
+        return item * item
+
+    assert list(in_threads(work, range(20))) == [item * item for item in range(20)]
 
 
-@pytest.mark.parametrize("threads", [1, 4])
-def test_the_first_failure_is_raised_and_the_rest_left_undone(monkeypatch, threads):
-    monkeypatch.setattr(parallel, "usable_threads", lambda: threads)
-    begun = []
+def test_calls_within_calls_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "usable_threads", lambda: 3)
+    found = in_threads(lambda outer: sum(in_threads(lambda inner: outer * inner, range(30))), range(30))
+    assert list(found) == [outer * sum(range(30)) for outer in range(30)]
 
-    def work(item):
+
+def test_the_first_failure_is_raised_and_the_rest_is_left() -> None:
+    begun: list[int] = []
+
+    def work(item: int) -> int:
         begun.append(item)
-        time.sleep(0.001)
-        if item >= 3:
-            raise ValueError(str(item))
+        if item == 2:
+            raise ValueError("two")
         return item
 
-    results = in_threads(work, range(1000))
-    assert [next(results) for _ in range(3)] == [0, 1, 2]
-    with pytest.raises(ValueError, match="3"):
-        next(results)
-    assert len(begun) < 1000
-    assert not [thread for thread in threading.enumerate() if thread.name == "fhash"]
+    with pytest.raises(ValueError, match="two"):
+        list(in_threads(work, range(10_000)))
+    assert len(begun) < 10_000
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_forked_process_has_threads_of_its_own() -> None:
+    assert list(in_threads(abs, range(-8, 0)))[0] == 8
+    child = os.fork()
+    if child == 0:
+        signal.alarm(30)  # kills the child where it hangs
+        os._exit(0 if list(in_threads(abs, range(-8, 0)))[-1] == 1 else 1)
+    assert os.waitpid(child, 0)[1] == 0
