@@ -46,9 +46,9 @@ class Lattice:
         weight = step - first
         space = tuple(slice(low, high) for low, high in region)
         steps = self._array.read((slice(first, first + (2 if weight else 1)), *space))
-        if not weight:
-            return steps[0]
-        values: npt.NDArray[np.float64] = steps[0].astype(np.float64) * (1 - weight) + steps[1].astype(np.float64) * weight
+        values: npt.NDArray[Any] = steps[0]
+        if weight:
+            values = values.astype(np.float64) * (1 - weight) + steps[1].astype(np.float64) * weight
         return values
 
     def coarse(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:

@@ -125,6 +125,7 @@ def scene_options(command: Command) -> Command:
         "opacity": "transfer_function.opacity",
         "range": "transfer_function.range",
         "density": "transfer_function.density",
+        "scale": "scale",
         "background": "background",
         "step": "march.step",
         "threshold": "march.threshold",
@@ -146,6 +147,7 @@ def scene_options(command: Command) -> Command:
     @click.option("--position", type=NumbersType(3), help="Where the camera stands, in the coordinates of the series.")
     @click.option("--focal-point", type=NumbersType(3), help="What the camera looks at.")
     @click.option("--view-up", type=NumbersType(3), help="What is upwards in the picture.")
+    @click.option("--scale", type=NumbersType(3), help="Stretch the axes.  [default: one in other units is as long as the rest]")
     @click.option("--cmap", metavar="NAME", help="Colour map, or a ParaView preset (JSON).")
     @click.option("--opacity", type=OpacityType(), help="auto, feature, linear, geom, sigmoid, foreground, opaque, or points.")
     @click.option("--range", type=NumbersType(2), help="Values that the colours reach from and to.")

@@ -154,8 +154,9 @@ class Comparison:
                 ours, theirs = [], []
                 with self._peer(plan, "cpu") as peer:
                     peer.look(plan.task.rays)
-                    for step, values in zip(steps, frames, strict=True):
-                        ours.append(timed(partial(renderer.render, replace(scene, step=step, time=None)))[1])
+                    shown = [replace(scene, step=step, time=None) for step in steps]
+                    for each, following, values in zip(shown, [*shown[1:], None], frames, strict=True):
+                        ours.append(timed(partial(renderer.render, each, upcoming=following))[1])
                         begun = time.perf_counter()
                         peer.load(values)
                         peer.draw()
@@ -187,7 +188,7 @@ class Comparison:
         assert plan.task.table is not None
         peer = VtkPeer(
             self.values,
-            self.renderer.grid,
+            plan.task.rays.grid,
             plan.task.table,
             unit=plan.function.unit_distance,
             size=plan.task.rays.size,

@@ -7,11 +7,11 @@ import re
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -27,7 +27,14 @@ from fhash_formats.writers.atomic import check_output
 
 __all__ = ["Animated", "animate", "numbered"]
 
-Draw = Callable[[Scene], Image]
+
+class Draw(Protocol):
+    """What renders a scene while it prepares another one, as `Renderer.render` does."""
+
+    def __call__(self, scene: Scene, /, *, upcoming: Scene | None = None) -> Image:
+        """The picture."""
+
+
 Pixels = npt.NDArray[np.uint8]
 
 END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
@@ -99,7 +106,8 @@ def animate(
                     yield _pixels(paths[number])
             else:
                 assert draw is not None
-                image = draw(each)
+                following = number + 1 < len(scenes) and not (kept and kept[number + 1])
+                image = draw(each, upcoming=scenes[number + 1] if following else None)
                 counters.update(image.counters)
                 image = dataclasses.replace(image, scene=each.to_dict(), source=str(volume.path), digest=volume.container.digest)
                 if paths:

@@ -143,7 +143,7 @@ class _Way:
         given = [float(key.at) for key in keys if key.at is not None]
         self.at = np.array(given or np.linspace(0, 1, len(self.scenes)))
         cameras = tuple(each.camera for each in self.scenes)
-        self.path = CameraPath(at=self.at, cameras=cameras, grid=Grid.of(volume.coords), size=scene.size)
+        self.path = CameraPath(at=self.at, cameras=cameras, grid=Grid.of(volume.coords, scene.scale), size=scene.size)
         steps = [_step(each, volume) for each in self.scenes]
         self.moments, self.steps = self.at, np.array(steps)
         self.moving = any(step != steps[0] for step in steps)

@@ -8,7 +8,7 @@ picture is as VTK's of the same camera, uneven voxels and descending axes includ
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from fhash_formats.series import Coordinate
 __all__ = ["Grid", "Rays"]
 
 Floats = npt.NDArray[np.float64]
+Vector = tuple[float, float, float]
 
 TOLERANCE = 1e-3
 """Of an axis's extent: coordinates further from even ones are drawn as even ones with a warning."""
@@ -43,16 +44,21 @@ class Grid:
     """Where the vertices are: `counts`, `origin` of the first and `spacing` between two, each (x, y, z).
 
     Spacings are negative where coordinates descend. An axis of one vertex has the mean of the others' and reaches half of it
-    to both sides.
+    to both sides. `scale` (x, y, z) is contained in both: by how much the axes are stretched.
     """
 
     counts: tuple[int, int, int]
     origin: Floats
     spacing: Floats
+    scale: Vector = (1.0, 1.0, 1.0)
 
     @classmethod
-    def of(cls, coords: Mapping[str, Coordinate]) -> Grid:
-        """From a volume's coordinates; warns with FhashWarning where they are not even, and then spreads them evenly."""
+    def of(cls, coords: Mapping[str, Coordinate], scale: Vector | None = None) -> Grid:
+        """From a volume's coordinates; warns with FhashWarning where they are not even, and then spreads them evenly.
+
+        scale: factors by which the axes are stretched. If None they have the lengths of their coordinates, but for an axis in other
+        units than the most have, whose length cannot be compared: its vertices are drawn as far apart as those of the others.
+        """
         axes = [np.asarray(coords[axis].values, dtype=np.float64) for axis in "xyz"]
         spacing = np.full(3, np.nan)
         origin = np.array([values[0] if np.isfinite(values[0]) else 0.0 for values in axes])
@@ -69,9 +75,15 @@ class Grid:
                     continue
                 wrong = "are not evenly spaced; they are drawn as if they were"
             warnings.warn(f"the coordinates {coords['xyz'[number]].name!r} of {'xyz'[number]} {wrong}", FhashWarning, stacklevel=2)
-        known = np.abs(spacing[~np.isnan(spacing)])
-        spacing[np.isnan(spacing)] = known.mean() if known.size else 1.0
-        return cls(counts=(len(axes[0]), len(axes[1]), len(axes[2])), origin=origin, spacing=spacing)
+        flat = np.isnan(spacing)
+        factors = _proportions([coords[axis] for axis in "xyz"], np.abs(spacing)) if scale is None else np.array(scale, dtype=np.float64)
+        spacing[flat] = np.mean(np.abs(spacing * factors)[~flat]) / factors[flat] if not flat.all() else 1.0
+        return cls(
+            counts=(len(axes[0]), len(axes[1]), len(axes[2])),
+            origin=origin * factors,
+            spacing=spacing * factors,
+            scale=(float(factors[0]), float(factors[1]), float(factors[2])),
+        )
 
     @property
     def vertex_spacing(self) -> float:
@@ -181,6 +193,21 @@ class Rays:
         w = from_eye @ up / (up @ up) / scale
         width, height = self.size
         return np.stack([(u + 1) / 2 * width, (1 - w) / 2 * height], axis=-1), depth
+
+
+def _proportions(coords: Sequence[Coordinate], spacing: Floats) -> Floats:
+    """Factors (3,) that leave all axes of the commonest units as they are, and draw vertices of the others as far apart as those."""
+    units = [str(each.attributes.get("units", "")).strip() for each in coords]
+    known = [each for each, length in zip(units, spacing, strict=True) if np.isfinite(length)]
+    factors = np.ones(3)
+    if len(set(known)) < 2 or "" in known:
+        return factors
+    usual = max(known, key=known.count)
+    across = float(np.mean([length for each, length in zip(units, spacing, strict=True) if each == usual and np.isfinite(length)]))
+    for axis, (each, length) in enumerate(zip(units, spacing, strict=True)):
+        if each != usual and np.isfinite(length):
+            factors[axis] = across / length
+    return factors
 
 
 def _upright(away: Floats, upward: Floats) -> tuple[Floats, Floats]:

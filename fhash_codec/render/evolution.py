@@ -5,19 +5,18 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from fhash_codec.progress import Progress, silent
+from fhash_codec.render.animate import Draw
 from fhash_codec.render.image import Image
 from fhash_codec.render.scene import LARGEST_SIDE, Scene
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
 
 __all__ = ["evolution"]
-
-Draw = Callable[[Scene], Image]
 
 GAP = 1 / 64
 """Between two pictures, as a share of their width."""
@@ -66,7 +65,7 @@ def evolution(
     counters: Counter[str] = Counter()
     seconds = 0.0
     for number, each in enumerate(scenes):
-        image = draw(each)
+        image = draw(each, upcoming=scenes[number + 1] if number + 1 < len(scenes) else None)
         row, column = divmod(number, columns)
         top, left = row * (height + gap), column * (width + gap)
         rgba[top : top + height, left : left + width] = image.rgba

@@ -12,18 +12,19 @@ if TYPE_CHECKING:
 __all__ = ["reasons"]
 
 
-def reasons(plan: Plan, volume: Volume, why_lod: str) -> list[tuple[str, str]]:
+def reasons(plan: Plan, volume: Volume) -> list[tuple[str, str]]:
     """What is done and why, a line for each topic."""
     task, scene, effects = plan.task, plan.scene, plan.scene.effects
     width, height = scene.size
     found = [
         ("picture", f"{width} x {height}, {scene.camera.projection}, {task.antialiasing**2} ray(s) for each pixel"),
+        ("proportions", _scale_text(plan)),
         ("time", f"step {plan.step:g}" + ("" if float(plan.step).is_integer() else ", between two: both are decoded")),
         ("march", _mode_text(plan, volume)),
         ("value", _value_text(plan)),
         ("gradient", _gradient_text(plan)),
         ("secondary rays", _secondary_text(plan)),
-        ("level of detail", f"{plan.lod}: {why_lod}"),
+        ("level of detail", f"{plan.lod}: {plan.why_lod}"),
         ("region", "z {}:{}, y {}:{}, x {}:{}".format(*(end for part in plan.region for end in part)) + _region_text(plan, volume)),
         ("bricks", _brick_text(plan)),
         ("rays end", f"where less than {task.threshold:.3g} of the light is left" if task.threshold > 0 else "behind the volume"),
@@ -36,6 +37,14 @@ def reasons(plan: Plan, volume: Volume, why_lod: str) -> list[tuple[str, str]]:
     if around:
         found.append(("around", ", ".join(around) + ": drawn afterwards"))
     return found
+
+
+def _scale_text(plan: Plan) -> str:
+    scale = plan.task.rays.grid.scale
+    if scale == (1.0, 1.0, 1.0):
+        return "those of the coordinates"
+    why = "as the scene says" if plan.scene.scale is not None else "an axis in other units than the rest has its vertices as far apart"
+    return f"x, y, z are stretched by {', '.join(f'{factor:.4g}' for factor in scale)}: {why}"
 
 
 def _mode_text(plan: Plan, volume: Volume) -> str:

@@ -59,7 +59,8 @@ class Plan:
 
     Attributes:
         scene: as given. task: what is marched; its `light` is computed from the frame, where `shadows` or `occlusion` ask for it.
-        step: of the series, fractional between two. time: physical. mode: cache, arm or stream. lod: level of detail.
+        step: of the series, fractional between two. time: physical. mode: cache, arm or stream. lod: level of detail, `why_lod` for
+            people.
         region: part of the domain (z, y, x) that is decoded. function: the transfer function. units: of the marched values.
         shadows, occlusion: settings of light that is computed beforehand, or None. lamp: unit vector (x, y, z) of the shadows.
         reasons: (topic, what is done and why), for people.
@@ -71,6 +72,7 @@ class Plan:
     time: float
     mode: str
     lod: int
+    why_lod: str
     region: Box
     function: TransferFunction
     units: Units
@@ -98,7 +100,7 @@ class Plan:
         if effects.maximum_intensity and spec.nothing:
             raise InputError("maximum_intensity shows the volume, which 'nothing' leaves out; take one of them")
         step = _step_of(volume, scene)
-        grid = grid or Grid.of(volume.coords)
+        grid = grid or Grid.of(volume.coords, scene.scale)
         rays = Rays.of(scene.camera, grid, scene.size)
         function = _function(volume, scene, grid, histogram)
         lod, why_lod = _level(volume, scene, rays)
@@ -141,14 +143,14 @@ class Plan:
         # Light comes from all of the volume, seen or not.
         everything: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
         region = part_in_view(rays, volume) if shadows is None and occlusion is None else everything
-        times = volume.coords["t"].values
         plan = cls(
             scene=scene,
             task=task,
             step=step,
-            time=float(np.interp(step, np.arange(len(times)), times)),
+            time=_time_of(volume, step),
             mode=mode,
             lod=lod,
+            why_lod=why_lod,
             region=region,
             function=function,
             units=units,
@@ -157,7 +159,13 @@ class Plan:
             lamp=lamp,
             reasons=(),
         )
-        return replace(plan, reasons=tuple(reasons(plan, volume, why_lod)))
+        return replace(plan, reasons=tuple(reasons(plan, volume)))
+
+    def at(self, volume: Volume, scene: Scene) -> Plan:
+        """The plan of a scene that differs in nothing but its time."""
+        step = _step_of(volume, scene)
+        plan = replace(self, scene=scene, step=step, time=_time_of(volume, step))
+        return replace(plan, reasons=tuple(reasons(plan, volume)))
 
     @property
     def lights(self) -> bool:
@@ -183,6 +191,11 @@ def _step_of(volume: Volume, scene: Scene) -> float:
     if not 0 <= step <= last:
         raise InputError(f"step {step:g} is outside the series, which has steps 0 to {last}")
     return step
+
+
+def _time_of(volume: Volume, step: float) -> float:
+    times = volume.coords["t"].values
+    return float(np.interp(step, np.arange(len(times)), times))
 
 
 def _function(volume: Volume, scene: Scene, grid: Grid, histogram: Callable[[], Histogram] | None) -> TransferFunction:

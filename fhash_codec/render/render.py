@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,6 @@ import numpy.typing as npt
 from fhash_codec.coreset import Box
 from fhash_codec.progress import Progress, silent
 from fhash_codec.render.bricks import Bricks
-from fhash_codec.render.camera import Grid
 from fhash_codec.render.counters import complete
 from fhash_codec.render.fields import Field, FrameField, NetworkField
 from fhash_codec.render.image import Image
@@ -25,8 +25,12 @@ from fhash_codec.render.scene import Scene
 from fhash_codec.render.stream import stream
 from fhash_codec.render.task import Frame, Marched
 from fhash_codec.volume import Volume
+from fhash_formats.errors import FhashError
 
 __all__ = ["Renderer", "render"]
+
+Key = tuple[float, int]
+"""Step and level of detail of a decoded frame."""
 
 MEMORY = 2 << 30
 """Bytes of decoded frames that a renderer keeps."""
@@ -57,30 +61,46 @@ class _Decoded:
 class Renderer:
     """Makes pictures of one volume, and keeps what it decoded for the next ones, up to `memory` bytes.
 
-    Not for several threads at once.
+    Not for several threads at once. After a picture with an `upcoming` one the volume is read in the background until the next.
     """
 
     def __init__(self, volume: Volume, *, memory: int = MEMORY, threads: int | None = None) -> None:
         self.volume, self.memory, self.threads = volume, memory, threads
-        self.grid = Grid.of(volume.coords)
-        self._decoded: OrderedDict[tuple[float, int], _Decoded] = OrderedDict()
+        self._decoded: OrderedDict[Key, _Decoded] = OrderedDict()
         self._histogram: Histogram | None = None
+        self._planned: tuple[Scene, Plan] | None = None
+        self._reader: ThreadPoolExecutor | None = None
+        self._coming: tuple[Key, Future[_Decoded]] | None = None
 
     def plan(self, scene: Scene) -> Plan:
         """What a picture of a scene would take; raises InputError or RegionError as `render` does."""
-        return Plan.of(self.volume, scene, grid=self.grid, histogram=self.histogram)
+        timeless = replace(scene, step=None, time=None)
+        if self._planned is not None and self._planned[0] == timeless:
+            return self._planned[1].at(self.volume, scene)
+        plan = Plan.of(self.volume, scene, histogram=self.histogram)
+        self._planned = timeless, plan
+        return plan
 
-    def render(self, scene: Scene | None = None, *, plan: Plan | None = None, progress: Progress = silent) -> Image:
-        """A picture of a scene, or of a plan that was made for it."""
+    def render(
+        self, scene: Scene | None = None, *, plan: Plan | None = None, upcoming: Scene | None = None, progress: Progress = silent
+    ) -> Image:
+        """A picture of a scene, or of a plan that was made for it.
+
+        upcoming: the scene of the next picture. What that needs is decoded while this one is marched.
+        """
         begin = time.perf_counter()
         plan = plan if plan is not None else self.plan(Scene() if scene is None else scene)
         task = plan.task
         lit: dict[str, int] = {}
         frame = self._frame(plan, progress) if plan.mode == "cache" or plan.lights or self.volume.profile == "compact" else None
+        if upcoming is not None:
+            self._prepare(upcoming)
         if plan.lights:
             assert frame is not None
             progress("lighting", 0, 1, "")
-            light = light_grid(frame.frame, self.grid, task.table, shadows=plan.shadows, lamp=plan.lamp, ambient_occlusion=plan.occlusion)
+            light = light_grid(
+                frame.frame, task.rays.grid, task.table, shadows=plan.shadows, lamp=plan.lamp, ambient_occlusion=plan.occlusion
+            )
             task, lit = replace(task, light=light), {"secondary_rays": light.secondary_rays}
             progress("lighting", 1, 1, "")
         if plan.mode == "cache":
@@ -90,7 +110,7 @@ class Renderer:
             progress("marching", 1, 1, "")
         else:
             field: Field = (
-                FrameField(frame.frame, self.grid, frame.bricks)
+                FrameField(frame.frame, task.rays.grid, frame.bricks)
                 if frame is not None and self.volume.profile == "compact"
                 else NetworkField(self.volume, plan.step, plan.units)
             )
@@ -100,6 +120,7 @@ class Renderer:
     def histogram(self) -> Histogram:
         """How frequent values are in the series: of its first, middle and last step, coarse where the file has levels of detail."""
         if self._histogram is None:
+            self._settle()
             volume = self.volume
             last = volume.shape[0] - 1
             edges = np.linspace(volume.value_range.low, volume.value_range.high, BINS + 1)
@@ -119,14 +140,14 @@ class Renderer:
 
     def _frame(self, plan: Plan, progress: Progress) -> _Decoded:
         """The decoded frame of a plan, from those that are kept if one of them holds its region."""
-        key = (plan.step, plan.lod)
-        kept = self._decoded.get(key)
-        if kept is not None and all(a <= c and d <= b for (a, b), (c, d) in zip(kept.region, plan.region, strict=True)):
-            self._decoded.move_to_end(key)
+        kept = self._kept(plan)
+        if kept is not None:
             return kept
+        key = plan.step, plan.lod
         progress("decoding", 0, 1, "")
-        frame = decoded_frame(self.volume, plan.step, plan.lod, plan.region, plan.units)
-        made = _Decoded(frame=frame, region=plan.region, bricks=Bricks.of(frame))
+        made = self._settle(key)
+        if made is None or not _holds(made, plan):
+            made = _decode(self.volume, plan)
         progress("decoding", 1, 1, "")
         self._decoded.pop(key, None)
         while self._decoded and sum(each.nbytes for each in self._decoded.values()) + made.nbytes > self.memory:
@@ -134,6 +155,37 @@ class Renderer:
         if made.nbytes <= self.memory:
             self._decoded[key] = made
         return made
+
+    def _prepare(self, scene: Scene) -> None:
+        """Begin to decode what a picture of this scene needs; what is wrong with it is raised when that picture is made."""
+        try:
+            plan = self.plan(scene)
+        except (FhashError, OSError):
+            return
+        if plan.mode != "cache" or self._kept(plan) is not None:
+            return
+        self._settle()
+        if self._reader is None:
+            self._reader = ThreadPoolExecutor(1, thread_name_prefix="fhash-render")
+        self._coming = (plan.step, plan.lod), self._reader.submit(_decode, self.volume, plan)
+
+    def _kept(self, plan: Plan) -> _Decoded | None:
+        """What is kept of a plan's frame, if that holds its region."""
+        kept = self._decoded.get((plan.step, plan.lod))
+        if kept is None or not _holds(kept, plan):
+            return None
+        self._decoded.move_to_end((plan.step, plan.lod))
+        return kept
+
+    def _settle(self, key: Key | None = None) -> _Decoded | None:
+        """Wait for what is decoded in the background, since a volume is read by one thread at a time; that frame, if it is of this key."""
+        if self._coming is None:
+            return None
+        (of, future), self._coming = self._coming, None
+        if of == key:
+            return future.result()
+        future.exception()  # waits; a failure of a frame that nobody wants is no one's
+        return None
 
     def _finished(self, plan: Plan, marched: Marched, lit: dict[str, int], begin: float) -> Image:
         volume = self.volume
@@ -158,6 +210,16 @@ class Renderer:
             label=label,
         )
         return replace(drawn, seconds=time.perf_counter() - begin)
+
+
+def _holds(kept: _Decoded, plan: Plan) -> bool:
+    """Whether a frame reaches as far as a plan looks."""
+    return all(a <= c and d <= b for (a, b), (c, d) in zip(kept.region, plan.region, strict=True))
+
+
+def _decode(volume: Volume, plan: Plan) -> _Decoded:
+    frame = decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units)
+    return _Decoded(frame=frame, region=plan.region, bricks=Bricks.of(frame))
 
 
 def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Units) -> Frame:

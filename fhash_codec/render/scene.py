@@ -151,6 +151,13 @@ class Scene(Record):
 
     camera: Camera = Camera()
     size: tuple[int, int] = limits((512, 512), "pixels across and down", low=1, high=LARGEST_SIDE)
+    scale: Vector | None = limits(
+        None,
+        "factors by which the axes (x, y, z) are stretched; if left out, one in other units than the rest has its vertices as far apart. "
+        "The camera lives in the stretched coordinates",
+        low=1e-100,
+        high=1e100,
+    )
     background: str = limits("#ffffff", "'#rrggbb', a name, or 'transparent'")
     step: float | None = limits(
         None, "step of the series, between two of them too; the first if neither it nor time is given", low=0, high=1e15

@@ -52,9 +52,11 @@ class Drawing:
 
     def __init__(self) -> None:
         self.scenes: list[Scene] = []
+        self.upcoming: list[Scene | None] = []
 
-    def __call__(self, scene: Scene) -> Image:
+    def __call__(self, scene: Scene, *, upcoming: Scene | None = None) -> Image:
         self.scenes.append(scene)
+        self.upcoming.append(upcoming)
         width, height = scene.size
         rgba = np.ones((height, width, 4), dtype=np.float32)
         rgba[..., 0] = (scene.step or 0) / 10
@@ -250,6 +252,7 @@ def test_pictures_are_numbered_and_hold_their_scene(volume, tmp_path: Path) -> N
     assert [path.name for path in done.paths] == [f"a.000{number}.png" for number in range(5)]
     assert (done.rendered, done.kept, done.counters) == (5, 0, {"rays": 5 * 280})
     assert [scene_in_png(path) for path in done.paths] == draw.scenes
+    assert draw.upcoming == [*draw.scenes[1:], None]
     assert [path.name for path in numbered(Path("b.png"), 10_001)][-1] == "b.10000.png"
 
 
@@ -263,6 +266,7 @@ def test_an_interrupted_animation_goes_on(volume, tmp_path: Path) -> None:
     done = animate(volume, SMALL, animation, output, draw=draw)
     assert (done.rendered, done.kept) == (2, 3)
     assert [scene.step for scene in draw.scenes] == [1, 3]
+    assert draw.upcoming == [None, None]  # what follows is there already
     assert [path.read_bytes() for path in whole.paths] == before
 
 
@@ -291,7 +295,7 @@ def test_pictures_that_are_not_right_are_replaced_only_by_force(spoil: str, volu
 def test_pictures_with_buffers_are_kept_only_with_them(volume, tmp_path: Path) -> None:
     scene = dataclasses.replace(SMALL, effects=Effects(buffers=("depth",)))
 
-    def draw(each: Scene) -> Image:
+    def draw(each: Scene, *, upcoming: Scene | None = None) -> Image:
         return dataclasses.replace(Drawing()(each), depth=np.ones((14, 20), dtype=np.float32))
 
     animation, output = Animation.parse("steps=0:1", volume), tmp_path / "a.png"
@@ -359,7 +363,7 @@ def test_a_gif_shows_the_pictures_in_order(volume, tmp_path: Path) -> None:
 
 
 def test_an_interrupted_film_leaves_nothing(volume, tmp_path: Path) -> None:
-    def draw(scene: Scene) -> Image:
+    def draw(scene: Scene, *, upcoming: Scene | None = None) -> Image:
         if scene.step == 2:
             raise KeyboardInterrupt
         return Drawing()(scene)

@@ -46,6 +46,32 @@ def test_an_axis_of_one_vertex_is_as_thick_as_the_others_mean() -> None:
     np.testing.assert_allclose(grid(x=[1.0], y=[2.0], z=[3.0]).corners, [[0.5, 1.5], [1.5, 2.5], [2.5, 3.5]])
 
 
+def test_an_axis_in_other_units_is_drawn_in_the_proportions_of_its_vertices() -> None:
+    def in_units(z: str, x: str = "degrees", scale: tuple[float, float, float] | None = None) -> Grid:
+        units = {"x": x, "y": "degrees", "z": z}
+        axes = {axis: np.arange(5.0) * step for axis, step in {"x": 0.25, "y": -0.75, "z": 100.0}.items()}
+        return Grid.of({axis: Coordinate(name=axis, values=axes[axis], attributes={"units": units[axis]}) for axis in axes}, scale)
+
+    stretched = in_units("m")
+    np.testing.assert_allclose(stretched.spacing, [0.25, -0.75, 0.5])
+    np.testing.assert_allclose(stretched.scale, [1, 1, 0.005])
+    for same in (in_units("degrees"), in_units("")):
+        np.testing.assert_array_equal(same.spacing, [0.25, -0.75, 100.0])
+        assert same.scale == (1, 1, 1)
+    # Of three different units that of x counts.
+    np.testing.assert_allclose(in_units("m", x="s").spacing, [0.25, -0.25, 0.25])
+    given = in_units("m", scale=(1, 2, 0.01))
+    np.testing.assert_allclose(given.spacing, [0.25, -1.5, 1.0])
+    assert given.scale == (1, 2, 0.01)
+
+
+def test_a_stretched_grid_keeps_its_corners_apart_by_the_factors() -> None:
+    axes = {axis: Coordinate(name=axis, values=np.linspace(3, 5, 6)) for axis in "xyz"}
+    np.testing.assert_allclose(Grid.of(axes, (1, 2, 3)).corners, Grid.of(axes).corners * np.array([[1], [2], [3]]))
+    flat = axes | {"z": Coordinate(name="z", values=np.array([4.0]))}
+    np.testing.assert_allclose(Grid.of(flat, (1, 3, 7)).spacing, [0.4, 1.2, 0.8])
+
+
 def test_coordinates_that_are_not_even_are_told() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from fhash_codec.render.counters import COUNTERS, complete, rows
 from fhash_codec.render.image import scene_in_png
 from fhash_codec.render.plan import Units
 from fhash_formats import native
+from fhash_formats.errors import DamagedFileError, InputError
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="marched natively")
 SMALL = {"size": [40, 32]}
@@ -75,6 +77,47 @@ def test_what_was_decoded_is_kept(renderer: Renderer, monkeypatch: pytest.Monkey
     last = renderer.render(scene())
     assert decoded == [0, 2]
     np.testing.assert_array_equal(first.rgba, last.rgba)
+
+
+def test_what_comes_next_is_decoded_beside(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[tuple[float, bool]] = []
+    original = module.decoded_frame
+
+    def counted(volume: Volume, step: float, *others: Any) -> Any:
+        decoded.append((step, threading.current_thread() is threading.main_thread()))
+        return original(volume, step, *others)
+
+    monkeypatch.setattr(module, "decoded_frame", counted)
+    renderer, alone = Renderer(volume), Renderer(volume)
+    shown = [scene(step=step) for step in (0, 1, 2)]
+    for each, following in zip(shown, [*shown[1:], None], strict=True):
+        np.testing.assert_array_equal(renderer.render(each, upcoming=following).rgba, alone.render(each).rgba)
+    assert [entry for entry in decoded if not entry[1]] == [(1, False), (2, False)]
+    assert sorted(entry[0] for entry in decoded) == [0, 0, 1, 1, 2, 2]
+    # What nobody came for, what cannot be planned and what is not decoded at all do no harm.
+    renderer.render(shown[0], upcoming=scene(step=0.5))
+    assert renderer.render(scene(step=1.5)).rgba.any()
+    renderer.render(shown[0], upcoming=scene(step=99))
+    renderer.render(shown[0], upcoming=scene(step=1.25, march={"mode": "arm"}))
+    with pytest.raises(InputError, match="step 99 is outside"):
+        renderer.render(scene(step=99))
+
+
+def test_a_failure_beside_is_that_of_its_own_picture(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = module.decoded_frame
+
+    def failing(volume: Volume, step: float, *others: Any) -> Any:
+        if step == 1:
+            raise DamagedFileError("step 1 is damaged")
+        return original(volume, step, *others)
+
+    monkeypatch.setattr(module, "decoded_frame", failing)
+    renderer = Renderer(volume)
+    assert renderer.render(scene(step=0), upcoming=scene(step=1)).rgba.any()
+    assert renderer.render(scene(step=2)).rgba.any()
+    renderer.render(scene(step=0), upcoming=scene(step=1))
+    with pytest.raises(DamagedFileError, match="step 1"):
+        renderer.render(scene(step=1))
 
 
 def test_what_does_not_fit_is_not_kept(volume: Volume) -> None:

@@ -7,6 +7,7 @@ import signal
 import threading
 
 import pytest
+
 from fhash_formats.container import parallel
 from fhash_formats.container.parallel import in_threads
 
@@ -46,7 +47,7 @@ def test_the_first_failure_is_raised_and_the_rest_is_left() -> None:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_forked_process_has_threads_of_its_own() -> None:
-    assert list(in_threads(abs, range(-8, 0)))[0] == 8
+    assert next(iter(in_threads(abs, range(-8, 0)))) == 8
     child = os.fork()
     if child == 0:
         signal.alarm(30)  # kills the child where it hangs
