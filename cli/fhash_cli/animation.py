@@ -46,10 +46,18 @@ class AnimationOptions:
         if self.columns is not None and self.evolution is None:
             raise click.UsageError("--columns is of an evolution: give --evolution too")
 
-    @property
-    def several(self) -> bool:
+    def several(self, scene: Scene) -> bool:
         """Whether there is more than one picture to make, which `run_animation` does."""
-        return self.animate is not None or self.evolution is not None
+        return self.animate is not None or scene.evolution is not None
+
+    def over(self, scene: Scene, volume: Volume) -> Scene:
+        """The scene with the steps of `--evolution`; itself without the option."""
+        from fhash_codec.render.scene import Evolution
+
+        if self.evolution is None:
+            return scene
+        steps = tuple(map(float, steps_of(volume, self.evolution, "--evolution")))
+        return dataclasses.replace(scene, step=None, time=None, evolution=Evolution(steps=steps, columns=self.columns))
 
     def tracked(self, volume: Volume, progress: Progress) -> list[Tracked]:
         """The features of `--track`, none without it."""
@@ -98,9 +106,10 @@ def tracking(volume: Volume, scene: Scene, options: AnimationOptions, progress: 
 def run_animation(
     volume: Volume, scene: Scene, options: AnimationOptions, output: str, *, force: bool, progress: Progress
 ) -> tuple[dict[str, Any], str]:
-    """Make the pictures of `--animate` or `--evolution` at `output`; the result as JSON values and as text.
+    """Make the pictures of `--animate`, or of a scene that is an evolution, at `output`; the result as JSON values and as text.
 
-    Only for options that are `several`; applies `--track` itself. Raises InputError before any work for outputs that cannot be written.
+    Only for options and a scene that are `several`; applies `--track` itself. Raises InputError before any work for outputs that cannot
+    be written.
     """
     from pathlib import Path
 
@@ -135,8 +144,9 @@ def run_animation(
     if Path(output).suffix.lower() != ".png":
         raise InputError(f"{output}: an evolution is one picture and is written as .png; use such a name")
     check_writable(output, force, sources=[volume.path])
-    steps = steps_of(volume, options.evolution, "--evolution")
-    image = evolution(volume, shown, steps, columns=options.columns, progress=progress)
+    assert shown.evolution is not None
+    steps = list(shown.evolution.steps)
+    image = evolution(volume, shown, progress=progress)
     paths = [str(path) for path in image.save(output, force=force)]
     followed = follow(volume, tracked, steps) if tracked else []
     result = {

@@ -46,15 +46,15 @@ def command(
     With --animate the output is NAME.png for numbered pictures, which are made anew only where they are not there yet, or a film
     NAME.mp4 or NAME.gif.
     """
-    if several.several and (explain or save_scene is not None):
-        raise click.UsageError("--explain and --save-scene are of one picture; leave them out with --animate and --evolution")
     import fhash_codec
     from fhash_codec.render.render import Renderer
 
     path = Path(output) if output is not None else Path(Path(run).stem + ".png")
     with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
-        scene = options.scene(volume)
-        if several.several:
+        scene = several.over(options.scene(volume), volume)
+        if several.several(scene):
+            if explain or save_scene is not None:
+                raise click.UsageError("--explain and --save-scene are of one picture; leave them out of an animation or evolution")
             result, text = run_animation(volume, scene, several, str(path), force=force, progress=progress)
             emit(result, text, as_json)
             return

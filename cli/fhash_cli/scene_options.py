@@ -89,7 +89,7 @@ class SceneOptions:
         values = base.to_dict()
         moment = {name for name in ("step", "time") if name in self.places}
         if moment:
-            for name in ("step", "time"):
+            for name in ("step", "time", "evolution"):
                 values.pop(name, None)
         for place, value in self.places.items():
             _put(values, place, value)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -24,23 +23,15 @@ WIDE = 1.6
 """Width of the whole over its height that the number of columns aims at."""
 
 
-def evolution(
-    volume: Volume,
-    scene: Scene,
-    steps: Sequence[float],
-    *,
-    columns: int | None = None,
-    progress: Progress = silent,
-    draw: Draw | None = None,
-) -> Image:
-    """Some steps of a scene in one picture, row by row, each of the size of the scene with its time; a colour bar only in the last.
+def evolution(volume: Volume, scene: Scene, *, progress: Progress = silent, draw: Draw | None = None) -> Image:
+    """The steps of `scene.evolution` in one picture, row by row, each with its time; a colour bar only in the last.
 
-    columns: of pictures; by the shape of the whole if None. The picture has the scene of the first step. draw: what renders,
-    `Renderer(volume).render` if None. Raises InputError without a step or for too large a whole.
+    draw: what renders, `Renderer(volume).render` if None. Raises InputError for a scene without steps and for too large a whole.
     """
-    if not steps:
+    asked = scene.evolution
+    if asked is None or not asked.steps:
         raise InputError("an evolution needs at least one step")
-    width, height = scene.size
+    steps, columns, (width, height) = asked.steps, asked.columns, scene.size
     if columns is None:
         columns = min(len(steps), max(1, round(math.sqrt(WIDE * len(steps) * height / width))))
         columns = math.ceil(len(steps) / math.ceil(len(steps) / columns))
@@ -58,7 +49,7 @@ def evolution(
     plain = dataclasses.replace(scene.effects, time_label=True, colour_bar=False, buffers=())
     last = dataclasses.replace(plain, colour_bar=scene.effects.colour_bar)
     scenes = [
-        dataclasses.replace(scene, step=float(step), time=None, effects=plain if number < len(steps) - 1 else last)
+        dataclasses.replace(scene, evolution=None, step=step, effects=plain if number < len(steps) - 1 else last)
         for number, step in enumerate(steps)
     ]
     rgba = np.zeros((whole[1], whole[0], 4), dtype=np.float32)
@@ -75,7 +66,7 @@ def evolution(
     return Image(
         rgba=rgba,
         counters=dict(counters),
-        scene=scenes[0].to_dict(),
+        scene=scene.to_dict(),
         source=str(volume.path),
         digest=volume.container.digest,
         seconds=seconds,

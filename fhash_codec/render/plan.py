@@ -94,6 +94,8 @@ class Plan:
                 f"size {width} x {height} with {effects.antialiasing**2} rays for each pixel are more than {MOST_RAYS:,} rays; "
                 "take a smaller picture"
             )
+        if scene.evolution is not None:
+            raise InputError("the scene is an evolution, of several pictures; leave 'evolution' out for one of them")
         parse_background(scene.background)
         if spec.nothing and not effects.isosurfaces:
             raise InputError("the scene shows nothing: 'nothing' leaves the volume out and there is no isosurface")

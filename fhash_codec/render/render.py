@@ -14,6 +14,7 @@ from fhash_codec.coreset import Box
 from fhash_codec.progress import Progress, silent
 from fhash_codec.render.bricks import Bricks
 from fhash_codec.render.counters import complete
+from fhash_codec.render.evolution import evolution
 from fhash_codec.render.fields import Field, FrameField, NetworkField
 from fhash_codec.render.image import Image
 from fhash_codec.render.light import light_grid
@@ -88,6 +89,8 @@ class Renderer:
 
         upcoming: the scene of the next picture. What that needs is decoded while this one is marched.
         """
+        if plan is None and scene is not None and scene.evolution is not None:
+            return evolution(self.volume, scene, progress=progress, draw=self.render)
         begin = time.perf_counter()
         plan = plan if plan is not None else self.plan(Scene() if scene is None else scene)
         task = plan.task

@@ -16,6 +16,7 @@ __all__ = [
     "AmbientOcclusion",
     "Camera",
     "Effects",
+    "Evolution",
     "Isosurface",
     "Marching",
     "Scene",
@@ -146,6 +147,14 @@ class Marching(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Evolution(Record):
+    """Several steps side by side in one picture, each of the size of the scene."""
+
+    steps: tuple[float, ...] = limits(dataclasses.MISSING, "steps of the series, between two of them too", low=0, high=1e15)
+    columns: int | None = limits(None, "pictures beside each other; by the shape of the whole if left out", low=1, high=1000)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scene(Record):
     """All that a picture is made from beside the volume."""
 
@@ -166,11 +175,14 @@ class Scene(Record):
     transfer_function: TransferFunctionSpec = TransferFunctionSpec()
     effects: Effects = Effects()
     march: Marching = Marching()
+    evolution: Evolution | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.step is not None and self.time is not None:
             raise InputError("scene: step and time exclude each other")
+        if self.evolution is not None and (self.step is not None or self.time is not None):
+            raise InputError("scene: an evolution has steps of its own; leave step and time out")
 
     @classmethod
     def load(cls, path: str | Path) -> Scene:

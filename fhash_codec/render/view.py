@@ -35,11 +35,14 @@ def pixel_vertices(rays: Rays) -> float:
 
 
 def part_in_view(rays: Rays, volume: Volume) -> Box:
-    """The region (z, y, x) of vertices around what the picture shows, widened to whole chunks; all where that is not much more."""
+    """The region (z, y, x) of vertices around what the picture shows, widened to whole chunks; all where that is not much more.
+
+    One vertex where the picture shows nothing of the volume.
+    """
     everything: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
     seen = _seen(rays)
     if seen is None:
-        return everything
+        return ((0, 1), (0, 1), (0, 1))
     found = []
     for low, high, length, chunk, (first, _) in zip(*seen[::-1].T, volume.shape[1:], volume.chunks[1:], volume.box, strict=True):
         start, stop = max(int(np.floor(low)), 0), min(int(np.ceil(high)) + 1, length)

@@ -35,8 +35,9 @@ def program() -> None:
 def render(run: str, output: str, force: bool, several: AnimationOptions) -> None:
     """Stands for `fhash render`."""
     with fhash_codec.open(run) as volume, Progress(quiet=True) as progress:
-        if several.several:
-            result, text = run_animation(volume, SMALL, several, output, force=force, progress=progress)
+        scene = several.over(SMALL, volume)
+        if several.several(scene):
+            result, text = run_animation(volume, scene, several, output, force=force, progress=progress)
         else:
             result, text = tracking(volume, SMALL, several, progress).to_dict(), ""
     click.echo(json.dumps({"result": result, "text": text}))

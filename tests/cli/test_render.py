@@ -136,3 +136,20 @@ def test_a_file_that_is_missing_or_damaged_keeps_its_exit_code(refused: Callable
     assert "no such" in refused(2, "render", tmp_path / "none.fhz", "-o", tmp_path / "v.png")
     (tmp_path / "bad.fhz").write_bytes(b"not a container")
     refused(4, "render", tmp_path / "bad.fhz", "-o", tmp_path / "v.png")
+
+
+@marched
+def test_an_evolution_is_replayed_from_its_picture(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    first, second, single = (tmp_path / name for name in ("a.png", "b.png", "c.png"))
+    for words in (
+        ["-o", first, "--size", "32", "--evolution", ":", "--columns", "2"],
+        ["-o", second, "--scene", first],
+        ["-o", single, "--scene", first, "--t", "1"],
+    ):
+        assert fhash("render", run, *words).exit_code == 0
+    assert first.read_bytes() == second.read_bytes()
+    with Pictures.open(first) as whole, Pictures.open(single) as one:
+        assert (whole.size, one.size) == ((65, 65), (32, 32))
+    refused = fhash("render", run, "-o", tmp_path / "d.png", "--scene", first, "--explain")
+    assert refused.exit_code == 2
+    assert "--explain" in refused.stderr

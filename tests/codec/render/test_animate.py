@@ -13,7 +13,7 @@ import pytest
 from PIL import Image as Pictures
 
 import fhash_codec
-from fhash_codec import EncodeConfig
+from fhash_codec import EncodeConfig, Renderer
 from fhash_codec.render.animate import animate, numbered
 from fhash_codec.render.animation import Animation, Key, mixed
 from fhash_codec.render.camera import Grid, Rays
@@ -21,7 +21,7 @@ from fhash_codec.render.evolution import evolution
 from fhash_codec.render.film import film
 from fhash_codec.render.image import Image, scene_in_png
 from fhash_codec.render.poses import CameraPath, pchip
-from fhash_codec.render.scene import Camera, Effects, Isosurface, Scene, TransferFunctionSpec
+from fhash_codec.render.scene import Camera, Effects, Evolution, Isosurface, Scene, TransferFunctionSpec
 from fhash_codec.render.tracking import COLOURS, Tracked, follow, parse_tracked, tracking_scene
 from fhash_formats.errors import FhashWarning, InputError, MissingDependencyError, OutputError, OutputExistsError, RegionError
 from fhash_formats.series import ArraySeries, Coordinate
@@ -408,8 +408,9 @@ def test_an_encoder_that_fails_is_one_line(tmp_path: Path, monkeypatch: pytest.M
 
 def test_an_evolution_is_a_grid_of_its_steps(volume) -> None:
     draw = Drawing()
-    scene = dataclasses.replace(SMALL, effects=Effects(colour_bar=True), background="transparent")
-    image = evolution(volume, scene, [0.0, 1.0, 2.5, 3.0, 4.0], columns=3, draw=draw)
+    asked = Evolution(steps=(0.0, 1.0, 2.5, 3.0, 4.0), columns=3)
+    scene = dataclasses.replace(SMALL, effects=Effects(colour_bar=True), background="transparent", evolution=asked)
+    image = evolution(volume, scene, draw=draw)
     assert image.rgba.shape == (2 * 14 + 1, 3 * 20 + 2, 4)
     for number, step in enumerate([0, 1, 2.5, 3, 4]):
         row, column = divmod(number, 3)
@@ -421,19 +422,33 @@ def test_an_evolution_is_a_grid_of_its_steps(volume) -> None:
     assert all(each.effects.time_label for each in draw.scenes)
     assert image.counters == {"rays": 5 * 280}
     assert image.seconds == 2.5
-    assert Scene.from_dict(image.scene).step == 0
+    assert Scene.from_dict(image.scene) == scene
 
 
 @pytest.mark.parametrize(("count", "size", "columns"), [(1, (64, 64), 1), (6, (64, 64), 3), (5, (128, 16), 1), (4, (16, 128), 4)])
 def test_an_evolution_is_wider_than_high(count: int, size: tuple[int, int], columns: int, volume) -> None:
-    image = evolution(volume, dataclasses.replace(SMALL, size=size), [0.0] * count, draw=Drawing())
+    scene = dataclasses.replace(SMALL, size=size, evolution=Evolution(steps=(0.0,) * count))
+    image = evolution(volume, scene, draw=Drawing())
     assert image.rgba.shape[1] // size[0] == columns
 
 
 def test_evolutions_that_cannot_be(volume) -> None:
     for steps, columns, size, part in (([], None, (9, 9), "at least one"), ([0], 2, (9, 9), "columns"), ([0] * 9, 9, (9999, 9), "pixels")):
         with pytest.raises(InputError, match=part):
-            evolution(volume, dataclasses.replace(SMALL, size=size), steps, columns=columns, draw=Drawing())
+            evolution(volume, dataclasses.replace(SMALL, size=size, evolution=Evolution(steps=steps, columns=columns)), draw=Drawing())
+    with pytest.raises(InputError, match="at least one"):
+        evolution(volume, SMALL, draw=Drawing())
+    with pytest.raises(InputError, match="steps of its own"):
+        dataclasses.replace(SMALL, step=1.0, evolution=Evolution(steps=(0.0,)))
+    with pytest.raises(InputError, match="the scene is an evolution"):
+        Renderer(volume).plan(dataclasses.replace(SMALL, evolution=Evolution(steps=(0.0,))))
+
+
+def test_a_renderer_draws_evolutions(files: dict[str, Path]) -> None:
+    with fhash_codec.open(files["compact"]) as real:
+        image = fhash_codec.render(real, dataclasses.replace(SMALL, evolution=Evolution(steps=(0.0, 1.5), columns=2)))
+        single = fhash_codec.render(real, dataclasses.replace(SMALL, step=1.5, effects=Effects(time_label=True)))
+        np.testing.assert_array_equal(image.rgba[:, -SMALL.size[0] :], single.rgba)
 
 
 def test_features_get_colours_and_thresholds(volume) -> None:
