@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, overload
 
@@ -106,7 +106,7 @@ def feature_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
         for level, patch in enumerate(patches):
             before, after, _ = _locate(network, level, chunk)
             rows = slice(level * network.embedding_size, (level + 1) * network.embedding_size)
-            head.inputs[rows, :count] = _interpolate(_corners(patch, before, network.levels[level]), after, False)[0]
+            head.inputs[rows, :count] = interpolate(_corners(patch, before, network.levels[level]), after, False)[0]
         head.run()
         slopes[:, start : start + count] = head.gradient()[:, :count]
     return slopes
@@ -121,7 +121,7 @@ def _evaluate(network: Network, patches: Sequence[Patch], points: npt.NDArray[np
         rows = slice(level * size, (level + 1) * size)
         before, after, pace = _locate(network, level, points)
         corners = _corners(patch, before, network.levels[level])
-        head.inputs[rows, :count], changes = _interpolate(corners, after, gradient)
+        head.inputs[rows, :count], changes = interpolate(corners, after, gradient)
         for axis, change in enumerate(changes):
             np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows])
     values = head.run()[:count]
@@ -192,8 +192,11 @@ def _corners(patch: Patch, before: npt.NDArray[np.int64], resolution: Sequence[i
     return np.ascontiguousarray(np.moveaxis(found, -1, 1), dtype=np.float32).reshape(2, 2, 2, 2, shape[4], -1)
 
 
-def _interpolate(corners: Floats, after: Floats, gradient: bool) -> tuple[Floats, list[Floats]]:
-    """Corners (2, 2, 2, 2, E, n) to (E, n), linearly along t, z, y, x in turn; with `gradient` also the change across the cell per axis."""
+def interpolate(corners: Floats, after: Iterable[Floats], gradient: bool) -> tuple[Floats, list[Floats]]:
+    """Corners, as (2, 2, 2, 2, E, n), to (E, n), linearly along the first axes in turn, one for each weight of the corner after it.
+
+    With `gradient` also the change across the cell along each of these axes, in their order. Also for tensors of torch.
+    """
     changes: list[Floats] = []
     for weight in after:
         changes = [_between(change, weight) for change in changes]

@@ -26,8 +26,8 @@ ALLOWED = {
     "fhash_codec": {"fhash_codec", "fhash_formats"},
     "fhash_cli": {"fhash_cli", "fhash_codec", "fhash_formats"},
 }
-TORCH_FILES = re.compile(r"(head_training|model|tesseract|train)\.py|(engines|bench)/.+\.py")
-"""Modules of fhash_codec in which tensors are trained or evaluated, or that start a training."""
+TORCH_FILES = re.compile(r"(head_training|model|tesseract|train)\.py|(engines|bench)/.+\.py|render/torch_arrays\.py")
+"""Modules of fhash_codec in which tensors are trained or evaluated, or marched through, or that start a training."""
 SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy")
 
 

@@ -146,7 +146,7 @@ def _render_text(result: RenderBench) -> str:
         ("VTK on software OpenGL", "size", "step", "PSNR", "SSIM", "largest", "by its rules"),
         *(
             (
-                _lit(each.scene, each.shaded),
+                _lit(each.scene, bool(each.gradient)) + (", central differences" if each.gradient == "central" else ""),
                 str(each.size),
                 f"{each.step:g}",
                 _decibels(each.psnr),

@@ -131,6 +131,7 @@ def scene_options(command: Command) -> Command:
         "threshold": "march.threshold",
         "lod": "march.lod",
         "march": "march.mode",
+        "device": "march.device",
         "samples_per_pass": "march.samples_per_pass",
         "antialiasing": "effects.antialiasing",
     }
@@ -166,6 +167,7 @@ def scene_options(command: Command) -> Command:
     @click.option("--depth", is_flag=True, help="Write the depth too, as NAME.depth.npy.")
     @click.option("--normal", is_flag=True, help="Write normals too, as NAME.normal.npy.")
     @click.option("--march", metavar="NAME", help="Way to march: auto, cache, arm or stream.")
+    @click.option("--device", metavar="NAME", help="Where arm and stream compute: auto, cpu or cuda.")
     @click.option("--step", type=float, metavar="X", help="Length of a step in vertex spacings.")
     @click.option("--threshold", type=float, metavar="X", help="Share of the light at which a ray ends.")
     @click.option("--lod", type=int, metavar="N", help="Level of detail; by the size of a pixel if left out.")

@@ -73,11 +73,12 @@ class Against:
 class Exactness:
     """The picture here and by VTK's mapper for graphics cards at a step of `step` vertex spacings: PSNR (dB), SSIM, largest byte apart.
 
+    gradient: that the picture here is lit by, of the cell or by central differences, as VTK's is; empty where it is not lit.
     explained: PSNR of VTK's picture to one computed slowly by VTK's conventions for samples, gradients and highlights, at a coarser step.
     """
 
     scene: str
-    shaded: bool
+    gradient: str
     size: int
     step: float
     psnr: float | None

@@ -23,7 +23,7 @@ from fhash_codec.render.bricks import Bricks
 from fhash_codec.render.march import march
 from fhash_codec.render.plan import Plan, Units
 from fhash_codec.render.render import Renderer
-from fhash_codec.render.scene import Scene, Shading, TransferFunctionSpec
+from fhash_codec.render.scene import GRADIENTS, Scene, Shading, TransferFunctionSpec
 from fhash_codec.render.task import Frame
 from fhash_codec.volume import Volume
 
@@ -107,28 +107,30 @@ class Comparison:
         found = []
         frame = Frame(values=self.values, first=(0, 0, 0))
         for name in self.functions:
-            for shaded in (False, True):
-                scene = self._scene(name, shaded, FINE_SIZE)
+            explained = {shaded: self._explained(name, shaded) for shaded in (False, True)}
+            for gradient in ("", *GRADIENTS):
+                scene = self._scene(name, bool(gradient), FINE_SIZE)
+                if gradient:
+                    scene = replace(scene, effects=replace(scene.effects, shading=Shading(gradient=gradient)))
                 plan = self.renderer.plan(replace(scene, march=replace(scene.march, step=FINE, threshold=0.0)))
                 with self._peer(plan, "gpu") as peer:
                     peer.look(plan.task.rays)
                     peer.draw()  # the first picture is of a frame that is not all there yet
                     theirs = peer.draw().pixels
                 ours = black(march(frame, plan.task).rgba)
-                explained = self._explained(name, shaded)
                 found.append(
                     Exactness(
                         scene=name,
-                        shaded=shaded,
+                        gradient=gradient,
                         size=FINE_SIZE,
                         step=FINE,
                         psnr=picture_psnr(ours, theirs, 255.0),
                         ssim=picture_ssim(ours, theirs),
                         largest=int(np.max(np.abs(ours.astype(np.int16) - theirs))),
-                        explained=explained,
+                        explained=explained[bool(gradient)],
                     )
                 )
-            self.progress("exactness", len(found), 2 * len(self.functions), name)
+            self.progress("exactness", len(found), 3 * len(self.functions), name)
         return tuple(found)
 
     def _explained(self, name: str, shaded: bool) -> float | None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.render.palette import Palette
 from fhash_codec.render.task import Frame, Task
 from fhash_formats import native
 from fhash_formats.container.parallel import in_threads
@@ -64,13 +65,7 @@ class Bricks:
         slack = ROUNDING * max(float(np.abs(low).max()), float(np.abs(high).max()))
         found = np.zeros(low.shape, dtype=bool)
         if task.table is not None:
-            table = task.table
-            last = len(table.extinctions) - 1
-            scale = last / (table.high - table.low)
-            first = np.floor(np.clip((low - table.low) * scale, 0, last)).astype(np.int64)
-            stop = np.ceil(np.clip((high - table.low) * scale, 0, last)).astype(np.int64)
-            before = np.concatenate([[0], np.cumsum(table.extinctions > 0)])
-            found |= before[stop + 1] > before[first]
+            found |= np.asarray(Palette.of(task.table).visible(low, high))
         for surface in task.surfaces:
             found |= (low - slack <= surface.value) & (surface.value <= high + slack)
         return found & known

@@ -35,6 +35,8 @@ VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]
     "zy": ((-1, 0, 0), (0, 1, 0)),
 }
 """Direction from the volume towards the camera, and what is upwards, as PyVista has them."""
+LONGEST = 1e100
+"""Largest position that is drawn where it is, and the reciprocal of the shortest axis."""
 PARALLEL = 1e-6
 """Sine of the angle between view and upward direction below which the picture has no upright."""
 
@@ -61,12 +63,14 @@ class Grid:
         """
         axes = [np.asarray(coords[axis].values, dtype=np.float64) for axis in "xyz"]
         spacing = np.full(3, np.nan)
-        origin = np.array([values[0] if np.isfinite(values[0]) else 0.0 for values in axes])
+        origin = np.array([values[0] if abs(values[0]) <= LONGEST else 0.0 for values in axes])
         for number, values in enumerate(axes):
             if len(values) == 1:
                 continue
-            extent = values[-1] - values[0]
-            if not np.all(np.isfinite(values)) or extent == 0 or not np.isfinite(extent):
+            # Not NaN, either. Products of a few lengths and squares of distances stay far from the ends of float64.
+            ordinary = bool(np.all(np.abs(values) <= LONGEST))
+            extent = values[-1] - values[0] if ordinary else 0.0
+            if not 1 / LONGEST <= abs(extent):
                 spacing[number], origin[number] = 1.0, 0.0
                 wrong = "are no positions along a line; vertices are drawn one unit apart"
             else:
@@ -123,7 +127,7 @@ class Rays:
         """The rays of a camera; raises InputError where it has no direction or no upright."""
         low, high = grid.corners[:, 0], grid.corners[:, 1]
         middle = low / 2 + high / 2
-        radius = float(np.linalg.norm(high / 2 - low / 2))
+        radius = float(np.linalg.norm((grid.bounds[:, 1] - grid.bounds[:, 0]) * grid.spacing / 2))
         focal = middle if camera.focal_point is None else np.array(camera.focal_point)
         aspect = size[0] / size[1]
         # Half the picture's height at a distance of 1; VTK narrows the angle by the zoom instead, which is the same for small ones.
@@ -139,10 +143,9 @@ class Rays:
                 distance = float(np.linalg.norm(away))
             if not np.isfinite(distance):
                 raise InputError(f"camera: position {_text(np.array(camera.position))} is too far away to compute with")
-        # Below what float64 tells apart at these coordinates there is no direction either.
-        least = 1e-12 * max(radius, float(np.max(np.abs(focal))))
-        if distance <= least:
-            raise InputError(f"camera: position and focal_point are the same, {_text(focal)}; move one of them")
+            # Below what float64 tells apart at these coordinates there is no direction either.
+            if distance <= 1e-12 * max(radius, float(np.max(np.abs(focal)))):
+                raise InputError(f"camera: position and focal_point are the same, {_text(focal)}; move one of them")
         away = away / np.linalg.norm(away)
         turn, right = _upright(away, upward)
         away, right = (_turned(part, turn, camera.azimuth) for part in (away, right))
@@ -152,10 +155,11 @@ class Rays:
         if camera.projection == "parallel":
             half = camera.parallel_scale if camera.parallel_scale is not None else radius / min(aspect, 1.0)
         half /= camera.zoom
-        eye = focal + away * distance
         spacing = grid.spacing
+        # From the first vertex: where coordinates are large beside the volume, a sum with them would lose the eye's place.
+        begin = grid.bounds.mean(axis=1) * spacing if camera.focal_point is None else focal - grid.origin
         return cls(
-            eye=(eye - grid.origin) / spacing,
+            eye=(begin + away * distance) / spacing,
             right=right * half * aspect / spacing,
             up=up * half / spacing,
             forward=-away / spacing,

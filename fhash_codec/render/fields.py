@@ -2,38 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from itertools import product
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from fhash_codec.network import Network, TableSource
 from fhash_codec.paper import PaperModel
-from fhash_codec.points import sample_points
+from fhash_codec.render.arrays import NUMPY, Array, Arrays
 from fhash_codec.render.bricks import Bricks
 from fhash_codec.render.camera import Grid
+from fhash_codec.render.inference import DenseInference, Inference, PatchInference
+from fhash_codec.render.palette import Palette
 from fhash_codec.render.plan import Units
-from fhash_codec.render.task import Frame, Task
+from fhash_codec.render.task import Frame
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
 
-__all__ = ["Field", "FrameField", "NetworkField"]
-
-Floats = npt.NDArray[np.float64]
-Single = npt.NDArray[np.float32]
-Cells = npt.NDArray[np.int64]
-
-BATCH = 1 << 15
-"""Points that are looked up at a time: what they take stays in the processor's cache."""
+__all__ = ["Field", "FrameField", "NetworkField", "central_slopes"]
 
 
 class Field(Protocol):
-    """Values anywhere in the domain; places (n, 3) are x, y, z in vertices of the domain."""
+    """Values anywhere in the domain; places (n, 3), float64, are x, y, z in vertices of the domain, in arrays of `arrays`."""
 
     @property
-    def bounds(self) -> Floats:
+    def arrays(self) -> Arrays:
+        """Where it takes places and gives values."""
+        ...
+
+    @property
+    def bounds(self) -> Array:
         """The box (3, 2), x, y, z, beyond which nothing has a value."""
+        ...
+
+    @property
+    def vertices(self) -> Array:
+        """The box (3, 2), x, y, z, from its first vertex to its last."""
         ...
 
     @property
@@ -42,7 +47,7 @@ class Field(Protocol):
         ...
 
     @property
-    def first(self) -> Floats:
+    def first(self) -> Array:
         """Where the first brick begins (x, y, z), and `stride` vertices of the domain make a cell's side."""
         ...
 
@@ -51,187 +56,191 @@ class Field(Protocol):
         """Vertices of the domain from one value to the next."""
         ...
 
-    def visible(self, task: Task) -> npt.NDArray[np.bool_]:
+    def visible(self, palette: Palette) -> Array:
         """Cells (z, y, x), the first at `first`, in which a sample could have an opacity; a few more may be among them."""
         ...
 
-    def values(self, places: Floats) -> Floats:
-        """Values (n,), NaN where there is none."""
+    def values(self, places: Array) -> Array:
+        """Values float64 (n,), NaN where there is none."""
         ...
 
-    def slopes(self, places: Floats) -> Floats:
-        """Derivatives (n, 3) by x, y and z per vertex, 0 where there are none."""
+    def slopes(self, places: Array) -> Array:
+        """Derivatives float64 (n, 3) by x, y and z per vertex, 0 where there are none."""
         ...
+
+
+def central_slopes(field: Field, places: Array) -> Array:
+    """Slopes by differences between the places one vertex of the field before and behind along each axis, clamped to its vertices.
+
+    places: (n, 3). Where one of the two has no value, the field's own slope along that axis.
+    """
+    arrays, xp, (low, high) = field.arrays, field.arrays.xp, field.vertices.T
+    found = arrays.empty((len(places), 3))
+    for axis in range(3):
+        ends = []
+        for way in (-field.stride, field.stride):
+            moved = arrays.copy(places)
+            moved[:, axis] = xp.clip(xp.clip(places[:, axis], low[axis], high[axis]) + way, low[axis], high[axis])
+            ends.append(field.values(moved))
+        found[:, axis] = (ends[1] - ends[0]) / (2 * field.stride)
+    (missing,) = arrays.nonzero(xp.any(xp.isnan(found), axis=1))
+    if len(missing):
+        found[missing] = xp.where(xp.isnan(found[missing]), field.slopes(places[missing]), found[missing])
+    return found
 
 
 class FrameField:
     """Trilinear between decoded vertices; a place whose cell has a vertex of weight without a value has none."""
 
-    def __init__(self, frame: Frame, grid: Grid, bricks: Bricks) -> None:
-        self.bricks = bricks
-        self._flat = bricks.values.reshape(-1)
-        self.first = np.array(frame.first[::-1], dtype=np.float64)
+    def __init__(self, frame: Frame, grid: Grid, bricks: Bricks, arrays: Arrays = NUMPY) -> None:
+        self.arrays, self.bricks = arrays, bricks
         self.stride = float(frame.stride)
-        self._counts = np.array(frame.values.shape[::-1])
-        ends = self.first + self._counts * frame.stride
+        first, counts = np.array(frame.first[::-1], dtype=np.float64), np.array(frame.values.shape[::-1])
+        ends = first + counts * frame.stride
         # A frame reaches to the end of the domain if no more of its vertices would fit.
-        low = np.where(self.first == 0, grid.bounds[:, 0], self.first)
+        low = np.where(first == 0, grid.bounds[:, 0], first)
         high = np.where(ends > np.array(grid.counts) - 1, grid.bounds[:, 1], ends - frame.stride)
-        self.bounds: Floats = np.stack([low, high], axis=-1)
-        self._jumps = np.array([1, self._counts[0], self._counts[0] * self._counts[1]])
+        self.bounds, self.first = arrays.array(np.stack([low, high], axis=-1)), arrays.array(first)
+        self.vertices = arrays.array(np.stack([first, ends - frame.stride], axis=-1))
+        self._last, self._last_cell = arrays.array(counts - 1.0), arrays.array(np.maximum(counts - 2.0, 0.0))
+        self._jumps = (1, int(counts[0]), int(counts[0] * counts[1]))
+        self._wide = [bool(count > 1) for count in counts]
+        with arrays.guarded():
+            self._values = arrays.array(bricks.values)
+        self._flat = self._values.reshape(-1)
 
-    def visible(self, task: Task) -> npt.NDArray[np.bool_]:
+    def visible(self, palette: Palette) -> Array:
         """As `Field` has it."""
-        return np.concatenate(
-            [
-                Bricks(values=layers, low=_of_cells(layers, np.fmin), high=_of_cells(layers, np.fmax)).matters(task)
-                for layers in _layers(self.bricks.values)
-            ]
-        )
+        arrays, xp = self.arrays, self.arrays.xp
+        layers = max(1, arrays.batch // self._jumps[2])
+        found = []
+        for start in range(0, max(len(self._values) - 1, 1), layers):
+            values = self._values[start : start + layers + 1]
+            found.append(palette.visible(*(arrays.real(_of_cells(values, extreme)) for extreme in (xp.fmin, xp.fmax))))
+        return xp.concatenate(found)
 
-    def values(self, places: Floats) -> Floats:
+    def values(self, places: Array) -> Array:
         """As `Field` has it."""
-        result = np.empty(len(places))
-        for start in range(0, len(places), BATCH):
-            inside, low, share = self._located(places[start : start + BATCH])
+        result = self.arrays.empty((len(places),))
+        for start in range(0, len(places), self.arrays.batch):
+            inside, low, share = self._located(places[start : start + self.arrays.batch], self._last)
             # The corner after counts only where it has weight, so that a missing one beyond a vertex does not matter.
-            corners = self._corners(low, np.where(share > 0, self._jumps, 0))
+            jumps = [self.arrays.whole(share[:, axis] > 0) * jump for axis, jump in enumerate(self._jumps)]
+            corners = self._corners(low, jumps)
             along = corners[:, :, 0] + share[:, 0] * (corners[:, :, 1] - corners[:, :, 0])
             across = along[:, 0] + share[:, 1] * (along[:, 1] - along[:, 0])
             found = across[0] + share[:, 2] * (across[1] - across[0])
-            result[start : start + BATCH] = np.where(inside, found, np.nan)
+            result[start : start + len(found)] = self.arrays.xp.where(inside, found, np.nan)
         return result
 
-    def slopes(self, places: Floats) -> Floats:
+    def slopes(self, places: Array) -> Array:
         """As `Field` has it; on the border of two cells those of the cell after it."""
-        result = np.empty((len(places), 3))
-        for start in range(0, len(places), BATCH):
-            _, low, share = self._located(places[start : start + BATCH])
-            corners = self._corners(low, np.where(self._counts > 1, self._jumps, 0)[None])
+        xp = self.arrays.xp
+        result = self.arrays.empty((len(places), 3))
+        for start in range(0, len(places), self.arrays.batch):
+            _, low, share = self._located(places[start : start + self.arrays.batch], self._last_cell)
+            corners = self._corners(low, [jump if wide else 0 for jump, wide in zip(self._jumps, self._wide, strict=True)])
             x, y, z = share.T
             steps = corners[:, :, 1] - corners[:, :, 0]
             along = corners[:, :, 0] + x * steps
             across = along[:, 0] + y * (along[:, 1] - along[:, 0])
             part = steps[:, 0] + y * (steps[:, 1] - steps[:, 0])
             rise = along[:, 1] - along[:, 0]
-            found = np.stack([part[0] + z * (part[1] - part[0]), rise[0] + z * (rise[1] - rise[0]), across[1] - across[0]], axis=-1)
-            result[start : start + BATCH] = np.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0) / self.stride
+            found = xp.stack([part[0] + z * (part[1] - part[0]), rise[0] + z * (rise[1] - rise[0]), across[1] - across[0]], axis=-1)
+            result[start : start + len(found)] = xp.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0) / self.stride
         return result
 
-    def _located(self, places: Floats) -> tuple[npt.NDArray[np.bool_], Cells, Floats]:
-        inside = np.all((places >= self.bounds[:, 0]) & (places <= self.bounds[:, 1]), axis=1)
-        last = self._counts - 1
-        at = np.clip((places - self.first) / self.stride, 0.0, last)
-        low = np.minimum(at.astype(np.int64), np.maximum(last - 1, 0))
-        return inside, low, at - low
+    def _located(self, places: Array, most: Array) -> tuple[Array, Array, Array]:
+        """Whether places are within the bounds, the numbers (n,) of the vertices before them, and shares (n, 3) of those after.
 
-    def _corners(self, low: Cells, jumps: Cells) -> Floats:
-        """Values (z 2, y 2, x 2, n) around places; jumps (n or 1, 3) to the corner after along x, y and z."""
-        first = low @ self._jumps
-        x, y, z = np.broadcast_to(jumps, low.shape).T
-        found = np.empty((2, 2, 2, len(low)))
-        for corner in np.ndindex(2, 2, 2):
-            found[corner] = self._flat.take(first + corner[0] * z + corner[1] * y + corner[2] * x)
+        most: the last vertex (x, y, z) that counts as one before a place.
+        """
+        arrays, xp, last = self.arrays, self.arrays.xp, self._last
+        inside = xp.all((places >= self.bounds[:, 0]) & (places <= self.bounds[:, 1]), axis=1)
+        at = xp.clip((places - self.first) / self.stride, 0 * last, last)
+        before = xp.minimum(xp.floor(at), most)
+        x, y, z = arrays.whole(before).T
+        return inside, x + y * self._jumps[1] + z * self._jumps[2], at - before
+
+    def _corners(self, low: Array, jumps: list[Array] | list[int]) -> Array:
+        """Values (z 2, y 2, x 2, n) around places; jumps, (n,) or one for all, to the vertices after them along x, y and z."""
+        found = self.arrays.empty((2, 2, 2, len(low)))
+        for corner in product((0, 1), repeat=3):
+            found[corner] = self.arrays.xp.take(self._flat, low + sum(jump for up, jump in zip(corner[::-1], jumps, strict=True) if up))
         return found
 
 
 class NetworkField:
     """The network of a file of the profile paper at every point: between its vertices it has values of its own."""
 
-    def __init__(self, volume: Volume, step: float, units: Units) -> None:
+    def __init__(self, volume: Volume, step: float, units: Units, arrays: Arrays = NUMPY) -> None:
         model = volume._model
         if not isinstance(model, PaperModel):
             raise InputError(f"{volume.path}: a file of the profile {volume.profile} has no network")
-        self._range, self._units = volume.value_range, units
-        self._key = volume.key_times.key_index(step)
+        self.arrays, self.stride = arrays, 1.0
+        self._low, self._high = (float(end) for end in units.to([volume.value_range.low, volume.value_range.high]))
+        key = volume.key_times.key_index(step)
+        first, last = (np.array([float(ends[side]) for ends in volume.box][::-1]) for side in (0, 1))
+        flat = np.array(volume.shape[:0:-1]) == 1
+        ends = np.stack([first, last - 1], axis=-1)
+        self.vertices, self.bounds = arrays.array(ends), arrays.array(ends + np.where(flat[:, None], [-0.5, 0.5], 0.0))
+        self.first, self._last, self._flat = (arrays.array(part) for part in (first, last - 1 - first, flat))
+        occupied = np.ascontiguousarray(volume.occupancy(step, volume.box))
         network = model.network
-        tables = [_Nodes(table, _nodes(network, level, self._key)) for level, table in enumerate(network.tables)]
-        self._network = replace(network, tables=tables)
-        self.first = np.array([low for low, _ in volume.box][::-1], dtype=np.float64)
-        self.stride = 1.0
-        self._counts = np.array([high - low for low, high in volume.box][::-1])
-        self._flat_axes = np.array(volume.shape[:0:-1]) == 1
-        self._occupied = np.ascontiguousarray(volume.occupancy(step, volume.box))
-        self._jumps = np.array([1, self._counts[0], self._counts[0] * self._counts[1]])
-        ends = np.stack([self.first, self.first + self._counts - 1], axis=-1)
-        self.bounds: Floats = ends + np.where(self._flat_axes[:, None], [-0.5, 0.5], 0.0)
-        self.bricks = self._possible()
+        with arrays.guarded():
+            self._occupied = arrays.array(occupied)
+            self._inference: Inference = PatchInference(network, key) if arrays is NUMPY else DenseInference(network, key, arrays)
+        self._jumps = (1, occupied.shape[2], occupied.shape[1] * occupied.shape[2])
+        self.bricks = self._possible(occupied)
 
-    def _possible(self) -> Bricks:
+    def _possible(self, occupied: Array) -> Bricks:
         """What a brick of a network holds is not known before it is evaluated: any value, with a margin, where there is one at all."""
-        found = Bricks.of(Frame(values=np.where(self._occupied, np.float32(1), np.float32(np.nan)), first=(0, 0, 0)))
-        low, high = self._units.to([self._range.low, self._range.high])
+        found = Bricks.of(Frame(values=np.where(occupied, np.float32(1), np.float32(np.nan)), first=(0, 0, 0)))
+        low, high = np.float32(2 * self._low - self._high), np.float32(2 * self._high - self._low)
         known = found.low <= found.high
-        low, high = np.float32(2 * low - high), np.float32(2 * high - low)
         return replace(found, low=np.where(known, low, np.float32(np.inf)), high=np.where(known, high, np.float32(-np.inf)))
 
-    def visible(self, task: Task) -> npt.NDArray[np.bool_]:
+    def visible(self, palette: Palette) -> Array:
         """As `Field` has it: where there is a vertex of the coreset."""
-        return np.concatenate([_of_cells(layers, np.logical_or) for layers in _layers(self._occupied)])
+        return _of_cells(self._occupied, self.arrays.xp.logical_or)
 
-    def values(self, places: Floats) -> Floats:
+    def values(self, places: Array) -> Array:
         """As `Field` has it."""
         at, inside = self._inside(places)
-        result = np.full(len(places), np.nan)
-        if inside.any():
-            unit = sample_points(self._network, self._key, *at[inside].T[::-1])
-            result[inside] = self._units.to(self._range.from_unit(unit))
+        result = self.arrays.full(len(places), np.nan)
+        if len(at := at[inside]):
+            unit = self.arrays.xp.clip(self.arrays.real(self._inference.values(at)), 0.0, 1.0)
+            result[inside] = self._low + unit * (self._high - self._low)
         return result
 
-    def slopes(self, places: Floats) -> Floats:
+    def slopes(self, places: Array) -> Array:
         """As `Field` has it: analytic, through interpolation and network."""
         at, inside = self._inside(places)
-        result = np.zeros((len(places), 3))
-        if inside.any():
-            _, slopes = sample_points(self._network, self._key, *at[inside].T[::-1], gradient=True)
-            extent = (self._range.high - self._range.low) * self._units.factor
-            result[inside] = np.nan_to_num(slopes[:, :0:-1].astype(np.float64) * extent, nan=0.0, posinf=0.0, neginf=0.0)
+        result = self.arrays.full((len(places), 3), 0.0)
+        if len(at := at[inside]):
+            slopes = self.arrays.real(self._inference.slopes(at)) * (self._high - self._low)
+            result[inside] = self.arrays.xp.nan_to_num(slopes, nan=0.0, posinf=0.0, neginf=0.0)
         return result
 
-    def _inside(self, places: Floats) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    def _inside(self, places: Array) -> tuple[Array, Array]:
         """Places in vertices of the box, and whether all vertices of weight around them are in the coreset."""
-        at = np.where(self._flat_axes, 0.0, places - self.first)
-        last = self._counts - 1
-        inside = np.all((at >= 0) & (at <= last), axis=1)
-        at = np.clip(at, 0.0, last)
-        low = at.astype(np.int64)
-        first = low @ self._jumps
-        x, y, z = np.where(at > low, self._jumps, 0).T
+        arrays, xp, last = self.arrays, self.arrays.xp, self._last
+        at = xp.where(self._flat, 0.0, places - self.first)
+        inside = xp.all((at >= 0) & (at <= last), axis=1)
+        at = xp.clip(at, 0 * last, last)
+        low = arrays.whole(at)
+        first = low[:, 0] + low[:, 1] * self._jumps[1] + low[:, 2] * self._jumps[2]
+        jumps = [arrays.whole(at[:, axis] > low[:, axis]) * jump for axis, jump in enumerate(self._jumps)]
         flat = self._occupied.reshape(-1)
-        for corner in np.ndindex(2, 2, 2):
-            inside &= flat.take(first + corner[0] * z + corner[1] * y + corner[2] * x)
+        for corner in product((0, 1), repeat=3):
+            inside &= xp.take(flat, first + sum(jump for up, jump in zip(corner[::-1], jumps, strict=True) if up))
         return at, inside
 
 
-class _Nodes:
-    """The time nodes of a table between which one key index lies, in memory, so that a pass of samples does not read them again."""
-
-    def __init__(self, table: TableSource, nodes: slice) -> None:
-        self.shape = tuple(table.shape)
-        self._first = nodes.start
-        self._values = table.read((nodes, *(slice(0, length) for length in self.shape[1:])))
-
-    def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """Values of a region (t, z, y, x) whose times are among the nodes."""
-        time = region[0]
-        return self._values[(slice(time.start - self._first, time.stop - self._first), *region[1:])]
-
-
-def _nodes(network: Network, level: int, key: float) -> slice:
-    count = network.levels[level][0]
-    first = min(int(key * (count - 1) / max(network.key_frames - 1, 1)), max(count - 2, 0))
-    return slice(first, min(first + 2, count))
-
-
-def _layers(values: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
-    """The two vertices in z around each layer of cells."""
-    return [values[z : z + 2] for z in range(max(len(values) - 1, 1))]
-
-
-def _of_cells(values: npt.NDArray[Any], reduce: np.ufunc) -> npt.NDArray[Any]:
-    """A ufunc over the eight vertices of each cell; an axis of one vertex has one cell."""
+def _of_cells(values: Array, reduce: Callable[[Array, Array], Array]) -> Array:
+    """A function of two arrays over the eight vertices of each cell (z, y, x); an axis of one vertex has one cell."""
     for axis in range(3):
         if values.shape[axis] > 1:
-            low, high = (np.take(values, range(side, values.shape[axis] - 1 + side), axis=axis) for side in (0, 1))
-            values = reduce(low, high)
-    return np.where(np.isnan(values), np.float32(np.inf if reduce is np.fmin else -np.inf), values) if values.dtype.kind == "f" else values
+            before = (slice(None),) * axis
+            values = reduce(values[(*before, slice(None, -1))], values[(*before, slice(1, None))])
+    return values

@@ -1,4 +1,4 @@
-"""Marching rays through a frame of values: natively in packets, or slower in numpy where the native library is not there."""
+"""Marching rays through a frame of values: natively in packets, or slower streamed in numpy where the native library is not there."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 
 from fhash_codec.render.bricks import Bricks
+from fhash_codec.render.fields import FrameField
 from fhash_codec.render.native_march import MOST_SURFACES, MOST_VALUES, march_native
-from fhash_codec.render.portable_march import march_portable
+from fhash_codec.render.stream import stream
 from fhash_codec.render.task import Frame, Marched, Task
 from fhash_formats import native
 from fhash_formats.errors import InputError
@@ -44,7 +45,9 @@ def march(frame: Frame, task: Task, *, bricks: Bricks | None = None, threads: in
 def _march(frame: Frame, task: Task, bricks: Bricks, threads: int | None) -> Marched:
     library = native.library()
     if library is None or bricks.values.size > MOST_VALUES:
-        return march_portable(frame, task, bricks)
+        streamed = stream(FrameField(frame, task.rays.grid, bricks), task, adaptive=True)
+        # A decoded frame is no model that is evaluated.
+        return dataclasses.replace(streamed, counters={**streamed.counters, "evaluations": 0})
     return march_native(library, frame, task, bricks, threads)
 
 

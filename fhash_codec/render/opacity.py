@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.features import Interval, Isosurface, Segmentation, parse_feature
+from fhash_codec.normalise import ValueRange
 from fhash_formats.errors import InputError
 
-__all__ = ["PRESETS", "Histogram", "opacity_preset", "shown_range"]
+__all__ = ["PRESETS", "Histogram", "about", "opacity_preset", "shown_range"]
 
 Floats = npt.NDArray[np.float64]
 Range = tuple[float, float]
@@ -32,6 +33,7 @@ EDGE = 0.1
 TENT = 0.02
 """Half the width of an isosurface's tent, of the value range."""
 SHARES = np.linspace(0.0, 1.0, 65)
+ENDS = (-float(np.finfo(np.float64).max), float(np.finfo(np.float64).max))
 
 
 def opacity_preset(name: str, *, shown: Range, value_range: Range, features: Sequence[str], histogram: Histogram | None) -> Floats:
@@ -72,7 +74,19 @@ def shown_range(features: Sequence[str], value_range: Range) -> Range:
     low, high = value_range
     if found and len(found) == len(features):
         low, high = min(part[0] for part in found), max(part[1] for part in found)
-    return (low, high) if low < high else (low, low + max(abs(low) * 1e-6, 1e-30))
+    return (low, high) if low < high else about(low)
+
+
+def about(value: float) -> Range:
+    """A narrow range that begins at a value, or where float64 ends there, ends at it."""
+    extent = max(abs(value) * 1e-6, 1e-30)
+    return (value, value + extent) if math.isfinite(value + extent) else (value - extent, value)
+
+
+def _part(share: float, reach: Range) -> float:
+    """A share of the width of a range; the width itself may overflow."""
+    low, high = reach
+    return share * (high - low) if math.isfinite(high - low) else share * high - share * low
 
 
 def _values(text: str, value_range: Range) -> Range | None:
@@ -98,15 +112,16 @@ def _of_feature(text: str, value_range: Range) -> Floats | None:
     feature = parse_feature(text)
     low, high = value_range
     if isinstance(feature, Isosurface):
-        half = TENT * (high - low) or max(abs(low) * 1e-6, 1e-30)
-        return np.array([[feature.value - half, 0.0], [feature.value, SURFACE], [feature.value + half, 0.0]])
+        half = _part(TENT, value_range) or max(abs(low) * 1e-6, 1e-30)
+        tent = np.array([[feature.value - half, 0.0], [feature.value, SURFACE], [feature.value + half, 0.0]])
+        return tent[np.isfinite(tent[:, 0])]
     inside = _values(text, value_range)
     if inside is None:
         # A feature of one value, or of none that the data have, is drawn as a surface.
         return (
             _of_feature(f"isosurface:{feature.low}", value_range) if isinstance(feature, Interval) and math.isfinite(feature.low) else None
         )
-    edge = EDGE * (inside[1] - inside[0])
+    edge = _part(EDGE, inside)
     if isinstance(feature, Segmentation):
         return np.array([[inside[0], 0.0], [inside[0] + edge, INTERVAL]])
     assert isinstance(feature, Interval)
@@ -143,6 +158,9 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
         return np.array([[low, BACKGROUND]])
     if len(edges) != len(counts) + 1 or len(counts) == 0 or not counts.sum() > 0:
         return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
+    # By a power of two, 1 for every ordinary range, so that no difference overflows or is a denormal.
+    scale = ValueRange(low, high).scale
+    edges, low, high = edges * scale, low * scale, high * scale
     middles = edges[:-1] / 2 + edges[1:] / 2
     background = float(middles[np.argmax(counts)])
     distance = np.abs(middles - background)
@@ -154,11 +172,13 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
     far = max(float(distance[order[most]]), near + width)
     rise = [[background + near, 0.0], [background + far, BACKGROUND]] if background + near < high else []
     fall = [[background - far, BACKGROUND], [background - near, 0.0]] if background - near > low else []
-    return np.array(fall + rise or [[low, BACKGROUND]])
+    points = np.array(fall + rise or [[low, BACKGROUND]])
+    points[:, 0] = np.clip(points[:, 0], ENDS[0] * scale, ENDS[1] * scale) / scale
+    return points
 
 
 def _over(shown: Range, shares: Floats, opacities: Floats) -> Floats:
     low, high = shown
     if not low < high:
-        high = low + max(abs(low) * 1e-6, 1e-30)
+        low, high = about(low)
     return np.stack([low * (1 - shares) + high * shares, opacities], axis=-1)

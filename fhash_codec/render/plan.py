@@ -13,7 +13,7 @@ from fhash_codec.coreset import Box
 from fhash_codec.render.camera import Grid, Rays
 from fhash_codec.render.colours import parse_colour
 from fhash_codec.render.explain import reasons
-from fhash_codec.render.opacity import Histogram
+from fhash_codec.render.opacity import Histogram, about
 from fhash_codec.render.scene import AmbientOcclusion, Scene, Shading, Shadows
 from fhash_codec.render.task import Lighting, Surface, Table, Task
 from fhash_codec.render.transfer_function import TransferFunction
@@ -25,6 +25,8 @@ __all__ = ["Plan", "Units"]
 
 Floats = npt.NDArray[np.float64]
 
+LARGE_OFFSET = 2.0**9
+"""Half ranges that float32 values may be large: 15 bits are left for the range then."""
 MOST_RAYS = 2**26
 """Rays of a picture: more would not fit in the memory of most machines."""
 SHOULDER = (-0.7, 1.0, 1.0)
@@ -40,12 +42,17 @@ class Units:
 
     @classmethod
     def of(cls, volume: Volume) -> Units:
-        """Of float64 volumes the middle and the size of the value range, a power of two; float32 values stay what they are."""
-        if volume.dtype == np.float32:
-            return cls()
+        """Of float64 volumes the middle and the size of the value range, a power of two.
+
+        float32 values stay what they are unless they are so much larger than their range that what lies between them would be coarse.
+        """
         low, high = volume.value_range.low, volume.value_range.high
+        if low == high:
+            low, high = about(low)
         extent = high / 2 - low / 2
-        exponent = math.frexp(extent)[1] if extent > 0 else 0
+        if volume.dtype == np.float32 and max(abs(low), abs(high)) <= LARGE_OFFSET * extent:
+            return cls()
+        exponent = math.frexp(extent)[1]
         return cls(shift=low / 2 + high / 2, factor=math.ldexp(1.0, -max(-1000, min(1000, exponent))))
 
     def to(self, values: npt.ArrayLike) -> Floats:
@@ -141,7 +148,11 @@ class Plan:
             jitter=effects.jitter,
             skipping=march.skipping,
         )
-        mode = "cache" if march.mode == "auto" else march.mode
+        mode = march.mode
+        if mode == "auto":
+            mode = "arm" if march.device == "cuda" else "cache"
+        if mode == "cache" and march.device == "cuda":
+            raise InputError("march 'cache' computes on the CPU; take 'arm' or 'stream' for device 'cuda'")
         # Light comes from all of the volume, seen or not.
         everything: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
         region = part_in_view(rays, volume) if shadows is None and occlusion is None else everything
@@ -213,8 +224,9 @@ def _function(volume: Volume, scene: Scene, grid: Grid, histogram: Callable[[], 
     if histogram is None or scene.transfer_function.opacity != "auto" or scene.transfer_function.nothing:
         return found
     # What a histogram of one value would change tells whether the opacity depends on one at all.
-    low, high = value_range
-    probe = made((np.linspace(low, high, 9), np.array([0, 0, 0, 0, 1, 0, 0, 0], dtype=np.int64))) if low < high else found
+    (low, high), scale = value_range, volume.value_range.scale
+    edges = np.linspace(low * scale, high * scale, 9) / scale
+    probe = made((edges, np.array([0, 0, 0, 0, 1, 0, 0, 0], dtype=np.int64))) if low < high else found
     return found if np.array_equal(found.points, probe.points) else made(histogram())
 
 
@@ -244,6 +256,8 @@ def _lamp(rays: Rays, shading: Shading | None, shadows: Shadows | None) -> Float
     """Where the light comes from, unit vector (x, y, z) of the coordinates; None for the camera's, which casts no shadow that it sees."""
     chosen = shading.light if shading is not None and shading.light is not None else None
     if shadows is not None and shadows.light is not None:
+        if chosen is not None and chosen != shadows.light:
+            raise InputError("shading and shadows name different lights; there is one lamp: leave 'light' out of one of them")
         chosen = shadows.light
     if chosen is not None:
         length = float(np.linalg.norm(chosen))

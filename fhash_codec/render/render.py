@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from fhash_codec.coreset import Box
 from fhash_codec.progress import Progress, silent
+from fhash_codec.render.arrays import arrays_on
 from fhash_codec.render.bricks import Bricks
 from fhash_codec.render.counters import complete
 from fhash_codec.render.evolution import evolution
@@ -112,10 +113,11 @@ class Renderer:
             marched = march(frame.frame, task, bricks=frame.bricks, threads=self.threads)
             progress("marching", 1, 1, "")
         else:
+            arrays = arrays_on(plan.scene.march.device)
             field: Field = (
-                FrameField(frame.frame, task.rays.grid, frame.bricks)
+                FrameField(frame.frame, task.rays.grid, frame.bricks, arrays)
                 if frame is not None and self.volume.profile == "compact"
-                else NetworkField(self.volume, plan.step, plan.units)
+                else NetworkField(self.volume, plan.step, plan.units, arrays)
             )
             marched = stream(field, task, adaptive=plan.mode == "arm", budget=plan.scene.march.samples_per_pass, progress=progress)
         return self._finished(plan, marched, lit, begin)
@@ -126,7 +128,9 @@ class Renderer:
             self._settle()
             volume = self.volume
             last = volume.shape[0] - 1
-            edges = np.linspace(volume.value_range.low, volume.value_range.high, BINS + 1)
+            # By a power of two, 1 for every ordinary range, so that edges of denormals are apart and no width overflows.
+            scale = volume.value_range.scale
+            edges = np.linspace(volume.value_range.low * scale, volume.value_range.high * scale, BINS + 1)
             counts = np.zeros(BINS, dtype=np.int64)
             if volume.profile == "compact":
                 size = float(np.prod([high - low for low, high in volume.box]))
@@ -137,8 +141,9 @@ class Renderer:
             else:
                 frames = [volume.read(last // 2)]
             for frame in frames:
-                counts += np.histogram(np.clip(frame[np.isfinite(frame)], edges[0], edges[-1]), edges)[0]
-            self._histogram = edges, counts
+                known = frame[np.isfinite(frame)]
+                counts += np.histogram(np.clip(known if scale == 1 else known * scale, edges[0], edges[-1]), edges)[0]
+            self._histogram = edges / scale, counts
         return self._histogram
 
     def _frame(self, plan: Plan, progress: Progress) -> _Decoded:

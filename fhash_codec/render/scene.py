@@ -9,6 +9,7 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
+from fhash_codec.render.arrays import DEVICES
 from fhash_codec.render.record import Record, limits
 from fhash_formats.errors import InputError
 
@@ -143,6 +144,7 @@ class Marching(Record):
     samples_per_pass: int | None = limits(
         None, "N_r of adaptive ray marching: samples in a pass; the number of rays if left out", low=1, high=2**40
     )
+    device: str = limits("auto", "where arm and stream compute: on the first GPU if there is one, or as named", choices=DEVICES)
     skipping: bool = limits(True, "whether bricks without anything visible are passed over")
 
 

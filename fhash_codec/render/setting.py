@@ -1,4 +1,4 @@
-"""A task in the vertices of a frame: what every way to march begins with."""
+"""A task in the vertices of a frame, as the native library takes it, and what a gradient counts as."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from fhash_codec.render.bricks import Bricks
 from fhash_codec.render.task import Frame, Table, Task
 
-__all__ = ["Setting"]
+__all__ = ["Setting", "empty_table", "flatness"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -70,8 +70,7 @@ class Setting:
             with np.errstate(over="ignore"):
                 values = (bricks.values.astype(np.float64) / unit - middle / unit).clip(-LARGEST, LARGEST).astype(np.float32)
         low, high, least, most = (number / unit - middle / unit for number in (low, high, least, most))
-        span = max(high - low, (most - least) * 1e-15) or 1.0
-        noise = 4 * 2.0**-23 * max(abs(least), abs(most)) / span
+        span, floor = flatness(low, high, least, most)
         light = task.light
         return cls(
             values=values,
@@ -86,10 +85,20 @@ class Setting:
             seen=seen,
             spacing=spacing,
             gradient=vertex / (span * spacing),
-            floor=max(FLATTEST, min(noise, 1.0)),
+            floor=floor,
             light_offset=np.zeros(3) if light is None else (first - light.first) / light.cell,
             light_scale=1.0 if light is None else stride / light.cell,
         )
+
+
+def flatness(low: float, high: float, least: float, most: float) -> tuple[float, float]:
+    """The range that gradients are shares of, and the one per vertex at which light from a direction is half gone.
+
+    low, high: ends of the table. least, most: values of the frame, whose rounding to float32 must not be lit.
+    """
+    span = max(high - low, (most - least) * 1e-15) or 1.0
+    noise = 4 * 2.0**-23 * max(abs(least), abs(most)) / span
+    return span, max(FLATTEST, min(noise, 1.0))
 
 
 def empty_table(low: float, high: float) -> Table:

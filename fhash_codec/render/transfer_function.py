@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.normalise import ValueRange
 from fhash_codec.render.colours import ColourMap, is_map, named_map, parse_colour
-from fhash_codec.render.opacity import Histogram, opacity_preset, shown_range
+from fhash_codec.render.opacity import Histogram, about, opacity_preset, shown_range
 from fhash_codec.render.paraview import Preset, read_preset
 from fhash_codec.render.scene import TransferFunctionSpec
 from fhash_formats.errors import FhashWarning, InputError
@@ -111,7 +112,9 @@ class TransferFunction:
     def opacity(self, values: npt.ArrayLike) -> Floats:
         """Opacity 0..1 after the unit distance, without the density; 0 where a value is NaN."""
         array = np.asarray(values, dtype=np.float64)
-        found = np.interp(array, self.points[:, 0], self.points[:, 1])
+        # By a power of two, 1 for ordinary values: the distance of two points may overflow, and so may its reciprocal.
+        scale = ValueRange(self.points[0, 0], self.points[-1, 0]).scale
+        found = np.interp(scale * array, scale * self.points[:, 0], self.points[:, 1])
         return np.where(np.isnan(array), 0.0, found)
 
     def extinction(self, values: npt.ArrayLike) -> Floats:
@@ -128,7 +131,8 @@ class TransferFunction:
         share = np.arange(n) / (n - 1)
         values = low * (1 - share) + high * share
         extinctions = self.extinction(values)
-        places = np.clip(np.interp(self.points[:, 0], [low, high], [0, n - 1]), 0, n - 1)
+        scale = ValueRange(low, high).scale
+        places = np.clip(np.interp(self.points[:, 0] * scale, [low * scale, high * scale], [0, n - 1]), 0, n - 1)
         around = np.maximum(extinctions[np.floor(places).astype(np.int64)], extinctions[np.ceil(places).astype(np.int64)])
         inside = (self.points[:, 0] >= low) & (self.points[:, 0] <= high)
         if np.any(inside & (self.points[:, 1] > 0) & (around == 0)) and self.density > 0:
@@ -146,10 +150,11 @@ class TransferFunction:
         Exact by the points, for an interval widened by one entry of the table on either side. False where either end is NaN or
         the minimum is above the maximum.
         """
-        entry = (self.span[1] - self.span[0]) / (n - 1)
+        entry = self.span[1] / (n - 1) - self.span[0] / (n - 1)
         low, high = np.asarray(minimum, dtype=np.float64), np.asarray(maximum, dtype=np.float64)
         known = low <= high
-        low, high = np.where(known, low, 0.0) - entry, np.where(known, high, 0.0) + entry
+        with np.errstate(over="ignore"):
+            low, high = np.where(known, low, 0.0) - entry, np.where(known, high, 0.0) + entry
         at, positive = self.points[:, 0], self.points[:, 1] > 0
         # Between two points the opacity is above 0 if it is at either; beyond the ends it is that of the ends.
         pieces = np.concatenate([positive[:1], positive[1:] | positive[:-1], positive[-1:]])
@@ -212,6 +217,5 @@ def _span(points: Floats, colours: ColourMap, value_range: tuple[float, float]) 
         low = max(low, points[first - 1, 0] if first > 0 else min(points[0, 0], ends[0]))
         high = min(high, points[last + 1, 0] if last + 1 < len(points) else max(points[-1, 0], ends[1]))
     if not low < high:
-        low = min(low, high)
-        high = low + max(abs(low) * 1e-6, 1e-30)
+        low, high = about(float(min(low, high)))
     return float(low), float(high)

@@ -12,11 +12,11 @@ import threading
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import MissingDependencyError
 
 __all__ = ["ABI_VERSION", "library"]
 
-ABI_VERSION = 5
+ABI_VERSION = 6
 """The number that `fhash_abi_version()` must return; `FHASH_ABI` in core.hpp is its twin."""
 
 _HERE = Path(__file__).parent
@@ -29,7 +29,7 @@ def library() -> ctypes.CDLL | None:
 
     The library is loaded once; the environment is read at each call. Safe to call from several threads.
 
-    Raises InputError where a library is there but cannot be loaded or was built from other sources (another ABI number).
+    Raises MissingDependencyError where a library is there but cannot be loaded or was built from other sources (another ABI number).
     """
     if os.environ.get("FHASH_NATIVE") == "0":
         return None
@@ -49,9 +49,9 @@ def _load(folder: Path) -> ctypes.CDLL | None:
         loaded = ctypes.CDLL(str(path))
         version = loaded.fhash_abi_version
     except (OSError, AttributeError) as error:
-        raise InputError(f"the native library {path} cannot be used ({error}): {advice}") from error
+        raise MissingDependencyError(f"the native library {path} cannot be used ({error}): {advice}") from error
     version.argtypes = []
     version.restype = ctypes.c_int64
     if version() != ABI_VERSION:
-        raise InputError(f"the native library {path} has ABI {version()}, this version of the package needs {ABI_VERSION}: {advice}")
+        raise MissingDependencyError(f"the native library {path} has ABI {version()}, this version of the package needs {ABI_VERSION}: {advice}")
     return loaded

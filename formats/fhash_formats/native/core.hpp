@@ -8,7 +8,7 @@
 #include <cstdint>
 
 // Raise it whenever an exported signature or its meaning changes; native/__init__.py holds the same number.
-constexpr std::int64_t FHASH_ABI = 5;
+constexpr std::int64_t FHASH_ABI = 6;
 
 #if defined(_MSC_VER)
 #define FHASH_EXPORT extern "C" __declspec(dllexport)

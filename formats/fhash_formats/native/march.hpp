@@ -1,4 +1,4 @@
-// What a marcher is given, and values between vertices; shared by march.cpp and march_surface.hpp.
+// What a marcher is given, and values between vertices; shared by march.cpp and its parts.
 #pragma once
 
 #include <algorithm>
@@ -8,15 +8,16 @@
 
 #include "core.hpp"
 
-constexpr int FHASH_SURFACES = 64, FHASH_POWERS = 1024;
+constexpr int FHASH_SURFACES = 64, FHASH_POWERS = 1024, FHASH_BRICK = 4;
 
 // Mirrored field by field in fhash_codec/render/native_march.py. All places and directions are in vertices of the frame, x, y, z.
 extern "C" struct FhashMarch {
     const float* values;          // (z, y, x), NaN where there is none
     std::int64_t shape[3];        // z, y, x
     const std::int32_t* distance; // (z, y, x) of bricks: chessboard distance to the nearest that matters, 0 for such a one; null: all matter
+    const std::uint32_t* cells;   // (z, y, x, 2) of bricks: bit x + 4 y + 16 z for each cell where something can be seen; or null
     const float* highest;         // (z, y, x) of bricks: largest value, for the maximum along a ray; null: all may hold it
-    std::int64_t bricks[3], brick;  // bricks along z, y, x; cells along a brick's side
+    std::int64_t bricks[3];       // of FHASH_BRICK cells along a side, along z, y, x
     const float* table;           // (entries + 1, 4): red, green, blue, opacity of one step; the last entry twice
     const double* extinction;     // (entries + 1,): of one step
     std::int64_t entries;
@@ -39,6 +40,8 @@ extern "C" struct FhashMarch {
     float* out;                   // (height, width, 4), multiplied by the opacity
     float* depth;                 // (height, width) or null
     float* normal;                // (height, width, 3) or null
+    std::int64_t central;         // whether gradients that are shaded by are differences over two vertices
+    std::int64_t path;            // of the processor: 0 the quickest that there is, 1 at most AVX2, 2 neither
 };
 
 struct FhashCell {
@@ -51,9 +54,9 @@ inline FhashCell fhash_cell_at(const FhashMarch& m, double x, double y, double z
     using std::max;
     using std::min;
     const int nx = (int)m.shape[2], ny = (int)m.shape[1], nz = (int)m.shape[0];
-    x = min(max(x, 0.0), nx - 1.0);
-    y = min(max(y, 0.0), ny - 1.0);
-    z = min(max(z, 0.0), nz - 1.0);
+    x = max(0.0, min(x, nx - 1.0));  // in this order: what is not a number becomes 0
+    y = max(0.0, min(y, ny - 1.0));
+    z = max(0.0, min(z, nz - 1.0));
     const int i = min((int)x, max(nx - 2, 0)), j = min((int)y, max(ny - 2, 0)), h = min((int)z, max(nz - 2, 0));
     const int sx = nx > 1, sy = ny > 1 ? nx : 0;
     const std::int64_t sz = nz > 1 ? (std::int64_t)nx * ny : 0;
@@ -69,4 +72,22 @@ inline FhashCell fhash_cell_at(const FhashMarch& m, double x, double y, double z
     const double gy = (1 - fz) * ((1 - fx) * (c[2] - c[0]) + fx * (c[3] - c[1])) + fz * ((1 - fx) * (c[6] - c[4]) + fx * (c[7] - c[5]));
     const double gz = (1 - fy) * ((1 - fx) * (c[4] - c[0]) + fx * (c[5] - c[1])) + fy * ((1 - fx) * (c[6] - c[2]) + fx * (c[7] - c[3]));
     return {value, gx, gy, gz};
+}
+
+// The gradient by central differences: half of that between the values a vertex behind and before, clamped. Where one of them is missing
+// that of the cell, along that axis.
+inline void fhash_central(const FhashMarch& m, double x, double y, double z, FhashCell& cell) {
+    using std::max;
+    using std::min;
+    double at[3] = {min(max(x, 0.0), m.shape[2] - 1.0), min(max(y, 0.0), m.shape[1] - 1.0), min(max(z, 0.0), m.shape[0] - 1.0)};
+    double* const slopes[3] = {&cell.gx, &cell.gy, &cell.gz};
+    for (int c = 0; c < 3; c++) {
+        const double here = at[c];
+        at[c] = here + 1;
+        const double behind = fhash_cell_at(m, at[0], at[1], at[2]).value;
+        at[c] = here - 1;
+        const double difference = (behind - fhash_cell_at(m, at[0], at[1], at[2]).value) / 2;
+        at[c] = here;
+        if (difference == difference) *slopes[c] = difference;
+    }
 }

@@ -1,5 +1,7 @@
 """What bricks of a frame hold, and which of them matter."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,6 +55,16 @@ def test_bricks_matter_where_something_can_be_seen(way):
     assert bricks.matters(task_of(values.shape, [0.0, 0.0], (surface,))).sum() == 2
     assert not bricks.matters(task_of(values.shape, [0.0, 0.0])).any()
     assert bricks.matters(task_of(values.shape, [1.0, 0.0])).all()
+
+
+def test_a_table_of_denormal_width_is_one():
+    values = np.zeros((6, 6, 6), dtype=np.float32)
+    values[1, 1, 1] = 1.0
+    colours = np.ones((4097, 3), dtype=np.float32)
+    task = task_of(values.shape, [0.0, 1.0])
+    for extinctions, expected in ((np.ones(4097), True), (np.zeros(4097), False)):
+        table = Table(low=0.0, high=5e-324, colours=colours, extinctions=extinctions)
+        assert np.all(bricks_of(values).matters(replace(task, table=table)) == expected)
 
 
 def test_the_distance_is_that_to_the_nearest_brick_that_matters(way):

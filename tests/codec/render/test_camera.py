@@ -78,7 +78,7 @@ def test_coordinates_that_are_not_even_are_told() -> None:
         grid(x=np.arange(11) + 0.009 * (np.arange(11) == 5))
     with pytest.warns(FhashWarning, match="'x' of x are not evenly spaced"):
         assert grid(x=np.arange(11) ** 2).spacing[0] == 10
-    for wrong in ([1.0, 1.0], [np.nan, 1.0], [0.0, np.inf]):
+    for wrong in ([1.0, 1.0], [np.nan, 1.0], [0.0, np.inf], [np.inf, np.inf], [-1e308, 1e308], [0.0, 1e101], [1e150, 1.1e150], [0.0, 1e-101]):
         with pytest.warns(FhashWarning, match="'y' of y are no positions along a line"):
             assert grid(y=wrong).spacing[1] == 1
 
@@ -139,6 +139,14 @@ def test_a_point_on_a_pixels_ray_is_seen_in_that_pixel(camera: Camera, where: Gr
     j, i = np.meshgrid(np.arange(5), np.arange(7), indexing="ij")
     np.testing.assert_allclose(pixels, np.stack([i + 0.5, j + 0.5], axis=-1), atol=1e-9)
     np.testing.assert_allclose(depth, 12.5)
+
+
+@pytest.mark.parametrize("projection", ["perspective", "parallel"])
+def test_far_from_the_origin_the_rays_are_the_same(projection: str) -> None:
+    fine = 2.0**-20 * np.arange(11)
+    near, far = (Rays.of(Camera(projection=projection), grid(x=fine + at, y=fine - at, z=fine + at), (9, 9)) for at in (0.0, 1e9))
+    for name in ("eye", "right", "up", "forward"):
+        np.testing.assert_allclose(getattr(far, name), getattr(near, name), rtol=1e-9)
 
 
 def test_turning_and_rising_as_vtk_does() -> None:

@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fhash_codec.render.bricks import Bricks
 from fhash_codec.render.camera import Grid, Rays
 from fhash_codec.render.light import light_grid
 from fhash_codec.render.march import march
-from fhash_codec.render.portable_march import march_portable
 from fhash_codec.render.scene import AmbientOcclusion, Camera, Shadows
 from fhash_codec.render.task import Frame, Lighting, Surface, Table, Task
 from fhash_formats import native
@@ -221,9 +219,7 @@ def test_native_and_numpy_make_one_picture(case, spacing):
     more = {"step": 0.5, **CASES[case]}
     more["step"] *= unit
     task = task_of(values.shape, table, camera=Camera(azimuth=20.0), size=(45, 35), spacing=spacing, **more)
-    one, other = march(frame_of(values), task), march_portable(frame_of(values), task, Bricks.of(frame_of(values)))
-    if task.maximum and task.surfaces:
-        other = march_numpy(values, task)
+    one, other = march(frame_of(values), task), march_numpy(values, task)
     assert one.rgba[..., 3].max() > 0.2
     np.testing.assert_allclose(one.rgba, other.rgba, atol=2e-4)
     if task.depth:
@@ -272,6 +268,25 @@ def test_a_part_of_the_domain_is_sampled_where_the_whole_is(way):
     part = Frame(values=values[:21, 8:, 7:], first=(0, 8, 7))
     whole = march(frame_of(values), task)
     np.testing.assert_allclose(march(part, task).rgba, whole.rgba, atol=1e-4)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_surfaces_of_a_part_are_seen_up_to_its_faces(stride):
+    if native.library() is None:
+        pytest.skip("no native library")
+    n = np.arange(0, 40, stride)
+    z, y, x = np.meshgrid(n, n, n, indexing="ij")
+    values = (0.5 + 0.5 * np.sin((x + 2 * y - z) / 9)).astype(np.float32)[1:, :-2, 2:]
+    frame = Frame(values=values, first=(stride, 0, 2 * stride), stride=stride)
+    surfaces = (Surface(value=0.6, colour=WHITE, opacity=0.5),)
+    table, camera = table_of(np.linspace(0, 0.3, 100)), Camera(azimuth=10)
+    task = task_of((43, 43, 43), table, size=(50, 50), camera=camera, shaded=True, surfaces=surfaces, depth=True)
+    one = march(frame, task)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FHASH_NATIVE", "0")
+        other = march(frame, task)
+    np.testing.assert_allclose(other.rgba, one.rgba, atol=1e-4)
+    np.testing.assert_allclose(other.depth, one.depth, atol=1e-3)
 
 
 def test_a_coarse_frame_covers_the_same_box(way):

@@ -95,3 +95,14 @@ def test_colours_reach_over_the_feature() -> None:
     assert shown_range(("interval:3:7", "isosurface:9"), RANGE) == RANGE
     low, high = shown_range((), (5.0, 5.0))
     assert low == 5 < high
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0**-1000, 2.0**1019])
+def test_the_background_is_clear_however_small_or_large_the_values_are(scale: float) -> None:
+    counts = np.zeros(16, dtype=np.int64)
+    counts[[0, 8, 15]] = 2, 100, 1
+    reach = 15 * scale
+    edges = np.linspace(-1.0, 1.0, 17) * reach
+    with np.errstate(all="raise", under="ignore"):
+        found = at("auto", [-reach, 0.06 * reach, reach], value_range=(-reach, reach), histogram=(edges, counts))
+    assert found == pytest.approx([BACKGROUND, 0, BACKGROUND], rel=0.1, abs=0.01)

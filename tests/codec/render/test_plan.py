@@ -141,6 +141,9 @@ def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]
         ({"transfer_function": {"density": 0}}, "shows nothing"),
         ({"background": "wite"}, "did you mean 'white'"),
         ({"effects": {"shading": {"light": [0, 0, 0]}}}, "no length"),
+        ({"effects": {"shading": {"light": [0, 0, 1]}, "shadows": {"light": [0, 1, 1]}}}, "one lamp"),
+        ({"march": {"mode": "cache", "device": "cuda"}}, "computes on the CPU"),
+        ({"march": {"device": "gpu"}}, "allowed: auto, cpu, cuda"),
         ({"camera": {"position": [1, 1, 1], "focal_point": [1, 1, 1]}}, "are the same"),
         ({"camera": {"view_up": [0, 0, 0]}}, "no length"),
     ],
@@ -169,3 +172,37 @@ def test_wide_values_keep_their_range_in_single_precision(tmp_path: Path) -> Non
         table = plan(wide).task.table
         assert table is not None
         assert -2 <= table.low < table.high <= 2
+
+
+@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
+@pytest.mark.parametrize("mode", ["stream", "arm", "portable"])
+def test_single_precision_with_a_large_offset_is_marched_without_it(tmp_path: Path, mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    z, y, x = np.meshgrid(*map(np.arange, (6, 7, 8)), indexing="ij")
+    field = (1e8 + 100 * np.sin(x / 3) * np.cos(y / 2) * z / 5).astype(np.float32)[None]
+    fhash_codec.encode(field, tmp_path / "far.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "far.fhz") as far:
+        assert np.abs(Units.of(far).to(far.read(0))).max() <= 2
+        shown = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
+        if mode == "portable":
+            monkeypatch.setenv("FHASH_NATIVE", "0")
+        other = fhash_codec.render(far, Scene.from_dict({"size": [32, 32], "march": {"mode": "cache" if mode == "portable" else mode}}))
+    np.testing.assert_allclose(other.rgba, shown.rgba, atol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_ordinary_single_precision_stays_what_it_is(tmp_path: Path, dtype: type) -> None:
+    field = np.linspace(200, 300, 5 * 6 * 7).reshape(1, 5, 6, 7).astype(dtype)
+    fhash_codec.encode(field, tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert (Units.of(volume) == Units()) is (dtype is np.float32)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("value", [0.0, 5.0, 1e-320, -1.7976931348623157e308])
+def test_constant_values_have_a_table_that_single_precision_holds(tmp_path: Path, value: float) -> None:
+    fhash_codec.encode(np.full((1, 5, 6, 7), value), tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        table = plan(volume).task.table
+        assert table is not None
+        assert np.float32(table.low) < np.float32(table.high)
+        assert np.isfinite(fhash_codec.render(volume, Scene.from_dict({"size": [16, 16]})).rgba).all()

@@ -207,6 +207,18 @@ def test_the_histogram_does_not_depend_on_the_step(renderer: Renderer) -> None:
     assert len(edges) == len(counts) + 1
 
 
+@pytest.mark.parametrize("factor", [5e-324, 1e307, -1e307], ids=str)
+def test_values_at_the_ends_of_float64_have_a_picture(tmp_path: Path, factor: float) -> None:
+    values = np.linspace(-17, 17, 5 * 6 * 7).reshape(1, 5, 6, 7).round() * factor
+    fhash_codec.encode(values, tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume, np.errstate(all="raise", under="ignore"):
+        shown = Renderer(volume)
+        image = shown.render(scene())
+        assert shown.histogram()[1].sum() == values.size
+    assert np.isfinite(image.rgba).all()
+    assert image.rgba[..., 3].max() > 0.1
+
+
 def test_counters_are_complete_and_known() -> None:
     assert complete({"rays": 2}, {"rays": 3, "samples": 1}) == {**dict.fromkeys(COUNTERS, 0), "rays": 5, "samples": 1}
     with pytest.raises(KeyError):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fhash_codec.render.opacity import PRESETS
+from fhash_codec.render.opacity import INTERVAL, PRESETS
 from fhash_codec.render.scene import TransferFunctionSpec
 from fhash_codec.render.transfer_function import OPAQUE, TransferFunction, alpha, extinction_of
 from fhash_formats.errors import FhashWarning, InputError
@@ -170,3 +170,30 @@ def test_a_constant_series_and_json() -> None:
     assert np.all(found.extinction([3.0]) == OPAQUE)
     assert json.loads(json.dumps(found.to_dict()))["opacity"] == [[3.0, 1.0]]
     assert made({}, value_range=(3.0, 3.0), features=("isosurface:3",)).visible(3.0, 3.0)
+
+
+LARGEST = float(np.finfo(np.float64).max)
+
+
+@pytest.mark.parametrize("value", [LARGEST, -LARGEST, 5e-324, 0.0])
+@pytest.mark.parametrize("opacity", ["auto", "linear", "opaque"])
+def test_a_constant_at_the_end_of_float64_has_a_table(value: float, opacity: str) -> None:
+    with np.errstate(all="raise", under="ignore"):
+        found = made({"opacity": opacity}, value_range=(value, value), features=("isosurface:" + repr(value),))
+        low, high, colours, extinctions = found.table()
+    assert -LARGEST <= low < high <= LARGEST
+    assert np.isfinite(colours).all()
+    assert np.isfinite(extinctions).all()
+    assert bool(found.visible(value, value))
+
+
+@pytest.mark.parametrize("reach", [LARGEST, 1e300, 1.0])
+def test_a_range_whose_width_overflows_is_drawn_like_any_other(reach: float) -> None:
+    features = ("interval:-inf:" + repr(reach / 2),)
+    with np.errstate(all="raise", under="ignore"):
+        found = made({}, value_range=(-reach, reach), features=features)
+        opacities = found.opacity(reach * np.array([-1, -0.5, 0.4, 0.425, 0.5, 1]))
+        found.table()
+        linear = made({"opacity": "linear"}, value_range=(-reach, reach)).opacity(reach * np.array([-1, -0.5, 0, 1]))
+    np.testing.assert_allclose(opacities / INTERVAL, [1, 1, 2 / 3, 0.5, 0, 0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(linear, [0, 0.25, 0.5, 1])
