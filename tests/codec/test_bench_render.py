@@ -192,7 +192,7 @@ def test_every_part_has_its_figures(result: RenderBench) -> None:
     assert all(entry["ours_ms"] > 0 and entry["window_ms"] > 0 for entry in report["against"])
     assert all(entry["psnr"] is None or entry["psnr"] > 25 for entry in report["against"])
     for entry in report["exactness"]:
-        assert entry["psnr"] is None or entry["psnr"] > (25 if entry["shaded"] else 50), entry
+        assert entry["psnr"] is None or entry["psnr"] > {"": 50, "cell": 25, "central": 42}[entry["gradient"]], entry
         assert entry["explained"] is None or entry["explained"] > 50, entry
     assert [entry["steps"] for entry in report["playback"]] == [3] * 4
     assert report["summary"].keys() == {"unshaded_median", "unshaded_least", "shaded_median", "shaded_least", "playback_median"}
