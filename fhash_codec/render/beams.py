@@ -13,6 +13,8 @@ __all__ = ["Beams", "shares", "slab"]
 
 ENDLESS = 2.0**62
 """Samples: more than a ray can have."""
+NEAR = 1e-7
+"""Vertices: rounding moves a place by less, even where the camera is far away."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,6 +93,16 @@ class Beams:
         extra = (1,) * (at.ndim - 1)
         origin, pace = (part[rays].reshape(-1, *extra, 3) for part in (self.origin, self.pace))
         return self.arrays.xp.clip(origin + at[..., None] * pace, self.bounds[:, 0], self.bounds[:, 1])
+
+    def borders(self, rays: Array, at: Array) -> Array:
+        """The same for where rays enter or leave: what rounding keeps off a face lies on it.
+
+        Of a surface with the value of a whole face that decides whether it is met.
+        """
+        xp, places = self.arrays.xp, self.places(rays, at)
+        for face in (self.bounds[:, 0], self.bounds[:, 1]):
+            places = xp.where(xp.abs(places - face) < NEAR, face, places)
+        return places
 
 
 def slab(origin: Array, direction: Array, bounds: Array, arrays: Arrays) -> tuple[Array, Array]:

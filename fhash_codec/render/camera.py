@@ -67,10 +67,10 @@ class Grid:
         for number, values in enumerate(axes):
             if len(values) == 1:
                 continue
-            # Not NaN, either. Products of a few lengths and squares of distances stay far from the ends of float64.
+            # Not NaN, either. Products of a few lengths, and squares of distances, stay far from the ends of float64.
             ordinary = bool(np.all(np.abs(values) <= LONGEST))
             extent = values[-1] - values[0] if ordinary else 0.0
-            if not 1 / LONGEST <= abs(extent):
+            if abs(extent) < 1 / LONGEST:
                 spacing[number], origin[number] = 1.0, 0.0
                 wrong = "are no positions along a line; vertices are drawn one unit apart"
             else:
@@ -216,13 +216,15 @@ def _proportions(coords: Sequence[Coordinate], spacing: Floats) -> Floats:
 
 def _upright(away: Floats, upward: Floats) -> tuple[Floats, Floats]:
     """Unit vectors: the upward direction as given, and the one to the right in the picture."""
-    length = float(np.linalg.norm(upward))
+    unit = upward / max(float(np.abs(upward).max()), 1.0)  # first, since the squares of the largest numbers go beyond float64
+    length = float(np.linalg.norm(unit))
     if not length > 0 or not np.isfinite(length):
         raise InputError("camera: view_up has no length; give a direction such as 0, 0, 1")
-    right = np.cross(upward / length, away)
+    unit = unit / length
+    right = np.cross(unit, away)
     if np.linalg.norm(right) < PARALLEL:
         raise InputError(f"camera: view_up {_text(upward)} is parallel to the direction of view; give another")
-    return upward / length, right / np.linalg.norm(right)
+    return unit, right / np.linalg.norm(right)
 
 
 def _turned(vector: Floats, axis: Floats, degrees: float) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
-import math
+import sys
 import tomllib
 import types
 import typing
@@ -146,5 +146,5 @@ def _fitted(hint: Any, value: Any) -> Any:
     if hint is bool or isinstance(value, bool):
         return value if hint is bool and isinstance(value, bool) else _WRONG
     if hint is float:
-        return float(value) if isinstance(value, int | float) and abs(value) < 1.8e308 and math.isfinite(value) else _WRONG
+        return float(value) if isinstance(value, int | float) and abs(value) <= sys.float_info.max else _WRONG
     return value if isinstance(value, hint) else _WRONG

@@ -190,10 +190,10 @@ class _Marcher:
         to = xp.minimum(places, leaving)
         values = arrays.copy(values)
         beyond = (places >= leaving) & (sample < self.end[alive][:, None])
-        values[beyond] = self._looked_up(beams.places(alive, to)[beyond])
+        values[beyond] = self._looked_up(beams.borders(alive, to)[beyond])
         rays = alive[xp.isnan(self.before[alive])]
         self.from_[rays] = xp.maximum(arrays.real(self.next[rays] - sample.shape[1] - 1), beams.entered[rays])
-        self.before[rays] = self._looked_up(beams.places(rays, self.from_[rays]))
+        self.before[rays] = self._looked_up(beams.borders(rays, self.from_[rays]))
         found = crossings(
             lambda row, at: self._looked_up(beams.places(alive[row], at)),
             xp.concatenate([self.from_[alive][:, None], to], axis=1),

@@ -68,6 +68,7 @@ def _seen(rays: Rays) -> Floats | None:
             # A plane holds the other direction and the ray at the picture's edge; the rest of the picture is on its inner side.
             along = middle if rays.parallel else middle + sign * side
             normal = np.cross(along, other)
+            normal = normal / np.abs(normal).max()  # first, since the squares of the largest scales go beyond float64
             normal = normal / np.linalg.norm(normal)
             normal = -normal if normal @ side * sign > 0 else normal
             place = rays.eye + sign * side if rays.parallel else rays.eye

@@ -63,11 +63,10 @@ inline FhashCell fhash_cell_at(const FhashMarch& m, double x, double y, double z
     const double fx = x - i, fy = y - j, fz = z - h;
     const float* v = m.values + ((std::int64_t)h * ny + j) * nx + i;
     const double c[8] = {v[0], v[sx], v[sy], v[sy + sx], v[sz], v[sz + sx], v[sz + sy], v[sz + sy + sx]};
-    double value = 0;
-    for (int n = 0; n < 8; n++) {
-        const double weight = (n & 1 ? fx : 1 - fx) * (n & 2 ? fy : 1 - fy) * (n & 4 ? fz : 1 - fz);
-        if (weight != 0) value += weight * c[n];
-    }
+    // Exactly the value of a face whose vertices all have the same.
+    const auto mix = [](double a, double b, double share) { return share == 0 ? a : share == 1 ? b : a + share * (b - a); };
+    const double near = mix(mix(c[0], c[1], fx), mix(c[2], c[3], fx), fy), far = mix(mix(c[4], c[5], fx), mix(c[6], c[7], fx), fy);
+    const double value = mix(near, far, fz);
     const double gx = (1 - fz) * ((1 - fy) * (c[1] - c[0]) + fy * (c[3] - c[2])) + fz * ((1 - fy) * (c[5] - c[4]) + fy * (c[7] - c[6]));
     const double gy = (1 - fz) * ((1 - fx) * (c[2] - c[0]) + fx * (c[3] - c[1])) + fz * ((1 - fx) * (c[6] - c[4]) + fx * (c[7] - c[5]));
     const double gz = (1 - fy) * ((1 - fx) * (c[4] - c[0]) + fx * (c[5] - c[1])) + fy * ((1 - fx) * (c[6] - c[2]) + fx * (c[7] - c[3]));

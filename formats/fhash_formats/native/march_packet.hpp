@@ -87,6 +87,15 @@ template <int WANTED> struct Packet {
     FhashCell cell(int l, double sample) const {
         return fhash_cell_at(m, o[0][l] + sample * d[0][l], o[1][l] + sample * d[1][l], o[2][l] + sample * d[2][l]);
     }
+    // Where a ray enters or leaves. What rounding keeps off a face lies on it: of a surface with the value of a whole face that decides.
+    FhashCell border(int l, double sample) const {
+        double at[3];
+        for (int c = 0; c < 3; c++) {
+            at[c] = o[c][l] + sample * d[c][l];
+            for (const double face : m.seen[c]) at[c] = std::fabs(at[c] - face) < 1e-7 ? face : at[c];
+        }
+        return fhash_cell_at(m, at[0], at[1], at[2]);
+    }
     FHASH_INLINE void flush() {
         #pragma omp simd
         for (int l = 0; l < N; l++) {

@@ -119,7 +119,7 @@ template <int WANTED> bool Packet<WANTED>::visible(int l, double sample) const {
 template <int WANTED> void Packet<WANTED>::meet(Counters& counted) {
     for (int l = 0; l < N; l++) {
         if (k[l] >= count[l] || !visible(l, entered[l])) continue;
-        previous[l] = (float)cell(l, entered[l]).value;
+        previous[l] = (float)border(l, entered[l]).value;
         counted.samples++;
     }
 }
@@ -129,7 +129,7 @@ template <int WANTED> void Packet<WANTED>::part_ways(const int* leapt, Counters&
     for (int l = 0; l < N; l++) {
         if (!leapt[l] || k[l] < count[l] || !visible(l, leaving[l])) continue;
         from[l] = max(count[l] - 2.0, entered[l]);
-        previous[l] = (float)cell(l, from[l]).value;
+        previous[l] = (float)border(l, from[l]).value;
         counted.samples++;
         k[l] = previous[l] == previous[l] ? count[l] - 1 : count[l];
     }

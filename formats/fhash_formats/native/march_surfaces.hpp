@@ -86,12 +86,12 @@ template <int WANTED> void Packet<WANTED>::surfaces(Counters& counted) {
         if (!on[l]) continue;
         if (!(previous[l] == previous[l])) {  // the first, or the first after a gap: from the entry, or the sample before it
             from[l] = max(k[l] - 1.0, entered[l]);
-            previous[l] = (float)cell(l, from[l]).value;
+            previous[l] = (float)border(l, from[l]).value;
             counted.samples++;
         }
         const bool beyond = k[l] >= leaving[l];
         if (beyond) {
-            cross(l, leaving[l], cell(l, leaving[l]).value, counted);
+            cross(l, leaving[l], border(l, leaving[l]).value, counted);
             previous[l] = NONE;
             continue;
         }
@@ -106,7 +106,7 @@ template <int WANTED> void Packet<WANTED>::finish(Counters& counted) {
     for (int l = 0; l < N; l++)
         if (on[l] && k[l] + 1 == count[l] && leaving[l] > k[l]) {
             counted.samples++;
-            cross(l, leaving[l], cell(l, leaving[l]).value, counted);
+            cross(l, leaving[l], border(l, leaving[l]).value, counted);
         }
 }
 

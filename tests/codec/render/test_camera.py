@@ -78,7 +78,16 @@ def test_coordinates_that_are_not_even_are_told() -> None:
         grid(x=np.arange(11) + 0.009 * (np.arange(11) == 5))
     with pytest.warns(FhashWarning, match="'x' of x are not evenly spaced"):
         assert grid(x=np.arange(11) ** 2).spacing[0] == 10
-    for wrong in ([1.0, 1.0], [np.nan, 1.0], [0.0, np.inf], [np.inf, np.inf], [-1e308, 1e308], [0.0, 1e101], [1e150, 1.1e150], [0.0, 1e-101]):
+    for wrong in (
+        [1.0, 1.0],
+        [np.nan, 1.0],
+        [0.0, np.inf],
+        [np.inf, np.inf],
+        [-1e308, 1e308],
+        [0.0, 1e101],
+        [1e150, 1.1e150],
+        [0.0, 1e-101],
+    ):
         with pytest.warns(FhashWarning, match="'y' of y are no positions along a line"):
             assert grid(y=wrong).spacing[1] == 1
 

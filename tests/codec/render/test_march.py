@@ -115,6 +115,28 @@ def test_roots_of_a_plane_are_exact(way):
     assert marched.depth[2, 2] == pytest.approx(eye[2, 2, 2] - place, abs=1e-4)
 
 
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.3, 0.7, 0.9)])
+def test_a_surface_of_the_value_of_a_face_is_that_face(way, spacing):
+    """Whatever rounding makes of where rays enter: all that meet the face from outside see it, of either sign of the slope."""
+    shape = (9, 8, 7)
+    for low, high in ((2.0, 6.0), (6.0, 2.0)):
+        ramp = np.broadcast_to(np.linspace(low, high, 9, dtype=np.float32)[:, None, None], shape)
+        camera = Camera(azimuth=7, elevation=50)
+        task = task_of(
+            shape, None, camera=camera, size=(64, 64), spacing=spacing, surfaces=(Surface(value=6.0, colour=WHITE, opacity=1.0),)
+        )
+        seen = march(frame_of(ramp), replace(task, depth=True))
+        origin, direction = (part.reshape(-1, 3) for part in task.rays.pixels())
+        face = 8.0 if high == 6.0 else 0.0
+        with np.errstate(divide="ignore"):
+            place = origin + ((face - origin[:, 2]) / direction[:, 2])[:, None] * direction
+        inside = np.all((place[:, :2] > 0.01) & (place[:, :2] < np.array([5.99, 6.99])), axis=1).reshape(64, 64)
+        outside = np.any((place[:, :2] < -0.01) | (place[:, :2] > np.array([6.01, 7.01])), axis=1).reshape(64, 64)
+        assert inside.sum() > 200
+        assert seen.rgba[inside, 3].min() == 1
+        assert seen.rgba[outside, 3].max() == 0
+
+
 def test_surfaces_are_drawn_in_the_order_in_which_a_ray_meets_them(way):
     ramp = np.broadcast_to(np.linspace(0, 1, 11, dtype=np.float32)[:, None, None], (11, 5, 5))
     red, blue = (Surface(value=v, colour=np.array(c), opacity=0.5) for v, c in ((0.81, (1.0, 0, 0)), (0.83, (0, 0, 1.0))))

@@ -320,6 +320,20 @@ def test_torch_evaluates_a_network_as_numpy_does(files: dict[str, Path], tensors
         np.testing.assert_allclose(there.normal, here.normal, atol=1e-3)
 
 
+@pytest.mark.parametrize("kind", ["compact", "paper"])
+def test_cuda_makes_the_picture_of_numpy(files: dict[str, Path], kind: str) -> None:
+    import torch
+
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    with fhash_codec.open(files[kind]) as found:
+        here, there = (stream(*planned(found, CENTRAL, arrays_on(device)), adaptive=True) for device in ("cpu", "cuda"))
+    assert here.rgba[..., 3].max() > 0.05
+    np.testing.assert_allclose(there.rgba, here.rgba, atol=1e-4)
+    np.testing.assert_allclose(there.normal, here.normal, atol=1e-3)
+    assert there.counters["rays"] == here.counters["rays"]
+
+
 def test_whole_tables_give_the_values_and_slopes_of_patches(files: dict[str, Path], tensors: Arrays) -> None:
     with fhash_codec.open(files["paper"]) as network:
         model = network._model
