@@ -19,6 +19,7 @@ from fhash_codec.coreset import Coreset
 from fhash_codec.train import Course
 from fhash_formats.errors import InputError
 from fhash_formats.writers.atomic import replacing
+from fhash_formats.writers.leftovers import clear
 
 # Settings that change neither the model nor the course of its training.
 PARTIAL_BYTES = 24  # what a temporary name adds while the checkpoint is written
@@ -45,7 +46,11 @@ def save_checkpoint(path: Path, state: Mapping[str, npt.NDArray[Any]], course: C
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, npt.NDArray[Any]], Course] | None:
-    """The state and course saved at `path`, or None where there is none; InputError for one that cannot be read."""
+    """The state and course saved at `path`, or None where there is none; InputError for one that cannot be read.
+
+    What a training left that was killed while it saved is cleared away, since this one may never save.
+    """
+    clear([path])
     if not path.exists():
         return None
     try:

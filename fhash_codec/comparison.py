@@ -31,6 +31,11 @@ def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> di
 
 
 def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any]:
-    """The quality of a volume as it decodes against its series, every step of it: `metrics.Quality` as JSON values."""
+    """The quality of a volume as it decodes against its series, every step of it: `metrics.Quality` as JSON values.
+
+    Raises InputError if the series changed since it was opened.
+    """
     data_range = volume.value_range.high - volume.value_range.low
-    return measure_quality(series.read, volume.read, series.shape[0], data_range, volume.background, progress).to_dict()
+    quality = measure_quality(series.read, volume.read, series.shape[0], data_range, volume.background, progress)
+    series.check()
+    return quality.to_dict()

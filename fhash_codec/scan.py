@@ -42,7 +42,7 @@ class Scan:
 
 
 def scan(series: Series, progress: Progress) -> Scan:
-    """Read every frame once; raises InputError if no value at all is finite. Progress stage: "scanning"."""
+    """Read every frame once; raises InputError if no value at all is finite, or if the series changed. Progress stage: "scanning"."""
     low, high, mean = np.inf, -np.inf, Mean()
     missing: dict[int, npt.NDArray[np.uint8]] = {}
     last: npt.NDArray[np.uint8] | None = None
@@ -58,6 +58,7 @@ def scan(series: Series, progress: Progress) -> Scan:
             last = last if last is not None and np.array_equal(bits, last) else bits
             missing[step] = last
         progress("scanning", step + 1, steps, "")
+    series.check()
     if mean.count == 0:
         raise InputError(f"{series.source}: '{series.name}' has no finite value in any of its {steps} steps; there is nothing to encode")
     value_range = ValueRange(low, high)

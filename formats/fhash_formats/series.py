@@ -75,6 +75,13 @@ class Series(ABC):
         if not 0 <= step < self.shape[0]:
             raise RegionError(f"{self.source}: step {step} is outside 0..{self.shape[0] - 1}")
 
+    def check(self) -> None:  # noqa: B027 - a series in memory does not change
+        """Raise InputError if what it is read from changed since it was opened: then the frames read are not of one state.
+
+        `read` notices most changes at once. Only this looks at every file, such as the chunks of a Zarr folder; whoever makes something
+        of all frames calls it before that counts.
+        """
+
     def close(self) -> None:  # noqa: B027 - a series in memory has nothing to release
         """Release the file."""
 
@@ -110,6 +117,9 @@ class StepsSeries(Series):
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)
         return self.whole.read(self.steps[step])
+
+    def check(self) -> None:
+        self.whole.check()
 
     def close(self) -> None:
         self.whole.close()

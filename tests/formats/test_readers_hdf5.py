@@ -301,6 +301,21 @@ def test_a_virtual_dataset_without_its_source_is_refused(tmp_path: Path) -> None
         open_series(tmp_path / "a.h5")
 
 
+def test_a_source_of_a_virtual_dataset_that_changes_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "part.h5", v=VALUES)
+    layout = h5py.VirtualLayout(shape=VALUES.shape, dtype="f4")
+    layout[:] = h5py.VirtualSource("part.h5", "v", shape=VALUES.shape)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_virtual_dataset("v", layout)
+    with open_series(tmp_path / "a.h5") as series:
+        series.read(0)
+        series.check()
+        os.utime(tmp_path / "part.h5", ns=(1, 1))
+        for look in (series.check, lambda: series.read(1)):
+            with pytest.raises(InputError, match=r"part\.h5 changed while it was being read"):
+                look()
+
+
 def test_a_chunk_of_many_steps_is_decompressed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("v", data=VALUES, chunks=(3, 3, 5, 6), compression="gzip")

@@ -115,6 +115,8 @@ def test_a_file_that_changes_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"f1.npy changed while it was being read"):
             series.read(1)
         np.testing.assert_array_equal(series.read(2), VALUES[2])
+        with pytest.raises(InputError, match=r"f1.npy changed while it was being read"):
+            series.check()
 
 
 def test_a_file_that_changes_while_it_is_opened_is_refused(tmp_path: Path) -> None:

@@ -315,6 +315,30 @@ def test_a_hierarchy_that_changes_is_refused(tmp_path: Path) -> None:
             series.read(0)
 
 
+@pytest.mark.parametrize("change", ["write", "touch", "delete", "add", "gone"])
+def test_chunks_that_change_are_noticed_by_the_check_of_the_whole(tmp_path: Path, change: str) -> None:
+    path = tmp_path / "a.zarr"
+    create(path, VALUES, name="v", chunks=(1, 3, 5, 6))
+    with open_series(path, steps=slice(1, None)) as series:
+        series.check()
+        series.read(0)
+        series.check()
+        chunk = path / "v" / "c" / "2" / "0" / "0" / "0"
+        if change == "write":
+            zarr.open_group(path, mode="a")["v"][2] = VALUES[1]
+        elif change == "touch":
+            os.utime(chunk, ns=(1, 1))
+        elif change == "delete":
+            chunk.unlink()
+        elif change == "add":
+            (chunk.parent / "1").write_bytes(b"x")
+        else:
+            shutil.rmtree(path)
+        with pytest.raises(InputError, match=r"changed while it was being read|cannot be read") as caught:
+            series.check()
+        assert "\n" not in str(caught.value)
+
+
 def test_stale_consolidated_metadata_is_not_believed(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
     array = create(path, VALUES, name="v", zarr_format=2, chunks=(1, 3, 5, 6))

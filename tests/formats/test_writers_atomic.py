@@ -162,6 +162,44 @@ def test_of_several_outputs_all_or_none_take_their_names(tmp_path: Path, monkeyp
     assert tree(tmp_path) == {"a": b"new", "b": b"new", "c": b"new"}
 
 
+@pytest.mark.parametrize("directory", [True, False])
+@pytest.mark.parametrize("links", [True, False])
+def test_another_writer_between_moving_aside_and_replacing_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, directory: bool, links: bool
+) -> None:
+    if not links:
+        monkeypatch.setattr(os, "link", no_links)
+    path = tmp_path / "out.zarr"
+    store(path) if directory else path.write_text("old")
+
+    def refuse(source: Path, target: Path) -> None:
+        monkeypatch.undo()
+        if directory:
+            store(path, "somebody else's")
+        else:
+            path.write_text("somebody else's") if not path.exists() else store_file(path, "somebody else's")
+            raise OSError(errno.EIO, "Input/output error")
+        os.rename(source, target)
+
+    monkeypatch.setattr(os, "replace", refuse)
+
+    def save() -> None:
+        with replacing(path, force=True, directory=directory) as temporary:
+            store(temporary, "new") if directory else temporary.write_text("new")
+
+    with pytest.raises(OutputError, match="another process wrote it meanwhile" if directory else "Input/output error"):
+        save()
+    assert [found.name for found in tmp_path.iterdir()] == ["out.zarr"]
+    assert (path / "c" / "0" if directory else path).read_text() == "somebody else's"
+
+
+def store_file(path: Path, text: str) -> None:
+    """Replace a file by another one, as other writers do."""
+    other = path.with_name("other")
+    other.write_text(text)
+    other.rename(path)
+
+
 def test_an_output_that_exists_stops_all_before_anything_is_written(tmp_path: Path) -> None:
     (tmp_path / "b").write_text("old")
     with pytest.raises(OutputExistsError), replacing_all([tmp_path / "a", tmp_path / "b"], force=False):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -57,3 +58,44 @@ class Stamp:
         if now != self:
             grown = f"{self.size} bytes before, {now.size} now" if now.size != self.size else "same size, written again"
             raise InputError(f"{self.path} changed while it was being read ({grown}); wait until it is complete and start again")
+
+
+@dataclass(frozen=True)
+class FolderStamp:
+    """What is below a folder: number of files, their bytes, and a digest of their names, sizes, times and identities.
+
+    One look at every file, which is too dear around every frame: `Series.check` is for it.
+    """
+
+    path: Path
+    files: int
+    size: int
+    digest: bytes
+
+    @classmethod
+    def of(cls, path: Path) -> FolderStamp:
+        """The stamp of a folder as it is now; raises InputError if it is gone."""
+        files, size, digest = 0, 0, hashlib.sha256()
+        with refusing(f"{path} cannot be read"):
+            folders = [os.fspath(path)]
+            while folders:
+                folder = folders.pop()
+                with os.scandir(folder) as found:
+                    entries = sorted(found, key=lambda entry: entry.name)
+                for entry in entries:
+                    if entry.is_dir():
+                        folders.append(entry.path)
+                        continue
+                    state = os.stat(entry.path)
+                    files, size = files + 1, size + state.st_size
+                    digest.update(f"{entry.path}\0{state.st_size} {state.st_mtime_ns} {state.st_ino}\0".encode(errors="surrogateescape"))
+        return cls(path, files, size, digest.digest())
+
+    def check(self) -> None:
+        """Raise InputError if anything in the folder is no longer what it was when the folder was opened."""
+        now = FolderStamp.of(self.path)
+        if now != self:
+            what = "something in it was written again"
+            if (now.files, now.size) != (self.files, self.size):
+                what = f"{self.files} files and {self.size} bytes before, {now.files} and {now.size} now"
+            raise InputError(f"{self.path} changed while it was being read ({what}); wait until it is complete and start again")

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.failures import Stamp
+from fhash_formats.readers.failures import FolderStamp, Stamp
 from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.series import Coordinate, Series, index_coordinate
 
@@ -45,9 +45,14 @@ class _Part:
     """What was seen of one file when the series was opened."""
 
     path: Path
-    stamp: Stamp
+    stamps: tuple[Stamp | FolderStamp, ...]
     steps: int
     time: Coordinate | None
+
+    def check(self) -> None:
+        """Raise InputError if it is no longer what was opened."""
+        for stamp in self.stamps:
+            stamp.check()
 
 
 class JoinedSeries(Series):
@@ -70,7 +75,7 @@ class JoinedSeries(Series):
                 first = first or part
                 _check_alike(part, path, first, paths[0])
                 time = part.coords["t"] if "t" in part.given else None
-                self._parts.append(_Part(path=path, stamp=part.stamp, steps=part.shape[0], time=time))
+                self._parts.append(_Part(path=path, stamps=part.stamps, steps=part.shape[0], time=time))
                 names.append(part.name)
                 files += part.files
         assert first is not None
@@ -88,18 +93,22 @@ class JoinedSeries(Series):
             self._current = (number, self._reopened(self._parts[number]))
         return self._current[1].read(step - (self._ends[number] - self._parts[number].steps))
 
+    def check(self) -> None:
+        for part in self._parts:
+            part.check()
+
     def close(self) -> None:
         if self._current is not None:
             self._current[1].close()
             self._current = None
 
     def _reopened(self, part: _Part) -> FileSeries:
-        part.stamp.check()  # before, because a file that is being written may not open at all
+        part.check()  # before, because a file that is being written may not open at all
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it was said when the series was opened
             series = self._open_part(part.path)
         try:
-            part.stamp.check()  # after, because from here on the series compares with the file that it opened
+            part.check()  # after, because from here on the series compares with the file that it opened
         except BaseException:
             series.close()
             raise

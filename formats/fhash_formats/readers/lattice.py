@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fhash_formats.attributes import plain_text
 from fhash_formats.errors import InputError
-from fhash_formats.readers.failures import Stamp, refusing
+from fhash_formats.readers.failures import FolderStamp, Stamp, refusing
 from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
 
 SLAB_BYTES = 64 * 2**20
@@ -33,11 +33,12 @@ class FileSeries(Series):
     Arguments: `shape` and `axes` in the file's order; `fetch(slices)` returns a fresh array of the file's dimensions, in physical values
     of type `dtype` (any byte order); `chunks` is the shape of a stored chunk, None without chunks: as many steps of one chunk as fit
     SLAB_BYTES are fetched at once and kept until the next fetch, a frame alone otherwise; `stamp` is checked before and after every
-    fetch; `beside` are files that hold values of it, other than `source`. Raises InputError for a shape or type that cannot be a series.
+    fetch; `beside` are files that hold values of it, other than `source`, and are checked likewise; `folder` is the stamp of all its
+    files, which `check` alone looks at. Raises InputError for a shape or type that cannot be a series.
 
     Attributes:
         given: the axes whose coordinate the file gives.
-        stamp: of the file when it was opened.
+        stamps: of all that it is read from when it was opened.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class FileSeries(Series):
         chunks: Sequence[int] | None = None,
         close: Callable[[], None] = lambda: None,
         beside: Sequence[Path] = (),
+        folder: FolderStamp | None = None,
     ) -> None:
         lengths = dict(zip(axes, shape, strict=True))
         self.source, self.name, self.dtype = source, plain_text(name), native(dtype)
@@ -64,7 +66,9 @@ class FileSeries(Series):
         self.units = str(self.attributes.get("units", ""))
         self.given = frozenset(coords or {})
         self.coords = {axis: index_coordinate(axis, length) for axis, length in zip(AXES, self.shape, strict=True)} | dict(coords or {})
-        self._axes, self._fetch, self.stamp, self._close = tuple(axes), fetch, stamp, close
+        self._axes, self._fetch, self._close = tuple(axes), fetch, close
+        self._quick = (stamp, *map(Stamp.of, beside))
+        self.stamps: tuple[Stamp | FolderStamp, ...] = self._quick if folder is None else (*self._quick, folder)
         frame_bytes = self.dtype.itemsize * prod(self.shape[1:])
         self._together = max(1, min(_steps_of_a_chunk(self._axes, shape, chunks), SLAB_BYTES // frame_bytes))
         self._slab: tuple[int, npt.NDArray[Any]] | None = None
@@ -79,21 +83,29 @@ class FileSeries(Series):
             self._slab = None  # before the fetch, so that two slabs are never held
             slab = self._slab = (start, self._block(start, min(start + self._together, self.shape[0])))
         else:
-            self.stamp.check()
+            self._check_files()
         return np.array(slab[1][step - start], dtype=self.dtype, order="C")
+
+    def check(self) -> None:
+        for stamp in self.stamps:
+            stamp.check()
 
     def close(self) -> None:
         self._slab = None
         self._close()
 
+    def _check_files(self) -> None:
+        for stamp in self._quick:
+            stamp.check()
+
     def _block(self, start: int, stop: int) -> npt.NDArray[Any]:
         """Steps start to stop as (t, z, y, x)."""
         steps = f"step {start}" if stop == start + 1 else f"steps {start} to {stop - 1}"
-        self.stamp.check()
+        self._check_files()
         with refusing(f"{self.source}: {steps} of {self.name} cannot be read"):
             ranges = {axis: slice(0, length) for axis, length in zip(AXES, self.shape, strict=True)} | {"t": slice(start, stop)}
             values = self._fetch(tuple(ranges[axis] for axis in self._axes))
-        self.stamp.check()
+        self._check_files()
         expected = {**dict(zip(AXES, self.shape, strict=True)), "t": stop - start}
         if values.shape != tuple(expected[axis] for axis in self._axes):
             raise InputError(f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed while it was being read")

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from fhash_formats.attributes import PACKING, PLUMBING, json_attributes
 from fhash_formats.errors import InputError
 from fhash_formats.readers.cf_packing import packing
-from fhash_formats.readers.failures import Stamp, condense, refusing
+from fhash_formats.readers.failures import FolderStamp, Stamp, condense, refusing
 from fhash_formats.readers.hdf5_tree import sibling
 from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.positions import Column, beside, coordinate, usable
@@ -147,8 +147,9 @@ def _series(root: Path, store: Any, arrays: Mapping[str, zarr.Array[Any]], faile
         dtype=values.dtype,
         axes=axes,
         fetch=values.read,
-        # in a folder it is the array's metadata that tells of a change of shape; chunks written anew are not noticed
+        # in a folder it is the array's metadata that tells of a change of shape at once, and all files at the end that of a chunk
         stamp=Stamp.of((_metadata(root / path) or root) if root.is_dir() else root),
+        folder=FolderStamp.of(root / path) if root.is_dir() else None,
         coords=coords,
         attributes=json_attributes(dict(array.attrs), without=PLUMBING | PACKING),
         chunks=array.chunks,

@@ -1,21 +1,22 @@
 """Outputs that are complete or absent, and never half of one: the one helper for every file that fhash writes.
 
 The bytes go to a temporary sibling in the same folder, are synced to the disk, and only then take the output's name.
-Whatever happens before (an error, a full disk, Ctrl-C) removes the temporary and leaves an older output as it was.
+Whatever happens before (an error, a full disk, Ctrl-C) removes the temporary and leaves an older output as it was. Of a writer that was
+killed the temporary stays, until the next writer of that output clears it away (see `leftovers`).
 """
 
 from __future__ import annotations
 
 import errno
 import os
-import secrets
-import shutil
 import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from fhash_formats.errors import FhashError, InputError, OutputError, OutputExistsError
+from fhash_formats.writers import leftovers
+from fhash_formats.writers.leftovers import remove
 from fhash_formats.writers.signals import signals_held
 
 ZARR_METADATA = ("zarr.json", ".zgroup", ".zarray")
@@ -87,7 +88,7 @@ def _same(one: Path, other: Path) -> bool:
 def replacing(path: Path, *, force: bool, directory: bool = False) -> Iterator[Path]:
     """A temporary path that becomes `path` when the block ends, and vanishes when the block fails.
 
-    The block creates a file (or with `directory` a directory) at the path it is given, `.NAME.<random>.partial` in the
+    The block creates a file (or with `directory` a directory) at the path it is given, `.NAME.<writer>.partial` in the
     same folder. Raises what `check_output` raises, before the block; an OSError of the block becomes an OutputError.
     """
     with replacing_all([path], force=force, directory=directory) as temporaries:
@@ -101,9 +102,10 @@ def replacing_all(paths: Sequence[Path], *, force: bool, directory: bool = False
     Raises and guarantees what `replacing` does. Only a process that is killed between two renames can leave some of
     several outputs without the others: name the one that refers to the others last.
     """
+    outputs = [_Output(path) for path in paths]
+    leftovers.clear(output.target for output in outputs)
     for path in paths:
         check_output(path, force, directory=directory)
-    outputs = [_Output(path) for path in paths]
     try:
         yield [output.temporary for output in outputs]
         for output in outputs:
@@ -149,10 +151,9 @@ class _Output:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.target = Path(os.path.realpath(path))
-        # Cut, so that the temporary's name stays below the 255 bytes of most file systems.
-        stem = f".{self.target.name[:40]}.{secrets.token_hex(4)}"
-        self.temporary = self.target.with_name(f"{stem}.partial")
-        self.old = self.target.with_name(f"{stem}.old")
+        stem = leftovers.new_stem(self.target.name)
+        self.temporary = self.target.with_name(stem + leftovers.PARTIAL)
+        self.old = self.target.with_name(stem + leftovers.OLD)
         self.placed = False
 
     def place(self, force: bool, directory: bool) -> None:
@@ -163,7 +164,12 @@ class _Output:
             if os.path.lexists(self.target):
                 self._keep_mode()
                 self._keep_old()
-            os.replace(self.temporary, self.target)
+            try:
+                os.replace(self.temporary, self.target)
+            except OSError as error:
+                if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # a folder takes no name that another took since
+                    raise OutputError(f"{self.path}: another process wrote it meanwhile, and that is kept") from error
+                raise
         else:
             self._create()
         self.placed = True
@@ -204,25 +210,18 @@ class _Output:
         """Everything as it was before."""
         with suppress(OSError):  # what went wrong first is what the user must see
             if self.placed:
-                _remove(self.target)
-            if os.path.lexists(self.old):
-                os.replace(self.old, self.target)
-                _remove(self.old)  # replacing one hard link by another of the same file does nothing
-        _remove(self.temporary)
+                remove(self.target)
+            if not os.path.lexists(self.target):
+                os.rename(self.old, self.target)
+            elif not self.placed:  # what is there is the older output itself, or what another process put in its place
+                remove(self.old)
+        remove(self.temporary)
 
     def forget_old(self) -> None:
         """Delete the older output that was replaced."""
-        _remove(self.old)
+        remove(self.old)
         if os.path.lexists(self.old):
             raise OutputError(f"{self.path} is written, but the older one could not be deleted; delete {self.old}")
-
-
-def _remove(path: Path) -> None:
-    with suppress(OSError):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
 
 
 def _sync(path: Path) -> None:
