@@ -14,6 +14,7 @@ def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[s
 
     ratio: raw bytes / bytes of the whole file. psnr, rmse, max_abs_error, ssim: over the coreset of all steps, also those between key
     frames; *_domain: over every finite vertex, the background standing outside the coreset. curve: the training history.
+    restarts: how often the training diverged and began again at a quarter of the learning rate.
     tables_loss_db: what coded tables cost at the key frames, None for others.
     seconds: of the whole job that was reported on.
     """
@@ -36,6 +37,7 @@ def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[s
         "profile": info["model"]["profile"],
         "tables_loss_db": info["model"].get("tables_loss_db"),
         "device": info["training"]["device"],
+        "restarts": info["training"].get("restarts", 0),
         "gains": info["model"].get("gains", []),
         "quality": quality,
     }

@@ -7,7 +7,8 @@ of the components (`mixed`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import prod
+from dataclasses import dataclass
+from math import isfinite, prod
 from typing import Any
 
 import numpy as np
@@ -151,28 +152,51 @@ def table_chunk(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
     return tuple(chunk)
 
 
+@dataclass(frozen=True, kw_only=True)
+class NumberType:
+    """How embeddings stand in a file: as `dtype`, of 8 bits as offset + scale * number."""
+
+    dtype: np.dtype[Any]
+    scale: float = 1.0
+    offset: float = 0.0
+
+    @classmethod
+    def of(cls, values: Floats, kind: str) -> NumberType:
+        """That of embeddings to be stored as `kind`; raises InputError where they do not fit in it or are not finite."""
+        dtype = np.dtype(kind)
+        low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
+        if not (isfinite(low) and isfinite(high)):
+            raise InputError("embeddings are not finite: the training diverged; set a lower --learning-rate")
+        if dtype.kind == "u":
+            # Zero, which stands wherever nothing was trained, is within the range, so that it costs little.
+            low, high = min(low, 0.0), max(high, 0.0)
+        reached = high - low if dtype.kind == "u" else max(-low, high)
+        if reached > float(np.finfo(np.float32 if dtype.kind == "u" else dtype).max):
+            raise InputError(f"embeddings reach {reached:g}, more than {kind} holds; use --tables float32")
+        if dtype.kind == "f":
+            return cls(dtype=dtype)
+        # A step that float32 does not hold to all its digits would not give back what it was made from.
+        scale = max((high - low) / np.iinfo(dtype).max, float(np.finfo(np.float32).tiny)) if high > low else 1.0
+        return cls(dtype=dtype, scale=scale, offset=low)
+
+    def stored(self, embeddings: Floats) -> npt.NDArray[Any]:
+        """Embeddings as numbers of the type, of the same shape."""
+        if self.dtype.kind == "f":
+            return embeddings.astype(self.dtype)
+        return np.asarray(np.rint(embeddings / self.scale - self.offset / self.scale).astype(self.dtype))
+
+
 def _write_table(writer: ContainerWriter, number: int, shape: tuple[int, ...], values: Floats, frames: Iterator[Floats], kind: str) -> None:
     """Write one level from its frames (z, y, x, E), one time node at a time."""
-    dtype = np.dtype(kind)
-    attributes: dict[str, Any] = {}
-    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
-    if dtype.kind == "u":
-        # Zero, which stands wherever nothing was trained, is within the range, so that it costs little.
-        low, high = min(low, 0.0), max(high, 0.0)
-        scale = (high - low) / np.iinfo(dtype).max or 1.0
-        attributes = {"offset": low, "scale": scale}
-        low, high = low / scale, high / scale
-    elif max(-low, high) > np.finfo(dtype).max:
-        raise InputError(f"embeddings reach {max(-low, high):g}, more than {kind} holds; use --tables float32")
-
-    def stored(frame: Floats) -> npt.NDArray[Any]:
-        return frame.astype(dtype) if dtype.kind == "f" else np.rint(frame / attributes["scale"] - low).astype(dtype)
+    numbers = NumberType.of(values, kind)
+    dtype = numbers.dtype
+    attributes = {"offset": numbers.offset, "scale": numbers.scale} if dtype.kind == "u" else None
 
     chunk = table_chunk(shape, dtype.itemsize)
 
     def chunks() -> Iterator[npt.NDArray[Any]]:
         for frame in frames:
-            node = stored(frame)[None]
+            node = numbers.stored(frame)[None]
             for start in np.ndindex(*(-(-n // c) for n, c in zip(node.shape, chunk, strict=True))):
                 yield node[tuple(slice(i * c, (i + 1) * c) for i, c in zip(start, chunk, strict=True))]
 
@@ -183,5 +207,5 @@ def _write_table(writer: ContainerWriter, number: int, shape: tuple[int, ...], v
         chunk_shape=chunk,
         chunks=chunks(),
         dimension_names=TABLE_AXES,
-        attributes=attributes or None,
+        attributes=attributes,
     )

@@ -9,6 +9,7 @@ from math import log10, prod
 
 import numpy as np
 import numpy.typing as npt
+from torch import Tensor
 
 from fhash_codec.coreset import Coreset
 from fhash_codec.engines import Engine
@@ -21,6 +22,20 @@ STEPS_AN_EPOCH = (20, 256)
 USUAL_EPOCHS, USUAL_STEPS = 20, 1000
 HISTORY_POINTS = 100
 PROBE_BRICKS = 512  # on which the quality of an epoch is measured
+DIVERGED = 4.0
+"""Mean squared error of a batch, in squares of the range, above which a training diverged: no start is as wrong, and what is ends as a
+constant for the most part (a rate of 0.1 reaches 2.3 and recovers)."""
+WATCHED = 16
+"""Batches after which their errors are looked at: a GPU would have to wait after each."""
+USUAL_RATE, DEAD, STILL = 0.01, 0.05, 0.5
+"""A model is dead whose error is the values' variance but for a share of DEAD, and moved by no more than STILL dB over the second half of
+the training: it says a constant, and a rate above the usual one killed it. What learnt too little is still on its way."""
+LOWER, MOST_RESTARTS = 0.25, 8
+"""What a rate that diverged is multiplied by, and how often."""
+
+
+class Diverged(TrainingError):
+    """The error grew beyond all that a lower learning rate would not mend."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,12 +82,24 @@ def plan_training(coreset: Coreset, *, epochs: int, learning_rate: float, schedu
 
 @dataclass(kw_only=True)
 class Course:
-    """How far a training has come: finished epochs, batches within the present one, seconds spent, and the quality after each epoch."""
+    """How far a training has come: finished epochs, batches within the present one, seconds spent, and the quality after each epoch.
+
+    restarts: how often it diverged and began again, each time at LOWER times the learning rate; the seconds are those of all.
+    """
 
     epoch: int = 0
     batch: int = 0
     seconds: float = 0.0
     history: list[dict[str, float | None]] = field(default_factory=list)
+    restarts: int = 0
+
+    def rate(self, asked: float) -> float:
+        """The learning rate to begin with where `asked` was asked for."""
+        return asked * LOWER**self.restarts
+
+    def again(self) -> Course:
+        """The course from the start at a lower rate. What led here is no place to go back to: the state of Adam has grown with it."""
+        return Course(seconds=self.seconds, restarts=self.restarts + 1)
 
 
 def train(
@@ -92,20 +119,27 @@ def train(
     Every epoch (of more than 100: every 2nd, 3rd, ...) adds {seconds, epoch, psnr} to the history; PSNR in dB of the normalised
     values on a fixed random choice of bricks.
     `save` is called with the course every `save_seconds`, and when `stop` asks for an end, which comes after the running batch.
-    The loop also ends once `budget_seconds` are spent. Raises TrainingError if the error is no longer finite.
+    The loop also ends once `budget_seconds` are spent. Raises Diverged where the error of a batch is above DIVERGED or not finite,
+    and where a higher rate than the usual one left nothing but a constant.
     """
     probe = np.sort(np.random.default_rng(plan.seed).permutation(plan.bricks)[:PROBE_BRICKS])
     begun = saved = time.perf_counter()
     before, note = course.seconds, ""
     every = -(-plan.epochs // HISTORY_POINTS)
+    counts, worst = np.diff(coreset.offsets), None
     while course.epoch < plan.epochs:
         for chosen in plan.order(course.epoch)[course.batch :]:
-            engine.train(chosen)
+            error = engine.train(chosen) / max(int(counts[chosen].sum()), 1)
+            worst = error if worst is None else worst.maximum(error)
             course.batch += 1
             now = time.perf_counter()
             course.seconds = before + now - begun
             asked = stop is not None and stop.asked
-            if save and (asked or now - saved > save_seconds):
+            saving = save is not None and (asked or now - saved > save_seconds)
+            if saving or course.batch % WATCHED == 0 or course.batch == plan.batches:
+                _watch(worst, course)
+                worst = None
+            if save and saving:
                 save(course)
                 # Saving may take long for a large model: never more than a twentieth of the time.
                 saved = time.perf_counter()
@@ -119,6 +153,8 @@ def train(
             course.seconds = before + time.perf_counter() - begun
             course.history.append({"seconds": course.seconds, "epoch": course.epoch, "psnr": psnr})
             note = "exact" if psnr is None else f"epoch {course.epoch}: {psnr:.1f} dB"
+    if plan.rates[0] > USUAL_RATE and _dead(course, _variance(coreset, probe)):
+        raise Diverged("training ended in a constant")
     return True
 
 
@@ -127,5 +163,28 @@ def probe_psnr(engine: Engine, coreset: Coreset, bricks: npt.NDArray[np.int64]) 
     samples = int(np.diff(coreset.offsets)[bricks].sum())
     error = sum(engine.squared_error(part) for part in np.array_split(bricks, -(-len(bricks) // BATCH_BRICKS)))
     if not np.isfinite(error):
-        raise TrainingError("training diverged: the error is no longer finite; set a lower --learning-rate")
+        raise Diverged("training diverged: the error is no longer finite; set a lower --learning-rate")
     return None if error == 0 else -10 * log10(error / samples)
+
+
+def _watch(worst: Tensor | None, course: Course) -> None:
+    """Raise Diverged for a largest mean squared error that is beyond DIVERGED or not finite."""
+    error = 0.0 if worst is None else float(worst)
+    if not error <= DIVERGED:
+        raise Diverged(f"training diverged in epoch {course.epoch + 1}: the error reached {error**0.5:.3g} times the range of the values")
+
+
+def _dead(course: Course, variance: float) -> bool:
+    """Whether the second half of a training said nothing but the mean of values of this variance (normalised)."""
+    late = [point["psnr"] for point in course.history[len(course.history) // 2 :]]
+    if not variance > 0 or len(late) < 2:
+        return False
+    constant = -10 * log10(variance)
+    off = [abs(psnr - constant) for psnr in late if psnr is not None]
+    return len(off) == len(late) and max(off) <= STILL and off[-1] <= -10 * log10(1 - DEAD)
+
+
+def _variance(coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float:
+    """Of the normalised values over the coreset vertices of `bricks`."""
+    parts = [coreset.values[first:end] for first, end in zip(coreset.offsets[bricks], coreset.offsets[bricks + 1], strict=True)]
+    return float(np.var(np.concatenate(parts), dtype=np.float64))

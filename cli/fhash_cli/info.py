@@ -46,10 +46,12 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _network(info: dict[str, Any], seconds: str) -> list[tuple[str, str]]:
     model, training = info["model"], info["training"]
+    rate = training.get("learning_rate")
+    lowered = "" if rate is None else f"; it diverged, and came to its end at a learning rate of {rate:.3g}"
     return [
         *loss_rows(model),
         ("network", f"{model['profile']}, {len(model['levels'])} levels, {model['parameters']:,} parameters in {model['tables']}"),
-        ("training", f"{training['epochs']} epochs{seconds} on {training['device']}, seed {info['encoder']['seed']}"),
+        ("training", f"{training['epochs']} epochs{seconds} on {training['device']}, seed {info['encoder']['seed']}{lowered}"),
     ]
 
 

@@ -36,6 +36,14 @@ def test_info_of_a_paper_file_says_how_it_was_trained(fhash: Fhash, data: Path, 
     assert "1 epochs" in result.stdout
 
 
+@pytest.mark.filterwarnings("ignore:training diverged")
+def test_info_says_that_a_training_diverged(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    wild = ["--profile", "paper", "--epochs", "3", "--width", "64", "--hidden-layers", "2", "--learning-rate", "1", "--quiet"]
+    assert fhash("encode", data, "-o", tmp_path / "run.fhz", *wild).exit_code == 0
+    assert "it diverged, and came to its end at a learning rate of 0." in fhash("info", tmp_path / "run.fhz").stdout
+    assert json.loads(fhash("info", tmp_path / "run.fhz", "--json").stdout)["training"]["restarts"] > 0
+
+
 def test_info_as_json_is_one_object(fhash: Fhash, run: Path) -> None:
     info = json.loads(fhash("info", run, "--json").stdout)
     assert info["domain"]["shape"] == [3, 6, 7, 8]

@@ -19,7 +19,7 @@ from fhash_codec.features import Everything
 from fhash_codec.interrupts import StopRequest, deferred_interrupts
 from fhash_codec.progress import silent
 from fhash_codec.scan import scan
-from fhash_codec.train import Course, plan_training, train
+from fhash_codec.train import Course, Diverged, plan_training, train
 from fhash_formats.errors import InputError, TrainingError
 from fhash_formats.series import ArraySeries
 
@@ -139,6 +139,31 @@ def test_training_that_diverges_is_an_error(coreset):
     engine.flat.fill_(float("nan"))
     with pytest.raises(TrainingError, match="diverged"):
         train(engine, plan, coreset, Course())
+
+
+@pytest.mark.parametrize("hidden_layers", [0, 1, 2])
+def test_an_error_of_more_than_twice_the_range_is_seen_at_its_batch(coreset, hidden_layers):
+    plan = plan_training(coreset, epochs=4, learning_rate=1.0, schedule="constant", batch=0, seed=5)
+    architecture = Architecture.for_box(box_size(coreset.box), 3, width=64, hidden_layers=hidden_layers)
+    engine = make_engine("slab", architecture, coreset, plan.rates, seed=5, device=torch.device("cpu"))
+    course = Course()
+    with pytest.raises(Diverged, match="training diverged in epoch 1: the error reached"):
+        train(engine, plan, coreset, course)
+    assert course.epoch == 0
+    assert engine.step < plan.batches
+
+
+@pytest.mark.parametrize(("rate", "says"), [(0.02, "mean"), (0.01, "mean"), (0.02, "zero")])
+def test_a_network_that_died_of_its_rate_is_no_result(coreset, rate, says):
+    plan, engine = setup(coreset, learning_rate=rate)
+    engine.rates = np.zeros_like(plan.rates)  # it learns nothing
+    engine.layers[-1].zero_()
+    engine.layers[-1][0, -1] = float(coreset.values.mean()) if says == "mean" else 0.0
+    if rate > 0.01 and says == "mean":
+        with pytest.raises(Diverged, match="ended in a constant"):
+            train(engine, plan, coreset, Course())
+    else:  # a lower rate than the usual one would not help, nor does it where the training was too short
+        assert train(engine, plan, coreset, Course())
 
 
 def test_a_budget_ends_the_training(coreset):

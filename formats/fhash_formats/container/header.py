@@ -48,17 +48,19 @@ def validate_header(header: Mapping[str, Any]) -> None:
     encoder.whole("seed", -(2**63), 2**64 - 1)
     variable.text("name")
     variable.text("units")
-    variable.choice("dtype", tuple(DTYPES))
+    dtype = DTYPES[variable.choice("dtype", tuple(DTYPES))]
     variable.record("attributes")
     shape = top.record("domain").wholes("shape", 4, 1, MAX_LENGTH)
     low, high = top.numbers("value_range", 2)
+    most = _largest_decoded(dtype)
     top.need(low <= high, "value_range", "low <= high")
-    top.number("background")
+    top.need(max(abs(low), abs(high)) <= most, "value_range", f"numbers up to {most:.6g}, as values of {dtype} decode to")
+    top.need(abs(top.number("background")) <= most, "background", f"a number up to {most:.6g}, as values of {dtype} decode to")
     box = _box(top, shape)
     top.texts("features")
     top.whole("dilation", 0, MAX_LENGTH)
     top.need(0 <= top.number("coreset_fraction") <= 1, "coreset_fraction", "a number from 0 to 1")
-    profile = _check_model(top.record("model"), shape[0], box)
+    profile = _check_model(top.record("model"), shape[0], box, dtype)
     if profile == COMPACT or header["model"]["tables"] == CODED:
         needed = f"{TRANSFORM_FEATURE} in the profile {COMPACT} and for tables coded by {CODED}"
         top.need(TRANSFORM_FEATURE in header["required_features"], "required_features", needed)
@@ -70,6 +72,9 @@ def validate_header(header: Mapping[str, Any]) -> None:
     training.number_or_null("seconds")
     training.whole("epochs", 0, MAX_LENGTH)
     training.text("device")
+    if training.has("restarts"):
+        training.whole("restarts", 0, MAX_LENGTH)
+    training.number_or_null("learning_rate")
     for key in QUALITY:
         quality.number_or_null(key)
     for entry in top.records("history") if profile == PAPER or isinstance(top.get("history"), list) else ():
@@ -89,8 +94,6 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
             raise DamagedFileError(f"array {name} is missing")
         _check_array(name, arrays[name], shape, dtypes)
         attributes = Record(arrays[name].attributes, f"array {name} attribute ")
-        if name.startswith("coords/") and "name" in arrays[name].attributes:
-            attributes.text("name")
         if name.startswith("tables/") and arrays[name].dtype == np.uint8 and header["model"]["profile"] == "paper":
             attributes.number("offset")
             attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
@@ -107,6 +110,9 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
     for name, shape, dtypes in _optional(header):
         if name in arrays:
             _check_array(name, arrays[name], shape, dtypes)
+    for axis in POSITIONS:
+        if f"coords/{axis}" in arrays and "name" in arrays[f"coords/{axis}"].attributes:
+            Record(arrays[f"coords/{axis}"].attributes, f"array coords/{axis} attribute ").text("name")
 
 
 def check_key_frames(header: Mapping[str, Any], key_frames: npt.NDArray[np.int64]) -> None:
@@ -159,7 +165,12 @@ def _check_coordinates(top: Record, shape: Sequence[int]) -> None:
                 check_positions(coordinates.record(axis), length)
 
 
-def _check_model(model: Record, steps: int, box: Sequence[int]) -> str:
+def _largest_decoded(source: np.dtype[Any]) -> float:
+    """The largest value of the type that values of a source decode to: float32 where it is precise enough, else float64."""
+    return float(np.finfo(np.float32 if source.itemsize <= 2 or source == np.float32 else np.float64).max)
+
+
+def _check_model(model: Record, steps: int, box: Sequence[int], source: np.dtype[Any]) -> str:
     """The profile."""
     profile = model.text("profile")
     if profile not in KNOWN_PROFILES:
@@ -176,7 +187,9 @@ def _check_model(model: Record, steps: int, box: Sequence[int]) -> str:
     else:
         model.whole("embedding_size", 1, 1)
         model.whole("parameters", 0, 1 << 62)
-        model.choice("tables", tuple(DTYPES))
+        tables = DTYPES[model.choice("tables", tuple(DTYPES))]
+        narrow = _largest_decoded(source) < np.finfo(np.float64).max
+        model.need(not (narrow and tables == np.float64), "tables", f"no float64 for a source of {source}")
         model.need(model.get("head") is None or isinstance(model.get("head"), Mapping), "head", "an object or null")
     levels = model.get("levels")
     model.need(isinstance(levels, list) and 1 <= len(levels) <= MAX_LEVELS, "levels", f"1 to {MAX_LEVELS} of [t, z, y, x]")
@@ -220,6 +233,8 @@ def _expected(header: Mapping[str, Any]) -> Iterator[Expected]:
 def _optional(header: Mapping[str, Any]) -> Iterator[Expected]:
     """Arrays that are checked where they are there."""
     model, steps = header["model"], header["domain"]["shape"][0]
+    for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
+        yield f"coords/{axis}", (length,), ("float64",)
     if model["profile"] == COMPACT:
         key_frames, *box = model["levels"][0]
         yield "key_frames", (key_frames,), ("int64",)

@@ -54,6 +54,9 @@ BAD = [
     ("value_range", [0.0]),
     ("value_range", [0.0, "1"]),
     ("value_range", [0, 10**400]),
+    ("value_range", [-1e39, 0]),
+    ("value_range", [0, 1e300]),
+    ("background", -1e39),
     ("background", None),
     ("background", 10**400),
     ("background", True),
@@ -95,6 +98,9 @@ BAD = [
     ("training.seconds", "1"),
     ("training.epochs", None),
     ("training.device", 0),
+    ("training.restarts", -1),
+    ("training.restarts", "1"),
+    ("training.learning_rate", "0.1"),
     ("config", None),
     ("quality", ...),
     ("quality.psnr", "48"),
@@ -134,6 +140,19 @@ def test_wrong_key_is_named(samples, path, value):
 )
 def test_allowed(samples, path, value):
     validate_header(changed({**FIXED, **samples.header()}, path, value))
+
+
+@pytest.mark.parametrize("dtype", ["float64", "int64", "uint32"])
+def test_sources_that_decode_to_float64_may_have_its_range(samples, dtype):
+    header = changed({**FIXED, **samples.header()}, "variable.dtype", dtype)
+    validate_header({**header, "value_range": [-1e300, 1e300], "background": 1e299})
+
+
+def test_a_table_that_overflows_the_type_of_decoded_values_is_refused(samples):
+    header = {**FIXED, **samples.compact_header()}
+    validate_header(changed(header, "model.tables", "int32"))
+    with pytest.raises(DamagedFileError, match=r"header key model\.tables"):
+        validate_header(changed(header, "model.tables", "float64"))
 
 
 ARRAYS = {
