@@ -8,7 +8,6 @@ level * embedding_size + e, finest level first.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.levels import Resolution
+from fhash_formats.container import parallel
 from fhash_formats.errors import DamagedFileError, InputError
 
 Item = TypeVar("Item")
@@ -146,7 +146,8 @@ class Head:
             current = inputs[start : start + PRODUCTS]
             for matrix, hidden in zip(self.matrices, self.hidden, strict=True):
                 out = hidden[: len(current)]
-                np.matmul(matrix, current, out=out)
+                with np.errstate(over="ignore", invalid="ignore"):  # of hostile weights; values are clipped to their range
+                    np.matmul(matrix, current, out=out)
                 if hidden is not self.hidden[-1]:
                     np.maximum(out, 0.0, out=out)
                 current = out
@@ -160,15 +161,16 @@ class Head:
         """
         assert len(self.outputs) <= PRODUCTS, "only the last products' hidden layers are kept"
         slope = np.broadcast_to(self.matrices[-1][0, :, None], (len(self.outputs), self.matrices[-1].shape[1], COLUMNS))
-        for matrix, hidden in zip(self.matrices[-2::-1], self.hidden[-2::-1], strict=True):
-            slope = np.matmul(matrix.T, slope * (hidden > 0))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for matrix, hidden in zip(self.matrices[-2::-1], self.hidden[-2::-1], strict=True):
+                slope = np.matmul(matrix.T, slope * (hidden > 0))
         return slope.transpose(1, 0, 2).reshape(len(self.inputs), -1)[:-1]
 
 
 def usable_threads(threads: int | None) -> int:
-    """The number of threads to use: `threads`, or where it is None one for each processor that this process may run on."""
+    """The number of threads to use: `threads`, or where it is None what `parallel.usable_threads` says."""
     if threads is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return parallel.usable_threads()
     if threads < 1:
         raise InputError(f"threads is {threads}; at least 1 is needed")
     return threads

@@ -15,6 +15,7 @@ import click
 from fhash_formats.attributes import plain_text
 from fhash_formats.errors import FhashError, OutputError
 
+NO_MEMORY = ("can't allocate memory", "memory allocation failed")
 QUIET_SECONDS = 2.0
 """Stages shorter than this show no progress."""
 
@@ -115,13 +116,22 @@ def describe_error(error: Exception) -> tuple[str, int]:
         context = getattr(error, "ctx", None)
         hint = f" (see '{context.command_path} --help')" if context is not None else ""
         line, code = error.format_message().rstrip(".") + hint, error.exit_code
-    elif isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # torch has its own
+    elif _is_no_memory(error):
         line, code = "out of memory; take fewer steps (--t), a smaller region or a smaller network", 1
+    elif isinstance(error, RuntimeError) and str(error) == "can't start new thread":
+        line, code = "no thread can be started: no memory is left, or no process (ulimit -u); FHASH_THREADS=1 takes fewer", 1
     elif isinstance(error, OSError) and error.strerror:
         line, code = f"{error.strerror}: {error.filename}" if error.filename else error.strerror, 1
     else:
         line, code = f"unexpected {type(error).__name__}: {error}; please report this (FHASH_DEBUG=1 shows where it came from)", 1
     return " ".join(line.split()), code
+
+
+def _is_no_memory(error: Exception) -> bool:
+    """Whether there was no memory: torch (CUDA, CPU) and HDF5 say so in errors of their own."""
+    if isinstance(error, RuntimeError):
+        return type(error).__name__ == "OutOfMemoryError" or any(words in str(error) for words in NO_MEMORY)
+    return isinstance(error, MemoryError)
 
 
 class Progress:

@@ -334,3 +334,14 @@ def test_a_table_that_is_not_finite_is_refused_not_decoded(bad):
         decode_region(net, 0, whole(net))
     with pytest.raises(DamagedFileError, match="level 1"):
         sample_points(net, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+def test_weights_that_overflow_give_no_warning(gradient):
+    """Of hostile files; infinities are then clipped to the range of values."""
+    net = random_network((2, 3, 4), 2, 2, 2, 2)
+    layers = tuple((np.where(weight > 0, np.float32(3e38), np.float32(-3e38)), bias) for weight, bias in net.layers)
+    hostile = replace(net, layers=layers)
+    positions = np.full((4, 3), 0.5)
+    sample_points(hostile, *positions, gradient=gradient)
+    decode_region(hostile, 0.5, ((0, 2), (0, 3), (0, 4)))

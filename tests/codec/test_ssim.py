@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -175,3 +177,27 @@ def test_a_decoded_value_that_is_not_finite_is_refused(monkeypatch, choice):
     decoded[6, 6, 6] = np.inf
     with pytest.raises(InputError, match="not finite"):
         ssim(original, decoded, 1.0)
+
+
+MEMORY = """
+import resource
+import numpy as np
+from fhash_codec.ssim import _Frames
+frame = np.zeros((16, 1200, 1200), np.float32)
+frame[3] = 1
+frames = _Frames(frame, frame, 1.0, None)
+with open("/proc/self/status") as status:
+    used = next(int(line.split()[1]) for line in status if line.startswith("VmData")) << 10
+resource.setrlimit(resource.RLIMIT_DATA, (used + (64 << 20), used + (64 << 20)))
+try:
+    frames.similarity(((0, 16), (0, 1200), (0, 1200)))
+except MemoryError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux" or native.library() is None, reason="needs the native library and Linux's limits on memory")
+def test_no_memory_for_a_tile_is_said_and_ends_no_process():
+    done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "no memory to compare" in done.stdout

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fhash_formats import native
-from fhash_formats.errors import InputError
+from fhash_formats.errors import MissingDependencyError
 
 SOURCES = Path(native.__file__).parent
 
@@ -32,7 +32,7 @@ def test_a_folder_without_a_build_has_no_library(tmp_path: Path) -> None:
 
 def test_a_damaged_library_is_a_plain_error(tmp_path: Path) -> None:
     (tmp_path / f"_core{EXTENSION_SUFFIXES[0]}").write_bytes(b"not a library")
-    with pytest.raises(InputError, match="FHASH_NATIVE=0"):
+    with pytest.raises(MissingDependencyError, match="FHASH_NATIVE=0"):
         native._load(tmp_path)
 
 
@@ -43,7 +43,8 @@ def test_a_library_of_other_sources_is_a_plain_error(tmp_path: Path, monkeypatch
     shutil.copy(built, copy)
     assert native._load(tmp_path) is not None
     monkeypatch.setattr(native, "ABI_VERSION", native.ABI_VERSION + 1)
-    with pytest.raises(InputError, match=f"has ABI {native.ABI_VERSION - 1}, this version of the package needs {native.ABI_VERSION}"):
+    message = f"has ABI {native.ABI_VERSION - 1}, this version of the package needs {native.ABI_VERSION}"
+    with pytest.raises(MissingDependencyError, match=message):
         native._load(tmp_path)
 
 

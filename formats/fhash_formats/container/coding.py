@@ -77,6 +77,8 @@ class PlainCoder:
         try:
             decompress(data, values)
         except (RuntimeError, ValueError) as error:
+            if "Allocation error" in str(error):  # zstd's own work space, which says nothing of the data
+                raise MemoryError("no memory to decompress a chunk") from error
             raise DamagedFileError(f"zstd data are damaged: {error}") from error
         return values.astype(self._native, copy=False)
 

@@ -9,12 +9,24 @@ from itertools import count
 from threading import Lock
 from typing import TypeVar
 
+from fhash_formats.errors import InputError
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+MOST_THREADS = 1024
+
 
 def usable_threads() -> int:
-    """Processors that this process may use."""
+    """Processors that this process may use, or N where the environment says `FHASH_THREADS=N`; it is read at each call.
+
+    Raises InputError for what is not a number of threads.
+    """
+    given = os.environ.get("FHASH_THREADS")
+    if given is not None:
+        if not (given.isascii() and given.isdigit() and 1 <= int(given) <= MOST_THREADS):
+            raise InputError(f"FHASH_THREADS is '{given:.40}'; allowed: 1 to {MOST_THREADS}")
+        return int(given)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

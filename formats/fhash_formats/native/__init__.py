@@ -53,5 +53,7 @@ def _load(folder: Path) -> ctypes.CDLL | None:
     version.argtypes = []
     version.restype = ctypes.c_int64
     if version() != ABI_VERSION:
-        raise MissingDependencyError(f"the native library {path} has ABI {version()}, this version of the package needs {ABI_VERSION}: {advice}")
+        raise MissingDependencyError(
+            f"the native library {path} has ABI {version()}, this version of the package needs {ABI_VERSION}: {advice}"
+        )
     return loaded

@@ -382,16 +382,22 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
     return 0;
 }
 
-FHASH_CLONES Encoder encode(Coder<0> coder, int32_t* q, const int64_t* shape, const int32_t* table, int64_t count) {
-    coder.run(q, nullptr, shape, table, count);
-    return coder.range;
+FHASH_CLONES int64_t encode(Coder<0> coder, int32_t* q, const int64_t* shape, const int32_t* table, int64_t count) {
+    return guarded([&]() FHASH_LAMBDA -> int64_t {
+        coder.run(q, nullptr, shape, table, count);
+        coder.range.finish();
+        return 0;
+    });
 }
-FHASH_CLONES Encoder encode_chosen(Coder<2> coder, int32_t* q, const float* scaled, const int64_t* shape, const int32_t* table, int64_t count) {
-    coder.run(q, scaled, shape, table, count);
-    return coder.range;
+FHASH_CLONES int64_t encode_chosen(Coder<2> coder, int32_t* q, const float* scaled, const int64_t* shape, const int32_t* table, int64_t count) {
+    return guarded([&]() FHASH_LAMBDA -> int64_t {
+        coder.run(q, scaled, shape, table, count);
+        coder.range.finish();
+        return 0;
+    });
 }
 FHASH_CLONES int64_t decode(Coder<1> coder, int32_t* q, const int64_t* shape, const int32_t* table, int64_t count) {
-    return coder.run(q, nullptr, shape, table, count);
+    return guarded([&]() FHASH_LAMBDA { return coder.run(q, nullptr, shape, table, count); });
 }
 
 }  // namespace
@@ -399,24 +405,28 @@ FHASH_CLONES int64_t decode(Coder<1> coder, int32_t* q, const int64_t* shape, co
 // Encode integers q (t, z, y, x), |q| < 2^30, in the bands of a table (bands.py); everything outside the bands counts as 0.
 // scaled: nullptr, or coefficients / step: then the magnitudes are chosen anew (and put into q), lambda being the squared steps a bit is worth.
 // The state is what transform/coder.py describes; it comes back as it was left if `keep`. Bytes needed; data is filled if they fit,
-// and if they do not, the state is as it was: call again with the same q and more room.
+// and if they do not, the state is as it was: call again with the same q and more room. NO_MEMORY.
 FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda, const int64_t* shape, const int32_t* table, int64_t count,
                                   uint16_t* slots, int64_t slot_count, int32_t* weights, int64_t weight_count, uint16_t* simples,
                                   int64_t simple_count, int64_t keep, uint8_t* data, int64_t capacity) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
-    std::vector<uint8_t> out;
-    Encoder range = scaled ? encode_chosen({{&out}, &state, lambda / 2048}, q, scaled, shape, table, count)
-                           : encode({{&out}, &state, 0}, q, shape, table, count);
-    range.finish();
-    const int64_t size = put(out, data, capacity);
-    if (keep && size <= capacity) keep_state(state, slots, weights, simples, LANES);
-    return size;
+    return guarded([&]() -> int64_t {
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        std::vector<uint8_t> out;
+        const int64_t code = scaled ? encode_chosen({{&out}, &state, lambda / 2048}, q, scaled, shape, table, count)
+                                    : encode({{&out}, &state, 0}, q, shape, table, count);
+        if (code < 0) return code;
+        const int64_t size = put(out, data, capacity);
+        if (keep && size <= capacity) keep_state(state, slots, weights, simples, LANES);
+        return size;
+    });
 }
 
-// Decode into q, which must be zeros. 0, or -1 for bytes that no encoder writes.
+// Decode into q, which must be zeros. 0, or -1 for bytes that no encoder writes, or NO_MEMORY.
 FHASH_EXPORT int64_t fhash_decode(int32_t* q, const int64_t* shape, const int32_t* table, int64_t count, const uint16_t* slots,
                                   int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
                                   int64_t simple_count, const uint8_t* data, int64_t size) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
-    return decode({{data, size}, &state, 0}, q, shape, table, count);
+    return guarded([&] {
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        return decode({{data, size}, &state, 0}, q, shape, table, count);
+    });
 }

@@ -124,35 +124,44 @@ template <int MODE> struct MaskCoder {
     }
 };
 
-FHASH_CLONES Encoder encode(MaskCoder<0> coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
-    coder.run(mask, level, other, shape);
-    return coder.range;
+FHASH_CLONES int64_t encode(MaskCoder<0> coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
+    return guarded([&]() FHASH_LAMBDA -> int64_t {
+        coder.run(mask, level, other, shape);
+        coder.range.finish();
+        return 0;
+    });
 }
-FHASH_CLONES void decode(MaskCoder<1> coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
-    coder.run(mask, level, other, shape);
+FHASH_CLONES int64_t decode(MaskCoder<1> coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
+    return guarded([&]() FHASH_LAMBDA -> int64_t {
+        coder.run(mask, level, other, shape);
+        return 0;
+    });
 }
 
 }  // namespace
 
 // Encode a mask of zeros and ones (t, z, y, x); level: 0..31, other: 0..15 of each vertex. The state is what transform/mask.py describes;
-// it comes back as it was left if `keep` and the bytes fit. Bytes needed; data is filled if they fit.
+// it comes back as it was left if `keep` and the bytes fit. Bytes needed; data is filled if they fit. NO_MEMORY.
 FHASH_EXPORT int64_t fhash_encode_mask(const uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape, uint16_t* slots,
                                        int64_t slot_count, int32_t* weights, int64_t weight_count, uint16_t* simples, int64_t simple_count,
                                        int64_t keep, uint8_t* data, int64_t capacity) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
-    std::vector<uint8_t> out, bits(mask, mask + shape[0] * shape[1] * shape[2] * shape[3]);
-    Encoder range = encode({{&out}, &state}, bits.data(), level, other, shape);
-    range.finish();
-    const int64_t size = put(out, data, capacity);
-    if (keep && size <= capacity) keep_state(state, slots, weights, simples, LANES);
-    return size;
+    return guarded([&]() -> int64_t {
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        std::vector<uint8_t> out, bits(mask, mask + shape[0] * shape[1] * shape[2] * shape[3]);
+        const int64_t code = encode({{&out}, &state}, bits.data(), level, other, shape);
+        if (code < 0) return code;
+        const int64_t size = put(out, data, capacity);
+        if (keep && size <= capacity) keep_state(state, slots, weights, simples, LANES);
+        return size;
+    });
 }
 
-// Decode into mask. Any bytes give some mask: a digest must tell whether it is the right one.
+// Decode into mask. Any bytes give some mask: a digest must tell whether it is the right one. 0 or NO_MEMORY.
 FHASH_EXPORT int64_t fhash_decode_mask(uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape, const uint16_t* slots,
                                        int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
                                        int64_t simple_count, const uint8_t* data, int64_t size) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
-    decode({{data, size}, &state}, mask, level, other, shape);
-    return 0;
+    return guarded([&]() -> int64_t {
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        return decode({{data, size}, &state}, mask, level, other, shape);
+    });
 }

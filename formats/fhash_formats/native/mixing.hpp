@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "core.hpp"
+#include "guard.hpp"
 #include "range.hpp"
 
 #if (defined(__SSE2__) || defined(_M_X64)) && !defined(FHASH_PLAIN)

@@ -352,36 +352,44 @@ template <bool DECODES> struct Pass {
 
 FHASH_CLONES int64_t encode(Pass<false>& pass, int32_t* q, const uint8_t* care, const int64_t* shape, const int64_t* levels,
                             const int32_t* passes, int64_t pass_count, const int32_t* taps, const int16_t* weights) {
-    return pass.all(q, care, shape, levels, passes, pass_count, taps, weights);
+    return guarded([&]() FHASH_LAMBDA -> int64_t {
+        const int64_t code = pass.all(q, care, shape, levels, passes, pass_count, taps, weights);
+        pass.range.finish();
+        return code;
+    });
 }
 FHASH_CLONES int64_t decode(Pass<true>& pass, int32_t* q, const int64_t* shape, const int64_t* levels, const int32_t* passes,
                             int64_t pass_count, const int32_t* taps, const int16_t* weights) {
-    return pass.all(q, nullptr, shape, levels, passes, pass_count, taps, weights);
+    return guarded([&]() FHASH_LAMBDA { return pass.all(q, nullptr, shape, levels, passes, pass_count, taps, weights); });
 }
 
 }  // namespace
 
 // Encode integers q (t, z, y, x), |q| <= 2^27; those that care (bytes, or nullptr for all) does not mark become what is predicted.
 // levels: halvings along each axis; passes, taps, weights: see transform/predictor.py. Bytes needed; data is filled if they fit. -1 if a
-// prediction runs out of bounds.
+// prediction runs out of bounds, or NO_MEMORY.
 FHASH_EXPORT int64_t fhash_encode_predicted(int32_t* q, const uint8_t* care, const int64_t* shape, const int64_t* levels, const int32_t* passes,
                                             int64_t pass_count, const int32_t* taps, const int16_t* tap_weights, const uint16_t* slots,
                                             int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
                                             int64_t simple_count, uint8_t* data, int64_t capacity) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
-    std::vector<uint8_t> out;
-    Pass<false> pass{{&out}, &state};
-    if (encode(pass, q, care, shape, levels, passes, pass_count, taps, tap_weights) < 0) return -1;
-    pass.range.finish();
-    return put(out, data, capacity);
+    return guarded([&]() -> int64_t {
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        std::vector<uint8_t> out;
+        Pass<false> pass{{&out}, &state};
+        const int64_t code = encode(pass, q, care, shape, levels, passes, pass_count, taps, tap_weights);
+        if (code < 0) return code;
+        return put(out, data, capacity);
+    });
 }
 
-// Decode into q. 0, or -1 for bytes that no encoder writes.
+// Decode into q. 0, or -1 for bytes that no encoder writes, or NO_MEMORY.
 FHASH_EXPORT int64_t fhash_decode_predicted(int32_t* q, const int64_t* shape, const int64_t* levels, const int32_t* passes, int64_t pass_count,
                                             const int32_t* taps, const int16_t* tap_weights, const uint16_t* slots, int64_t slot_count,
                                             const int32_t* weights, int64_t weight_count, const uint16_t* simples, int64_t simple_count,
                                             const uint8_t* data, int64_t size) {
-    State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
-    Pass<true> pass{{data, size}, &state};
-    return decode(pass, q, shape, levels, passes, pass_count, taps, tap_weights);
+    return guarded([&] {
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        Pass<true> pass{{data, size}, &state};
+        return decode(pass, q, shape, levels, passes, pass_count, taps, tap_weights);
+    });
 }

@@ -7,10 +7,10 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <new>
 #include <vector>
 
 #include "core.hpp"
+#include "guard.hpp"
 
 namespace {
 
@@ -229,10 +229,10 @@ FHASH_CLONES int64_t masked_errors_double(const double* one, const double* other
     return errors<double, true>(one, other, mask, n, scale, result);
 }
 FHASH_CLONES int64_t similarity_float(const float* one, const float* other, const Frame& frame, const int64_t* tile, double* result) {
-    return similarity<float>(one, other, frame, tile, result);
+    return guarded([&]() FHASH_LAMBDA { return similarity<float>(one, other, frame, tile, result); });
 }
 FHASH_CLONES int64_t similarity_double(const double* one, const double* other, const Frame& frame, const int64_t* tile, double* result) {
-    return similarity<double>(one, other, frame, tile, result);
+    return guarded([&]() FHASH_LAMBDA { return similarity<double>(one, other, frame, tile, result); });
 }
 
 }  // namespace
@@ -253,20 +253,12 @@ FHASH_EXPORT int64_t fhash_errors_f64(const double* original, const double* deco
 // Structural similarity over a tile of two frames (codec: ssim.py). shape: (z, y, x) of the frames; tile: start and stop along each axis;
 // numbers: scale, mean after scaling, c1, c2, and the window's six weights from its middle outwards. result gets the sum of the local
 // similarity of the vertices that count (finite in the original, and set in the mask, nullptr being all); their number is returned, -1
-// where a decoded value that is compared is not finite, -2 without memory.
+// where a decoded value that is compared is not finite, NO_MEMORY.
 FHASH_EXPORT int64_t fhash_ssim_f32(const float* original, const float* decoded, const uint8_t* mask, const int64_t* shape, const int64_t* tile, const double* numbers, double* result) {
-    try {
-        return similarity_float(original, decoded, make_frame(mask, shape, numbers), tile, result);
-    } catch (const std::bad_alloc&) {
-        return -2;
-    }
+    return similarity_float(original, decoded, make_frame(mask, shape, numbers), tile, result);
 }
 FHASH_EXPORT int64_t fhash_ssim_f64(const double* original, const double* decoded, const uint8_t* mask, const int64_t* shape, const int64_t* tile, const double* numbers, double* result) {
-    try {
-        return similarity_double(original, decoded, make_frame(mask, shape, numbers), tile, result);
-    } catch (const std::bad_alloc&) {
-        return -2;
-    }
+    return similarity_double(original, decoded, make_frame(mask, shape, numbers), tile, result);
 }
 
 // How large n coefficients are: counts and squares by the upper bits of their magnitude, bits >> shift, of which there are 2^(31 - shift).

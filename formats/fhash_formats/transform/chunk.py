@@ -121,7 +121,9 @@ def _encode(tile: Values, quality: Quality, specs: tuple[TransformSpec, ...]) ->
     center = float(low) + (float(high) / 2 - float(low) / 2)
     if high == low or (with_bound and float(high) / 2 - float(low) / 2 <= reach):
         constant = encode_tile(tile, replace(plain, center=center, low=center, high=center), care=nothing, own=True)
-        if within(tile, constant.decoded, error, None if every else finite):
+        # Without loss zeros keep their signs, which the constant has not.
+        signed = with_bound and error == 0 and low == 0 and bool(np.signbit(counted).any())
+        if within(tile, constant.decoded, error, None if every else finite) and not signed:
             return constant
     if high == low:
         return exact_tile(tile)

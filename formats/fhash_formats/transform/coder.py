@@ -23,6 +23,7 @@ __all__ = [
     "MAX_INTEGER",
     "Encoded",
     "array_arguments",
+    "checked",
     "decode_block",
     "decode_integers",
     "encode_block",
@@ -78,7 +79,7 @@ def encode_integers(
             ctypes.c_int64(kept),
             *array_arguments(buffer, capacity),
         )
-        if size <= capacity:
+        if checked(size) <= capacity:
             return Encoded(data=buffer[:size].tobytes(), integers=integers)
         # Once more with the same integers: those chosen would be coded otherwise, as rows that became empty are told apart.
         capacity = size
@@ -102,7 +103,7 @@ def decode_integers(data: bytes | memoryview, shape: tuple[int, ...], table: Tab
         *state_arguments(prior_state()),
         *array_arguments(source, source.size),
     )
-    if code < 0:
+    if checked(code) < 0:
         raise DamagedFileError("the coded integers are damaged")
     return integers
 
@@ -123,6 +124,13 @@ def decode_block(data: bytes | memoryview, shape: tuple[int, ...]) -> Integers:
     if np.abs(integers.astype(np.int64)).max(initial=0) > MAX_INTEGER or encode_block(integers) != bytes(data):
         raise DamagedFileError("the coded integers are damaged")
     return integers
+
+
+def checked(code: int) -> int:
+    """What a native function returned; raises MemoryError where that is that it had no memory."""
+    if code == -2:
+        raise MemoryError("no memory for the work of a native function")
+    return code
 
 
 def _pointer(array: npt.NDArray[Any] | None) -> ctypes.c_void_p:

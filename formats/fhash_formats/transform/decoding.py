@@ -105,6 +105,7 @@ def _decode(
         return values[_every(lod)] if lod else values, mask
     if settings is None:
         raise DamagedFileError("a coded tile has no settings")
+    largest = _check_numbers(settings, kind)
     if flags & EMPTY:
         check_ended(sections)
         result = cast(np.full(_lod_shape(shape, lod), settings.center), kind)
@@ -144,7 +145,20 @@ def _decode(
     linear = linear_values(integers, transform, settings)
     mask = None if packed is None else _mask_of(packed, linear, settings)
     base = linear if settings.head is None else settings.head.apply(linear)
-    return restored(outside(corrected(base, residual, settings.quantum, kind), mask, settings), missing), mask
+    found = corrected(base, residual, settings.quantum, kind)
+    # Only with a residual can values leave the range.
+    if residual is not None and settings.quantum * 2.0**31 > largest / 2 and np.isinf(found).any():
+        raise DamagedFileError(f"a residual of a coded tile is beyond {kind}")
+    return restored(outside(found, mask, settings), missing), mask
+
+
+def _check_numbers(settings: Settings, kind: np.dtype[Any]) -> float:
+    """Refuse settings that make infinities of finite values in the type of the source or in the working type; the largest such number."""
+    types = [settings.dtype] if kind.kind != "f" else [settings.dtype, kind]
+    largest = min(float(np.finfo(name).max) for name in types)
+    if kind.kind == "f" and max(abs(settings.low), abs(settings.high), abs(settings.center)) > largest:
+        raise DamagedFileError(f"the range of a coded tile or its centre is beyond {largest:.6g}")
+    return largest
 
 
 def linear_values(integers: npt.NDArray[np.int32], transform: Transform, settings: Settings) -> Values:

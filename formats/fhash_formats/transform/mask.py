@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
-from fhash_formats.transform.coder import array_arguments, state_arguments
+from fhash_formats.transform.coder import array_arguments, checked, state_arguments
 from fhash_formats.transform.mask_levels import Levels
 from fhash_formats.transform.prior import State, pack_state, unpack_state
 
@@ -74,7 +74,7 @@ def encode_mask(mask: Mask, levels: tuple[Levels, Levels], *, state: State | Non
             ctypes.c_int64(kept),
             *array_arguments(buffer, capacity),
         )
-        if size <= capacity:
+        if checked(size) <= capacity:
             return buffer[:size].tobytes()
         capacity = size
 
@@ -91,10 +91,11 @@ def decode_mask(data: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask
     mask = np.empty(shape, dtype=np.uint8)
     first, second = (np.ascontiguousarray(part, dtype=np.uint8) for part in levels)
     source = np.frombuffer(data, dtype=np.uint8)
-    library.fhash_decode_mask(
+    code = library.fhash_decode_mask(
         *(ctypes.c_void_p(part.ctypes.data) for part in (mask, first, second)),
         (ctypes.c_int64 * 4)(*shape),
         *state_arguments(mask_prior_state()),
         *array_arguments(source, source.size),
     )
+    checked(code)
     return mask.view(np.bool_)

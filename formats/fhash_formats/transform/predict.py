@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError
-from fhash_formats.transform.coder import array_arguments, state_arguments
+from fhash_formats.transform.coder import array_arguments, checked, state_arguments
 from fhash_formats.transform.elementwise import pieces
 from fhash_formats.transform.predictor import CLASSES, Predictor, pass_arrays
 from fhash_formats.transform.prior import State
@@ -95,7 +95,7 @@ def encode_predicted(integers: Integers, care: Mask | None, predictor: Predictor
             *state_arguments(_blank()),
             *array_arguments(buffer, capacity),
         )
-        if size <= capacity:
+        if checked(size) <= capacity:
             return buffer[:size].tobytes(), result
         capacity = size
 
@@ -116,7 +116,7 @@ def decode_predicted(data: bytes | memoryview, shape: tuple[int, ...], predictor
         *state_arguments(_blank()),
         *array_arguments(source, source.size),
     )
-    if code < 0:
+    if checked(code) < 0:
         raise DamagedFileError("the predicted integers of a tile are damaged")
     return integers
 

@@ -51,7 +51,8 @@ def dequantise(integers: npt.NDArray[np.int32], step: float, offsets: tuple[int,
     if library is None:
         magnitude = np.abs(integers)
         offset = np.array([0.0, one, two, more], dtype=kind)[np.minimum(magnitude, 3)]
-        value: Values = (magnitude.astype(kind) + offset) * np.array(step, dtype=kind)
+        with np.errstate(over="ignore"):
+            value: Values = (magnitude.astype(kind) + offset) * np.array(step, dtype=kind)
         return np.where(integers < 0, -value, value)
     result, source = np.empty(integers.shape, kind), np.ascontiguousarray(integers)
     getattr(library, f"fhash_dequantise_f{kind.itemsize * 8}")(

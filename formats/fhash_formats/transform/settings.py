@@ -56,7 +56,7 @@ class Settings:
                 raise InputError(f"{name} is {value!r:.40}; a finite number is needed")
         if not (self.step > 0 and self.quantum >= 0 and self.low <= self.high):
             raise InputError(f"step {self.step}, quantum {self.quantum}, range {self.low} to {self.high} do not fit together")
-        if not (self.double or np.finfo(np.float32).tiny < self.step < np.finfo(np.float32).max):
+        if not (self.double or float(np.finfo(np.float32).tiny) < self.step < float(np.finfo(np.float32).max)):
             raise InputError(f"step {self.step} is not for float32")
         if len(self.offsets) != 3 or not all(type(o) is int and abs(o) <= OFFSET_UNIT for o in self.offsets):
             raise InputError(f"offsets are {self.offsets!r:.60}; three whole numbers within +-{OFFSET_UNIT} are needed")

@@ -39,6 +39,19 @@ def test_decoding_gives_what_was_coded(dtype):
         assert decoded.dtype.isnative
 
 
+def test_a_lack_of_memory_is_no_damage(monkeypatch):
+    chunk = np.arange(24, dtype=np.float32)
+    coder = chunk_coder(plain_codecs(chunk.dtype), chunk.dtype, chunk.shape)
+    data = memoryview(coder.encode(chunk))
+
+    def fail(*_):
+        raise RuntimeError("Zstd decompression error: b'Allocation error : not enough memory'")
+
+    monkeypatch.setattr(numcodecs.zstd, "decompress", fail)
+    with pytest.raises(MemoryError):
+        coder.decode(data)
+
+
 class Negative:
     """A codec of its own: the values with their sign turned, uncompressed."""
 

@@ -121,6 +121,20 @@ def test_an_axis_without_positions_is_refused(tmp_path, samples):
         write(tmp_path / "a.fhz", header)
 
 
+WRONG_ARRAYS = {
+    "another length": (np.zeros(1), {}, "coords/time is float64 [(]1,[)]"),
+    "another type": (np.zeros(4, np.float32), {}, "coords/time is float32"),
+    "a name that is none": (np.zeros(4), {"name": 5}, "attribute name"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_ARRAYS)
+def test_an_array_beside_a_description_is_checked_as_well(tmp_path, samples, case):
+    values, attributes, message = WRONG_ARRAYS[case]
+    with pytest.raises(InputError, match=message):
+        write(tmp_path / "a.fhz", samples.compact_header(), [("coords/time", values, attributes)])
+
+
 def test_the_paper_profile_has_arrays(sample, samples):
     header = samples.header()
     with Container.open(sample) as container:

@@ -9,7 +9,8 @@ import threading
 import pytest
 
 from fhash_formats.container import parallel
-from fhash_formats.container.parallel import in_threads
+from fhash_formats.container.parallel import in_threads, usable_threads
+from fhash_formats.errors import InputError
 
 
 def test_results_come_in_order_and_from_several_threads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,3 +54,17 @@ def test_a_forked_process_has_threads_of_its_own() -> None:
         signal.alarm(30)  # kills the child where it hangs
         os._exit(0 if list(in_threads(abs, range(-8, 0)))[-1] == 1 else 1)
     assert os.waitpid(child, 0)[1] == 0
+
+
+def test_the_environment_says_how_many_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("FHASH_THREADS", raising=False)
+    assert usable_threads() >= 1
+    monkeypatch.setenv("FHASH_THREADS", "3")
+    assert usable_threads() == 3
+
+
+@pytest.mark.parametrize("given", ["", "0", "-1", "2.5", "many", "99999999999", "\u00b2"])
+def test_another_number_of_threads_is_refused(monkeypatch: pytest.MonkeyPatch, given: str) -> None:
+    monkeypatch.setenv("FHASH_THREADS", given)
+    with pytest.raises(InputError, match=r"FHASH_THREADS is '.*'; allowed: 1 to 1024"):
+        usable_threads()

@@ -157,3 +157,11 @@ def test_unsuitable_qualities_are_refused(quality: dict[str, Any]) -> None:
 def test_unsuitable_types_are_refused(dtype: str) -> None:
     with pytest.raises(InputError, match="not "):
         encode_chunk(np.zeros(3).astype(dtype), max_error=1)
+
+
+@pytest.mark.parametrize("values", [[-0.0], [-0.0, 0.0, -0.0], [0.0, 0.0], [-0.0, np.nan, 0.0]])
+@pytest.mark.parametrize("dtype", ["f2", "f4", "f8"])
+def test_zeros_without_loss_keep_their_signs(values: list[float], dtype: str) -> None:
+    given = np.array(values, dtype)
+    found = decode_chunk(encode_chunk(given, max_error=0.0), given.shape, given.dtype)
+    assert found.tobytes() == given.tobytes()

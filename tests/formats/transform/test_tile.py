@@ -10,6 +10,9 @@ import numpy.typing as npt
 import pytest
 
 from fhash_formats.errors import DamagedFileError, FhashError
+from fhash_formats.transform.bands import band_table, single_band
+from fhash_formats.transform.coder import encode_integers
+from fhash_formats.transform.sections import assembled
 from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile import decode_tile, encode_tile, exact_tile, within
@@ -135,7 +138,7 @@ def test_damage_is_found(name: str) -> None:
     assert refused > 0.95 * len(damaged)
 
 
-@pytest.mark.parametrize("change", [{"step": 10**400}, {"step": "1"}, {"range": 3}, {"transform": []}, {"center": None}])
+@pytest.mark.parametrize("change", [{"step": 10**400}, {"step": 1e300}, {"step": "1"}, {"range": 3}, {"transform": []}, {"center": None}])
 def test_hostile_settings_are_damage(change: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     values = {**SETTINGS.to_dict(), **change}
     monkeypatch.setattr(Settings, "to_dict", lambda self: values)
@@ -147,3 +150,42 @@ def test_hostile_settings_are_damage(change: dict[str, Any], monkeypatch: pytest
 def test_shared_settings_are_needed() -> None:
     with pytest.raises(FhashError, match="no settings"):
         decode_tile(encode_tile(wave(), SETTINGS).data, SHAPE, np.float32)
+
+
+PLAIN = TransformSpec(axes=(AxisTransform(kind="none"),) * 4)
+BEYOND: dict[str, tuple[dict[str, Any], str]] = {
+    "range beyond the type": ({"step": 1e299, "low": -1e300, "high": 1e300, "double": True}, "float32"),
+    "range beyond the arithmetic": ({"step": 1e38, "low": -1e300, "high": 1e300}, "float64"),
+    "centre beyond the type": ({"center": 1e300, "high": 1e301, "double": True}, "float32"),
+    "centre beyond the arithmetic": ({"center": 1e300, "high": 1e301}, "float64"),
+    "residual beyond the type": ({"quantum": 1e300}, "float32"),
+    "residual beyond everything": ({"quantum": 1e308}, "float64"),
+    "range beyond half precision": ({"low": -1e5}, "float16"),
+}
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize("case", BEYOND)
+def test_numbers_that_end_in_infinities_are_damage(case: str, native: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Infinities of the source have marks of their own: what else decodes to one was made to."""
+    changes, dtype = BEYOND[case]
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    settings = Settings(**{"transform": PLAIN, "step": 1.0, "center": 0.0, "low": -9.0, "high": 9.0, "quantum": 0.1, **changes})
+    integers = np.full(SHAPE, 100, np.int32)
+    coded = encode_integers(integers, single_band(SHAPE)).data
+    for residual in (None, integers) if "residual" not in case else (integers,):
+        data = assembled(None, b"", coded, integers, residual, None)
+        with pytest.raises(DamagedFileError, match="beyond"):
+            decode_tile(data, SHAPE, dtype, settings)
+    if "residual" not in case:
+        with pytest.raises(DamagedFileError, match="beyond"):
+            decode_tile(assembled(None, b"", b"", None, None, None), SHAPE, dtype, settings)
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+def test_a_transform_that_overflows_gives_no_warning(native: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    settings = replace(SETTINGS, step=3e38, quantum=0.0)
+    integers = np.full(SHAPE, 1000, np.int32)
+    data = assembled(None, b"", encode_integers(integers, band_table(SPEC, SHAPE)).data, integers, None, None)
+    assert not np.isinf(decode_tile(data, SHAPE, np.float32, settings)).any()
