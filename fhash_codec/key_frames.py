@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -49,8 +50,10 @@ class KeyTimes:
     def key_index(self, step: float) -> float:
         """The fractional key index of a fractional step, in [0, key frames - 1]; a whole number exactly at each key frame.
 
-        Step -> physical time (piecewise linear between steps) -> key index (piecewise linear between the key times). Steps before the
-        first or after the last key frame clamp to it; a step outside the series raises RegionError; a single key frame gives 0.
+        Step -> physical time (piecewise linear between steps) -> key index (piecewise linear between the key times). Both together are
+        linear from one step to the next, since key frames are steps: so it is computed, because times between steps may be too close for
+        float64 to tell apart. Steps before the first or after the last key frame clamp to it; a step outside the series raises
+        RegionError; a single key frame gives 0.
         """
         return float(self.key_indices(step))
 
@@ -61,10 +64,17 @@ class KeyTimes:
         outside = ~((steps >= 0) & (steps <= last))
         if outside.any():
             raise RegionError(f"step {steps[outside].flat[0]:g} is outside 0..{last}")
-        ascending = self._ascending()
-        times = np.interp(steps, np.arange(last + 1), ascending)
+        return np.asarray(np.clip(np.interp(steps, np.arange(last + 1), self._key_indices_of_steps), 0, len(self.key_frames) - 1))
+
+    @cached_property
+    def _key_indices_of_steps(self) -> npt.NDArray[np.float64]:
+        """The key index of every step (T,)."""
+        ascending = self._ascending() * self._scale
         keys = ascending[list(self.key_frames)]
-        return np.asarray(np.clip(np.interp(times, keys, np.arange(keys.size)), 0, keys.size - 1))
+        indices = np.interp(ascending, keys, np.arange(keys.size))
+        # Times that scaling made equal are different steps all the same.
+        indices[list(self.key_frames)] = np.arange(keys.size)
+        return np.asarray(indices)
 
     def step_of_time(self, time: float) -> float:
         """The fractional step at a physical time, piecewise linear between steps; raises RegionError outside the times of the series."""
@@ -77,7 +87,15 @@ class KeyTimes:
         outside = ~((turned >= ascending[0]) & (turned <= ascending[-1]))
         if outside.any():
             raise RegionError(f"time {times[outside].flat[0]:g} is outside {self.times.min():g}..{self.times.max():g}")
-        return np.asarray(np.interp(turned, ascending, np.arange(ascending.size)))
+        found = np.asarray(np.interp(turned * self._scale, ascending * self._scale, np.arange(ascending.size)))
+        # A time of the series is its step, also where scaling made it equal to another.
+        at = np.searchsorted(ascending, turned)
+        return np.where(ascending[at] == turned, at, found)
+
+    @property
+    def _scale(self) -> float:
+        """A power of two, which is exact: differences of the largest times would overflow, slopes between the smallest as well."""
+        return power_of_two(float(np.abs(self.times).max()))
 
     def _sign(self) -> float:
         return -1.0 if self.times[-1] < self.times[0] else 1.0

@@ -108,7 +108,7 @@ class Errors:
         self._squares += squares
         self._largest = max(self._largest, largest)
         rmse = self._rmse(squares, count)
-        figures = StepQuality(step=step, psnr=psnr(self.data_range, rmse), rmse=rmse, max_abs_error=self._unscaled(largest, count))
+        figures = StepQuality(step=step, psnr=self._psnr(squares, count), rmse=rmse, max_abs_error=self._unscaled(largest, count))
         self.steps.append(figures)
         return figures
 
@@ -120,12 +120,16 @@ class Errors:
     @property
     def psnr(self) -> float | None:
         """In dB, over all frames."""
-        return psnr(self.data_range, self.rmse)
+        return self._psnr(self._squares, self.count)
 
     @property
     def max_abs_error(self) -> float | None:
         """The largest difference over all frames, in data units."""
         return self._unscaled(self._largest, self.count)
+
+    def _psnr(self, squares: float, count: int) -> float | None:
+        # In scaled units: a mean of denormals is rounded to one.
+        return psnr(self.data_range * self._scale, math.sqrt(squares / count) if count else None)
 
     def _rmse(self, squares: float, count: int) -> float | None:
         return self._unscaled(math.sqrt(squares / count) if count else 0.0, count)

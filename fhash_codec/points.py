@@ -125,7 +125,8 @@ def _evaluate(network: Network, patches: Sequence[Patch], points: npt.NDArray[np
         for axis, change in enumerate(changes):
             np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows])
     values = head.run()[:count]
-    return values, np.einsum("fn,afn->an", head.gradient()[:, :count], slopes) if gradient else None
+    with np.errstate(over="ignore", invalid="ignore"):  # of hostile weights
+        return values, np.einsum("fn,afn->an", head.gradient()[:, :count], slopes) if gradient else None
 
 
 def _points(network: Network, arrays: Sequence[npt.ArrayLike]) -> npt.NDArray[np.float64]:

@@ -27,6 +27,8 @@ SLACK = 1e-6
 """The quantum of the residual is this part less than twice the bound, and less by the rounding of what is decoded."""
 SLACK_OF_TYPE = 0.1
 """At most so much less for that rounding: a bound near the precision of the type is not helped by it."""
+LEAST_STEP = 1e-153
+"""Its square is a number above 0. Ranges that would need a smaller one are coded exactly."""
 DOUBLE_STEPS = 2.0**20
 """Steps in the range from which on float32 is not precise enough."""
 
@@ -61,7 +63,7 @@ def with_step(settings: Settings, step: float, goal: Goal, rounding: float = 0.0
     data_range = settings.high - settings.low
     largest = max(abs(settings.low), abs(settings.high))
     # Integers beyond 2^30 cannot be coded. In a constant series the step only has to be small enough for the centre, a float32.
-    step = max(step, data_range * SMALLEST_STEP, largest * 2.0**-30 if data_range == 0 else 0.0, 1e-300)
+    step = max(step, data_range * SMALLEST_STEP, largest * 2.0**-30 if data_range == 0 else 0.0, LEAST_STEP)
     double = data_range / step > DOUBLE_STEPS or largest > step * DOUBLE_STEPS or largest > 1e37 or step < 1e-30
     # Half a quantum off, and then rounded to the type of the source, must still keep the bound: if not, a whole tile is stored exactly.
     quantum = 0.0 if not goal.error else 2 * goal.error * (1 - SLACK - min(rounding * largest / goal.error, SLACK_OF_TYPE))
@@ -138,6 +140,8 @@ def _solve_size(sample: Sample, settings: Settings, way: Way, size: float, data_
     """The step at which the tiles take so many bytes."""
     if size <= 0:
         raise InputError("the ratio leaves no room for values: the rest of the file is larger already; ask for a smaller ratio")
+    if data_range == 0:
+        return settings, sample.run(settings, way)
     low, high = math.log(max(data_range, 1e-300) * 2.0**-24), math.log(max(data_range, 1e-300) * 4)
     log_step, fall = math.log(settings.step), SLOPE / EXCHANGE
     before: tuple[float, float] | None = None

@@ -113,8 +113,8 @@ def _of_feature(text: str, value_range: Range) -> Floats | None:
     low, high = value_range
     if isinstance(feature, Isosurface):
         half = _part(TENT, value_range) or max(abs(low) * 1e-6, 1e-30)
-        tent = np.array([[feature.value - half, 0.0], [feature.value, SURFACE], [feature.value + half, 0.0]])
-        return tent[np.isfinite(tent[:, 0])]
+        tent = [[feature.value - half, 0.0], [feature.value, SURFACE], [feature.value + half, 0.0]]
+        return np.array([point for point in tent if math.isfinite(point[0])])
     inside = _values(text, value_range)
     if inside is None:
         # A feature of one value, or of none that the data have, is drawn as a surface.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -19,7 +20,7 @@ from fhash_codec.render.task import Lighting, Surface, Table, Task
 from fhash_codec.render.transfer_function import TransferFunction
 from fhash_codec.render.view import part_in_view, pixel_vertices
 from fhash_codec.volume import MAX_LOD, Volume
-from fhash_formats.errors import InputError
+from fhash_formats.errors import FhashWarning, InputError
 
 __all__ = ["Plan", "Units"]
 
@@ -27,6 +28,8 @@ Floats = npt.NDArray[np.float64]
 
 LARGE_OFFSET = 2.0**9
 """Half ranges that float32 values may be large: 15 bits are left for the range then."""
+MANY_SAMPLES = 10**5
+"""Of a ray: more take minutes for a picture of usual size."""
 MOST_RAYS = 2**26
 """Rays of a picture: more would not fit in the memory of most machines."""
 SHOULDER = (-0.7, 1.0, 1.0)
@@ -148,6 +151,14 @@ class Plan:
             jitter=effects.jitter,
             skipping=march.skipping,
         )
+        longest = float(np.linalg.norm(np.diff(grid.bounds, axis=1)[:, 0] * grid.spacing)) / task.step
+        if longest > MANY_SAMPLES:
+            warnings.warn(
+                f"a ray takes up to {longest:.3g} samples, since the axes are of very different lengths or the step is short; "
+                "stretch the axes with 'scale', or take a longer 'step'",
+                FhashWarning,
+                stacklevel=2,
+            )
         mode = march.mode
         if mode == "auto":
             mode = "arm" if march.device == "cuda" else "cache"

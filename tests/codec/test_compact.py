@@ -144,6 +144,15 @@ def test_a_constant_series_is_exact_and_small(tmp_path, value):
         assert np.abs(decoded(tmp_path / f"{name}.fhz") - source).max() <= (1e-3 if name == "bound" else 0)
 
 
+@pytest.mark.parametrize("value", [0.0, 5e-324, 1e-160, 5.0])
+@pytest.mark.parametrize("promise", [{}, {"ratio": 3.0}, {"max_error_rel": 0.1}], ids=str)
+@pytest.mark.parametrize("effort", [2, 5])
+def test_a_constant_series_is_exact_with_every_effort_and_promise(tmp_path, value, promise, effort):
+    source = np.full((4, 9, 10, 11), value)
+    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(effort=effort, **promise))
+    assert np.array_equal(decoded(tmp_path / "a.fhz"), source)
+
+
 def test_values_near_the_largest_float_are_kept(tmp_path):
     source = (2 * np.random.default_rng(0).random((2, 4, 5, 6)) - 1) * 1.7e308
     figures = fhash_codec.encode(source, tmp_path / "a.fhz", FAST)

@@ -15,7 +15,7 @@ from fhash_codec.render.opacity import Histogram
 from fhash_codec.render.plan import MOST_RAYS, Plan, Units
 from fhash_codec.render.scene import Camera
 from fhash_codec.render.view import part_in_view, pixel_vertices
-from fhash_formats.errors import InputError, RegionError
+from fhash_formats.errors import FhashWarning, InputError, RegionError
 
 
 def plan(volume: Volume, **scene: Any) -> Plan:
@@ -206,3 +206,9 @@ def test_constant_values_have_a_table_that_single_precision_holds(tmp_path: Path
         assert table is not None
         assert np.float32(table.low) < np.float32(table.high)
         assert np.isfinite(fhash_codec.render(volume, Scene.from_dict({"size": [16, 16]})).rgba).all()
+
+
+def test_a_picture_that_would_take_ages_is_told(volume: Volume) -> None:
+    for scene in ({"scale": [1e6, 1, 1e-6]}, {"march": {"step": 1e-5}}):
+        with pytest.warns(FhashWarning, match="a ray takes up to .* samples"):
+            plan(volume, **scene)
