@@ -28,6 +28,7 @@ COMMANDS = {
     "diff": "measure RUN.fhz against the data it was made from",
     "demo": "simulate, encode, decode, compare, draw",
     "bench": "measure speed on this machine",
+    "selftest": "check hard cases on this machine",
 }
 """Each command's line of help. Its module `fhash_cli.NAME` is imported when it is used, so that `--help` is quick."""
 

@@ -1,0 +1,92 @@
+"""`fhash selftest`: its table, exit codes, JSON and report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from fhash_codec.selftest import workers
+from fhash_codec.selftest.case import Case, Finding
+from fhash_codec.selftest.results import CaseResult, Summary
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+    """Puts a figure in place of every case: {"worst": figure}; what was asked for is added."""
+    asked: dict[str, float] = {"worst": 0.5}
+
+    def run(cases: list[Case], *, everything: bool, processes: int | None, progress: object) -> Summary:
+        asked.update(cases=len(cases), everything=everything, processes=processes or 0)
+        found = Finding(name="bound", worst=asked["worst"], limit=1.0, unit="of it", under="psnr")
+        return Summary(
+            results=[CaseResult(name=one.name, group=one.group, about=one.about, under=("psnr",), findings=(found,)) for one in cases]
+        )
+
+    monkeypatch.setattr(workers, "run_cases", run)
+    return asked
+
+
+def test_one_case_runs_and_holds(fhash):
+    result = fhash("selftest", "--case", "nothing-finite", "--processes", "1", "--quiet")
+    assert result.exit_code == 0, result.output
+    assert "values      1        3" in result.stdout
+    assert result.stdout.endswith("everything holds\n")
+
+
+def test_a_failure_is_listed_and_exits_with_1(fhash, measured):
+    measured["worst"] = 1.25
+    result = fhash("selftest", "--group", "times", "--quiet")
+    assert result.exit_code == 1
+    assert "uneven: psnr: bound is 1.25 of it, at most 1" in result.stdout
+    assert result.stderr == ""
+
+
+def test_json_holds_every_figure(fhash, measured):
+    result = fhash("selftest", "--case", "spike", "--case", "twos", "--json")
+    found = json.loads(result.stdout)
+    assert result.exit_code == 0
+    assert found["holds"] is True
+    assert [case["name"] for case in found["cases"]] == ["twos", "spike"]
+    assert found["cases"][0]["findings"][0] == {
+        "name": "bound",
+        "worst": 0.5,
+        "limit": 1.0,
+        "unit": "of it",
+        "under": "psnr",
+        "holds": True,
+    }
+
+
+def test_all_runs_more(fhash, measured):
+    assert fhash("selftest", "--quiet").exit_code == 0
+    few = measured["cases"]
+    assert not measured["everything"]
+    assert fhash("selftest", "--all", "--processes", "3", "--quiet").exit_code == 0
+    assert measured["cases"] >= few
+    assert measured["everything"]
+    assert measured["processes"] == 3
+
+
+def test_the_report_is_written_once(fhash, measured, tmp_path: Path):
+    path = tmp_path / "stability.md"
+    assert fhash("selftest", "--case", "spike", "--report", path, "--quiet").exit_code == 0
+    assert "| spike | one value of 1e6, all others 0 | psnr | bound (psnr) | 0.5 of it | 1 |" in path.read_text()
+    again = fhash("selftest", "--case", "spike", "--report", path)
+    assert again.exit_code == 2
+    assert "--force" in again.stderr
+    assert fhash("selftest", "--case", "spike", "--report", path, "--force", "--quiet").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--case", "spikey"), "unknown case 'spikey'; did you mean 'spike'?"),
+        (("--group", "frontes"), "unknown group 'frontes'; did you mean 'fronts'?"),
+        (("--report", "no/such/folder/a.md"), "no/such/folder"),
+        (("--processes", "0"), "0 is not in the range"),
+    ],
+)
+def test_what_cannot_be_is_refused(refused, words, message):
+    assert message in refused(2, "selftest", *words)
