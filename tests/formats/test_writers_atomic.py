@@ -193,6 +193,24 @@ def test_another_writer_between_moving_aside_and_replacing_is_kept(
     assert (path / "c" / "0" if directory else path).read_text() == "somebody else's"
 
 
+def test_a_folder_that_appears_at_the_last_moment_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, rename = tmp_path / "out.zarr", os.rename
+
+    def late(source: Path, target: Path) -> None:
+        store(path, "somebody else's")
+        rename(source, target)
+
+    def save() -> None:
+        with replacing(path, force=False, directory=True) as temporary:
+            store(temporary, "new")
+            monkeypatch.setattr(os, "rename", late)
+
+    with pytest.raises(OutputExistsError, match="appeared meanwhile"):
+        save()
+    assert [found.name for found in tmp_path.iterdir()] == ["out.zarr"]
+    assert (path / "c" / "0").read_text() == "somebody else's"
+
+
 def store_file(path: Path, text: str) -> None:
     """Replace a file by another one, as other writers do."""
     other = path.with_name("other")

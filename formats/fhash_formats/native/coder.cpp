@@ -116,6 +116,7 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
     for (int64_t b = 0; b < count; b++) {
         const int32_t* row = table + b * COLUMNS;
         for (int a = 0; a < 4; a++) {
+            if (row[a] < 0 || row[a] > row[4 + a] || row[4 + a] > shape[a]) return -1;
             bands[b].low[a] = row[a];
             bands[b].size[a] = row[4 + a] - row[a];
         }
@@ -421,7 +422,7 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
     });
 }
 
-// Decode into q, which must be zeros. 0, or -1 for bytes that no encoder writes, or NO_MEMORY.
+// Decode into q, which must be zeros. 0, or -1 for bytes that no encoder writes and for bands beyond q, or NO_MEMORY.
 FHASH_EXPORT int64_t fhash_decode(int32_t* q, const int64_t* shape, const int32_t* table, int64_t count, const uint16_t* slots,
                                   int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
                                   int64_t simple_count, const uint8_t* data, int64_t size) {

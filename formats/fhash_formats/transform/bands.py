@@ -13,7 +13,8 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.errors import InputError
+from fhash_formats.transform.spec import AXES, AxisTransform, TransformSpec
 
 __all__ = ["COLUMNS", "Table", "band_table", "single_band"]
 
@@ -28,8 +29,14 @@ Span = tuple[int, int, int]
 
 
 def band_table(spec: TransformSpec, shape: Sequence[int]) -> Table:
-    """The table of a transform on tiles of a shape (t, z, y, x)."""
+    """The table of a transform on tiles of a shape (t, z, y, x); raises InputError for a basis of another length.
+
+    The native coder believes it: every band lies within the shape.
+    """
     t, z, y, x = spec.axes
+    for name, axis, length in zip(AXES, spec.axes, shape, strict=True):
+        if axis.basis is not None and axis.basis.n != length:
+            raise InputError(f"the basis along {name} is for {axis.basis.n} vertices, the tile has {length}")
     return _table(
         _spans(t, shape[0]), _spans(z, shape[1]), _spans(y, shape[2]), _spans(x, shape[3]), spec.coupled, y.kind == "klt" or x.kind == "klt"
     )

@@ -114,7 +114,13 @@ def _decode(
         mask = np.zeros(shape, bool) if masked else None
         return restored(outside(result, mask, settings), missing), mask
     predictor = settings.predictor
+    transform = None
     if not predicted:
+        # Before anything is decoded: the bands of what does not fit would lie beyond the tile.
+        try:
+            transform = transform_for(settings, shape)
+        except InputError as error:
+            raise DamagedFileError(f"the settings of a coded tile do not fit its shape: {error}") from error
         integers = decode_integers(next(sections, b""), shape, band_table(settings.transform, shape))
     elif predictor is not None:
         integers = decode_predicted(next(sections, b""), shape, predictor)
@@ -129,16 +135,13 @@ def _decode(
     check_ended(sections)
     if crc != digest:
         raise DamagedFileError("the decoded integers of a tile differ from their digest")
-    if predicted and predictor is not None:
+    if transform is None:
+        assert predictor is not None
         found = predicted_values(integers, predictor, settings)
         if lod:
             return cast(found[_every(lod)], kind), None
         mask = None if packed is None else _mask_of(packed, found, settings)
         return restored(outside(cast(found, kind), mask, settings), missing), mask
-    try:
-        transform = transform_for(settings, shape)
-    except InputError as error:
-        raise DamagedFileError(f"the settings of a coded tile do not fit its shape: {error}") from error
     if lod:
         coarse = transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype), lod=lod)
         return cast(_shifted(coarse, settings), kind), None

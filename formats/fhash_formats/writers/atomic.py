@@ -201,7 +201,12 @@ class _Output:
                 return
         if os.path.lexists(self.target):
             raise self._appeared()
-        os.rename(self.temporary, self.target)
+        try:
+            os.rename(self.temporary, self.target)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # a folder, just now
+                raise self._appeared() from None
+            raise
 
     def _appeared(self) -> OutputExistsError:
         return OutputExistsError(f"{self.path} exists: it appeared meanwhile; use --force (force=True) to replace it, or another name")

@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fhash_formats.errors import DamagedFileError, FhashError
+from fhash_formats.errors import DamagedFileError, FhashError, InputError
 from fhash_formats.transform.bands import band_table, single_band
+from fhash_formats.transform.basis import Basis
 from fhash_formats.transform.coder import encode_integers
 from fhash_formats.transform.sections import assembled
 from fhash_formats.transform.settings import Settings
@@ -189,3 +190,21 @@ def test_a_transform_that_overflows_gives_no_warning(native: str, monkeypatch: p
     integers = np.full(SHAPE, 1000, np.int32)
     data = assembled(None, b"", encode_integers(integers, band_table(SPEC, SHAPE)).data, integers, None, None)
     assert not np.isinf(decode_tile(data, SHAPE, np.float32, settings)).any()
+
+
+@pytest.mark.parametrize("axis", range(4))
+@pytest.mark.parametrize("native", ["0", "1"])
+def test_a_basis_longer_than_the_tile_is_damage_before_anything_is_decoded(axis: int, native: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its bands would lie beyond the tile: the decoder wrote behind the end of its array."""
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    n = SHAPE[axis] + 3
+    basis = Basis(integers=np.eye(n, dtype=np.int32), exponents=(0,) * n)
+    axes = [AxisTransform(kind="none")] * 4
+    axes[axis] = AxisTransform(kind="klt", basis=basis)
+    settings = replace(SETTINGS, transform=TransformSpec(axes=(axes[0], axes[1], axes[2], axes[3])), quantum=0.0)
+    integers = np.zeros(SHAPE, np.int32)
+    for coded in (b"", bytes(range(40))):
+        with pytest.raises(DamagedFileError, match="do not fit its shape"):
+            decode_tile(assembled(None, b"", coded, integers, None, None), SHAPE, np.float32, settings)
+    with pytest.raises(InputError, match="basis along"):
+        band_table(settings.transform, SHAPE)
