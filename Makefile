@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test clean
+.PHONY: demo test hard clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png.
 demo: .venv/.stamp
@@ -13,6 +13,15 @@ test: .venv/.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
+
+# The long set of hard cases, hostile files, faults and fuzzing: some 45 minutes on 4 processors. docs/stability.md gets the figures.
+hard: .venv/.stamp
+	mkdir -p build/hard
+	rm -f build/hard/figures.jsonl
+	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest tests/hard
+	FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python tests/hard/fuzz/run.py --march --seconds 600 --crashes build/hard/crashes
+	$(BIN)/fhash selftest --all --report build/hard/stability.md --force
+	$(BIN)/python tests/hard/summary.py build/hard/stability.md build/hard/figures.jsonl docs/stability.md
 
 # torch comes first and alone: where pip has more than one build of the pinned version (a CPU wheel beside the one with CUDA),
 # the choice is made before any other requirement counts.

@@ -24,6 +24,7 @@ from fhash_codec.render.scene import Scene
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.writers.atomic import check_output
+from fhash_formats.writers.leftovers import clear
 
 __all__ = ["Animated", "animate", "numbered"]
 
@@ -85,6 +86,7 @@ def animate(
     scenes = animation.scenes(scene, volume)
     base = output if suffix == ".png" else None if pictures is None else Path(pictures)
     paths = [] if base is None else numbered(base, len(scenes))
+    clear(paths)  # also beside the pictures that are kept, which no one writes anew
     kept = [_kept(path, each, volume) for path, each in zip(paths, scenes, strict=bool(paths))] if paths else []
     if suffix != ".png":
         check_output(output, force, sources=[volume.path])

@@ -88,7 +88,7 @@ def _passed(extinction: Single, step: Floats, count: int, length: float) -> Sing
     if library is None:
         for number in range(count):
             _add_shifted(extinction, step * (number + 0.5), sums)
-        return np.asarray(np.exp(-length * sums), dtype=np.float32)
+        return _left(sums, length)
     shape, along = (ctypes.c_int64 * 3)(*extinction.shape), (ctypes.c_double * 3)(*step)
     _in_layers(
         extinction.shape[0],
@@ -96,7 +96,14 @@ def _passed(extinction: Single, step: Floats, count: int, length: float) -> Sing
             _address(extinction), shape, along, ctypes.c_int64(count), ctypes.c_int64(z), ctypes.c_int64(z + 1), _address(sums)
         ),
     )
-    return np.asarray(np.exp(-length * sums), dtype=np.float32)
+    return _left(sums, length)
+
+
+def _left(sums: Single, length: float) -> Single:
+    """exp(-length * sums), float32; in float64 where the length is beyond float32, in which infinity times 0 would be no number."""
+    factor = length if length < 1e30 else np.float64(length)
+    with np.errstate(over="ignore"):  # then nothing is left, as it should be
+        return np.asarray(np.exp(-factor * sums), dtype=np.float32)
 
 
 def _add_shifted(extinction: Single, offset: Floats, sums: Single) -> None:

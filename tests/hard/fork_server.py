@@ -1,0 +1,74 @@
+"""A process that imports fhash once and runs each command line in a fork of itself; started by `forks.Server`.
+
+It takes one JSON object per line. {"words": [...], "log": path, "inject": [[name, ...], ...]} starts a command line, and its process id is
+the answer; {"wait": pid} is answered by how that process ended: its exit code, or minus the number of the signal.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from typing import Any
+
+import injections
+
+import fhash_cli.animation
+import fhash_cli.decode
+import fhash_cli.encode
+import fhash_cli.render  # noqa: F401 - imported for the forks
+from fhash_cli.main import main
+
+MODULES = ("fhash_codec", "fhash_codec.encoding", "fhash_codec.compact.encoder", "fhash_codec.isosurface", "fhash_codec.render.render")
+OTHERS = ("h5py", "zarr", "xarray", "h5netcdf", "PIL.PngImagePlugin", "PIL.GifImagePlugin", "fhash_formats.container", "scipy.special")
+TRAINING = ("torch", "fhash_codec.engines.portable", "fhash_codec.checkpoint", "fhash_codec.train")
+
+
+def run(words: list[str], log: str, inject: list[list[Any]]) -> None:
+    """The child: the command line with its streams in a file, as the console script runs it; never returns."""
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    code = 1
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for name, *arguments in inject:
+            getattr(injections, name)(*arguments)
+        sys.argv = ["fhash", *words]
+        main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    except BaseException as error:
+        print(f"ESCAPED {type(error).__name__}: {error}", file=sys.stderr)
+        code = 99
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def serve() -> None:
+    """Answer requests until the input ends."""
+    import importlib
+    import importlib.util
+
+    for name in (*MODULES, *OTHERS, *TRAINING):
+        if importlib.util.find_spec(name) is not None:
+            importlib.import_module(name)
+    print("ready", flush=True)
+    for line in sys.stdin:
+        request = json.loads(line)
+        if "wait" in request:
+            _, status = os.waitpid(request["wait"], 0)
+            print(os.waitstatus_to_exitcode(status), flush=True)
+            continue
+        child = os.fork()
+        if child == 0:
+            run(**request)
+        print(child, flush=True)
+
+
+if __name__ == "__main__":
+    serve()

@@ -1,0 +1,14 @@
+// An entry for one function only, with which a test sees that an overrun is found.
+#include "reader.hpp"
+
+extern "C" std::int64_t fhash_dequantise_f32(const std::int32_t*, std::int64_t, double, double, double, double, float*);
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
+    Reader in(data, size);
+    const std::int64_t n = 1 + in.word() % 100;
+    std::vector<std::int32_t> whole = in.numbers<std::int32_t>(n);
+    for (std::int32_t& value : whole) value /= 2;
+    std::vector<float> values(whole.size());
+    fhash_dequantise_f32(whole.data(), n, 1.0, 0.0, 0.0, 0.0, values.data());
+    return 0;
+}

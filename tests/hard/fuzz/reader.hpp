@@ -1,0 +1,47 @@
+// Numbers from the bytes of one input; past its end everything is 0.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+class Reader {
+public:
+    Reader(const std::uint8_t* data, std::size_t size) : at(data), left(size) {}
+
+    std::uint8_t byte() { return left ? (left--, *at++) : 0; }
+    std::uint16_t word() {
+        const std::uint16_t low = byte();
+        return static_cast<std::uint16_t>(low | byte() << 8);
+    }
+    // From low to high.
+    std::int64_t within(std::int64_t low, std::int64_t high) { return low + byte() % (high - low + 1); }
+    template <class T> T number() {
+        std::uint8_t bytes[sizeof(T)];
+        for (std::uint8_t& one : bytes) one = byte();
+        T value;
+        std::memcpy(&value, bytes, sizeof value);
+        return value;
+    }
+    // A float that is finite, as Python lets through.
+    template <class T> T finite() {
+        const T value = number<T>();
+        return std::isfinite(value) ? value : T(0);
+    }
+    template <class T> std::vector<T> numbers(std::int64_t n) {
+        std::vector<T> values(static_cast<std::size_t>(n));
+        for (T& value : values) value = number<T>();
+        return values;
+    }
+    // In memory of its own, so that a byte read beyond the end is seen.
+    std::vector<std::uint8_t> rest() {
+        std::vector<std::uint8_t> bytes(at, at + left);
+        left = 0;
+        return bytes;
+    }
+
+private:
+    const std::uint8_t* at;
+    std::size_t left;
+};

@@ -1,0 +1,143 @@
+"""What the fuzzer begins from: setups that Python would call the native decoders with, and inputs made of the golden containers."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.container import Container
+from fhash_formats.container.coding import TRANSFORM
+from fhash_formats.transform.bands import band_table, single_band
+from fhash_formats.transform.coder import encode_integers
+from fhash_formats.transform.mask import encode_mask, mask_prior_state
+from fhash_formats.transform.predict import _blank, encode_predicted
+from fhash_formats.transform.predictor import Predictor, pass_arrays, passes_of
+from fhash_formats.transform.prior import prior_state
+from fhash_formats.transform.sections import EMPTY, EXACT, MISSING, OWN, PREDICTED, sections_of
+from fhash_formats.transform.settings import Settings
+from fhash_formats.transform.spec import AxisTransform, TransformSpec
+
+GOLDENS = Path(__file__).parents[2] / "golden"
+CODER, MASK, PREDICTOR, TRANSFORMS, HEAD, VALUES, MARCH = range(7)
+"""First byte of an input, as targets.cpp has it."""
+
+SPECS: tuple[tuple[tuple[str, int], ...], ...] = (
+    (("none", 0),) * 4,
+    (("haar", 1), ("5/3", 1), ("9/7", 2), ("9/7", 2)),
+    (("haar", 2), ("none", 0), ("5/3", 1), ("9/7", 3)),
+    (("9/7", 10), ("9/7", 10), ("9/7", 10), ("9/7", 10)),
+    (("none", 0), ("haar", 3), ("none", 0), ("5/3", 5)),
+)
+SHAPES = ((1, 1, 1, 1), (2, 3, 4, 5), (1, 1, 1, 40), (5, 1, 7, 3), (3, 6, 9, 17), (1, 4, 16, 33), (11, 2, 1, 2))
+PREDICTORS = (((0, 0, 0, 0), 0), ((1, 1, 1, 1), 1), ((2, 3, 3, 3), 2), ((0, 0, 2, 3), 2), ((8, 0, 1, 8), 1), ((1, 0, 0, 0), 0))
+
+
+def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
+    """Write the file that setups.hpp reads; the bands as (shape, table) and the passes as (shape, Predictor) in its order."""
+    bands = [(shape, single_band(shape)) for shape in SHAPES]
+    bands += [(shape, band_table(_spec(axes), shape)) for axes in SPECS for shape in SHAPES]
+    bands += [(shape, band_table(settings.transform, shape)) for _, settings, shape in golden_streams() if np.prod(shape) < 1 << 14]
+    passes = [(shape, _predictor(levels, order, reach)) for levels, reach in PREDICTORS for shape, order in _orders()]
+    passes += [(shape, settings.predictor) for _, settings, shape in golden_streams() if settings.predictor is not None]
+    with path.open("wb") as file:
+
+        def put(array: npt.NDArray[Any]) -> None:
+            data = np.ascontiguousarray(array).tobytes()
+            file.write(struct.pack("<q", len(data)) + data)
+
+        for state in (prior_state(), mask_prior_state(), _blank()):
+            for part in (state.slots, state.weights, state.simples):
+                put(part)
+        file.write(struct.pack("<q", len(bands)))
+        for shape, table in bands:
+            put(np.array(shape, np.int64))
+            put(table)
+        file.write(struct.pack("<q", len(passes)))
+        for shape, predictor in passes:
+            rows, taps, _ = pass_arrays(predictor)
+            for part in (np.array(shape, np.int64), np.array(predictor.levels, np.int64), rows, taps):
+                put(part)
+    return bands, passes
+
+
+def write_seeds(folder: Path, bands: list[Any], passes: list[Any]) -> int:
+    """Write the inputs, one file each; how many."""
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = count()
+    rng = np.random.default_rng(0)
+
+    def put(target: int, *parts: bytes) -> None:
+        (folder / f"{next(numbers):04}").write_bytes(bytes([target]) + b"".join(parts))
+
+    for number, (shape, table) in enumerate(bands):
+        for scale in (0.5, 30.0, 1e8):
+            integers = (rng.laplace(0, scale, shape)).astype(np.int32)
+            put(CODER, struct.pack("<H", number), encode_integers(integers, table).data)
+    for number, (shape, predictor) in enumerate(passes):
+        weights = np.array(predictor.weights, np.int16).tobytes()
+        smooth = np.cumsum(rng.integers(-3, 4, shape), axis=-1)
+        for integers in (smooth, rng.integers(-(1 << 20), 1 << 20, shape)):
+            put(PREDICTOR, struct.pack("<H", number), weights, encode_predicted(integers.astype(np.int32), None, predictor)[0])
+    known = {(shape, table.tobytes()): number for number, (shape, table) in reversed(list(enumerate(bands)))}
+    for stream, settings, shape in golden_streams():
+        data, found = coefficients_of(stream), known.get((shape, band_table(settings.transform, shape).tobytes()))
+        if data and found is not None:
+            put(CODER, struct.pack("<H", found), data)
+    for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (4, 8, 8, 24)):
+        nothing = (np.zeros(shape, np.uint8),) * 2
+        for density in (0.02, 0.5):
+            coded = encode_mask(rng.random(shape) < density, nothing)
+            put(MASK, bytes([*(n - 1 for n in shape), 0]), coded)
+    for target in (MASK, TRANSFORMS, HEAD, VALUES, MARCH):
+        for _ in range(24):
+            put(target, rng.bytes(400))
+        put(target, bytes(300))
+    return next(numbers)
+
+
+def golden_streams() -> Iterator[tuple[bytes, Settings, tuple[int, int, int, int]]]:
+    """Every coded tile of the goldens with its settings and shape."""
+    for path in sorted(GOLDENS.glob("*.fhz")):
+        with Container.open(path) as container:
+            for array in container.arrays.values():
+                inner = array._metadata.codecs if array._metadata.sharding is None else array._metadata.sharding.codecs
+                if inner[0]["name"] != TRANSFORM:
+                    continue
+                settings = Settings.from_dict(inner[0]["configuration"])
+                t, z, y, x = array.chunk_shape
+                for shard, member in array.chunks.items():
+                    sharding = array._metadata.sharding
+                    assert sharding is not None
+                    for offset, size in array._shard_index(sharding, shard):
+                        if size:
+                            yield container._source.read(member.data_offset + int(offset), int(size))[:-4], settings, (t, z, y, x)
+
+
+def coefficients_of(stream: bytes) -> bytes:
+    """The section of coded coefficients; nothing where there is none."""
+    flags = stream[0]
+    if flags & (EXACT | EMPTY) or flags & 0xE0 >= PREDICTED:
+        return b""
+    parts = [bytes(part) for part in sections_of(memoryview(stream)[5:])]
+    return parts[bool(flags & OWN) + bool(flags & MISSING)]
+
+
+def _spec(axes: tuple[tuple[str, int], ...]) -> TransformSpec:
+    t, z, y, x = (AxisTransform(kind=kind, depth=depth) for kind, depth in axes)
+    return TransformSpec(axes=(t, z, y, x))
+
+
+def _orders() -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    return [(shape, (3, 2, 1, 0) if number % 2 else (0, 1, 2, 3)) for number, shape in enumerate(SHAPES)]
+
+
+def _predictor(levels: tuple[int, ...], order: tuple[int, ...], reach: int) -> Predictor:
+    taps = sum(len(part.taps) for part in passes_of(levels, order, reach))  # type: ignore[arg-type]
+    weights = tuple(int(weight) for weight in np.random.default_rng(taps).integers(-600, 600, taps))
+    return Predictor(step=1.0, origin=0.0, levels=levels, order=order, reach=reach, weights=weights)  # type: ignore[arg-type]

@@ -1,0 +1,245 @@
+"""One hostile file and the commands of `fhash` on it, in a process whose memory and time are bounded.
+
+    python tests/hard/hostile_trial.py FOLDER
+
+reads numbers of mutations from stdin and answers each with one line of JSON; FOLDER is for its files. With --write NUMBER FILE.fhz it
+writes the file of a number.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import resource
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from functools import cache
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import mutations
+import numpy as np
+from PIL import Image
+
+import fhash_cli.main
+import fhash_codec
+from fhash_cli.output import describe_error, say
+from fhash_formats.container import Container
+from fhash_formats.errors import FhashError, FhashWarning
+
+MEMORY = 512 << 20
+"""Bytes beyond what the process has before: an allocation above that fails."""
+SECONDS = 10.0
+"""Of processor time for one command, on a machine that others use as well; on one of its own it takes less than 2."""
+LARGE = 1 << 22
+"""Vertices of a series that are decoded as a whole; of more only a region, as decoding takes as long as there are vertices."""
+OWN_WARNING = "fhash: warning: "
+
+
+class Trial:
+    """One mutated file and the commands on it."""
+
+    def __init__(self, number: int, folder: Path) -> None:
+        self.mutation = mutations.mutation(number)
+        self.path, self.folder = folder / "run.fhz", folder
+        self.path.write_bytes(self.mutation.data)
+        self.ends: list[dict[str, Any]] = []
+        self.shape = self._declared()
+
+    def _declared(self) -> tuple[int, ...]:
+        """Shape of the volume as the file says it; that of the golden where it cannot be opened."""
+        try:
+            with Container.open(self.path) as container:
+                return tuple(container.header["domain"]["shape"])
+        except FhashError:
+            return tuple(mutations.header_of(mutations.goldens()[self.mutation.golden][1])["domain"]["shape"])
+        except Exception:  # which the first command will report
+            return (5, 6, 7, 9)
+
+    def run(self) -> dict[str, Any]:
+        """All commands; what the worker answers."""
+        run, region = str(self.path), self._region()
+        roi = ",".join(f"{low}:{high}" for low, high in region[1:])
+        steps = f"{region[0][0]}:{region[0][1]}"
+        whole, part, picture = (str(self.folder / name) for name in ("whole.npy", "part.npy", "picture.png"))
+        self._command("info", ["info", run])
+        self._command("info --json", ["info", run, "--json"])
+        self._command("verify", ["verify", run, "-q"])
+        if self._small():
+            self._command("decode", ["decode", run, "-o", whole, "--force", "-q"], lambda: self._values(whole, self.shape, "whole"))
+        sizes = [high - low for low, high in region]
+        check = lambda: self._values(part, sizes, "part", region)  # noqa: E731
+        self._command("decode region", ["decode", run, "--roi", roi, "--t", steps, "-o", part, "--force", "-q"], check)
+        self._end("sample", self._sample)
+        self._command("render", ["render", run, "-o", picture, "--size", "32x32", "--force", "-q"], lambda: self._picture(picture))
+        return {"number": self.mutation.number, "kind": self.mutation.kind, "golden": self.mutation.golden, "ends": self.ends}
+
+    def _small(self) -> bool:
+        return prod(self.shape) <= LARGE
+
+    def _region(self) -> list[tuple[int, int]]:
+        """A small part in the middle."""
+        found = []
+        for length in self.shape:
+            low = length // 3
+            found.append((low, min(length, low + 3)))
+        return found
+
+    def _command(self, name: str, arguments: list[str], check: Callable[[], str | None] | None = None) -> None:
+        def work() -> str | None:
+            try:
+                fhash_cli.main.program.main(args=arguments, prog_name="fhash")
+            except SystemExit as left:
+                if left.code:
+                    raise
+            return check() if check is not None else None
+
+        self._end(name, work)
+
+    def _end(self, name: str, work: Callable[[], str | None]) -> None:
+        """Do the work and note how it ended; `work` returns what is wrong with its result."""
+        out, err, wrong = io.StringIO(), io.StringIO(), None
+        _reset_peak()
+        before, start = _resident("VmRSS"), time.process_time()
+        _bound_time()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
+            warnings.showwarning = _warned
+            try:
+                wrong = work()
+                code = 0
+            except SystemExit as left:
+                code = int(left.code or 0)
+            except Exception as error:
+                code, wrong = -1, f"{type(error).__name__}: {error}"[:300]
+        seconds, peak = time.process_time() - start, max(0, _resident("VmHWM") - before)
+        said = err.getvalue()
+        if wrong is None:
+            wrong = self._judged(name, code, said)
+        if wrong is None and seconds > SECONDS:
+            wrong = f"{seconds:.1f} s of processor time"
+        end = {0: "decoded", 4: "refused", 1: "too large", 2: "nothing to show"}.get(code, f"exit {code}")
+        self.ends.append({"command": name, "end": end, "seconds": seconds, "bytes": peak, "wrong": wrong})
+
+    def _judged(self, name: str, code: int, said: str) -> str | None:
+        """What may not be about an exit code and what was printed with it."""
+        lines = [line for line in said.splitlines() if not line.startswith(OWN_WARNING)]
+        if code == 0:
+            if lines:
+                return f"success, but it says {said[:200]!r}"
+            if name == "verify" and not self.mutation.sealed and self.mutation.data != self._golden():
+                return "a damaged file is called sound"
+            return None
+        if len(lines) != 1 or not lines[0].startswith("fhash: error: "):
+            return f"exit code {code} and {len(lines)} lines: {said[:300]!r}"
+        # A sound file may hold more than there is memory for.
+        if code == 1 and self.mutation.sealed and lines[0].startswith("fhash: error: out of memory"):
+            return None
+        # Of a sound file with strange values, the usual scene may have nothing to show.
+        if code == 2 and self.mutation.sealed and name == "render":
+            return None
+        return None if code == 4 else f"exit code {code}: {lines[0][:300]}"
+
+    def _golden(self) -> bytes:
+        return mutations.goldens()[self.mutation.golden][0]
+
+    def _values(self, path: str, shape: Iterable[int], what: str, region: list[tuple[int, int]] | None = None) -> str | None:
+        """What is wrong with decoded values: finite and of the declared shape, those of the golden where nothing was sealed."""
+        values = np.load(path)
+        os.unlink(path)
+        if values.shape != tuple(shape):
+            return f"{what}: shape {values.shape} instead of {tuple(shape)}"
+        if np.isinf(values).any():
+            return f"{what}: infinities"
+        if not self.mutation.sealed:
+            expected = expected_values(self.mutation.golden)
+            if region is not None:
+                expected = expected[tuple(slice(low, high) for low, high in region)]
+            if not np.array_equal(values, expected, equal_nan=True):
+                return f"{what}: values that differ from the golden's"
+        return None
+
+    def _sample(self) -> str | None:
+        """Points between vertices, by the API: errors as the command line would end with."""
+        chance = np.random.default_rng(self.mutation.number)
+        # Within a few vertices: a sample decodes what lies between its points, too.
+        points = [chance.uniform(low, high - 1, 9) for low, high in self._region()]
+        try:
+            with fhash_codec.open(self.path) as volume:
+                t, z, y, x = points
+                values, slopes = volume.sample(t=t, z=z, y=y, x=x, gradient=True)
+        except Exception as error:
+            line, code = describe_error(error)
+            say(f"error: {line}")
+            raise SystemExit(code) from error
+        # A derivative may well be larger than its type holds.
+        return "infinities" if np.isinf(values).any() or slopes.shape != (*values.shape, 4) else None
+
+    def _picture(self, path: str) -> str | None:
+        with Image.open(path) as image:
+            size = image.size
+            image.load()
+        os.unlink(path)
+        return None if size == (32, 32) else f"a picture of {size}"
+
+
+def _warned(message: Warning | str, category: type[Warning], *_: Any) -> None:
+    """A warning as the command line shows it, those that are meant for users apart from those of the libraries below."""
+    say(f"{'warning' if issubclass(category, FhashWarning) else category.__name__}: {' '.join(str(message).split())}")
+
+
+@cache
+def expected_values(golden: str) -> Any:
+    """All values of a golden."""
+    with fhash_codec.open(mutations.GOLDENS / f"{golden}.fhz") as volume:
+        return volume[...]
+
+
+def _resident(key: str) -> int:
+    """A figure of this process's memory, bytes."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(key + ":"):
+            return int(line.split()[1]) * 1024
+    return 0
+
+
+def _reset_peak() -> None:
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+def _bound_time() -> None:
+    """End the process where the next command takes more than a few times what it may."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime + 3 * SECONDS) + 1, resource.RLIM_INFINITY))
+
+
+def worker(folder: Path) -> None:
+    """Warm up, bound the memory, then a line of JSON for each number on stdin."""
+    fhash_cli.main.warn = _warned  # type: ignore[assignment]
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    for golden in mutations.goldens():
+        expected_values(golden)
+        warm = Trial(0, folder)
+        warm.mutation = mutations.Mutation(number=0, golden=golden, kind="none", sealed=True, data=mutations.goldens()[golden][0])
+        warm.path.write_bytes(warm.mutation.data)
+        warm.shape = warm._declared()
+        wrong = [end for end in warm.run()["ends"] if end["wrong"]]
+        assert not wrong, wrong
+    limit = _resident("VmData") + MEMORY
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    for line in sys.stdin:
+        if os.environ.get("FHASH_HOSTILE_CRASH") == line.strip():  # a test of this
+            os.kill(os.getpid(), signal.SIGSEGV)
+        answers.write(json.dumps(Trial(int(line), folder).run()) + "\n")
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--write":
+        Path(sys.argv[3]).write_bytes(mutations.mutation(int(sys.argv[2])).data)
+    else:
+        worker(Path(sys.argv[1]))

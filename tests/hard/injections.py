@@ -1,0 +1,147 @@
+"""What goes wrong in a forked command line; each function is named in a request to the fork server."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import shutil
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def at_operation(folder: str, number: int, code: int, counted: str = "") -> None:
+    """At the n-th operation on files below `folder`: code > 0 fails it and all later ones with that errno, < 0 sends the signal -code.
+
+    counted: a file outside the folder to which the number of operations is written at the end.
+    """
+    library = ctypes.CDLL(os.environ["FHASH_FAULTS"])
+    library.fhash_fault_count.restype = ctypes.c_long
+    library.fhash_faults(os.path.realpath(folder).encode(), ctypes.c_long(number), ctypes.c_int(code))
+    if counted:
+        leave = sys.exit
+
+        def end(code: Any = None) -> None:
+            Path(counted).write_text(str(library.fhash_fault_count()))
+            leave(code)
+
+        sys.exit = end  # type: ignore[assignment]
+
+
+def file_limit(size: int) -> None:
+    """No file may become longer than this; SIGXFSZ is ignored, as Python does by itself."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+def memory_limit(size: int, report: str = "") -> None:
+    """No more data (heap and private maps) than this; report: a file for the peak of the resident set in KiB."""
+    resource.setrlimit(resource.RLIMIT_DATA, (size, size))
+    if report:
+        leave = sys.exit
+
+        def end(code: Any = None) -> None:
+            Path(report).write_text(str(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss))
+            leave(code)
+
+        sys.exit = end  # type: ignore[assignment]
+
+
+def user(number: int) -> None:
+    """Become another user, whom permissions stop."""
+    os.setgid(number)
+    os.setuid(number)
+
+
+def _at_progress(stage: str, done: int, act: Callable[[], None]) -> None:
+    """Once, when a stage first reports `done` parts."""
+    from fhash_cli.output import Progress
+
+    listen, acts = Progress.__call__, [act]
+
+    def listening(self: Progress, now: str, count: int, *rest: Any) -> None:
+        listen(self, now, count, *rest)
+        if (now, count) == (stage, done) and acts:
+            acts.pop()()
+
+    Progress.__call__ = listening  # type: ignore[method-assign]
+
+
+def signal_at(stage: str, done: int, number: int) -> None:
+    """A signal to itself when a stage reports `done` parts."""
+    _at_progress(stage, done, lambda: signal.raise_signal(number))
+
+
+def no_memory_at(stage: str, done: int) -> None:
+    """A MemoryError when a stage reports `done` parts."""
+
+    def act() -> None:
+        raise MemoryError
+
+    _at_progress(stage, done, act)
+
+
+def no_memory_in(module: str, name: str) -> None:
+    """A MemoryError in a function of a module, or a method "Class.name"."""
+    import importlib
+
+    owner: Any = importlib.import_module(module)
+    *path, last = name.split(".")
+    for part in path:
+        owner = getattr(owner, part)
+
+    def act(*_: Any, **__: Any) -> Any:
+        raise MemoryError
+
+    setattr(owner, last, act)
+
+
+def note_stages(path: str) -> None:
+    """Write a line "stage done" for each report of progress."""
+    from fhash_cli.output import Progress
+
+    listen = Progress.__call__
+
+    def listening(self: Progress, stage: str, done: int, *rest: Any) -> None:
+        listen(self, stage, done, *rest)
+        with open(path, "a", encoding="utf-8") as file:
+            print(stage, done, file=file)
+
+    Progress.__call__ = listening  # type: ignore[method-assign]
+
+
+def eager_checkpoints() -> None:
+    """A training saves its checkpoint as often as it may."""
+    import functools
+
+    import fhash_codec.train
+
+    fhash_codec.train.train = functools.partial(fhash_codec.train.train, save_seconds=0.0)
+
+
+def change_at(stage: str, done: int, path: str, how: str) -> None:
+    """Change a source when a stage reports `done` parts: 'touch', 'shrink', 'vanish', 'grow', or the path of what replaces it."""
+    _at_progress(stage, done, lambda: change(path, how))
+
+
+def change(path: str, how: str) -> None:
+    """Change a file or folder, as `change_at` says."""
+    target = Path(path)
+    if how == "vanish":
+        shutil.rmtree(target) if target.is_dir() else target.unlink()
+    elif how == "shrink":
+        os.truncate(target, target.stat().st_size // 2)
+    elif how == "grow":
+        with target.open("ab") as file:
+            file.write(b"0" * 1000)
+    elif how == "touch":
+        os.utime(target)
+    else:
+        source = Path(how)
+        if source.is_dir():
+            shutil.copytree(source, target, dirs_exist_ok=True)
+        else:
+            target.write_bytes(source.read_bytes())

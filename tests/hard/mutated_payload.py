@@ -1,0 +1,223 @@
+"""Mutations of what chunks hold, all checksums redone, so that the decoders see them: streams of coders, settings, values."""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+import zlib
+from collections.abc import Callable
+from math import prod
+from typing import Any
+
+import numpy as np
+from containers import Parts, with_crc
+from mutated_json import DOCUMENT
+from numcodecs.zstd import compress, decompress
+
+from fhash_formats.container.array import ArrayMetadata
+from fhash_formats.container.sharding import Sharding, pack_index, parse_index
+from fhash_formats.errors import FhashError
+from fhash_formats.transform.bands import band_table, single_band
+from fhash_formats.transform.coder import decode_integers
+from fhash_formats.transform.decoding import linear_values, predicted_values, transform_for
+from fhash_formats.transform.mask import decode_mask
+from fhash_formats.transform.predict import decode_predicted
+from fhash_formats.transform.sections import (
+    EMPTY,
+    EXACT,
+    FORMAT,
+    MASKED,
+    MISSING,
+    OWN,
+    PREDICTED,
+    PREDICTED_MASKED,
+    RESIDUAL,
+    little,
+    sections_of,
+)
+from fhash_formats.transform.settings import Settings
+
+Change = Callable[[random.Random, bytes], bytes]
+
+
+def documents_of(parts: Parts) -> dict[str, Any]:
+    """Metadata of the arrays by name."""
+    found = {name.rpartition("/")[0]: json.loads(data) for name, data in parts if name.endswith(DOCUMENT)}
+    return {name: values for name, values in found.items() if values["node_type"] == "array"}
+
+
+def chosen(chance: random.Random, parts: Parts, coded: bool | None = None) -> tuple[str, dict[str, Any], str, bytes]:
+    """An array, its metadata, and one of its members; coded: by `fhash.transform`, or not, or whichever."""
+    documents = documents_of(parts)
+    fitting = [(name, data) for name, data in parts if "/c/" in name and (coded is None or is_coded(documents[_array_of(name)]) == coded)]
+    name, data = chance.choice(fitting)
+    return _array_of(name), documents[_array_of(name)], name, data
+
+
+def _array_of(member: str) -> str:
+    return member[: member.rindex("/c/")]
+
+
+def is_coded(document: dict[str, Any]) -> bool:
+    return bool(document["codecs"][0]["name"] == "sharding_indexed")
+
+
+def replaced(parts: Parts, new: dict[str, bytes]) -> Parts:
+    return [(name, new.get(name, data)) for name, data in parts]
+
+
+def damaged(chance: random.Random, data: bytes) -> bytes:
+    """Bytes of a stream changed a little or much."""
+    if not data:
+        return chance.randbytes(chance.randrange(9))
+    changed = bytearray(data)
+    turn = chance.random()
+    if turn < 0.55:
+        for _ in range(chance.choice((1, 1, 2, 8))):
+            changed[chance.randrange(len(changed))] ^= 1 << chance.randrange(8)
+    elif turn < 0.7:
+        del changed[chance.randrange(len(changed)) :]
+    elif turn < 0.8:
+        at = chance.randrange(len(changed))
+        changed[at:at] = chance.randbytes(chance.randrange(1, 20))
+    elif turn < 0.9:
+        changed = bytearray(chance.randbytes(chance.randrange(2 * len(data) + 1)))
+    else:
+        changed = bytearray(chance.choice((b"\xff", b"\x00", b"\x80")) * chance.randrange(1, 3000))
+    return bytes(changed)
+
+
+def inner_chunks(document: dict[str, Any], member: str, data: bytes) -> tuple[Sharding, np.ndarray[Any, Any], list[bytes]]:
+    """The sharding of an array, which inner chunks of a shard are present, and these with their CRC-32C."""
+    metadata = ArrayMetadata.from_dict(document)
+    sharding = metadata.sharding
+    assert sharding is not None
+    shard = tuple(int(i) for i in member[member.rindex("/c/") + 3 :].split("/"))
+    present = sharding.present(shard, metadata.shape)
+    index = parse_index(data[-sharding.index_bytes :], present, len(data) - sharding.index_bytes)
+    return sharding, present, [data[offset : offset + size] for offset, size in index[present]]
+
+
+def shard_of(sharding: Sharding, present: np.ndarray[Any, Any], chunks: list[bytes]) -> bytes:
+    return b"".join(chunks) + pack_index([len(chunk) for chunk in chunks], present)
+
+
+def bytes_changed(chance: random.Random, parts: Parts) -> Parts:
+    """Bytes of a chunk as they lie in the file, with their CRC-32C redone."""
+    _, document, member, data = chosen(chance, parts)
+    if not is_coded(document):
+        return replaced(parts, {member: with_crc(damaged(chance, data[:-4]))})
+    sharding, present, chunks = inner_chunks(document, member, data)
+    at = chance.randrange(len(chunks))
+    chunks[at] = with_crc(damaged(chance, chunks[at][:-4]))
+    return replaced(parts, {member: shard_of(sharding, present, chunks)})
+
+
+def _index(chance: random.Random, parts: Parts) -> Parts:
+    """The index of a shard: entries that overlap, point at themselves, lie outside or are not there."""
+    coded = [name for name, document in documents_of(parts).items() if is_coded(document)]
+    if not coded:
+        return bytes_changed(chance, parts)
+    _, document, member, data = chosen(chance, parts, True)
+    sharding, _, _ = inner_chunks(document, member, data)
+    start = len(data) - sharding.index_bytes
+    table = list(struct.unpack(f"<{2 * prod(sharding.counts)}Q", data[start:-4]))
+    for _ in range(chance.choice((1, 1, 2))):
+        at = chance.randrange(len(table))
+        table[at] = chance.choice((0, 1, start, start + 1, 2**64 - 1, 2**63, 2**32, max(table[at], 1) - 1, chance.choice(table)))
+    return replaced(parts, {member: data[:start] + with_crc(struct.pack(f"<{len(table)}Q", *table))})
+
+
+SPECIAL = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-45, 1e38, -3.4e38, 1e300, -1e308, 5e-324)
+
+
+def values_changed(chance: random.Random, parts: Parts) -> Parts:
+    """Values of an ordinary array: coordinates, weights, tables, occupancy, key frames."""
+    _, document, member, data = chosen(chance, parts, False)
+    dtype = np.dtype(document["data_type"])
+    values = np.frombuffer(decompress(data[:-4]), dtype).copy()
+    with np.errstate(all="ignore"):
+        for _ in range(chance.choice((1, 2, len(values)))):
+            at = chance.randrange(len(values))
+            if dtype.kind == "f":
+                values[at] = chance.choice((*SPECIAL, float(values[at]) * 1e6, -float(values[at]), float(values[0])))
+            else:
+                values[at] = chance.choice((0, 1, np.iinfo(dtype).min, np.iinfo(dtype).max, int(values[at]) ^ 1, 255 & int(values[at]) + 1))
+    if chance.random() < 0.2:
+        values[:] = chance.choice(SPECIAL) if dtype.kind == "f" else chance.choice((0, 255))
+    return replaced(parts, {member: with_crc(compress(values.tobytes(), 1))})
+
+
+def section(data: bytes) -> bytes:
+    """A section behind its length (LEB128)."""
+    size, head = len(data), bytearray()
+    while True:
+        head.append(size & 127 | (128 if size > 127 else 0))
+        size >>= 7
+        if not size:
+            return bytes(head) + data
+
+
+def configuration_of(document: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = document["codecs"][0]["configuration"]["codecs"][0]["configuration"]
+    return found
+
+
+def _stream(chance: random.Random, parts: Parts) -> Parts:
+    """Sections of a coded tile changed, with the digests of what they decode to: another valid tile, unless a decoder refuses it."""
+    if not any(is_coded(document) for document in documents_of(parts).values()):
+        return values_changed(chance, parts)
+    _, document, member, data = chosen(chance, parts, True)
+    sharding, present, chunks = inner_chunks(document, member, data)
+    at = chance.randrange(len(chunks))
+    settings, shape = Settings.from_dict(configuration_of(document)), sharding.chunk_shape
+    chunks[at] = with_crc(_restreamed(chance, chunks[at][:-4], settings, shape))
+    return replaced(parts, {member: shard_of(sharding, present, chunks)})
+
+
+def _restreamed(chance: random.Random, stream: bytes, settings: Settings, shape: tuple[int, ...]) -> bytes:
+    flags = stream[0]
+    coded = not flags & (EXACT | EMPTY)
+    sections = [bytes(part) for part in sections_of(memoryview(stream)[5 if coded else 1 :])]
+    if not coded:
+        return stream[:1] + b"".join(section(damaged(chance, part)) for part in sections)
+    first = bool(flags & OWN) + bool(flags & MISSING)
+    at = chance.randrange(first, len(sections))
+    sections[at] = damaged(chance, sections[at])
+    if chance.random() < 0.15 and not flags & RESIDUAL and flags & 0xE0 in (FORMAT, MASKED):  # a residual where none was
+        flags |= RESIDUAL
+        sections.insert(first + 1, chance.randbytes(chance.randrange(200)))
+    try:
+        if flags & 0xE0 in (PREDICTED, PREDICTED_MASKED) and settings.predictor is not None:
+            integers = decode_predicted(sections[first], shape, settings.predictor)
+        else:
+            integers = decode_integers(sections[first], shape, band_table(settings.transform, shape))
+        digest = zlib.crc32(little(integers))
+        if flags & RESIDUAL:
+            digest = zlib.crc32(little(decode_integers(sections[first + 1], shape, single_band(shape))), digest)
+        if flags & 0xE0 in (MASKED, PREDICTED_MASKED) and settings.mask is not None and sections[-1]:
+            sections[-1] = _mask_section(sections[-1][2:], integers, settings, shape, bool(flags & 0xE0 == PREDICTED_MASKED))
+    except FhashError:
+        digest = chance.getrandbits(32)
+    return bytes([flags]) + digest.to_bytes(4, "little") + b"".join(map(section, sections))
+
+
+def _mask_section(coded: bytes, integers: Any, settings: Settings, shape: tuple[int, ...], predicted: bool) -> bytes:
+    """A coded mask behind the digest of what it decodes to."""
+    assert settings.mask is not None
+    with np.errstate(all="ignore"):
+        if predicted and settings.predictor is not None:
+            linear = predicted_values(integers, settings.predictor, settings)
+        else:
+            linear = linear_values(integers, transform_for(settings, shape), settings)  # type: ignore[arg-type]
+        mask = decode_mask(coded, settings.mask.levels(linear.astype(settings.dtype)))
+    return (zlib.crc32(np.packbits(mask).data) & 0xFFFF).to_bytes(2, "little") + coded
+
+
+KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {
+    "bytes": bytes_changed,
+    "stream": _stream,
+    "index": _index,
+    "values": values_changed,
+}

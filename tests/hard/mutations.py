@@ -1,0 +1,128 @@
+"""Deterministic mutations of the golden containers: the same number always makes the same file.
+
+Two sorts. A damaged file is what an accident leaves: its checksums tell. A sealed one is what an attacker makes: every checksum and the
+digest are redone, so that the damage reaches what lies behind them; it may even be a sound file of something else.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import mutated_json
+import mutated_payload
+import mutated_settings
+import mutated_zip
+from containers import Parts, pack, unpack
+
+GOLDENS = Path(__file__).parents[1] / "golden"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mutation:
+    """One file. golden: name of what it was made of; kind: how; sealed: whether all checksums were redone."""
+
+    number: int
+    golden: str
+    kind: str
+    sealed: bool
+    data: bytes
+
+
+@cache
+def goldens() -> dict[str, tuple[bytes, Parts]]:
+    """Bytes and members of each golden by name."""
+    return {path.stem: (data := path.read_bytes(), unpack(data)) for path in sorted(GOLDENS.glob("*.fhz"))}
+
+
+def mutation(number: int) -> Mutation:
+    """The mutation of a number from 0 on; goldens and kinds take turns."""
+    chance = random.Random(number)
+    names, kinds = list(goldens()), list(KINDS)
+    golden, kind = names[number % len(names)], kinds[number // len(names) % len(kinds)]
+    data, parts = goldens()[golden]
+    if kind in DAMAGES:
+        return Mutation(number=number, golden=golden, kind=kind, sealed=False, data=DAMAGES[kind](chance, data))
+    return Mutation(number=number, golden=golden, kind=kind, sealed=True, data=SEALED[kind](chance, parts))
+
+
+def _flip(chance: random.Random, data: bytes) -> bytes:
+    changed = bytearray(data)
+    for _ in range(chance.choice((1, 1, 1, 2, 8, 64))):
+        changed[chance.randrange(len(changed))] ^= 1 << chance.randrange(8)
+    return bytes(changed)
+
+
+def _cut(chance: random.Random, data: bytes) -> bytes:
+    at = chance.randrange(len(data))
+    return data[:at] if chance.random() < 0.7 else data[at:]
+
+
+def _piece(chance: random.Random, data: bytes, most: int = 4096) -> tuple[int, int]:
+    at = chance.randrange(len(data))
+    return at, min(len(data), at + chance.randrange(1, most))
+
+
+def _removed(chance: random.Random, data: bytes) -> bytes:
+    low, high = _piece(chance, data)
+    return data[:low] + data[high:]
+
+
+def _doubled(chance: random.Random, data: bytes) -> bytes:
+    low, high = _piece(chance, data)
+    return data[:high] + data[low:]
+
+
+def _swapped(chance: random.Random, data: bytes) -> bytes:
+    a, b, c, d = sorted(chance.sample(range(len(data) + 1), 4))
+    return data[:a] + data[c:d] + data[b:c] + data[a:b] + data[d:]
+
+
+def _overwritten(chance: random.Random, data: bytes) -> bytes:
+    low, high = _piece(chance, data, 512)
+    new = bytes(high - low) if chance.random() < 0.5 else chance.randbytes(high - low)
+    return data[:low] + new + data[high:]
+
+
+def _surrounded(chance: random.Random, data: bytes) -> bytes:
+    extra = chance.randbytes(chance.randrange(1, 300))
+    return data + extra if chance.random() < 0.5 else extra + data
+
+
+def _spliced(chance: random.Random, data: bytes) -> bytes:
+    other, _ = chance.choice(list(goldens().values()))
+    return data[: chance.randrange(len(data))] + other[chance.randrange(len(other)) :]
+
+
+DAMAGES: dict[str, Callable[[random.Random, bytes], bytes]] = {
+    "flipped": _flip,
+    "cut": _cut,
+    "removed": _removed,
+    "doubled": _doubled,
+    "swapped": _swapped,
+    "overwritten": _overwritten,
+    "surrounded": _surrounded,
+    "spliced": _spliced,
+}
+
+
+def _packed(change: Callable[[random.Random, Parts], Parts]) -> Callable[[random.Random, Parts], bytes]:
+    """A change of members as one of the file."""
+    return lambda chance, parts: pack(change(chance, parts))
+
+
+SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
+    **mutated_zip.KINDS,
+    **{name: _packed(change) for module in (mutated_json, mutated_payload, mutated_settings) for name, change in module.KINDS.items()},
+}
+KINDS = (*DAMAGES, *SEALED)
+
+
+def header_of(parts: Parts) -> Any:
+    """The header of a golden, for those who want to know what it declares."""
+    return json.loads(dict(parts)["zarr.json"])["attributes"]["fhash"]

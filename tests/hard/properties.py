@@ -1,0 +1,61 @@
+"""How far the property-based tests look: few and always the same examples in `make test`, many and new ones in the long set."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, Phase, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from reporting import LONG
+
+INTEGERS = ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")
+FLOATS = ("float16", "float32", "float64")
+NUMBERS = (*INTEGERS, *FLOATS)
+
+
+def looking(few: int, many: int = 2000) -> settings:
+    """Settings of a test: `few` examples, or `many` in the long set."""
+    return settings(
+        max_examples=many if LONG else few,
+        derandomize=not LONG,
+        deadline=None,
+        database=None,
+        print_blob=True,
+        # What fails in the quick set fails again; looking for the smallest example takes minutes and is for the long set.
+        phases=list(Phase) if LONG else [Phase.explicit, Phase.generate],
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture],
+    )
+
+
+def arrays(dtypes: tuple[str, ...] = NUMBERS, *, dims: tuple[int, int] = (4, 4), side: int = 6) -> st.SearchStrategy[np.ndarray]:
+    """Arrays of any numbers, NaN, infinities, denormals and signed zeros among them."""
+    shapes = hnp.array_shapes(min_dims=dims[0], max_dims=dims[1], min_side=1, max_side=side)
+    return st.sampled_from(dtypes).flatmap(lambda dtype: hnp.arrays(np.dtype(dtype), shapes))
+
+
+def chunks(shape: tuple[int, ...]) -> st.SearchStrategy[tuple[int, ...]]:
+    """A chunk of an array: along each axis from one vertex to all."""
+    return st.tuples(*(st.integers(1, length) for length in shape))
+
+
+def same(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two arrays have the same type, shape and values, the sign of zero included; all NaN are alike."""
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    if one.dtype.kind != "f":
+        return bool((one == other).all())
+    return bool((((one == other) & (np.signbit(one) == np.signbit(other))) | (np.isnan(one) & np.isnan(other))).all())
+
+
+def one_line(error: Exception) -> None:
+    """Assert that an error is a line for people."""
+    text = str(error)
+    assert text
+    assert "\n" not in text
+    assert len(text) < 500
+
+
+Draw = Any
+"""What `st.data()` and `st.composite` give to draw with."""

@@ -1,0 +1,63 @@
+"""Joins the results of `fhash selftest` and the figures of the long tests into one document.
+
+Usage: `python tests/hard/summary.py SELFTEST.md FIGURES.jsonl OUT.md`.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+ABOUT = {
+    "hostile files": "Mutations of the golden containers through `verify`, `decode`, a region and `render`: how each of them ended, and at\n"
+    "most how many seconds of processor time and bytes of memory it took.",
+    "the native code under sanitizers": "Coverage-guided fuzzing of the native library under address and undefined-behaviour sanitizers.",
+    "kill -9 at an operation": "The process is killed before each of its operations on files: the older output stays whole, and the next\n"
+    "run clears away what was left.",
+    "kill -9 at a random moment": "The process is killed at random: the older output stays whole, and the same command gives the same file.",
+    "kill -9 while checkpoints are written": "The same, where checkpoints are written all the time.",
+    "a full disk": "Each operation on files fails as it does on a full disk: refused with one line, nothing half-written. What is not\n"
+    "refused did not need the operation.",
+    "a signal at each stage": "Ctrl-C and SIGTERM in each stage: one line, nothing half-written, and the older output stays.",
+    "a signal at an operation": "The same at operations on files.",
+    "a source that changes": "The source grows, shrinks, is written again or vanishes while it is read: refused.",
+    "two at once": "Two writers of one output: the result is one of the two, whole.",
+    "little memory": "Under tighter and tighter limits of memory: done, or one line.",
+    "a large series": "",
+    "a large decode within 1 GiB": "A series larger than the limit of memory, decoded within it.",
+}
+
+
+def text(records: list[dict[str, Any]]) -> str:
+    """A section for each case, a row for each of its records."""
+    cases: dict[str, list[dict[str, Any]]] = {}
+    for record in records:
+        cases.setdefault(record.pop("case"), []).append(record)
+    parts = ["## Hostile files and faults\n\nMade by `make hard`.\n"]
+    for case, rows in cases.items():
+        columns = list(dict.fromkeys(name for row in rows for name in row))
+        lines = [columns, ["---"] * len(columns), *([_cell(row.get(name, "")) for name in columns] for row in rows)]
+        about = ABOUT.get(case, "")
+        parts.append(f"### {case[0].upper()}{case[1:]}\n\n" + (f"{about}\n\n" if about else ""))
+        parts[-1] += "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    return "\n".join(parts)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_cell(part)}" for name, part in value.items())
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return f"{value:,}" if isinstance(value, int) else str(value).replace("|", "\\|")
+
+
+def main() -> None:
+    selftest, figures, out = map(Path, sys.argv[1:])
+    records = [json.loads(line) for line in figures.read_text(encoding="utf-8").splitlines()]
+    out.write_text(selftest.read_text(encoding="utf-8") + "\n" + text(records), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Ctrl-C, SIGTERM and SIGHUP at each stage and at each operation on files: exit code 130, one line, nothing half written."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+from pathlib import Path
+
+import pytest
+from faulty import COMMANDS, PROFILES, Bench, moments
+from reporting import LONG, record
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+EACH_ALONE = ("render pictures",)
+"""Commands with several outputs, each of which is complete or absent by itself."""
+COMMITTED = ("encode compact", "encode paper", "decode npy", "decode h5", "decode zarr", "decode pvd", "render png", "render gif")
+
+
+def stages(bench: Bench, name: str, noted: Path) -> list[tuple[str, int]]:
+    """The first and the last report of each stage of a command."""
+    noted.unlink(missing_ok=True)
+    words = [word for word in bench.words(name) if word != "-q"]
+    ended = bench.server.run(*words, inject=[("note_stages", noted)])
+    assert ended.code == 0, ended.output
+    found = [(line.rpartition(" ")[0], int(line.rpartition(" ")[2])) for line in noted.read_text().splitlines()]
+    chosen = []
+    for _, group in itertools.groupby(dict.fromkeys(found), key=lambda report: report[0]):
+        reports = list(group)
+        chosen += reports if LONG else dict.fromkeys([reports[0], reports[-1]])
+    return list(dict.fromkeys(chosen))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_signal_at_each_stage_leaves_the_older_output(bench: Bench, name: str, tmp_path: Path) -> None:
+    bench.old(name)
+    found = stages(bench, name, tmp_path / "stages")
+    assert found or name.startswith("decode vtp")
+    if name in [f"encode {profile}" for profile in PROFILES]:
+        assert {stage for stage, _ in found} >= {"scanning", "measuring", "training" if "paper" in name else "coding"}
+    for turn, (stage, done) in enumerate(found):
+        number = SIGNALS[turn % len(SIGNALS)]
+        before = bench.old(name)
+        ended = bench.run(name, ("signal_at", stage, done, number))
+        assert ended.code == 130, (stage, done, ended.output)
+        assert ended.line.startswith("fhash: error: interrupted"), (stage, done)
+        now = bench.now()
+        kept = {place: data for place, data in now.items() if not place.endswith(".checkpoint")}
+        assert kept.keys() == before.keys(), (stage, done)
+        assert name in EACH_ALONE or kept == before, (stage, done)
+        assert len(now) == len(kept) or stage in ("training", "coding tables", "measuring"), (stage, done)
+    ended = bench.run(name)  # goes on from the checkpoint, if there is one
+    assert ended.code == 0, ended.output
+    assert bench.now() == bench.new(name)
+    record("a signal at each stage", {"command": name, "stages": len({stage for stage, _ in found}), "signals": len(found)})
+
+
+@pytest.mark.parametrize("name", COMMITTED)
+def test_a_signal_at_any_operation_leaves_one_of_the_two_outputs(bench: Bench, name: str) -> None:
+    count = bench.operations(name)
+    for turn, place in enumerate(moments(count, 6)):
+        before = bench.old(name)
+        ended = bench.run(name, ("at_operation", bench.out, place, -SIGNALS[turn % len(SIGNALS)]))
+        now = bench.now()
+        if ended.code == 0:  # it came when everything was done
+            assert now == bench.new(name), place
+            continue
+        assert ended.code == 130, (place, ended.output)
+        assert ended.line.startswith("fhash: error: interrupted"), place
+        kept = {name: data for name, data in now.items() if not name.endswith(".checkpoint")}
+        assert kept in (before, bench.new(name)), place
+    record("a signal at an operation", {"command": name, "operations": count, "signals": len(moments(count, 6))})

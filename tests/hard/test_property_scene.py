@@ -1,0 +1,244 @@
+"""Any scene is written and read as it is, and any volume is drawn by it in finite pixels or refuses it in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import tempfile
+import types
+import typing
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from properties import looking, one_line
+
+import fhash_codec
+from fhash_codec import EncodeConfig, FhashWarning, Renderer, Volume
+from fhash_codec.render.image import Image
+from fhash_codec.render.record import Record
+from fhash_codec.render.scene import Scene
+from fhash_formats.errors import FhashError, InputError, RegionError
+
+COLOURS = st.sampled_from(["#000000", "#ff8000", "white", "red", "transparent", "no colour"])
+TEXTS = {
+    "colours": st.sampled_from(["viridis", "gray", "coolwarm", "no map"]),
+    "opacity": st.sampled_from(["auto", "feature", "linear", "linear_r", "geom", "sigmoid", "foreground", "opaque", "none such"]),
+    "background": COLOURS,
+    "colour": COLOURS,
+}
+QUICK_FIELDS: dict[str, st.SearchStrategy[Any]] = {
+    "size": st.tuples(st.integers(1, 20), st.integers(1, 20)),
+    "antialiasing": st.integers(1, 2),
+    "samples_per_pass": st.none() | st.integers(1, 4000),
+}
+"""Of fields whose whole range would take minutes for a picture."""
+
+
+def values_of(hint: Any, each: dataclasses.Field[Any], *, quick: bool) -> st.SearchStrategy[Any]:
+    """Values of a field by its annotation and its limits."""
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    low, high = each.metadata.get("low"), each.metadata.get("high")
+    choices = each.metadata.get("choices", ())
+    if quick and each.name in QUICK_FIELDS:
+        return QUICK_FIELDS[each.name]
+    if origin in (types.UnionType, typing.Union):
+        return st.one_of(*(values_of(part, each, quick=quick) for part in parts))
+    if origin is tuple and parts[-1] is ...:
+        return st.lists(values_of(parts[0], each, quick=quick), max_size=3).map(tuple)
+    if origin is tuple:
+        return st.tuples(*(values_of(part, each, quick=quick) for part in parts))
+    if isinstance(hint, type) and issubclass(hint, Record):
+        return records(hint, quick=quick)
+    if hint is type(None):
+        return st.none()
+    if hint is bool:
+        return st.booleans()
+    if hint is int:
+        return st.integers(int(low), int(high))
+    if hint is float:
+        return floats(each.name, low, high, quick=quick)
+    return st.sampled_from(choices) if choices else TEXTS.get(each.name, COLOURS)
+
+
+def floats(name: str, low: float | None, high: float | None, *, quick: bool) -> st.SearchStrategy[float]:
+    """Numbers within limits, the limits themselves and near ones often."""
+    if quick and name == "step" and low == 1e-6:  # of a march: a small one takes as many samples
+        low = 0.02
+    everything = st.floats(low, high, allow_nan=False, allow_infinity=False)
+    near = [value for value in (low, high, 0.0, 0.5, 1.0, 2.0, -3.0, 1e30) if value is not None]
+    return st.one_of(
+        everything, st.sampled_from([value for value in near if (low is None or value >= low) and (high is None or value <= high)])
+    )
+
+
+def records(kind: type[Record], *, quick: bool) -> st.SearchStrategy[Any]:
+    """Records of any fields; those that contradict themselves are left out."""
+    hints = typing.get_type_hints(kind)
+    fields = {each.name: values_of(hints[each.name], each, quick=quick) for each in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    required = {each.name for each in dataclasses.fields(kind) if each.default is dataclasses.MISSING}  # type: ignore[arg-type]
+    chosen = st.fixed_dictionaries(
+        {name: strategy for name, strategy in fields.items() if name in required},
+        optional={name: strategy for name, strategy in fields.items() if name not in required},
+    )
+
+    def made(values: dict[str, Any]) -> Record | None:
+        try:
+            return kind(**values)
+        except InputError:
+            return None
+
+    return chosen.map(made).filter(lambda record: record is not None)
+
+
+def toml(values: dict[str, Any]) -> str:
+    """The values as TOML, with inline tables."""
+
+    def text(value: Any) -> str:
+        if isinstance(value, dict):
+            return "{" + ", ".join(f"{json.dumps(key)} = {text(part)}" for key, part in value.items()) + "}"
+        if isinstance(value, list):
+            return "[" + ", ".join(map(text, value)) + "]"
+        return repr(value) if isinstance(value, float) else json.dumps(value)
+
+    return "\n".join(f"{json.dumps(key)} = {text(value)}" for key, value in values.items())
+
+
+@looking(150)
+@given(scene=records(Scene, quick=False))
+def test_a_scene_is_what_its_values_say(scene: Scene) -> None:
+    values = scene.to_dict()
+    assert Scene.from_dict(values) == scene
+    assert Scene.from_dict(json.loads(json.dumps(values, allow_nan=False))) == scene
+    assert Scene.from_dict(values).to_dict() == values
+
+
+@looking(25)
+@given(scene=records(Scene, quick=False))
+def test_a_scene_comes_back_from_every_file(scene: Scene) -> None:
+    with tempfile.TemporaryDirectory(prefix="fhash-") as folder:
+        place = Path(folder)
+        (place / "a.json").write_text(json.dumps(scene.to_dict()))
+        (place / "a.toml").write_text(toml(scene.to_dict()))
+        assert Scene.load(place / "a.json") == scene
+        assert Scene.load(place / "a.toml") == scene
+        values = scene.to_dict()
+        picture = Image(rgba=np.zeros((2, 3, 4), np.float32), scene=values)
+        if "background" in values:
+            picture = dataclasses.replace(picture, scene={**values, "background": "white"})
+        picture.save(place / "a.png")
+        assert Scene.load(place / "a.png") == Scene.from_dict(dict(picture.scene))
+
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+PLACES = [(), ("camera",), ("transfer_function",), ("effects",), ("effects", "shading"), ("march",)]
+
+
+@looking(150)
+@given(
+    place=st.sampled_from(PLACES),
+    name=st.sampled_from(["size", "camera", "step", "view", "position", "range", "opacity", "isosurfaces", "light", "lod", "nonsense"]),
+    value=ANYTHING,
+)
+@example(place=(), name="step", value=10**400)
+@example(place=("transfer_function",), name="range", value=[[1, 2], 3])
+def test_any_values_make_a_scene_or_are_refused_in_one_line(place: tuple[str, ...], name: str, value: object) -> None:
+    values: dict[str, Any] = {name: value}
+    for part in reversed(place):
+        values = {part: values}
+    try:
+        scene = Scene.from_dict(values)
+    except InputError as error:
+        one_line(error)
+    else:
+        assert Scene.from_dict(scene.to_dict()) == scene
+
+
+def field(shape: tuple[int, ...], *, holes: bool = False) -> np.ndarray:
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
+    values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
+    if holes:
+        values[:, :2, 3:5] = np.nan
+    return values
+
+
+VOLUMES: dict[str, tuple[tuple[int, ...], EncodeConfig]] = {
+    "compact": ((3, 6, 7, 8), EncodeConfig(effort=1)),
+    "compact, a feature": ((3, 6, 7, 8), EncodeConfig(effort=1, features=("interval:0.2:2",), dilation=0)),
+    "paper": ((3, 6, 7, 8), EncodeConfig(profile="paper", epochs=1, width=4)),
+    "a plane": ((2, 1, 7, 8), EncodeConfig(effort=1)),
+    "one vertex": ((1, 1, 1, 1), EncodeConfig(effort=1)),
+}
+
+
+@pytest.fixture(scope="module", params=VOLUMES)
+def volume(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Volume]:
+    shape, config = VOLUMES[request.param]
+    path = tmp_path_factory.mktemp("scenes") / "a.fhz"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FhashWarning)
+        fhash_codec.encode(field(shape, holes="compact" in request.param), path, config)
+    with fhash_codec.open(path) as opened:
+        yield opened
+
+
+SMALL = {"size": [6, 5]}
+FOUND: dict[str, dict[str, Any]] = {
+    "smallest scale": {"scale": [1e-100, 1e-100, 1e-100]},
+    "largest scale": {"scale": [6e99, 6e99, 0.5]},
+    "light over a huge length": {"scale": [9.9e99, 6.3e99, 9.2e15], "effects": {"shading": {}, "shadows": {}}},
+    "occlusion over a huge length": {"scale": [1e30, 5.5e99, 8.6e99], "effects": {"ambient_occlusion": {}}},
+    "a surface beyond float32": {"effects": {"isosurfaces": [{"value": 6e44}, {"value": 0.0}]}},
+    "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
+}
+"""Scenes that the test below has found."""
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_scenes_that_were_found(volume: Volume, name: str) -> None:
+    check_picture(volume, Scene.from_dict({**SMALL, **FOUND[name]}))
+
+
+@looking(25, 1000)
+@given(scene=records(Scene, quick=True))
+def test_any_scene_is_drawn_in_finite_pixels_or_refused_in_one_line(volume: Volume, scene: Scene) -> None:
+    check_picture(volume, scene)
+
+
+def check_picture(volume: Volume, scene: Scene) -> None:
+    """Finite pixels, depths and normals, or an error of one line."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FhashWarning)
+            image = Renderer(volume, threads=1).render(scene)
+    except (InputError, RegionError) as error:
+        one_line(error)
+        return
+    except FhashError as error:
+        pytest.fail(f"{type(error).__name__}: {error}")
+    width, height = scene.size
+    if scene.evolution is not None:  # several pictures side by side
+        height, width = image.rgba.shape[:2]
+    assert image.rgba.shape == (height, width, 4)
+    assert np.isfinite(image.rgba).all()
+    assert image.rgba.min() >= -1e-6
+    assert image.rgba[..., 3].max() <= 1 + 1e-5
+    assert (image.rgba[..., :3].max(axis=-1) <= image.rgba[..., 3] * (1 + 1e-5) + 11 * (scene.effects.shading is not None) + 1e-5).all()
+    if image.depth is not None:
+        assert not np.isnan(image.depth).any()
+    if image.normal is not None:
+        lengths = np.linalg.norm(image.normal, axis=-1)
+        assert (np.isclose(lengths, 1, atol=1e-3) | (lengths == 0)).all()
+    assert all(math.isfinite(count) for count in image.counters.values())
+    assert Scene.from_dict(dict(image.scene)) is not None
+    assert image.to_uint8().shape[:2] == (height, width)

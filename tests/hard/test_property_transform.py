@@ -1,0 +1,169 @@
+"""The transform and its coder: any numbers of any shape keep their bound, and both engines write the same bytes."""
+
+from __future__ import annotations
+
+import json
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from properties import FLOATS, Draw, arrays, looking, same
+
+from fhash_formats import native
+from fhash_formats.transform import coder_portable
+from fhash_formats.transform.bands import band_table, single_band
+from fhash_formats.transform.basis import fit_basis
+from fhash_formats.transform.chunk import decode_chunk, encode_chunk
+from fhash_formats.transform.coder import MAX_INTEGER, decode_block, decode_integers, encode_block, encode_integers
+from fhash_formats.transform.lifting import Transform
+from fhash_formats.transform.spec import KINDS, WAVELETS, AxisTransform, TransformSpec
+
+NATIVE = pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
+
+
+@st.composite
+def specs(draw: Draw, shape: tuple[int, ...]) -> TransformSpec:
+    """A transform of any kinds and depths that fits a tile."""
+    axes = []
+    for length in shape:
+        kind = draw(st.sampled_from(KINDS))
+        if kind == "klt":
+            columns = np.cumsum(np.random.default_rng(draw(st.integers(0, 9))).standard_normal((length, 4 * length)), axis=0)
+            axes.append(AxisTransform(kind=kind, basis=fit_basis(columns @ columns.T, draw(st.sampled_from([1e-3, 1.0, 8.0])))))
+        else:
+            axes.append(AxisTransform(kind=kind, depth=draw(st.integers(1, 10)) if kind in WAVELETS else 0))
+    t, z, y, x = axes
+    return TransformSpec(axes=(t, z, y, x))
+
+
+TILES = hnp.array_shapes(min_dims=4, max_dims=4, min_side=1, max_side=9)
+
+
+@looking(60)
+@given(
+    shape=TILES,
+    dtype=st.sampled_from(["float32", "float64"]),
+    power=st.integers(-90, 90),
+    kind=st.sampled_from(["noise", "constant", "step", "spike", "checkerboard", "ramp"]),
+    data=st.data(),
+)
+def test_any_tile_of_any_size_of_values_comes_back(shape: tuple[int, ...], dtype: str, power: int, kind: str, data: Draw) -> None:
+    """Relative to the largest value: nothing is lost by how large the numbers are."""
+    spec = data.draw(specs(shape).filter(lambda spec: all(axis.basis is None or axis.basis.rank == axis.basis.n for axis in spec.axes)))
+    t, z, y, x = np.meshgrid(*map(np.arange, shape), indexing="ij")
+    values = {
+        "noise": np.random.default_rng(0).standard_normal(shape),
+        "constant": np.ones(shape),
+        "step": np.where(x + y > shape[3] // 2, 1.0, -1.0),
+        "spike": (np.arange(math.prod(shape)) == math.prod(shape) // 2).reshape(shape) * 1.0,
+        "checkerboard": 1.0 - 2 * ((t + z + y + x) % 2),
+        "ramp": 0.1 * (t + 2.0 * z - y + 3 * x),
+    }[kind]
+    values = np.ldexp(values, power).astype(dtype)
+    transform = Transform(spec, shape, np.dtype(dtype))
+    again = transform.inverse(transform.forward(values))
+    largest = float(np.abs(values).max())
+    error = float(np.abs(again.astype(np.float64) - values).max())
+    assert error <= (2e-4 if dtype == "float32" else 1e-11) * largest
+
+
+@looking(60)
+@given(shape=TILES, data=st.data())
+def test_a_transform_is_what_its_json_says(shape: tuple[int, ...], data: Draw) -> None:
+    spec = data.draw(specs(shape))
+    again = TransformSpec.from_dict(json.loads(json.dumps(spec.to_dict())))
+    values = np.random.default_rng(0).standard_normal(shape)
+    assert again.to_dict() == spec.to_dict()
+    assert same(Transform(again, shape, np.float64).forward(values), Transform(spec, shape, np.float64).forward(values))
+
+
+INTEGERS = hnp.arrays(
+    np.int32,
+    hnp.array_shapes(min_dims=4, max_dims=4, min_side=1, max_side=7),
+    elements=st.one_of(st.integers(-3, 3), st.integers(-MAX_INTEGER, MAX_INTEGER)),
+    fill=st.just(0),
+)
+
+
+@looking(80)
+@given(integers=INTEGERS, data=st.data())
+def test_any_integers_in_any_bands_come_back(integers: np.ndarray, data: Draw) -> None:
+    table = band_table(data.draw(specs(integers.shape)), integers.shape)
+    encoded = encode_integers(integers, table)
+    again = decode_integers(encoded.data, integers.shape, table)
+    kept = np.zeros_like(integers)
+    for row in table:
+        box = tuple(slice(int(low), int(high)) for low, high in zip(row[:4], row[4:8], strict=True))
+        kept[box] = integers[box]
+    assert (again == kept).all()
+
+
+@NATIVE
+@looking(25, 300)
+@given(integers=INTEGERS.filter(lambda integers: integers.size <= 60), data=st.data())
+def test_both_engines_write_the_same_bytes(integers: np.ndarray, data: Draw) -> None:
+    table = band_table(data.draw(specs(integers.shape)), integers.shape)
+    fast = encode_integers(integers, table)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FHASH_NATIVE", "0")
+        patch.setattr(coder_portable, "_RUN", [None])  # plain Python: compiling takes longer than all examples
+        slow = encode_integers(integers, table)
+        assert slow.data == fast.data
+        crossed = decode_integers(fast.data, integers.shape, table)
+    assert (crossed == decode_integers(slow.data, integers.shape, table)).all()
+
+
+@looking(60)
+@given(integers=hnp.arrays(np.int32, hnp.array_shapes(min_dims=4, max_dims=4, min_side=0, max_side=5), elements=st.integers(-999, 999)))
+def test_a_block_comes_back(integers: np.ndarray) -> None:
+    assert (decode_block(encode_block(integers), integers.shape) == integers).all()
+    if integers.size:
+        assert (decode_integers(encode_block(integers), integers.shape, single_band(integers.shape)) == integers).all()
+
+
+def gap(one: np.ndarray, other: np.ndarray) -> Fraction:
+    """The largest difference of the finite values, exactly."""
+    return max((abs(Fraction(a) - Fraction(b)) for a, b in zip(one.tolist(), other.tolist(), strict=True)), default=Fraction(0))
+
+
+@looking(150)
+@given(values=arrays(dims=(0, 6), side=5), bound=st.one_of(st.just(0.0), st.floats(0, 1e300), st.sampled_from([1e-9, 0.5, 3.0, 1e5])))
+@example(values=np.array([1e8, 1e8 + 1e-3]), bound=1e-4)
+@example(values=np.array([-(2**63), 2**63 - 1], dtype=np.int64), bound=0.0)
+@example(values=np.array([5e-324, -5e-324, 0.0]), bound=0.0)
+@example(values=np.array([-0.0, 0.0]), bound=0.0)
+def test_any_chunk_keeps_its_bound_strictly(values: np.ndarray, bound: float) -> None:
+    found = decode_chunk(encode_chunk(values, max_error=bound), values.shape, values.dtype)
+    assert found.dtype == values.dtype
+    assert found.shape == values.shape
+    if bound == 0:
+        assert same(found, values)
+        return
+    finite = np.isfinite(values) if values.dtype.kind == "f" else np.ones(values.shape, bool)
+    assert same(found[~finite], values[~finite])
+    assert gap(found[finite], values[finite]) <= Fraction(bound)
+
+
+@looking(80)
+@given(values=arrays(FLOATS, dims=(1, 4), side=6), share=st.floats(1e-7, 1))
+def test_any_chunk_keeps_its_relative_bound(values: np.ndarray, share: float) -> None:
+    found = decode_chunk(encode_chunk(values, max_error_rel=share), values.shape, values.dtype)
+    finite = np.isfinite(values)
+    assert same(found[~finite], values[~finite])
+    exact = [Fraction(value) for value in values[finite].tolist()]
+    if exact:
+        span = max(exact) - min(exact)
+        assert gap(found[finite], values[finite]) <= Fraction(share) * span * Fraction(1 + 1e-9)
+
+
+@looking(60)
+@given(values=arrays(dims=(1, 4), side=6), step=st.floats(1e-6, 1e6))
+def test_the_same_chunk_gives_the_same_bytes(values: np.ndarray, step: float) -> None:
+    first = encode_chunk(values, step=step)
+    assert encode_chunk(np.asfortranarray(values), step=step) == first
+    assert encode_chunk(values.astype(values.dtype.newbyteorder()), step=step) == first
+    decode_chunk(first, values.shape, values.dtype)
