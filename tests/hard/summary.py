@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any
 
 ABOUT = {
-    "hostile files": "Mutations of the golden containers through `verify`, `decode`, a region and `render`: how each of them ended, and at\n"
-    "most how many seconds of processor time and bytes of memory it took.",
+    "hostile files": "Mutations of the golden containers through `verify`, `decode`, a region and `render`: how each of them ended, and\n"
+    "at most how many seconds of processor time and bytes of memory it took.",
     "the native code under sanitizers": "Coverage-guided fuzzing of the native library under address and undefined-behaviour sanitizers.",
-    "kill -9 at an operation": "The process is killed before each of its operations on files: the older output stays whole, and the next\n"
-    "run clears away what was left.",
-    "kill -9 at a random moment": "The process is killed at random: the older output stays whole, and the same command gives the same file.",
+    "kill -9 at an operation": "The process is killed before each of its operations on files: the older output stays whole, and the\n"
+    "next run clears away what was left.",
+    "kill -9 at a random moment": "The process is killed at random: the older output stays, and the same command gives the same file.",
     "kill -9 while checkpoints are written": "The same, where checkpoints are written all the time.",
-    "a full disk": "Each operation on files fails as it does on a full disk: refused with one line, nothing half-written. What is not\n"
-    "refused did not need the operation.",
+    "a full disk": "Each operation on files fails as it does on a full disk: refused with one line, nothing half-written. What is\n"
+    "not refused did not need the operation.",
     "a signal at each stage": "Ctrl-C and SIGTERM in each stage: one line, nothing half-written, and the older output stays.",
     "a signal at an operation": "The same at operations on files.",
     "a source that changes": "The source grows, shrinks, is written again or vanishes while it is read: refused.",
