@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from itertools import count
 from threading import Lock
 from typing import TypeVar
@@ -55,7 +56,10 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
         while one():
             pass
 
-    helpers = [_pool().submit(every) for _ in range(min(usable_threads(), len(work)) - 1)]
+    helpers: list[Future[None]] = []
+    with suppress(RuntimeError):  # where no more threads can be started, there are fewer: the caller's own is enough
+        for _ in range(min(usable_threads(), len(work)) - 1):
+            helpers.append(_pool().submit(every))  # one by one: those before the one that fails count
     try:
         for future in found:
             while not future.done() and one():

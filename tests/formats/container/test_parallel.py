@@ -45,6 +45,16 @@ def test_the_first_failure_is_raised_and_the_rest_is_left() -> None:
     assert len(begun) < 10_000
 
 
+def test_without_threads_the_callers_own_does_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Exhausted:
+        def submit(self, *_: object) -> None:
+            raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(parallel, "usable_threads", lambda: 3)
+    monkeypatch.setattr(parallel, "_pool", Exhausted)
+    assert list(in_threads(abs, range(-4, 0))) == [4, 3, 2, 1]
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_forked_process_has_threads_of_its_own() -> None:
