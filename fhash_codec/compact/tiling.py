@@ -6,6 +6,7 @@ import math
 from itertools import product
 from math import prod
 
+from fhash_formats.container.coding import MOST_TILE_VERTICES
 from fhash_formats.errors import InputError
 from fhash_formats.transform.tile import Shape
 
@@ -30,7 +31,7 @@ def parse_tile(text: str, shape: Shape) -> Shape | None:
     if text == "auto":
         return None
     if text == "whole":
-        return shape
+        return _allowed(text, shape)
     try:
         numbers = [int(part) for part in text.split("x")]
     except ValueError:
@@ -38,7 +39,13 @@ def parse_tile(text: str, shape: Shape) -> Shape | None:
     if len(numbers) != 4 or min(numbers) < 1:
         raise InputError(f"tile is '{text}'; allowed: auto, whole, or four whole numbers as in 4x32x32x32 (t, z, y, x)")
     t, z, y, x = (min(n, length) for n, length in zip(numbers, shape, strict=True))
-    return t, z, y, x
+    return _allowed(text, (t, z, y, x))
+
+
+def _allowed(text: str, tile: Shape) -> Shape:
+    if prod(tile) > MOST_TILE_VERTICES:
+        raise InputError(f"tile '{text}' has {prod(tile):,} vertices; at most {MOST_TILE_VERTICES:,} are decoded together: name a smaller one")
+    return tile
 
 
 def even_tile(shape: Shape, tiles: int, steps: int) -> Shape:

@@ -13,6 +13,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, QualityError, RegionError
+from fhash_codec.compact.tiling import parse_tile
 from fhash_codec.features import dilate, parse_feature
 
 FAST = EncodeConfig(effort=1)
@@ -422,3 +423,10 @@ def test_a_series_larger_than_memory_is_coded_layer_by_layer(tmp_path, monkeypat
         assert volume.chunks == (4, 6, 10, 17)
         error = volume[...].astype(np.float64) - values
     assert 20 * np.log10(np.ptp(values) / np.sqrt(np.mean(error**2))) >= 40 - 1e-3
+
+
+@pytest.mark.parametrize("text", ["whole", "200x1000x1000x1"])
+def test_a_tile_that_no_reader_would_take_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"at most 134,217,728 are decoded together"):
+        parse_tile(text, (200, 1000, 1000, 2))
+    assert parse_tile("1x1000x1000x9", (200, 1000, 1000, 2)) == (1, 1000, 1000, 2)

@@ -83,8 +83,14 @@ class PlainCoder:
         return values.astype(self._native, copy=False)
 
 
+MOST_TILE_VERTICES = 1 << 27
+"""Of a tile of the codec `fhash.transform`: decoding takes some 30 bytes for each, and a damaged file may claim any number."""
+
+
 def _transform_coder(codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]) -> ChunkCoder:
-    """The coder of `fhash.transform`."""
+    """The coder of `fhash.transform`; raises DamagedFileError for tiles that are too large."""
+    if prod(shape) > MOST_TILE_VERTICES:
+        raise DamagedFileError(f"tiles of {prod(shape):,} vertices; the limit is {MOST_TILE_VERTICES:,}")
     # Containers without it are read without loading it.
     from fhash_formats.transform.stream import TransformCoder
 
