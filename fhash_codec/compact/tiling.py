@@ -44,7 +44,7 @@ def parse_tile(text: str, shape: Shape) -> Shape | None:
 
 def _allowed(text: str, tile: Shape) -> Shape:
     if prod(tile) > MOST_TILE_VERTICES:
-        raise InputError(f"tile '{text}' has {prod(tile):,} vertices; at most {MOST_TILE_VERTICES:,} are decoded together: name a smaller one")
+        raise InputError(f"tile '{text}' has {prod(tile):,} vertices; at most {MOST_TILE_VERTICES:,} are decoded together; name another")
     return tile
 
 

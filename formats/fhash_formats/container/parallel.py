@@ -58,8 +58,9 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
 
     helpers: list[Future[None]] = []
     with suppress(RuntimeError):  # where no more threads can be started, there are fewer: the caller's own is enough
-        for _ in range(min(usable_threads(), len(work)) - 1):
-            helpers.append(_pool().submit(every))  # one by one: those before the one that fails count
+        more = min(usable_threads(), len(work)) - 1
+        for _ in range(more):
+            helpers.append(_threads.pool(more).submit(every))
     try:
         for future in found:
             while not future.done() and one():
@@ -73,22 +74,30 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
                 helper.result()
 
 
-def _pool() -> ThreadPoolExecutor:
+class _Threads:
     """Threads that wait for work: starting new ones for every call would take longer than small work itself."""
-    global _threads
-    with _lock:
-        if _threads is None:
-            _threads = ThreadPoolExecutor(max(1, usable_threads() - 1), thread_name_prefix="fhash")
-        return _threads
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._pool: ThreadPoolExecutor | None = None
+        self._size = 0
+
+    def pool(self, size: int) -> ThreadPoolExecutor:
+        """A pool of at least so many threads."""
+        with self._lock:
+            if self._pool is None or self._size < size:
+                if self._pool is not None:
+                    self._pool.shutdown(wait=False)  # what it has begun it ends
+                self._pool, self._size = ThreadPoolExecutor(size, thread_name_prefix="fhash"), size
+            return self._pool
 
 
 def _forked() -> None:
     """A forked process has none of its parent's threads, and their pool would hang there."""
-    global _threads, _lock
-    _threads, _lock = None, Lock()
+    global _threads
+    _threads = _Threads()
 
 
-_threads: ThreadPoolExecutor | None = None
-_lock = Lock()
+_threads = _Threads()
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forked)

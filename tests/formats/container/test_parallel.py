@@ -25,6 +25,13 @@ def test_results_come_in_order_and_from_several_threads(monkeypatch: pytest.Monk
     assert list(in_threads(work, range(20))) == [item * item for item in range(20)]
 
 
+def test_the_threads_grow_with_what_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    for count in (2, 5, 3):
+        monkeypatch.setattr(parallel, "usable_threads", lambda count=count: count)
+        all_at_once = threading.Barrier(count, timeout=60)
+        assert len(list(in_threads(lambda _, meet=all_at_once: meet.wait(), range(count)))) == count
+
+
 def test_calls_within_calls_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "usable_threads", lambda: 3)
     found = in_threads(lambda outer: sum(in_threads(lambda inner: outer * inner, range(30))), range(30))
@@ -47,11 +54,14 @@ def test_the_first_failure_is_raised_and_the_rest_is_left() -> None:
 
 def test_without_threads_the_callers_own_does_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
     class Exhausted:
+        def pool(self, _: int) -> Exhausted:
+            return self
+
         def submit(self, *_: object) -> None:
             raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(parallel, "usable_threads", lambda: 3)
-    monkeypatch.setattr(parallel, "_pool", Exhausted)
+    monkeypatch.setattr(parallel, "_threads", Exhausted())
     assert list(in_threads(abs, range(-4, 0))) == [4, 3, 2, 1]
 
 
