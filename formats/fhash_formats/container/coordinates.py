@@ -116,7 +116,7 @@ def _candidates(values: Floats, kind: str) -> Iterator[tuple[float, float]]:
         yield from ((start, 1.0) for start in starts)
         return
     first, last = _shortest(values[0], kind), _shortest(values[-1], kind)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # at the ends of float64; what is no number is no guess
         guesses = [float(values[1] - values[0]), float((values[-1] - values[0]) / (values.size - 1)), (last - first) / (values.size - 1)]
         # The middle of the steps that every position allows for, each within half of its spacing; the last may be no part of the rule.
         numbers, spacing = np.arange(1, values.size), np.spacing(values[1:].astype(kind)).astype(np.float64)

@@ -27,6 +27,7 @@ RULED = {
 }
 LISTED = {
     "uneven": (UNEVEN, None),
+    "to the end of float64 and back": (np.array([0.0, np.finfo(np.float64).max, 0.0]), None),
     "uneven float32": (UNEVEN.astype(np.float32).astype(float), "float32"),
     "negative zero": (np.array([-0.0, 1.0, 2.0]), "float32"),
     "repeated": (np.array([0.0, 1.0, 1.0, 1.0]), "float32"),
