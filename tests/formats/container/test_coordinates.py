@@ -12,6 +12,7 @@ from fhash_formats.container.coordinates import MAX_LISTED, MAX_RULED, describe_
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import Coordinate, index_coordinate
 
+LARGEST = float(np.finfo(np.float64).max)
 UNEVEN = np.cumsum(np.random.default_rng(0).random(MAX_LISTED))
 
 RULED = {
@@ -21,13 +22,13 @@ RULED = {
     "constant": (np.full(7, 2.0), {"start": 2, "step": 0}),
     "product and sum": (np.arange(128) * 0.1 + 5, {"start": 5, "step": 0.1}),
     "large": (1e300 + np.arange(5) * 1e299, {"start": 1e300, "step": 1e299}),
+    "to the end of float64 and back": (np.array([0.0, LARGEST, 0.0]), {"step": LARGEST, "last": 0}),
     "two far apart": (np.array([0.0, 3e-320]), {"step": 3e-320}),
     "float32": (np.linspace(0.1, 9.9, 128, dtype=np.float32).astype(float), {"start": 0.1, "dtype": "float32"}),
     "last": (np.linspace(-3.3, 7.1, 128), {"start": -3.3, "last": 7.1}),
 }
 LISTED = {
     "uneven": (UNEVEN, None),
-    "to the end of float64 and back": (np.array([0.0, np.finfo(np.float64).max, 0.0]), None),
     "uneven float32": (UNEVEN.astype(np.float32).astype(float), "float32"),
     "negative zero": (np.array([-0.0, 1.0, 2.0]), "float32"),
     "repeated": (np.array([0.0, 1.0, 1.0, 1.0]), "float32"),
