@@ -1,6 +1,8 @@
 # Everything runs in .venv, which is made (or brought up to date) on the first call. Needs python3 >= 3.11 with venv and pip.
 PYTHON ?= python3
 BIN := .venv/bin
+# Tests run in a process for each processor; those of a file stay together, since they share what is dear to make.
+SPREAD := -n auto --dist loadfile
 
 .PHONY: demo test hard clean
 
@@ -12,13 +14,13 @@ test: .venv/.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(SPREAD)
 
 # The long set of hard cases, hostile files, faults and fuzzing: some 45 minutes on 4 processors. docs/stability.md gets the figures.
 hard: .venv/.stamp
 	mkdir -p build/hard
 	rm -f build/hard/figures.jsonl
-	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest tests/hard
+	FHASH_HARD=1 FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python -m pytest $(SPREAD) tests/hard
 	FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python tests/hard/fuzz/run.py --march --seconds 600 --crashes build/hard/crashes
 	$(BIN)/fhash selftest --all --report build/hard/stability.md --force
 	$(BIN)/python tests/hard/summary.py build/hard/stability.md build/hard/figures.jsonl docs/stability.md
