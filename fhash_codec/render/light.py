@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,8 @@ __all__ = ["light_grid"]
 Floats = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
+OPAQUE = 1e30
+"""Extinction per vertex, at most: nothing passes long before that."""
 MOST_STEPS = 16
 """From a point to the end of its surroundings."""
 SIDES = np.array([side for side in itertools.product((-1.0, 0.0, 1.0), repeat=3) if sum(map(abs, side)) in (1, 3)])
@@ -54,6 +57,10 @@ def light_grid(
     first = np.array(frame.first[::-1], dtype=np.float64)
     if table is None or not table.extinctions.any():
         return LightGrid(shares=np.ones((1, 1, 1, 2), dtype=np.float32), first=first, cell=1.0)
+    # In lengths of a vertex: float32 has no room for those of all coordinates.
+    unit = grid.vertex_spacing
+    with np.errstate(over="ignore"):
+        table = replace(table, extinctions=np.minimum(table.extinctions * unit, OPAQUE))
     extinction = _extinction(np.ascontiguousarray(frame.values, dtype=np.float32), table, across)
     cell = float(across * frame.stride)
     shares = np.ones((*extinction.shape, 2), dtype=np.float32)
@@ -61,7 +68,7 @@ def light_grid(
     if shadows is not None and lamp is not None:
         step = np.asarray(lamp, dtype=np.float64) / (grid.spacing * cell)
         step /= np.abs(step).max()
-        passed = _passed(extinction, step, _steps_out(step, extinction.shape), float(np.linalg.norm(step * grid.spacing * cell)))
+        passed = _passed(extinction, step, _steps_out(step, extinction.shape), float(np.linalg.norm(step * grid.spacing * cell)) / unit)
         shares[..., 0] = 1 - np.float32(shadows.strength) * (1 - passed)
         rays += extinction.size
     if ambient_occlusion is not None:
@@ -69,7 +76,7 @@ def light_grid(
         around = np.zeros(extinction.shape, dtype=np.float32)
         for side in SIDES:
             step = side * ambient_occlusion.radius / (count * cell)
-            around += _passed(extinction, step, count, float(np.linalg.norm(step * grid.spacing * cell)))
+            around += _passed(extinction, step, count, float(np.linalg.norm(step * grid.spacing * cell)) / unit)
         shares[..., 1] = 1 - np.float32(ambient_occlusion.strength) * (1 - around / np.float32(len(SIDES)))
         rays += extinction.size * len(SIDES)
     return LightGrid(shares=np.clip(shares, 0, 1), first=first, cell=cell, secondary_rays=rays)

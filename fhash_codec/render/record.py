@@ -139,7 +139,7 @@ def _fitted(hint: Any, value: Any) -> Any:
         if isinstance(value, hint):
             return value
         if value is True:
-            return hint()
+            return hint.from_dict({})
         return hint.from_dict(value) if isinstance(value, Mapping) else _WRONG
     if hint is type(None):
         return None if value is None or value is False else _WRONG

@@ -54,7 +54,7 @@ class Camera(Record):
     projection: str = limits("perspective", "kind of projection", choices=("perspective", "parallel"))
     view_angle: float = limits(30.0, "vertical angle of the picture in degrees, of a perspective", low=0.1, high=170)
     parallel_scale: float | None = limits(
-        None, "half the height of the picture in units of the coordinates, of a parallel projection", low=1e-300, high=1e300
+        None, "half the height of the picture in units of the coordinates, of a parallel projection", low=1e-100, high=1e100
     )
 
 
@@ -166,8 +166,8 @@ class Scene(Record):
         None,
         "factors by which the axes (x, y, z) are stretched; if left out, one in other units than the rest has its vertices as far apart. "
         "The camera lives in the stretched coordinates",
-        low=1e-100,
-        high=1e100,
+        low=1e-30,
+        high=1e30,
     )
     background: str = limits("#ffffff", "'#rrggbb', a name, or 'transparent'")
     step: float | None = limits(

@@ -139,7 +139,7 @@ def test_a_large_file_is_decoded_within_one_gibibyte(huge: tuple[Path, int, floa
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "FHASH_THREADS": "2"}
     done = subprocess.run([sys.executable, "-c", script, "-", *words], capture_output=True, text=True, env=environment, check=False)
     if suffix == "zarr" and done.returncode:  # its threads reserve much more than they use, and the limit is on what is reserved
-        assert done.returncode == 1
+        assert done.returncode in (1, 4)
         assert len(done.stderr.splitlines()) == 1
         assert "memory" in done.stderr
         assert not output.exists()

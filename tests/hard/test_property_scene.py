@@ -152,6 +152,7 @@ PLACES = [(), ("camera",), ("transfer_function",), ("effects",), ("effects", "sh
 )
 @example(place=(), name="step", value=10**400)
 @example(place=("transfer_function",), name="range", value=[[1, 2], 3])
+@example(place=("effects",), name="isosurfaces", value=[True])
 def test_any_values_make_a_scene_or_are_refused_in_one_line(place: tuple[str, ...], name: str, value: object) -> None:
     values: dict[str, Any] = {name: value}
     for part in reversed(place):
@@ -194,11 +195,13 @@ def volume(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 SMALL = {"size": [6, 5]}
 FOUND: dict[str, dict[str, Any]] = {
-    "smallest scale": {"scale": [1e-100, 1e-100, 1e-100]},
-    "largest scale": {"scale": [6e99, 6e99, 0.5]},
-    "light over a huge length": {"scale": [9.9e99, 6.3e99, 9.2e15], "effects": {"shading": {}, "shadows": {}}},
-    "occlusion over a huge length": {"scale": [1e30, 5.5e99, 8.6e99], "effects": {"ambient_occlusion": {}}},
+    "smallest scale": {"scale": [1e-30, 1e-30, 1e-30]},
+    "largest scale": {"scale": [6e29, 6e29, 0.5]},
+    "light over a huge length": {"scale": [9.9e29, 6.3e29, 9.2e15], "effects": {"shading": {}, "shadows": {}}},
+    "occlusion over a huge length": {"scale": [1e10, 5.5e29, 8.6e29], "effects": {"ambient_occlusion": {}}},
     "a surface beyond float32": {"effects": {"isosurfaces": [{"value": 6e44}, {"value": 0.0}]}},
+    "shadows over tiny lengths": {"scale": [1.0, 1e-30, 1e-30], "effects": {"shadows": {}}},
+    "the largest parallel picture": {"camera": {"projection": "parallel", "parallel_scale": 1e100}},
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
 """Scenes that the test below has found."""
