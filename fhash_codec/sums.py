@@ -25,11 +25,15 @@ LANES, PIECE = 256, 1 << 14
 
 
 def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, float, float]:
-    """Number, least, greatest (inf and -inf if there is none) and sum times a factor of the finite ones of float32 or float64 values."""
+    """Number, least, greatest (inf and -inf if there is none) and sum times a factor of the finite ones of float32 or float64 values.
+
+    Zeros come without a sign, since which of two zeros is the least is nobody's order. A sum beyond float64 is infinite.
+    """
     flat = np.ascontiguousarray(values).reshape(-1)
     library = native.library()
     if library is not None:
-        return _call(library, "scan", flat, ctypes.c_int64(flat.size), factor, results=3)
+        count, low, high, total = _call(library, "scan", flat, ctypes.c_int64(flat.size), factor, results=3)
+        return count, low + 0.0, high + 0.0, total
     count, low, high, total = 0, np.inf, -np.inf, 0.0
     for start in range(0, flat.size, PIECE):
         part = flat[start : start + PIECE]
@@ -38,8 +42,9 @@ def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, floa
         if chosen.size:
             count += chosen.size
             low, high = min(low, float(chosen.min())), max(high, float(chosen.max()))
-        total += _lane_sum(np.where(finite, part, 0).astype(np.float64) * factor)
-    return count, low, high, total
+        with np.errstate(over="ignore"):
+            total += _lane_sum(np.where(finite, part, 0).astype(np.float64) * factor)
+    return count, low + 0.0, high + 0.0, total
 
 
 def squared_errors(original: Values, decoded: Values, mask: Mask | None, scale: float) -> tuple[int, float, float]:

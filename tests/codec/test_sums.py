@@ -35,6 +35,17 @@ def test_range_and_sum_are_those_of_numpy(size, dtype, missing):
     assert total == pytest.approx(finite.sum() / 2, rel=1e-9, abs=1e-9)
 
 
+@pytest.mark.parametrize("library", ["1", "0"])
+def test_zeros_have_no_sign_and_sums_may_be_infinite(monkeypatch, library):
+    monkeypatch.setenv("FHASH_NATIVE", library)
+    for values in ([0.0, -0.0], [-0.0, 0.0], [-0.0]):
+        _, low, high, _ = range_and_sum(np.array(values))
+        assert not np.signbit([low, high]).any()
+    largest = np.finfo(np.float64).max
+    assert range_and_sum(np.full(1000, largest)) == (1000, largest, largest, np.inf)
+    assert range_and_sum(np.full(1000, largest), 2.0**-20)[3] == pytest.approx(largest * (1000 * 2.0**-20))
+
+
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize(
     "dtypes", [(np.float32, np.float32), (np.float64, np.float64), (np.uint8, np.float32), (np.float32, np.float64)], ids=str
