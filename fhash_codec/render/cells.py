@@ -46,9 +46,9 @@ def limits_of(bricks: Bricks, task: Task) -> Single:
     limits = np.array(joined, dtype=np.float64).reshape(-1, 2)
     with np.errstate(over="ignore"):  # a surface beyond float32 lies at infinity, where no value is
         near = limits.astype(np.float32)
-    # Outwards where float32 does not have them.
-    below = np.where(near[:, 0] > limits[:, 0], np.nextafter(near[:, 0], np.float32(-np.inf)), near[:, 0])
-    above = np.where(near[:, 1] < limits[:, 1], np.nextafter(near[:, 1], np.float32(np.inf)), near[:, 1])
+        # Outwards where float32 does not have them.
+        below = np.where(near[:, 0] > limits[:, 0], np.nextafter(near[:, 0], np.float32(-np.inf)), near[:, 0])
+        above = np.where(near[:, 1] < limits[:, 1], np.nextafter(near[:, 1], np.float32(np.inf)), near[:, 1])
     return np.stack([below, above], axis=-1)
 
 

@@ -271,10 +271,12 @@ def _lamp(rays: Rays, shading: Shading | None, shadows: Shadows | None) -> Float
             raise InputError("shading and shadows name different lights; there is one lamp: leave 'light' out of one of them")
         chosen = shadows.light
     if chosen is not None:
-        length = float(np.linalg.norm(chosen))
-        if not length > 0 or not math.isfinite(length):
+        direction = np.array(chosen)
+        largest = float(np.abs(direction).max())
+        if not largest > 0:
             raise InputError("light has no length; give a direction such as 1, 1, 2")
-        return np.array(chosen) / length
+        direction = direction / largest  # first, since the squares of the largest numbers go beyond float64
+        return np.asarray(direction / np.linalg.norm(direction), dtype=np.float64)
     if shadows is None:
         return None
     spacing = rays.grid.spacing

@@ -202,6 +202,8 @@ FOUND: dict[str, dict[str, Any]] = {
     "a surface beyond float32": {"effects": {"isosurfaces": [{"value": 6e44}, {"value": 0.0}]}},
     "shadows over tiny lengths": {"scale": [1.0, 1e-30, 1e-30], "effects": {"shadows": {}}},
     "the largest parallel picture": {"camera": {"projection": "parallel", "parallel_scale": 1e100}},
+    "a surface at the end of float32": {"effects": {"isosurfaces": [{"value": -3.402823364973241e38}]}},
+    "light from a huge direction": {"effects": {"shadows": {"light": [0.0, 1e200, 1.7e308]}}},
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
 """Scenes that the test below has found."""
@@ -236,7 +238,8 @@ def check_picture(volume: Volume, scene: Scene) -> None:
     assert np.isfinite(image.rgba).all()
     assert image.rgba.min() >= -1e-6
     assert image.rgba[..., 3].max() <= 1 + 1e-5
-    assert (image.rgba[..., :3].max(axis=-1) <= image.rgba[..., 3] * (1 + 1e-5) + 11 * (scene.effects.shading is not None) + 1e-5).all()
+    lit = scene.effects.shading is not None or bool(scene.effects.isosurfaces)  # highlights are added
+    assert (image.rgba[..., :3].max(axis=-1) <= image.rgba[..., 3] * (1 + 1e-5) + 11 * lit + 1e-5).all()
     if image.depth is not None:
         assert not np.isnan(image.depth).any()
     if image.normal is not None:
