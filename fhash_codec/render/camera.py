@@ -138,11 +138,8 @@ class Rays:
             upward = np.array(camera.view_up)
         distance = radius / narrow
         if camera.position is not None:
-            with np.errstate(over="ignore", invalid="ignore"):
-                away = np.array(camera.position) - focal
-                distance = float(np.linalg.norm(away))
-            if not np.isfinite(distance):
-                raise InputError(f"camera: position {_text(np.array(camera.position))} is too far away to compute with")
+            away = np.array(camera.position) - focal
+            distance = float(np.linalg.norm(away))
             # Below what float64 tells apart at these coordinates there is no direction either.
             if distance <= 1e-12 * max(radius, float(np.max(np.abs(focal)))):
                 raise InputError(f"camera: position and focal_point are the same, {_text(focal)}; move one of them")

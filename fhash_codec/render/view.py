@@ -40,7 +40,8 @@ def part_in_view(rays: Rays, volume: Volume) -> Box:
     One vertex where the picture shows nothing of the volume.
     """
     everything: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
-    seen = _seen(rays)
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # of cameras at the ends of float64
+        seen = _seen(rays)
     if seen is None:
         return ((0, 1), (0, 1), (0, 1))
     found = []
@@ -75,6 +76,8 @@ def _seen(rays: Rays) -> Floats | None:
             normals.append(normal)
             offsets.append(-float(normal @ place))
     normal, offset = np.array(normals), np.array(offsets)
+    if not (np.isfinite(normal).all() and np.isfinite(offset).all()):
+        return bounds
     tolerance = 1e-9 * float(np.abs(bounds).max() + np.abs(rays.eye).max())
     threes = np.array(list(itertools.combinations(range(len(normal)), 3)))
     threes = threes[np.abs(np.linalg.det(normal[threes])) >= 1e-12]

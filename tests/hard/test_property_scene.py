@@ -204,6 +204,8 @@ FOUND: dict[str, dict[str, Any]] = {
     "the largest parallel picture": {"camera": {"projection": "parallel", "parallel_scale": 1e100}},
     "a surface at the end of float32": {"effects": {"isosurfaces": [{"value": -3.402823364973241e38}]}},
     "light from a huge direction": {"effects": {"shadows": {"light": [0.0, 1e200, 1.7e308]}}},
+    "a camera turned by next to nothing": {"camera": {"view": "xy", "azimuth": 2.2e-311}},
+    "a focal point far away": {"camera": {"focal_point": [0.0, 0.0, 1e100]}},
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
 """Scenes that the test below has found."""
