@@ -57,7 +57,7 @@ template <int WANTED> FHASH_INLINE int Packet<WANTED>::aim(int64_t x, int64_t y,
     #pragma omp simd reduction(+ : met)
     for (int l = 0; l < N; l++) {
         const int column = left_most + l % SIDE, line = top_most + l / SIDE;
-        const bool hit = leave[l] > enter[l] && stop[l] > first[l];
+        const bool hit = leave[l] > enter[l] && leave[l] < ENDLESS && stop[l] > first[l];  // without a direction a ray never leaves
         const double steps = hit ? (leave[l] - enter[l]) / m.step : 0, most = min(std::ceil(steps), 2147483000.0);
         const uint32_t number = ((uint32_t)min(line, height - 1) * width + min(column, width - 1)) * (uint32_t)(m.rays * m.rays) + (uint32_t)ray;
         const double share = m.jitter ? random_share(number) : 0.5;
