@@ -84,7 +84,7 @@ def light_grid(
 
 def _steps_out(step: Floats, shape: tuple[int, ...]) -> int:
     """Steps after which the last point is out of the grid; step x, y, z in its cells."""
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", over="ignore"):
         return int(np.min(np.ceil(np.array(shape[::-1]) / np.abs(step)))) + 1
 
 

@@ -206,6 +206,7 @@ FOUND: dict[str, dict[str, Any]] = {
     "light from a huge direction": {"effects": {"shadows": {"light": [0.0, 1e200, 1.7e308]}}},
     "a camera turned by next to nothing": {"camera": {"view": "xy", "azimuth": 2.2e-311}},
     "a focal point far away": {"camera": {"focal_point": [0.0, 0.0, 1e100]}},
+    "light hardly aslant": {"effects": {"shadows": {"light": [0.0, 2.2471164185778944e307, 0.5]}}},
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
 """Scenes that the test below has found."""
