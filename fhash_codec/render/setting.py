@@ -60,7 +60,6 @@ class Setting:
         seen[:, 0] = np.where(first == 0, box[:, 0], seen[:, 0])
         seen[:, 1] = np.where(first + stride * counts > np.array(grid.counts) - 1, box[:, 1], seen[:, 1])
         spacing = grid.spacing * stride
-        vertex = float(np.exp(np.mean(np.log(np.abs(spacing)))))
         least, most = bricks.value_range
         low, high = (task.table.low, task.table.high) if task.table is not None else (least, most)
         values, middle, unit = bricks.values, 0.0, 1.0
@@ -84,7 +83,7 @@ class Setting:
             box=box,
             seen=seen,
             spacing=spacing,
-            gradient=vertex / (span * spacing),
+            gradient=stride * grid.vertex_spacing / (span * spacing),
             floor=floor,
             light_offset=np.zeros(3) if light is None else (first - light.first) / light.cell,
             light_scale=1.0 if light is None else stride / light.cell,

@@ -34,6 +34,7 @@ from fhash_formats.transform.sections import (
     PREDICTED_MASKED,
     RESIDUAL,
     little,
+    section,
     sections_of,
 )
 from fhash_formats.transform.settings import Settings
@@ -147,16 +148,6 @@ def values_changed(chance: random.Random, parts: Parts) -> Parts:
     if chance.random() < 0.2:
         values[:] = chance.choice(SPECIAL) if dtype.kind == "f" else chance.choice((0, 255))
     return replaced(parts, {member: with_crc(compress(values.tobytes(), 1))})
-
-
-def section(data: bytes) -> bytes:
-    """A section behind its length (LEB128)."""
-    size, head = len(data), bytearray()
-    while True:
-        head.append(size & 127 | (128 if size > 127 else 0))
-        size >>= 7
-        if not size:
-            return bytes(head) + data
 
 
 def configuration_of(document: dict[str, Any]) -> dict[str, Any]:

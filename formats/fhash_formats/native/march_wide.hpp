@@ -138,30 +138,41 @@ template <int WANTED, bool CELLS> FHASH_AVX512 __attribute__((noinline)) int lea
     return on ? 3 : 0;
 }
 
+// The eight vertices around places, and the shares of those behind them.
+struct Corners {
+    __m512 fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3;
+};
+FHASH_AVX512 inline __attribute__((always_inline)) Corners corners_at(const FhashMarch& m, __m512 x, __m512 y, __m512 z) {
+    const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
+    const int sy = ly > 1 ? lx : 0, sz = lz > 1 ? lx * ly : 0;
+    const __m512i i = _mm512_min_epi32(_mm512_cvttps_epi32(x), _mm512_set1_epi32(lx - 2));
+    const __m512i j = _mm512_min_epi32(_mm512_cvttps_epi32(y), _mm512_set1_epi32(max(ly - 2, 0)));
+    const __m512i h = _mm512_min_epi32(_mm512_cvttps_epi32(z), _mm512_set1_epi32(max(lz - 2, 0)));
+    const __m512i row = _mm512_add_epi32(_mm512_mullo_epi32(h, _mm512_set1_epi32(ly)), j);
+    const __m512i q = _mm512_add_epi32(_mm512_mullo_epi32(row, _mm512_set1_epi32(lx)), i);
+    Corners c;
+    c.fx = _mm512_sub_ps(x, _mm512_cvtepi32_ps(i));
+    c.fy = _mm512_sub_ps(y, _mm512_cvtepi32_ps(j));
+    c.fz = _mm512_sub_ps(z, _mm512_cvtepi32_ps(h));
+    pairs(m.values, q, c.a0, c.a1);
+    pairs(m.values + sy, q, c.a2, c.a3);
+    pairs(m.values + sz, q, c.b0, c.b1);
+    pairs(m.values + sz + sy, q, c.b2, c.b3);
+    return c;
+}
+
 // As `sample`, and the colours.
 template <int WANTED> FHASH_AVX512 __attribute__((noinline))
 void sample_wide(Packet<WANTED>& p, Counters& counted, int& seen, int& ending, int& lost) {
     const FhashMarch& m = p.m;
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
-    const int sy = ly > 1 ? lx : 0, sz = lz > 1 ? lx * ly : 0;
     const __m512 zero = _mm512_setzero_ps();
     const __m512i k = _mm512_load_si512(p.k);
     const __mmask16 on = _mm512_test_epi32_mask(_mm512_load_si512(p.on), _mm512_load_si512(p.on));
     const __m512 f = _mm512_cvtepi32_ps(k);
     const __m512 x = place(p.ox, p.dx, f, _mm512_set1_ps((float)(lx - 1))), y = place(p.oy, p.dy, f, _mm512_set1_ps((float)(ly - 1)));
     const __m512 z = place(p.oz, p.dz, f, _mm512_set1_ps((float)(lz - 1)));
-    const __m512i i = _mm512_min_epi32(_mm512_cvttps_epi32(x), _mm512_set1_epi32(lx - 2));
-    const __m512i j = _mm512_min_epi32(_mm512_cvttps_epi32(y), _mm512_set1_epi32(max(ly - 2, 0)));
-    const __m512i h = _mm512_min_epi32(_mm512_cvttps_epi32(z), _mm512_set1_epi32(max(lz - 2, 0)));
-    const __m512 fx = _mm512_sub_ps(x, _mm512_cvtepi32_ps(i)), fy = _mm512_sub_ps(y, _mm512_cvtepi32_ps(j));
-    const __m512 fz = _mm512_sub_ps(z, _mm512_cvtepi32_ps(h));
-    const __m512i row = _mm512_add_epi32(_mm512_mullo_epi32(h, _mm512_set1_epi32(ly)), j);
-    const __m512i q = _mm512_add_epi32(_mm512_mullo_epi32(row, _mm512_set1_epi32(lx)), i);
-    __m512 a0, a1, a2, a3, b0, b1, b2, b3;
-    pairs(m.values, q, a0, a1);
-    pairs(m.values + sy, q, a2, a3);
-    pairs(m.values + sz, q, b0, b1);
-    pairs(m.values + sz + sy, q, b2, b3);
+    const auto [fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3] = corners_at(m, x, y, z);
     const __m512 d0 = _mm512_sub_ps(a1, a0), d1 = _mm512_sub_ps(a3, a2), d2 = _mm512_sub_ps(b1, b0), d3 = _mm512_sub_ps(b3, b2);
     const __m512 p0 = _mm512_fmadd_ps(fx, d0, a0), p1 = _mm512_fmadd_ps(fx, d1, a2);
     const __m512 p2 = _mm512_fmadd_ps(fx, d2, b0), p3 = _mm512_fmadd_ps(fx, d3, b2);
@@ -207,20 +218,7 @@ void sample_wide(Packet<WANTED>& p, Counters& counted, int& seen, int& ending, i
 
 // Trilinear at places of the frame.
 FHASH_AVX512 inline __attribute__((always_inline)) __m512 values_at(const FhashMarch& m, __m512 x, __m512 y, __m512 z) {
-    const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
-    const int sy = ly > 1 ? lx : 0, sz = lz > 1 ? lx * ly : 0;
-    const __m512i i = _mm512_min_epi32(_mm512_cvttps_epi32(x), _mm512_set1_epi32(lx - 2));
-    const __m512i j = _mm512_min_epi32(_mm512_cvttps_epi32(y), _mm512_set1_epi32(max(ly - 2, 0)));
-    const __m512i h = _mm512_min_epi32(_mm512_cvttps_epi32(z), _mm512_set1_epi32(max(lz - 2, 0)));
-    const __m512 fx = _mm512_sub_ps(x, _mm512_cvtepi32_ps(i)), fy = _mm512_sub_ps(y, _mm512_cvtepi32_ps(j));
-    const __m512 fz = _mm512_sub_ps(z, _mm512_cvtepi32_ps(h));
-    const __m512i row = _mm512_add_epi32(_mm512_mullo_epi32(h, _mm512_set1_epi32(ly)), j);
-    const __m512i q = _mm512_add_epi32(_mm512_mullo_epi32(row, _mm512_set1_epi32(lx)), i);
-    __m512 a0, a1, a2, a3, b0, b1, b2, b3;
-    pairs(m.values, q, a0, a1);
-    pairs(m.values + sy, q, a2, a3);
-    pairs(m.values + sz, q, b0, b1);
-    pairs(m.values + sz + sy, q, b2, b3);
+    const auto [fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3] = corners_at(m, x, y, z);
     const __m512 near = between(between(a0, a1, fx), between(a2, a3, fx), fy);
     return between(near, between(between(b0, b1, fx), between(b2, b3, fx), fy), fz);
 }

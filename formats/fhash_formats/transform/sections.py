@@ -51,6 +51,7 @@ __all__ = [
     "pack_mask",
     "pack_missing",
     "restored",
+    "section",
     "sections_of",
     "settings_from",
     "unpack_mask",
@@ -82,7 +83,7 @@ def assembled(
     flags = numbers[mask is not None] | (OWN if settings else 0) | (MISSING if missing else 0)
     sections = [*_own(settings), *([missing] if missing else [])]
     if integers is None:
-        return bytes([flags | EMPTY]) + b"".join(map(_section, sections))
+        return bytes([flags | EMPTY]) + b"".join(map(section, sections))
     crc = zlib.crc32(little(integers))
     sections.append(coefficients)
     if residual is not None:
@@ -91,10 +92,10 @@ def assembled(
         sections.append(encode_integers(residual, single_band(residual.shape)).data)
     if mask is not None:
         sections.append(mask)
-    return bytes([flags]) + crc.to_bytes(4, "little") + b"".join(map(_section, sections))
+    return bytes([flags]) + crc.to_bytes(4, "little") + b"".join(map(section, sections))
 
 
-def _section(data: bytes) -> bytes:
+def section(data: bytes) -> bytes:
     """A section behind its length."""
     size, head = len(data), bytearray()
     while True:
@@ -167,7 +168,7 @@ def exact_bytes(values: Values, settings: Settings | None, occupied: Mask | None
     planes = plain.view(np.uint8).reshape(-1, plain.dtype.itemsize).T
     body = zlib.compress(planes.tobytes(), 6)
     sections = [*_own(settings), body, *([] if occupied is None else [pack_mask(occupied, no_levels(values.shape))])]
-    return bytes([flags]) + b"".join(map(_section, sections))
+    return bytes([flags]) + b"".join(map(section, sections))
 
 
 def exact_values(data: bytes | memoryview, shape: Shape, dtype: np.dtype[Any]) -> Values:
