@@ -71,8 +71,8 @@ class TransferFunctionSpec(Record):
     unit_distance: float | None = limits(
         None,
         "length after which the opacity is as given, in units of the coordinates; a vertex spacing if left out",
-        low=1e-300,
-        high=1e300,
+        low=1e-100,
+        high=1e100,
     )
     nothing: bool = limits(False, "show no volume at all, for surfaces alone")
 

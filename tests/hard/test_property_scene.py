@@ -207,6 +207,7 @@ FOUND: dict[str, dict[str, Any]] = {
     "a camera turned by next to nothing": {"camera": {"view": "xy", "azimuth": 2.2e-311}},
     "a focal point far away": {"camera": {"focal_point": [0.0, 0.0, 1e100]}},
     "light hardly aslant": {"effects": {"shadows": {"light": [0.0, 2.2471164185778944e307, 0.5]}}},
+    "a tiny unit of distance": {"scale": [1.0, 1.0, 1.9e27], "transfer_function": {"unit_distance": 1e-100}},
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
 """Scenes that the test below has found."""

@@ -21,6 +21,8 @@ Codec = Mapping[str, Any]
 """A codec as Zarr v3 names it: {"name": str, "configuration": {...}}."""
 
 ZSTD_LEVEL = 9
+ZSTD_MOST_RATIO = 32 << 10
+"""Bytes in a byte of zstd at most: a block of at most 128 KiB takes at least a header of three bytes and one more (RFC 8878, 3.1.1.2)."""
 CRC32C: Codec = {"name": "crc32c"}
 
 _CRC = struct.Struct("<I")
@@ -72,6 +74,8 @@ class PlainCoder:
         declared = zstd_content_size(data)
         if declared != self._size:
             raise DamagedFileError(f"zstd declares {declared} bytes; the chunk has {self._size}")
+        if declared > ZSTD_MOST_RATIO * len(data):
+            raise DamagedFileError(f"zstd declares {declared} bytes, which {len(data)} bytes cannot hold")
         # Into a buffer of exactly the chunk's size, which bounds what a hostile frame can write.
         values = np.empty(self._shape, dtype=self._stored)
         try:

@@ -30,13 +30,15 @@ MASK = ":mask"
 
 @contextmanager
 def damage_named(path: object) -> Iterator[None]:
-    """Put the path before what is wrong with a file, and turn what a hostile or unreadable file provokes into DamagedFileError."""
+    """Put the path before what is wrong with a file, and turn what a hostile or unreadable file provokes into DamagedFileError.
+
+    MemoryError passes: the coders refuse sizes that the bytes of a chunk cannot hold, so what is left is a machine with less memory than a
+    sound file takes, and whoever is told that a file is damaged may well delete it.
+    """
     try:
         yield
     except DamagedFileError as error:
         raise type(error)(f"{path}: {error}") from error
-    except MemoryError as error:
-        raise DamagedFileError(f"{path}: what the file declares does not fit in memory") from error
     except (RecursionError, OverflowError, UnicodeError, struct.error) as error:
         raise DamagedFileError(f"{path}: the file is damaged: {type(error).__name__}") from error
     except OSError as error:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import Container
-from fhash_formats.container.coding import crc32c
+from fhash_formats.container.coding import PlainCoder, crc32c, plain_codecs
 from fhash_formats.container.layout import Member, comment, deflated, ending, local_header
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
@@ -401,6 +401,15 @@ def test_chunk_data(sample, samples, case):
     parts = samples.unpack(sample.read_bytes())
     data = samples.pack([(n, coded if n == "coords/time/c/0" else old) for n, old in parts])
     refused(sample, data, f"member coords/time/c/0: {message}")
+
+
+def test_a_frame_cannot_declare_more_than_zstd_packs_into_its_bytes():
+    """So that what does not fit in memory is not taken for damage, and damage not for a lack of memory."""
+    float64 = np.dtype("<f8")
+    most = PlainCoder(plain_codecs(float64)[:-1], float64, (2**17,))
+    assert not most.decode(memoryview(numcodecs.zstd.compress(bytes(2**20), 19))).any()
+    with pytest.raises(DamagedFileError, match="which 17 bytes cannot hold"):
+        PlainCoder(plain_codecs(float64)[:-1], float64, (2**40,)).decode(memoryview(frame(b"abc"[:1], size=2**43)))
 
 
 @pytest.mark.parametrize("coded", [b"", b"abc", b"abcd", numcodecs.zstd.compress(bytes(32), 1) + b"abcd"])
