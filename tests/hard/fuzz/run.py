@@ -1,4 +1,4 @@
-"""The native decoders under address and undefined-behaviour sanitizers with a coverage-guided fuzzer.
+"""The native code under address and undefined-behaviour sanitizers with a coverage-guided fuzzer.
 
     python tests/hard/fuzz/run.py --seconds 600
 
@@ -25,8 +25,8 @@ from typing import Any
 
 HERE = Path(__file__).parent
 NATIVE = HERE.parents[2] / "formats" / "fhash_formats" / "native"
-TARGETS = HERE / "targets.cpp"
-SOURCES = ("coder", "mask", "predict", "lifting", "head", "quantise", "values")
+TARGETS = tuple(HERE / f"{name}.cpp" for name in ("targets", "target_encode", "target_light"))
+SOURCES = ("coder", "mask", "predict", "lifting", "head", "quantise", "values", "march_light")
 MARCH = ("march", "march_bricks")
 """Besides, where it is asked for: compiled without optimisation, for which the compiler takes a minute; otherwise it takes ten."""
 SANITIZE = ("-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-g")
@@ -65,7 +65,7 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
         jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing, "-fno-sanitize=float-cast-overflow", "-O0")) for name in MARCH]
         jobs += [(HERE / "target_march.cpp", (*SANITIZE, f"-I{NATIVE}"))]
     jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing)) for name in SOURCES]
-    jobs += [(TARGETS, (*SANITIZE, *(["-DFHASH_FUZZ_MARCH"] if march else [])))]
+    jobs += [(target, (*SANITIZE, *(["-DFHASH_FUZZ_MARCH"] if march else []))) for target in TARGETS]
 
     def compiled(job: tuple[Path, tuple[str, ...]]) -> Path:
         source, flags = job

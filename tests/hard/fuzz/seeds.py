@@ -24,7 +24,7 @@ from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 
 GOLDENS = Path(__file__).parents[2] / "golden"
-CODER, MASK, PREDICTOR, TRANSFORMS, HEAD, VALUES, MARCH = range(7)
+CODER, MASK, PREDICTOR, TRANSFORMS, HEAD, VALUES, ENCODE, LIGHT, MARCH = range(9)
 """First byte of an input, as targets.cpp has it."""
 
 SPECS: tuple[tuple[tuple[str, int], ...], ...] = (
@@ -94,8 +94,8 @@ def write_seeds(folder: Path, bands: list[Any], passes: list[Any]) -> int:
         for density in (0.02, 0.5):
             coded = encode_mask(rng.random(shape) < density, nothing)
             put(MASK, bytes([*(n - 1 for n in shape), 0]), coded)
-    for target in (MASK, TRANSFORMS, HEAD, VALUES, MARCH):
-        for _ in range(24):
+    for target in (MASK, TRANSFORMS, HEAD, VALUES, ENCODE, LIGHT, MARCH):
+        for _ in range(96 if target == ENCODE else 24):
             put(target, rng.bytes(400))
         put(target, bytes(300))
     return next(numbers)

@@ -1,11 +1,16 @@
-// What a decoder is called with besides hostile bytes: priors, tables of bands and passes, as Python makes them (seeds.py writes the file).
+// What the targets share: with what a decoder is called besides hostile bytes (priors, tables of bands and passes, as Python makes them:
+// seeds.py writes the file), and arrays from few bytes.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <limits>
 #include <vector>
+
+#include "reader.hpp"
 
 struct State {
     std::vector<std::uint16_t> slots;
@@ -67,3 +72,45 @@ private:
         if (!into.empty() && std::fread(into.data(), sizeof(T), into.size(), file) != into.size()) std::exit(2);
     }
 };
+
+inline const Setups& setups() {
+    static const Setups loaded(std::getenv("FHASH_FUZZ_SETUPS"));
+    return loaded;
+}
+
+inline std::int64_t volume(const std::vector<std::int64_t>& shape) { return shape[0] * shape[1] * shape[2] * shape[3]; }
+
+inline std::vector<std::int64_t> small_shape(Reader& in, std::int64_t most) {
+    std::vector<std::int64_t> shape;
+    for (int axis = 0; axis < 4; axis++) shape.push_back(in.within(1, axis == 3 ? 3 * most : most));
+    return shape;
+}
+
+template <class T> std::vector<T> repeated(Reader& in, std::int64_t n) {
+    const std::vector<T> seed = in.numbers<T>(12);
+    std::vector<T> values(static_cast<std::size_t>(n));
+    for (std::size_t i = 0; i < values.size(); i++) values[i] = seed[(i * 5 + i / 7) % seed.size()];
+    return values;
+}
+
+// Never -2^31, which no coder gives.
+inline std::vector<std::int32_t> integers(Reader& in, std::int64_t n) {
+    std::vector<std::int32_t> values = repeated<std::int32_t>(in, n);
+    for (std::int32_t& value : values) value = std::max(value, -std::numeric_limits<std::int32_t>::max());
+    return values;
+}
+
+// Levels of a mask: below 32 and below 16; all 0 where it is not `informed`.
+inline void mask_levels(Reader& in, bool informed, std::vector<std::uint8_t>& level, std::vector<std::uint8_t>& other) {
+    for (std::size_t i = 0; i < level.size() && informed; i++) {
+        const std::uint8_t both = i % 4 ? static_cast<std::uint8_t>(level[i - 1] + 1) : in.byte();
+        level[i] = both & 31;
+        other[i] = both >> 4;
+    }
+}
+
+inline std::vector<std::int16_t> tap_weights(Reader& in, const Passes& with) {
+    std::vector<std::int16_t> weights = in.numbers<std::int16_t>(static_cast<std::int64_t>(with.taps.size() / 5));
+    for (std::int16_t& weight : weights) weight = std::max<std::int16_t>(weight, -32767);
+    return weights;
+}

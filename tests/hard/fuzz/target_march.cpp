@@ -6,6 +6,7 @@
 
 #include "march.hpp"
 #include "reader.hpp"
+#include "setups.hpp"
 
 using std::int64_t;
 
@@ -23,13 +24,6 @@ double number_of(Reader& in) {
     if (kind < 200) return (static_cast<double>(in.byte()) - 128) / 8;
     const double value = in.finite<double>();
     return std::max(-1e100, std::min(1e100, value));
-}
-
-template <class T> std::vector<T> repeated(Reader& in, int64_t n) {
-    const std::vector<T> seed = in.numbers<T>(11);
-    std::vector<T> values(static_cast<std::size_t>(n));
-    for (std::size_t i = 0; i < values.size(); i++) values[i] = seed[(i * 3 + i / 5) % seed.size()];
-    return values;
 }
 
 }  // namespace

@@ -1,16 +1,17 @@
-// One entry per decoding function of the native library: hostile bytes become arguments as far as Python passes them unchecked.
+// One entry per kind of function of the native library: hostile bytes become arguments as far as Python passes them unchecked.
 //
 // The first byte of an input chooses the function. Arrays lie in memory of their own and of exact length, so that the address sanitizer sees
 // every step beyond them.
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 #include "reader.hpp"
 #include "setups.hpp"
 
 using std::int64_t;
 
+void round_trip(Reader& in);  // target_encode.cpp
+void light(Reader& in);       // target_light.cpp
 #if defined(FHASH_FUZZ_MARCH)
 void march(Reader& in);  // target_march.cpp
 #endif
@@ -53,19 +54,6 @@ int64_t fhash_dequantise_f64(const std::int32_t*, int64_t, double, double, doubl
 
 namespace {
 
-const Setups& setups() {
-    static const Setups loaded(std::getenv("FHASH_FUZZ_SETUPS"));
-    return loaded;
-}
-
-int64_t volume(const std::vector<int64_t>& shape) { return shape[0] * shape[1] * shape[2] * shape[3]; }
-
-std::vector<int64_t> small_shape(Reader& in, int64_t most) {
-    std::vector<int64_t> shape;
-    for (int axis = 0; axis < 4; axis++) shape.push_back(in.within(1, axis == 3 ? 3 * most : most));
-    return shape;
-}
-
 void decode_integers(Reader& in) {
     const Bands& with = setups().bands[in.word() % setups().bands.size()];
     const State& prior = setups().coder;
@@ -82,11 +70,7 @@ void decode_mask(Reader& in) {
     const std::size_t n = static_cast<std::size_t>(volume(shape));
     std::vector<std::uint8_t> mask(n), level(n), other(n);
     const bool informed = in.byte() & 1;
-    for (std::size_t i = 0; i < n && informed; i++) {
-        const std::uint8_t both = i % 4 ? static_cast<std::uint8_t>(level[i - 1] + 1) : in.byte();
-        level[i] = both & 31;
-        other[i] = both >> 4;
-    }
+    mask_levels(in, informed, level, other);
     const std::vector<std::uint8_t> data = in.rest();
     fhash_decode_mask(mask.data(), level.data(), other.data(), shape.data(), prior.slots.data(), static_cast<int64_t>(prior.slots.size() / 4),
                       prior.weights.data(), static_cast<int64_t>(prior.weights.size()), prior.simples.data(),
@@ -96,8 +80,7 @@ void decode_mask(Reader& in) {
 void decode_predicted(Reader& in) {
     const Passes& with = setups().passes[in.word() % setups().passes.size()];
     const State& blank = setups().predictor;
-    std::vector<std::int16_t> weights = in.numbers<std::int16_t>(static_cast<int64_t>(with.taps.size() / 5));
-    for (std::int16_t& weight : weights) weight = std::max<std::int16_t>(weight, -32767);
+    const std::vector<std::int16_t> weights = tap_weights(in, with);
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();
     fhash_decode_predicted(q.data(), with.shape.data(), with.levels.data(), with.passes.data(), static_cast<int64_t>(with.passes.size() / 4),
@@ -180,20 +163,6 @@ void head(Reader& in) {
              low, high, 0.5F / sigma, unit, out.data());
 }
 
-template <class T> std::vector<T> repeated(Reader& in, int64_t n) {
-    const std::vector<T> seed = in.numbers<T>(12);
-    std::vector<T> values(static_cast<std::size_t>(n));
-    for (std::size_t i = 0; i < values.size(); i++) values[i] = seed[(i * 5 + i / 7) % seed.size()];
-    return values;
-}
-
-// Never -2^31, which no coder gives.
-std::vector<std::int32_t> integers(Reader& in, int64_t n) {
-    std::vector<std::int32_t> values = repeated<std::int32_t>(in, n);
-    for (std::int32_t& value : values) value = std::max(value, -std::numeric_limits<std::int32_t>::max());
-    return values;
-}
-
 void values(Reader& in) {
     const std::uint8_t which = in.byte();
     const int64_t n = in.word() % 3000;
@@ -234,9 +203,9 @@ void values(Reader& in) {
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
     Reader in(data, size);
 #if defined(FHASH_FUZZ_MARCH)
-    const int targets = 7;
+    const int targets = 9;
 #else
-    const int targets = 6;
+    const int targets = 8;
 #endif
     switch (in.byte() % targets) {
         case 0: decode_integers(in); break;
@@ -245,6 +214,8 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
         case 3: transform(in); break;
         case 4: head(in); break;
         case 5: values(in); break;
+        case 6: round_trip(in); break;
+        case 7: light(in); break;
 #if defined(FHASH_FUZZ_MARCH)
         default: march(in);
 #endif

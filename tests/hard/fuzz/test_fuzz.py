@@ -39,7 +39,7 @@ def test_an_overrun_is_found(folder, tmp_path, monkeypatch):
     (tmp_path / "core.hpp").write_text((run.NATIVE / "core.hpp").read_text(encoding="utf-8"), encoding="utf-8")
     monkeypatch.setattr(run, "NATIVE", tmp_path)
     monkeypatch.setattr(run, "SOURCES", ("quantise",))
-    monkeypatch.setattr(run, "TARGETS", run.HERE / "overrun.cpp")
+    monkeypatch.setattr(run, "TARGETS", (run.HERE / "overrun.cpp",))
     try:
         found = run.fuzz(folder / "overrun", tmp_path / "crashes", seconds=2.0, processes=1, optimise="-O0")
     except run.CannotBuild as error:
