@@ -24,18 +24,12 @@ from fhash_formats.transform.decoding import linear_values, predicted_values, tr
 from fhash_formats.transform.mask import decode_mask
 from fhash_formats.transform.predict import decode_predicted
 from fhash_formats.transform.sections import (
-    EMPTY,
-    EXACT,
-    FORMAT,
-    MASKED,
     MISSING,
     OWN,
-    PREDICTED,
-    PREDICTED_MASKED,
     RESIDUAL,
     little,
+    parts_of,
     section,
-    sections_of,
 )
 from fhash_formats.transform.settings import Settings
 
@@ -168,27 +162,26 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _restreamed(chance: random.Random, stream: bytes, settings: Settings, shape: tuple[int, ...]) -> bytes:
-    flags = stream[0]
-    coded = not flags & (EXACT | EMPTY)
-    sections = [bytes(part) for part in sections_of(memoryview(stream)[5 if coded else 1 :])]
-    if not coded:
+    parts = parts_of(stream)
+    flags, sections = parts.flags, parts.sections()
+    if not parts.coded:
         return stream[:1] + b"".join(section(damaged(chance, part)) for part in sections)
     first = bool(flags & OWN) + bool(flags & MISSING)
     at = chance.randrange(first, len(sections))
     sections[at] = damaged(chance, sections[at])
-    if chance.random() < 0.15 and not flags & RESIDUAL and flags & 0xE0 in (FORMAT, MASKED):  # a residual where none was
+    if chance.random() < 0.15 and not flags & RESIDUAL and not parts.predicted:  # a residual where none was
         flags |= RESIDUAL
         sections.insert(first + 1, chance.randbytes(chance.randrange(200)))
     try:
-        if flags & 0xE0 in (PREDICTED, PREDICTED_MASKED) and settings.predictor is not None:
+        if parts.predicted and settings.predictor is not None:
             integers = decode_predicted(sections[first], shape, settings.predictor)
         else:
             integers = decode_integers(sections[first], shape, band_table(settings.transform, shape))
         digest = zlib.crc32(little(integers))
         if flags & RESIDUAL:
             digest = zlib.crc32(little(decode_integers(sections[first + 1], shape, single_band(shape))), digest)
-        if flags & 0xE0 in (MASKED, PREDICTED_MASKED) and settings.mask is not None and sections[-1]:
-            sections[-1] = _mask_section(sections[-1][2:], integers, settings, shape, bool(flags & 0xE0 == PREDICTED_MASKED))
+        if parts.masked and settings.mask is not None and sections[-1]:
+            sections[-1] = _mask_section(sections[-1][2:], integers, settings, shape, parts.predicted)
     except FhashError:
         digest = chance.getrandbits(32)
     return bytes([flags]) + digest.to_bytes(4, "little") + b"".join(map(section, sections))

@@ -21,23 +21,13 @@ from fhash_formats.transform.predict import decode_predicted, values_of
 from fhash_formats.transform.predictor import Predictor
 from fhash_formats.transform.quantise import dequantise
 from fhash_formats.transform.sections import (
-    EMPTY,
     EXACT,
-    FORMAT,
-    MASKED,
-    MISSING,
-    OWN,
-    PREDICTED,
-    PREDICTED_MASKED,
-    RESIDUAL,
     Shape,
-    check_ended,
     exact_values,
-    last_section,
     little,
     no_levels,
+    parts_of,
     restored,
-    sections_of,
     settings_from,
     unpack_mask,
 )
@@ -79,74 +69,56 @@ def _decode(
     data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: Settings | None, lod: int
 ) -> tuple[Values, Mask | None]:
     kind = np.dtype(dtype)
-    data = memoryview(data)
-    if not len(data):
-        raise DamagedFileError("a coded tile is empty")
-    flags = data[0]
-    if flags & 0xE0 not in (FORMAT, MASKED, PREDICTED, PREDICTED_MASKED):
-        raise DamagedFileError(f"a coded tile begins with {flags:#04x}, which is no known stream format")
-    masked, predicted = flags & 0xE0 in (MASKED, PREDICTED_MASKED), flags & 0xE0 in (PREDICTED, PREDICTED_MASKED)
-    coded = not flags & (EXACT | EMPTY)
-    if predicted and flags & (EXACT | EMPTY | RESIDUAL):
-        raise DamagedFileError("a coded tile is by prediction and something else as well")
-    if len(data) < 5 and coded:
-        raise DamagedFileError("a coded tile is cut short")
-    digest = int.from_bytes(data[1:5], "little") if coded else 0
-    sections = sections_of(data[5:] if coded else data[1:])
-    if flags & OWN:
-        settings = settings_from(next(sections, b""))
-    missing = bytes(next(sections, b"")) if flags & MISSING else b""
-    if flags & MISSING and not missing:
-        raise DamagedFileError("a coded tile has lost its missing values")
-    if flags & EXACT:
-        values = exact_values(next(sections, b""), shape, kind)
-        mask = unpack_mask(last_section(sections), no_levels(shape)) if masked else None
-        check_ended(sections)
+    parts = parts_of(data)
+    if parts.settings is not None:
+        settings = settings_from(parts.settings)
+    missing = b"" if parts.missing is None else bytes(parts.missing)
+    if parts.flags & EXACT:
+        assert parts.body is not None
+        values = exact_values(parts.body, shape, kind)
+        mask = None if parts.mask is None else unpack_mask(parts.mask, no_levels(shape))
         return values[_every(lod)] if lod else values, mask
     if settings is None:
         raise DamagedFileError("a coded tile has no settings")
     largest = _check_numbers(settings, kind)
-    if flags & EMPTY:
-        check_ended(sections)
+    if parts.body is None:
         result = cast(np.full(_lod_shape(shape, lod), settings.center), kind)
         if lod:
             return result, None
-        mask = np.zeros(shape, bool) if masked else None
+        mask = np.zeros(shape, bool) if parts.masked else None
         return restored(outside(result, mask, settings), missing), mask
     predictor = settings.predictor
     transform = None
-    if not predicted:
+    if not parts.predicted:
         # Before anything is decoded: the bands of what does not fit would lie beyond the tile.
         try:
             transform = transform_for(settings, shape)
         except InputError as error:
             raise DamagedFileError(f"the settings of a coded tile do not fit its shape: {error}") from error
-        integers = decode_integers(next(sections, b""), shape, band_table(settings.transform, shape))
+        integers = decode_integers(parts.body, shape, band_table(settings.transform, shape))
     elif predictor is not None:
-        integers = decode_predicted(next(sections, b""), shape, predictor)
+        integers = decode_predicted(parts.body, shape, predictor)
     else:
         raise DamagedFileError("a coded tile is by prediction, of which its settings know nothing")
     crc = zlib.crc32(little(integers))
     residual = None
-    if flags & RESIDUAL:
-        residual = decode_integers(next(sections, b""), shape, single_band(shape))
+    if parts.residual is not None:
+        residual = decode_integers(parts.residual, shape, single_band(shape))
         crc = zlib.crc32(little(residual), crc)
-    packed = last_section(sections) if masked else None
-    check_ended(sections)
-    if crc != digest:
+    if crc != parts.digest:
         raise DamagedFileError("the decoded integers of a tile differ from their digest")
     if transform is None:
         assert predictor is not None
         found = predicted_values(integers, predictor, settings)
         if lod:
             return cast(found[_every(lod)], kind), None
-        mask = None if packed is None else _mask_of(packed, found, settings)
+        mask = None if parts.mask is None else _mask_of(parts.mask, found, settings)
         return restored(outside(cast(found, kind), mask, settings), missing), mask
     if lod:
         coarse = transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype), lod=lod)
         return cast(_shifted(coarse, settings), kind), None
     linear = linear_values(integers, transform, settings)
-    mask = None if packed is None else _mask_of(packed, linear, settings)
+    mask = None if parts.mask is None else _mask_of(parts.mask, linear, settings)
     base = linear if settings.head is None else settings.head.apply(linear)
     found = corrected(base, residual, settings.quantum, kind)
     # Only with a residual can values leave the range.

@@ -18,6 +18,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -40,19 +41,18 @@ __all__ = [
     "PREDICTED",
     "PREDICTED_MASKED",
     "RESIDUAL",
+    "Parts",
     "Shape",
     "assembled",
-    "check_ended",
     "exact_bytes",
     "exact_values",
-    "last_section",
     "little",
     "no_levels",
     "pack_mask",
     "pack_missing",
+    "parts_of",
     "restored",
     "section",
-    "sections_of",
     "settings_from",
     "unpack_mask",
 ]
@@ -64,6 +64,31 @@ Mask = npt.NDArray[np.bool_]
 OWN, MISSING, RESIDUAL, EXACT, EMPTY = 1, 2, 4, 8, 16
 FORMAT, MASKED, PREDICTED, PREDICTED_MASKED = 1 << 5, 2 << 5, 3 << 5, 4 << 5
 """The upper three bits of the flags are the number of the stream format, 1 or with a mask 2; by prediction 3, or with a mask 4."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts:
+    """A stream taken apart.
+
+    flags: the first byte; masked, predicted: what its number says; coded: whether `body` is coded integers, else exact values or nothing.
+    digest: CRC-32 of the integers, 0 where none are coded. The rest are the sections, None where the flags say that there is none: own
+    settings, missing, coefficients or exact values, residual, mask.
+    """
+
+    flags: int
+    masked: bool
+    predicted: bool
+    coded: bool
+    digest: int
+    settings: memoryview | None = None
+    missing: memoryview | None = None
+    body: memoryview | None = None
+    residual: memoryview | None = None
+    mask: memoryview | None = None
+
+    def sections(self) -> list[bytes]:
+        """Those that there are, in their order."""
+        return [bytes(part) for part in (self.settings, self.missing, self.body, self.residual, self.mask) if part is not None]
 
 
 def assembled(
@@ -105,7 +130,43 @@ def section(data: bytes) -> bytes:
             return bytes(head) + data
 
 
-def sections_of(data: memoryview) -> Iterator[memoryview]:
+def parts_of(data: bytes | memoryview) -> Parts:
+    """A stream taken apart; raises DamagedFileError where flags contradict each other, or other sections are there than they say.
+
+    All of that is known before anything is decoded, which may take long.
+    """
+    data = memoryview(data)
+    if not len(data):
+        raise DamagedFileError("a coded tile is empty")
+    flags = data[0]
+    number = flags & 0xE0
+    if number not in (FORMAT, MASKED, PREDICTED, PREDICTED_MASKED):
+        raise DamagedFileError(f"a coded tile begins with {flags:#04x}, which is no known stream format")
+    masked, predicted, coded = number in (MASKED, PREDICTED_MASKED), number in (PREDICTED, PREDICTED_MASKED), not flags & (EXACT | EMPTY)
+    if predicted and flags & (EXACT | EMPTY | RESIDUAL):
+        raise DamagedFileError("a coded tile is by prediction and something else as well")
+    if coded and len(data) < 5:
+        raise DamagedFileError("a coded tile is cut short")
+    empty = not coded and not flags & EXACT
+    expected = {
+        "settings": bool(flags & OWN),
+        "missing": bool(flags & MISSING),
+        "body": not empty,
+        "residual": coded and bool(flags & RESIDUAL),
+        "mask": masked and not empty,
+    }
+    names = [name for name, there in expected.items() if there]
+    sections = list(_sections(data[5:] if coded else data[1:]))
+    if len(sections) != len(names):
+        raise DamagedFileError(f"a coded tile has {len(sections)} sections; its flags say {len(names)}")
+    found = dict(zip(names, sections, strict=True))
+    if flags & MISSING and not len(found["missing"]):
+        raise DamagedFileError("a coded tile has lost its missing values")
+    digest = int.from_bytes(data[1:5], "little") if coded else 0
+    return Parts(flags=flags, masked=masked, predicted=predicted, coded=coded, digest=digest, **found)
+
+
+def _sections(data: memoryview) -> Iterator[memoryview]:
     """The sections one after the other; DamagedFileError where one reaches beyond the end."""
     at = 0
     while at < len(data):
@@ -122,20 +183,6 @@ def sections_of(data: memoryview) -> Iterator[memoryview]:
             raise DamagedFileError("a coded tile is cut short")
         yield data[at : at + size]
         at += size
-
-
-def last_section(sections: Iterator[memoryview]) -> memoryview:
-    """The section of the mask; DamagedFileError where there is none."""
-    found = next(sections, None)
-    if found is None:
-        raise DamagedFileError("a coded tile has lost its mask")
-    return found
-
-
-def check_ended(sections: Iterator[memoryview]) -> None:
-    """DamagedFileError where there is one more section."""
-    if next(sections, None) is not None:
-        raise DamagedFileError("a coded tile has more sections than its flags say")
 
 
 def _own(settings: Settings | None) -> list[bytes]:

@@ -113,11 +113,12 @@ def test_disk_error_while_reading(sample, monkeypatch):
             container.arrays["mlp/weight_1"].read()
 
 
-def test_what_does_not_fit_in_memory_is_refused(sample, monkeypatch):
+def test_what_does_not_fit_in_memory_is_not_called_damaged(sample, monkeypatch):
+    """Or a sound file might be thrown away."""
     with Container.open(sample) as container:
         array = container.arrays["mlp/weight_1"]
         monkeypatch.setattr(array, "_decode", lambda index, lod: (_ for _ in ()).throw(MemoryError()))
-        with pytest.raises(DamagedFileError, match="memory"):
+        with pytest.raises(MemoryError):
             array.read()
 
 

@@ -10,10 +10,11 @@ import numpy.typing as npt
 import pytest
 
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
+from fhash_formats.transform import decoding
 from fhash_formats.transform.bands import band_table, single_band
 from fhash_formats.transform.basis import Basis
 from fhash_formats.transform.coder import encode_integers
-from fhash_formats.transform.sections import assembled
+from fhash_formats.transform.sections import assembled, parts_of, section
 from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile import decode_tile, encode_tile, exact_tile, within
@@ -137,6 +138,23 @@ def test_damage_is_found(name: str) -> None:
         except DamagedFileError:
             refused += 1
     assert refused > 0.95 * len(damaged)
+
+
+@pytest.mark.parametrize("name", list(streams()))
+def test_other_sections_than_the_flags_say_are_damage_before_anything_is_decoded(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    values, data = streams()[name]
+    parts = parts_of(data)
+    head = data[:5] if parts.coded else data[:1]
+    assert head + b"".join(map(section, parts.sections())) == data
+
+    def decoded(*_: object) -> None:
+        pytest.fail("decoded")
+
+    for function in ("decode_integers", "decode_predicted", "exact_values"):
+        monkeypatch.setattr(decoding, function, decoded)
+    for sections in ([*parts.sections(), b""], parts.sections()[:-1]):
+        with pytest.raises(DamagedFileError, match="sections; its flags say"):
+            decode_tile(head + b"".join(map(section, sections)), values.shape, values.dtype)
 
 
 @pytest.mark.parametrize("change", [{"step": 10**400}, {"step": 1e300}, {"step": "1"}, {"range": 3}, {"transform": []}, {"center": None}])

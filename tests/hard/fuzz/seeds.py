@@ -19,7 +19,7 @@ from fhash_formats.transform.mask import encode_mask, mask_prior_state
 from fhash_formats.transform.predict import _blank, encode_predicted
 from fhash_formats.transform.predictor import Predictor, pass_arrays, passes_of
 from fhash_formats.transform.prior import prior_state
-from fhash_formats.transform.sections import EMPTY, EXACT, MISSING, OWN, PREDICTED, sections_of
+from fhash_formats.transform.sections import parts_of
 from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
 
@@ -121,11 +121,8 @@ def golden_streams() -> Iterator[tuple[bytes, Settings, tuple[int, int, int, int
 
 def coefficients_of(stream: bytes) -> bytes:
     """The section of coded coefficients; nothing where there is none."""
-    flags = stream[0]
-    if flags & (EXACT | EMPTY) or flags & 0xE0 >= PREDICTED:
-        return b""
-    parts = [bytes(part) for part in sections_of(memoryview(stream)[5:])]
-    return parts[bool(flags & OWN) + bool(flags & MISSING)]
+    parts = parts_of(stream)
+    return bytes(parts.body) if parts.coded and not parts.predicted and parts.body is not None else b""
 
 
 def _spec(axes: tuple[tuple[str, int], ...]) -> TransformSpec:
