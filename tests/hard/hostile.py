@@ -31,7 +31,7 @@ class Report:
     """Counts of ends by command; what may not be; and the worst figures of all commands, each with the number of its mutation."""
 
     mutations: int = 0
-    ends: Counter[str] = field(default_factory=Counter)
+    ends: dict[str, Counter[str]] = field(default_factory=dict)
     kinds: dict[str, Counter[str]] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)
     worst_seconds: tuple[float, str] = (0.0, "")
@@ -42,7 +42,7 @@ class Report:
         self.mutations += 1
         name = f"{answer['number']} ({answer['kind']} of {answer['golden']})"
         for end in answer["ends"]:
-            self.ends[f"{end['command']}: {end['end']}"] += 1
+            self.ends.setdefault(end["command"], Counter())[end["end"]] += 1
             self.kinds.setdefault(answer["kind"], Counter())[end["end"]] += 1
             self.worst_seconds = max(self.worst_seconds, (end["seconds"], f"{name}, {end['command']}"))
             self.worst_bytes = max(self.worst_bytes, (end["bytes"], f"{name}, {end['command']}"))
@@ -53,13 +53,13 @@ class Report:
         """JSON values."""
         return {
             "mutations": self.mutations,
-            "ends": dict(sorted(self.ends.items())),
-            "ends_by_kind": {kind: dict(counts) for kind, counts in sorted(self.kinds.items())},
             "wrong": len(self.wrong),
             "worst_seconds": round(self.worst_seconds[0], 3),
             "slowest": self.worst_seconds[1],
             "worst_bytes": self.worst_bytes[0],
             "largest": self.worst_bytes[1],
+            "command": {command: dict(counts) for command, counts in self.ends.items()},
+            "kind of mutation": {kind: dict(counts) for kind, counts in sorted(self.kinds.items())},
         }
 
 

@@ -31,23 +31,32 @@ ABOUT = {
 
 
 def text(records: list[dict[str, Any]]) -> str:
-    """A section for each case, a row for each of its records."""
+    """A section for each case, a row for each of its records; figures that are tables themselves come after it."""
     cases: dict[str, list[dict[str, Any]]] = {}
     for record in records:
         cases.setdefault(record.pop("case"), []).append(record)
     parts = ["## Hostile files and faults\n\nMade by `make hard`.\n"]
-    for case, rows in cases.items():
-        columns = list(dict.fromkeys(name for row in rows for name in row))
-        lines = [columns, ["---"] * len(columns), *([_cell(row.get(name, "")) for name in columns] for row in rows)]
+    for case, records_of_case in cases.items():
         about = ABOUT.get(case, "")
-        parts.append(f"### {case[0].upper()}{case[1:]}\n\n" + (f"{about}\n\n" if about else ""))
-        parts[-1] += "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+        plain = [{name: value for name, value in record.items() if not isinstance(value, dict)} for record in records_of_case]
+        tables = [_table(plain)]
+        for record in records_of_case:
+            tables += [
+                _table([{name: row, **columns} for row, columns in value.items()])
+                for name, value in record.items()
+                if isinstance(value, dict)
+            ]
+        parts.append("\n\n".join([f"### {case[0].upper()}{case[1:]}", *([about] if about else []), *tables]) + "\n")
     return "\n".join(parts)
 
 
+def _table(rows: list[dict[str, Any]]) -> str:
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    lines = [columns, ["---"] * len(columns), *([_cell(row.get(name, "")) for name in columns] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
 def _cell(value: Any) -> str:
-    if isinstance(value, dict):
-        return ", ".join(f"{name} {_cell(part)}" for name, part in value.items())
     if isinstance(value, float):
         return f"{value:.4g}"
     return f"{value:,}" if isinstance(value, int) else str(value).replace("|", "\\|")
