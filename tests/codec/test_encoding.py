@@ -389,7 +389,7 @@ def test_a_promise_cannot_hold_where_the_psnr_is_unknown(tmp_path):
 
 
 def test_a_failure_after_the_training_leaves_its_checkpoint(tmp_path, monkeypatch):
-    monkeypatch.setattr("fhash_codec.encoding.KEEP_SECONDS", 0.0)
+    monkeypatch.setattr("fhash_codec.trained.KEEP_SECONDS", 0.0)
     config = EncodeConfig(profile="paper", epochs=2, width=16, timings=False)
     fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
     trained = []
@@ -412,7 +412,7 @@ def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_training(tmp_path
     def full(*args):
         raise OutputError("no space left")
 
-    monkeypatch.setattr("fhash_codec.encoding.KEEP_SECONDS", 0.0)
+    monkeypatch.setattr("fhash_codec.trained.KEEP_SECONDS", 0.0)
     monkeypatch.setattr("fhash_codec.checkpoint.save_checkpoint", full)
     with pytest.warns(fhash_codec.FhashWarning, match="no checkpoint: no space left"):
         fhash_codec.encode(field(), tmp_path / "a.fhz", QUICK)
