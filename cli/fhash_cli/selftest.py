@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,16 +46,19 @@ def command(
     from fhash_codec.selftest.catalogue import chosen
     from fhash_codec.selftest.workers import run_cases
 
+    begun = time.perf_counter()
     cases = chosen(names=names, groups=groups, everything=everything)
     with Progress(quiet=quiet) as progress:
         summary = run_cases(cases, everything=everything, processes=processes, progress=progress)
     if report is not None:
+        from fhash_codec.selftest.environment import surroundings
         from fhash_codec.selftest.report import markdown
         from fhash_formats.writers.atomic import replacing
 
         given = "".join([" --all" * everything, *(f" --case {name}" for name in names), *(f" --group {name}" for name in groups)])
+        where = f"It took {(time.perf_counter() - begun) / 60:.1f} minutes with {surroundings()}."
         with replacing(Path(report), force=force) as temporary:
-            temporary.write_text(markdown(summary, options=given), encoding="utf-8")
+            temporary.write_text(markdown(summary, options=given, where=where), encoding="utf-8")
     emit(summary.to_dict(), _text(summary), as_json)
     context.exit(0 if summary.holds else 1)
 

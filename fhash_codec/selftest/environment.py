@@ -1,12 +1,34 @@
-"""What the codec reads from the environment, set for a while."""
+"""Where the codec runs: what it reads from the environment, set for a while, and what there is of machine and libraries."""
 
 from __future__ import annotations
 
 import os
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 
-__all__ = ["environment"]
+from fhash_formats import native
+from fhash_formats.container.parallel import usable_threads
+
+__all__ = ["environment", "surroundings"]
+
+
+def surroundings() -> str:
+    """Versions, machine and what is used of it, in a line. Loads torch."""
+    from fhash_codec.engines import choose_device
+
+    parts = [
+        f"fhash {version('fhash')}",
+        f"Python {platform.python_version()}",
+        f"numpy {version('numpy')}",
+        f"torch {version('torch')}",
+        f"{platform.system()} {platform.machine()}",
+        f"{usable_threads()} processors",
+        "without the native core" if native.library() is None else "native core",
+        "CUDA" if choose_device("auto").type == "cuda" else "no CUDA",
+    ]
+    return ", ".join(parts)
 
 
 @contextmanager

@@ -13,17 +13,20 @@ HEAD = """\
 # Numerical stability
 
 Made by `fhash selftest{options} --report`: {cases} hard cases, each encoded under several settings, decoded and drawn. A figure holds where
-it is at most its limit. Of each case the property is shown that came nearest to its limit.
+it is at most its limit. Of each case the property is shown that came nearest to its limit.{where}
 
 **{verdict}**
 """
 
 
-def markdown(summary: Summary, *, options: str = "") -> str:
-    """The verdict, the worst figure of every property, then of every case, group by group. options: of the command that made it."""
+def markdown(summary: Summary, *, options: str = "", where: str = "") -> str:
+    """The verdict, the worst figure of every property, then of every case, group by group.
+
+    options: of the command that made it. where: a sentence on machine and time.
+    """
     failures = summary.failures
     verdict = "Everything holds." if summary.holds else "1 does not hold." if len(failures) == 1 else f"{len(failures)} do not hold."
-    parts = [HEAD.format(options=options, cases=len(summary.results), verdict=verdict)]
+    parts = [HEAD.format(options=options, cases=len(summary.results), verdict=verdict, where=where and f"\n\n{where}")]
     if failures:
         parts.append("## What does not hold\n\n" + "\n".join(f"- {_plain(line)}" for line in failures) + "\n")
     worst = summary.worst()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import platform
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -72,6 +74,7 @@ def test_all_runs_more(fhash, measured):
 def test_the_report_is_written_once(fhash, measured, tmp_path: Path):
     path = tmp_path / "stability.md"
     assert fhash("selftest", "--case", "spike", "--report", path, "--quiet").exit_code == 0
+    assert f"minutes with fhash {version('fhash')}, Python {platform.python_version()}," in path.read_text()
     assert "| spike | one value of 1e6, all others 0 | psnr | bound (psnr) | 0.5 of it | 1 |" in path.read_text()
     again = fhash("selftest", "--case", "spike", "--report", path)
     assert again.exit_code == 2
