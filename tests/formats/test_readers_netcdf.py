@@ -94,6 +94,34 @@ def test_packing_is_undone_and_fill_values_are_nan(tmp_path: Path, stored: str, 
     np.testing.assert_array_equal(got, np.where(raw == fill, np.nan, raw * 0.25 + 10.0))
 
 
+@pytest.mark.parametrize(
+    ("stored", "fill", "packing"),
+    [
+        ("i8", -(2**63) + 2, {}),
+        ("u8", 2**64 - 2, {}),
+        ("i8", -2, {"_Unsigned": "true"}),
+        ("i8", 2**62, {"scale_factor": 0.5, "add_offset": 1.0}),
+    ],
+)
+def test_neighbours_of_a_fill_value_that_float64_does_not_tell_from_it_are_values(
+    tmp_path: Path, stored: str, fill: int, packing: dict[str, object]
+) -> None:
+    raw = np.zeros(VALUES.shape, stored)
+    raw[0, 0, 0, :3] = np.array([fill, fill + 1, 7], stored)
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        variable = file.create_dataset("v", data=raw)
+        for place, name in enumerate(DIMS):
+            file[name] = np.arange(float(raw.shape[place]))
+            file[name].make_scale(name)
+            variable.dims[place].attach_scale(file[name])
+        variable.attrs.update({"_FillValue": raw.dtype.type(fill), **packing})
+    got = frames(tmp_path / "a.nc")
+    numbers = raw.view("u8") if "_Unsigned" in packing else raw
+    expected = numbers.astype(np.float64) * packing.get("scale_factor", 1) + packing.get("add_offset", 0)
+    expected[0, 0, 0, 0] = np.nan
+    np.testing.assert_array_equal(got, expected)
+
+
 def test_fill_values_of_floats(tmp_path: Path) -> None:
     values = VALUES.copy()
     values[0, 1, 2, 3] = np.nan

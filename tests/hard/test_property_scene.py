@@ -23,7 +23,7 @@ import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning, Renderer, Volume
 from fhash_codec.render.image import Image
 from fhash_codec.render.record import Record
-from fhash_codec.render.scene import Scene
+from fhash_codec.render.scene import Scene, Shading
 from fhash_formats.errors import FhashError, InputError, RegionError
 
 COLOURS = st.sampled_from(["#000000", "#ff8000", "white", "red", "transparent", "no colour"])
@@ -208,6 +208,7 @@ FOUND: dict[str, dict[str, Any]] = {
     "a focal point far away": {"camera": {"focal_point": [0.0, 0.0, 1e100]}},
     "light hardly aslant": {"effects": {"shadows": {"light": [0.0, 2.2471164185778944e307, 0.5]}}},
     "a tiny unit of distance": {"scale": [1.0, 1.0, 1.9e27], "transfer_function": {"unit_distance": 1e-100}},
+    "all the light there may be": {"effects": {"shading": {"ambient": 10.0, "diffuse": 10.0, "specular": 10.0, "specular_power": 1.0}}},
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
 """Scenes that the test below has found."""
@@ -242,8 +243,9 @@ def check_picture(volume: Volume, scene: Scene) -> None:
     assert np.isfinite(image.rgba).all()
     assert image.rgba.min() >= -1e-6
     assert image.rgba[..., 3].max() <= 1 + 1e-5
-    lit = scene.effects.shading is not None or bool(scene.effects.isosurfaces)  # highlights are added
-    assert (image.rgba[..., :3].max(axis=-1) <= image.rgba[..., 3] * (1 + 1e-5) + 11 * lit + 1e-5).all()
+    light = scene.effects.shading or Shading()  # surfaces are always lit
+    brightest = max(1.0, light.ambient + light.diffuse + light.specular)
+    assert (image.rgba[..., :3].max(axis=-1) <= image.rgba[..., 3] * brightest * (1 + 1e-5) + 1e-5).all()
     if image.depth is not None:
         assert not np.isnan(image.depth).any()
     if image.normal is not None:

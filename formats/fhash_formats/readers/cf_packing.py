@@ -1,4 +1,4 @@
-"""Packed values in zarr arrays, as xarray writes them: fill values and scaling by the CF conventions (1.11, sections 2.5.1 and 8.1).
+"""Packed values, as xarray writes them to zarr arrays: fill values and scaling by the CF conventions (1.11, sections 2.5.1 and 8.1).
 
 xarray is not needed for it: value = stored * scale_factor + add_offset, and NaN where stored equals `_FillValue` or `missing_value`.
 The type of the result follows xarray: float64 where there is a scale or an offset (JSON numbers have no narrower type), for fill values

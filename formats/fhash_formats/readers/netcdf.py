@@ -10,13 +10,17 @@ from __future__ import annotations
 import gc
 import importlib
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
+
 from fhash_formats.attributes import PACKING, PLUMBING, json_attributes, text_of
 from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.readers.cf_packing import packing
 from fhash_formats.readers.failures import Stamp, condense, refusing
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.readers.hdf5_tree import require_filters
@@ -29,6 +33,9 @@ from fhash_formats.series import AXES, Coordinate
 
 if TYPE_CHECKING:
     import xarray as xr
+
+Values = npt.NDArray[Any]
+Exact = Callable[[Values, tuple[slice, ...]], Values]
 
 SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
 CLASSIC = (b"CDF\x01", b"CDF\x02")
@@ -132,9 +139,12 @@ def _series(source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Datas
     hints = [_role(dimension, scope) for dimension in dimensions]
     axes = assign_axes(source, array.shape, hints, dimensions, request.axes)
 
+    exact = _exactly_filled(source, path, variable.name, array.encoding)
+
     def fetch(ranges: tuple[slice, ...]) -> Any:
         with _quietly():
-            return array[ranges].to_numpy()
+            values = array[ranges].to_numpy()
+            return values if exact is None else exact(values, ranges)
 
     return FileSeries(
         source=source,
@@ -149,6 +159,32 @@ def _series(source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Datas
         chunks=array.encoding.get("chunksizes"),
         close=lambda: _close(groups),
     )
+
+
+def _exactly_filled(
+    source: str, path: Path, name: str, encoding: Mapping[str, Any]
+) -> Callable[[Values, tuple[slice, ...]], Values] | None:
+    """What tells the neighbours of a fill value from it, where float64 does not: None where it does.
+
+    xarray compares as float64, in which many 64-bit integers beyond 2^53 are the same.
+    """
+    import h5py
+
+    stored = np.dtype(encoding.get("dtype", np.float32))
+    if stored.kind not in "iu" or stored.itemsize < 8:
+        return None
+    plain = {key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value for key, value in encoding.items()}
+    packed = packing(source, stored, plain)
+    if all(abs(int(fill)) < 1 << 53 for fill in packed.fills):
+        return None
+
+    def exact(values: Values, ranges: tuple[slice, ...]) -> Values:
+        if not np.isnan(values).any():
+            return values
+        with h5py.File(path, "r") as file:
+            return packed.unpack(np.asarray(file[name][ranges]))
+
+    return exact
 
 
 def _check_filters(source: str, path: Path, name: str) -> None:
