@@ -77,19 +77,24 @@ def test_a_variable_of_time_spans_stays_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frames(path), VALUES)
 
 
-@pytest.mark.parametrize(("stored", "expected"), [("i2", "f8"), ("u1", "f8"), ("i4", "f8")])
-def test_packing_is_undone_and_fill_values_are_nan(tmp_path: Path, stored: str, expected: str) -> None:
-    fill = 200 if stored == "u1" else -99
-    raw = np.random.default_rng(1).integers(0, 100, VALUES.shape).astype(stored)
-    raw[1, 2, 3, 4] = fill
-    with h5py.File(tmp_path / "a.nc", "w") as file:
+def stored_as(path: Path, raw: np.ndarray, attributes: dict[str, object]) -> Path:
+    """A NetCDF4 file of numbers as they are stored, with the attributes that say what they mean."""
+    with h5py.File(path, "w") as file:
         variable = file.create_dataset("v", data=raw)
         for place, name in enumerate(DIMS):
             file[name] = np.arange(float(raw.shape[place]))
             file[name].make_scale(name)
             variable.dims[place].attach_scale(file[name])
-        variable.attrs.update({"_FillValue": raw.dtype.type(fill), "scale_factor": 0.25, "add_offset": 10.0})
-    got = frames(tmp_path / "a.nc")
+        variable.attrs.update(attributes)
+    return path
+
+
+@pytest.mark.parametrize(("stored", "expected"), [("i2", "f8"), ("u1", "f8"), ("i4", "f8")])
+def test_packing_is_undone_and_fill_values_are_nan(tmp_path: Path, stored: str, expected: str) -> None:
+    fill = 200 if stored == "u1" else -99
+    raw = np.random.default_rng(1).integers(0, 100, VALUES.shape).astype(stored)
+    raw[1, 2, 3, 4] = fill
+    got = frames(stored_as(tmp_path / "a.nc", raw, {"_FillValue": raw.dtype.type(fill), "scale_factor": 0.25, "add_offset": 10.0}))
     assert got.dtype == expected
     np.testing.assert_array_equal(got, np.where(raw == fill, np.nan, raw * 0.25 + 10.0))
 
@@ -108,14 +113,7 @@ def test_neighbours_of_a_fill_value_that_float64_does_not_tell_from_it_are_value
 ) -> None:
     raw = np.zeros(VALUES.shape, stored)
     raw[0, 0, 0, :3] = np.array([fill, fill + 1, 7], stored)
-    with h5py.File(tmp_path / "a.nc", "w") as file:
-        variable = file.create_dataset("v", data=raw)
-        for place, name in enumerate(DIMS):
-            file[name] = np.arange(float(raw.shape[place]))
-            file[name].make_scale(name)
-            variable.dims[place].attach_scale(file[name])
-        variable.attrs.update({"_FillValue": raw.dtype.type(fill), **packing})
-    got = frames(tmp_path / "a.nc")
+    got = frames(stored_as(tmp_path / "a.nc", raw, {"_FillValue": raw.dtype.type(fill), **packing}))
     numbers = raw.view("u8") if "_Unsigned" in packing else raw
     expected = numbers.astype(np.float64) * packing.get("scale_factor", 1) + packing.get("add_offset", 0)
     expected[0, 0, 0, 0] = np.nan
