@@ -37,6 +37,8 @@ VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]
 """Direction from the volume towards the camera, and what is upwards, as PyVista has them."""
 LONGEST = 1e100
 """Largest position that is drawn where it is, and the reciprocal of the shortest axis."""
+FARTHEST = 1e12
+"""Lengths of a vertex spacing that a picture is across, at most: eyes are a few times as far away, and float64 tells 1e-3 of one apart."""
 PARALLEL = 1e-6
 """Sine of the angle between view and upward direction below which the picture has no upright."""
 
@@ -60,6 +62,7 @@ class Grid:
 
         scale: factors by which the axes are stretched. If None they have the lengths of their coordinates, but for an axis in other
         units than the most have, whose length cannot be compared: its vertices are drawn as far apart as those of the others.
+        Raises InputError where axes are of lengths too different to place rays.
         """
         axes = [np.asarray(coords[axis].values, dtype=np.float64) for axis in "xyz"]
         spacing = np.full(3, np.nan)
@@ -82,10 +85,17 @@ class Grid:
         flat = np.isnan(spacing)
         factors = _proportions([coords[axis] for axis in "xyz"], np.abs(spacing)) if scale is None else np.array(scale, dtype=np.float64)
         spacing[flat] = np.mean(np.abs(spacing * factors)[~flat]) / factors[flat] if not flat.all() else 1.0
+        spacing *= factors
+        longest, shortest = float(np.max(np.abs(spacing) * [len(values) for values in axes])), float(np.min(np.abs(spacing)))
+        if longest > FARTHEST * shortest:
+            raise InputError(
+                f"the longest axis of the volume is {longest:.3g}, and vertices of the shortest are {shortest:.3g} apart: no ray can be "
+                f"placed that finely, at most {FARTHEST:.0e} times; stretch the axes with 'scale'"
+            )
         return cls(
             counts=(len(axes[0]), len(axes[1]), len(axes[2])),
             origin=origin * factors,
-            spacing=spacing * factors,
+            spacing=spacing,
             scale=(float(factors[0]), float(factors[1]), float(factors[2])),
         )
 

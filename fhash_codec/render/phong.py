@@ -7,7 +7,7 @@ from itertools import product
 
 from fhash_codec.render.arrays import Array, Arrays
 from fhash_codec.render.fields import Field
-from fhash_codec.render.setting import flatness
+from fhash_codec.render.setting import flatness, slope_scale
 from fhash_codec.render.task import LightGrid, Lighting, Task
 
 __all__ = ["LightAt", "Phong"]
@@ -36,12 +36,11 @@ class Phong:
         least, most = field.bricks.value_range
         low, high = (least, most) if task.table is None else (task.table.low, task.table.high)
         span, floor = flatness(low, high, least, most)
-        grid = task.rays.grid
         return cls(
             arrays=arrays,
             lighting=lighting,
             lamp=None if lighting.lamp is None else arrays.array(lighting.lamp, "float64"),
-            scale=arrays.array(field.stride * grid.vertex_spacing / (span * grid.spacing)),
+            scale=arrays.array(field.stride * slope_scale(task.rays.grid, span, least, most)),
             floor=floor,
         )
 

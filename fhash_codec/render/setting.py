@@ -8,14 +8,17 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.render.bricks import Bricks
+from fhash_codec.render.camera import Grid
 from fhash_codec.render.task import Frame, Table, Task
 
-__all__ = ["Setting", "empty_table", "flatness"]
+__all__ = ["Setting", "empty_table", "flatness", "slope_scale"]
 
 Floats = npt.NDArray[np.float64]
 
 FLATTEST = 1e-6
 """Of the value range per vertex: a gradient that counts as half of one. Rounding of the values raises it."""
+STEEPEST = 1e18
+"""The largest gradient whose square float32 can compute with."""
 LARGEST, SMALLEST = 1e36, 1e-28
 """Magnitude and range of values that float32 can compute with; others are scaled."""
 
@@ -83,7 +86,7 @@ class Setting:
             box=box,
             seen=seen,
             spacing=spacing,
-            gradient=stride * grid.vertex_spacing / (span * spacing),
+            gradient=slope_scale(grid, span, least, most),
             floor=floor,
             light_offset=np.zeros(3) if light is None else (first - light.first) / light.cell,
             light_scale=1.0 if light is None else stride / light.cell,
@@ -98,6 +101,18 @@ def flatness(low: float, high: float, least: float, most: float) -> tuple[float,
     span = max(high - low, (most - least) * 1e-15) or 1.0
     noise = 4 * 2.0**-23 * max(abs(least), abs(most)) / span
     return span, max(FLATTEST, min(noise, 1.0))
+
+
+def slope_scale(grid: Grid, span: float, least: float, most: float) -> Floats:
+    """Factors (3,), x, y, z, from differences between vertices to gradients: shares of `span` in the distance of vertices.
+
+    No more than what makes STEEPEST of the difference between least and most, the values of the frame: with axes of lengths that differ
+    that much the direction is the same, and float32 has no room for the squares of more.
+    """
+    with np.errstate(over="ignore", divide="ignore"):
+        limit = STEEPEST / np.float64(most - least)
+        factors: Floats = np.clip(grid.vertex_spacing / (span * grid.spacing), -limit, limit)
+    return factors
 
 
 def empty_table(low: float, high: float) -> Table:

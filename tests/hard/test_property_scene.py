@@ -72,6 +72,8 @@ def floats(name: str, low: float | None, high: float | None, *, quick: bool) -> 
     if quick and name == "step" and low == 1e-6:  # of a march: a small one takes as many samples
         low = 0.02
     everything = st.floats(low, high, allow_nan=False, allow_infinity=False)
+    if quick and name == "scale":  # of three from everywhere most are too different to be drawn
+        everything = st.one_of(everything, st.floats(1e-3, 1e3), st.sampled_from([1e-30, 1e-29, 1e29, 1e30]))
     near = [value for value in (low, high, 0.0, 0.5, 1.0, 2.0, -3.0, 1e30) if value is not None]
     return st.one_of(
         everything, st.sampled_from([value for value in near if (low is None or value >= low) and (high is None or value <= high)])
@@ -209,6 +211,7 @@ FOUND: dict[str, dict[str, Any]] = {
     "light hardly aslant": {"effects": {"shadows": {"light": [0.0, 2.2471164185778944e307, 0.5]}}},
     "a tiny unit of distance": {"scale": [1.0, 1.0, 1.9e27], "transfer_function": {"unit_distance": 1e-100}},
     "all the light there may be": {"effects": {"shading": {"ambient": 10.0, "diffuse": 10.0, "specular": 10.0, "specular_power": 1.0}}},
+    "rays without an end": {"scale": [8e29, 2.4e29, 1e-30], "camera": {"view": "yz"}},
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
 """Scenes that the test below has found."""

@@ -330,6 +330,15 @@ def test_shading_is_stable_where_the_gradient_vanishes(way):
     np.testing.assert_allclose(rgba[..., :3], 0.2 * rgba[..., 3:] * np.ones(3), atol=0.15)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-6])
+def test_light_has_a_direction_where_one_axis_is_much_shorter_than_the_others(way, unit):
+    """Its derivative is as much larger, of a narrow range even more so, and no square of it may leave float32."""
+    values = np.broadcast_to(np.linspace(0, 1, 12)[:, None, None], (12, 12, 12))
+    table = table_of([50 / unit, 50 / unit], low=0.5, high=0.5 + 1e-14)
+    task = task_of(values.shape, table, size=(8, 8), step=0.5 * unit, spacing=(1 / unit, 1 / unit, unit), shaded=True)
+    np.testing.assert_allclose(march(frame_of(values), task).rgba[4, 4], [1.3, 1.3, 1.3, 1.0], rtol=1e-3)
+
+
 def test_counters_show_that_nothing_is_done_unasked(way):
     values = waves()
     task = task_of(values.shape, table_of([0.1, 0.3]), size=(20, 20), depth=True)

@@ -1,0 +1,173 @@
+"""Any series under any settings: what is promised is kept as an independent look at the values finds it, or is refused in one line."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import example, given
+from hypothesis import strategies as st
+from properties import Draw, looking, one_line
+
+import fhash_codec
+from fhash_codec import EncodeConfig, FhashWarning
+from fhash_formats.container import Container
+from fhash_formats.errors import FhashError, QualityError
+
+DTYPES = ("float16", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32", "uint32")
+Shape = tuple[int, int, int, int]
+
+
+def waves(chance: np.random.Generator, shape: Shape) -> np.ndarray:
+    """A few plane waves."""
+    places = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
+    return sum(np.sin(sum(chance.normal(0, 6) * place for place in places)) for _ in range(3))
+
+
+def front(chance: np.random.Generator, shape: Shape) -> np.ndarray:
+    """A step that moves along x by part of a vertex a step."""
+    t, x = np.arange(shape[0])[:, None, None, None], np.arange(shape[3])
+    return np.broadcast_to(np.where(x > chance.uniform(0, shape[3]) + 0.3 * t, 1.0, 0.0), shape).copy()
+
+
+def spikes(chance: np.random.Generator, shape: Shape) -> np.ndarray:
+    """Nothing but a few vertices."""
+    return np.where(chance.random(shape) < 0.02, chance.normal(0, 1, shape), 0.0)
+
+
+KINDS = {
+    "waves": waves,
+    "noise": lambda chance, shape: chance.normal(0, 1, shape),
+    "front": front,
+    "spikes": spikes,
+    "constant": lambda chance, shape: np.full(shape, chance.normal()),
+    "heavy tails": lambda chance, shape: chance.standard_cauchy(shape),
+    "in time alone": lambda chance, shape: np.broadcast_to(chance.normal(0, 1, (shape[0], 1, 1, 1)), shape).copy(),
+    "waves and noise": lambda chance, shape: waves(chance, shape) + 0.01 * chance.normal(0, 1, shape),
+}
+
+
+@st.composite
+def fields(draw: Draw) -> np.ndarray:
+    """A series (t, z, y, x) of some structure, type, size of values and offset; floats with holes."""
+    shape = tuple(draw(st.integers(1, most)) for most in (6, 9, 12, 17))
+    chance = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    values = KINDS[draw(st.sampled_from(sorted(KINDS)))](chance, shape)
+    dtype = np.dtype(draw(st.sampled_from(DTYPES)))
+    if dtype.kind != "f":
+        limits = np.iinfo(dtype)
+        values = values - values.min()
+        share = values / (values.max() or 1.0)
+        return np.rint(limits.min + share * (limits.max - limits.min) * draw(st.sampled_from([1.0, 0.3, 1e-2]))).astype(dtype)
+    power = draw(st.integers(-4, 3) if dtype.itemsize == 2 else st.integers(-30, 30))
+    offset = draw(st.sampled_from([0.0, 0.0, 1.0, -1e3]))
+    with np.errstate(over="ignore"):  # what is beyond float16 is infinite, as in other files
+        values = ((values + offset) * 10.0**power).astype(dtype)
+    holes = draw(st.sampled_from([0.0, 0.0, 0.01, 0.5]))
+    values[chance.random(shape) < holes] = draw(st.sampled_from([np.nan, np.inf, -np.inf]))
+    return values
+
+
+@st.composite
+def settings(draw: Draw, values: np.ndarray) -> EncodeConfig:
+    """Settings that do not contradict themselves; features and bounds about as large as the values."""
+    finite = values[np.isfinite(values)].astype(np.float64)
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    common: dict[str, Any] = {"seed": draw(st.integers(0, 2**63 - 1)), "timings": False, "dilation": draw(st.integers(0, 2))}
+    if draw(st.integers(0, 2)) == 0:
+        ends = sorted(low + (high - low) * draw(st.floats(-0.2, 1.2)) for _ in range(2))
+        common["features"] = (draw(st.sampled_from([f"interval:{ends[0]!r}:{ends[1]!r}", f"isosurface:{ends[0]!r}", "segmentation"])),)
+    if draw(st.integers(0, 3)) == 0:
+        common["tables"] = draw(st.sampled_from(["float32", "float16", "uint8", "transform"]))
+        common["key_frames"] = draw(st.sampled_from(["all", "every:2", "0"]))
+        common["fold"] = draw(st.integers(2, 8))
+        common["embedding_size"] = draw(st.integers(1, 8))
+        common["hidden_layers"] = draw(st.integers(0, 2))
+        common["width"] = draw(st.integers(1, 16))
+        common["learning_rate"] = draw(st.sampled_from([1e-8, 0.01, 1.0]))
+        return EncodeConfig(profile="paper", epochs=draw(st.integers(1, 3)), psnr=draw(st.sampled_from([None, None, 20.0])), **common)
+    promise = draw(
+        st.sampled_from(
+            [
+                {},
+                {"psnr": draw(st.floats(0, 120))},
+                {"max_error": draw(st.floats(0, 1.5)) * (high - low)},
+                {"max_error": 0.0},
+                {"max_error_rel": draw(st.floats(0, 1))},
+                {"ratio": draw(st.floats(1, 100))},
+            ]
+        )
+    )
+    tile = draw(st.sampled_from(["auto", "whole", "2x4x4x4", "1x1x1x1", "3x5x7x9"]))
+    return EncodeConfig(effort=draw(st.integers(1, 6)), tile=tile, **promise, **common)
+
+
+@st.composite
+def tasks(draw: Draw) -> tuple[np.ndarray, EncodeConfig]:
+    """A series and settings for it."""
+    values = draw(fields())
+    return values, draw(settings(values))
+
+
+@looking(40, 1000)
+@given(task=tasks())
+@example(task=(np.zeros((1, 1, 1, 1)), EncodeConfig(max_error_rel=0.0)))
+def test_any_settings_keep_their_promise_or_are_refused_in_one_line(task: tuple[np.ndarray, EncodeConfig]) -> None:
+    values, config = task
+    with tempfile.TemporaryDirectory(prefix="fhash-") as folder, warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.simplefilter("ignore", FhashWarning)
+        path, missed = Path(folder) / "a.fhz", ""
+        try:
+            figures = fhash_codec.encode(values, path, config)
+        except QualityError as error:
+            one_line(error)
+            figures, missed = error.figures, str(error)
+        except FhashError as error:
+            one_line(error)
+            assert os.listdir(folder) == []
+            return
+        assert os.listdir(folder) == ["a.fhz"]
+        assert figures["bytes"] == path.stat().st_size
+        with Container.open(path) as container:
+            container.verify()
+        with fhash_codec.open(path) as volume:
+            decoded = np.asarray(volume[...]).astype(np.float64)
+    check(values, config, decoded, figures, missed)
+
+
+def check(values: np.ndarray, config: EncodeConfig, decoded: np.ndarray, figures: dict[str, Any], missed: str) -> None:
+    """What was promised, and what is said of the file, against the values themselves."""
+    given, finite, found = values.astype(np.float64), np.isfinite(values), np.isfinite(decoded)
+    assert decoded.shape == values.shape
+    assert not np.isinf(decoded).any()
+    assert not found[~finite].any()
+    if config.key_frames != "all":  # of other steps the model knows what is between them, where they have values
+        pass
+    elif config.features == ("all",):
+        assert (found == finite).all()
+    elif config.features[0].startswith("interval"):
+        ends = [float(end) for end in config.features[0].split(":")[1:]]
+        assert found[finite & (given >= ends[0]) & (given <= ends[1])].all()
+    errors = np.abs(decoded[found] - given[found])
+    span = float(given[finite].max() - given[finite].min())
+    largest, squares = float(errors.max()), float(np.sqrt(np.mean((errors / (span or 1.0)) ** 2)))
+    assert math.isclose(largest, figures["max_abs_error"], rel_tol=1e-9), (largest, figures["max_abs_error"])
+    psnr = math.inf if squares == 0 else -20 * math.log10(squares)
+    stated = math.inf if figures["rmse"] == 0 else figures["psnr"]
+    if span > 0:
+        assert stated is not None
+        assert psnr == stated or math.isclose(psnr, stated, abs_tol=1e-3), (psnr, stated)
+    bound = config.max_error if config.max_error is not None else math.inf
+    if config.max_error_rel is not None:
+        bound = config.max_error_rel * span
+    assert missed or largest <= bound
+    if config.psnr is not None and span > 0:
+        assert missed or psnr >= config.psnr - 1e-9
+    if missed:  # and the miss is true
+        assert largest > bound or psnr < (config.psnr if config.psnr is not None else 50.0)
