@@ -12,10 +12,10 @@ from typing import Any
 
 ABOUT = {
     "hostile files": "Mutations of the golden containers through the commands: how each of them ended, and at most how many seconds of\n"
-    "processor time and bytes of memory it took. Too large (exit code 1) is a sound file that declares more than there is memory for here,\n"
-    "nothing to show (exit code 2) one of which the usual picture would be empty; all that is refused ends with exit code 4.",
-    "the native code under sanitizers": "Coverage-guided fuzzing of the native library under address and undefined-behaviour sanitizers: decoders,\n"
-    "encoders (what they write has to decode to what was coded), transforms, heads, the marcher and its light.",
+    "processor time and bytes of memory it took. What is refused ends with exit code 4. Too large (1) is a sound file that declares more\n"
+    "than there is memory for here, nothing to show (2) one of which the usual picture would be empty.",
+    "the native code under sanitizers": "Coverage-guided fuzzing of the native library under address and undefined-behaviour\n"
+    "sanitizers: decoders, encoders (what they write has to decode to what was coded), transforms, heads, the marcher and its light.",
     "kill -9 at an operation": "The process is killed before each of its operations on files: the older output stays whole, and the\n"
     "next run clears away what was left.",
     "kill -9 at a random moment": "The process is killed at random: the older output stays, and the same command gives the same file.",
