@@ -96,12 +96,8 @@ class FrameField:
         self.arrays, self.bricks = arrays, bricks
         self.stride = float(frame.stride)
         first, counts = np.array(frame.first[::-1], dtype=np.float64), np.array(frame.values.shape[::-1])
-        ends = first + counts * frame.stride
-        # A frame reaches to the end of the domain if no more of its vertices would fit.
-        low = np.where(first == 0, grid.bounds[:, 0], first)
-        high = np.where(ends > np.array(grid.counts) - 1, grid.bounds[:, 1], ends - frame.stride)
-        self.bounds, self.first = arrays.array(np.stack([low, high], axis=-1)), arrays.array(first)
-        self.vertices = arrays.array(np.stack([first, ends - frame.stride], axis=-1))
+        self.bounds, self.first = arrays.array(frame.bounds(grid)), arrays.array(first)
+        self.vertices = arrays.array(np.stack([first, first + (counts - 1) * frame.stride], axis=-1))
         self._last, self._last_cell = arrays.array(counts - 1.0), arrays.array(np.maximum(counts - 2.0, 0.0))
         self._jumps = (1, int(counts[0]), int(counts[0] * counts[1]))
         self._wide = [bool(count > 1) for count in counts]

@@ -56,12 +56,6 @@ class Setting:
         """From a frame, its bricks and a task."""
         grid, stride = task.rays.grid, float(frame.stride)
         first = np.array(frame.first[::-1], dtype=np.float64)
-        counts = np.array(bricks.values.shape[::-1])
-        box = (grid.bounds - first[:, None]) / stride
-        seen = np.stack([np.zeros(3), counts - 1.0], axis=-1)
-        # A frame reaches to the end of the domain if no more of its vertices would fit.
-        seen[:, 0] = np.where(first == 0, box[:, 0], seen[:, 0])
-        seen[:, 1] = np.where(first + stride * counts > np.array(grid.counts) - 1, box[:, 1], seen[:, 1])
         spacing = grid.spacing * stride
         least, most = bricks.value_range
         low, high = (task.table.low, task.table.high) if task.table is not None else (least, most)
@@ -83,8 +77,8 @@ class Setting:
             right=task.rays.right / stride,
             up=task.rays.up / stride,
             forward=task.rays.forward / stride,
-            box=box,
-            seen=seen,
+            box=(grid.bounds - first[:, None]) / stride,
+            seen=(frame.bounds(grid) - first[:, None]) / stride,
             spacing=spacing,
             gradient=slope_scale(grid, span, least, most),
             floor=floor,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.render.camera import Rays
+from fhash_codec.render.camera import Grid, Rays
 
 __all__ = ["Frame", "LightGrid", "Lighting", "Marched", "Surface", "Table", "Task"]
 
@@ -69,6 +69,17 @@ class Frame:
     values: Single
     first: tuple[int, int, int]
     stride: int = 1
+
+    def bounds(self, grid: Grid) -> Floats:
+        """The box (3, 2), x, y, z, in vertices of the domain, that there are values of.
+
+        It reaches to the end of the domain where no more vertices of the frame would fit.
+        """
+        first, counts = np.array(self.first[::-1], dtype=np.float64), np.array(self.values.shape[::-1])
+        ends = first + counts * self.stride
+        low = np.where(first == 0, grid.bounds[:, 0], first)
+        high = np.where(ends > np.array(grid.counts) - 1, grid.bounds[:, 1], ends - self.stride)
+        return np.stack([low, high], axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
