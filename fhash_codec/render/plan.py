@@ -28,10 +28,10 @@ Floats = npt.NDArray[np.float64]
 
 LARGE_OFFSET = 2.0**9
 """Half ranges that float32 values may be large: 15 bits are left for the range then."""
-MANY_SAMPLES = 10**5
-"""Of a ray: more take minutes for a picture of usual size."""
-MOST_SAMPLES = 10**8
-"""Of a ray: more would take days, and no Ctrl-C would end one that is marched."""
+LONG_RAY = 10**5
+"""Samples: more take minutes for a picture of usual size."""
+LONGEST_RAY = 10**8
+"""Samples: more would take days, and no Ctrl-C would end one that is marched."""
 MOST_RAYS = 2**26
 """Rays of a picture: more would not fit in the memory of most machines."""
 SHOULDER = (-0.7, 1.0, 1.0)
@@ -154,13 +154,13 @@ class Plan:
             skipping=march.skipping,
         )
         longest = float(np.linalg.norm(np.diff(grid.bounds, axis=1)[:, 0] * grid.spacing)) / task.step
-        if longest > MANY_SAMPLES:
+        if longest > LONG_RAY:
             line = (
                 f"a ray takes up to {longest:.3g} samples, since the axes are of very different lengths or the step is short; "
                 "stretch the axes with 'scale', or take a longer 'step'"
             )
-            if longest > MOST_SAMPLES:
-                raise InputError(f"{line}; at most {MOST_SAMPLES:.0e} are taken")
+            if longest > LONGEST_RAY:
+                raise InputError(f"{line}; at most {LONGEST_RAY:.0e} are taken")
             warnings.warn(line, FhashWarning, stacklevel=2)
         mode = march.mode
         if mode == "auto":
