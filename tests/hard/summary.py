@@ -13,7 +13,7 @@ from typing import Any
 ABOUT = {
     "hostile files": "Mutations of the golden containers through the commands: how each of them ended, and at most how many seconds of\n"
     "processor time and bytes of memory it took. What is refused ends with exit code 4. Too large (1) is a sound file that declares more\n"
-    "than there is memory for here, nothing to show (2) one of which the usual picture would be empty.",
+    "than there is memory for here, nothing to show (2) one whose usual picture would be empty or cannot be placed.",
     "the native code under sanitizers": "Coverage-guided fuzzing of the native library under address and undefined-behaviour\n"
     "sanitizers: decoders, encoders (what they write has to decode to what was coded), transforms, heads, the marcher and its light.",
     "kill -9 at an operation": "The process is killed before each of its operations on files: the older output stays whole, and the\n"
