@@ -16,7 +16,7 @@ test: .venv/.stamp
 	$(BIN)/mypy
 	$(BIN)/python -m pytest $(SPREAD)
 
-# The long set of hard cases, hostile files, faults and fuzzing: some 45 minutes on 4 processors. docs/stability.md gets the figures.
+# The long set of hard cases, hostile files, faults and fuzzing: some 35 minutes on 4 processors; needs g++. docs/stability.md gets the figures.
 hard: .venv/.stamp
 	mkdir -p build/hard
 	rm -f build/hard/figures.jsonl
