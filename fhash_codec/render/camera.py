@@ -37,8 +37,8 @@ VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]
 """Direction from the volume towards the camera, and what is upwards, as PyVista has them."""
 LONGEST = 1e100
 """Largest position that is drawn where it is, and the reciprocal of the shortest axis."""
-FARTHEST = 1e13
-"""Lengths of a vertex spacing that a picture is across, at most: eyes are a few times as far away, and float64 tells 1e-2 of one apart."""
+FARTHEST = 1e14
+"""Lengths of a vertex spacing that a picture is across, at most: eyes are a few times as far away, and float64 tells 0.1 of one apart."""
 PARALLEL = 1e-6
 """Sine of the angle between view and upward direction below which the picture has no upright."""
 

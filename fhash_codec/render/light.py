@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fhash_codec.render.camera import Grid
 from fhash_codec.render.scene import AmbientOcclusion, Shadows
-from fhash_codec.render.task import Frame, LightGrid, Table
+from fhash_codec.render.task import Frame, LightGrid, Table, extinctions_in
 from fhash_formats import native
 from fhash_formats.container.parallel import in_threads
 from fhash_formats.errors import InputError
@@ -27,8 +27,6 @@ __all__ = ["light_grid"]
 Floats = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
-OPAQUE = 1e30
-"""Extinction per vertex, at most: nothing passes long before that."""
 MOST_STEPS = 16
 """From a point to the end of its surroundings."""
 SIDES = np.array([side for side in itertools.product((-1.0, 0.0, 1.0), repeat=3) if sum(map(abs, side)) in (1, 3)])
@@ -59,8 +57,7 @@ def light_grid(
         return LightGrid(shares=np.ones((1, 1, 1, 2), dtype=np.float32), first=first, cell=1.0)
     # In lengths of a vertex: float32 has no room for those of all coordinates.
     unit = grid.vertex_spacing
-    with np.errstate(over="ignore"):
-        table = replace(table, extinctions=np.minimum(table.extinctions * unit, OPAQUE))
+    table = replace(table, extinctions=extinctions_in(table.extinctions, unit))
     extinction = _extinction(np.ascontiguousarray(frame.values, dtype=np.float32), table, across)
     cell = float(across * frame.stride)
     shares = np.ones((*extinction.shape, 2), dtype=np.float32)

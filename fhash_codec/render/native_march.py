@@ -16,7 +16,7 @@ import numpy.typing as npt
 from fhash_codec.render.bricks import SIDE, Bricks
 from fhash_codec.render.cells import cells_of
 from fhash_codec.render.setting import Setting, empty_table
-from fhash_codec.render.task import Frame, Marched, Table, Task
+from fhash_codec.render.task import Frame, Marched, Table, Task, extinctions_in
 from fhash_formats.container.parallel import in_threads, usable_threads
 
 __all__ = ["MOST_SURFACES", "march_native"]
@@ -27,8 +27,6 @@ MOST_VALUES = 2**31 - 1
 """Of a frame, for the vectors' indices of 32 bits."""
 ENTRIES = 4000
 """Of a table, at least."""
-OPAQUE = 1e30
-"""An extinction in a step, of which the smallest part is opaque."""
 POWERS = 1024
 TILE = 16
 GROUP = 8
@@ -219,13 +217,12 @@ def _spans(task: Task) -> list[tuple[int, int]]:
 def _entries(table: Table, step: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:
     """Colours and opacities (n + 1, 4), and extinctions (n + 1,), of a step; the last entry twice.
 
-    They lie so close that opacity is linear between them as extinction is. An extinction beyond OPAQUE is as good as that.
+    They lie so close that opacity is linear between them as extinction is.
     """
     last = len(table.extinctions) - 1
     places = np.append(np.linspace(0, last, last * -(-ENTRIES // last) + 1), last)
     columns = [np.interp(places, np.arange(last + 1), column) for column in table.colours.T]
-    with np.errstate(over="ignore"):  # infinite ones would give NaN between entries
-        extinctions = np.minimum(np.interp(places, np.arange(last + 1), table.extinctions) * step, OPAQUE)
+    extinctions = extinctions_in(np.interp(places, np.arange(last + 1), table.extinctions), step)
     return np.stack([*columns, -np.expm1(-extinctions)], axis=-1).astype(np.float32), extinctions
 
 

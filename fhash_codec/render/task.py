@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from fhash_codec.render.camera import Grid, Rays
 
-__all__ = ["Frame", "LightGrid", "Lighting", "Marched", "Surface", "Table", "Task"]
+__all__ = ["Frame", "LightGrid", "Lighting", "Marched", "Surface", "Table", "Task", "extinctions_in"]
 
 Floats = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
@@ -57,6 +57,16 @@ class Surface:
     value: float
     colour: Floats
     opacity: float
+
+
+DENSEST = 1e30
+"""An extinction of which the smallest part is opaque."""
+
+
+def extinctions_in(extinctions: Floats, length: float) -> Floats:
+    """Extinctions in a length of the coordinates, DENSEST at most: infinite ones would give NaN between the entries of a table."""
+    with np.errstate(over="ignore"):
+        return np.minimum(extinctions * length, DENSEST)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -161,9 +161,7 @@ def _series(source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Datas
     )
 
 
-def _exactly_filled(
-    source: str, path: Path, name: str, encoding: Mapping[str, Any]
-) -> Callable[[Values, tuple[slice, ...]], Values] | None:
+def _exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, Any]) -> Exact | None:
     """What tells the neighbours of a fill value from it, where float64 does not: None where it does.
 
     xarray compares as float64, in which many 64-bit integers beyond 2^53 are the same.
