@@ -13,7 +13,15 @@ NATIVE = Path("formats/fhash_formats/native")
 
 # No contraction into fused multiply-adds and no fast-math: a stream must decode to the same bits on every machine. That nothing traps, and
 # loops marked as independent, change no bit; without them the compiler does not vectorise the marcher.
-GNU_FLAGS = ["-O3", "-std=c++17", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd", "-fvisibility=hidden"]
+GNU_FLAGS = [
+    "-O3",
+    "-std=c++17",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fopenmp-simd",
+    "-fvisibility=hidden",
+]
 MSVC_FLAGS = ["/O2", "/std:c++17", "/fp:precise", "/EHsc"]
 
 
@@ -22,7 +30,9 @@ class BuildNative(build_ext):
 
     def build_extensions(self) -> None:
         for extension in self.extensions:
-            extension.extra_compile_args = MSVC_FLAGS if self.compiler.compiler_type == "msvc" else GNU_FLAGS
+            extension.extra_compile_args = (
+                MSVC_FLAGS if self.compiler.compiler_type == "msvc" else GNU_FLAGS
+            )
         super().build_extensions()
 
 

@@ -42,7 +42,12 @@ class Architecture:
         """The paper's model of a feature bounding box and a number of key frames."""
         levels = level_resolutions(box_size, key_frames, fold)
         return cls(
-            levels=levels, embedding_size=embedding_size, hidden_layers=hidden_layers, width=width, box_size=box_size, key_frames=key_frames
+            levels=levels,
+            embedding_size=embedding_size,
+            hidden_layers=hidden_layers,
+            width=width,
+            box_size=box_size,
+            key_frames=key_frames,
         )
 
     @property
@@ -64,4 +69,6 @@ class Architecture:
     @property
     def parameters(self) -> int:
         """All trained numbers, tables and MLP."""
-        return parameter_count(self.levels, self.embedding_size) + sum(o * (i + 1) for o, i in self.layer_shapes)
+        return parameter_count(self.levels, self.embedding_size) + sum(
+            o * (i + 1) for o, i in self.layer_shapes
+        )

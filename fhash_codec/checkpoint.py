@@ -29,7 +29,11 @@ UNRELATED = ("psnr", "tables", "timings")
 def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Path:
     """Where the checkpoint of this training stands: `OUTPUT.<digest of coreset and settings>.checkpoint`."""
     settings = {name: value for name, value in config.to_dict().items() if name not in UNRELATED}
-    digest = hashlib.sha256(json.dumps([version("fhash"), settings, coreset.box, coreset.key_frames], sort_keys=True).encode())
+    digest = hashlib.sha256(
+        json.dumps(
+            [version("fhash"), settings, coreset.box, coreset.key_frames], sort_keys=True
+        ).encode()
+    )
     for array in (coreset.values, coreset.bricks, coreset.mask_bits):
         digest.update(array.data)
     end = f".{digest.hexdigest()[:12]}.checkpoint"
@@ -58,4 +62,6 @@ def load_checkpoint(path: Path) -> tuple[dict[str, npt.NDArray[Any]], Course] | 
             state = {name: file[name] for name in file.files}
         return state, Course(**json.loads(state.pop("course").tobytes()))
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-        raise InputError(f"checkpoint {path} cannot be read; delete it to train from the start") from error
+        raise InputError(
+            f"checkpoint {path} cannot be read; delete it to train from the start"
+        ) from error

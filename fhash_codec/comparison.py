@@ -27,7 +27,9 @@ def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> di
             raise InputError(
                 f"{series.source} has shape {series.shape}, {path} has {volume.shape} in (t, z, y, x); give the same --var, --axes, --t"
             )
-        return report(volume, measure(series, volume, progress), seconds=time.perf_counter() - begun)
+        return report(
+            volume, measure(series, volume, progress), seconds=time.perf_counter() - begun
+        )
 
 
 def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any]:
@@ -36,6 +38,8 @@ def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any
     Raises InputError if the series changed since it was opened.
     """
     data_range = volume.value_range.high - volume.value_range.low
-    quality = measure_quality(series.read, volume.read, series.shape[0], data_range, volume.background, progress)
+    quality = measure_quality(
+        series.read, volume.read, series.shape[0], data_range, volume.background, progress
+    )
     series.check()
     return quality.to_dict()

@@ -36,7 +36,14 @@ def setting(
 
     profile: the only one that takes a value other than the default, where there is one.
     """
-    limits = {"help": help, "choices": choices, "low": low, "high": high, "option": option, "profile": profile}
+    limits = {
+        "help": help,
+        "choices": choices,
+        "low": low,
+        "high": high,
+        "option": option,
+        "profile": profile,
+    }
     return dataclasses.field(default=default, metadata=limits)
 
 
@@ -60,18 +67,41 @@ class EncodeConfig:
         "paper: steps to train on, as all, every:K, auto:N (N chosen by interpolation error) or a list such as 0,4,9",
         profile="paper",
     )
-    fold: int = setting(2, "paper: ratio of resolution from one level to the next", low=2, high=64, profile="paper")
-    embedding_size: int = setting(2, "paper: numbers trained at each grid corner", low=1, high=16, profile="paper")
-    hidden_layers: int = setting(1, "paper: hidden layers of the network", low=0, high=8, profile="paper")
-    width: int = setting(64, "paper: neurons of each hidden layer", low=1, high=1024, profile="paper")
+    fold: int = setting(
+        2, "paper: ratio of resolution from one level to the next", low=2, high=64, profile="paper"
+    )
+    embedding_size: int = setting(
+        2, "paper: numbers trained at each grid corner", low=1, high=16, profile="paper"
+    )
+    hidden_layers: int = setting(
+        1, "paper: hidden layers of the network", low=0, high=8, profile="paper"
+    )
+    width: int = setting(
+        64, "paper: neurons of each hidden layer", low=1, high=1024, profile="paper"
+    )
     epochs: int = setting(
-        0, "paper: passes over the coreset, 0 for 20 or as many as make 1000 training steps", low=0, high=100_000, profile="paper"
+        0,
+        "paper: passes over the coreset, 0 for 20 or as many as make 1000 training steps",
+        low=0,
+        high=100_000,
+        profile="paper",
     )
-    learning_rate: float = setting(0.01, "paper: Adam's learning rate at the start", low=1e-8, high=1.0, profile="paper")
+    learning_rate: float = setting(
+        0.01, "paper: Adam's learning rate at the start", low=1e-8, high=1.0, profile="paper"
+    )
     schedule: str = setting(
-        "cosine", "paper: course of the learning rate over the training", choices=("cosine", "constant"), profile="paper"
+        "cosine",
+        "paper: course of the learning rate over the training",
+        choices=("cosine", "constant"),
+        profile="paper",
     )
-    batch: int = setting(0, "paper: samples per training step, 0 for a size that suits the data", low=0, high=2**31, profile="paper")
+    batch: int = setting(
+        0,
+        "paper: samples per training step, 0 for a size that suits the data",
+        low=0,
+        high=2**31,
+        profile="paper",
+    )
     psnr: float | None = setting(
         None,
         "promise of quality in dB over the coreset of all steps (compact: 50 if nothing is promised); missing it ends with exit code 3",
@@ -79,7 +109,11 @@ class EncodeConfig:
         high=400.0,
     )
     max_error: float | None = setting(
-        None, "compact: strict bound of the error of each value, in data units", low=0.0, high=1.7e308, profile="compact"
+        None,
+        "compact: strict bound of the error of each value, in data units",
+        low=0.0,
+        high=1.7e308,
+        profile="compact",
     )
     max_error_rel: float | None = setting(
         None,
@@ -89,7 +123,11 @@ class EncodeConfig:
         profile="compact",
     )
     ratio: float | None = setting(
-        None, "compact: make the file this many times smaller than the raw data", low=1.0, high=1e9, profile="compact"
+        None,
+        "compact: make the file this many times smaller than the raw data",
+        low=1.0,
+        high=1e9,
+        profile="compact",
     )
     effort: int = setting(
         5,
@@ -109,7 +147,9 @@ class EncodeConfig:
         choices=TABLE_TYPES,
         profile="paper",
     )
-    engine: str = setting("auto", "paper: training engine", choices=("auto", *ENGINES), profile="paper")
+    engine: str = setting(
+        "auto", "paper: training engine", choices=("auto", *ENGINES), profile="paper"
+    )
     device: str = setting("auto", "where to train", choices=("auto", "cpu", "cuda"))
     seed: int = setting(0, "seed of every random choice", low=0, high=2**63 - 1)
     timings: bool = setting(
@@ -131,16 +171,23 @@ class EncodeConfig:
         for field in dataclasses.fields(self):
             owner = field.metadata["profile"]
             if owner and owner != self.profile and getattr(self, field.name) != field.default:
-                raise InputError(f"{_option(field)} belongs to --profile {owner}; the profile is {self.profile}")
+                raise InputError(
+                    f"{_option(field)} belongs to --profile {owner}; the profile is {self.profile}"
+                )
         promised = [
-            _option(field) for field in dataclasses.fields(self) if field.name in PROMISES and getattr(self, field.name) is not None
+            _option(field)
+            for field in dataclasses.fields(self)
+            if field.name in PROMISES and getattr(self, field.name) is not None
         ]
         if len(promised) > 1:
             raise InputError(f"{' and '.join(promised)} are given; promise one of them")
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name; `from_dict` gives the same record back."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in vars(self).items()
+        }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> EncodeConfig:
@@ -150,7 +197,10 @@ class EncodeConfig:
             if name not in known:
                 near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
                 raise InputError(f"unknown setting '{name}'; did you mean '{near[0]}'?")
-        given: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+        given: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in values.items()
+        }
         return cls(**given)
 
 
@@ -167,7 +217,12 @@ def _check(field: dataclasses.Field[Any], value: Any) -> None:
         raise InputError(f"{name} is '{value}'; allowed: {', '.join(limits['choices'])}")
     if limits["low"] is not None and value is not None:
         low, high = cast(float, limits["low"]), cast(float, limits["high"])
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or not low <= value <= high:
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not math.isfinite(value)
+            or not low <= value <= high
+        ):
             raise InputError(f"{name} is {value}; allowed: {low:g} to {high:g}")
         if isinstance(field.default, int) and not isinstance(value, int):
             raise InputError(f"{name} is {value}; a whole number is needed")

@@ -90,12 +90,21 @@ class Extent:
 
     def mask(self, key: int) -> npt.NDArray[np.bool_]:
         """Which vertices (z, y, x) of the box are in the coreset at a key frame."""
-        whole = np.unpackbits(self.packed[key], count=prod(self.domain)).view(np.bool_).reshape(self.domain)
+        whole = (
+            np.unpackbits(self.packed[key], count=prod(self.domain))
+            .view(np.bool_)
+            .reshape(self.domain)
+        )
         return crop(whole, self.box)
 
 
 def find_extent(
-    series: Series, scan: Scan, key_frames: Sequence[int], features: Sequence[Feature], dilation: int, progress: Progress
+    series: Series,
+    scan: Scan,
+    key_frames: Sequence[int],
+    features: Sequence[Feature],
+    dilation: int,
+    progress: Progress,
 ) -> Extent:
     """Where the coreset lies: finite vertices of the merged features, dilated, at every key frame; raises and warns as `build_coreset`."""
     packed: list[npt.NDArray[np.uint8]] = []
@@ -129,10 +138,14 @@ def find_extent(
     if box is None:
         low, high = scan.value_range.low, scan.value_range.high
         names = ", ".join(str(feature) for feature in features)
-        raise InputError(f"feature {names} selects nothing; values range from {low:.9g} to {high:.9g}")
+        raise InputError(
+            f"feature {names} selects nothing; values range from {low:.9g} to {high:.9g}"
+        )
 
     for feature in sorted(map(str, idle)):
-        warnings.warn(f"feature {feature} selects nothing; the others do", FhashWarning, stacklevel=2)
+        warnings.warn(
+            f"feature {feature} selects nothing; the others do", FhashWarning, stacklevel=2
+        )
     return Extent(
         box=box,
         key_frames=tuple(key_frames),
@@ -187,7 +200,9 @@ def build_coreset(
         bricks=np.concatenate([coordinates for coordinates, _, _ in layers]),
         mask_bits=np.concatenate([bits for _, bits, _ in layers]),
         values=values,
-        offsets=np.cumsum(np.concatenate([np.zeros(1, dtype=np.int64), *(counts for _, _, counts in layers)])),
+        offsets=np.cumsum(
+            np.concatenate([np.zeros(1, dtype=np.int64), *(counts for _, _, counts in layers)])
+        ),
         occupancy=tuple(grids),
         fraction=extent.fraction,
         background=extent.background,
@@ -204,7 +219,9 @@ def brick_shape(size: Sizes) -> Sizes:
     bits = [min(usual, most) for usual, most in zip(BRICK_BITS, room, strict=True)]
     while sum(bits) < sum(BRICK_BITS) and bits != room:
         # The thinnest axis that has room; x before y before z where equal, since x is contiguous.
-        axis = min((axis for axis in (2, 1, 0) if bits[axis] < room[axis]), key=lambda axis: bits[axis])
+        axis = min(
+            (axis for axis in (2, 1, 0) if bits[axis] < room[axis]), key=lambda axis: bits[axis]
+        )
         bits[axis] += 1
     counts = [-(-axis // 2**bit) for axis, bit in zip(size, bits, strict=True)]
     z, y, x = (-(-axis // count) for axis, count in zip(size, counts, strict=True))
@@ -226,7 +243,10 @@ def fuse(boxes: Sequence[Box | None]) -> Box | None:
     there = [box for box in boxes if box is not None]
     if not there:
         return None
-    z, y, x = ((min(low for low, _ in spans), max(high for _, high in spans)) for spans in zip(*there, strict=True))
+    z, y, x = (
+        (min(low for low, _ in spans), max(high for _, high in spans))
+        for spans in zip(*there, strict=True)
+    )
     return z, y, x
 
 
@@ -262,7 +282,12 @@ def _dilated(
     return mask, finite
 
 
-def _add_outside(mean: Mean, frame: npt.NDArray[Any], mask: npt.NDArray[np.bool_], finite: npt.NDArray[np.bool_] | None) -> None:
+def _add_outside(
+    mean: Mean,
+    frame: npt.NDArray[Any],
+    mask: npt.NDArray[np.bool_],
+    finite: npt.NDArray[np.bool_] | None,
+) -> None:
     """Take the finite values outside the coreset into a mean, plane by plane so that their float64 copy stays small."""
     for z, plane in enumerate(frame):
         outside = ~mask[z] if finite is None else finite[z] & ~mask[z]

@@ -17,11 +17,27 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.network import ArrayTable, Floats, Head, Network, TableSource, share_out, usable_threads
+from fhash_codec.network import (
+    ArrayTable,
+    Floats,
+    Head,
+    Network,
+    TableSource,
+    share_out,
+    usable_threads,
+)
 from fhash_codec.points import sample_points
 from fhash_formats.errors import InputError, RegionError
 
-__all__ = ["ArrayTable", "Box", "Network", "TableSource", "block_shape", "decode_region", "sample_points"]
+__all__ = [
+    "ArrayTable",
+    "Box",
+    "Network",
+    "TableSource",
+    "block_shape",
+    "decode_region",
+    "sample_points",
+]
 
 Box = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
 """((z0, z1), (y0, y1), (x0, x1)), half-open, in vertices of the feature bounding box."""
@@ -49,7 +65,12 @@ class Piece:
 
 
 def decode_region(
-    network: Network, key_index: float, region: Box, *, wanted: npt.NDArray[np.bool_] | None = None, threads: int | None = None
+    network: Network,
+    key_index: float,
+    region: Box,
+    *,
+    wanted: npt.NDArray[np.bool_] | None = None,
+    threads: int | None = None,
 ) -> Floats:
     """Normalised values float32 (z, y, x) of the vertices of a region at a key index in [0, key_frames - 1], fractional between key frames.
 
@@ -66,7 +87,11 @@ def decode_region(
         return result
     numbers = [sorted({block[axis] for block in blocks}) for axis in range(3)]
     parts = [
-        [_axis_parts(network.box_size[axis], level[axis + 1], shape[axis], numbers[axis]) for axis in range(3)] for level in network.levels
+        [
+            _axis_parts(network.box_size[axis], level[axis + 1], shape[axis], numbers[axis])
+            for axis in range(3)
+        ]
+        for level in network.levels
     ]
     pieces = [_piece(network, level, key_index, axes) for level, axes in enumerate(parts)]
 
@@ -88,14 +113,18 @@ def block_shape(box_size: tuple[int, int, int]) -> tuple[int, int, int]:
     Each axis is split evenly, so that little of the last block hangs over the end. It depends on the box alone.
     """
     shape = [min(size, limit) for size, limit in zip(box_size, (8, 16, 32), strict=True)]
-    while (growing := [axis for axis in (2, 1, 0) if shape[axis] < box_size[axis]]) and 2 * math.prod(shape) <= BLOCK_VERTICES:
+    while (
+        growing := [axis for axis in (2, 1, 0) if shape[axis] < box_size[axis]]
+    ) and 2 * math.prod(shape) <= BLOCK_VERTICES:
         axis = min(growing, key=lambda axis: shape[axis])
         shape[axis] = min(2 * shape[axis], box_size[axis])
     z, y, x = (-(-size // -(-size // limit)) for size, limit in zip(box_size, shape, strict=True))
     return z, y, x
 
 
-def _check(network: Network, key_index: float, region: Box, wanted: npt.NDArray[np.bool_] | None) -> None:
+def _check(
+    network: Network, key_index: float, region: Box, wanted: npt.NDArray[np.bool_] | None
+) -> None:
     if not 0 <= key_index <= network.key_frames - 1:
         raise RegionError(f"key index {key_index} is outside 0..{network.key_frames - 1}")
     for axis, (start, stop), size in zip("zyx", region, network.box_size, strict=True):
@@ -103,19 +132,28 @@ def _check(network: Network, key_index: float, region: Box, wanted: npt.NDArray[
             raise RegionError(f"region {axis} {start}:{stop} is empty or outside the box, 0:{size}")
     shape = tuple(stop - start for start, stop in region)
     if wanted is not None and (wanted.shape != shape or wanted.dtype != np.bool_):
-        raise InputError(f"wanted is {wanted.dtype} {wanted.shape}; a bool array {shape} is needed, as large as the region")
+        raise InputError(
+            f"wanted is {wanted.dtype} {wanted.shape}; a bool array {shape} is needed, as large as the region"
+        )
 
 
-def _blocks(shape: Sequence[int], region: Box, wanted: npt.NDArray[np.bool_] | None) -> list[tuple[int, int, int]]:
+def _blocks(
+    shape: Sequence[int], region: Box, wanted: npt.NDArray[np.bool_] | None
+) -> list[tuple[int, int, int]]:
     """Numbers (z, y, x) of the blocks that touch the region and hold a wanted vertex."""
-    z, y, x = (range(start // length, (stop - 1) // length + 1) for (start, stop), length in zip(region, shape, strict=True))
+    z, y, x = (
+        range(start // length, (stop - 1) // length + 1)
+        for (start, stop), length in zip(region, shape, strict=True)
+    )
     blocks = list(product(z, y, x))
     if wanted is None:
         return blocks
     return [block for block in blocks if wanted[_crop(block, shape, region)[1]].any()]
 
 
-def _crop(block: Sequence[int], shape: Sequence[int], region: Box) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+def _crop(
+    block: Sequence[int], shape: Sequence[int], region: Box
+) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     """Where a block and a region meet: slices of the block and slices of the region."""
     inside, outside = [], []
     for number, length, (start, stop) in zip(block, shape, region, strict=True):
@@ -125,7 +163,9 @@ def _crop(block: Sequence[int], shape: Sequence[int], region: Box) -> tuple[tupl
     return tuple(inside), tuple(outside)
 
 
-def _axis_parts(size: int, resolution: int, length: int, numbers: Iterable[int]) -> dict[int, AxisPart]:
+def _axis_parts(
+    size: int, resolution: int, length: int, numbers: Iterable[int]
+) -> dict[int, AxisPart]:
     """The parts that blocks of a length need of one axis, by number of the block.
 
     Vertex i lies at i (R - 1) / (S - 1), in whole numbers, so that a vertex on a corner has exactly its embedding.
@@ -148,14 +188,19 @@ def _axis_parts(size: int, resolution: int, length: int, numbers: Iterable[int])
     return parts
 
 
-def _piece(network: Network, level: int, key_index: float, axes: Sequence[dict[int, AxisPart]]) -> Piece:
+def _piece(
+    network: Network, level: int, key_index: float, axes: Sequence[dict[int, AxisPart]]
+) -> Piece:
     """Read what all blocks need of a level, a few large reads at the one or two time nodes, and interpolate it in time."""
     nodes = network.levels[level][0]
     position = key_index * (nodes - 1) / max(network.key_frames - 1, 1)
     node = min(int(position), nodes - 1)
     weight = np.float32(position - node)
     time = slice(node, node + 1 if weight == 0 else node + 2)
-    (z0, z1), (y0, y1), (x0, x1) = ((min(p.first for p in parts.values()), max(p.stop for p in parts.values())) for parts in axes)
+    (z0, z1), (y0, y1), (x0, x1) = (
+        (min(p.first for p in parts.values()), max(p.stop for p in parts.values()))
+        for parts in axes
+    )
     values = np.empty((network.embedding_size, z1 - z0, y1 - y0, x1 - x0), np.float32)
     planes = max(1, READ_NUMBERS // values[:, 0].size)
     for start in range(z0, z1, planes):
@@ -180,7 +225,10 @@ def _encode(
     size, (bz, by, bx) = network.embedding_size, shape
     for level, (piece, axes) in enumerate(zip(pieces, parts, strict=True)):
         z, y, x = (axes[axis][block[axis]] for axis in range(3))
-        slices = (slice(part.first - first, part.stop - first) for part, first in zip((z, y, x), piece.first, strict=True))
+        slices = (
+            slice(part.first - first, part.stop - first)
+            for part, first in zip((z, y, x), piece.first, strict=True)
+        )
         values = piece.values[(slice(None), *slices)]
         rows = head.inputs[level * size : (level + 1) * size, : bz * by * bx]
         if network.levels[level][1:] == network.box_size:
@@ -191,4 +239,6 @@ def _encode(
             whole[tuple(slice(length) for length in values.shape)] = values
         else:
             upsampled = y.weights @ (values @ x.weights.T)
-            np.matmul(z.weights, upsampled.reshape(size, -1, by * bx), out=rows.reshape(size, bz, by * bx))
+            np.matmul(
+                z.weights, upsampled.reshape(size, -1, by * bx), out=rows.reshape(size, bz, by * bx)
+            )

@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.encoder import code_series, compact_header, promise, required_features, write_table
+from fhash_codec.compact.encoder import (
+    code_series,
+    compact_header,
+    promise,
+    required_features,
+    write_table,
+)
 from fhash_codec.comparison import measure
 from fhash_codec.config import EncodeConfig
 from fhash_codec.normalise import ValueRange
@@ -57,7 +63,11 @@ def encode(
     check_name(path)
     check_output(path, force)
     with opened(source) as series:
-        masks = [feature.removeprefix("mask:") for feature in config.features if feature.startswith("mask:")]
+        masks = [
+            feature.removeprefix("mask:")
+            for feature in config.features
+            if feature.startswith("mask:")
+        ]
         check_output(path, force, sources=[*series.files, *masks])
         with ContainerWriter(path, force=force) as writer:
             fill = _compact if config.profile == "compact" else _paper
@@ -75,7 +85,12 @@ def encode(
 
 
 def _paper(
-    writer: ContainerWriter, series: Series, config: EncodeConfig, mask: npt.ArrayLike | None, path: Path, progress: Progress
+    writer: ContainerWriter,
+    series: Series,
+    config: EncodeConfig,
+    mask: npt.ArrayLike | None,
+    path: Path,
+    progress: Progress,
 ) -> tuple[dict[str, Any], Path | None]:
     """Train the published model and write it; the header without its quality, and the checkpoint to be removed."""
     selected = select(series, config, progress, mask)
@@ -88,7 +103,16 @@ def _paper(
 
         # A promise counts every step; what is between key frames this search does not see.
         psnr = config.psnr if len(coreset.key_frames) == series.shape[0] else None
-        loss = write_coded(writer, architecture, coreset, trained.fine, trained.tables, trained.layers, psnr, progress)
+        loss = write_coded(
+            writer,
+            architecture,
+            coreset,
+            trained.fine,
+            trained.tables,
+            trained.layers,
+            psnr,
+            progress,
+        )
     else:
         write_tables(writer, architecture, coreset, trained.fine, trained.tables, config.tables)
     write_model(writer, architecture, coreset, trained.layers)
@@ -100,7 +124,12 @@ def _paper(
 
 
 def _compact(
-    writer: ContainerWriter, series: Series, config: EncodeConfig, mask: npt.ArrayLike | None, path: Path, progress: Progress
+    writer: ContainerWriter,
+    series: Series,
+    config: EncodeConfig,
+    mask: npt.ArrayLike | None,
+    path: Path,
+    progress: Progress,
 ) -> tuple[dict[str, Any], Path | None]:
     """Code the lattice values and write them; the header without its quality."""
     if native.library() is None:
@@ -129,9 +158,14 @@ def _compact(
         "features": [str(feature) for feature in found.features],
         "coreset_fraction": found.extent.fraction,
         "model": compact_header(table, config),
-        "config": {name: value for name, value in config.to_dict().items() if value != defaults[name]} | promise(config),
+        "config": {
+            name: value for name, value in config.to_dict().items() if value != defaults[name]
+        }
+        | promise(config),
         "training": training,
-        "history": {name: [point.get(name) for point in history] for name in (history[0] if history else ())},
+        "history": {
+            name: [point.get(name) for point in history] for name in (history[0] if history else ())
+        },
     }
     return header, None
 
@@ -140,7 +174,12 @@ def _described(series: Series, value_range: ValueRange, config: EncodeConfig) ->
     """What the headers of both profiles say of the series."""
     return {
         "encoder": {"version": version("fhash"), "seed": config.seed},
-        "variable": {"name": series.name, "units": series.units, "dtype": series.dtype.name, "attributes": dict(series.attributes)},
+        "variable": {
+            "name": series.name,
+            "units": series.units,
+            "dtype": series.dtype.name,
+            "attributes": dict(series.attributes),
+        },
         "domain": {"shape": list(series.shape)},
         "value_range": [value_range.low, value_range.high],
         "dilation": config.dilation,
@@ -152,9 +191,18 @@ def _check_promise(path: Path, config: EncodeConfig, figures: dict[str, Any]) ->
     """Raise QualityError where the written file does not keep what was promised."""
     psnr, largest = figures["psnr"], figures["max_abs_error"]
     asked, found = "", ""
-    wanted = promise(config) if config.profile == "compact" else {} if config.psnr is None else {"psnr": config.psnr}
+    wanted = (
+        promise(config)
+        if config.profile == "compact"
+        else {}
+        if config.psnr is None
+        else {"psnr": config.psnr}
+    )
     if "psnr" in wanted and figures["rmse"] != 0 and (psnr is None or psnr < wanted["psnr"]):
-        asked, found = f"{wanted['psnr']:g} dB were", "an unknown PSNR" if psnr is None else f"{psnr:.2f} dB over the coreset"
+        asked, found = (
+            f"{wanted['psnr']:g} dB were",
+            "an unknown PSNR" if psnr is None else f"{psnr:.2f} dB over the coreset",
+        )
     bound = wanted.get("max_error", math.inf)
     if "max_error_rel" in wanted:
         bound = wanted["max_error_rel"] * figures["data_range"]
@@ -162,20 +210,29 @@ def _check_promise(path: Path, config: EncodeConfig, figures: dict[str, Any]) ->
         asked, found = f"at most {bound:g} was", f"a largest error of {largest:g}"
     if asked:
         more = "" if config.profile == "compact" else ". More --epochs may help"
-        raise QualityError(f"{path}: {found}, {asked} asked for; the file is written{more}", figures)
+        raise QualityError(
+            f"{path}: {found}, {asked} asked for; the file is written{more}", figures
+        )
 
 
 def check_name(path: Path) -> None:
     """Refuse to give a container the name of another kind of file (InputError): most often it is that of the data."""
     if path.suffix.lower() in (suffix for writer in WRITERS for suffix in writer.suffixes):
-        raise InputError(f"{path}: a container is not a {path.suffix} file; give it a name that ends in .fhz")
+        raise InputError(
+            f"{path}: a container is not a {path.suffix} file; give it a name that ends in .fhz"
+        )
 
 
 MISSING_CHUNK_BYTES = 1 << 20  # a member of its own for each step would cost 130 bytes a step
 
 
 def write_series(
-    writer: ContainerWriter, series: Series, scanned: Scan, key_frames: Sequence[int], *, brief: bool = False
+    writer: ContainerWriter,
+    series: Series,
+    scanned: Scan,
+    key_frames: Sequence[int],
+    *,
+    brief: bool = False,
 ) -> dict[str, Any]:
     """Coordinates, key frames, and where the source has no finite value; what the header has to say of them.
 
@@ -186,7 +243,11 @@ def write_series(
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
             coordinate = series.coords[axis]
-            writer.add_whole(f"coords/{stored}", coordinate.values, attributes={**coordinate.attributes, "name": coordinate.name})
+            writer.add_whole(
+                f"coords/{stored}",
+                coordinate.values,
+                attributes={**coordinate.attributes, "name": coordinate.name},
+            )
     if not brief or len(key_frames) < steps:
         writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
     if scanned.missing:
@@ -198,16 +259,27 @@ def write_series(
             dtype=empty.dtype,
             chunk_shape=(rows, empty.size),
             chunks=(
-                np.stack([scanned.missing.get(step, empty) for step in range(start, min(start + rows, steps))])
+                np.stack(
+                    [
+                        scanned.missing.get(step, empty)
+                        for step in range(start, min(start + rows, steps))
+                    ]
+                )
                 for start in range(0, steps, rows)
             ),
         )
     return {"coordinates": described} if brief else {}
 
 
-def _header(series: Series, selected: Selection, trained: Trained, config: EncodeConfig) -> dict[str, Any]:
+def _header(
+    series: Series, selected: Selection, trained: Trained, config: EncodeConfig
+) -> dict[str, Any]:
     """The container's header (FORMAT.md), its quality still to be measured."""
-    architecture, coreset, value_range = selected.architecture, selected.coreset, selected.scanned.value_range
+    architecture, coreset, value_range = (
+        selected.architecture,
+        selected.coreset,
+        selected.scanned.value_range,
+    )
     seconds = trained.history[-1]["seconds"] if trained.history else 0.0
     return {
         **_described(series, value_range, config),
@@ -230,7 +302,11 @@ def _header(series: Series, selected: Selection, trained: Trained, config: Encod
             "seconds": seconds if config.timings else None,
             "epochs": trained.epochs,
             "device": trained.device,
-            **({"restarts": trained.restarts, "learning_rate": trained.learning_rate} if trained.restarts else {}),
+            **(
+                {"restarts": trained.restarts, "learning_rate": trained.learning_rate}
+                if trained.restarts
+                else {}
+            ),
         },
         "history": brief_history(trained.history, timings=config.timings),
     }

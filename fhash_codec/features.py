@@ -102,7 +102,9 @@ class Segmentation(Feature):
 
     def select(self, frame: Frame, step: int) -> Selection:
         if self.threshold is None:
-            raise InputError("feature 'segmentation' has no threshold yet; resolve_features finds Otsu's from the data")
+            raise InputError(
+                "feature 'segmentation' has no threshold yet; resolve_features finds Otsu's from the data"
+            )
         selected: Selection = np.isfinite(frame)
         selected &= frame > _alike(self.threshold, frame)
         return selected
@@ -123,7 +125,9 @@ class Mask(Feature):
             raise InputError(f"feature '{self}' is not open yet; resolve_features opens it")
         marked = self.read(step)
         if marked.shape != frame.shape:
-            raise InputError(f"feature '{self}': the mask of step {step} has shape {marked.shape}; the frame has {frame.shape} (z, y, x)")
+            raise InputError(
+                f"feature '{self}': the mask of step {step} has shape {marked.shape}; the frame has {frame.shape} (z, y, x)"
+            )
         return np.isfinite(frame) & marked
 
     def __str__(self) -> str:
@@ -140,10 +144,16 @@ def parse_feature(text: str) -> Feature:
         low, high = _numbers(text, values, 2, "interval:LO:HI with LO <= HI")
         return Interval(low, high)
     if kind == "isosurface":
-        return Isosurface(*_numbers(text, values, 1, "isosurface:V with a finite number V", finite=True))
+        return Isosurface(
+            *_numbers(text, values, 1, "isosurface:V with a finite number V", finite=True)
+        )
     if kind == "segmentation":
         form = "segmentation or segmentation:T with a finite number T"
-        return Segmentation() if values is None else Segmentation(*_numbers(text, values, 1, form, finite=True))
+        return (
+            Segmentation()
+            if values is None
+            else Segmentation(*_numbers(text, values, 1, form, finite=True))
+        )
     if kind == "mask" and values:
         return Mask(values)
     raise InputError(f"feature '{text}' is not known; allowed: {KINDS}")
@@ -165,14 +175,18 @@ def resolve_features(
     features = [parse_feature(text) for text in texts]
     if Segmentation() in features:
         edges = value_range.from_unit(np.linspace(0.0, 1.0, BINS + 1))
-        filled = Segmentation(otsu_threshold(_histogram(series, key_frames, value_range, progress), edges))
+        filled = Segmentation(
+            otsu_threshold(_histogram(series, key_frames, value_range, progress), edges)
+        )
         features = [filled if feature == Segmentation() else feature for feature in features]
     if any(isinstance(feature, Mask) for feature in features) and open_mask is None:
         from fhash_formats.readers import open_mask as open_mask_file
 
         open_mask = open_mask_file
     return tuple(
-        dataclasses.replace(feature, read=open_mask(feature.path, series.shape)) if isinstance(feature, Mask) and open_mask else feature
+        dataclasses.replace(feature, read=open_mask(feature.path, series.shape))
+        if isinstance(feature, Mask) and open_mask
+        else feature
         for feature in features
     )
 
@@ -187,7 +201,9 @@ def otsu_threshold(counts: npt.ArrayLike, edges: npt.ArrayLike) -> float:
     below, total = np.cumsum(weights)[:-1], weights.sum()
     above = total - below
     difference = np.cumsum(moments)[:-1] * total - moments.sum() * below
-    variance = np.divide(difference**2, below * above, out=np.zeros_like(below), where=below * above > 0)
+    variance = np.divide(
+        difference**2, below * above, out=np.zeros_like(below), where=below * above > 0
+    )
     best = np.flatnonzero(variance == variance.max())
     return float(bounds[best[best.size // 2] + 1])
 
@@ -215,23 +231,31 @@ def _alike(value: float, frame: Frame) -> np.generic:
         return np.float64(value).astype(frame.dtype if frame.dtype.kind == "f" else np.float64)
 
 
-def _histogram(series: Series, key_frames: Sequence[int], value_range: ValueRange, progress: Progress) -> npt.NDArray[np.int64]:
+def _histogram(
+    series: Series, key_frames: Sequence[int], value_range: ValueRange, progress: Progress
+) -> npt.NDArray[np.int64]:
     counts = np.zeros(BINS, dtype=np.int64)
     for done, step in enumerate(key_frames):
         for part in pieces(series.read(step)):
             unit = value_range.to_unit(finite_values(part))
-            counts += np.bincount(np.minimum((unit * BINS).astype(np.int64), BINS - 1), minlength=BINS)
+            counts += np.bincount(
+                np.minimum((unit * BINS).astype(np.int64), BINS - 1), minlength=BINS
+            )
         progress("thresholding", done + 1, len(key_frames), "")
     return counts
 
 
-def _numbers(text: str, values: str | None, count: int, form: str, *, finite: bool = False) -> list[float]:
+def _numbers(
+    text: str, values: str | None, count: int, form: str, *, finite: bool = False
+) -> list[float]:
     parts = [] if values is None else values.split(":")
     try:
         numbers = [float(part) for part in parts]
     except ValueError:
         numbers = []
-    if len(numbers) != count or any(math.isnan(number) or (finite and math.isinf(number)) for number in numbers):
+    if len(numbers) != count or any(
+        math.isnan(number) or (finite and math.isinf(number)) for number in numbers
+    ):
         raise InputError(f"feature '{text}' is malformed; write {form}")
     return numbers
 

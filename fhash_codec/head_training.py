@@ -17,7 +17,14 @@ from torch import Tensor
 from fhash_codec.engines.adam import adam_step
 from fhash_formats.errors import InputError
 from fhash_formats.transform.head import MAX_BIAS, MAX_WEIGHT, Head, Layer, layer_inputs
-from fhash_formats.transform.head_portable import CROSS, FEATURES, STEPS, centre_features, clip, compress
+from fhash_formats.transform.head_portable import (
+    CROSS,
+    FEATURES,
+    STEPS,
+    centre_features,
+    clip,
+    compress,
+)
 
 __all__ = ["Pair", "TrainedHead", "train_head"]
 
@@ -94,21 +101,47 @@ def train_head(
     """
     if steps is not None and seconds is not None:
         raise InputError("give the steps or the seconds of a head's training, not both")
-    if device not in ("auto", "cpu", "cuda") or (device == "cuda" and not torch.cuda.is_available()):
-        raise InputError(f"a head cannot be trained on device {device!r}: allowed are auto, cpu, and cuda where there is one")
-    place = torch.device("cuda" if device == "auto" and torch.cuda.is_available() else "cpu" if device == "auto" else device)
+    if device not in ("auto", "cpu", "cuda") or (
+        device == "cuda" and not torch.cuda.is_available()
+    ):
+        raise InputError(
+            f"a head cannot be trained on device {device!r}: allowed are auto, cpu, and cuda where there is one"
+        )
+    place = torch.device(
+        "cuda"
+        if device == "auto" and torch.cuda.is_available()
+        else "cpu"
+        if device == "auto"
+        else device
+    )
     bounds = np.float32(low), np.float32(high)
     random = np.random.default_rng(seed)
-    learnt, tested = (_draw(pairs, max(1, round(count / _BATCH)) * _BATCH, random, *bounds) for count in (samples, samples // 5))
+    learnt, tested = (
+        _draw(pairs, max(1, round(count / _BATCH)) * _BATCH, random, *bounds)
+        for count in (samples, samples // 5)
+    )
     errors = np.concatenate([drawn.originals - drawn.values for drawn in learnt])
     sigma = np.sqrt(np.mean(errors.astype(np.float64) ** 2)).astype(np.float32)
     if not sigma > 0:
         raise InputError("a head has nothing to learn: the decoded values are the original ones")
     seen = CROSS if cross else CROSS[:1]
-    training, held_out = (_samples(pairs, drawn, seen, random, sigma, *bounds, place) for drawn in (learnt, tested))
+    training, held_out = (
+        _samples(pairs, drawn, seen, random, sigma, *bounds, place) for drawn in (learnt, tested)
+    )
     with _one_thread:
-        layers, history = _optimise(training, held_out, hidden, cross, 4000 if steps is None else steps, seconds, seed, progress)
-    head = Head(layers=layers, sigma=float(sigma), low=float(bounds[0]), high=float(bounds[1]), cross=cross)
+        layers, history = _optimise(
+            training,
+            held_out,
+            hidden,
+            cross,
+            4000 if steps is None else steps,
+            seconds,
+            seed,
+            progress,
+        )
+    head = Head(
+        layers=layers, sigma=float(sigma), low=float(bounds[0]), high=float(bounds[1]), cross=cross
+    )
     return TrainedHead(head=head, gain_db=history[-1][2], history=tuple(history))
 
 
@@ -143,7 +176,9 @@ def _optimise(
     progress: Callable[[float], None] | None,
 ) -> tuple[tuple[Layer, ...], list[tuple[float, int, float]]]:  # fmt: skip
     generator = torch.Generator().manual_seed(seed)
-    parameters = _initial(layer_inputs(hidden, cross), [*hidden, 1], generator, training.inputs.device)
+    parameters = _initial(
+        layer_inputs(hidden, cross), [*hidden, 1], generator, training.inputs.device
+    )
     means, squares = ([torch.zeros_like(parameter) for parameter in parameters] for _ in range(2))
     step, part = 0, 0.0
     history: list[tuple[float, int, float]] = []
@@ -154,16 +189,29 @@ def _optimise(
         part = min(1.0, step / steps if seconds is None else elapsed / seconds)
         if len(parameters[0]) > 1 and part >= _CHOSEN_AT:
             best = int(_gains(parameters, held_out, rounded=False).argmax())
-            parameters, means, squares = ([tensor[best : best + 1].detach() for tensor in held] for held in (parameters, means, squares))
-        rate = _RATE * (part / _WARM_UP if part < _WARM_UP else 0.5 + 0.5 * math.cos(math.pi * (part - _WARM_UP) / (1 - _WARM_UP)))
+            parameters, means, squares = (
+                [tensor[best : best + 1].detach() for tensor in held]
+                for held in (parameters, means, squares)
+            )
+        rate = _RATE * (
+            part / _WARM_UP
+            if part < _WARM_UP
+            else 0.5 + 0.5 * math.cos(math.pi * (part - _WARM_UP) / (1 - _WARM_UP))
+        )
         for parameter in parameters:
             parameter.requires_grad_(True)
         error = _errors(parameters, training, step % len(training), rounded=part > _ROUNDED_FROM)
         gradients = torch.autograd.grad(error.square().mean(dim=1).sum(), parameters)
         with torch.no_grad():
-            norms = torch.stack([gradient.square().flatten(1).sum(dim=1) for gradient in gradients]).sum(dim=0).sqrt()
+            norms = (
+                torch.stack([gradient.square().flatten(1).sum(dim=1) for gradient in gradients])
+                .sum(dim=0)
+                .sqrt()
+            )
             shrink = (_GRADIENT_NORM / (norms + 1e-9)).clamp(max=1.0)[:, None, None]
-            for parameter, gradient, mean, square in zip(parameters, gradients, means, squares, strict=True):
+            for parameter, gradient, mean, square in zip(
+                parameters, gradients, means, squares, strict=True
+            ):
                 adam_step(parameter, gradient * shrink, mean, square, step, rate)
         if part >= min(1.0, (len(history) + 1) / _MEASUREMENTS):
             gain = float(_gains(parameters, held_out, rounded=True).max())
@@ -173,9 +221,18 @@ def _optimise(
     return _layers(parameters), history
 
 
-def _draw(pairs: Sequence[Pair], samples: int, random: np.random.Generator, low: np.float32, high: np.float32) -> list[_Drawn]:
+def _draw(
+    pairs: Sequence[Pair],
+    samples: int,
+    random: np.random.Generator,
+    low: np.float32,
+    high: np.float32,
+) -> list[_Drawn]:
     """So many voxels that count, of each tile its share."""
-    counted = np.array([original.size if care is None else np.count_nonzero(care) for _, original, care in pairs], dtype=np.int64)
+    counted = np.array(
+        [original.size if care is None else np.count_nonzero(care) for _, original, care in pairs],
+        dtype=np.int64,
+    )
     if counted.sum() == 0:
         raise InputError("a head cannot be trained: no voxel counts")
     ends = np.rint(np.cumsum(counted) / counted.sum() * samples).astype(np.int64)
@@ -184,7 +241,11 @@ def _draw(pairs: Sequence[Pair], samples: int, random: np.random.Generator, low:
         among = original.size if care is None else np.flatnonzero(care)
         chosen = np.sort(random.choice(among, number)) if number else np.empty(0, np.int64)
         values = clip(decoded.ravel()[chosen], low, high)
-        drawn.append(_Drawn(np.stack(np.unravel_index(chosen, original.shape)), values, original.ravel()[chosen]))
+        drawn.append(
+            _Drawn(
+                np.stack(np.unravel_index(chosen, original.shape)), values, original.ravel()[chosen]
+            )
+        )
     return drawn
 
 
@@ -208,11 +269,18 @@ def _samples(
         piece = _PIECE // len(seen)
         for start in range(0, places.shape[1], piece):
             part = places[:, start : start + piece]
-            at = np.stack([origin + strides @ np.clip(part + np.array(step)[:, None], 0, edges) for step in seen])
+            at = np.stack(
+                [
+                    origin + strides @ np.clip(part + np.array(step)[:, None], 0, edges)
+                    for step in seen
+                ]
+            )
             centre = flat[at]
             features = np.empty((FEATURES, *at.shape), dtype=np.int16)
             for number, step in enumerate(STEPS):
-                features[number] = compress((flat[at + int(strides @ np.array(step))] - centre) * inverse)
+                features[number] = compress(
+                    (flat[at + int(strides @ np.array(step))] - centre) * inverse
+                )
             features[-2:] = centre_features(centre, low, inverse, unit)
             batch, slot = np.divmod(order[first : first + at.shape[1]], _BATCH)
             inputs[batch, :, :, slot] = features.transpose(2, 0, 1)
@@ -231,14 +299,21 @@ def _samples(
     )
 
 
-def _initial(inputs: Sequence[int], outputs: Sequence[int], generator: torch.Generator, device: torch.device) -> list[Tensor]:
+def _initial(
+    inputs: Sequence[int], outputs: Sequence[int], generator: torch.Generator, device: torch.device
+) -> list[Tensor]:
     """Weights (starts, out, in) and biases (starts, out, 1) of each layer in turn; the last layer begins near 0."""
     parameters = []
     for number, (columns, rows) in enumerate(zip(inputs, outputs, strict=True)):
         last = number == len(outputs) - 1
         reach = columns**-0.5
-        for shape, scale in (((_STARTS, rows, columns), 0.1 if last else 1.0), ((_STARTS, rows, 1), 0.0 if last else 1.0)):
-            parameters.append(((torch.rand(shape, generator=generator) * 2 - 1) * reach * scale).to(device))
+        for shape, scale in (
+            ((_STARTS, rows, columns), 0.1 if last else 1.0),
+            ((_STARTS, rows, 1), 0.0 if last else 1.0),
+        ):
+            parameters.append(
+                ((torch.rand(shape, generator=generator) * 2 - 1) * reach * scale).to(device)
+            )
     return parameters
 
 
@@ -255,7 +330,9 @@ def _rounded(parameter: Tensor, most: int) -> Tensor:
     return parameter + (steps * scale - parameter).detach()
 
 
-def _errors(parameters: Sequence[Tensor], samples: _Samples, batch: int, *, rounded: bool) -> Tensor:
+def _errors(
+    parameters: Sequence[Tensor], samples: _Samples, batch: int, *, rounded: bool
+) -> Tensor:
     """Corrected minus original values of a batch (starts, n) in units of sigma."""
     inputs = samples.inputs[batch].to(torch.float32).mul_(1 / 512)
     values = inputs.reshape(1, FEATURES, -1).expand(len(parameters[0]), -1, -1)
@@ -264,17 +341,27 @@ def _errors(parameters: Sequence[Tensor], samples: _Samples, batch: int, *, roun
         if rounded:
             weights, biases = _rounded(weights, MAX_WEIGHT), _rounded(biases, MAX_BIAS)
         # Before the second layer, the voxels looked at become inputs: those of one output of the first layer after those of another.
-        values = torch.baddbmm(biases, weights, values.reshape(len(values), -1, inputs.shape[2]) if layer == 2 else values)
+        values = torch.baddbmm(
+            biases,
+            weights,
+            values.reshape(len(values), -1, inputs.shape[2]) if layer == 2 else values,
+        )
         if layer + 2 < len(parameters):
             values = torch.nn.functional.leaky_relu(values, 0.125)
     # Whatever lies beyond the clip range costs nothing more: the decoder clips it.
-    return torch.minimum(torch.maximum(values[:, 0], samples.least[batch]), samples.greatest[batch]) - samples.targets[batch]
+    return (
+        torch.minimum(torch.maximum(values[:, 0], samples.least[batch]), samples.greatest[batch])
+        - samples.targets[batch]
+    )
 
 
 def _gains(parameters: Sequence[Tensor], held_out: _Samples, *, rounded: bool) -> Tensor:
     """dB that each of the starts gains on the held-out samples."""
     with torch.no_grad():
-        errors = [_errors(parameters, held_out, batch, rounded=rounded).square().mean(dim=1) for batch in range(len(held_out))]
+        errors = [
+            _errors(parameters, held_out, batch, rounded=rounded).square().mean(dim=1)
+            for batch in range(len(held_out))
+        ]
         return 10 * torch.log10(held_out.targets.square().mean() / torch.stack(errors).mean(dim=0))
 
 
@@ -282,10 +369,24 @@ def _layers(parameters: Sequence[Tensor]) -> tuple[Layer, ...]:
     layers = []
     for number in range(0, len(parameters), 2):
         quantised, scales = [], []
-        for parameter, most in zip(parameters[number : number + 2], (MAX_WEIGHT, MAX_BIAS), strict=True):
+        for parameter, most in zip(
+            parameters[number : number + 2], (MAX_WEIGHT, MAX_BIAS), strict=True
+        ):
             scale = _scale(parameter, most)
-            quantised.append((parameter.detach() / scale).round().clamp(-most, most)[0].to(torch.int8).cpu().numpy())
+            quantised.append(
+                (parameter.detach() / scale)
+                .round()
+                .clamp(-most, most)[0]
+                .to(torch.int8)
+                .cpu()
+                .numpy()
+            )
             scales.append(float(scale))
-        weights, biases = np.ascontiguousarray(quantised[0]), np.ascontiguousarray(quantised[1][:, 0])
-        layers.append(Layer(weights=weights, biases=biases, weight_scale=scales[0], bias_scale=scales[1]))
+        weights, biases = (
+            np.ascontiguousarray(quantised[0]),
+            np.ascontiguousarray(quantised[1][:, 0]),
+        )
+        layers.append(
+            Layer(weights=weights, biases=biases, weight_scale=scales[0], bias_scale=scales[1])
+        )
     return tuple(layers)

@@ -45,7 +45,9 @@ class KeyTimes:
 
     def __post_init__(self) -> None:
         if not strictly_monotonic(self.times):
-            raise InputError("times are not finite and strictly ascending or descending; use step numbers in their place")
+            raise InputError(
+                "times are not finite and strictly ascending or descending; use step numbers in their place"
+            )
 
     def key_index(self, step: float) -> float:
         """The fractional key index of a fractional step, in [0, key frames - 1]; a whole number exactly at each key frame.
@@ -64,7 +66,13 @@ class KeyTimes:
         outside = ~((steps >= 0) & (steps <= last))
         if outside.any():
             raise RegionError(f"step {steps[outside].flat[0]:g} is outside 0..{last}")
-        return np.asarray(np.clip(np.interp(steps, np.arange(last + 1), self._key_indices_of_steps), 0, len(self.key_frames) - 1))
+        return np.asarray(
+            np.clip(
+                np.interp(steps, np.arange(last + 1), self._key_indices_of_steps),
+                0,
+                len(self.key_frames) - 1,
+            )
+        )
 
     @cached_property
     def _key_indices_of_steps(self) -> npt.NDArray[np.float64]:
@@ -86,8 +94,12 @@ class KeyTimes:
         ascending, turned = self._ascending(), self._sign() * times
         outside = ~((turned >= ascending[0]) & (turned <= ascending[-1]))
         if outside.any():
-            raise RegionError(f"time {times[outside].flat[0]:g} is outside {self.times.min():g}..{self.times.max():g}")
-        found = np.asarray(np.interp(turned * self._scale, ascending * self._scale, np.arange(ascending.size)))
+            raise RegionError(
+                f"time {times[outside].flat[0]:g} is outside {self.times.min():g}..{self.times.max():g}"
+            )
+        found = np.asarray(
+            np.interp(turned * self._scale, ascending * self._scale, np.arange(ascending.size))
+        )
         # A time of the series is its step, also where scaling made it equal to another.
         at = np.searchsorted(ascending, turned)
         return np.where(ascending[at] == turned, at, found)
@@ -105,7 +117,9 @@ class KeyTimes:
         return self._sign() * self.times
 
 
-def select_key_frames(spec: str, series: Series, times: npt.NDArray[np.float64], progress: Progress) -> tuple[int, ...]:
+def select_key_frames(
+    spec: str, series: Series, times: npt.NDArray[np.float64], progress: Progress
+) -> tuple[int, ...]:
     """The ascending steps that `spec` names: all | every:K (the last step always included) | auto:N | a list such as 0,4,9.
 
     `auto:N` reads every frame once (progress stage "key frames") and needs strictly monotonic times (T,).
@@ -121,7 +135,9 @@ def select_key_frames(spec: str, series: Series, times: npt.NDArray[np.float64],
     if kind == "auto":
         count = _count(spec, value, "auto:N with N >= 2")
         if count == 1 and steps > 1:
-            raise InputError(f"key-frames is '{spec}' for {steps} steps; allowed: auto:N with N at least 2, since both ends are kept")
+            raise InputError(
+                f"key-frames is '{spec}' for {steps} steps; allowed: auto:N with N at least 2, since both ends are kept"
+            )
         return tuple(range(steps)) if count >= steps else _auto(series, times, count, progress)
     return _listed(spec, steps)
 
@@ -138,13 +154,19 @@ def _listed(spec: str, steps: int) -> tuple[int, ...]:
         raise InputError(f"key-frames is '{spec}'; allowed: {FORMS}")
     chosen = tuple(int(part) for part in parts)
     if chosen[-1] >= steps or any(second <= first for first, second in pairwise(chosen)):
-        raise InputError(f"key-frames is '{spec}'; a list must ascend without repeats within 0..{steps - 1}")
+        raise InputError(
+            f"key-frames is '{spec}'; a list must ascend without repeats within 0..{steps - 1}"
+        )
     return chosen
 
 
-def _auto(series: Series, times: npt.NDArray[np.float64], count: int, progress: Progress) -> tuple[int, ...]:
+def _auto(
+    series: Series, times: npt.NDArray[np.float64], count: int, progress: Progress
+) -> tuple[int, ...]:
     if not strictly_monotonic(times):
-        raise InputError("key-frames auto:N needs times that strictly ascend or descend; use step numbers in their place")
+        raise InputError(
+            "key-frames auto:N needs times that strictly ascend or descend; use step numbers in their place"
+        )
     steps = series.shape[0]
     stride = lattice_stride(series.shape[1:], max(1, min(MAX_VOXELS, MAX_SAMPLES // steps)))
     samples: list[npt.NDArray[Any]] = []
@@ -168,7 +190,10 @@ def gram_matrix(samples: Sequence[npt.NDArray[Any]]) -> npt.NDArray[np.float64]:
     The shift changes no interpolation error, since the weights of an interpolation add up to one, and spares the digits of it.
     NaN and infinite values are set to the mean of all finite ones.
     """
-    peak = max(float(np.abs(frame[np.isfinite(frame)].astype(np.float64)).max(initial=0.0)) for frame in samples)
+    peak = max(
+        float(np.abs(frame[np.isfinite(frame)].astype(np.float64)).max(initial=0.0))
+        for frame in samples
+    )
     scale = power_of_two(peak)
     total, count = 0.0, 0
     for block in _columns(samples):
@@ -190,7 +215,9 @@ def _columns(samples: Sequence[npt.NDArray[Any]]) -> Iterator[npt.NDArray[np.flo
         yield np.stack([frame[start : start + width].astype(np.float64) for frame in samples])
 
 
-def segment_costs(gram: npt.NDArray[np.float64], times: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def segment_costs(
+    gram: npt.NDArray[np.float64], times: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
     """cost[a, b], (T, T): summed squared error of the frames strictly between a and b if they are interpolated in time from a and b.
 
     With y_k = x_k - x_a and s_k = t_k - t_a, the error of frame k is |y_k - s_k / s_b y_b|^2, whose sum over k needs only the inner
@@ -209,7 +236,9 @@ def segment_costs(gram: npt.NDArray[np.float64], times: npt.NDArray[np.float64])
         # Sums over a < k < b, for every b at once.
         before_squares, before_s2, before_s = (np.cumsum(v) - v for v in (squares, s * s, s))
         before_to_a = np.cumsum(s * to_a) - s * to_a
-        mixed = upper[later, later].T @ s - before_to_a - (to_a - own) * before_s  # sum of s_k (y_k . y_b)
+        mixed = (
+            upper[later, later].T @ s - before_to_a - (to_a - own) * before_s
+        )  # sum of s_k (y_k . y_b)
         costs[a, later] = before_squares - 2 * mixed / s + squares * before_s2 / (s * s)
     np.maximum(costs, 0.0, out=costs)  # rounding may leave a tiny negative sum
     return costs

@@ -55,7 +55,10 @@ class Lattice:
         """Every 2^lod-th vertex (z, y, x) of the box at a step, low-passed by each tile on its own; a region of them in coarse vertices."""
         tile, stride = self._array.chunk_shape, 1 << lod
         result = np.empty([high - low for low, high in region], dtype=self._array.dtype)
-        grid = [range(low * stride // n, (high - 1) * stride // n + 1) for (low, high), n in zip(region, tile[1:], strict=True)]
+        grid = [
+            range(low * stride // n, (high - 1) * stride // n + 1)
+            for (low, high), n in zip(region, tile[1:], strict=True)
+        ]
         for index in product(*grid):
             # A tile that begins between two coarse vertices gives its own lattice; the nearest of its vertices stand for those.
             ends = [
@@ -66,9 +69,15 @@ class Lattice:
                 continue
             part = self._array.decode_chunk((step // tile[0], *index), lod)[step % tile[0]]
             target, source = [], []
-            for i, n, (first, stop), (low, _), size in zip(index, tile[1:], ends, region, part.shape, strict=True):
+            for i, n, (first, stop), (low, _), size in zip(
+                index, tile[1:], ends, region, part.shape, strict=True
+            ):
                 target.append(slice(first - low, stop - low))
-                source.append(np.minimum((np.arange(first, stop) * stride - i * n + stride // 2) // stride, size - 1))
+                source.append(
+                    np.minimum(
+                        (np.arange(first, stop) * stride - i * n + stride // 2) // stride, size - 1
+                    )
+                )
             result[tuple(target)] = part[np.ix_(*source)]
         return result
 
@@ -76,7 +85,9 @@ class Lattice:
         """Values at points, quadrilinear: steps and (z, y, x) in vertices of the box, all inside."""
         return self._interpolated(steps, space)[0]
 
-    def slopes(self, steps: Positions, space: list[Positions]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def slopes(
+        self, steps: Positions, space: list[Positions]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Values, and derivatives (points, 4) by step, z, y and x; on the border of two cells those of the cell after it."""
         values, corners, weights = self._interpolated(steps, space)
         slopes = np.empty((values.size, 4))
@@ -89,7 +100,10 @@ class Lattice:
                 factor = factor * np.stack([1 - weights[other], weights[other]]).reshape(shape)
             # A corner without weight counts for nothing, also where it is not finite.
             weighted = np.where(factor == 0, 0.0, factor * corners)
-            low, high = (np.take(weighted, side, axis=axis).reshape(-1, values.size).sum(axis=0) for side in (0, 1))
+            low, high = (
+                np.take(weighted, side, axis=axis).reshape(-1, values.size).sum(axis=0)
+                for side in (0, 1)
+            )
             slopes[:, axis] = high - low
         return values, slopes
 
@@ -98,11 +112,16 @@ class Lattice:
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], list[Positions]]:
         """Values, the 16 corners (2, 2, 2, 2, points) around each point, and the weights of the upper corner along each axis."""
         shape = self._array.shape
-        low = [np.clip(np.floor(p).astype(np.int64), 0, max(n - 2, 0)) for p, n in zip([steps, *space], shape, strict=True)]
+        low = [
+            np.clip(np.floor(p).astype(np.int64), 0, max(n - 2, 0))
+            for p, n in zip([steps, *space], shape, strict=True)
+        ]
         weights = [p - i for p, i in zip([steps, *space], low, strict=True)]
         high = [np.minimum(i + 1, n - 1) for i, n in zip(low, shape, strict=True)]
         corners = np.empty((2, 2, 2, 2, steps.size))
-        box = tuple((int(i.min()), int(h.max()) + 1) for i, h in zip(low[1:], high[1:], strict=True))
+        box = tuple(
+            (int(i.min()), int(h.max()) + 1) for i, h in zip(low[1:], high[1:], strict=True)
+        )
         space_slices = tuple(slice(*part) for part in box)
         for step in np.unique(np.concatenate([low[0], high[0]])):
             frame = self._array.read((slice(int(step), int(step) + 1), *space_slices))[0]

@@ -85,17 +85,31 @@ class Errors:
         self._squares = 0.0
         self._largest = 0.0
 
-    def add(self, step: int, original: Values, decoded: Values, mask: npt.NDArray[np.bool_] | None = None) -> StepQuality:
+    def add(
+        self,
+        step: int,
+        original: Values,
+        decoded: Values,
+        mask: npt.NDArray[np.bool_] | None = None,
+    ) -> StepQuality:
         """Compare a frame where `mask` is set, everywhere if None; all of one shape. The step's figures.
 
         Raises InputError for other shapes and where a decoded value that counts is not finite.
         """
         return self.take(step, self.compare(step, original, decoded, mask))
 
-    def compare(self, step: int, original: Values, decoded: Values, mask: npt.NDArray[np.bool_] | None = None) -> tuple[int, float, float]:
+    def compare(
+        self,
+        step: int,
+        original: Values,
+        decoded: Values,
+        mask: npt.NDArray[np.bool_] | None = None,
+    ) -> tuple[int, float, float]:
         """Count, sum of squares and largest of the scaled differences of a frame, which `take` takes in; raises as `add`."""
         if original.shape != decoded.shape or (mask is not None and mask.shape != original.shape):
-            raise InputError(f"step {step}: the original is {original.shape}, the decoded {decoded.shape}; they must be of one shape")
+            raise InputError(
+                f"step {step}: the original is {original.shape}, the decoded {decoded.shape}; they must be of one shape"
+            )
         found = squared_errors(original, decoded, mask, self._scale)
         if found[0] < 0:
             raise InputError(f"step {step}: decoded values are not finite where they are compared")
@@ -108,7 +122,12 @@ class Errors:
         self._squares += squares
         self._largest = max(self._largest, largest)
         rmse = self._rmse(squares, count)
-        figures = StepQuality(step=step, psnr=self._psnr(squares, count), rmse=rmse, max_abs_error=self._unscaled(largest, count))
+        figures = StepQuality(
+            step=step,
+            psnr=self._psnr(squares, count),
+            rmse=rmse,
+            max_abs_error=self._unscaled(largest, count),
+        )
         self.steps.append(figures)
         return figures
 
@@ -179,8 +198,18 @@ def measure_quality(
         whole = bool(known.all())
         inside = coreset.compare(step, original, decoded, None if whole else known)
         # Where everything is decoded, both are the same.
-        outside = inside if whole else domain.compare(step, original, np.where(known, decoded, decoded.dtype.type(background)))
-        found = ssim(original, decoded, data_range, None if whole else known, threads=share) if similar else (0.0, 0)
+        outside = (
+            inside
+            if whole
+            else domain.compare(
+                step, original, np.where(known, decoded, decoded.dtype.type(background))
+            )
+        )
+        found = (
+            ssim(original, decoded, data_range, None if whole else known, threads=share)
+            if similar
+            else (0.0, 0)
+        )
         return _Compared(step=step, inside=inside, everywhere=outside, similarity=found)
 
     def collect() -> None:
@@ -188,8 +217,16 @@ def measure_quality(
         compared = waiting.popleft().result()
         figures = coreset.take(compared.step, compared.inside)
         domain.take(compared.step, compared.everywhere)
-        similarity, vertices = similarity + compared.similarity[0], vertices + compared.similarity[1]
-        progress("measuring", compared.step + 1, steps, "" if figures.psnr is None else f"{figures.psnr:.1f} dB")
+        similarity, vertices = (
+            similarity + compared.similarity[0],
+            vertices + compared.similarity[1],
+        )
+        progress(
+            "measuring",
+            compared.step + 1,
+            steps,
+            "" if figures.psnr is None else f"{figures.psnr:.1f} dB",
+        )
 
     with ThreadPoolExecutor(threads, thread_name_prefix="fhash-measure") as workers:
         for step in range(steps):
@@ -199,7 +236,11 @@ def measure_quality(
             at_once = max(1, min(FRAMES_HELD, steps, VERTICES_HELD // max(original.size, 1)))
             while len(waiting) >= at_once:
                 collect()
-            waiting.append(workers.submit(work, step, original, decoded, step in measured, -(-threads // at_once)))
+            waiting.append(
+                workers.submit(
+                    work, step, original, decoded, step in measured, -(-threads // at_once)
+                )
+            )
         while waiting:
             collect()
     return Quality(
@@ -207,7 +248,12 @@ def measure_quality(
         rmse=coreset.rmse,
         max_abs_error=coreset.max_abs_error,
         ssim=similarity / vertices if vertices else None,
-        ssim_window={"sigma": SIGMA, "window": WINDOW, "data_range": data_range if math.isfinite(data_range) else None, "steps": measured},
+        ssim_window={
+            "sigma": SIGMA,
+            "window": WINDOW,
+            "data_range": data_range if math.isfinite(data_range) else None,
+            "steps": measured,
+        },
         psnr_domain=domain.psnr,
         rmse_domain=domain.rmse,
         max_abs_error_domain=domain.max_abs_error,

@@ -18,7 +18,12 @@ class FHash(nn.Module):
     the value is normalised to the series' range.
     """
 
-    def __init__(self, architecture: Architecture, tables: Sequence[Tensor], layers: Sequence[tuple[Tensor, Tensor]]) -> None:
+    def __init__(
+        self,
+        architecture: Architecture,
+        tables: Sequence[Tensor],
+        layers: Sequence[tuple[Tensor, Tensor]],
+    ) -> None:
         """Tables (buckets, E) per level, finest first, and (weight (out, in), bias (out,)) per layer; they are trained in place."""
         super().__init__()
         self.architecture = architecture
@@ -29,7 +34,13 @@ class FHash(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Values (n,) at points (n, 4)."""
         sizes, levels = self.architecture.sizes, self.architecture.levels
-        hidden = torch.cat([interpolate(table, points, sizes, level) for table, level in zip(self.tables, levels, strict=True)], dim=1)
+        hidden = torch.cat(
+            [
+                interpolate(table, points, sizes, level)
+                for table, level in zip(self.tables, levels, strict=True)
+            ],
+            dim=1,
+        )
         for number, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             hidden = nn.functional.linear(hidden if number == 0 else hidden.relu(), weight, bias)
         return hidden.squeeze(1)
@@ -42,8 +53,14 @@ class FHash(nn.Module):
         derivative is the one of its flat side; on the border of two cells, that of the cell after it.
         """
         sizes, levels = self.architecture.sizes, self.architecture.levels
-        encoded = [interpolate_with_jacobian(table, points, sizes, level) for table, level in zip(self.tables, levels, strict=True)]
-        hidden, jacobian = torch.cat([value for value, _ in encoded], dim=1), torch.cat([slope for _, slope in encoded], dim=1)
+        encoded = [
+            interpolate_with_jacobian(table, points, sizes, level)
+            for table, level in zip(self.tables, levels, strict=True)
+        ]
+        hidden, jacobian = (
+            torch.cat([value for value, _ in encoded], dim=1),
+            torch.cat([slope for _, slope in encoded], dim=1),
+        )
         for number, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             if number > 0:
                 jacobian = jacobian * (hidden > 0).unsqueeze(-1)

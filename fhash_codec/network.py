@@ -81,9 +81,13 @@ class Network:
 
     def __post_init__(self) -> None:
         if not self.levels or len(self.tables) != len(self.levels):
-            raise InputError(f"network: {len(self.tables)} tables for {len(self.levels)} levels; each level needs one")
+            raise InputError(
+                f"network: {len(self.tables)} tables for {len(self.levels)} levels; each level needs one"
+            )
         if min(*self.box_size, self.key_frames) < 1:
-            raise InputError(f"network: box {self.box_size} with {self.key_frames} key frames; every length must be at least 1")
+            raise InputError(
+                f"network: box {self.box_size} with {self.key_frames} key frames; every length must be at least 1"
+            )
         for level, (resolution, table) in enumerate(zip(self.levels, self.tables, strict=True)):
             if tuple(table.shape) != (*resolution, self.embedding_size) or min(table.shape) < 1:
                 raise InputError(
@@ -92,7 +96,9 @@ class Network:
         width = self.features
         for index, (weight, bias) in enumerate(self.layers):
             if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
-                raise InputError(f"network: layer {index} has weight {weight.shape} and bias {bias.shape}; it gets {width} numbers")
+                raise InputError(
+                    f"network: layer {index} has weight {weight.shape} and bias {bias.shape}; it gets {width} numbers"
+                )
             if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
                 raise InputError(f"network: layer {index} holds numbers that are not finite")
             width = weight.shape[0]
@@ -137,7 +143,10 @@ class Head:
         self.inputs = np.zeros((network.features + 1, products * COLUMNS), np.float32)
         self.inputs[-1] = 1.0
         self.outputs = np.empty((products, COLUMNS), np.float32)
-        self.hidden = [np.empty((min(products, PRODUCTS), matrix.shape[0], COLUMNS), np.float32) for matrix in self.matrices]
+        self.hidden = [
+            np.empty((min(products, PRODUCTS), matrix.shape[0], COLUMNS), np.float32)
+            for matrix in self.matrices
+        ]
 
     def run(self) -> Floats:
         """The outputs (samples,) for `inputs`; the next run overwrites them."""
@@ -146,7 +155,9 @@ class Head:
             current = inputs[start : start + PRODUCTS]
             for matrix, hidden in zip(self.matrices, self.hidden, strict=True):
                 out = hidden[: len(current)]
-                with np.errstate(over="ignore", invalid="ignore"):  # of hostile weights; values are clipped to their range
+                with np.errstate(
+                    over="ignore", invalid="ignore"
+                ):  # of hostile weights; values are clipped to their range
                     np.matmul(matrix, current, out=out)
                 if hidden is not self.hidden[-1]:
                     np.maximum(out, 0.0, out=out)
@@ -160,7 +171,9 @@ class Head:
         Backwards through the layers; on a ReLU's kink the derivative is that of its flat side.
         """
         assert len(self.outputs) <= PRODUCTS, "only the last products' hidden layers are kept"
-        slope = np.broadcast_to(self.matrices[-1][0, :, None], (len(self.outputs), self.matrices[-1].shape[1], COLUMNS))
+        slope = np.broadcast_to(
+            self.matrices[-1][0, :, None], (len(self.outputs), self.matrices[-1].shape[1], COLUMNS)
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             for matrix, hidden in zip(self.matrices[-2::-1], self.hidden[-2::-1], strict=True):
                 slope = np.matmul(matrix.T, slope * (hidden > 0))

@@ -75,7 +75,9 @@ class ValueRange:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low <= self.high):
-            raise InputError(f"value range is {self.low!r} to {self.high!r}; two finite numbers, the lower first, are needed")
+            raise InputError(
+                f"value range is {self.low!r} to {self.high!r}; two finite numbers, the lower first, are needed"
+            )
 
     @property
     def scale(self) -> float:

@@ -22,7 +22,9 @@ def bit_order(shape: Shape) -> list[tuple[int, int]]:
     return [(axis, bit) for bit in range(max(widths)) for axis in (2, 1, 0) if bit < widths[axis]]
 
 
-def morton_index(z: npt.ArrayLike, y: npt.ArrayLike, x: npt.ArrayLike, shape: Shape) -> npt.NDArray[np.int64]:
+def morton_index(
+    z: npt.ArrayLike, y: npt.ArrayLike, x: npt.ArrayLike, shape: Shape
+) -> npt.NDArray[np.int64]:
     """The definition: bit number of the vertices (z, y, x), broadcast, in the grid of a box of `shape`."""
     vertex = [np.asarray(axis, dtype=np.int64) for axis in (z, y, x)]
     index = np.zeros(np.broadcast_shapes(*(axis.shape for axis in vertex)), dtype=np.int64)
@@ -45,7 +47,9 @@ def pack(mask: npt.NDArray[np.bool_]) -> Bits:
     """The grid of a mask (z, y, x): uint8 (packed_bytes,). Every small block of 8 vertices is one byte; bytes go to their Morton places."""
     shape = _shape(mask)
     steps, offsets = _byte_block(shape)
-    blocks = np.zeros([-(-size // step) for size, step in zip(shape, steps, strict=True)], dtype=np.uint8)
+    blocks = np.zeros(
+        [-(-size // step) for size, step in zip(shape, steps, strict=True)], dtype=np.uint8
+    )
     for place, (z, y, x) in enumerate(offsets):
         part = mask[z :: steps[0], y :: steps[1], x :: steps[2]].view(np.uint8)
         blocks[: part.shape[0], : part.shape[1], : part.shape[2]] |= part << (7 - place)
@@ -58,7 +62,9 @@ def pack(mask: npt.NDArray[np.bool_]) -> Bits:
 def unpack(bits: Bits, shape: Shape) -> npt.NDArray[np.bool_]:
     """The mask (z, y, x) of a packed grid: the inverse of `pack`."""
     steps, offsets = _byte_block(shape)
-    blocks = np.empty([-(-size // step) for size, step in zip(shape, steps, strict=True)], dtype=np.uint8)
+    blocks = np.empty(
+        [-(-size // step) for size, step in zip(shape, steps, strict=True)], dtype=np.uint8
+    )
     for z, plane in enumerate(blocks):
         plane[...] = bits[_byte_index(z, plane.shape, steps, shape)]
     mask = np.empty(shape, dtype=np.uint8)
@@ -86,10 +92,16 @@ def _byte_block(shape: Shape) -> tuple[list[int], list[tuple[int, int, int]]]:
     return steps, offsets
 
 
-def _byte_index(z: int, blocks: tuple[int, ...], steps: list[int], shape: Shape) -> npt.NDArray[np.int64]:
+def _byte_index(
+    z: int, blocks: tuple[int, ...], steps: list[int], shape: Shape
+) -> npt.NDArray[np.int64]:
     """Byte numbers (blocks y, blocks x) of one plane of byte blocks."""
     y = np.arange(blocks[0])[:, None] * steps[1]
     x = np.arange(blocks[1])[None, :] * steps[2]
     # z, y and x own different bits: interleave each axis alone and join.
-    alone = morton_index(z * steps[0], 0, 0, shape) | morton_index(0, y, 0, shape) | morton_index(0, 0, x, shape)
+    alone = (
+        morton_index(z * steps[0], 0, 0, shape)
+        | morton_index(0, y, 0, shape)
+        | morton_index(0, 0, x, shape)
+    )
     return alone >> 3

@@ -34,15 +34,23 @@ class Pair:
 
 def colours(values: npt.ArrayLike, low: float, high: float, points: Sequence[str]) -> Pixels:
     """Values of any shape as colours (..., 3) uint8, from `low` to `high` along the hexadecimal colours `points`; NaN becomes OUTSIDE."""
-    table = np.array([[int(point[i : i + 2], 16) for i in (0, 2, 4)] for point in points], dtype=np.float64)
+    table = np.array(
+        [[int(point[i : i + 2], 16) for i in (0, 2, 4)] for point in points], dtype=np.float64
+    )
     array = np.asarray(values, dtype=np.float64)
-    where = np.clip((np.nan_to_num(array) - low) / ((high - low) or 1.0), 0.0, 1.0) * (len(table) - 1)
-    mixed = np.stack([np.interp(where, np.arange(len(table)), channel) for channel in table.T], axis=-1)
+    where = np.clip((np.nan_to_num(array) - low) / ((high - low) or 1.0), 0.0, 1.0) * (
+        len(table) - 1
+    )
+    mixed = np.stack(
+        [np.interp(where, np.arange(len(table)), channel) for channel in table.T], axis=-1
+    )
     mixed[np.isnan(array)] = OUTSIDE
     return np.asarray(np.rint(mixed), dtype=np.uint8)
 
 
-def compare(pairs: Sequence[Pair], *, title: str, subtitle: str, quantity: str, footer: str = "") -> Image.Image:
+def compare(
+    pairs: Sequence[Pair], *, title: str, subtitle: str, quantity: str, footer: str = ""
+) -> Image.Image:
     """Three rows (original, decoded, error = decoded - original) with a column for each pair, about 1240 pixels wide.
 
     Slices are drawn with x to the right and y upwards; a vertex is a square of whole pixels, nothing is smoothed.
@@ -52,7 +60,10 @@ def compare(pairs: Sequence[Pair], *, title: str, subtitle: str, quantity: str, 
     errors = [pair.decoded - pair.original for pair in pairs]
     low = min(float(pair.original.min()) for pair in pairs)
     high = max(float(pair.original.max()) for pair in pairs)
-    worst = max((float(np.nanmax(np.abs(error))) for error in errors if not np.isnan(error).all()), default=0.0)
+    worst = max(
+        (float(np.nanmax(np.abs(error))) for error in errors if not np.isnan(error).all()),
+        default=0.0,
+    )
     scale = max(1, (_WIDTH - _LEFT - _RIGHT - _GAP * (len(pairs) - 1)) // (len(pairs) * columns))
     wide, tall = columns * scale, rows * scale
     inner = len(pairs) * (wide + _GAP) - _GAP
@@ -85,7 +96,13 @@ def compare(pairs: Sequence[Pair], *, title: str, subtitle: str, quantity: str, 
     return image
 
 
-def _bar(image: Image.Image, place: tuple[int, int, int], points: Sequence[str], ticks: Sequence[float], name: str) -> None:
+def _bar(
+    image: Image.Image,
+    place: tuple[int, int, int],
+    points: Sequence[str],
+    ticks: Sequence[float],
+    name: str,
+) -> None:
     """A vertical colour bar at (left, top, height) with evenly spaced labels from the bottom up, and its name above it."""
     left, top, height = place
     ramp = colours(np.linspace(1.0, 0.0, height)[:, None].repeat(18, axis=1), 0.0, 1.0, points)
@@ -95,7 +112,13 @@ def _bar(image: Image.Image, place: tuple[int, int, int], points: Sequence[str],
     for index, tick in enumerate(ticks):
         share = index / (len(ticks) - 1)
         inset = 8 - round(16 * share)  # keeps the outer labels within the bar's length
-        draw.text((left + 26, top + height - round(height * share) - inset), f"{tick:.3g}", _FAINT, _font(15), anchor="lm")
+        draw.text(
+            (left + 26, top + height - round(height * share) - inset),
+            f"{tick:.3g}",
+            _FAINT,
+            _font(15),
+            anchor="lm",
+        )
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

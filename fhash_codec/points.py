@@ -81,13 +81,19 @@ def sample_points(
         span = np.stack([points[:, group].min(axis=1), points[:, group].max(axis=1)], axis=1)
         patches = [_patch(network, level, span) for level in range(len(network.levels))]
 
-        def work(chunks: Sequence[npt.NDArray[np.intp]], patches: Sequence[Patch] = patches) -> None:
+        def work(
+            chunks: Sequence[npt.NDArray[np.intp]], patches: Sequence[Patch] = patches
+        ) -> None:
             for chunk in chunks:
                 values[chunk], slope = _evaluate(network, patches, points[:, chunk], gradient)
                 if slope is not None:
                     slopes[chunk] = slope.T
 
-        share_out(work, [group[start : start + CHUNK_POINTS] for start in range(0, len(group), CHUNK_POINTS)], threads)
+        share_out(
+            work,
+            [group[start : start + CHUNK_POINTS] for start in range(0, len(group), CHUNK_POINTS)],
+            threads,
+        )
     return (values, slopes) if gradient else values
 
 
@@ -106,13 +112,17 @@ def feature_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
         for level, patch in enumerate(patches):
             before, after, _ = _locate(network, level, chunk)
             rows = slice(level * network.embedding_size, (level + 1) * network.embedding_size)
-            head.inputs[rows, :count] = interpolate(_corners(patch, before, network.levels[level]), after, False)[0]
+            head.inputs[rows, :count] = interpolate(
+                _corners(patch, before, network.levels[level]), after, False
+            )[0]
         head.run()
         slopes[:, start : start + count] = head.gradient()[:, :count]
     return slopes
 
 
-def _evaluate(network: Network, patches: Sequence[Patch], points: npt.NDArray[np.float64], gradient: bool) -> tuple[Floats, Floats | None]:
+def _evaluate(
+    network: Network, patches: Sequence[Patch], points: npt.NDArray[np.float64], gradient: bool
+) -> tuple[Floats, Floats | None]:
     """Values (n,) at points (4, n) within the patches and, if asked for, derivatives (4, n)."""
     size, count = network.embedding_size, points.shape[1]
     head = Head(network, count)
@@ -126,7 +136,9 @@ def _evaluate(network: Network, patches: Sequence[Patch], points: npt.NDArray[np
             np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows])
     values = head.run()[:count]
     with np.errstate(over="ignore", invalid="ignore"):  # of hostile weights
-        return values, np.einsum("fn,afn->an", head.gradient()[:, :count], slopes) if gradient else None
+        return values, np.einsum(
+            "fn,afn->an", head.gradient()[:, :count], slopes
+        ) if gradient else None
 
 
 def _points(network: Network, arrays: Sequence[npt.ArrayLike]) -> npt.NDArray[np.float64]:
@@ -140,14 +152,20 @@ def _points(network: Network, arrays: Sequence[npt.ArrayLike]) -> npt.NDArray[np
         raise InputError(
             f"points have shapes {', '.join(str(c.shape) for c in columns)}; one length (n,) is needed for key_index, z, y and x"
         )
-    for axis, column, size in zip(AXES, points, (network.key_frames, *network.box_size), strict=True):
+    for axis, column, size in zip(
+        AXES, points, (network.key_frames, *network.box_size), strict=True
+    ):
         outside = np.flatnonzero(~((column >= 0) & (column <= size - 1)))
         if len(outside):
-            raise RegionError(f"point {outside[0]}: {axis} {column[outside[0]]:g} is outside 0..{size - 1}")
+            raise RegionError(
+                f"point {outside[0]}: {axis} {column[outside[0]]:g} is outside 0..{size - 1}"
+            )
     return points
 
 
-def _locate(network: Network, level: int, points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], Floats, npt.NDArray[np.float64]]:
+def _locate(
+    network: Network, level: int, points: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.int64], Floats, npt.NDArray[np.float64]]:
     """The corner before each point (4, n), the weight in [0, 1] of the corner after it (4, n), and corners per vertex (4,)."""
     corners = np.array(network.levels[level])[:, None]
     span = np.array([max(size - 1, 1) for size in (network.key_frames, *network.box_size)])[:, None]
@@ -156,7 +174,9 @@ def _locate(network: Network, level: int, points: npt.NDArray[np.float64]) -> tu
     return before, (position - before).astype(np.float32), ((corners - 1) / span)[:, 0]
 
 
-def _groups(network: Network, points: npt.NDArray[np.float64], chosen: npt.NDArray[np.intp]) -> Iterator[npt.NDArray[np.intp]]:
+def _groups(
+    network: Network, points: npt.NDArray[np.float64], chosen: npt.NDArray[np.intp]
+) -> Iterator[npt.NDArray[np.intp]]:
     """Split points until the part of the finest table that a group spans is small, or well filled and not too large to be read at once."""
     if not len(chosen):
         return
@@ -174,8 +194,12 @@ def _groups(network: Network, points: npt.NDArray[np.float64], chosen: npt.NDArr
 def _patch(network: Network, level: int, span: npt.NDArray[np.float64]) -> Patch:
     """Read the part of a level that surrounds all points between the ends of a span (4, 2)."""
     first, last = _locate(network, level, span)[0].T.tolist()
-    ends = (min(corner + 2, length) for corner, length in zip(last, network.levels[level], strict=True))
-    values = network.read(level, tuple(slice(start, stop) for start, stop in zip(first, ends, strict=True)))
+    ends = (
+        min(corner + 2, length) for corner, length in zip(last, network.levels[level], strict=True)
+    )
+    values = network.read(
+        level, tuple(slice(start, stop) for start, stop in zip(first, ends, strict=True))
+    )
     return Patch(np.ascontiguousarray(values), tuple(first))
 
 
@@ -187,13 +211,21 @@ def _corners(patch: Patch, before: npt.NDArray[np.int64], resolution: Sequence[i
     for corner, first, stride in zip(before, patch.first, strides, strict=True):
         index += (corner - first) * stride
     # An axis of one vertex has no corner after it: both are the same.
-    steps = [(0, stride if length > 1 else 0) for stride, length in zip(strides, resolution, strict=True)]
-    offsets = np.array([t + z + y + x for t in steps[0] for z in steps[1] for y in steps[2] for x in steps[3]])
+    steps = [
+        (0, stride if length > 1 else 0) for stride, length in zip(strides, resolution, strict=True)
+    ]
+    offsets = np.array(
+        [t + z + y + x for t in steps[0] for z in steps[1] for y in steps[2] for x in steps[3]]
+    )
     found = patch.values.reshape(-1, shape[4]).take(offsets[:, None] + index, axis=0, mode="clip")
-    return np.ascontiguousarray(np.moveaxis(found, -1, 1), dtype=np.float32).reshape(2, 2, 2, 2, shape[4], -1)
+    return np.ascontiguousarray(np.moveaxis(found, -1, 1), dtype=np.float32).reshape(
+        2, 2, 2, 2, shape[4], -1
+    )
 
 
-def interpolate(corners: Floats, after: Iterable[Floats], gradient: bool) -> tuple[Floats, list[Floats]]:
+def interpolate(
+    corners: Floats, after: Iterable[Floats], gradient: bool
+) -> tuple[Floats, list[Floats]]:
     """Corners, as (2, 2, 2, 2, E, n), to (E, n), linearly along the first axes in turn, one for each weight of the corner after it.
 
     With `gradient` also the change across the cell along each of these axes, in their order. Also for tensors of torch.

@@ -60,9 +60,16 @@ def scan(series: Series, progress: Progress) -> Scan:
         progress("scanning", step + 1, steps, "")
     series.check()
     if mean.count == 0:
-        raise InputError(f"{series.source}: '{series.name}' has no finite value in any of its {steps} steps; there is nothing to encode")
+        raise InputError(
+            f"{series.source}: '{series.name}' has no finite value in any of its {steps} steps; there is nothing to encode"
+        )
     value_range = ValueRange(low, high)
-    return Scan(value_range=value_range, mean=min(max(mean.value(), low), high), finite_count=mean.count, missing=missing)
+    return Scan(
+        value_range=value_range,
+        mean=min(max(mean.value(), low), high),
+        finite_count=mean.count,
+        missing=missing,
+    )
 
 
 def _part(part: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:

@@ -47,17 +47,26 @@ def _array_series(source: npt.ArrayLike) -> Series:
             values, attributes = np.asarray(labels[dim]), json_attributes(labels[dim].attrs)
             if values.dtype.kind == "M":
                 values = (values - np.datetime64(0, "s")) / np.timedelta64(1, "s")
-                attributes = {"units": "seconds since 1970-01-01", "calendar": "proleptic_gregorian"}
-            coords[axis] = Coordinate(name=str(dim), values=values.astype(np.float64), attributes=attributes)
+                attributes = {
+                    "units": "seconds since 1970-01-01",
+                    "calendar": "proleptic_gregorian",
+                }
+            coords[axis] = Coordinate(
+                name=str(dim), values=values.astype(np.float64), attributes=attributes
+            )
     attributes = json_attributes(source.attrs)  # type: ignore[union-attr]
     name = str(getattr(source, "name", None) or "values")
-    return ArraySeries(np.asarray(source), name=name, units=str(attributes.get("units", "")), coords=coords)
+    return ArraySeries(
+        np.asarray(source), name=name, units=str(attributes.get("units", "")), coords=coords
+    )
 
 
 def _array_mask(mask: npt.ArrayLike, series: Series) -> Feature:
     marked = np.asarray(mask, dtype=bool)
     if marked.shape not in (series.shape, series.shape[1:]):
-        raise InputError(f"mask has shape {marked.shape}; the series has {series.shape} in (t, z, y, x)")
+        raise InputError(
+            f"mask has shape {marked.shape}; the series has {series.shape} in (t, z, y, x)"
+        )
     return Mask("array", read=lambda step: marked if marked.ndim == 3 else marked[step])
 
 
@@ -80,7 +89,9 @@ class Selection:
     architecture: Architecture
 
 
-def find(series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None) -> Found:
+def find(
+    series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None
+) -> Found:
     """Scan a series, choose its key frames and find its features, a frame at a time.
 
     mask: booleans (t, z, y, x) or (z, y, x), one more feature; it stands for 'all' where the settings name nothing else.
@@ -94,7 +105,9 @@ def find(series: Series, config: EncodeConfig, progress: Progress, mask: npt.Arr
     )
 
 
-def select(series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None) -> Selection:
+def select(
+    series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None
+) -> Selection:
     """As `find`, and gather the coreset for training."""
     scanned, key_frames, features = _resolved(series, config, progress, mask)
     coreset = build_coreset(series, scanned, key_frames, features, config.dilation, progress)
@@ -115,11 +128,16 @@ def _resolved(
     times = time_axis(series.coords["t"].values)
     if times is not series.coords["t"].values:
         warnings.warn(
-            f"{series.source}: its times do not strictly ascend or descend; step numbers stand for them", FhashWarning, stacklevel=3
+            f"{series.source}: its times do not strictly ascend or descend; step numbers stand for them",
+            FhashWarning,
+            stacklevel=3,
         )
     scanned = scan(series, progress)
     key_frames = select_key_frames(config.key_frames, series, times, progress)
     features = resolve_features(config.features, series, key_frames, scanned.value_range, progress)
     if mask is not None:
-        features = (_array_mask(mask, series), *(feature for feature in features if config.features != ("all",)))
+        features = (
+            _array_mask(mask, series),
+            *(feature for feature in features if config.features != ("all",)),
+        )
     return scanned, tuple(key_frames), features

@@ -38,7 +38,12 @@ Tile = tuple[tuple[int, int], ...]
 
 
 def ssim(
-    original: npt.NDArray[Any], decoded: npt.NDArray[Any], data_range: float, mask: Mask | None = None, *, threads: int | None = None
+    original: npt.NDArray[Any],
+    decoded: npt.NDArray[Any],
+    data_range: float,
+    mask: Mask | None = None,
+    *,
+    threads: int | None = None,
 ) -> tuple[float, int]:
     """Sum of the local similarity of two frames (z, y, x) and the number of vertices it is over; their quotient is the mean SSIM.
 
@@ -48,14 +53,22 @@ def ssim(
     mean of its finite values, and the vertex does not count. A range that is 0 or not finite has no SSIM: (0.0, 0).
     Raises InputError for frames of different shapes and for decoded values that are not finite where the frames are compared.
     """
-    if original.ndim != 3 or original.shape != decoded.shape or (mask is not None and mask.shape != original.shape):
-        raise InputError(f"SSIM: the original is {original.shape}, the decoded {decoded.shape}; frames (z, y, x) of one shape are needed")
+    if (
+        original.ndim != 3
+        or original.shape != decoded.shape
+        or (mask is not None and mask.shape != original.shape)
+    ):
+        raise InputError(
+            f"SSIM: the original is {original.shape}, the decoded {decoded.shape}; frames (z, y, x) of one shape are needed"
+        )
     if not 0 < data_range < math.inf:
         return 0.0, 0
     whole = mask is None or bool(mask.all())
     margins = [RADIUS if whole and size >= WINDOW else 0 for size in original.shape]
     frame = _Frames(original, decoded, data_range, None if whole else mask)
-    spans = zip(margins, original.shape, TILE if native.library() is None else NATIVE_TILE, strict=True)
+    spans = zip(
+        margins, original.shape, TILE if native.library() is None else NATIVE_TILE, strict=True
+    )
     tiles = list(product(*(_cuts(margin, size - margin, most) for margin, size, most in spans)))
     results: dict[Tile, tuple[float, int]] = {}
 
@@ -64,7 +77,9 @@ def ssim(
             results[tile] = frame.similarity(tile)
 
     share_out(work, tiles, usable_threads(threads))
-    return math.fsum(total for total, _ in results.values()), sum(count for _, count in results.values())
+    return math.fsum(total for total, _ in results.values()), sum(
+        count for _, count in results.values()
+    )
 
 
 def ssim_steps(steps: int, vertices_per_step: int, budget: int = BUDGET) -> list[int]:
@@ -78,19 +93,32 @@ def ssim_steps(steps: int, vertices_per_step: int, budget: int = BUDGET) -> list
 class _Frames:
     """Two frames to compare, scaled by a power of two near the range and shifted to the original's mean: squares stay small and exact."""
 
-    def __init__(self, original: npt.NDArray[Any], decoded: npt.NDArray[Any], data_range: float, mask: Mask | None) -> None:
+    def __init__(
+        self,
+        original: npt.NDArray[Any],
+        decoded: npt.NDArray[Any],
+        data_range: float,
+        mask: Mask | None,
+    ) -> None:
         self.original, self.decoded, self.mask = original, decoded, mask
         self.scale = np.float64(power_of_two(data_range))
         self.c1, self.c2 = (K1 * data_range * self.scale) ** 2, (K2 * data_range * self.scale) ** 2
         self._library = native.library()
         if self._library is not None:
-            narrow = decoded.dtype == np.float32 and (original.dtype == np.float32 or original.dtype.itemsize <= 2)
+            narrow = decoded.dtype == np.float32 and (
+                original.dtype == np.float32 or original.dtype.itemsize <= 2
+            )
             kind = np.float32 if narrow else np.float64
-            self.original, self.decoded = (np.ascontiguousarray(frame, dtype=kind) for frame in (original, decoded))
+            self.original, self.decoded = (
+                np.ascontiguousarray(frame, dtype=kind) for frame in (original, decoded)
+            )
             self.mask = None if mask is None else np.ascontiguousarray(mask)
         count, total = 0, 0.0
         for part in pieces(self.original):
-            found = range_and_sum(part if part.dtype in (np.float32, np.float64) else part.astype(np.float64), float(self.scale))
+            found = range_and_sum(
+                part if part.dtype in (np.float32, np.float64) else part.astype(np.float64),
+                float(self.scale),
+            )
             count, total = count + found[0], total + found[3]
         self.mean = np.float64(total / count if count else 0.0)
 
@@ -99,12 +127,17 @@ class _Frames:
         return self._portable(tile) if self._library is None else self._native(self._library, tile)
 
     def _native(self, library: ctypes.CDLL, tile: Tile) -> tuple[float, int]:
-        function = library.fhash_ssim_f32 if self.original.dtype == np.float32 else library.fhash_ssim_f64
+        function = (
+            library.fhash_ssim_f32 if self.original.dtype == np.float32 else library.fhash_ssim_f64
+        )
         function.restype = ctypes.c_int64
         total = ctypes.c_double()
         numbers = (self.scale, self.mean, self.c1, self.c2, *_weights()[RADIUS:])
         count = function(
-            *(ctypes.c_void_p(None if array is None else array.ctypes.data) for array in (self.original, self.decoded, self.mask)),
+            *(
+                ctypes.c_void_p(None if array is None else array.ctypes.data)
+                for array in (self.original, self.decoded, self.mask)
+            ),
             (ctypes.c_int64 * 3)(*self.original.shape),
             (ctypes.c_int64 * 6)(*(end for span in tile for end in span)),
             (ctypes.c_double * len(numbers))(*numbers),
@@ -156,9 +189,14 @@ def _cuts(start: int, stop: int, most: int) -> list[tuple[int, int]]:
 
 def _around(values: npt.NDArray[Any], tile: Tile) -> npt.NDArray[Any]:
     """A tile with RADIUS more on every side; beyond the frame mirrored, the end vertices repeated (d c b a | a b c d | d c b a)."""
-    ends = [(max(start - RADIUS, 0), min(stop + RADIUS, size)) for (start, stop), size in zip(tile, values.shape, strict=True)]
+    ends = [
+        (max(start - RADIUS, 0), min(stop + RADIUS, size))
+        for (start, stop), size in zip(tile, values.shape, strict=True)
+    ]
     part = values[tuple(slice(*end) for end in ends)]
-    for axis, ((start, stop), (first, _), size) in enumerate(zip(tile, ends, values.shape, strict=True)):
+    for axis, ((start, stop), (first, _), size) in enumerate(
+        zip(tile, ends, values.shape, strict=True)
+    ):
         if part.shape[axis] < stop - start + 2 * RADIUS:
             index = np.arange(start - RADIUS, stop + RADIUS) % (2 * size)
             part = part.take(np.minimum(index, 2 * size - 1 - index) - first, axis=axis)

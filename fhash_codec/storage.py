@@ -20,7 +20,9 @@ from fhash_codec.network import Floats, Network, TableSource
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.errors import DamagedFileError, InputError
 
-CHUNK_BYTES = 2 << 20  # a time node in one chunk up to this size, in bricks above: each chunk has a fixed cost, each read a whole chunk
+CHUNK_BYTES = (
+    2 << 20
+)  # a time node in one chunk up to this size, in bricks above: each chunk has a fixed cost, each read a whole chunk
 TABLE_AXES = ("t", "z", "y", "x", "embedding")
 
 
@@ -39,7 +41,12 @@ def write_model(
 
 
 def write_tables(
-    writer: ContainerWriter, architecture: Architecture, coreset: Coreset, fine: Floats, tables: list[Floats], kind: str
+    writer: ContainerWriter,
+    architecture: Architecture,
+    coreset: Coreset,
+    fine: Floats,
+    tables: list[Floats],
+    kind: str,
 ) -> None:
     """Write the tables as numbers of the type `kind`.
 
@@ -48,9 +55,16 @@ def write_tables(
     """
     size = architecture.embedding_size
     _write_table(
-        writer, 1, (*architecture.levels[0], size), fine, (finest_frame(coreset, fine, k) for k in range(architecture.key_frames)), kind
+        writer,
+        1,
+        (*architecture.levels[0], size),
+        fine,
+        (finest_frame(coreset, fine, k) for k in range(architecture.key_frames)),
+        kind,
     )
-    for number, (level, table) in enumerate(zip(architecture.levels[1:], tables, strict=True), start=2):
+    for number, (level, table) in enumerate(
+        zip(architecture.levels[1:], tables, strict=True), start=2
+    ):
         _write_table(writer, number, (*level, size), table, iter(table.reshape(*level, size)), kind)
 
 
@@ -62,7 +76,9 @@ def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
     chosen = np.flatnonzero(coreset.bricks[:, 0] == key)
     z, y, x = coreset.bricks[chosen, 1:].T
     blocks[z, y, x] = np.moveaxis(fine[chosen].reshape(-1, size, *shape), 1, -1)
-    padded = blocks.transpose(0, 3, 1, 4, 2, 5, 6).reshape(*(g * s for g, s in zip(grid, shape, strict=True)), size)
+    padded = blocks.transpose(0, 3, 1, 4, 2, 5, 6).reshape(
+        *(g * s for g, s in zip(grid, shape, strict=True)), size
+    )
     return np.ascontiguousarray(padded[tuple(slice(high - low) for low, high in coreset.box)])
 
 
@@ -72,13 +88,16 @@ def load_network(container: Container) -> Network:
     model = header["model"]
     levels = tuple(tuple(level) for level in model["levels"])
     layers = tuple(
-        (container.arrays[f"mlp/weight_{n}"].read(), container.arrays[f"mlp/bias_{n}"].read()) for n in range(1, model["hidden_layers"] + 2)
+        (container.arrays[f"mlp/weight_{n}"].read(), container.arrays[f"mlp/bias_{n}"].read())
+        for n in range(1, model["hidden_layers"] + 2)
     )
     try:
         return Network(
             levels=levels,
             embedding_size=model["embedding_size"],
-            tables=[_table(container, n, model["embedding_size"]) for n in range(1, len(levels) + 1)],
+            tables=[
+                _table(container, n, model["embedding_size"]) for n in range(1, len(levels) + 1)
+            ],
             layers=layers,
             box_size=tuple(high - low for low, high in header["feature_bounding_box"]),
             key_frames=levels[0][0],
@@ -90,7 +109,9 @@ def load_network(container: Container) -> Network:
 def _table(container: Container, level: int, size: int) -> TableSource:
     """The table of a level, in whichever way it is stored."""
     if container.header["model"]["tables"] == "transform":
-        return CodedTable([container.arrays[component_name(level, number)] for number in range(1, size + 1)])
+        return CodedTable(
+            [container.arrays[component_name(level, number)] for number in range(1, size + 1)]
+        )
     return StoredTable(container.arrays[f"tables/level_{level}"])
 
 
@@ -105,7 +126,9 @@ def mixed(components: Sequence[Floats], mixing: Floats) -> Floats:
     In float32, each product and each sum rounded, from the first component on: the same bits on every machine.
     """
     result = np.empty((*components[0].shape, mixing.shape[1]), np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):  # of hostile numbers; the network refuses what is not finite
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # of hostile numbers; the network refuses what is not finite
         for number in range(mixing.shape[1]):
             total = components[0] * mixing[0, number]
             for component, weights in zip(components[1:], mixing[1:], strict=True):
@@ -166,27 +189,44 @@ class NumberType:
         dtype = np.dtype(kind)
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
         if not (isfinite(low) and isfinite(high)):
-            raise InputError("embeddings are not finite: the training diverged; set a lower --learning-rate")
+            raise InputError(
+                "embeddings are not finite: the training diverged; set a lower --learning-rate"
+            )
         if dtype.kind == "u":
             # Zero, which stands wherever nothing was trained, is within the range, so that it costs little.
             low, high = min(low, 0.0), max(high, 0.0)
         reached = high - low if dtype.kind == "u" else max(-low, high)
         if reached > float(np.finfo(np.float32 if dtype.kind == "u" else dtype).max):
-            raise InputError(f"embeddings reach {reached:g}, more than {kind} holds; use --tables float32")
+            raise InputError(
+                f"embeddings reach {reached:g}, more than {kind} holds; use --tables float32"
+            )
         if dtype.kind == "f":
             return cls(dtype=dtype)
         # A step that float32 does not hold to all its digits would not give back what it was made from.
-        scale = max((high - low) / np.iinfo(dtype).max, float(np.finfo(np.float32).tiny)) if high > low else 1.0
+        scale = (
+            max((high - low) / np.iinfo(dtype).max, float(np.finfo(np.float32).tiny))
+            if high > low
+            else 1.0
+        )
         return cls(dtype=dtype, scale=scale, offset=low)
 
     def stored(self, embeddings: Floats) -> npt.NDArray[Any]:
         """Embeddings as numbers of the type, of the same shape."""
         if self.dtype.kind == "f":
             return embeddings.astype(self.dtype)
-        return np.asarray(np.rint(embeddings / self.scale - self.offset / self.scale).astype(self.dtype))
+        return np.asarray(
+            np.rint(embeddings / self.scale - self.offset / self.scale).astype(self.dtype)
+        )
 
 
-def _write_table(writer: ContainerWriter, number: int, shape: tuple[int, ...], values: Floats, frames: Iterator[Floats], kind: str) -> None:
+def _write_table(
+    writer: ContainerWriter,
+    number: int,
+    shape: tuple[int, ...],
+    values: Floats,
+    frames: Iterator[Floats],
+    kind: str,
+) -> None:
     """Write one level from its frames (z, y, x, E), one time node at a time."""
     numbers = NumberType.of(values, kind)
     dtype = numbers.dtype
@@ -198,7 +238,9 @@ def _write_table(writer: ContainerWriter, number: int, shape: tuple[int, ...], v
         for frame in frames:
             node = numbers.stored(frame)[None]
             for start in np.ndindex(*(-(-n // c) for n, c in zip(node.shape, chunk, strict=True))):
-                yield node[tuple(slice(i * c, (i + 1) * c) for i, c in zip(start, chunk, strict=True))]
+                yield node[
+                    tuple(slice(i * c, (i + 1) * c) for i, c in zip(start, chunk, strict=True))
+                ]
 
     writer.add_array(
         f"tables/level_{number}",

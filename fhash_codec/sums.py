@@ -32,7 +32,9 @@ def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, floa
     flat = np.ascontiguousarray(values).reshape(-1)
     library = native.library()
     if library is not None:
-        count, low, high, total = _call(library, "scan", flat, ctypes.c_int64(flat.size), factor, results=3)
+        count, low, high, total = _call(
+            library, "scan", flat, ctypes.c_int64(flat.size), factor, results=3
+        )
         return count, low + 0.0, high + 0.0, total
     count, low, high, total = 0, np.inf, -np.inf, 0.0
     for start in range(0, flat.size, PIECE):
@@ -47,14 +49,20 @@ def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, floa
     return count, low + 0.0, high + 0.0, total
 
 
-def squared_errors(original: Values, decoded: Values, mask: Mask | None, scale: float) -> tuple[int, float, float]:
+def squared_errors(
+    original: Values, decoded: Values, mask: Mask | None, scale: float
+) -> tuple[int, float, float]:
     """Number, sum of squares and largest magnitude of (original - decoded) * scale, in float64.
 
     Arrays of one shape and any real type; counted are those with a finite original where the mask is set (None: everywhere). The number is
     -1 where a decoded value that counts is not finite. 64-bit integers are compared exactly, where float64 would round differences to 0.
     """
     library = native.library()
-    if library is not None and original.dtype == decoded.dtype and original.dtype in (np.float32, np.float64):
+    if (
+        library is not None
+        and original.dtype == decoded.dtype
+        and original.dtype in (np.float32, np.float64)
+    ):
         one, other = np.ascontiguousarray(original), np.ascontiguousarray(decoded)
         counted = None if mask is None else np.ascontiguousarray(mask, dtype=np.bool_)
         pointers = _pointer(other), _pointer(counted)
@@ -64,7 +72,12 @@ def squared_errors(original: Values, decoded: Values, mask: Mask | None, scale: 
     masks = pieces(np.broadcast_to(np.True_, original.shape) if mask is None else mask)
     for one, other, counts in zip(pieces(original), pieces(decoded), masks, strict=True):
         if library is not None and not exact:
-            found = squared_errors(one.astype(np.float64), other.astype(np.float64), None if mask is None else counts, scale)
+            found = squared_errors(
+                one.astype(np.float64),
+                other.astype(np.float64),
+                None if mask is None else counts,
+                scale,
+            )
         else:
             found = _squared_errors(one, other, counts, np.float64(scale))
         if found[0] < 0:
@@ -73,7 +86,9 @@ def squared_errors(original: Values, decoded: Values, mask: Mask | None, scale: 
     return count, squares, largest
 
 
-def _call(library: ctypes.CDLL, name: str, values: Values, *arguments: Any, results: int) -> tuple[Any, ...]:
+def _call(
+    library: ctypes.CDLL, name: str, values: Values, *arguments: Any, results: int
+) -> tuple[Any, ...]:
     function = getattr(library, f"fhash_{name}_f{values.dtype.itemsize * 8}")
     function.restype = ctypes.c_int64
     found = (ctypes.c_double * results)()
@@ -95,7 +110,9 @@ def _lane_sum(values: Doubles) -> float:
     return total
 
 
-def _squared_errors(original: Values, decoded: Values, mask: Mask, scale: np.float64) -> tuple[int, float, float]:
+def _squared_errors(
+    original: Values, decoded: Values, mask: Mask, scale: np.float64
+) -> tuple[int, float, float]:
     count, squares, largest = 0, 0.0, 0.0
     for start in range(0, original.size, PIECE):
         part = slice(start, start + PIECE)
@@ -115,8 +132,14 @@ def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> 
         difference = np.asarray(original * scale - decoded * scale, dtype=np.float64)
     if original.dtype.kind in "iu" and original.dtype.itemsize == 8:
         limits = np.iinfo(original.dtype)
-        whole = np.clip(np.rint(decoded.astype(np.float64)), float(limits.min), np.nextafter(float(limits.max), 0.0))
+        whole = np.clip(
+            np.rint(decoded.astype(np.float64)),
+            float(limits.min),
+            np.nextafter(float(limits.max), 0.0),
+        )
         # Differences wrap at 2^64; those beyond 2^62 do not need the exactness.
-        exact = (original - whole.astype(original.dtype)).view(np.int64) - (decoded.astype(np.float64) - whole)
+        exact = (original - whole.astype(original.dtype)).view(np.int64) - (
+            decoded.astype(np.float64) - whole
+        )
         difference = np.where(np.abs(difference) < 2.0**62 * scale, exact * scale, difference)
     return difference

@@ -32,7 +32,9 @@ class Scene:
     feature: str
 
 
-def simulate(name: str, shape: tuple[int, int, int, int] = (16, 32, 48, 48), seed: int = 0) -> ArraySeries:
+def simulate(
+    name: str, shape: tuple[int, int, int, int] = (16, 32, 48, 48), seed: int = 0
+) -> ArraySeries:
     """The series (t, z, y, x) float32 of a scene of `SCENES`, with time in s and positions in m.
 
     Raises InputError for an unknown scene, or fewer than 2 steps or 8 vertices along an axis.
@@ -40,14 +42,22 @@ def simulate(name: str, shape: tuple[int, int, int, int] = (16, 32, 48, 48), see
     if name not in SCENES:
         raise InputError(f"scene is '{name}'; allowed: {', '.join(SCENES)}")
     if shape[0] < 2 or min(shape[1:]) < 8:
-        raise InputError(f"scene shape is {shape} in (t, z, y, x); at least 2 steps and 8 vertices along every axis are needed")
+        raise InputError(
+            f"scene shape is {shape} in (t, z, y, x); at least 2 steps and 8 vertices along every axis are needed"
+        )
     scene = SCENES[name]
-    positions = {"t": np.linspace(0.0, 1.0, shape[0])} | {axis: _centres(n) for axis, n in zip("zyx", shape[1:], strict=True)}
+    positions = {"t": np.linspace(0.0, 1.0, shape[0])} | {
+        axis: _centres(n) for axis, n in zip("zyx", shape[1:], strict=True)
+    }
     coords = {
-        axis: Coordinate(name=AXIS_NAMES[axis], values=values, attributes={"units": "s" if axis == "t" else "m"})
+        axis: Coordinate(
+            name=AXIS_NAMES[axis], values=values, attributes={"units": "s" if axis == "t" else "m"}
+        )
         for axis, values in positions.items()
     }
-    return ArraySeries(np.stack(list(scene.frames(shape, seed))), name=scene.name, units=scene.units, coords=coords)
+    return ArraySeries(
+        np.stack(list(scene.frames(shape, seed))), name=scene.name, units=scene.units, coords=coords
+    )
 
 
 def _centres(n: int) -> npt.NDArray[np.float64]:
@@ -73,22 +83,36 @@ def _vortex(shape: tuple[int, int, int, int], seed: int) -> Iterator[Frame]:
         -swirl * np.sin(np.pi * y) ** 2 * np.sin(2 * np.pi * x) / 2 * (1 + 0 * z),
         swirl * np.sin(np.pi * x) ** 2 * np.sin(2 * np.pi * y) / 2 * (1 + 0 * z),
     )
-    counts = [np.fft.fftfreq(box[0], 1 / box[0]), np.fft.fftfreq(box[1], 1 / box[1]), np.fft.rfftfreq(box[2], 1 / box[2])]
+    counts = [
+        np.fft.fftfreq(box[0], 1 / box[0]),
+        np.fft.fftfreq(box[1], 1 / box[1]),
+        np.fft.rfftfreq(box[2], 1 / box[2]),
+    ]
     waves = np.meshgrid(*(2 * np.pi * count for count in counts), indexing="ij", sparse=True)
     # The product u c makes waves that the lattice mistakes for longer ones: the usual two-thirds rule removes them.
-    kept = np.meshgrid(*(np.abs(count) < n / 3 for count, n in zip(counts, box, strict=True)), indexing="ij", sparse=True)
+    kept = np.meshgrid(
+        *(np.abs(count) < n / 3 for count, n in zip(counts, box, strict=True)),
+        indexing="ij",
+        sparse=True,
+    )
     filtered = kept[0] & kept[1] & kept[2]
     square = sum(wave**2 for wave in waves)
 
     def slope(spectrum: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
         tracer = np.fft.irfftn(spectrum, s=box, axes=(0, 1, 2))
-        carried = sum(1j * wave * np.fft.rfftn(u * tracer) for wave, u in zip(waves, flow, strict=True))
+        carried = sum(
+            1j * wave * np.fft.rfftn(u * tracer) for wave, u in zip(waves, flow, strict=True)
+        )
         return np.asarray(-diffusivity * square * spectrum - filtered * carried)
 
     noise = np.random.default_rng(seed).uniform(-0.03, 0.03, size=(2, 3))
     tracer = np.zeros(box)
-    for (cz, cy, cx), amplitude in zip(np.array([[0.36, 0.5, 0.27], [0.52, 0.5, 0.72]]) + noise, (1.0, 0.75), strict=True):
-        tracer += amplitude * np.exp(-(((z - cz) / 0.15) ** 2 + ((y - cy) / 0.14) ** 2 + ((x - cx) / 0.14) ** 2))
+    for (cz, cy, cx), amplitude in zip(
+        np.array([[0.36, 0.5, 0.27], [0.52, 0.5, 0.72]]) + noise, (1.0, 0.75), strict=True
+    ):
+        tracer += amplitude * np.exp(
+            -(((z - cz) / 0.15) ** 2 + ((y - cy) / 0.14) ** 2 + ((x - cx) / 0.14) ** 2)
+        )
     spectrum = np.fft.rfftn(tracer) * filtered
     # Stable for |u| k dt < 2.8 (Runge-Kutta on the imaginary axis).
     speed = sum(float(np.abs(u).max()) * n for u, n in zip(flow, box, strict=True)) * 2 * np.pi / 3
@@ -113,7 +137,9 @@ def _front(shape: tuple[int, int, int, int], seed: int) -> Iterator[Frame]:
     directions = generator.normal(size=(60, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     fingers = np.zeros(box)
-    for (dz, dy, dx), height in zip(directions, generator.uniform(-1.0, 1.0, size=len(directions)), strict=True):
+    for (dz, dy, dx), height in zip(
+        directions, generator.uniform(-1.0, 1.0, size=len(directions)), strict=True
+    ):
         fingers += height * np.exp(28.0 * ((z * dz + y * dy + x * dx) / (radius + 1e-9) - 1.0))
     for step in range(steps):
         age = 0.12 + 0.88 * step / (steps - 1)
@@ -125,9 +151,17 @@ def _front(shape: tuple[int, int, int, int], seed: int) -> Iterator[Frame]:
 
 SCENES = {
     "vortex": Scene(
-        help="two blobs of a tracer carried and mixed by a swirl", frames=_vortex, name="tracer", units="1", feature="interval:0.08:2"
+        help="two blobs of a tracer carried and mixed by a swirl",
+        frames=_vortex,
+        name="tracer",
+        units="1",
+        feature="interval:0.08:2",
     ),
     "front": Scene(
-        help="a blast's shell that expands and grows fingers", frames=_front, name="density", units="kg m-3", feature="interval:0.25:2"
+        help="a blast's shell that expands and grows fingers",
+        frames=_front,
+        name="density",
+        units="kg m-3",
+        feature="interval:0.25:2",
     ),
 }

@@ -58,10 +58,14 @@ class Plan:
 
     def order(self, epoch: int) -> list[npt.NDArray[np.int64]]:
         """The batches of an epoch: every brick once; depends on nothing but the seed and the epoch."""
-        return np.array_split(np.random.default_rng([self.seed, epoch]).permutation(self.bricks), self.batches)
+        return np.array_split(
+            np.random.default_rng([self.seed, epoch]).permutation(self.bricks), self.batches
+        )
 
 
-def plan_training(coreset: Coreset, *, epochs: int, learning_rate: float, schedule: str, batch: int, seed: int) -> Plan:
+def plan_training(
+    coreset: Coreset, *, epochs: int, learning_rate: float, schedule: str, batch: int, seed: int
+) -> Plan:
     """A plan for a coreset.
 
     epochs: 0 for 20 of them, or as many as make 1000 steps. batch: in samples, 0 for 64 bricks where that makes 20 to 256 steps an
@@ -76,7 +80,9 @@ def plan_training(coreset: Coreset, *, epochs: int, learning_rate: float, schedu
     batches = min(batches, bricks)
     epochs = epochs or max(USUAL_EPOCHS, -(-USUAL_STEPS // batches))
     share = np.arange(epochs * batches + 1) / max(epochs * batches, 1)
-    rates = learning_rate * (0.5 + 0.5 * np.cos(np.pi * share) if schedule == "cosine" else np.ones_like(share))
+    rates = learning_rate * (
+        0.5 + 0.5 * np.cos(np.pi * share) if schedule == "cosine" else np.ones_like(share)
+    )
     return Plan(epochs=epochs, bricks=bricks, batches=batches, seed=seed, rates=rates)
 
 
@@ -146,7 +152,12 @@ def train(
                 save_seconds = max(save_seconds, 20 * (saved - now))
             if asked or course.seconds > budget_seconds:
                 return False
-            progress("training", course.epoch * plan.batches + course.batch, plan.epochs * plan.batches, note)
+            progress(
+                "training",
+                course.epoch * plan.batches + course.batch,
+                plan.epochs * plan.batches,
+                note,
+            )
         course.epoch, course.batch = course.epoch + 1, 0
         if course.epoch % every == 0 or course.epoch == plan.epochs:
             psnr = probe_psnr(engine, coreset, probe)
@@ -161,9 +172,14 @@ def train(
 def probe_psnr(engine: Engine, coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float | None:
     """PSNR in dB of the normalised values (range 1) over the coreset vertices of `bricks`; None where the error is exactly 0."""
     samples = int(np.diff(coreset.offsets)[bricks].sum())
-    error = sum(engine.squared_error(part) for part in np.array_split(bricks, -(-len(bricks) // BATCH_BRICKS)))
+    error = sum(
+        engine.squared_error(part)
+        for part in np.array_split(bricks, -(-len(bricks) // BATCH_BRICKS))
+    )
     if not np.isfinite(error):
-        raise Diverged("training diverged: the error is no longer finite; set a lower --learning-rate")
+        raise Diverged(
+            "training diverged: the error is no longer finite; set a lower --learning-rate"
+        )
     return None if error == 0 else -10 * log10(error / samples)
 
 
@@ -171,7 +187,9 @@ def _watch(worst: Tensor | None, course: Course) -> None:
     """Raise Diverged for a largest mean squared error that is beyond DIVERGED or not finite."""
     error = 0.0 if worst is None else float(worst)
     if not error <= DIVERGED:
-        raise Diverged(f"training diverged in epoch {course.epoch + 1}: the error reached {error**0.5:.3g} times the range of the values")
+        raise Diverged(
+            f"training diverged in epoch {course.epoch + 1}: the error reached {error**0.5:.3g} times the range of the values"
+        )
 
 
 def _dead(course: Course, variance: float) -> bool:
@@ -186,5 +204,8 @@ def _dead(course: Course, variance: float) -> bool:
 
 def _variance(coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float:
     """Of the normalised values over the coreset vertices of `bricks`."""
-    parts = [coreset.values[first:end] for first, end in zip(coreset.offsets[bricks], coreset.offsets[bricks + 1], strict=True)]
+    parts = [
+        coreset.values[first:end]
+        for first, end in zip(coreset.offsets[bricks], coreset.offsets[bricks + 1], strict=True)
+    ]
     return float(np.var(np.concatenate(parts), dtype=np.float64))

@@ -14,7 +14,13 @@ from fhash_codec.architecture import Architecture
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset import Coreset
 from fhash_codec.progress import Progress, silent
-from fhash_formats.errors import FhashWarning, InputError, InterruptedEncodingError, OutputError, TrainingError
+from fhash_formats.errors import (
+    FhashWarning,
+    InputError,
+    InterruptedEncodingError,
+    OutputError,
+    TrainingError,
+)
 
 __all__ = ["Trained", "train_model"]
 
@@ -41,7 +47,13 @@ class Trained:
     learning_rate: float
 
 
-def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConfig, path: Path, progress: Progress = silent) -> Trained:
+def train_model(
+    coreset: Coreset,
+    architecture: Architecture,
+    config: EncodeConfig,
+    path: Path,
+    progress: Progress = silent,
+) -> Trained:
     """Train the model of a coreset, from the checkpoint of the same training beside `path` if there is one.
 
     A training that diverges begins again at a lower learning rate, with a FhashWarning. Raises TrainingError where no rate helps.
@@ -70,17 +82,29 @@ def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConf
     while True:
         rate = course.rate(config.learning_rate)
         plan = plan_training(
-            coreset, epochs=config.epochs, learning_rate=rate, schedule=config.schedule, batch=config.batch, seed=config.seed
+            coreset,
+            epochs=config.epochs,
+            learning_rate=rate,
+            schedule=config.schedule,
+            batch=config.batch,
+            seed=config.seed,
         )
-        engine = make_engine(config.engine, architecture, coreset, plan.rates, seed=config.seed, device=device)
+        engine = make_engine(
+            config.engine, architecture, coreset, plan.rates, seed=config.seed, device=device
+        )
         if saved:
             try:
                 engine.restore(saved[0])
             except (KeyError, RuntimeError, ValueError) as error:
-                raise InputError(f"checkpoint {checkpoint} does not fit; delete it to train from the start") from error
+                raise InputError(
+                    f"checkpoint {checkpoint} does not fit; delete it to train from the start"
+                ) from error
         kept = course.epoch == plan.epochs
         try:
-            with deferred_interrupts() as stop, threads_for(plan.batch_bricks * prod(coreset.brick_shape)):
+            with (
+                deferred_interrupts() as stop,
+                threads_for(plan.batch_bricks * prod(coreset.brick_shape)),
+            ):
                 done = train(engine, plan, coreset, course, stop=stop, save=save, progress=progress)
                 # What follows may fail or be interrupted as well: a training worth keeping is kept until the file is complete.
                 if done and not kept and (stop.asked or course.seconds > KEEP_SECONDS):
@@ -91,14 +115,21 @@ def train_model(coreset: Coreset, architecture: Architecture, config: EncodeConf
                 raise TrainingError(f"{error}, even at a learning rate of {rate:.3g}") from error
             course, saved = course.again(), None
             lower = course.rate(config.learning_rate)
-            warnings.warn(f"{error}; it begins again at a learning rate of {lower:.3g}", FhashWarning, stacklevel=2)
+            warnings.warn(
+                f"{error}; it begins again at a learning rate of {lower:.3g}",
+                FhashWarning,
+                stacklevel=2,
+            )
         del engine  # before the next one: a large model would not fit twice
     if stop.asked:
         raise InterruptedEncodingError(
             f"interrupted after {course.epoch} of {plan.epochs} epochs; saved in {checkpoint}; the same command goes on from there"
         )
     parameters = engine.parameters()
-    if not all(bool(part.isfinite().all()) for part in (parameters.fine, parameters.coarse, parameters.network)):
+    if not all(
+        bool(part.isfinite().all())
+        for part in (parameters.fine, parameters.coarse, parameters.network)
+    ):
         raise TrainingError("the trained numbers are not finite; set a lower --learning-rate")
     tables, layers = parameters.dense(architecture)
     return Trained(

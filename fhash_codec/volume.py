@@ -82,7 +82,9 @@ class Volume:
     def key_times(self) -> KeyTimes:
         """How steps and times map to the model's time axis."""
         stored = self.container.arrays.get("key_frames")
-        key_frames = tuple(range(self.shape[0]) if stored is None else (int(step) for step in stored.read()))
+        key_frames = tuple(
+            range(self.shape[0]) if stored is None else (int(step) for step in stored.read())
+        )
         return KeyTimes(times=time_axis(self.coords["t"].values), key_frames=key_frames)
 
     @property
@@ -91,7 +93,11 @@ class Volume:
         header = self.container.header
         raw = self.size * np.dtype(header["variable"]["dtype"]).itemsize
         arrays = {
-            name: {"shape": list(array.shape), "dtype": str(array.dtype), "bytes": array.nbytes_stored}
+            name: {
+                "shape": list(array.shape),
+                "dtype": str(array.dtype),
+                "bytes": array.nbytes_stored,
+            }
             for name, array in self.container.arrays.items()
         }
         return {
@@ -111,7 +117,9 @@ class Volume:
 
     # -- reading -----------------------------------------------------------------------------------------------------------
 
-    def read(self, t: float, region: Box | None = None, *, outside: str = "nan") -> npt.NDArray[Any]:
+    def read(
+        self, t: float, region: Box | None = None, *, outside: str = "nan"
+    ) -> npt.NDArray[Any]:
         """Values (z, y, x) of `self.dtype` of a region (all if None) at step `t`, which may lie between steps.
 
         Between steps time runs evenly from one to the next. Outside the coreset stands NaN, or with outside='background' the
@@ -127,7 +135,11 @@ class Volume:
         if found is not None:
             target, local = found
             wanted = self._occupied(key, local)
-            np.copyto(result[target], self._model.region(key, local, wanted).astype(self.dtype, copy=False), where=wanted)
+            np.copyto(
+                result[target],
+                self._model.region(key, local, wanted).astype(self.dtype, copy=False),
+                where=wanted,
+            )
         if outside == "background":
             result[np.isnan(result)] = self.background
         missing = self._missing_at(t)
@@ -147,7 +159,10 @@ class Volume:
         if not float(t).is_integer():
             raise InputError(f"step {t:g} lies between two; levels of detail are of whole steps")
         step = int(self._key_index(t))
-        part: Box = tuple(((v[0] - low) >> lod, ((v[-1] - low) >> lod) + 1) for v, (low, _) in zip(vertices, self.box, strict=True))  # type: ignore[assignment]
+        part: Box = tuple(
+            ((v[0] - low) >> lod, ((v[-1] - low) >> lod) + 1)
+            for v, (low, _) in zip(vertices, self.box, strict=True)
+        )  # type: ignore[assignment]
         values = self._model.coarse(step, int(lod), part).astype(self.dtype)
         surrounding: Box = tuple((v[0], v[-1] + 1) for v in vertices)  # type: ignore[assignment]
         values[~self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]] = np.nan
@@ -158,11 +173,17 @@ class Volume:
 
         Raises InputError for another lod than 0 to 10, RegionError for a region outside the domain or without such a vertex.
         """
-        if isinstance(lod, bool) or not isinstance(lod, int | np.integer) or not 0 <= lod <= MAX_LOD:
+        if (
+            isinstance(lod, bool)
+            or not isinstance(lod, int | np.integer)
+            or not 0 <= lod <= MAX_LOD
+        ):
             raise InputError(f"lod is {lod}; allowed: 0 to {MAX_LOD}")
         every = 1 << int(lod)
         found = []
-        for axis, (first, end), (low, high) in zip(AXES[1:], self.box, self._checked(region), strict=True):
+        for axis, (first, end), (low, high) in zip(
+            AXES[1:], self.box, self._checked(region), strict=True
+        ):
             inside = range(first + -(-max(low - first, 0) // every) * every, min(high, end), every)
             if not inside:
                 raise RegionError(
@@ -176,7 +197,10 @@ class Volume:
     def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
         """Values by numpy's basic indexing: integers, slices and `...`, negative as usual; RegionError (an IndexError) outside."""
         parts = _expanded(index)
-        picked = [_positions(part, length, axis) for part, length, axis in zip(parts, self.shape, AXES, strict=True)]
+        picked = [
+            _positions(part, length, axis)
+            for part, length, axis in zip(parts, self.shape, AXES, strict=True)
+        ]
         steps, *space = picked
         result = np.empty([len(p) for p in picked], dtype=self.dtype)
         if result.size:
@@ -184,12 +208,18 @@ class Volume:
             local = np.ix_(*(np.array(p) - low for p, (low, _) in zip(space, region, strict=True)))
             for number, step in enumerate(steps):
                 result[number] = self.read(step, region)[local]
-        return result[tuple(0 if isinstance(part, int | np.integer) else slice(None) for part in parts)]
+        return result[
+            tuple(0 if isinstance(part, int | np.integer) else slice(None) for part in parts)
+        ]
 
-    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
+    def __array__(
+        self, dtype: npt.DTypeLike | None = None, copy: bool | None = None
+    ) -> npt.NDArray[Any]:
         """The whole volume."""
         if copy is False:
-            raise ValueError("a volume cannot become an array without a copy: its values are decoded")
+            raise ValueError(
+                "a volume cannot become an array without a copy: its values are decoded"
+            )
         values = self[...]
         return values if dtype is None else values.astype(dtype)
 
@@ -233,7 +263,9 @@ class Volume:
                 # From per key frame to per step: between two steps the key index runs evenly.
                 first = np.minimum(np.floor(steps[inside]), max(self.shape[0] - 2, 0))
                 after = np.minimum(first + 1, self.shape[0] - 1)
-                slopes[inside, 0] *= self.key_times.key_indices(after) - self.key_times.key_indices(first)
+                slopes[inside, 0] *= self.key_times.key_indices(after) - self.key_times.key_indices(
+                    first
+                )
             else:
                 values[inside] = self._model.points(chosen[0], chosen[1:])
         values = values.reshape(shape).astype(self.dtype)
@@ -265,7 +297,9 @@ class Volume:
 
     def _checked_times(self) -> KeyTimes:
         if not strictly_monotonic(self.coords["t"].values):
-            raise InputError(f"{self.path}: the times of the series do not strictly ascend or descend; ask for a step instead")
+            raise InputError(
+                f"{self.path}: the times of the series do not strictly ascend or descend; ask for a step instead"
+            )
         return self.key_times
 
     def _key_index(self, t: float) -> float:
@@ -279,16 +313,25 @@ class Volume:
             return tuple((0, length) for length in self.shape[1:])  # type: ignore[return-value]
         for axis, (low, high), length in zip(AXES[1:], region, self.shape[1:], strict=True):
             if not 0 <= low < high <= length:
-                raise RegionError(f"{self.path}: region {low}:{high} of axis {axis} is empty or outside 0:{length}")
+                raise RegionError(
+                    f"{self.path}: region {low}:{high} of axis {axis} is empty or outside 0:{length}"
+                )
         return region
 
     def _within_box(self, region: Box) -> tuple[tuple[slice, ...], Box] | None:
         """Where a region of the domain and the box meet: as slices of the region, and in vertices of the box; None where they do not."""
-        inner = [(max(low, b0), min(high, b1)) for (low, high), (b0, b1) in zip(region, self.box, strict=True)]
+        inner = [
+            (max(low, b0), min(high, b1))
+            for (low, high), (b0, b1) in zip(region, self.box, strict=True)
+        ]
         if not all(low < high for low, high in inner):
             return None
-        target = tuple(slice(low - r0, high - r0) for (low, high), (r0, _) in zip(inner, region, strict=True))
-        return target, tuple((low - b0, high - b0) for (low, high), (b0, _) in zip(inner, self.box, strict=True))  # type: ignore[return-value]
+        target = tuple(
+            slice(low - r0, high - r0) for (low, high), (r0, _) in zip(inner, region, strict=True)
+        )
+        return target, tuple(
+            (low - b0, high - b0) for (low, high), (b0, _) in zip(inner, self.box, strict=True)
+        )  # type: ignore[return-value]
 
     def _occupied(self, key: float, local: Box) -> npt.NDArray[np.bool_]:
         """Which vertices of a part of the box count at a key index."""
@@ -301,15 +344,21 @@ class Volume:
             return None
         steps = range(int(np.floor(t)), int(np.ceil(t)) + 1)
         bits = stored.read((slice(steps[0], steps[-1] + 1), slice(0, stored.shape[1])))
-        masks = np.unpackbits(np.bitwise_or.reduce(bits, axis=0), count=prod(self.shape[1:])).reshape(self.shape[1:])
+        masks = np.unpackbits(
+            np.bitwise_or.reduce(bits, axis=0), count=prod(self.shape[1:])
+        ).reshape(self.shape[1:])
         return np.asarray(masks, dtype=bool)
 
     def _interpolable(
-        self, steps: npt.NDArray[np.float64], keys: npt.NDArray[np.float64], space: list[npt.NDArray[np.float64]]
+        self,
+        steps: npt.NDArray[np.float64],
+        keys: npt.NDArray[np.float64],
+        space: list[npt.NDArray[np.float64]],
     ) -> npt.NDArray[np.bool_]:
         """Points whose every cell vertex of weight above 0 is in the coreset."""
         inside: npt.NDArray[np.bool_] = np.all(
-            [(p >= low) & (p <= high - 1) for p, (low, high) in zip(space, self.box, strict=True)], axis=0
+            [(p >= low) & (p <= high - 1) for p, (low, high) in zip(space, self.box, strict=True)],
+            axis=0,
         )
         # Points between the same steps and key frames share one occupancy.
         between = np.stack([np.floor(steps), np.ceil(steps), np.floor(keys), np.ceil(keys)])
@@ -320,10 +369,15 @@ class Volume:
                 continue
             low = [np.floor(p[chosen]).astype(np.int64) for p in space]
             high = [np.ceil(p[chosen]).astype(np.int64) for p in space]
-            around: Box = tuple((int(b.min()), int(h.max()) + 1) for b, h in zip(low, high, strict=True))  # type: ignore[assignment]
+            around: Box = tuple(
+                (int(b.min()), int(h.max()) + 1) for b, h in zip(low, high, strict=True)
+            )  # type: ignore[assignment]
             occupied = self.occupancy(steps[representative], around)
             for corner in np.ndindex(2, 2, 2):
-                at = ((h if up else b) - start for up, b, h, (start, _) in zip(corner, low, high, around, strict=True))
+                at = (
+                    (h if up else b) - start
+                    for up, b, h, (start, _) in zip(corner, low, high, around, strict=True)
+                )
                 inside[chosen] &= occupied[tuple(at)]
         return inside
 
@@ -336,7 +390,12 @@ class Volume:
     def __enter__(self) -> Volume:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self.close()
 
     def __reduce__(self) -> tuple[Any, tuple[Path]]:
@@ -357,7 +416,9 @@ def _expanded(index: Index | tuple[Index, ...]) -> list[int | slice]:
     """One part per axis, `...` and missing axes filled with full slices."""
     parts = list(index) if isinstance(index, tuple) else [index]
     for part in parts:
-        if part is not Ellipsis and (isinstance(part, bool) or not isinstance(part, int | np.integer | slice)):
+        if part is not Ellipsis and (
+            isinstance(part, bool) or not isinstance(part, int | np.integer | slice)
+        ):
             raise RegionError(
                 f"a volume is indexed by integers, slices and '...', not by {type(part).__name__}; take np.asarray of it for more"
             )

@@ -44,11 +44,17 @@ class VolumeModel(Protocol):
         """Values (n,) at points: key indices and (z, y, x), all inside."""
         ...
 
-    def slopes(self, keys: Positions, space: list[Positions]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def slopes(
+        self, keys: Positions, space: list[Positions]
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Values (n,) and derivatives (n, 4) by key index, z, y and x; on the border of two cells those of the cell after it."""
         ...
 
 
 def open_model(container: Container) -> VolumeModel:
     """The model of a container; nothing is read yet."""
-    return Lattice(container.arrays) if container.header["model"]["profile"] == "compact" else PaperModel(container)
+    return (
+        Lattice(container.arrays)
+        if container.header["model"]["profile"] == "compact"
+        else PaperModel(container)
+    )

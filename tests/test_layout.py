@@ -26,7 +26,9 @@ ALLOWED = {
     "fhash_codec": {"fhash_codec", "fhash_formats"},
     "fhash_cli": {"fhash_cli", "fhash_codec", "fhash_formats"},
 }
-TORCH_FILES = re.compile(r"(head_training|model|tesseract|train)\.py|(engines|bench)/.+\.py|render/torch_arrays\.py")
+TORCH_FILES = re.compile(
+    r"(head_training|model|tesseract|train)\.py|(engines|bench)/.+\.py|render/torch_arrays\.py"
+)
 """Modules of fhash_codec in which tensors are trained or evaluated, or marched through, or that start a training."""
 SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy")
 
@@ -71,8 +73,14 @@ def test_source_roots_are_no_packages(folder: str) -> None:
 
 
 def test_every_package_folder_is_installed_and_typed() -> None:
-    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
-    found = {".".join([package, *path.parent.relative_to(PACKAGES[package]).parts]) for package in PACKAGES for path in modules(package)}
+    listed = set(
+        tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    )
+    found = {
+        ".".join([package, *path.parent.relative_to(PACKAGES[package]).parts])
+        for package in PACKAGES
+        for path in modules(package)
+    }
     assert listed == found
     assert all((folder / "py.typed").exists() for folder in PACKAGES.values())
 
@@ -106,21 +114,34 @@ def test_nothing_slow_is_loaded_before_it_is_needed(statement: str) -> None:
 
 
 def test_constraints_pin_every_requirement_and_name_no_place() -> None:
-    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    lines = [
+        line
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if not line.startswith("#")
+    ]
     assert all(re.fullmatch(r"[a-z0-9._-]+==[0-9][0-9a-z.]*", line) for line in lines), (
         "only name==version, without path, URL or local build"
     )
     pinned = {re.sub(r"[-_.]+", "-", line.split("==")[0]) for line in lines}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    required = [*project["dependencies"], *(name for extra in project["optional-dependencies"].values() for name in extra)]
-    names = {re.sub(r"[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", line)[0].lower()) for line in required} - {"fhash"}  # type: ignore[index]
+    required = [
+        *project["dependencies"],
+        *(name for extra in project["optional-dependencies"].values() for name in extra),
+    ]
+    names = {
+        re.sub(r"[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", line)[0].lower()) for line in required
+    } - {"fhash"}  # type: ignore[index]
     assert names <= pinned
 
 
 def readme_commands() -> list[str]:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```\w*\n(.*?)```", text, flags=re.DOTALL)
-    lines = [line.strip().removeprefix("$ ") for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    lines = [
+        line.strip().removeprefix("$ ")
+        for block in blocks
+        for line in block.replace("\\\n", " ").splitlines()
+    ]
     return [line for line in lines if line.startswith("fhash ")]
 
 

@@ -40,7 +40,11 @@ class AnimationOptions:
     def __post_init__(self) -> None:
         if self.animate is not None and self.evolution is not None:
             raise click.UsageError("--animate and --evolution exclude each other")
-        for name, given in (("--frames", self.frames), ("--fps", self.fps), ("--pictures", self.pictures)):
+        for name, given in (
+            ("--frames", self.frames),
+            ("--fps", self.fps),
+            ("--pictures", self.pictures),
+        ):
             if given is not None and self.animate is None:
                 raise click.UsageError(f"{name} is of an animation: give --animate too")
         if self.columns is not None and self.evolution is None:
@@ -57,7 +61,9 @@ class AnimationOptions:
         if self.evolution is None:
             return scene
         steps = tuple(map(float, steps_of(volume, self.evolution, "--evolution")))
-        return dataclasses.replace(scene, step=None, time=None, evolution=Evolution(steps=steps, columns=self.columns))
+        return dataclasses.replace(
+            scene, step=None, time=None, evolution=Evolution(steps=steps, columns=self.columns)
+        )
 
     def tracked(self, volume: Volume, progress: Progress) -> list[Tracked]:
         """The features of `--track`, none without it."""
@@ -66,7 +72,9 @@ class AnimationOptions:
         if not self.track:
             return []
         if OWN in self.track and len(self.track) > 1:
-            raise InputError(f"--track {OWN} stands for the features of the file; leave it out, or the others")
+            raise InputError(
+                f"--track {OWN} stands for the features of the file; leave it out, or the others"
+            )
         return parse_tracked([] if OWN in self.track else self.track, volume, progress)
 
 
@@ -74,13 +82,34 @@ def add_animation_options(command: Command) -> Command:
     """Add the options of AnimationOptions; the command gets them as `several`."""
 
     @click.option(
-        "--animate", metavar="SPEC", help="steps[=A:B], time[=A:B], orbit[=DEGREES], separated by commas, or a file (TOML, JSON)."
+        "--animate",
+        metavar="SPEC",
+        help="steps[=A:B], time[=A:B], orbit[=DEGREES], separated by commas, or a file (TOML, JSON).",
     )
-    @click.option("--frames", type=click.IntRange(1, 100_000), metavar="N", help="Pictures of an animation.")
-    @click.option("--fps", type=RealRange(0.1, 240), metavar="X", help="Pictures per second of a film.")
-    @click.option("--pictures", metavar="NAME.png", type=click.Path(), help="Of a film, keep the pictures too: NAME.0000.png and so on.")
-    @click.option("--evolution", metavar="A:B:S", type=SliceType(), help="These steps side by side in one picture.")
-    @click.option("--columns", type=click.IntRange(1, 1000), metavar="N", help="Pictures beside each other of an evolution.")
+    @click.option(
+        "--frames", type=click.IntRange(1, 100_000), metavar="N", help="Pictures of an animation."
+    )
+    @click.option(
+        "--fps", type=RealRange(0.1, 240), metavar="X", help="Pictures per second of a film."
+    )
+    @click.option(
+        "--pictures",
+        metavar="NAME.png",
+        type=click.Path(),
+        help="Of a film, keep the pictures too: NAME.0000.png and so on.",
+    )
+    @click.option(
+        "--evolution",
+        metavar="A:B:S",
+        type=SliceType(),
+        help="These steps side by side in one picture.",
+    )
+    @click.option(
+        "--columns",
+        type=click.IntRange(1, 1000),
+        metavar="N",
+        help="Pictures beside each other of an evolution.",
+    )
     @click.option(
         "--track",
         metavar="FEATURE[=#RRGGBB]",
@@ -104,7 +133,13 @@ def tracking(volume: Volume, scene: Scene, options: AnimationOptions, progress: 
 
 
 def run_animation(
-    volume: Volume, scene: Scene, options: AnimationOptions, output: str, *, force: bool, progress: Progress
+    volume: Volume,
+    scene: Scene,
+    options: AnimationOptions,
+    output: str,
+    *,
+    force: bool,
+    progress: Progress,
 ) -> tuple[dict[str, Any], str]:
     """Make the pictures of `--animate`, or of a scene that is an evolution, at `output`; the result as JSON values and as text.
 
@@ -122,27 +157,50 @@ def run_animation(
     tracked = options.tracked(volume, progress)
     shown = tracking_scene(scene, tracked, volume) if tracked else scene
     if options.animate is not None:
-        changes = {name: value for name, value in (("frames", options.frames), ("fps", options.fps)) if value is not None}
+        changes = {
+            name: value
+            for name, value in (("frames", options.frames), ("fps", options.fps))
+            if value is not None
+        }
         animation = dataclasses.replace(Animation.parse(options.animate, volume), **changes)  # type: ignore[arg-type]
         for path in (output, options.pictures):
             if path is not None:
                 # Numbered pictures that are there may be kept: which must not be replaced is seen when their scenes are known.
                 counted = Path(path).suffix.lower() == ".png"
-                check_writable(numbered(Path(path), 1)[0] if counted else path, force or counted, sources=[volume.path])
+                check_writable(
+                    numbered(Path(path), 1)[0] if counted else path,
+                    force or counted,
+                    sources=[volume.path],
+                )
         try:
-            done = animate(volume, shown, animation, output, pictures=options.pictures, force=force, progress=progress)
+            done = animate(
+                volume,
+                shown,
+                animation,
+                output,
+                pictures=options.pictures,
+                force=force,
+                progress=progress,
+            )
         except OutputExistsError as error:
             # Nothing has failed yet but the command as it was written.
             raise InputError(str(error)) from error
         result = done.to_dict()
         rows = [
-            ("written", result["paths"][0] if len(result["paths"]) == 1 else f"{result['paths'][0]} to {result['paths'][-1]}"),
+            (
+                "written",
+                result["paths"][0]
+                if len(result["paths"]) == 1
+                else f"{result['paths'][0]} to {result['paths'][-1]}",
+            ),
             ("pictures", f"{done.rendered} rendered, {done.kept} kept"),
             ("seconds", number(done.seconds, digits=3)),
         ]
         return result, table(rows)
     if Path(output).suffix.lower() != ".png":
-        raise InputError(f"{output}: an evolution is one picture and is written as .png; use such a name")
+        raise InputError(
+            f"{output}: an evolution is one picture and is written as .png; use such a name"
+        )
     check_writable(output, force, sources=[volume.path])
     assert shown.evolution is not None
     steps = list(shown.evolution.steps)
@@ -157,7 +215,13 @@ def run_animation(
         "seconds": image.seconds,
         "tracked": followed,
     }
-    text = table([("written", paths[0]), ("steps", str(len(steps))), ("seconds", number(image.seconds, digits=3))])
+    text = table(
+        [
+            ("written", paths[0]),
+            ("steps", str(len(steps))),
+            ("seconds", number(image.seconds, digits=3)),
+        ]
+    )
     if followed:
         text += "\n\n" + _places(followed)
     return result, text
@@ -171,7 +235,11 @@ def _places(followed: list[dict[str, Any]]) -> str:
         cells = []
         for entry in followed:
             here = entry["steps"][number_]
-            middle = "" if here["centroid"] is None else " at " + ", ".join(f"{part:.4g}" for part in here["centroid"])
+            middle = (
+                ""
+                if here["centroid"] is None
+                else " at " + ", ".join(f"{part:.4g}" for part in here["centroid"])
+            )
             cells.append(f"{here['vertices']:,}{middle}")
         rows.append((f"{place['step']:g}", *cells))
     return table([header, *rows])

@@ -32,14 +32,20 @@ class EnginesType(click.ParamType[tuple[str, ...]]):
 
     name = "A,B"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
         """The names; refuses one that is unknown."""
         from fhash_codec.config import ENGINES
 
         names = tuple(name.strip() for name in str(value).split(","))
         for name in names:
             if name not in ENGINES:
-                self.fail(f"'{name}' is no engine; allowed, separated by commas: {', '.join(ENGINES)}", param, ctx)
+                self.fail(
+                    f"'{name}' is no engine; allowed, separated by commas: {', '.join(ENGINES)}",
+                    param,
+                    ctx,
+                )
         return names
 
 
@@ -54,7 +60,9 @@ class NamesType(click.ParamType[str]):
         from fhash_codec.bench.results import PEERS
         from fhash_codec.config import EncodeConfig
 
-        profiles = next(field for field in dataclasses.fields(EncodeConfig) if field.name == "profile").metadata["choices"]
+        profiles = next(
+            field for field in dataclasses.fields(EncodeConfig) if field.name == "profile"
+        ).metadata["choices"]
         allowed = (*(PEERS if self.name == "peer" else profiles), "none")
         if value not in allowed:
             self.fail(f"'{value}' is no {self.name}; allowed: {', '.join(allowed)}", param, ctx)
@@ -73,7 +81,14 @@ command.add_command(render)
 @click.argument("data", type=click.Path())
 @series_options
 @click.option("--engines", type=EnginesType(), help="Which to measure. Default: all there are.")
-@click.option("--seconds", type=RealRange(0.1, 3600), default=12.0, show_default=True, metavar="X", help="Training of each engine.")
+@click.option(
+    "--seconds",
+    type=RealRange(0.1, 3600),
+    default=12.0,
+    show_default=True,
+    metavar="X",
+    help="Training of each engine.",
+)
 @config_options(
     "features",
     "dilation",
@@ -90,7 +105,13 @@ command.add_command(render)
 @json_option
 @quiet_option
 def train(
-    data: str, source: SourceOptions, engines: tuple[str, ...] | None, seconds: float, config: EncodeConfig, as_json: bool, quiet: bool
+    data: str,
+    source: SourceOptions,
+    engines: tuple[str, ...] | None,
+    seconds: float,
+    config: EncodeConfig,
+    as_json: bool,
+    quiet: bool,
 ) -> None:
     """Train the model of DATA with each engine for a while, in turns; speeds in million samples a second.
 
@@ -101,16 +122,41 @@ def train(
     with source.open(data) as series, Progress(quiet=quiet) as progress:
         from fhash_codec.bench.train import bench_train
 
-        result = bench_train(series, config, engines=engines or ENGINES, seconds=seconds, progress=progress)
+        result = bench_train(
+            series, config, engines=engines or ENGINES, seconds=seconds, progress=progress
+        )
     emit(result, _text(result), as_json)
 
 
 def _text(result: dict[str, Any]) -> str:
     """A row of figures for each engine, and what they were taken on."""
-    header = ("engine", "train M/s", "x naive", "infer M/s", "x naive", "of peak", "epochs", "PSNR dB")
-    figures = ("train_msamples_s", "train_ratio", "infer_msamples_s", "infer_ratio", "fraction_of_peak", "epochs", "psnr")
-    rows = [(entry["engine"], *(number(entry[name], digits=3) for name in figures)) for entry in result["engines"]]
-    facts = {name.replace("_", " "): number(fact) if isinstance(fact, float) else fact for name, fact in result["machine"].items()}
+    header = (
+        "engine",
+        "train M/s",
+        "x naive",
+        "infer M/s",
+        "x naive",
+        "of peak",
+        "epochs",
+        "PSNR dB",
+    )
+    figures = (
+        "train_msamples_s",
+        "train_ratio",
+        "infer_msamples_s",
+        "infer_ratio",
+        "fraction_of_peak",
+        "epochs",
+        "psnr",
+    )
+    rows = [
+        (entry["engine"], *(number(entry[name], digits=3) for name in figures))
+        for entry in result["engines"]
+    ]
+    facts = {
+        name.replace("_", " "): number(fact) if isinstance(fact, float) else fact
+        for name, fact in result["machine"].items()
+    }
     machine = ", ".join(f"{name} {fact}" for name, fact in facts.items())
     return f"{table([header, *rows])}\n{result['samples']:,} samples; {machine}"
 
@@ -118,15 +164,42 @@ def _text(result: dict[str, Any]) -> str:
 @command.command("rate", short_help="size, speed and access beside other codecs, at equal quality")
 @click.argument("data", type=click.Path())
 @series_options
-@click.option("--target", "targets", type=RealRange(5, 200), multiple=True, metavar="X", help="PSNR over all frames in dB; repeat.")
 @click.option(
-    "--bound", "bounds", type=RealRange(1e-9, 0.5), multiple=True, metavar="X", help="Largest error as a share of the range; repeat."
+    "--target",
+    "targets",
+    type=RealRange(5, 200),
+    multiple=True,
+    metavar="X",
+    help="PSNR over all frames in dB; repeat.",
 )
 @click.option(
-    "--peer", "names", type=NamesType("peer"), multiple=True, help="SZ3, SPERR, ZFP, BitRound, Blosc or none; repeat. Default: all."
+    "--bound",
+    "bounds",
+    type=RealRange(1e-9, 0.5),
+    multiple=True,
+    metavar="X",
+    help="Largest error as a share of the range; repeat.",
 )
-@click.option("--profile", "profiles", type=NamesType("profile"), multiple=True, help="Of fhash, or none; repeat. Default: all.")
-@click.option("--speed/--no-speed", default=True, show_default=True, help="Measure speed and access too, at the target nearest to 50 dB.")
+@click.option(
+    "--peer",
+    "names",
+    type=NamesType("peer"),
+    multiple=True,
+    help="SZ3, SPERR, ZFP, BitRound, Blosc or none; repeat. Default: all.",
+)
+@click.option(
+    "--profile",
+    "profiles",
+    type=NamesType("profile"),
+    multiple=True,
+    help="Of fhash, or none; repeat. Default: all.",
+)
+@click.option(
+    "--speed/--no-speed",
+    default=True,
+    show_default=True,
+    help="Measure speed and access too, at the target nearest to 50 dB.",
+)
 @setting_options("effort", "tile", "epochs", "width", "device", "seed")
 @click.option("--plot", metavar="FILE.png", type=click.Path(), help="Draw bytes against quality.")
 @force_option
@@ -199,24 +272,46 @@ def _rate_text(result: RateBench) -> str:
         rows.append((name, *cells, *(number(row["ratios"][codec], "x", digits=3) for codec in own)))
     parts = [table(rows)]
     if any(point.as_asked is False for point in result.points):
-        parts.append("* its own tolerance of this bound does not keep it; a tighter one was taken where one does")
+        parts.append(
+            "* its own tolerance of this bound does not keep it; a tighter one was taken where one does"
+        )
     short = {point.codec: point for point in result.points if not point.reached}
-    parts += [f"{codec} does not reach all: {number(point.psnr, 'dB')} in {point.bytes:,} bytes" for codec, point in short.items()]
+    parts += [
+        f"{codec} does not reach all: {number(point.psnr, 'dB')} in {point.bytes:,} bytes"
+        for codec, point in short.items()
+    ]
     if result.speeds:
         speeds = [
-            (speed.codec, number(speed.psnr, "dB"), number(speed.encode_mb_s, digits=3), number(speed.decode_mb_s, digits=3))
+            (
+                speed.codec,
+                number(speed.psnr, "dB"),
+                number(speed.encode_mb_s, digits=3),
+                number(speed.decode_mb_s, digits=3),
+            )
             for speed in result.speeds
         ]
         parts.append("\n" + table([("speed", "PSNR", "encode MB/s", "decode MB/s"), *speeds]))
     if result.access:
         region = f"{extent(result.access[0].region)} of a step"
         access = [
-            (entry.setting, number(entry.psnr, "dB"), f"{entry.bytes:,}", number(entry.milliseconds, digits=3), f"{entry.bytes_read:,}")
+            (
+                entry.setting,
+                number(entry.psnr, "dB"),
+                f"{entry.bytes:,}",
+                number(entry.milliseconds, digits=3),
+                f"{entry.bytes_read:,}",
+            )
             for entry in result.access
         ]
         parts.append("\n" + table([(region, "PSNR", "bytes", "ms", "bytes read"), *access]))
-    parts += ["", f"{result.series}, {result.dtype} {extent(result.shape)}, {size(result.raw_bytes)}", *result.notes]
+    parts += [
+        "",
+        f"{result.series}, {result.dtype} {extent(result.shape)}, {size(result.raw_bytes)}",
+        *result.notes,
+    ]
     if result.missing:
-        parts.append(f"{result.missing:,} values are not finite; lossy peers were given neighbouring values in their place")
+        parts.append(
+            f"{result.missing:,} values are not finite; lossy peers were given neighbouring values in their place"
+        )
     parts += [f"not measured: {reason}" for reason in result.refused.values()]
     return "\n".join(parts)

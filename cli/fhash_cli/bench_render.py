@@ -31,7 +31,11 @@ class PartType(click.ParamType[str]):
 @click.command("render", short_help="time and quality of pictures, beside VTK")
 @run_argument
 @click.option(
-    "--scene", "scene_file", metavar="FILE", type=click.Path(), help="JSON, TOML or a PNG of fhash render. Default: that of RUN.fhz."
+    "--scene",
+    "scene_file",
+    metavar="FILE",
+    type=click.Path(),
+    help="JSON, TOML or a PNG of fhash render. Default: that of RUN.fhz.",
 )
 @click.option(
     "--part",
@@ -40,9 +44,29 @@ class PartType(click.ParamType[str]):
     multiple=True,
     help="effects, accelerations, streams, vtk, exactness, playback or curves; repeat. Default: all.",
 )
-@click.option("--size", "side", type=click.IntRange(16, 4096), default=512, show_default=True, metavar="N", help="Pixels along both sides.")
-@click.option("--turns", type=click.IntRange(1, 1000), default=5, show_default=True, metavar="N", help="Runs that each median is of.")
-@click.option("--plot", metavar="FILE.png", type=click.Path(), help="Draw quality against time, and times beside VTK's.")
+@click.option(
+    "--size",
+    "side",
+    type=click.IntRange(16, 4096),
+    default=512,
+    show_default=True,
+    metavar="N",
+    help="Pixels along both sides.",
+)
+@click.option(
+    "--turns",
+    type=click.IntRange(1, 1000),
+    default=5,
+    show_default=True,
+    metavar="N",
+    help="Runs that each median is of.",
+)
+@click.option(
+    "--plot",
+    metavar="FILE.png",
+    type=click.Path(),
+    help="Draw quality against time, and times beside VTK's.",
+)
 @force_option
 @json_option
 @quiet_option
@@ -75,7 +99,9 @@ def render(
         if plot is not None:
             require_matplotlib()
         scene = Scene() if scene_file is None else Scene.load(scene_file)
-        result = bench_render(volume, scene, parts=parts or PARTS, size=side, turns=turns, progress=progress)
+        result = bench_render(
+            volume, scene, parts=parts or PARTS, size=side, turns=turns, progress=progress
+        )
     if plot is not None:
         from fhash_formats.writers.atomic import replacing
 
@@ -97,7 +123,15 @@ def _render_text(result: RenderBench) -> str:
 
     for title, switches in (("effect", result.effects), ("acceleration", result.accelerations)):
         add(
-            (title, "off ms", "on ms", "on / off", "samples off", "samples on", *(("PSNR",) if title == "acceleration" else ())),
+            (
+                title,
+                "off ms",
+                "on ms",
+                "on / off",
+                "samples off",
+                "samples on",
+                *(("PSNR",) if title == "acceleration" else ()),
+            ),
             *(
                 (
                     each.name,
@@ -146,7 +180,8 @@ def _render_text(result: RenderBench) -> str:
         ("VTK on software OpenGL", "size", "step", "PSNR", "SSIM", "largest", "by its rules"),
         *(
             (
-                _lit(each.scene, bool(each.gradient)) + (", central differences" if each.gradient == "central" else ""),
+                _lit(each.scene, bool(each.gradient))
+                + (", central differences" if each.gradient == "central" else ""),
                 str(each.size),
                 f"{each.step:g}",
                 _decibels(each.psnr),
@@ -173,11 +208,26 @@ def _render_text(result: RenderBench) -> str:
     )
     add(
         ("knob", "value", "ms", "samples", "PSNR"),
-        *((each.knob, f"{each.value:.4g}", ms(each.milliseconds), f"{each.samples:,}", _decibels(each.psnr)) for each in result.curves),
+        *(
+            (
+                each.knob,
+                f"{each.value:.4g}",
+                ms(each.milliseconds),
+                f"{each.samples:,}",
+                _decibels(each.psnr),
+            )
+            for each in result.curves
+        ),
     )
     facts = ", ".join(f"{name} {fact}" for name, fact in result.machine.items())
-    parts.append(f"{result.series}, {extent(result.shape)}, step {result.step:g}, {result.size} x {result.size}, medians of {result.turns}")
-    parts += [*result.notes, facts, *(f"not measured: {part}: {reason}" for part, reason in result.refused.items())]
+    parts.append(
+        f"{result.series}, {extent(result.shape)}, step {result.step:g}, {result.size} x {result.size}, medians of {result.turns}"
+    )
+    parts += [
+        *result.notes,
+        facts,
+        *(f"not measured: {part}: {reason}" for part, reason in result.refused.items()),
+    ]
     return "\n".join(parts)
 
 

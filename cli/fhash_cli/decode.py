@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from fhash_cli.options import IntervalsType, SliceType, check_writable, force_option, json_option, quiet_option, run_argument
+from fhash_cli.options import (
+    IntervalsType,
+    SliceType,
+    check_writable,
+    force_option,
+    json_option,
+    quiet_option,
+    run_argument,
+)
 from fhash_cli.output import Progress, apart, emit, extent, listed, number, spans, table
 from fhash_cli.selection import Span, coordinates, region_of, region_of_box, steps_of
 from fhash_formats.errors import InputError
@@ -18,22 +26,80 @@ if TYPE_CHECKING:
 
     from fhash_codec import Volume
 
-TYPES = ("float16", "float32", "float64", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64")
+TYPES = (
+    "float16",
+    "float32",
+    "float64",
+    "int8",
+    "int16",
+    "int32",
+    "int64",
+    "uint8",
+    "uint16",
+    "uint32",
+    "uint64",
+)
 
 
 @click.command("decode")
 @run_argument
-@click.option("--t", "steps", type=SliceType(), help="Steps, half-open as in Python: 42, 40:50, ::2, -1. Default: all.")
-@click.option("--time", "times", metavar="T", type=float, multiple=True, help="A physical time, between steps too; may be repeated.")
-@click.option("--roi", metavar="z0:z1,y0:y1,x0:x1", type=IntervalsType(int), help="Region in vertices, half-open as in Python.")
-@click.option("--box", metavar="z0:z1,y0:y1,x0:x1", type=IntervalsType(float), help="Region in physical positions, both ends included.")
-@click.option("--lod", type=click.IntRange(0, 10), metavar="N", help="Level of detail: every 2^N-th vertex of the feature bounding box.")
 @click.option(
-    "-o", "output", metavar="OUT", type=click.Path(), help="File to write: .npy, .h5, .nc, .zarr, .raw, .vti, .vtr, .pvd, .vtkhdf."
+    "--t",
+    "steps",
+    type=SliceType(),
+    help="Steps, half-open as in Python: 42, 40:50, ::2, -1. Default: all.",
 )
-@click.option("--isosurface", type=float, metavar="V", help="Write the surface of this value at one step, as triangles: -o s.vtp or s.ply.")
-@click.option("--outside", type=click.Choice(["nan", "background"]), default="nan", show_default=True, help="Values outside the coreset.")
-@click.option("--dtype", type=click.Choice(TYPES), help="Convert the values; integers are rounded and clipped to the type's range.")
+@click.option(
+    "--time",
+    "times",
+    metavar="T",
+    type=float,
+    multiple=True,
+    help="A physical time, between steps too; may be repeated.",
+)
+@click.option(
+    "--roi",
+    metavar="z0:z1,y0:y1,x0:x1",
+    type=IntervalsType(int),
+    help="Region in vertices, half-open as in Python.",
+)
+@click.option(
+    "--box",
+    metavar="z0:z1,y0:y1,x0:x1",
+    type=IntervalsType(float),
+    help="Region in physical positions, both ends included.",
+)
+@click.option(
+    "--lod",
+    type=click.IntRange(0, 10),
+    metavar="N",
+    help="Level of detail: every 2^N-th vertex of the feature bounding box.",
+)
+@click.option(
+    "-o",
+    "output",
+    metavar="OUT",
+    type=click.Path(),
+    help="File to write: .npy, .h5, .nc, .zarr, .raw, .vti, .vtr, .pvd, .vtkhdf.",
+)
+@click.option(
+    "--isosurface",
+    type=float,
+    metavar="V",
+    help="Write the surface of this value at one step, as triangles: -o s.vtp or s.ply.",
+)
+@click.option(
+    "--outside",
+    type=click.Choice(["nan", "background"]),
+    default="nan",
+    show_default=True,
+    help="Values outside the coreset.",
+)
+@click.option(
+    "--dtype",
+    type=click.Choice(TYPES),
+    help="Convert the values; integers are rounded and clipped to the type's range.",
+)
 @force_option
 @json_option
 @quiet_option
@@ -69,7 +135,9 @@ def command(
         raise click.UsageError("--lod has NaN outside the coreset; leave out --outside")
     if isosurface is not None:
         if output is None or dtype is not None:
-            raise click.UsageError("--isosurface writes a file of triangles: give -o s.vtp or -o s.ply, and no --dtype")
+            raise click.UsageError(
+                "--isosurface writes a file of triangles: give -o s.vtp or -o s.ply, and no --dtype"
+            )
         check_mesh_output(output, force, [run])
         require_marching_cubes()
     elif output is not None:
@@ -78,13 +146,21 @@ def command(
         chosen = [volume.step_of_time(time) for time in times] if times else steps_of(volume, steps)
         region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
         # A level of detail has its own vertices, those of the feature bounding box that lie in the region.
-        z, y, x = (range(low, high) for low, high in region) if lod is None else volume.lod_vertices(lod, region)
+        z, y, x = (
+            (range(low, high) for low, high in region)
+            if lod is None
+            else volume.lod_vertices(lod, region)
+        )
         kind = np.dtype(dtype or volume.dtype)
         statistics = Statistics()
 
         def frames() -> Iterator[npt.NDArray[Any]]:
             for done, step in enumerate(chosen):
-                frame = volume.read(step, region, outside=outside) if lod is None else volume.read_lod(step, lod, region)
+                frame = (
+                    volume.read(step, region, outside=outside)
+                    if lod is None
+                    else volume.read_lod(step, lod, region)
+                )
                 statistics.add(frame, _inside(volume, step, region, frame, outside))
                 yield convert(frame, kind, filled=outside == "background")
                 progress("decoding", done + 1, len(chosen))
@@ -93,10 +169,14 @@ def command(
         paths = []
         if output is not None and isosurface is not None:
             if len(chosen) != 1:
-                raise InputError(f"--isosurface is of one step; {len(chosen)} were chosen: give --t N or --time T")
+                raise InputError(
+                    f"--isosurface is of one step; {len(chosen)} were chosen: give --t N or --time T"
+                )
             coords = coordinates(volume, chosen, (z, y, x))
             (frame,) = frames()
-            mesh = surface(frame, isosurface, coords, name=volume.name, time=float(coords["t"].values[0]))
+            mesh = surface(
+                frame, isosurface, coords, name=volume.name, time=float(coords["t"].values[0])
+            )
             paths = [str(save_mesh(output, mesh, force=force, sources=[run]))]
         elif output is None:
             for _ in frames():
@@ -110,9 +190,19 @@ def command(
                 coords=coordinates(volume, chosen, (z, y, x)),
                 attributes=volume.attrs,
             )
-            paths = [str(path) for path in save_region(output, whole, frames(), force=force, sources=[run])]
+            paths = [
+                str(path)
+                for path in save_region(output, whole, frames(), force=force, sources=[run])
+            ]
         within = [(part.start, part.stop) for part in (z, y, x)]
-        result = {"paths": paths, "shape": shape, "dtype": kind.name, "steps": chosen, "region": within, **statistics.result()}
+        result = {
+            "paths": paths,
+            "shape": shape,
+            "dtype": kind.name,
+            "steps": chosen,
+            "region": within,
+            **statistics.result(),
+        }
         emit(result, table(_rows(result, volume.units)), as_json)
 
 
@@ -135,7 +225,10 @@ class Statistics:
         self.all += frame.size
         self.inside += inside
         if known.size:
-            self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
+            self.low, self.high = (
+                min(self.low, float(known.min())),
+                max(self.high, float(known.max())),
+            )
         for piece in pieces(known):
             self.mean.add(piece)
 
@@ -150,7 +243,9 @@ class Statistics:
         }
 
 
-def convert(frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any], *, filled: bool = False) -> npt.NDArray[Any]:
+def convert(
+    frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any], *, filled: bool = False
+) -> npt.NDArray[Any]:
     """A decoded frame in another number type: rounded and clipped for integers; raises InputError where the type cannot hold a value.
 
     `filled`: vertices outside the coreset have the background's value, so that NaN is what the data had none for.
@@ -163,11 +258,15 @@ def convert(frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any], *, filled
         with np.errstate(over="ignore"):
             narrow = frame.astype(kind)
         if np.isinf(narrow).any():
-            raise InputError(f"a value of {float(np.nanmax(np.abs(frame))):.6g} does not fit {kind}; choose a wider type")
+            raise InputError(
+                f"a value of {float(np.nanmax(np.abs(frame))):.6g} does not fit {kind}; choose a wider type"
+            )
         return narrow
     if np.isnan(frame).any():
         if filled:
-            raise InputError(f"the data have no value (NaN) at some vertices of the region, which {kind} cannot hold; take a float type")
+            raise InputError(
+                f"the data have no value (NaN) at some vertices of the region, which {kind} cannot hold; take a float type"
+            )
         raise InputError(
             f"the region holds vertices without a value (NaN), which {kind} cannot hold; add --outside background, or take a float type"
         )
@@ -180,7 +279,13 @@ def convert(frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any], *, filled
     return np.asarray(whole)
 
 
-def _inside(volume: Volume, step: float, region: tuple[Span, Span, Span], frame: npt.NDArray[Any], outside: str) -> int:
+def _inside(
+    volume: Volume,
+    step: float,
+    region: tuple[Span, Span, Span],
+    frame: npt.NDArray[Any],
+    outside: str,
+) -> int:
     """How many vertices of a decoded frame belong to the coreset."""
     import numpy as np
 

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.options import check_writable, force_option, json_option, quiet_option
-from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, say, size, table
+from fhash_cli.output import (
+    Progress,
+    compared,
+    emit,
+    extent,
+    number,
+    quality_rows,
+    say,
+    size,
+    table,
+)
 from fhash_codec.synthetic import SCENES, simulate
 from fhash_formats.errors import InputError
 
@@ -23,8 +33,22 @@ COLUMNS = 4
 
 
 @click.command("demo")
-@click.option("--scene", type=click.Choice(tuple(SCENES)), default="vortex", show_default=True, help="What to simulate.")
-@click.option("-o", "folder", metavar="DIR", type=click.Path(), default="demo", show_default=True, help="Folder for the three files.")
+@click.option(
+    "--scene",
+    type=click.Choice(tuple(SCENES)),
+    default="vortex",
+    show_default=True,
+    help="What to simulate.",
+)
+@click.option(
+    "-o",
+    "folder",
+    metavar="DIR",
+    type=click.Path(),
+    default="demo",
+    show_default=True,
+    help="Folder for the three files.",
+)
 @force_option
 @json_option
 @quiet_option
@@ -38,9 +62,13 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
     try:
         Path(folder).mkdir(exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: {error.strerror}; give a folder that exists or whose parent does") from error
+        raise InputError(
+            f"{folder}: {error.strerror}; give a folder that exists or whose parent does"
+        ) from error
     for output in (data, run, picture):
-        check_writable(output, force, sources=[other for other in (data, run, picture) if other != output])
+        check_writable(
+            output, force, sources=[other for other in (data, run, picture) if other != output]
+        )
     if not quiet:
         say(f"simulating '{scene}', {SCENES[scene].help}")
     simulated = simulate(scene)
@@ -62,10 +90,20 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
         start = time.perf_counter()
         report = fhash_codec.diff(data, run, progress=progress)
         seconds = time.perf_counter() - start
-    with open_series(data) as series, fhash_codec.open(run) as volume, replacing(picture, force=force) as temporary:
+    with (
+        open_series(data) as series,
+        fhash_codec.open(run) as volume,
+        replacing(picture, force=force) as temporary,
+    ):
         _draw(scene, series, volume, report).save(temporary, format="PNG", optimize=True)
     settings = f"--feature {config.features[0]}"
-    made = {"scene": scene, "data": str(data), "path": str(run), "picture": str(picture), "settings": settings}
+    made = {
+        "scene": scene,
+        "data": str(data),
+        "path": str(run),
+        "picture": str(picture),
+        "settings": settings,
+    }
     result = {**report, "seconds": encoded["seconds"], "diff_seconds": seconds, **made}
     emit(result, table(_rows(result, series)), as_json)
 

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import click
 
-from fhash_cli.options import RealRange, SourceOptions, json_option, quiet_option, run_argument, series_options
+from fhash_cli.options import (
+    RealRange,
+    SourceOptions,
+    json_option,
+    quiet_option,
+    run_argument,
+    series_options,
+)
 from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, table
 
 
@@ -12,12 +19,28 @@ from fhash_cli.output import Progress, compared, emit, extent, number, quality_r
 @click.argument("data", type=click.Path())
 @run_argument
 @series_options
-@click.option("--min-psnr", metavar="DB", type=RealRange(0), help="Exit code 3 if the PSNR in the coreset is below this.")
-@click.option("--max-error", metavar="E", type=RealRange(0), help="Exit code 3 if the largest error in the coreset is above this.")
+@click.option(
+    "--min-psnr",
+    metavar="DB",
+    type=RealRange(0),
+    help="Exit code 3 if the PSNR in the coreset is below this.",
+)
+@click.option(
+    "--max-error",
+    metavar="E",
+    type=RealRange(0),
+    help="Exit code 3 if the largest error in the coreset is above this.",
+)
 @json_option
 @quiet_option
 def command(
-    data: str, run: str, source: SourceOptions, min_psnr: float | None, max_error: float | None, as_json: bool, quiet: bool
+    data: str,
+    run: str,
+    source: SourceOptions,
+    min_psnr: float | None,
+    max_error: float | None,
+    as_json: bool,
+    quiet: bool,
 ) -> None:
     """Compare RUN.fhz with the DATA it was made from, over all steps."""
     import fhash_codec
@@ -33,8 +56,16 @@ def command(
     emit(report, table(rows), as_json)
     # No PSNR is defined where nothing differs, which meets any gate, and where the data are constant or nothing can be compared, which
     # meets none.
-    if min_psnr is not None and report["rmse"] != 0 and not (report["psnr"] is not None and report["psnr"] >= min_psnr):
-        found = "no PSNR is defined" if report["psnr"] is None else f"PSNR {number(report['psnr'], 'dB')}"
+    if (
+        min_psnr is not None
+        and report["rmse"] != 0
+        and not (report["psnr"] is not None and report["psnr"] >= min_psnr)
+    ):
+        found = (
+            "no PSNR is defined"
+            if report["psnr"] is None
+            else f"PSNR {number(report['psnr'], 'dB')}"
+        )
         raise QualityError(f"{run}: {found} in the coreset; at least {min_psnr:g} dB was asked for")
     worst = report["max_abs_error"]
     if max_error is not None and not (worst is not None and worst <= max_error):

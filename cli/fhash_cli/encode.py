@@ -8,8 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.options import SourceOptions, check_writable, config_options, force_option, json_option, quiet_option, series_options
-from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, size, spans, table
+from fhash_cli.options import (
+    SourceOptions,
+    check_writable,
+    config_options,
+    force_option,
+    json_option,
+    quiet_option,
+    series_options,
+)
+from fhash_cli.output import (
+    Progress,
+    compared,
+    emit,
+    extent,
+    number,
+    quality_rows,
+    size,
+    spans,
+    table,
+)
 from fhash_formats.errors import QualityError
 
 if TYPE_CHECKING:
@@ -18,13 +36,23 @@ if TYPE_CHECKING:
 
 @click.command("encode")
 @click.argument("data", type=click.Path())
-@click.option("-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write.")
+@click.option(
+    "-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write."
+)
 @series_options
 @config_options()
 @force_option
 @json_option
 @quiet_option
-def command(data: str, output: str, source: SourceOptions, config: EncodeConfig, force: bool, as_json: bool, quiet: bool) -> None:
+def command(
+    data: str,
+    output: str,
+    source: SourceOptions,
+    config: EncodeConfig,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
     """Find the features of DATA, encode them and write them as RUN.fhz.
 
     DATA is a file of HDF5, NetCDF, numpy or raw values, a Zarr folder, or a pattern of such files in quotes ('step_*.raw').
@@ -60,7 +88,10 @@ def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
         *gain_rows(report),
         ("steps, z, y, x", extent(report["shape"])),
         *([("key frames", str(len(report["key_frames"])))] if paper else []),
-        ("coreset", f"{report['coreset_fraction']:.3%} of the domain, in {spans(report['feature_bounding_box'])}"),
+        (
+            "coreset",
+            f"{report['coreset_fraction']:.3%} of the domain, in {spans(report['feature_bounding_box'])}",
+        ),
         *quality_rows(report, units),
         ("model", f"{model}, {report['profile']}"),
         *loss_rows(report),
@@ -78,7 +109,10 @@ def gain_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What each stage of a compact encoding made of the size, and when it was done; on a sample but for the last."""
     last = len(report["gains"]) - 1
     return [
-        ("  " + gain["what"], f"{'' if stage == last else 'about '}{size(gain['bytes'])}{_after(gain)}")
+        (
+            "  " + gain["what"],
+            f"{'' if stage == last else 'about '}{size(gain['bytes'])}{_after(gain)}",
+        )
         for stage, gain in enumerate(report["gains"])
     ]
 

@@ -76,7 +76,11 @@ class Program(click.Group):
         sys.exit(result if isinstance(result, int) else 0)
 
 
-@click.group(cls=Program, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.group(
+    cls=Program,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
+)
 @click.version_option(package_name="fhash", message="%(prog)s %(version)s")
 @click.pass_context
 def program(context: click.Context) -> None:

@@ -23,7 +23,9 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="No progress on 
 run_argument = click.argument("run", metavar="RUN.fhz", type=click.Path())
 
 
-def check_writable(path: str | Path, force: bool, *, region: bool = False, sources: Sequence[str | Path] = ()) -> None:
+def check_writable(
+    path: str | Path, force: bool, *, region: bool = False, sources: Sequence[str | Path] = ()
+) -> None:
     """Refuse an output (of `save_region` with `region`) before any work: it exists, cannot be replaced, or is one of the `sources`.
 
     Raises InputError throughout (exit code 2), since nothing has failed yet but the command as it was written.
@@ -40,7 +42,9 @@ def check_writable(path: str | Path, force: bool, *, region: bool = False, sourc
 class RealRange(click.FloatRange):
     """A number within limits; click's own lets NaN through, which is neither below nor above anything."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
         """The number; refuses NaN and whatever is outside the limits."""
         number = float(super().convert(value, param, ctx))
         if math.isnan(number):
@@ -53,14 +57,20 @@ class SliceType(click.ParamType[slice]):
 
     name = "A:B:S"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> slice:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> slice:
         """The slice that a text stands for; `-1` is `slice(-1, None)`, the last."""
         if isinstance(value, slice):
             return value
         try:
             return parse_slice(str(value))
         except ValueError:
-            self.fail(f"'{value}' is not an index or a half-open range A:B or A:B:S of indices, such as 4, 40:50, 10: or ::2", param, ctx)
+            self.fail(
+                f"'{value}' is not an index or a half-open range A:B or A:B:S of indices, such as 4, 40:50, 10: or ::2",
+                param,
+                ctx,
+            )
 
 
 class IntervalsType(click.ParamType[tuple[Any, ...]]):
@@ -70,17 +80,26 @@ class IntervalsType(click.ParamType[tuple[Any, ...]]):
         self.number = number
         self.name = "z0:z1,y0:y1,x0:x1"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[Any, ...]:
         """((z0, z1), (y0, y1), (x0, x1)), None for an end left out."""
         if isinstance(value, tuple):
             return value
         try:
-            intervals = tuple(tuple(self.number(end) if end.strip() else None for end in part.split(":")) for part in str(value).split(","))
+            intervals = tuple(
+                tuple(self.number(end) if end.strip() else None for end in part.split(":"))
+                for part in str(value).split(",")
+            )
         except ValueError:
             intervals = ()
         if [len(interval) for interval in intervals] != [2, 2, 2]:
             example = "0:16,:,8:24" if self.number is int else "0:0.5,:,1.5:2"
-            self.fail(f"'{value}' is not z0:z1,y0:y1,x0:x1, where an end may be left out, such as {example}", param, ctx)
+            self.fail(
+                f"'{value}' is not z0:z1,y0:y1,x0:x1, where an end may be left out, such as {example}",
+                param,
+                ctx,
+            )
         return intervals
 
 
@@ -110,7 +129,11 @@ class SourceOptions:
         """The Series at a path; the caller closes it."""
         from fhash_formats import RawLayout, open_series, parse_shape
 
-        raw = RawLayout(shape=None if self.shape is None else parse_shape(self.shape), dtype=self.dtype, endian=self.endian)
+        raw = RawLayout(
+            shape=None if self.shape is None else parse_shape(self.shape),
+            dtype=self.dtype,
+            endian=self.endian,
+        )
         return open_series(path, var=self.var, axes=self.axes, steps=self.t, raw=raw)
 
 
@@ -118,11 +141,25 @@ def series_options(command: Command) -> Command:
     """Add the options of SourceOptions; the command gets them as `source`."""
 
     @click.option("--var", metavar="NAME", help="Which variable or dataset of the file.")
-    @click.option("--axes", metavar="t,z,y,x", help="What the file's dimensions are, in its own order; letters left out have length 1.")
-    @click.option("--t", "t", type=SliceType(), help="Only these steps, half-open as in Python: 40:50, ::2.")
-    @click.option("--shape", metavar="x=64,y=64,z=32,t=10", help="Lengths of a raw file, the fastest axis first.")
-    @click.option("--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8.")
-    @click.option("--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file.")
+    @click.option(
+        "--axes",
+        metavar="t,z,y,x",
+        help="What the file's dimensions are, in its own order; letters left out have length 1.",
+    )
+    @click.option(
+        "--t", "t", type=SliceType(), help="Only these steps, half-open as in Python: 40:50, ::2."
+    )
+    @click.option(
+        "--shape",
+        metavar="x=64,y=64,z=32,t=10",
+        help="Lengths of a raw file, the fastest axis first.",
+    )
+    @click.option(
+        "--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8."
+    )
+    @click.option(
+        "--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file."
+    )
     @functools.wraps(command)
     def collected(**values: Any) -> None:
         names = [field.name for field in dataclasses.fields(SourceOptions)]
@@ -154,7 +191,9 @@ def setting_options(*names: str) -> Callable[[Command], Command]:
     """As `config_options`, for settings of several profiles: the command gets a dict of them as `settings`."""
     from fhash_codec.config import EncodeConfig
 
-    fields = [field for field in dataclasses.fields(EncodeConfig) if not names or field.name in names]
+    fields = [
+        field for field in dataclasses.fields(EncodeConfig) if not names or field.name in names
+    ]
     hints = typing.get_type_hints(EncodeConfig)
 
     def decorate(command: Command) -> Command:
@@ -177,15 +216,27 @@ def _setting(field: dataclasses.Field[Any], hint: Any) -> Callable[[Command], Co
     flag = "--" + (limits["option"] or field.name).replace("_", "-")
     text = limits["help"][0].upper() + limits["help"][1:] + "."
     if hint is bool:
-        return click.option(f"{flag}/--no-{flag[2:]}", field.name, default=field.default, show_default=True, help=text)
+        return click.option(
+            f"{flag}/--no-{flag[2:]}",
+            field.name,
+            default=field.default,
+            show_default=True,
+            help=text,
+        )
     multiple = typing.get_origin(hint) is tuple
-    kind: Any = next(inner for inner in (typing.get_args(hint) or (hint,)) if inner is not type(None))
+    kind: Any = next(
+        inner for inner in (typing.get_args(hint) or (hint,)) if inner is not type(None)
+    )
     metavar = None
     if limits["choices"]:
         kind = click.Choice(limits["choices"])
     elif limits["low"] is not None:
         metavar = "N" if kind is int else "X"
-        kind = click.IntRange(int(limits["low"]), int(limits["high"])) if kind is int else RealRange(limits["low"], limits["high"])
+        kind = (
+            click.IntRange(int(limits["low"]), int(limits["high"]))
+            if kind is int
+            else RealRange(limits["low"], limits["high"])
+        )
     return click.option(
         flag,
         field.name,

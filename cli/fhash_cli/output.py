@@ -26,7 +26,12 @@ def say(message: str) -> None:
 
 
 def warn(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None, line: str | None = None
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
 ) -> None:
     """A Python warning as one line on stderr; the signature is that of `warnings.showwarning`."""
     say(f"warning: {' '.join(str(message).split())}")
@@ -35,7 +40,9 @@ def warn(
 def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
     """The result on stdout: one JSON object in one line, or the text for people; raises OutputError where stdout is closed."""
     if sys.stdout is None:
-        raise OutputError("the result cannot be printed, stdout is closed; files named as outputs are written")
+        raise OutputError(
+            "the result cannot be printed, stdout is closed; files named as outputs are written"
+        )
     click.echo(json.dumps(result, allow_nan=False) if as_json else plain_text(text))
 
 
@@ -45,7 +52,11 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 
     def line(row: Sequence[str]) -> str:
         first, *rest = row
-        others = rest if len(row) == 2 else [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
+        others = (
+            rest
+            if len(row) == 2
+            else [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
+        )
         return "  ".join([first.ljust(widths[0]), *others]).rstrip()
 
     return "\n".join(line(row) for row in rows)
@@ -63,7 +74,11 @@ def size(count: float) -> str:
 def compared(report: Mapping[str, Any]) -> str:
     """The size of a container beside that of the data."""
     ratio = report["ratio"]
-    word = f"{number(ratio, digits=3)}x smaller" if ratio >= 1 else f"{number(1 / ratio, digits=3)}x larger"
+    word = (
+        f"{number(ratio, digits=3)}x smaller"
+        if ratio >= 1
+        else f"{number(1 / ratio, digits=3)}x larger"
+    )
     return f"{size(report['bytes'])} of {size(report['raw_bytes'])}, {word}"
 
 
@@ -88,7 +103,9 @@ def extent(shape: Sequence[int]) -> str:
 
 def spans(region: Sequence[Sequence[int]]) -> str:
     """A region in space such as z 0:32, y 4:40, x 0:48."""
-    return ", ".join(f"{axis} {low}:{high}" for axis, (low, high) in zip("zyx", region, strict=True))
+    return ", ".join(
+        f"{axis} {low}:{high}" for axis, (low, high) in zip("zyx", region, strict=True)
+    )
 
 
 def listed(names: Sequence[str]) -> str:
@@ -117,20 +134,31 @@ def describe_error(error: Exception) -> tuple[str, int]:
         hint = f" (see '{context.command_path} --help')" if context is not None else ""
         line, code = error.format_message().rstrip(".") + hint, error.exit_code
     elif _is_no_memory(error):
-        line, code = "out of memory; take fewer steps (--t), a smaller region or a smaller network", 1
+        line, code = (
+            "out of memory; take fewer steps (--t), a smaller region or a smaller network",
+            1,
+        )
     elif isinstance(error, RuntimeError) and str(error) == "can't start new thread":
-        line, code = "no thread can be started: no memory is left, or no process (ulimit -u); FHASH_THREADS=1 takes fewer", 1
+        line, code = (
+            "no thread can be started: no memory is left, or no process (ulimit -u); FHASH_THREADS=1 takes fewer",
+            1,
+        )
     elif isinstance(error, OSError) and error.strerror:
         line, code = f"{error.strerror}: {error.filename}" if error.filename else error.strerror, 1
     else:
-        line, code = f"unexpected {type(error).__name__}: {error}; please report this (FHASH_DEBUG=1 shows where it came from)", 1
+        line, code = (
+            f"unexpected {type(error).__name__}: {error}; please report this (FHASH_DEBUG=1 shows where it came from)",
+            1,
+        )
     return " ".join(line.split()), code
 
 
 def _is_no_memory(error: Exception) -> bool:
     """Whether there was no memory: torch (CUDA, CPU) and HDF5 say so in errors of their own."""
     if isinstance(error, RuntimeError):
-        return type(error).__name__ == "OutOfMemoryError" or any(words in str(error) for words in NO_MEMORY)
+        return type(error).__name__ == "OutOfMemoryError" or any(
+            words in str(error) for words in NO_MEMORY
+        )
     return isinstance(error, MemoryError)
 
 
@@ -152,7 +180,12 @@ class Progress:
     def __enter__(self) -> Progress:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self._erase()
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
@@ -174,7 +207,11 @@ class Progress:
         remark = f", {note}" if note else ""
         if self.terminal and (now - self.shown > 0.1 or share == 1):
             filled = round(24 * share)
-            click.echo(f"\r{stage:10} {'#' * filled}{'-' * (24 - filled)} {share:4.0%}{remark}{left}\x1b[K", err=True, nl=False)
+            click.echo(
+                f"\r{stage:10} {'#' * filled}{'-' * (24 - filled)} {share:4.0%}{remark}{left}\x1b[K",
+                err=True,
+                nl=False,
+            )
             self.drawn, self.shown = True, now
         elif not self.terminal and math.floor(10 * share) > self.tenth:
             self.tenth = math.floor(10 * share)
@@ -188,4 +225,6 @@ class Progress:
 
 def _clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"
+    return (
+        f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"
+    )

@@ -22,10 +22,21 @@ if TYPE_CHECKING:
 
 @click.command("render")
 @run_argument
-@click.option("-o", "output", metavar="VIEW.png", type=click.Path(), help="The picture to write.  [default: RUN.png in this folder]")
+@click.option(
+    "-o",
+    "output",
+    metavar="VIEW.png",
+    type=click.Path(),
+    help="The picture to write.  [default: RUN.png in this folder]",
+)
 @scene_options
 @add_animation_options
-@click.option("--save-scene", metavar="FILE.json", type=click.Path(), help="Write the scene, to be used again by --scene.")
+@click.option(
+    "--save-scene",
+    metavar="FILE.json",
+    type=click.Path(),
+    help="Write the scene, to be used again by --scene.",
+)
 @click.option("--explain", is_flag=True, help="Print the plan, and what the picture took.")
 @force_option
 @json_option
@@ -54,8 +65,12 @@ def command(
         scene = several.over(options.scene(volume), volume)
         if several.several(scene):
             if explain or save_scene is not None:
-                raise click.UsageError("--explain and --save-scene are of one picture; leave them out of an animation or evolution")
-            result, text = run_animation(volume, scene, several, str(path), force=force, progress=progress)
+                raise click.UsageError(
+                    "--explain and --save-scene are of one picture; leave them out of an animation or evolution"
+                )
+            result, text = run_animation(
+                volume, scene, several, str(path), force=force, progress=progress
+            )
             emit(result, text, as_json)
             return
         scene = tracking(volume, scene, several, progress)
@@ -110,7 +125,10 @@ def _text(plan: Plan, image: Image, paths: list[str], explain: bool) -> str:
     found = [("written", path) for path in paths]
     if not explain:
         height, width = image.rgba.shape[:2]
-        found += [("size", extent((width, height))), ("step", f"{plan.step:g}, t = {plan.time:.6g}")]
+        found += [
+            ("size", extent((width, height))),
+            ("step", f"{plan.step:g}, t = {plan.time:.6g}"),
+        ]
     found.append(("seconds", number(image.seconds, digits=3)))
     if not explain:
         return table(found)

@@ -29,7 +29,9 @@ class NumbersType(click.ParamType[tuple[float, ...]]):
     def __init__(self, count: int) -> None:
         self.count, self.name = count, NUMBERS[count]
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
         """The numbers; whether they are allowed is for the scene to say."""
         try:
             numbers = tuple(float(part) for part in str(value).split(","))
@@ -37,7 +39,9 @@ class NumbersType(click.ParamType[tuple[float, ...]]):
             numbers = ()
         if len(numbers) != self.count:
             self.fail(
-                f"'{value}' is not {self.count} numbers with commas between them, such as {','.join('123'[: self.count])}", param, ctx
+                f"'{value}' is not {self.count} numbers with commas between them, such as {','.join('123'[: self.count])}",
+                param,
+                ctx,
             )
         return numbers
 
@@ -47,7 +51,9 @@ class SizeType(click.ParamType[tuple[int, int]]):
 
     name = "WxH"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
         """The two numbers."""
         try:
             across, _, down = str(value).lower().partition("x")
@@ -68,7 +74,11 @@ class OpacityType(click.ParamType[Any]):
         try:
             return [[float(end) for end in part.split(":")] for part in str(value).split(",")]
         except ValueError:
-            self.fail(f"'{value}' is neither the name of an opacity nor points such as 0:0,1.5:0.2,2:0", param, ctx)
+            self.fail(
+                f"'{value}' is neither the name of an opacity nor points such as 0:0,1.5:0.2,2:0",
+                param,
+                ctx,
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +112,9 @@ class SceneOptions:
         for setting in self.settings:
             place, equals, text = setting.partition("=")
             if not equals:
-                raise InputError(f"--set {setting}: write PLACE=VALUE, such as effects.shading.ambient=0.3")
+                raise InputError(
+                    f"--set {setting}: write PLACE=VALUE, such as effects.shading.ambient=0.3"
+                )
             _put(values, place.strip(), _json(text))
         return Scene.from_dict(values)
 
@@ -136,21 +148,51 @@ def scene_options(command: Command) -> Command:
         "antialiasing": "effects.antialiasing",
     }
 
-    @click.option("--scene", "file", metavar="FILE", type=click.Path(), help="A scene to begin from: JSON, TOML, or a PNG of fhash render.")
-    @click.option("--t", type=float, metavar="N", help="Step, between two of them too; -1 is the last. Default: the first.")
+    @click.option(
+        "--scene",
+        "file",
+        metavar="FILE",
+        type=click.Path(),
+        help="A scene to begin from: JSON, TOML, or a PNG of fhash render.",
+    )
+    @click.option(
+        "--t",
+        type=float,
+        metavar="N",
+        help="Step, between two of them too; -1 is the last. Default: the first.",
+    )
     @click.option("--time", type=float, metavar="T", help="A physical time instead of a step.")
     @click.option("--size", type=SizeType(), help="Pixels across and down.  [default: 512x512]")
-    @click.option("--view", metavar="NAME", help="Direction to look from: iso, xy, xz, yz, yx, zx or zy.")
-    @click.option("--azimuth", type=float, metavar="DEGREES", help="Turn the camera about the upward direction.")
+    @click.option(
+        "--view", metavar="NAME", help="Direction to look from: iso, xy, xz, yz, yx, zx or zy."
+    )
+    @click.option(
+        "--azimuth",
+        type=float,
+        metavar="DEGREES",
+        help="Turn the camera about the upward direction.",
+    )
     @click.option("--elevation", type=float, metavar="DEGREES", help="Raise the camera.")
     @click.option("--zoom", type=float, metavar="X", help="Magnification.")
     @click.option("--projection", metavar="NAME", help="perspective or parallel.")
-    @click.option("--position", type=NumbersType(3), help="Where the camera stands, in the coordinates of the series.")
+    @click.option(
+        "--position",
+        type=NumbersType(3),
+        help="Where the camera stands, in the coordinates of the series.",
+    )
     @click.option("--focal-point", type=NumbersType(3), help="What the camera looks at.")
     @click.option("--view-up", type=NumbersType(3), help="What is upwards in the picture.")
-    @click.option("--scale", type=NumbersType(3), help="Stretch the axes.  [default: one in other units is as long as the rest]")
+    @click.option(
+        "--scale",
+        type=NumbersType(3),
+        help="Stretch the axes.  [default: one in other units is as long as the rest]",
+    )
     @click.option("--cmap", metavar="NAME", help="Colour map, or a ParaView preset (JSON).")
-    @click.option("--opacity", type=OpacityType(), help="auto, feature, linear, geom, sigmoid, foreground, opaque, or points.")
+    @click.option(
+        "--opacity",
+        type=OpacityType(),
+        help="auto, feature, linear, geom, sigmoid, foreground, opaque, or points.",
+    )
     @click.option("--range", type=NumbersType(2), help="Values that the colours reach from and to.")
     @click.option("--density", type=float, metavar="X", help="Factor of the extinction.")
     @click.option(
@@ -160,25 +202,49 @@ def scene_options(command: Command) -> Command:
         multiple=True,
         help="shading, shadows, ambient-occlusion, maximum-intensity, jitter, box, axes, colour-bar or time-label; may be repeated.",
     )
-    @click.option("--isosurface", "isosurfaces", metavar="V[,COLOUR][,OPACITY]", multiple=True, help="A surface; may be repeated.")
+    @click.option(
+        "--isosurface",
+        "isosurfaces",
+        metavar="V[,COLOUR][,OPACITY]",
+        multiple=True,
+        help="A surface; may be repeated.",
+    )
     @click.option("--no-volume", is_flag=True, help="Surfaces alone.")
     @click.option("--background", metavar="COLOUR", help="'#rrggbb', a name, or transparent.")
     @click.option("--antialiasing", type=int, metavar="N", help="Rays along a pixel's side.")
     @click.option("--depth", is_flag=True, help="Write the depth too, as NAME.depth.npy.")
     @click.option("--normal", is_flag=True, help="Write normals too, as NAME.normal.npy.")
     @click.option("--march", metavar="NAME", help="Way to march: auto, cache, arm or stream.")
-    @click.option("--device", metavar="NAME", help="Where arm and stream compute: auto, cpu or cuda.")
-    @click.option("--step", type=float, metavar="X", help="Length of a step in vertex spacings.")
-    @click.option("--threshold", type=float, metavar="X", help="Share of the light at which a ray ends.")
-    @click.option("--lod", type=int, metavar="N", help="Level of detail; by the size of a pixel if left out.")
-    @click.option("--samples-per-pass", type=int, metavar="N", help="N_r of adaptive ray marching.")
-    @click.option("--skipping/--no-skipping", default=None, help="Pass over bricks of which nothing can be seen.")
     @click.option(
-        "--set", "settings", metavar="PLACE=VALUE", multiple=True, help="Any part of a scene, such as effects.shading.ambient=0.3."
+        "--device", metavar="NAME", help="Where arm and stream compute: auto, cpu or cuda."
+    )
+    @click.option("--step", type=float, metavar="X", help="Length of a step in vertex spacings.")
+    @click.option(
+        "--threshold", type=float, metavar="X", help="Share of the light at which a ray ends."
+    )
+    @click.option(
+        "--lod", type=int, metavar="N", help="Level of detail; by the size of a pixel if left out."
+    )
+    @click.option("--samples-per-pass", type=int, metavar="N", help="N_r of adaptive ray marching.")
+    @click.option(
+        "--skipping/--no-skipping",
+        default=None,
+        help="Pass over bricks of which nothing can be seen.",
+    )
+    @click.option(
+        "--set",
+        "settings",
+        metavar="PLACE=VALUE",
+        multiple=True,
+        help="Any part of a scene, such as effects.shading.ambient=0.3.",
     )
     @functools.wraps(command)
     def collected(**values: Any) -> None:
-        given = {place: value for name, place in places.items() if (value := values.pop(name)) is not None}
+        given = {
+            place: value
+            for name, place in places.items()
+            if (value := values.pop(name)) is not None
+        }
         buffers = [name for name in ("depth", "normal") if values.pop(name)]
         if buffers:
             given["effects.buffers"] = buffers
@@ -189,7 +255,10 @@ def scene_options(command: Command) -> Command:
         if "step" in given and "time" in given:
             raise click.UsageError("--t and --time exclude each other")
         names = [field.name for field in dataclasses.fields(SceneOptions) if field.name != "places"]
-        command(options=SceneOptions(places=given, **{name: values.pop(name) for name in names}), **values)
+        command(
+            options=SceneOptions(places=given, **{name: values.pop(name) for name in names}),
+            **values,
+        )
 
     return collected
 
@@ -204,19 +273,27 @@ def _put(values: dict[str, Any], place: str, value: Any) -> None:
         if not isinstance(inner, dict):
             raise InputError(f"--set {place}: {part} has no settings of its own")
         values = inner
-    values[last] = dict(values[last]) if value is True and isinstance(values.get(last), dict) else value
+    values[last] = (
+        dict(values[last]) if value is True and isinstance(values.get(last), dict) else value
+    )
 
 
 def _effect(name: str) -> str:
     """The field of Effects that a word stands for."""
     from fhash_codec.render.scene import Effects
 
-    known = [field.name for field in dataclasses.fields(Effects) if field.name not in ("isosurfaces", "buffers", "antialiasing")]
+    known = [
+        field.name
+        for field in dataclasses.fields(Effects)
+        if field.name not in ("isosurfaces", "buffers", "antialiasing")
+    ]
     plain = name.replace("-", "_").replace("color", "colour")
     if plain not in known:
         near = difflib.get_close_matches(plain, known, n=1, cutoff=0.0)[0]
         names = ", ".join(each.replace("_", "-") for each in known)
-        raise InputError(f"effect '{name[:60]}' is not known; did you mean '{near.replace('_', '-')}'? Known: {names}")
+        raise InputError(
+            f"effect '{name[:60]}' is not known; did you mean '{near.replace('_', '-')}'? Known: {names}"
+        )
     return plain
 
 
@@ -231,7 +308,9 @@ def _isosurface(text: str) -> dict[str, Any]:
             except ValueError:
                 surface["colour"] = part.strip()
     except ValueError as error:
-        raise InputError(f"--isosurface {text}: write a value, then a colour and an opacity if need be, such as 1.5,orange,0.5") from error
+        raise InputError(
+            f"--isosurface {text}: write a value, then a colour and an opacity if need be, such as 1.5,orange,0.5"
+        ) from error
     return surface
 
 

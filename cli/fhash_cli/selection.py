@@ -18,15 +18,21 @@ def steps_of(volume: Volume, chosen: slice | None, option: str = "--t") -> list[
     """Indices of the steps of a slice, all of them for None; raises RegionError for a slice that leaves the series or holds nothing."""
     count = volume.shape[0]
     chosen = chosen if chosen is not None else slice(None)
-    low, high = _span(option, chosen.start, chosen.stop, count, f"the series has steps 0 to {count - 1}")
+    low, high = _span(
+        option, chosen.start, chosen.stop, count, f"the series has steps 0 to {count - 1}"
+    )
     return [float(step) for step in range(low, high, chosen.step or 1)]
 
 
-def region_of(volume: Volume, roi: Sequence[Sequence[int | None]] | None) -> tuple[Span, Span, Span]:
+def region_of(
+    volume: Volume, roi: Sequence[Sequence[int | None]] | None
+) -> tuple[Span, Span, Span]:
     """Vertices ((z0, z1), (y0, y1), (x0, x1)) of `--roi`, all of them for None; raises RegionError where it leaves the domain."""
     roi = roi if roi is not None else ((None, None),) * 3
     z, y, x = (
-        _span(f"--roi along {axis}", low, high, count, f"the domain has {count} vertices along {axis}")
+        _span(
+            f"--roi along {axis}", low, high, count, f"the domain has {count} vertices along {axis}"
+        )
         for axis, (low, high), count in zip("zyx", roi, volume.shape[1:], strict=True)
     )
     return z, y, x
@@ -45,7 +51,9 @@ def _vertices(volume: Volume, axis: str, low: float | None, high: float | None) 
     first, last = float(positions.min()), float(positions.max())
     start, end = first if low is None else low, last if high is None else high
     if not first <= start <= last or not first <= end <= last:
-        raise RegionError(f"--box along {axis} is {start:.12g}:{end:.12g}; the domain has positions {first:.12g} to {last:.12g}")
+        raise RegionError(
+            f"--box along {axis} is {start:.12g}:{end:.12g}; the domain has positions {first:.12g} to {last:.12g}"
+        )
     inside = np.flatnonzero((positions >= start) & (positions <= end))
     if not inside.size:
         raise RegionError(
@@ -60,7 +68,9 @@ def _vertices(volume: Volume, axis: str, low: float | None, high: float | None) 
     return low_index, high_index
 
 
-def coordinates(volume: Volume, steps: Sequence[float], vertices: Sequence[range]) -> dict[str, Coordinate]:
+def coordinates(
+    volume: Volume, steps: Sequence[float], vertices: Sequence[range]
+) -> dict[str, Coordinate]:
     """The Coordinate of each axis cut to some (fractional) steps and the vertices along z, y and x."""
     import numpy as np
 
@@ -68,8 +78,13 @@ def coordinates(volume: Volume, steps: Sequence[float], vertices: Sequence[range
 
     whole = volume.coords
     times = np.interp(steps, np.arange(volume.shape[0]), whole["t"].values)
-    values = {"t": times} | {axis: whole[axis].values[list(part)] for axis, part in zip("zyx", vertices, strict=True)}
-    return {axis: Coordinate(name=whole[axis].name, values=cut, attributes=whole[axis].attributes) for axis, cut in values.items()}
+    values = {"t": times} | {
+        axis: whole[axis].values[list(part)] for axis, part in zip("zyx", vertices, strict=True)
+    }
+    return {
+        axis: Coordinate(name=whole[axis].name, values=cut, attributes=whole[axis].attributes)
+        for axis, cut in values.items()
+    }
 
 
 def _span(what: str, low: int | None, high: int | None, count: int, allowed: str) -> Span:

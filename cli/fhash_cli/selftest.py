@@ -16,11 +16,28 @@ if TYPE_CHECKING:
 
 
 @click.command("selftest")
-@click.option("--all", "everything", is_flag=True, help="All cases under all settings: minutes instead of seconds.")
+@click.option(
+    "--all",
+    "everything",
+    is_flag=True,
+    help="All cases under all settings: minutes instead of seconds.",
+)
 @click.option("--case", "names", metavar="NAME", multiple=True, help="Run this case; repeat.")
-@click.option("--group", "groups", metavar="NAME", multiple=True, help="Run the cases of this group; repeat.")
-@click.option("--report", metavar="FILE.md", type=click.Path(), help="Write every case and its worst figure as Markdown.")
-@click.option("--processes", metavar="N", type=click.IntRange(1, 1024), help="Cases at the same time. Default: one for each processor.")
+@click.option(
+    "--group", "groups", metavar="NAME", multiple=True, help="Run the cases of this group; repeat."
+)
+@click.option(
+    "--report",
+    metavar="FILE.md",
+    type=click.Path(),
+    help="Write every case and its worst figure as Markdown.",
+)
+@click.option(
+    "--processes",
+    metavar="N",
+    type=click.IntRange(1, 1024),
+    help="Cases at the same time. Default: one for each processor.",
+)
 @force_option
 @json_option
 @quiet_option
@@ -55,7 +72,13 @@ def command(
         from fhash_codec.selftest.report import markdown
         from fhash_formats.writers.atomic import replacing
 
-        given = "".join([" --all" * everything, *(f" --case {name}" for name in names), *(f" --group {name}" for name in groups)])
+        given = "".join(
+            [
+                " --all" * everything,
+                *(f" --case {name}" for name in names),
+                *(f" --group {name}" for name in groups),
+            ]
+        )
         where = f"It took {(time.perf_counter() - begun) / 60:.1f} minutes with {surroundings()}."
         with replacing(Path(report), force=force) as temporary:
             temporary.write_text(markdown(summary, options=given, where=where), encoding="utf-8")
@@ -70,11 +93,26 @@ def _text(summary: Summary) -> str:
     groups = [("group", "cases", "figures", "failed")]
     for name, results in summary.groups.items():
         failed = sum(not result.holds for result in results)
-        groups.append((name, str(len(results)), str(sum(len(result.findings) for result in results)), str(failed)))
+        groups.append(
+            (
+                name,
+                str(len(results)),
+                str(sum(len(result.findings) for result in results)),
+                str(failed),
+            )
+        )
     figures = [("property", "worst", "limit", "case")]
     for name, (result, finding) in summary.worst().items():
         if relative(finding) > 0:
-            figures.append((name, f"{finding.worst:.6g} {finding.unit}", f"{finding.limit:.6g}", result.name))
+            figures.append(
+                (name, f"{finding.worst:.6g} {finding.unit}", f"{finding.limit:.6g}", result.name)
+            )
     failures = summary.failures
-    last = ["everything holds"] if summary.holds else [f"what does not hold ({len(failures)}):", *failures]
-    return "\n".join([table(groups), "", *([table(figures), ""] if len(figures) > 1 else []), *last])
+    last = (
+        ["everything holds"]
+        if summary.holds
+        else [f"what does not hold ({len(failures)}):", *failures]
+    )
+    return "\n".join(
+        [table(groups), "", *([table(figures), ""] if len(figures) > 1 else []), *last]
+    )

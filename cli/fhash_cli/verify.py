@@ -18,4 +18,8 @@ def command(run: str, as_json: bool, quiet: bool) -> None:
 
     with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
         arrays = volume.verify(progress=progress)
-    emit({"path": run, "sound": True, "arrays": arrays}, f"{run}: sound, {arrays} arrays checked", as_json)
+    emit(
+        {"path": run, "sound": True, "arrays": arrays},
+        f"{run}: sound, {arrays} arrays checked",
+        as_json,
+    )

@@ -96,13 +96,26 @@ class Bench:
                 if goal == "bound" and variant.mode == "tolerance":
                     as_asked = search.try_level(-20 * math.log10(asked)).max_error <= asked
                 aim = asked if goal == "psnr" else -20 * math.log10(asked)
-                trial = search.find(goal, aim, first=aim - UNIFORM, slack=SLACK if goal == "psnr" else BOUND_SLACK, most=TRIALS)
+                trial = search.find(
+                    goal,
+                    aim,
+                    first=aim - UNIFORM,
+                    slack=SLACK if goal == "psnr" else BOUND_SLACK,
+                    most=TRIALS,
+                )
             except InputError as error:
                 self.refused[variant.name] = str(error)
                 continue
             reached = trial is not None
             closest = trial or max(search.trials.values(), key=lambda tried: tried.quality(goal))
-            found = Found(codec=variant.peer, trial=closest, setting=variant.name, reached=reached, as_asked=as_asked, how=variant)
+            found = Found(
+                codec=variant.peer,
+                trial=closest,
+                setting=variant.name,
+                reached=reached,
+                as_asked=as_asked,
+                how=variant,
+            )
             self._keep((goal, asked), found)
 
     def _search(self, variant: Variant) -> Search:
@@ -127,9 +140,18 @@ class Bench:
             self.progress("comparing", self.done, self.total, f"fhash {profile}")
             trial = self.own.trial(config)
             # A bound is kept in data units; dividing by the range may round the share up by its last bit.
-            reached = trial.psnr >= asked if goal == "psnr" else trial.max_error <= asked * (1 + 1e-12)
+            reached = (
+                trial.psnr >= asked if goal == "psnr" else trial.max_error <= asked * (1 + 1e-12)
+            )
             as_asked = reached if goal == "bound" and profile != "paper" else None
-            found = Found(codec=f"{OWN}{profile}", trial=trial, setting=f"{OWN}{profile}", reached=reached, as_asked=as_asked, how=config)
+            found = Found(
+                codec=f"{OWN}{profile}",
+                trial=trial,
+                setting=f"{OWN}{profile}",
+                reached=reached,
+                as_asked=as_asked,
+                how=config,
+            )
             self._keep((goal, asked), found)
 
     def _keep(self, goal: tuple[str, float], new: Found) -> None:
@@ -180,11 +202,15 @@ class Bench:
             with opened_file(path) as file:
                 read_all(file, variant)
 
-        self._add_speed(found, [_timed(encode) for _ in range(RUNS)], [_timed(decode) for _ in range(RUNS)])
+        self._add_speed(
+            found, [_timed(encode) for _ in range(RUNS)], [_timed(decode) for _ in range(RUNS)]
+        )
 
     def _small_access(self, variant: Variant, target: float) -> None:
         try:
-            trial = self._search(variant).find("psnr", target, first=target - UNIFORM, slack=SLACK, most=TRIALS)
+            trial = self._search(variant).find(
+                "psnr", target, first=target - UNIFORM, slack=SLACK, most=TRIALS
+            )
         except InputError as error:
             self.refused[variant.name] = str(error)
         else:
@@ -209,10 +235,19 @@ class Bench:
     def _speed_of_own(self, found: Found, config: EncodeConfig) -> None:
         while len(self.own.seconds[config]) < RUNS and sum(self.own.seconds[config]) < LONG_SECONDS:
             self.own.encode(config)
-        self._add_speed(found, self.own.seconds[config], [self.own.decode(config) for _ in range(RUNS)])
-        self._add_access(found.codec, found.setting, found.trial, lambda step, box: self.own.read_region(config, step, box))
+        self._add_speed(
+            found, self.own.seconds[config], [self.own.decode(config) for _ in range(RUNS)]
+        )
+        self._add_access(
+            found.codec,
+            found.setting,
+            found.trial,
+            lambda step, box: self.own.read_region(config, step, box),
+        )
 
-    def _add_speed(self, found: Found, encoding: Sequence[float], decoding: Sequence[float]) -> None:
+    def _add_speed(
+        self, found: Found, encoding: Sequence[float], decoding: Sequence[float]
+    ) -> None:
         megabytes = self.series.values.nbytes / 1e6
         self.speeds.append(
             Speed(
@@ -225,16 +260,22 @@ class Bench:
             )
         )
 
-    def _add_access(self, codec: str, setting: str, trial: Trial, read: Callable[[int, Box], tuple[int, float]]) -> None:
+    def _add_access(
+        self, codec: str, setting: str, trial: Trial, read: Callable[[int, Box], tuple[int, float]]
+    ) -> None:
         """Read regions at the same places for every codec, and one before them that does not count."""
         rng = np.random.default_rng(0)
         steps, *space = self.series.shape
         size = [min(REGION, n) for n in space]
         measured = []
         for place in range(PLACES + 1):
-            low = [int(rng.integers(0, n - length + 1)) for n, length in zip(space, size, strict=True)]
+            low = [
+                int(rng.integers(0, n - length + 1)) for n, length in zip(space, size, strict=True)
+            ]
             step = int(rng.integers(0, steps))
-            box: Box = tuple((start, start + length) for start, length in zip(low, size, strict=True))  # type: ignore[assignment]
+            box: Box = tuple(
+                (start, start + length) for start, length in zip(low, size, strict=True)
+            )  # type: ignore[assignment]
             if place:
                 measured.append(read(step, box))
             else:

@@ -26,7 +26,11 @@ def promised(settings: Mapping[str, Any], profile: str, goal: str, asked: float)
 
     The paper profile is not steered by quality: its settings are the same for every goal.
     """
-    others = {field.name for field in dataclasses.fields(EncodeConfig) if field.metadata["profile"] not in ("", profile)}
+    others = {
+        field.name
+        for field in dataclasses.fields(EncodeConfig)
+        if field.metadata["profile"] not in ("", profile)
+    }
     promise = {} if profile == "paper" else {"psnr" if goal == "psnr" else "max_error_rel": asked}
     own = {name: value for name, value in settings.items() if name not in others}
     return EncodeConfig.from_dict(own | {"profile": profile} | promise)
@@ -90,4 +94,9 @@ def trial_of(errors: Errors, level: float, count: int) -> Trial:
     """The Trial that stands for measured errors and a number of bytes."""
     exact = errors.rmse == 0 or errors.psnr is None
     largest = errors.max_abs_error or 0.0
-    return Trial(level=level, bytes=count, psnr=EXACT if exact else float(errors.psnr or 0.0), max_error=largest / errors.data_range)
+    return Trial(
+        level=level,
+        bytes=count,
+        psnr=EXACT if exact else float(errors.psnr or 0.0),
+        max_error=largest / errors.data_range,
+    )

@@ -84,7 +84,9 @@ def peers() -> dict[str, tuple[Variant, ...]]:
     try:
         plugins = importlib.import_module("hdf5plugin")
     except ImportError as error:
-        raise MissingDependencyError("bench rate compares with the codecs of hdf5plugin; pip install 'fhash[bench]'") from error
+        raise MissingDependencyError(
+            "bench rate compares with the codecs of hdf5plugin; pip install 'fhash[bench]'"
+        ) from error
 
     def absolute(part: Values, data_range: float, level: float) -> Filter:
         return plugins.SZ3(absolute=tolerance(data_range, level))  # type: ignore[no-any-return]
@@ -94,7 +96,10 @@ def peers() -> dict[str, tuple[Variant, ...]]:
 
     def sperr_psnr(part: Values, data_range: float, level: float) -> Filter:
         own = max(float(part.max()) - float(part.min()), 1e-9 * data_range)
-        return plugins.Sperr(peak_signal_to_noise_ratio=max(0.1, level + 20 * math.log10(own / data_range)), swap=True)  # type: ignore[no-any-return]
+        return plugins.Sperr(
+            peak_signal_to_noise_ratio=max(0.1, level + 20 * math.log10(own / data_range)),
+            swap=True,
+        )  # type: ignore[no-any-return]
 
     def sperr_rate(part: Values, data_range: float, level: float) -> Filter:
         # Bits a value; a fixed ratio for each 6 dB is near the truth at low rates, and the search does the rest.
@@ -106,9 +111,16 @@ def peers() -> dict[str, tuple[Variant, ...]]:
     def blosc(part: Values, data_range: float, level: float) -> Filter:
         return plugins.Blosc(cname="zstd", clevel=5, shuffle=plugins.Blosc.SHUFFLE)  # type: ignore[no-any-return]
 
-    both, quality, bound = ("psnr", "bound"), ("psnr",), ("bound",)  # a tolerance of SPERR costs more bytes at equal PSNR
+    both, quality, bound = (
+        ("psnr", "bound"),
+        ("psnr",),
+        ("bound",),
+    )  # a tolerance of SPERR costs more bytes at equal PSNR
     return {
-        "SZ3": tuple(Variant(peer="SZ3", mode="tolerance", layout=layout, goals=both, setting=absolute) for layout in ("frame", "series")),
+        "SZ3": tuple(
+            Variant(peer="SZ3", mode="tolerance", layout=layout, goals=both, setting=absolute)
+            for layout in ("frame", "series")
+        ),
         "SPERR": tuple(
             Variant(peer="SPERR", mode=mode, layout=layout, goals=goals, setting=setting)
             for mode, goals, setting in (
@@ -119,16 +131,41 @@ def peers() -> dict[str, tuple[Variant, ...]]:
             for layout in ("frame", "plane")
         ),
         "ZFP": tuple(
-            Variant(peer="ZFP", mode="tolerance", layout=layout, goals=both, setting=zfp, step=LADDER) for layout in ("frame", "series")
+            Variant(
+                peer="ZFP", mode="tolerance", layout=layout, goals=both, setting=zfp, step=LADDER
+            )
+            for layout in ("frame", "series")
         ),
-        "BitRound": (Variant(peer="BitRound", mode="bits", layout="frame", goals=both, setting=blosc, step=LADDER, prepare=_bit_round),),
-        "Blosc": (Variant(peer="Blosc", mode="lossless", layout="frame", goals=both, setting=blosc, lossless=True),),
+        "BitRound": (
+            Variant(
+                peer="BitRound",
+                mode="bits",
+                layout="frame",
+                goals=both,
+                setting=blosc,
+                step=LADDER,
+                prepare=_bit_round,
+            ),
+        ),
+        "Blosc": (
+            Variant(
+                peer="Blosc",
+                mode="lossless",
+                layout="frame",
+                goals=both,
+                setting=blosc,
+                lossless=True,
+            ),
+        ),
     }
 
 
 def small_chunks(variants: Sequence[Variant]) -> Variant:
     """How to use a peer for random access: small chunks of a frame, with one tolerance for all, as chunks differ in range and detail."""
-    return replace(next(variant for variant in reversed(variants) if variant.layout == "frame"), chunk=SMALL_CHUNK)
+    return replace(
+        next(variant for variant in reversed(variants) if variant.layout == "frame"),
+        chunk=SMALL_CHUNK,
+    )
 
 
 def _bit_round(values: Values, level: float) -> Values:
@@ -137,11 +174,15 @@ def _bit_round(values: Values, level: float) -> Values:
 
     bits = min(max(round(level / LADDER), 1), np.finfo(values.dtype).nmant)
     codec = BitRound(bits)
-    return np.asarray(codec.decode(codec.encode(np.array(values))), dtype=values.dtype).reshape(values.shape)
+    return np.asarray(codec.decode(codec.encode(np.array(values))), dtype=values.dtype).reshape(
+        values.shape
+    )
 
 
 @contextmanager
-def stored(values: Values, variant: Variant, data_range: float, level: float, path: Path | None = None) -> Iterator[Any]:
+def stored(
+    values: Values, variant: Variant, data_range: float, level: float, path: Path | None = None
+) -> Iterator[Any]:
     """An open HDF5 file that holds values (t, z, y, x), in memory, or at `path` if one is given.
 
     Raises InputError for a shape or a setting that the filter refuses.
@@ -154,9 +195,17 @@ def stored(values: Values, variant: Variant, data_range: float, level: float, pa
     place: dict[str, Any] = {"driver": "core", "backing_store": False} if path is None else {}
     with h5py.File(path or f"{id(values)}.h5", "w", rdcc_nbytes=0, **place) as file:
         try:
-            for number, part in enumerate([values] if axis is None else np.moveaxis(values, axis, 0)):
+            for number, part in enumerate(
+                [values] if axis is None else np.moveaxis(values, axis, 0)
+            ):
                 filters = variant.setting(part, data_range, level)
-                file.create_dataset(str(number), data=part, chunks=variant.chunk_shape(part), track_times=False, **filters)
+                file.create_dataset(
+                    str(number),
+                    data=part,
+                    chunks=variant.chunk_shape(part),
+                    track_times=False,
+                    **filters,
+                )
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError(f"{variant.name}: {error}") from error
         yield file
@@ -184,7 +233,10 @@ def read_all(file: Any, variant: Variant) -> Values:
 
 def read_region(file: Any, variant: Variant, step: int, region: Box) -> Values:
     """A region (z, y, x) of one step."""
-    parts = [dataset[tuple(slice(*span) for span in spans)] for dataset, spans in _parts(file, variant, step, region)]
+    parts = [
+        dataset[tuple(slice(*span) for span in spans)]
+        for dataset, spans in _parts(file, variant, step, region)
+    ]
     return np.concatenate([part.reshape(-1, *part.shape[-2:]) for part in parts])
 
 
@@ -192,12 +244,20 @@ def touched_bytes(file: Any, variant: Variant, step: int, region: Box) -> int:
     """Stored bytes of the chunks that a region of one step meets."""
     total = 0
     for dataset, spans in _parts(file, variant, step, region):
-        firsts = [range(low // n * n, high, n) for (low, high), n in zip(spans, dataset.chunks, strict=True)]
-        total += sum(int(dataset.id.get_chunk_info_by_coord(corner).size) for corner in itertools.product(*firsts))
+        firsts = [
+            range(low // n * n, high, n)
+            for (low, high), n in zip(spans, dataset.chunks, strict=True)
+        ]
+        total += sum(
+            int(dataset.id.get_chunk_info_by_coord(corner).size)
+            for corner in itertools.product(*firsts)
+        )
     return total
 
 
-def _parts(file: Any, variant: Variant, step: int, region: Box) -> list[tuple[Any, list[tuple[int, int]]]]:
+def _parts(
+    file: Any, variant: Variant, step: int, region: Box
+) -> list[tuple[Any, list[tuple[int, int]]]]:
     """The datasets that hold a region of one step, with its spans in them."""
     time = (step, step + 1)
     if variant.layout == "frame":

@@ -20,7 +20,9 @@ def black(rgba: Single) -> Pixels:
     return np.asarray(np.rint(np.clip(rgba[..., :3], 0.0, 1.0) * 255), dtype=np.uint8)
 
 
-def picture_psnr(one: npt.NDArray[np.generic], other: npt.NDArray[np.generic], peak: float) -> float | None:
+def picture_psnr(
+    one: npt.NDArray[np.generic], other: npt.NDArray[np.generic], peak: float
+) -> float | None:
     """PSNR in dB over all pixels and channels, `peak` being white; None where nothing differs."""
     error = float(np.mean((one.astype(np.float64) - other.astype(np.float64)) ** 2))
     return 10 * math.log10(peak * peak / error) if error else None

@@ -64,20 +64,28 @@ def bench_rate(
         scanned = scan(series, progress)
         value_range = (scanned.value_range.low, scanned.value_range.high)
         if value_range[0] == value_range[1]:
-            raise InputError(f"{series.source}: '{series.name}' is constant; there is no quality to compare")
+            raise InputError(
+                f"{series.source}: '{series.name}' is constant; there is no quality to compare"
+            )
         values = np.stack(list(series.frames()))
         missing = values.size - scanned.finite_count
         plain = ArraySeries(values, name=series.name, units=series.units, coords=series.coords)
-        goals = [("psnr", target) for target in sorted(targets)] + [("bound", bound) for bound in sorted(bounds, reverse=True)]
+        goals = [("psnr", target) for target in sorted(targets)] + [
+            ("bound", bound) for bound in sorted(bounds, reverse=True)
+        ]
         bench = Bench(plain, value_range, missing, Path(folder), goals, progress)
         chosen = [variant for name in names for variant in known[name]]
-        bench.total = sum(goal in variant.goals for variant in chosen for goal, _ in goals) + len(goals) * len(profiles)
+        bench.total = sum(goal in variant.goals for variant in chosen for goal, _ in goals) + len(
+            goals
+        ) * len(profiles)
         for variant in chosen:
             bench.search(variant)
         for profile in profiles:
             bench.search_own(settings, profile)
         if speed and targets:
-            bench.measure_speed(min(targets, key=lambda target: (abs(target - SPEED_AT), target)), known)
+            bench.measure_speed(
+                min(targets, key=lambda target: (abs(target - SPEED_AT), target)), known
+            )
         return RateBench(
             series=f"{series.source} {series.name}",
             shape=series.shape,
@@ -95,7 +103,11 @@ def bench_rate(
 
 
 def _check(
-    settings: Mapping[str, Any], targets: Sequence[float], bounds: Sequence[float], names: Sequence[str], profiles: Sequence[str]
+    settings: Mapping[str, Any],
+    targets: Sequence[float],
+    bounds: Sequence[float],
+    names: Sequence[str],
+    profiles: Sequence[str],
 ) -> None:
     """Raise InputError for arguments of `bench_rate` that are not allowed."""
     for what, given, allowed in (("peer", names, PEERS), ("profile", profiles, PROFILES)):
@@ -109,8 +121,12 @@ def _check(
         if not 1e-9 <= bound <= 0.5:
             raise InputError(f"bound is {bound:g} of the range; allowed: 1e-9 to 0.5")
     if not (targets or bounds) or not (names or profiles):
-        raise InputError("nothing to measure; give at least one target or bound, and one peer or profile")
+        raise InputError(
+            "nothing to measure; give at least one target or bound, and one peer or profile"
+        )
     if tuple(settings.get("features", ("all",))) != ("all",):
-        raise InputError(f"feature is {', '.join(settings['features'])}; bench rate compares whole domains, leave it out")
+        raise InputError(
+            f"feature is {', '.join(settings['features'])}; bench rate compares whole domains, leave it out"
+        )
     for profile in profiles:
         promised(settings, profile, "psnr", SPEED_AT)

@@ -9,7 +9,13 @@ from typing import Any
 from fhash_codec.bench.results import OWN, Point, RateBench
 from fhash_formats.errors import MissingDependencyError
 
-COLOURS = {"SZ3": "#4a86c0", "SPERR": "#2f9e6e", "ZFP": "#b07aa1", "BitRound": "#9c8b5a", "Blosc": "#8a8f98"}
+COLOURS = {
+    "SZ3": "#4a86c0",
+    "SPERR": "#2f9e6e",
+    "ZFP": "#b07aa1",
+    "BitRound": "#9c8b5a",
+    "Blosc": "#8a8f98",
+}
 OWN_COLOURS = ("#d1604b", "#3b3f46", "#e0a030")
 
 
@@ -18,16 +24,30 @@ def require_matplotlib() -> Any:
     try:
         return importlib.import_module("matplotlib.figure")
     except ImportError as error:
-        raise MissingDependencyError("a plot needs matplotlib; pip install 'fhash[bench]'") from error
+        raise MissingDependencyError(
+            "a plot needs matplotlib; pip install 'fhash[bench]'"
+        ) from error
 
 
 def plot(result: RateBench, path: Path) -> None:
     """Draw a result as a PNG at `path`: a panel for each kind of quality, bytes on a logarithmic axis, what was not reached left out."""
     figure_module = require_matplotlib()
-    goals = [goal for goal in ("psnr", "bound") if any(point.goal == goal for point in result.points)]
+    goals = [
+        goal for goal in ("psnr", "bound") if any(point.goal == goal for point in result.points)
+    ]
     figure = figure_module.Figure(figsize=(1 + 5.5 * len(goals), 5), layout="constrained", dpi=140)
-    for number, (axes, goal) in enumerate(zip(figure.subplots(1, len(goals), squeeze=False)[0], goals, strict=True)):
-        _panel(axes, goal, [point for point in result.points if point.goal == goal and (point.reached or point.codec.startswith(OWN))])
+    for number, (axes, goal) in enumerate(
+        zip(figure.subplots(1, len(goals), squeeze=False)[0], goals, strict=True)
+    ):
+        _panel(
+            axes,
+            goal,
+            [
+                point
+                for point in result.points
+                if point.goal == goal and (point.reached or point.codec.startswith(OWN))
+            ],
+        )
         if number == 0:
             axes.set_ylabel("bytes")
             axes.legend(frameon=False)
@@ -39,12 +59,23 @@ def _panel(axes: Any, goal: str, points: list[Point]) -> None:
     own = sorted({point.codec for point in points if point.codec.startswith(OWN)})
     for codec in dict.fromkeys(point.codec for point in points):
         mine = [point for point in points if point.codec == codec]
-        colour = OWN_COLOURS[own.index(codec) % len(OWN_COLOURS)] if codec in own else COLOURS[codec]
+        colour = (
+            OWN_COLOURS[own.index(codec) % len(OWN_COLOURS)] if codec in own else COLOURS[codec]
+        )
         # A lossless codec has no place on the axis of quality, only its bytes.
-        places = {(point.psnr if goal == "psnr" else 100 * point.max_error, point.bytes) for point in mine if point.psnr is not None}
+        places = {
+            (point.psnr if goal == "psnr" else 100 * point.max_error, point.bytes)
+            for point in mine
+            if point.psnr is not None
+        }
         style = {"color": colour, "label": codec, "linewidth": 2.4 if codec in own else 1.4}
         if places:
-            axes.plot(*zip(*sorted(places), strict=True), marker="o", markersize=5 if codec in own else 3.5, **style)
+            axes.plot(
+                *zip(*sorted(places), strict=True),
+                marker="o",
+                markersize=5 if codec in own else 3.5,
+                **style,
+            )
         else:
             axes.axhline(mine[0].bytes, linestyle="--", **style)
     axes.set_yscale("log")

@@ -24,7 +24,10 @@ def vtk_picture(values: Single, task: Task) -> Single:
     """The picture (H, W, 4) of a task without surfaces, of a whole frame (z, y, x) of finite values, lit from the camera if it is lit."""
     assert task.table is not None
     rays = task.rays
-    origin, along = (np.array(np.broadcast_to(part.reshape(-1, 3), (rays.size[0] * rays.size[1], 3))) for part in rays.pixels())
+    origin, along = (
+        np.array(np.broadcast_to(part.reshape(-1, 3), (rays.size[0] * rays.size[1], 3)))
+        for part in rays.pixels()
+    )
     along = along / np.linalg.norm(along * rays.grid.spacing, axis=1, keepdims=True)
     bounds = rays.grid.bounds
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -41,11 +44,18 @@ def vtk_picture(values: Single, task: Task) -> Single:
         places = origin[alive] + (enter[alive] + (number + 1) * task.step)[:, None] * along[alive]
         places = np.clip(places, bounds[:, 0], bounds[:, 1])
         found = _trilinear(values, places)
-        shade = np.stack([np.interp(found, entries, channel) for channel in task.table.colours.T], axis=-1)
+        shade = np.stack(
+            [np.interp(found, entries, channel) for channel in task.table.colours.T], axis=-1
+        )
         length = np.minimum(task.step, leave[alive] - enter[alive] - number * task.step)
         opacity = -np.expm1(-np.interp(found, entries, task.table.extinctions) * length)
         if task.shaded and task.lighting is not None:
-            shade = _lit(shade, _central(values, places) / rays.grid.spacing, along[alive] * rays.grid.spacing, task.lighting)
+            shade = _lit(
+                shade,
+                _central(values, places) / rays.grid.spacing,
+                along[alive] * rays.grid.spacing,
+                task.lighting,
+            )
         colour[alive] += (clear[alive] * opacity)[:, None] * shade
         clear[alive] *= 1 - opacity
         number += 1
@@ -69,14 +79,27 @@ def _trilinear(values: Single, places: Floats) -> Floats:
 
 def _central(values: Single, places: Floats) -> Floats:
     """Differences (n, 3) over the vertex before and the vertex behind, per vertex."""
-    return np.stack([(_trilinear(values, places + one) - _trilinear(values, places - one)) / 2 for one in np.eye(3)], axis=-1)
+    return np.stack(
+        [
+            (_trilinear(values, places + one) - _trilinear(values, places - one)) / 2
+            for one in np.eye(3)
+        ],
+        axis=-1,
+    )
 
 
 def _lit(shade: Floats, gradient: Floats, along: Floats, lighting: Lighting) -> Floats:
     """Phong's model with the light at the eye: the mirrored ray and the way back to the eye enclose twice the angle to the normal."""
     length = np.linalg.norm(gradient, axis=1)
     known = length > 0
-    cosine = np.where(known, np.abs(np.sum(gradient * along, axis=1)) / np.where(known, length, 1.0), 0.0)
-    mirrored = np.where(known, np.maximum(2 * cosine * cosine - 1, 0.0), 0.0) ** lighting.specular_power
-    lit = shade * (lighting.ambient + lighting.diffuse * cosine)[:, None] + (lighting.specular * mirrored)[:, None]
+    cosine = np.where(
+        known, np.abs(np.sum(gradient * along, axis=1)) / np.where(known, length, 1.0), 0.0
+    )
+    mirrored = (
+        np.where(known, np.maximum(2 * cosine * cosine - 1, 0.0), 0.0) ** lighting.specular_power
+    )
+    lit = (
+        shade * (lighting.ambient + lighting.diffuse * cosine)[:, None]
+        + (lighting.specular * mirrored)[:, None]
+    )
     return np.minimum(lit, 1.0)

@@ -19,7 +19,15 @@ from fhash_codec.engines import choose_device
 from fhash_codec.progress import Progress, silent
 from fhash_codec.render.image import Image
 from fhash_codec.render.render import Renderer
-from fhash_codec.render.scene import AmbientOcclusion, Effects, Isosurface, Scene, Shading, Shadows, TransferFunctionSpec
+from fhash_codec.render.scene import (
+    AmbientOcclusion,
+    Effects,
+    Isosurface,
+    Scene,
+    Shading,
+    Shadows,
+    TransferFunctionSpec,
+)
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError, MissingDependencyError
 
@@ -67,8 +75,15 @@ def bench_render(
         if part not in PARTS:
             raise InputError(f"part is '{part}'; allowed: {', '.join(PARTS)}")
     if not parts or turns < 1 or size < 16:
-        raise InputError(f"{len(parts)} parts, {turns} turns, {size} pixels; at least one part, one turn and 16 pixels are needed")
-    plain = replace(scene, size=(size, size), effects=Effects(isosurfaces=scene.effects.isosurfaces), background="black")
+        raise InputError(
+            f"{len(parts)} parts, {turns} turns, {size} pixels; at least one part, one turn and 16 pixels are needed"
+        )
+    plain = replace(
+        scene,
+        size=(size, size),
+        effects=Effects(isosurfaces=scene.effects.isosurfaces),
+        background="black",
+    )
     bench = _Bench(volume, plain, turns, progress)
     found: dict[str, tuple[Any, ...]] = {}
     refused: dict[str, str] = {}
@@ -145,7 +160,9 @@ class _Bench:
                 none, shading=Shading(), shadows=Shadows(), ambient_occlusion=AmbientOcclusion()
             ),
             "isosurface": replace(none, isosurfaces=(*none.isosurfaces, Isosurface(value=middle))),
-            "translucent isosurface": replace(none, isosurfaces=(*none.isosurfaces, Isosurface(value=middle, opacity=0.4))),
+            "translucent isosurface": replace(
+                none, isosurfaces=(*none.isosurfaces, Isosurface(value=middle, opacity=0.4))
+            ),
             "maximum intensity": replace(none, maximum_intensity=True),
             "depth buffer": replace(none, buffers=("depth",)),
             "depth and normal buffers": replace(none, buffers=("depth", "normal")),
@@ -154,14 +171,23 @@ class _Bench:
             "box and axes": replace(none, box=True, axes=True),
             "colour bar and time label": replace(none, colour_bar=True, time_label=True),
         }
-        return self._switches({name: (self.scene, replace(self.scene, effects=effects)) for name, effects in variants.items()}, "effects")
+        return self._switches(
+            {
+                name: (self.scene, replace(self.scene, effects=effects))
+                for name, effects in variants.items()
+            },
+            "effects",
+        )
 
     def accelerations(self) -> tuple[Switch, ...]:
         """Skipping, early termination and level of detail on and off; their pictures are compared."""
         scene, march = self.scene, self.scene.march
         opaque = replace(scene, transfer_function=_dense(scene.transfer_function))
         pairs = {
-            "skipping": (replace(scene, march=replace(march, skipping=False)), replace(scene, march=replace(march, skipping=True))),
+            "skipping": (
+                replace(scene, march=replace(march, skipping=False)),
+                replace(scene, march=replace(march, skipping=True)),
+            ),
             "early termination": (
                 replace(scene, march=replace(march, threshold=0.0)),
                 replace(scene, march=replace(march, threshold=1 / 1024)),
@@ -175,13 +201,24 @@ class _Bench:
         while (level := self.renderer.plan(far).lod) == 0 and far.camera.zoom > NEAREST:
             far = replace(far, camera=replace(far.camera, zoom=far.camera.zoom / 2))
         if level > 0:
-            pairs[f"level of detail {level}, zoom {far.camera.zoom:g}"] = (replace(far, march=replace(march, lod=0)), far)
+            pairs[f"level of detail {level}, zoom {far.camera.zoom:g}"] = (
+                replace(far, march=replace(march, lod=0)),
+                far,
+            )
         return self._switches(pairs, "accelerations", compare=True)
 
-    def _switches(self, pairs: Mapping[str, tuple[Scene, Scene]], stage: str, *, compare: bool = False) -> tuple[Switch, ...]:
+    def _switches(
+        self, pairs: Mapping[str, tuple[Scene, Scene]], stage: str, *, compare: bool = False
+    ) -> tuple[Switch, ...]:
         found = []
         for number, (name, (without, with_)) in enumerate(pairs.items()):
-            measured = in_turns({"off": partial(self.renderer.render, without), "on": partial(self.renderer.render, with_)}, self.turns)
+            measured = in_turns(
+                {
+                    "off": partial(self.renderer.render, without),
+                    "on": partial(self.renderer.render, with_),
+                },
+                self.turns,
+            )
             (off_ms, off), (on_ms, on) = measured["off"], measured["on"]
             found.append(
                 Switch(
@@ -198,12 +235,16 @@ class _Bench:
 
     def streams(self) -> tuple[Stream, ...]:
         """Marching the cache, streaming, and adaptive ray marching with N_r of the rays and of 2^20, of a small picture."""
-        small = replace(self.scene, size=(STREAM_SIZE, STREAM_SIZE), march=replace(self.scene.march, lod=0))
+        small = replace(
+            self.scene, size=(STREAM_SIZE, STREAM_SIZE), march=replace(self.scene.march, lod=0)
+        )
         variants = {
             "cache": replace(small, march=replace(small.march, mode="cache")),
             "stream": replace(small, march=replace(small.march, mode="stream")),
             "arm": replace(small, march=replace(small.march, mode="arm", samples_per_pass=None)),
-            "arm, N_r 2^20": replace(small, march=replace(small.march, mode="arm", samples_per_pass=2**20)),
+            "arm, N_r 2^20": replace(
+                small, march=replace(small.march, mode="arm", samples_per_pass=2**20)
+            ),
         }
         # A whole turn takes seconds through the model: the fewest that have a median.
         measured = in_turns(
@@ -230,7 +271,9 @@ class _Bench:
         """Each knob swept, the others as the scene has them, against its finest setting."""
         knobs: dict[str, Sequence[float]] = {"step": STEPS, "threshold": THRESHOLDS}
         if self.volume.profile == "compact":
-            most = max(int(np.log2(max(min(high - low for low, high in self.volume.box) - 1, 1))), 0)
+            most = max(
+                int(np.log2(max(min(high - low for low, high in self.volume.box) - 1, 1))), 0
+            )
             knobs["lod"] = [level for level in LEVELS if level <= most]
         found = []
         for knob, values in knobs.items():

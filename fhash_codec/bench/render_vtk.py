@@ -59,12 +59,22 @@ class Comparison:
         found = []
         frame = Frame(values=self.values, first=(0, 0, 0))
         bricks = Bricks.of(frame)
-        variants = [(scale, name, shaded) for scale in (1, 2) for name in self.functions for shaded in (False, True)]
+        variants = [
+            (scale, name, shaded)
+            for scale in (1, 2)
+            for name in self.functions
+            for shaded in (False, True)
+        ]
         for number, (scale, name, shaded) in enumerate(variants):
             side = scale * self.scene.size[0]
             scene = self._scene(name, shaded, side)
-            plans = [self.renderer.plan(turned(scene, turn, self.turns)) for turn in range(self.turns)]
-            with self._peer(plans[0], "cpu") as peer, self._peer(plans[0], "cpu", empty=True) as window:
+            plans = [
+                self.renderer.plan(turned(scene, turn, self.turns)) for turn in range(self.turns)
+            ]
+            with (
+                self._peer(plans[0], "cpu") as peer,
+                self._peer(plans[0], "cpu", empty=True) as window,
+            ):
                 for plan in plans[:1]:
                     peer.look(plan.task.rays)
                     peer.draw()
@@ -82,7 +92,12 @@ class Comparison:
                     nothing.append(window.draw().seconds)
                     whole.append(timed(partial(self.renderer.render, plan=plan))[1])
                     pixels = black(marched.rgba)
-                    likeness.append((picture_psnr(pixels, drawn.pixels, 255.0), picture_ssim(pixels, drawn.pixels)))
+                    likeness.append(
+                        (
+                            picture_psnr(pixels, drawn.pixels, 255.0),
+                            picture_ssim(pixels, drawn.pixels),
+                        )
+                    )
                     samples = max(samples, int(marched.counters["samples"]))
             known = [psnr for psnr, _ in likeness if psnr is not None]
             found.append(
@@ -111,8 +126,12 @@ class Comparison:
             for gradient in ("", *GRADIENTS):
                 scene = self._scene(name, bool(gradient), FINE_SIZE)
                 if gradient:
-                    scene = replace(scene, effects=replace(scene.effects, shading=Shading(gradient=gradient)))
-                plan = self.renderer.plan(replace(scene, march=replace(scene.march, step=FINE, threshold=0.0)))
+                    scene = replace(
+                        scene, effects=replace(scene.effects, shading=Shading(gradient=gradient))
+                    )
+                plan = self.renderer.plan(
+                    replace(scene, march=replace(scene.march, step=FINE, threshold=0.0))
+                )
                 with self._peer(plan, "gpu") as peer:
                     peer.look(plan.task.rays)
                     peer.draw()  # the first picture is of a frame that is not all there yet
@@ -136,7 +155,9 @@ class Comparison:
     def _explained(self, name: str, shaded: bool) -> float | None:
         """PSNR of VTK's picture to one that takes its samples, gradients and highlights as VTK does."""
         scene = self._scene(name, shaded, EXPLAINED_SIZE)
-        plan = self.renderer.plan(replace(scene, march=replace(scene.march, step=EXPLAINED, threshold=0.0)))
+        plan = self.renderer.plan(
+            replace(scene, march=replace(scene.march, step=EXPLAINED, threshold=0.0))
+        )
         with self._peer(plan, "gpu") as peer:
             peer.look(plan.task.rays)
             peer.draw()
@@ -157,7 +178,9 @@ class Comparison:
                 with self._peer(plan, "cpu") as peer:
                     peer.look(plan.task.rays)
                     shown = [replace(scene, step=step, time=None) for step in steps]
-                    for each, following, values in zip(shown, [*shown[1:], None], frames, strict=True):
+                    for each, following, values in zip(
+                        shown, [*shown[1:], None], frames, strict=True
+                    ):
                         ours.append(timed(partial(renderer.render, each, upcoming=following))[1])
                         begun = time.perf_counter()
                         peer.load(values)
@@ -182,7 +205,11 @@ class Comparison:
         effects = replace(self.scene.effects, shading=SHADING if shaded else None, isosurfaces=())
         spec = replace(self.functions[name], colours=self.scene.transfer_function.colours)
         return replace(
-            self.scene, size=(side, side), transfer_function=spec, effects=effects, march=replace(self.scene.march, lod=0, mode="cache")
+            self.scene,
+            size=(side, side),
+            transfer_function=spec,
+            effects=effects,
+            march=replace(self.scene.march, lod=0, mode="cache"),
         )
 
     @contextmanager
@@ -209,7 +236,9 @@ class Comparison:
 
 def turned(scene: Scene, turn: int, turns: int) -> Scene:
     """The scene from another side."""
-    return replace(scene, camera=replace(scene.camera, azimuth=scene.camera.azimuth + 360.0 * turn / turns))
+    return replace(
+        scene, camera=replace(scene.camera, azimuth=scene.camera.azimuth + 360.0 * turn / turns)
+    )
 
 
 def whole_frame(volume: Volume, step: float, units: Units) -> Single:
@@ -230,8 +259,12 @@ def transfer_functions(values: Single, units: Units) -> dict[str, TransferFuncti
     band = np.array([first, first + edge, last - edge, last]) / units.factor + units.shift
     ends = np.array([low, low + extent]) / units.factor + units.shift
     return {
-        "feature": TransferFunctionSpec(opacity=tuple((float(v), o) for v, o in zip(band, (0.0, 0.3, 0.3, 0.0), strict=True))),
-        "fog": TransferFunctionSpec(opacity=tuple((float(v), o) for v, o in zip(ends, (0.0, 0.02), strict=True))),
+        "feature": TransferFunctionSpec(
+            opacity=tuple((float(v), o) for v, o in zip(band, (0.0, 0.3, 0.3, 0.0), strict=True))
+        ),
+        "fog": TransferFunctionSpec(
+            opacity=tuple((float(v), o) for v, o in zip(ends, (0.0, 0.02), strict=True))
+        ),
     }
 
 

@@ -89,9 +89,24 @@ class RateBench:
         for goal, asked in dict.fromkeys((point.goal, point.asked) for point in self.points):
             here = [point for point in self.points if (point.goal, point.asked) == (goal, asked)]
             own = [point for point in here if point.codec.startswith(OWN)]
-            best = min((point for point in here if point.reached and point not in own), key=lambda point: point.bytes, default=None)
-            ratios = {point.codec: best.bytes / point.bytes if best and point.reached else None for point in own}
-            rows.append({"goal": goal, "asked": asked, "peer": best and best.codec, "bytes": best and best.bytes, "ratios": ratios})
+            best = min(
+                (point for point in here if point.reached and point not in own),
+                key=lambda point: point.bytes,
+                default=None,
+            )
+            ratios = {
+                point.codec: best.bytes / point.bytes if best and point.reached else None
+                for point in own
+            }
+            rows.append(
+                {
+                    "goal": goal,
+                    "asked": asked,
+                    "peer": best and best.codec,
+                    "bytes": best and best.bytes,
+                    "ratios": ratios,
+                }
+            )
         return rows
 
     def to_dict(self) -> dict[str, Any]:

@@ -32,7 +32,9 @@ class Trial:
 class Search:
     """The trials of one way to use a codec; what one search measured helps the next."""
 
-    def __init__(self, measure: Callable[[float], Trial], *, step: float = 0.0, fixed: bool = False) -> None:
+    def __init__(
+        self, measure: Callable[[float], Trial], *, step: float = 0.0, fixed: bool = False
+    ) -> None:
         """measure: a trial at a level. step: levels are multiples of it, 0 for any. fixed: every level gives the same."""
         self._measure = measure
         self._step = step
@@ -41,12 +43,20 @@ class Search:
 
     def try_level(self, level: float) -> Trial:
         """The trial at a level, or at the next of the steps above it."""
-        level = 0.0 if self._fixed else math.ceil(level / self._step - 1e-9) * self._step if self._step else math.ceil(1e4 * level) / 1e4
+        level = (
+            0.0
+            if self._fixed
+            else math.ceil(level / self._step - 1e-9) * self._step
+            if self._step
+            else math.ceil(1e4 * level) / 1e4
+        )
         if level not in self.trials:
             self.trials[level] = self._measure(level)
         return self.trials[level]
 
-    def find(self, goal: str, asked: float, *, first: float, slack: float, most: int) -> Trial | None:
+    def find(
+        self, goal: str, asked: float, *, first: float, slack: float, most: int
+    ) -> Trial | None:
         """The smallest trial of all whose quality is at least `asked`; looks on until one exceeds it by no more than `slack`.
 
         first: level to begin with where nothing is known. most: new trials at most. None if no trial reached it.
@@ -70,14 +80,23 @@ class Search:
             return None
         tried = sorted(self.trials.values(), key=lambda trial: trial.level)
         good = next((trial for trial in tried if trial.quality(goal) >= asked), None)
-        bad = next((trial for trial in reversed(tried) if trial.quality(goal) < asked and (good is None or trial.level < good.level)), None)
+        bad = next(
+            (
+                trial
+                for trial in reversed(tried)
+                if trial.quality(goal) < asked and (good is None or trial.level < good.level)
+            ),
+            None,
+        )
         if good is not None and good.quality(goal) <= asked + slack:
             return None
         aim = asked + slack / 2
         if good is None or bad is None:
             nearest = tried[:2] if good is not None else tried[:-3:-1]
             away = (aim - nearest[0].quality(goal)) / _slope(nearest, goal)
-            return nearest[0].level + math.copysign(min(max(abs(away), self._step, 0.05), 60.0), away)
+            return nearest[0].level + math.copysign(
+                min(max(abs(away), self._step, 0.05), 60.0), away
+            )
         if self._step:
             between = round((good.level - bad.level) / self._step)
             return None if between <= 1 else bad.level + between // 2 * self._step

@@ -46,13 +46,22 @@ def bench_train(
     """
     config = config or EncodeConfig(profile="paper")
     if seconds <= 0 or not engines:
-        raise InputError(f"seconds is {seconds:g} for {len(engines)} engines; a positive time and at least one engine are needed")
+        raise InputError(
+            f"seconds is {seconds:g} for {len(engines)} engines; a positive time and at least one engine are needed"
+        )
     device = choose_device(config.device)
     with opened(source) as series:
         selected = select(series, config, progress)
         coreset, architecture = selected.coreset, selected.architecture
         name = f"{series.source} {series.name}"
-    plan = plan_training(coreset, epochs=1, learning_rate=config.learning_rate, schedule="constant", batch=config.batch, seed=config.seed)
+    plan = plan_training(
+        coreset,
+        epochs=1,
+        learning_rate=config.learning_rate,
+        schedule="constant",
+        batch=config.batch,
+        seed=config.seed,
+    )
     with threads_for(plan.batch_bricks * prod(coreset.brick_shape)):
         runs = [_Run(engine, architecture, coreset, plan, seconds, device) for engine in engines]
         for turn in range(TURNS):
@@ -67,7 +76,9 @@ def bench_train(
     naive = next((result for result in results if result["engine"] == "naive"), None)
     for result in results:
         for kind in ("train", "infer"):
-            result[f"{kind}_ratio"] = result[f"{kind}_msamples_s"] / naive[f"{kind}_msamples_s"] if naive else None
+            result[f"{kind}_ratio"] = (
+                result[f"{kind}_msamples_s"] / naive[f"{kind}_msamples_s"] if naive else None
+            )
     return {
         "engines": results,
         "machine": used,
@@ -80,12 +91,22 @@ def bench_train(
 class _Run:
     """One engine under measurement."""
 
-    def __init__(self, name: str, architecture: Architecture, coreset: Coreset, plan: Plan, seconds: float, device: torch.device) -> None:
+    def __init__(
+        self,
+        name: str,
+        architecture: Architecture,
+        coreset: Coreset,
+        plan: Plan,
+        seconds: float,
+        device: torch.device,
+    ) -> None:
         self.name, self.coreset, self.plan, self.device = name, coreset, plan, device
         self.counts = np.diff(coreset.offsets)
         # A first step, not counted, says how many fit in the seconds; the cosine over them is set then.
         rate = float(plan.rates[-1])
-        engine = make_engine(name, architecture, coreset, np.full(3, rate), seed=plan.seed, device=device)
+        engine = make_engine(
+            name, architecture, coreset, np.full(3, rate), seed=plan.seed, device=device
+        )
         for chosen in self.plan.order(0)[:2]:
             begun = time.perf_counter()
             engine.train(chosen)
@@ -94,7 +115,9 @@ class _Run:
         # Longer than that, so that turns that run faster than the first step find a rate as well.
         self.rates = np.full(8 * steps + 1, 0.0)
         self.rates[: steps + 1] = rate * (0.5 + 0.5 * np.cos(np.pi * np.arange(steps + 1) / steps))
-        self.engine = make_engine(name, architecture, coreset, self.rates, seed=plan.seed, device=device)
+        self.engine = make_engine(
+            name, architecture, coreset, self.rates, seed=plan.seed, device=device
+        )
         self.train_speeds: list[float] = []
         self.infer_speeds: list[float] = []
         self.seconds = 0.0
@@ -102,7 +125,9 @@ class _Run:
     def train(self, seconds: float) -> None:
         """Go on with the training for some seconds."""
         samples, begun = 0, time.perf_counter()
-        while (spent := time.perf_counter() - begun) < seconds and self.engine.step < len(self.rates) - 1:
+        while (spent := time.perf_counter() - begun) < seconds and self.engine.step < len(
+            self.rates
+        ) - 1:
             epoch, batch = divmod(self.engine.step, self.plan.batches)
             if batch == 0 or samples == 0:
                 batches = self.plan.order(epoch)

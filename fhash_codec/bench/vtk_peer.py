@@ -27,7 +27,13 @@ POINTS = 2048
 MODULES = {
     "vtkCommonCore": ("vtkLogger", "vtkUnsignedCharArray", "vtkVersion"),
     "vtkCommonDataModel": ("vtkImageData", "vtkPiecewiseFunction"),
-    "vtkRenderingCore": ("vtkColorTransferFunction", "vtkRenderer", "vtkRenderWindow", "vtkVolume", "vtkVolumeProperty"),
+    "vtkRenderingCore": (
+        "vtkColorTransferFunction",
+        "vtkRenderer",
+        "vtkRenderWindow",
+        "vtkVolume",
+        "vtkVolumeProperty",
+    ),
     "vtkRenderingOpenGL2": (),
     "vtkRenderingVolume": ("vtkFixedPointVolumeRayCastMapper",),
     "vtkRenderingVolumeOpenGL2": ("vtkOpenGLGPUVolumeRayCastMapper",),
@@ -43,7 +49,9 @@ def require_vtk() -> SimpleNamespace:
             loaded = importlib.import_module(f"vtkmodules.{module}")
             found.update({name: getattr(loaded, name) for name in names})
     except ImportError as error:
-        raise MissingDependencyError("comparing with VTK needs it: pip install 'fhash[vtk]'") from error
+        raise MissingDependencyError(
+            "comparing with VTK needs it: pip install 'fhash[vtk]'"
+        ) from error
     return SimpleNamespace(**found)
 
 
@@ -84,7 +92,11 @@ class VtkPeer:
         self.image.SetSpacing(*(abs(float(part)) for part in grid.spacing))
         self.image.SetOrigin(*(float(min(part)) for part in grid.corners))
         self.load(values)
-        self.mapper = vtk.vtkFixedPointVolumeRayCastMapper() if mapper == "cpu" else vtk.vtkOpenGLGPUVolumeRayCastMapper()
+        self.mapper = (
+            vtk.vtkFixedPointVolumeRayCastMapper()
+            if mapper == "cpu"
+            else vtk.vtkOpenGLGPUVolumeRayCastMapper()
+        )
         self.mapper.SetInputData(self.image)
         self.mapper.AutoAdjustSampleDistancesOff()
         self.mapper.SetSampleDistance(step)
@@ -106,10 +118,14 @@ class VtkPeer:
         if not empty:
             self.renderer.AddVolume(volume)
         self.renderer.SetBackground(0, 0, 0)
-        vtk.vtkLogger.SetStderrVerbosity(vtk.vtkLogger.VERBOSITY_ERROR)  # it warns of every display that it tries in vain
+        vtk.vtkLogger.SetStderrVerbosity(
+            vtk.vtkLogger.VERBOSITY_ERROR
+        )  # it warns of every display that it tries in vain
         self.window = vtk.vtkRenderWindow()
         if not self.window.SupportsOpenGL():
-            raise MissingDependencyError("VTK finds no OpenGL; install a software one such as Mesa's EGL (libegl1, libgl1-mesa-dri)")
+            raise MissingDependencyError(
+                "VTK finds no OpenGL; install a software one such as Mesa's EGL (libegl1, libgl1-mesa-dri)"
+            )
         self.window.SetOffScreenRendering(1)
         self.window.SetMultiSamples(0)
         self.window.SetSize(*size)
@@ -117,7 +133,11 @@ class VtkPeer:
 
     def load(self, values: Single) -> None:
         """Another frame; the mapper takes it up when it draws."""
-        turned = np.ascontiguousarray(values[tuple(slice(None, None, -1 if part < 0 else 1) for part in self.grid.spacing[::-1])])
+        turned = np.ascontiguousarray(
+            values[
+                tuple(slice(None, None, -1 if part < 0 else 1) for part in self.grid.spacing[::-1])
+            ]
+        )
         scalars = self.vtk.numpy_to_vtk(turned.ravel(), deep=1)
         self.image.GetPointData().SetScalars(scalars)
         self.image.Modified()
@@ -165,7 +185,14 @@ class VtkPeer:
     def version(self) -> str:
         """Of VTK, and the OpenGL that it found."""
         lines = str(self.window.ReportCapabilities()).splitlines()
-        graphics = next((line.partition(":")[2].strip() for line in lines if line.startswith("OpenGL renderer string")), "no OpenGL")
+        graphics = next(
+            (
+                line.partition(":")[2].strip()
+                for line in lines
+                if line.startswith("OpenGL renderer string")
+            ),
+            "no OpenGL",
+        )
         return f"VTK {self.vtk.vtkVersion.GetVTKVersion()}, {graphics}"
 
     def _give(self, table: Table, unit: float) -> None:
@@ -173,7 +200,9 @@ class VtkPeer:
         values = np.linspace(table.low, table.high, POINTS)
         entries = np.linspace(table.low, table.high, len(table.extinctions))
         opacities = -np.expm1(-np.interp(values, entries, table.extinctions) * unit)
-        shades = np.stack([np.interp(values, entries, channel) for channel in table.colours.T], axis=-1)
+        shades = np.stack(
+            [np.interp(values, entries, channel) for channel in table.colours.T], axis=-1
+        )
         colour, opacity = self.vtk.vtkColorTransferFunction(), self.vtk.vtkPiecewiseFunction()
         for value, shade, part in zip(values, shades, opacities, strict=True):
             colour.AddRGBPoint(float(value), *(float(each) for each in shade))

@@ -49,18 +49,29 @@ Square = npt.NDArray[np.float64]
 
 
 def choose_codings(
-    architecture: Architecture, samples: int, trained: Sequence[TrainedTable], slopes: Floats, step: float, workers: ThreadPoolExecutor
+    architecture: Architecture,
+    samples: int,
+    trained: Sequence[TrainedTable],
+    slopes: Floats,
+    step: float,
+    workers: ThreadPoolExecutor,
 ) -> list[Coding]:
     """The coding of each level at about a step. slopes: derivatives (features, n) of the network at some of so many samples."""
     size = architecture.embedding_size
     importance: list[Square] = []
     for number, (table, level) in enumerate(zip(trained, architecture.levels, strict=True)):
         own = slopes[number * size : (number + 1) * size].astype(np.float64)
-        reach = prod(squared_weights(length, resolution) for length, resolution in zip(architecture.sizes, level, strict=True))
+        reach = prod(
+            squared_weights(length, resolution)
+            for length, resolution in zip(architecture.sizes, level, strict=True)
+        )
         counting = sum(len(part) for part in _counting(table))
         importance.append(own @ own.T / own.shape[1] * (samples * reach / max(counting, 1)))
     floor = LEAST_LEVEL * max(float(np.trace(matrix)) for matrix in importance) or 1.0
-    return [_coding(table, matrix, floor, step, workers) for table, matrix in zip(trained, importance, strict=True)]
+    return [
+        _coding(table, matrix, floor, step, workers)
+        for table, matrix in zip(trained, importance, strict=True)
+    ]
 
 
 def squared_weights(length: int, resolution: int) -> float:
@@ -78,7 +89,9 @@ def _counting(table: TrainedTable) -> Iterator[Floats]:
         yield table.read((*region, slice(0, table.shape[4])))[table.cares(region)]
 
 
-def _coding(table: TrainedTable, importance: Square, floor: float, step: float, workers: ThreadPoolExecutor) -> Coding:
+def _coding(
+    table: TrainedTable, importance: Square, floor: float, step: float, workers: ThreadPoolExecutor
+) -> Coding:
     values, axes = np.linalg.eigh(importance)
     roots = np.sqrt(np.maximum(values, max(LEAST * float(values[-1]), floor)))
     half, inverse = axes * roots @ axes.T, axes / roots @ axes.T
@@ -96,7 +109,10 @@ def _coding(table: TrainedTable, importance: Square, floor: float, step: float, 
     for part in _counting(table):
         if len(part):
             components = part.astype(np.float64) @ unmixing.T
-            low, high = np.minimum(low, components.min(axis=0)), np.maximum(high, components.max(axis=0))
+            low, high = (
+                np.minimum(low, components.min(axis=0)),
+                np.maximum(high, components.max(axis=0)),
+            )
     t, z, y, x = table.shape[:4]
     tile = tile_shape((t, z, y, x))
     usual = _spec(TRANSFORMS[0], tile)
@@ -111,7 +127,9 @@ def _coding(table: TrainedTable, importance: Square, floor: float, step: float, 
         )
         for c, a, b in zip(center, low, high, strict=True)
     )
-    return _with_transforms(table, Coding(tile=tile, mixing=mixing, unmixing=unmixing, settings=settings), workers)
+    return _with_transforms(
+        table, Coding(tile=tile, mixing=mixing, unmixing=unmixing, settings=settings), workers
+    )
 
 
 def _with_transforms(table: TrainedTable, coding: Coding, workers: ThreadPoolExecutor) -> Coding:
@@ -137,12 +155,17 @@ def _with_transforms(table: TrainedTable, coding: Coding, workers: ThreadPoolExe
 
 
 def _region(index: Index, tile: Shape, shape: Sequence[int]) -> Region:
-    return tuple(slice(i * n, min((i + 1) * n, length)) for i, n, length in zip(index, tile, shape, strict=False))
+    return tuple(
+        slice(i * n, min((i + 1) * n, length))
+        for i, n, length in zip(index, tile, shape, strict=False)
+    )
 
 
 def _spec(kinds: Sequence[tuple[str, int]], tile: Shape) -> TransformSpec:
     """The transform of these kinds and depths along t, z, and y and x, less deep where a tile is short."""
-    t, z, y, x = (wavelet(*kind, length) for kind, length in zip((*kinds, kinds[-1]), tile, strict=True))
+    t, z, y, x = (
+        wavelet(*kind, length) for kind, length in zip((*kinds, kinds[-1]), tile, strict=True)
+    )
     return TransformSpec(axes=(t, z, y, x))
 
 

@@ -34,11 +34,18 @@ class Samples:
         corners = coreset.bricks[:, 1:].astype(np.int64) * np.array(coreset.brick_shape)
         touched: set[Index] = set()
         for (key, *_), corner in zip(coreset.bricks.tolist(), corners.tolist(), strict=True):
-            ends = [min(low + n, size) - 1 for low, n, size in zip(corner, coreset.brick_shape, self.sizes[1:], strict=True)]
-            z, y, x = (range(low // n, end // n + 1) for low, end, n in zip(corner, ends, tile[1:], strict=True))
+            ends = [
+                min(low + n, size) - 1
+                for low, n, size in zip(corner, coreset.brick_shape, self.sizes[1:], strict=True)
+            ]
+            z, y, x = (
+                range(low // n, end // n + 1)
+                for low, end, n in zip(corner, ends, tile[1:], strict=True)
+            )
             touched.update(product((key // tile[0],), z, y, x))
         counts = {
-            index: sum(int(np.count_nonzero(bricks.mask(key, box))) for key in keys) for index, keys, box in map(self._at, sorted(touched))
+            index: sum(int(np.count_nonzero(bricks.mask(key, box))) for key in keys)
+            for index, keys, box in map(self._at, sorted(touched))
         }
         self.counts = {index: count for index, count in counts.items() if count}
 
@@ -61,8 +68,16 @@ class Samples:
             for key in keys:
                 wanted = self._bricks.mask(key, box)
                 if wanted.any():
-                    decoded = decode_region(network, key, box, wanted=wanted)[wanted].astype(np.float64)
-                    total.append(float(np.square(np.clip(decoded, 0.0, 1.0) - self._bricks.samples(key, box)[wanted]).sum()))
+                    decoded = decode_region(network, key, box, wanted=wanted)[wanted].astype(
+                        np.float64
+                    )
+                    total.append(
+                        float(
+                            np.square(
+                                np.clip(decoded, 0.0, 1.0) - self._bricks.samples(key, box)[wanted]
+                            ).sum()
+                        )
+                    )
                     count += len(decoded)
         return fsum(total), count
 
@@ -72,11 +87,16 @@ class Samples:
         for index in tiles[:: -(-len(tiles) // SLOPE_TILES)]:
             _, keys, box = self._at(index)
             places = np.argwhere(np.stack([self._bricks.mask(key, box) for key in keys]))
-            places = places[:: -(-len(places) // SLOPE_POINTS)] + np.array([keys[0], *(low for low, _ in box)])
+            places = places[:: -(-len(places) // SLOPE_POINTS)] + np.array(
+                [keys[0], *(low for low, _ in box)]
+            )
             found.append(feature_slopes(network, places.T.astype(np.float64)))
         return np.concatenate(found, axis=1)
 
     def _at(self, index: Index) -> tuple[Index, range, Box]:
         """A tile, its key frames and its vertices of the box."""
-        spans = [(i * n, min((i + 1) * n, size)) for i, n, size in zip(index, self.tile, self.sizes, strict=True)]
+        spans = [
+            (i * n, min((i + 1) * n, size))
+            for i, n, size in zip(index, self.tile, self.sizes, strict=True)
+        ]
         return index, range(*spans[0]), (spans[1], spans[2], spans[3])

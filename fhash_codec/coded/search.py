@@ -77,9 +77,15 @@ def code_tables(
     own, count = samples.squares(exact, chosen)
     # The error of a plain quantiser, if every number of the tables were as large an error in all the values as the choice makes it.
     numbers = sum(prod(table.shape) for table in trained)
-    step = math.sqrt(12 * (_allowed(own / count, psnr) - own / count) * coreset.values.size / numbers)
-    codings = choose_codings(architecture, coreset.values.size, trained, samples.slopes(exact, chosen), step, workers)
-    smallest = max(SMALLEST, SMALLEST_STEP * max(s.high - s.low for coding in codings for s in coding.settings))
+    step = math.sqrt(
+        12 * (_allowed(own / count, psnr) - own / count) * coreset.values.size / numbers
+    )
+    codings = choose_codings(
+        architecture, coreset.values.size, trained, samples.slopes(exact, chosen), step, workers
+    )
+    smallest = max(
+        SMALLEST, SMALLEST_STEP * max(s.high - s.low for coding in codings for s in coding.settings)
+    )
 
     def nearest(step: float, tiles: Sequence[Index], trials: int, stage: str) -> CodedTables:
         """With the largest step found that keeps what is allowed on some tiles."""
@@ -89,14 +95,25 @@ def code_tables(
         best: CodedTables | None = None
         for trial in range(trials + MORE_TRIALS):
             progress(stage, min(trial, trials), trials, f"step {step:.3g}")
-            coded = [TiledTable(table, coding.with_step(step), workers) for table, coding in zip(trained, codings, strict=True)]
+            coded = [
+                TiledTable(table, coding.with_step(step), workers)
+                for table, coding in zip(trained, codings, strict=True)
+            ]
             total, _ = samples.squares(network(coded), tiles)
-            found = CodedTables(step=step, tables=coded, loss=10 * math.log10(total / own) if own > 0 and total > 0 else 0.0)
+            found = CodedTables(
+                step=step,
+                tables=coded,
+                loss=10 * math.log10(total / own) if own > 0 and total > 0 else 0.0,
+            )
             share = max(total - own, 0.0) / allowed
             if share <= 1 and (best is None or step > best.step):
                 best = found
             low, high = (max(low, step), high) if share <= 1 else (low, min(high, step))
-            if CLOSE <= share <= 1 or step == smallest or (best is not None and trial + 1 >= trials):
+            if (
+                CLOSE <= share <= 1
+                or step == smallest
+                or (best is not None and trial + 1 >= trials)
+            ):
                 break
             # The error grows as the square of the step, nearly; in small tables not even steadily.
             wanted = step * math.sqrt((1 + CLOSE) / 2 / max(share, 1e-3))
@@ -105,7 +122,12 @@ def code_tables(
             step = max(wanted if low < wanted < high else math.sqrt(low * high), smallest)
         return best or found
 
-    return nearest(nearest(step, chosen, TRIALS, "trying tables").step, everything, TRIALS_OF_ALL, "coding tables")
+    return nearest(
+        nearest(step, chosen, TRIALS, "trying tables").step,
+        everything,
+        TRIALS_OF_ALL,
+        "coding tables",
+    )
 
 
 def write_coded(
@@ -122,7 +144,9 @@ def write_coded(
     with pool() as workers:
         coded = code_tables(architecture, coreset, fine, tables, layers, psnr, workers, progress)
         for level, table in enumerate(coded.tables, start=1):
-            for number, (settings, mixing) in enumerate(zip(table.coding.settings, table.coding.mixing.tolist(), strict=True)):
+            for number, (settings, mixing) in enumerate(
+                zip(table.coding.settings, table.coding.mixing.tolist(), strict=True)
+            ):
                 writer.add_sharded(
                     component_name(level, number + 1),
                     shape=table.shape[:4],
@@ -132,7 +156,10 @@ def write_coded(
                     chunks=table.streams(number),
                     dimension_names=("t", "z", "y", "x"),
                     attributes={"mixing": mixing},
-                    codecs=[{"name": "fhash.transform", "configuration": settings.to_dict()}, {"name": "crc32c"}],
+                    codecs=[
+                        {"name": "fhash.transform", "configuration": settings.to_dict()},
+                        {"name": "crc32c"},
+                    ],
                 )
     return coded.loss
 

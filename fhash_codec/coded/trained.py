@@ -38,12 +38,18 @@ class FinestTable:
 
     def __init__(self, coreset: Coreset, bricks: Bricks, fine: Floats) -> None:
         self._bricks, self._fine = bricks, fine
-        self.shape: tuple[int, ...] = (len(coreset.key_frames), *box_size(coreset.box), fine.shape[1])
+        self.shape: tuple[int, ...] = (
+            len(coreset.key_frames),
+            *box_size(coreset.box),
+            fine.shape[1],
+        )
 
     def read(self, region: Region) -> Floats:
         """Embeddings of a region."""
         keys, box = _keys_and_box(region)
-        return np.stack([self._bricks.embeddings(self._fine, key, box) for key in keys])[..., region[4]]
+        return np.stack([self._bricks.embeddings(self._fine, key, box) for key in keys])[
+            ..., region[4]
+        ]
 
     def cares(self, region: Region) -> Mask:
         """The coreset."""
@@ -67,7 +73,9 @@ class CoarseTable:
         return self._care[region[:4]]
 
 
-def trained_tables(architecture: Architecture, coreset: Coreset, bricks: Bricks, fine: Floats, tables: list[Floats]) -> list[TrainedTable]:
+def trained_tables(
+    architecture: Architecture, coreset: Coreset, bricks: Bricks, fine: Floats, tables: list[Floats]
+) -> list[TrainedTable]:
     """All levels, finest first. fine: (bricks, E, vertices of a brick); tables: the coarser ones (buckets, E)."""
     size, levels = architecture.embedding_size, architecture.levels
     around = [np.zeros(level, bool) for level in levels[1:]]
@@ -80,7 +88,10 @@ def trained_tables(architecture: Architecture, coreset: Coreset, bricks: Bricks,
             first, last = corners(architecture.key_frames, level[0])
             for node in {int(first[key]), int(last[key])}:
                 care[node] |= found
-    coarse = [CoarseTable(table.reshape(*level, size), care) for table, level, care in zip(tables, levels[1:], around, strict=True)]
+    coarse = [
+        CoarseTable(table.reshape(*level, size), care)
+        for table, level, care in zip(tables, levels[1:], around, strict=True)
+    ]
     return [FinestTable(coreset, bricks, fine), *coarse]
 
 

@@ -44,7 +44,9 @@ class Blocks:
         self.dtype: np.dtype[Any] = series.dtype.newbyteorder("=")
         self.shape: Shape = (series.shape[0], *box_size(extent.box))
         self.tile: Shape = tuple(min(n, length) for n, length in zip(tile, self.shape, strict=True))  # type: ignore[assignment]
-        self.grid: Index = tuple(-(-length // n) for length, n in zip(self.shape, self.tile, strict=True))  # type: ignore[assignment]
+        self.grid: Index = tuple(
+            -(-length // n) for length, n in zip(self.shape, self.tile, strict=True)
+        )  # type: ignore[assignment]
         self.complete = extent.samples == prod(self.shape)
         self._held: tuple[int, Values, Care] | None = None
         self._whole = _Whole()
@@ -70,12 +72,17 @@ class Blocks:
         Any thread where the whole is held, else one at a time and in C order, since the layer of one t is kept.
         """
         values, care = self._layer(index[0])
-        spans = [slice(i * n, min((i + 1) * n, length)) for i, n, length in zip(index[1:], self.tile[1:], self.shape[1:], strict=True)]
+        spans = [
+            slice(i * n, min((i + 1) * n, length))
+            for i, n, length in zip(index[1:], self.tile[1:], self.shape[1:], strict=True)
+        ]
         part = values[:, spans[0], spans[1], spans[2]]
         kept = None if care is None else care[:, spans[0], spans[1], spans[2]]
         beyond = [(0, n - m) for n, m in zip(self.tile, part.shape, strict=True)]
         if not any(after for _, after in beyond):
-            return np.ascontiguousarray(part), None if kept is None or kept.all() else np.ascontiguousarray(kept)
+            return np.ascontiguousarray(
+                part
+            ), None if kept is None or kept.all() else np.ascontiguousarray(kept)
         inside = np.ones(part.shape, bool) if kept is None else kept
         return np.pad(part, beyond, mode="edge"), np.pad(inside, beyond)
 
@@ -87,7 +94,9 @@ class Blocks:
                 if self._whole.content is None:
                     self._whole.content = self._load(range(self.shape[0]))
             values, care = self._whole.content
-            return values[steps[0] : steps[-1] + 1], None if care is None else care[steps[0] : steps[-1] + 1]
+            return values[steps[0] : steps[-1] + 1], None if care is None else care[
+                steps[0] : steps[-1] + 1
+            ]
         if self._held is None or self._held[0] != t:
             self._held = None
             self._held = (t, *self._load(steps))
@@ -97,4 +106,6 @@ class Blocks:
         values = np.empty((len(steps), *self.shape[1:]), dtype=self.dtype)
         for number, step in enumerate(steps):
             values[number] = crop(self._series.read(step), self._extent.box)
-        return values, None if self.complete else np.stack([self._extent.mask(step) for step in steps])
+        return values, None if self.complete else np.stack(
+            [self._extent.mask(step) for step in steps]
+        )

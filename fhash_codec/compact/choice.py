@@ -35,10 +35,14 @@ def usual_transform(shape: Shape) -> TransformSpec:
     """A good guess without trial: 9/7 everywhere, deepest in the plane."""
     t, z, y, x = shape
     plane = min(4, max(1, max(y, x).bit_length() - 2))
-    return TransformSpec(axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), *_plane("9/7", plane, y, x)))
+    return TransformSpec(
+        axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), *_plane("9/7", plane, y, x))
+    )
 
 
-def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: bool = False) -> tuple[Settings, float]:
+def choose_transform(
+    sample: Sample, settings: Settings, way: Way, *, quick: bool = False
+) -> tuple[Settings, float]:
     """Settings with the transform of the lowest J on the sample, and that J.
 
     quick: only the kinds that the settings have, the usual ones, and the data's own bases in the plane and along z.
@@ -47,7 +51,10 @@ def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: boo
     bases = _Bases(sample, settings)
     if quick:
         usual = usual_transform(shape).axes
-        own = tuple(_known(axis, length) for axis, length in zip(settings.transform.axes, shape, strict=True))
+        own = tuple(
+            _known(axis, length)
+            for axis, length in zip(settings.transform.axes, shape, strict=True)
+        )
         trials = [usual, own]
         if bases.possible(*shape[1:]):
             trials.append((usual[0], *(bases.along(axis) for axis in (1, 2, 3))))
@@ -58,7 +65,10 @@ def choose_transform(sample: Sample, settings: Settings, way: Way, *, quick: boo
     best = math.inf
     for candidates in (_planes(shape, bases), _along(0, shape, bases), _along(1, shape, bases)):
         others = [tuple(change.get(axis, axes[axis]) for axis in range(4)) for change in candidates]
-        group: list[Axes] = [*([axes] if math.isinf(best) else []), *(other for other in others if other != axes)]  # type: ignore[list-item]
+        group: list[Axes] = [
+            *([axes] if math.isinf(best) else []),
+            *(other for other in others if other != axes),
+        ]  # type: ignore[list-item]
         costs = _judge(sample, settings, group, way)
         if group and min(costs) < best:
             best = min(costs)
@@ -72,7 +82,9 @@ def refit(sample: Sample, settings: Settings) -> Settings:
     if not any(axis.basis is not None for axis in axes):
         return settings
     bases = _Bases(sample, settings)
-    fresh = tuple(axis if axis.basis is None else bases.along(number) for number, axis in enumerate(axes))
+    fresh = tuple(
+        axis if axis.basis is None else bases.along(number) for number, axis in enumerate(axes)
+    )
     return replace(settings, transform=TransformSpec(axes=fresh))  # type: ignore[arg-type]
 
 
@@ -92,7 +104,9 @@ def _judge(sample: Sample, settings: Settings, trials: Sequence[Axes], way: Way)
         wrong = 0.0 if way.error is not None else outcome.squares / (0.8 * settings.step**2)
         return outcome.size + factors + wrong
 
-    outcomes = sample.run_all([(replace(settings, transform=TransformSpec(axes=axes)), way) for axes in trials])
+    outcomes = sample.run_all(
+        [(replace(settings, transform=TransformSpec(axes=axes)), way) for axes in trials]
+    )
     return [cost(axes, outcome) for axes, outcome in zip(trials, outcomes, strict=True)]
 
 
@@ -144,7 +158,9 @@ class _Bases:
             gram = np.zeros((length := self._sample.tiles[0][0].shape[axis], length))
             for part in self._sample.map_all(lambda tile: self._gram(tile[0], axis)):
                 gram += part
-            self._known[axis] = AxisTransform(kind="klt", basis=fit_basis(gram, self._settings.step))
+            self._known[axis] = AxisTransform(
+                kind="klt", basis=fit_basis(gram, self._settings.step)
+            )
         return self._known[axis]
 
     def _gram(self, values: npt.NDArray[np.generic], axis: int) -> npt.NDArray[np.float64]:

@@ -54,18 +54,30 @@ def code_series(series: Series, found: Found, config: EncodeConfig, progress: Pr
     blocks = Blocks(series, extent, series.shape)
     begun = time.perf_counter()
     with pool() as workers:
-        planned = plan(blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress, found.features)
+        planned = plan(
+            blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress, found.features
+        )
         if goal.psnr is None or goal.data_range == 0:
             streams, outcome = _code_all(planned, workers, progress)
             best = Table(planned=planned, streams=streams, outcome=outcome)
         else:
-            best = _to_psnr(planned, goal.psnr, quick=config.effort == 1, workers=workers, progress=progress)
+            best = _to_psnr(
+                planned, goal.psnr, quick=config.effort == 1, workers=workers, progress=progress
+            )
     gains = best.planned.gains
-    gains.append({"what": "all tiles", "bytes": best.outcome.size + OVERHEAD_BYTES, "seconds": round(time.perf_counter() - begun, 3)})
+    gains.append(
+        {
+            "what": "all tiles",
+            "bytes": best.outcome.size + OVERHEAD_BYTES,
+            "seconds": round(time.perf_counter() - begun, 3),
+        }
+    )
     return best
 
 
-def _to_psnr(planned: Planned, psnr: float, *, quick: bool, workers: ThreadPoolExecutor, progress: Progress) -> Table:
+def _to_psnr(
+    planned: Planned, psnr: float, *, quick: bool, workers: ThreadPoolExecutor, progress: Progress
+) -> Table:
     """Code all tiles until they reach a PSNR.
 
     Where the tiles turn out to be much worse than the sample said, what was learnt from it is dropped, one after the other: the head, then
@@ -74,7 +86,12 @@ def _to_psnr(planned: Planned, psnr: float, *, quick: bool, workers: ThreadPoolE
     data_range = planned.goal.data_range
     least = psnr + SAFE
     if quick:
-        planned = replace(planned, settings=replace(planned.settings, step=planned.settings.step * (1 - QUICK_AIM / SLOPE)))
+        planned = replace(
+            planned,
+            settings=replace(
+                planned.settings, step=planned.settings.step * (1 - QUICK_AIM / SLOPE)
+            ),
+        )
     best: Table | None = None
     for part in _simpler(planned):
         points: list[tuple[float, float]] = []
@@ -85,7 +102,11 @@ def _to_psnr(planned: Planned, psnr: float, *, quick: bool, workers: ThreadPoolE
             if best is None or _better(outcome, best.outcome, data_range, least):
                 best = Table(planned=now, streams=streams, outcome=outcome)
             missed = reached < least
-            if not missed and (attempt > 0 or reached < psnr + (QUICK_ROOM if quick else EXCEEDED) or math.isinf(reached)):
+            if not missed and (
+                attempt > 0
+                or reached < psnr + (QUICK_ROOM if quick else EXCEEDED)
+                or math.isinf(reached)
+            ):
                 break
             if reached < least - UNLIKE and attempt == 0 and now.settings.head is not None:
                 break  # the head does not hold for all tiles
@@ -109,7 +130,9 @@ def _simpler(planned: Planned) -> Iterator[Planned]:
         settings = replace(settings, head=None)
         yield replace(planned, settings=settings)
     if any(axis.basis is not None for axis in settings.transform.axes):
-        yield replace(planned, settings=replace(settings, transform=usual_transform(planned.blocks.tile)))
+        yield replace(
+            planned, settings=replace(settings, transform=usual_transform(planned.blocks.tile))
+        )
 
 
 def _better(one: Outcome, other: Outcome, data_range: float, least: float) -> bool:
@@ -131,15 +154,26 @@ def write_table(writer: ContainerWriter, table: Table) -> None:
         shard_shape=_shard(blocks.tile, blocks.grid),
         chunks=iter(table.streams),
         dimension_names=("t", "z", "y", "x"),
-        codecs=[{"name": "fhash.transform", "configuration": settings.to_dict()}, {"name": "crc32c"}],
+        codecs=[
+            {"name": "fhash.transform", "configuration": settings.to_dict()},
+            {"name": "crc32c"},
+        ],
     )
 
 
 def compact_header(table: Table, config: EncodeConfig) -> dict[str, Any]:
     """What a compact file's header says of its model."""
     blocks, settings, outcome = table.planned.blocks, table.planned.settings, table.outcome
-    weights = 0 if settings.head is None else sum(layer.weights.size + layer.biases.size for layer in settings.head.layers)
-    head = None if settings.head is None else {"hidden": list(settings.head.hidden), "cross": settings.head.cross}
+    weights = (
+        0
+        if settings.head is None
+        else sum(layer.weights.size + layer.biases.size for layer in settings.head.layers)
+    )
+    head = (
+        None
+        if settings.head is None
+        else {"hidden": list(settings.head.hidden), "cross": settings.head.cross}
+    )
     return {
         "profile": "compact",
         "levels": [list(blocks.shape)],
@@ -147,7 +181,10 @@ def compact_header(table: Table, config: EncodeConfig) -> dict[str, Any]:
         "tables": blocks.dtype.name,
         "parameters": outcome.nonzero + weights,
         "head": head,
-        "gains": [{name: value for name, value in gain.items() if config.timings or name != "seconds"} for gain in table.planned.gains],
+        "gains": [
+            {name: value for name, value in gain.items() if config.timings or name != "seconds"}
+            for gain in table.planned.gains
+        ],
     }
 
 
@@ -158,11 +195,17 @@ def required_features(table: Table) -> list[str]:
 
 def promise(config: EncodeConfig) -> dict[str, float]:
     """The promise of the settings by its name."""
-    given = {name: getattr(config, name) for name in ("psnr", "max_error", "max_error_rel", "ratio")}
-    return {name: value for name, value in given.items() if value is not None} or {"psnr": DEFAULT_PSNR}
+    given = {
+        name: getattr(config, name) for name in ("psnr", "max_error", "max_error_rel", "ratio")
+    }
+    return {name: value for name, value in given.items() if value is not None} or {
+        "psnr": DEFAULT_PSNR
+    }
 
 
-def _code_all(planned: Planned, workers: ThreadPoolExecutor, progress: Progress) -> tuple[list[bytes], Outcome]:
+def _code_all(
+    planned: Planned, workers: ThreadPoolExecutor, progress: Progress
+) -> tuple[list[bytes], Outcome]:
     """Code every tile; a few are on their way at a time, so that memory stays bounded."""
     blocks, settings, way = planned.blocks, planned.settings, planned.way
     everything = prod(blocks.grid)
@@ -171,7 +214,11 @@ def _code_all(planned: Planned, workers: ThreadPoolExecutor, progress: Progress)
     waiting: deque[Future[tuple[bytes, Outcome]]] = deque()
 
     # Of what the search filled already, nothing else is looked for.
-    known = {} if planned.sample is None or not way.filled else dict(zip(planned.sample.indices, planned.sample.tiles, strict=True))
+    known = (
+        {}
+        if planned.sample is None or not way.filled
+        else dict(zip(planned.sample.indices, planned.sample.tiles, strict=True))
+    )
 
     def work(tile: Index | tuple[Values, Care]) -> tuple[bytes, Outcome]:
         values, care = blocks.read(tile) if len(tile) == 4 else tile
@@ -185,7 +232,12 @@ def _code_all(planned: Planned, workers: ThreadPoolExecutor, progress: Progress)
         progress("coding", len(streams), everything, "")
 
     for index in blocks.indices():
-        waiting.append(workers.submit(work, known[index] if index in known else index if blocks.held else blocks.read(index)))
+        waiting.append(
+            workers.submit(
+                work,
+                known[index] if index in known else index if blocks.held else blocks.read(index),
+            )
+        )
         if len(waiting) > 2 * usable_threads(None):
             collect()
     while waiting:

@@ -31,7 +31,10 @@ def fill(values: Values, care: Care, settings: Settings, density: int) -> tuple[
     center = settings.dtype.type(settings.center)
     with np.errstate(over="ignore", invalid="ignore"):
         target = np.where(finite, values, 0).astype(settings.dtype) - center
-        found = filled(target, counts, finite, transform_for(settings, values.shape), settings, density) + center
+        found = (
+            filled(target, counts, finite, transform_for(settings, values.shape), settings, density)
+            + center
+        )
         # Beyond the range there is nothing to gain, and a type may have no such numbers.
         found = np.clip(found, settings.low, settings.high)
         if values.dtype.kind != "f":

@@ -80,25 +80,57 @@ def magnitudes(coefficients: npt.NDArray[np.float32]) -> Magnitudes:
         bins = (flat.view(np.uint32) & np.uint32(0x7FFFFFFF)) >> np.uint32(SHIFT)
         weights = np.square(flat, dtype=np.float64)
         squares = np.bincount(bins, weights=weights, minlength=BINS).astype(np.float64)
-        return Magnitudes(counts=np.bincount(bins, minlength=BINS).astype(np.int64), squares=squares)
+        return Magnitudes(
+            counts=np.bincount(bins, minlength=BINS).astype(np.int64), squares=squares
+        )
     found = Magnitudes(counts=np.zeros(BINS, np.int64), squares=np.zeros(BINS))
     pointers = (ctypes.c_void_p(array.ctypes.data) for array in (found.counts, found.squares))
-    library.fhash_magnitudes(ctypes.c_void_p(flat.ctypes.data), ctypes.c_int64(flat.size), ctypes.c_int64(SHIFT), *pointers)
+    library.fhash_magnitudes(
+        ctypes.c_void_p(flat.ctypes.data),
+        ctypes.c_int64(flat.size),
+        ctypes.c_int64(SHIFT),
+        *pointers,
+    )
     return found
 
 
-def tile_costs(blocks: Blocks, settings: Settings, workers: ThreadPoolExecutor) -> list[float] | None:
+def tile_costs(
+    blocks: Blocks, settings: Settings, workers: ThreadPoolExecutor
+) -> list[float] | None:
     """The bytes that each tile takes with the settings, roughly, in C order; None for a series that is not held in memory."""
-    return [found.size(settings.step) for found in _look(blocks, settings, workers)] if blocks.held else None
+    return (
+        [found.size(settings.step) for found in _look(blocks, settings, workers)]
+        if blocks.held
+        else None
+    )
 
 
-def foreseen_size(blocks: Blocks, settings: Settings, *, psnr: float, data_range: float, workers: ThreadPoolExecutor) -> float:
+def foreseen_size(
+    blocks: Blocks,
+    settings: Settings,
+    *,
+    psnr: float,
+    data_range: float,
+    workers: ThreadPoolExecutor,
+) -> float:
     """The bytes that the tiles of a series as in `foreseen_step` take at a PSNR, very roughly."""
     seen = _together(_look(blocks, settings, workers))
-    return seen.size(seen.step(math.prod(blocks.shape) * data_range**2 * 10 ** (-psnr / 10), data_range * SMALLEST_STEP))
+    return seen.size(
+        seen.step(
+            math.prod(blocks.shape) * data_range**2 * 10 ** (-psnr / 10), data_range * SMALLEST_STEP
+        )
+    )
 
 
-def foreseen_step(blocks: Blocks, settings: Settings, way: Way, *, psnr: float, data_range: float, workers: ThreadPoolExecutor) -> float:
+def foreseen_step(
+    blocks: Blocks,
+    settings: Settings,
+    way: Way,
+    *,
+    psnr: float,
+    data_range: float,
+    workers: ThreadPoolExecutor,
+) -> float:
     """The step at which the tiles of a series that is held, counts whole and is coded in float32 should reach a PSNR, in dB."""
 
     smallest = data_range * SMALLEST_STEP
@@ -107,9 +139,15 @@ def foreseen_step(blocks: Blocks, settings: Settings, way: Way, *, psnr: float, 
     step = seen.step(wanted, smallest)
     if math.prod(blocks.tile) > TRIAL_VERTICES:
         # Large tiles take long to code, and what is asked of them, parts of them can tell.
-        blocks = blocks.retile(even_tile(blocks.tile, math.prod(blocks.tile) // TRIAL_VERTICES + 1, TRIAL_STEPS))
+        blocks = blocks.retile(
+            even_tile(blocks.tile, math.prod(blocks.tile) // TRIAL_VERTICES + 1, TRIAL_STEPS)
+        )
         settings = replace(settings, transform=usual_transform(blocks.tile))
-    settings, indices, tiles = replace(settings, step=step), list(blocks.indices()), _look(blocks, settings, workers)
+    settings, indices, tiles = (
+        replace(settings, step=step),
+        list(blocks.indices()),
+        _look(blocks, settings, workers),
+    )
 
     def trial(number: int) -> float:
         values, care = blocks.read(indices[number])
@@ -118,14 +156,18 @@ def foreseen_step(blocks: Blocks, settings: Settings, way: Way, *, psnr: float, 
 
     # Those that err most stand for all: a tile's chance is its share of the error.
     shares = np.cumsum([tile.error(step) for tile in tiles])
-    chosen = np.searchsorted(shares, shares[-1] * (np.arange(TRIALS) + 0.5) / TRIALS).clip(0, len(tiles) - 1)
+    chosen = np.searchsorted(shares, shares[-1] * (np.arange(TRIALS) + 0.5) / TRIALS).clip(
+        0, len(tiles) - 1
+    )
     off = list(workers.map(trial, (int(number) for number in np.unique(chosen))))
     return seen.step(wanted * len(off) / math.fsum(off), smallest)
 
 
 def _look(blocks: Blocks, settings: Settings, workers: ThreadPoolExecutor) -> list[Magnitudes]:
     """The magnitudes of each tile."""
-    transform = transform_for(replace(settings, double=False, step=1.0), blocks.tile)  # only the kinds matter
+    transform = transform_for(
+        replace(settings, double=False, step=1.0), blocks.tile
+    )  # only the kinds matter
 
     def look(index: Index) -> Magnitudes:
         with np.errstate(over="ignore", invalid="ignore"):

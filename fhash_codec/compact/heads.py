@@ -72,24 +72,55 @@ def race(
     if outcome.size < LEAST_BYTES:
         return settings, outcome, []
     wider = sample.wider(TRAINING_VERTICES)
-    trial = _train(_pairs(wider, settings, way), settings, hidden=TRIED, cross=True, steps=400, samples=80_000, seed=seed, device=device)
+    trial = _train(
+        _pairs(wider, settings, way),
+        settings,
+        hidden=TRIED,
+        cross=True,
+        steps=400,
+        samples=80_000,
+        seed=seed,
+        device=device,
+    )
     if trial is None or trial.gain_db < LEAST_GAIN:
         return settings, outcome, []
-    hidden = _widths(outcome.size, GROWTH * trial.gain_db + HOPE, _octave(tried, data_range), effort)
+    hidden = _widths(
+        outcome.size, GROWTH * trial.gain_db + HOPE, _octave(tried, data_range), effort
+    )
     # The head is trained on what it will meet: coarser data, which it lifts to the quality that was asked for.
     coarser = replace(settings, step=settings.step * math.exp(trial.gain_db / SLOPE))
     pairs = _pairs(wider, coarser, way)
 
-    def train(widths: tuple[int, int], cross: bool) -> tuple[TrainedHead, tuple[Settings, Outcome], list[Outcome]] | None:
+    def train(
+        widths: tuple[int, int], cross: bool
+    ) -> tuple[TrainedHead, tuple[Settings, Outcome], list[Outcome]] | None:
         longer = 1 if cross else LONGER
         steps, samples = STEPS[effort] * longer, SAMPLES[effort] * longer
-        trained = _train(pairs, coarser, hidden=widths, cross=cross, steps=steps, samples=samples, seed=seed, device=device)
+        trained = _train(
+            pairs,
+            coarser,
+            hidden=widths,
+            cross=cross,
+            steps=steps,
+            samples=samples,
+            seed=seed,
+            device=device,
+        )
         again: list[Outcome] = []
-        return None if trained is None else (trained, solve(replace(coarser, head=trained.head), again), again)
+        return (
+            None
+            if trained is None
+            else (trained, solve(replace(coarser, head=trained.head), again), again)
+        )
 
     # Side by side: a training takes one processor, and so does coding a single tile.
     with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
-        runs = list(workers.map(lambda head: train(*head), [*([(hidden, True)] if hidden else []), (PERCEPTRON, False)]))
+        runs = list(
+            workers.map(
+                lambda head: train(*head),
+                [*([(hidden, True)] if hidden else []), (PERCEPTRON, False)],
+            )
+        )
     best, least, curve = (settings, outcome), 0.0, list[dict[str, float | None]]()
     for run in runs:
         if run is None:
@@ -99,10 +130,15 @@ def race(
         cost = found[1].size - outcome.size + len(trained.head.to_bytes()) * 4 / 3 + COURSE_BYTES
         if not strict:
             # Equal quality: what is left between the two searches, in bytes.
-            cost += outcome.size * (2 ** ((outcome.psnr(data_range) - reached) / _octave(again, data_range)) - 1)
+            cost += outcome.size * (
+                2 ** ((outcome.psnr(data_range) - reached) / _octave(again, data_range)) - 1
+            )
         if cost < least or not curve:
             base = reached - trained.gain_db
-            curve = [{"seconds": seconds, "epoch": step, "psnr": base + gain} for seconds, step, gain in trained.history]
+            curve = [
+                {"seconds": seconds, "epoch": step, "psnr": base + gain}
+                for seconds, step, gain in trained.history
+            ]
         if cost < least:
             best, least = found, cost
     return *best, curve
@@ -110,7 +146,9 @@ def race(
 
 def _octave(tried: list[Outcome], data_range: float) -> float:
     """dB that an octave of bytes buys."""
-    return exchange([(math.log2(found.size), found.psnr(data_range)) for found in tried if found.size], EXCHANGE)
+    return exchange(
+        [(math.log2(found.size), found.psnr(data_range)) for found in tried if found.size], EXCHANGE
+    )
 
 
 def _widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, int] | None:
@@ -122,7 +160,11 @@ def _widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, 
     def saved(hidden: tuple[int, int]) -> float:
         first, second = hidden
         weights = FEATURES * first + len(CROSS) * first * second + second
-        return size * (1 - 2 ** (-HEADS[hidden] * gain / octave) - WEIGHT_TIME * weights) - WEIGHT_BYTES * weights - HEAD_BYTES
+        return (
+            size * (1 - 2 ** (-HEADS[hidden] * gain / octave) - WEIGHT_TIME * weights)
+            - WEIGHT_BYTES * weights
+            - HEAD_BYTES
+        )
 
     best = max(list(HEADS)[: CHOICES[effort]], key=saved)
     return best if saved(best) > 0 else None
@@ -131,7 +173,9 @@ def _widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, 
 def _pairs(sample: Sample, settings: Settings, way: Way) -> list[Pair]:
     """The tiles as they decode without a head, as they were, and what counts in them."""
     decoded = sample.decoded(replace(settings, head=None, mask=None), way)
-    return [(found, values, care) for found, (values, care) in zip(decoded, sample.tiles, strict=True)]
+    return [
+        (found, values, care) for found, (values, care) in zip(decoded, sample.tiles, strict=True)
+    ]
 
 
 def _train(

@@ -84,12 +84,21 @@ def plan(
     begun = time.perf_counter()
     fixed = parse_tile(config.tile, blocks.shape)
     first = fixed or first_tile(blocks.shape)
-    if max(abs(value_range.low), abs(value_range.high)) > LARGEST_VALUE or 0 < goal.data_range < SMALLEST_RANGE:
+    if (
+        max(abs(value_range.low), abs(value_range.high)) > LARGEST_VALUE
+        or 0 < goal.data_range < SMALLEST_RANGE
+    ):
         return _exact(blocks, first, value_range, goal)
     gains: list[dict[str, Any]] = []
 
     def note(what: str, now: Outcome) -> None:
-        gains.append({"what": what, "bytes": round(now.size + overhead), "seconds": round(time.perf_counter() - begun, 3)})
+        gains.append(
+            {
+                "what": what,
+                "bytes": round(now.size + overhead),
+                "seconds": round(time.perf_counter() - begun, 3),
+            }
+        )
 
     def sampled(tiled: Blocks, settings: Settings, most: int) -> Sample:
         # What a tile costs does not depend much on the transform.
@@ -97,20 +106,38 @@ def plan(
         return Sample(tiled, most, workers, tile_costs(tiled, usual, workers)).filled(usual, 1)
 
     def masked(settings: Settings, error: float) -> Settings:
-        return settings if blocks.complete else replace(settings, mask=mask_levels(features, config.dilation, error, sample.tiles))
+        return (
+            settings
+            if blocks.complete
+            else replace(settings, mask=mask_levels(features, config.dilation, error, sample.tiles))
+        )
 
     progress("planning", 0, 4, "")
     thorough = 8 if config.effort >= 4 else 4 if config.effort > 1 else 1
     way = Way(filled=blocks.complete, density=0)
     tiled = blocks.retile(first)
     settings = _first(Sample(tiled, LOOK_VERTICES, workers), value_range, goal)
-    if config.effort == 1 and goal.psnr is not None and goal.data_range > 0 and tiled.held and tiled.complete and not settings.double:
+    if (
+        config.effort == 1
+        and goal.psnr is not None
+        and goal.data_range > 0
+        and tiled.held
+        and tiled.complete
+        and not settings.double
+    ):
         if fixed is None:
             tiled = blocks.retile(
-                tile_for(blocks.shape, foreseen_size(tiled, settings, psnr=goal.psnr, data_range=goal.data_range, workers=workers))
+                tile_for(
+                    blocks.shape,
+                    foreseen_size(
+                        tiled, settings, psnr=goal.psnr, data_range=goal.data_range, workers=workers
+                    ),
+                )
             )
         settings = replace(settings, transform=usual_transform(tiled.tile))
-        step = foreseen_step(tiled, settings, way, psnr=goal.psnr, data_range=goal.data_range, workers=workers)
+        step = foreseen_step(
+            tiled, settings, way, psnr=goal.psnr, data_range=goal.data_range, workers=workers
+        )
         progress("planning", 4, 4, "")
         return Planned(blocks=tiled, settings=with_step(settings, step, goal), way=way, goal=goal)
     sample = sampled(tiled, settings, LOOK_VERTICES)
@@ -126,20 +153,38 @@ def plan(
         settings, outcome = _tried(sample, settings, way, goal)
         if fixed is None:
             for tile in _other_tiles(tiled, outcome.size):
-                other = sampled(blocks.retile(tile), settings, MOST_TILE_VERTICES if tiled.complete else TRIAL_VERTICES)
+                other = sampled(
+                    blocks.retile(tile),
+                    settings,
+                    MOST_TILE_VERTICES if tiled.complete else TRIAL_VERTICES,
+                )
                 changed, found = _tried(other, settings, way, goal, quick=True)
-                if found.size < outcome.size * (1 / PRICE_OF_TILES if prod(tile[1:]) > prod(tiled.tile[1:]) else PRICE_OF_STEPS):
+                if found.size < outcome.size * (
+                    1 / PRICE_OF_TILES if prod(tile[1:]) > prod(tiled.tile[1:]) else PRICE_OF_STEPS
+                ):
                     sample, settings, outcome = other, changed, found
             if not tiled.complete and sample.blocks.tile != tiled.tile:
                 settings, outcome = _tried(sample, settings, way, goal)
-        sample = sample.wider(ALL_VERTICES if prod(blocks.shape) <= ALL_VERTICES else SAMPLE_VERTICES)
+        sample = sample.wider(
+            ALL_VERTICES if prod(blocks.shape) <= ALL_VERTICES else SAMPLE_VERTICES
+        )
     progress("planning", 2, 4, "")
-    way = replace(way, passes=2 if config.effort > 2 else 1, rounds=0 if config.effort == 1 else 2 if config.effort < 7 else 4)
+    way = replace(
+        way,
+        passes=2 if config.effort > 2 else 1,
+        rounds=0 if config.effort == 1 else 2 if config.effort < 7 else 4,
+    )
     if not blocks.complete:
         way = replace(way, rounds=2, filled=True)
-        sample = surroundings.race(sample, settings, way, goal, thorough) if config.effort > 1 else sample.filled(settings, thorough)
+        sample = (
+            surroundings.race(sample, settings, way, goal, thorough)
+            if config.effort > 1
+            else sample.filled(settings, thorough)
+        )
     outcomes: list[Outcome] = []
-    settings, outcome = solve(sample, settings, way, goal, tries=3 if config.effort == 1 else 5, tried=outcomes)
+    settings, outcome = solve(
+        sample, settings, way, goal, tries=3 if config.effort == 1 else 5, tried=outcomes
+    )
     if goal.psnr is None and outcome.count:
         settings = masked(settings, math.sqrt(outcome.squares / outcome.count))
     for _ in range(REFITS):
@@ -154,7 +199,9 @@ def plan(
     if config.effort > 1:
         note("transform by trial", outcome)
     history: list[dict[str, float | None]] = []
-    trainable = goal.size is None and goal.error != 0 and goal.data_range > 0 and not settings.double
+    trainable = (
+        goal.size is None and goal.error != 0 and goal.data_range > 0 and not settings.double
+    )
     if config.effort >= 5 and trainable:
         settings, outcome, history = heads.race(
             sample,
@@ -171,28 +218,52 @@ def plan(
         )
         note("head" if settings.head is not None else "head (left out)", outcome)
     if config.effort > 1 and goal.error and goal.data_range > 0:
-        settings, size = prediction.race(sample, settings, outcome.size, error=goal.error, effort=config.effort)
+        settings, size = prediction.race(
+            sample, settings, outcome.size, error=goal.error, effort=config.effort
+        )
         outcome = replace(outcome, size=size)
         note("prediction" if settings.predictor is not None else "prediction (left out)", outcome)
     progress("planning", 4, 4, "")
     if not blocks.complete and not (sample.complete and blocks.dtype.kind == "f"):
         # Whole numbers where nothing counts would cost more than what they were rounded from.
         way = replace(way, filled=False, density=thorough)
-    return Planned(blocks=sample.blocks, sample=sample, settings=settings, way=goal.bounded(way), goal=goal, gains=gains, history=history)
+    return Planned(
+        blocks=sample.blocks,
+        sample=sample,
+        settings=settings,
+        way=goal.bounded(way),
+        goal=goal,
+        gains=gains,
+        history=history,
+    )
 
 
 def _exact(blocks: Blocks, tile: Shape, value_range: ValueRange, goal: Goal) -> Planned:
     """Tiles without loss, for values whose squares overflow."""
     settings = Settings(
-        transform=usual_transform(tile), step=1.0, center=0.0, low=value_range.low, high=value_range.high, offsets=OFFSETS, double=True
+        transform=usual_transform(tile),
+        step=1.0,
+        center=0.0,
+        low=value_range.low,
+        high=value_range.high,
+        offsets=OFFSETS,
+        double=True,
     )
     settings = settings if blocks.complete else replace(settings, mask=MaskLevels())
     return Planned(blocks=blocks.retile(tile), settings=settings, way=Way(exact=True), goal=goal)
 
 
-def _tried(sample: Sample, settings: Settings, way: Way, goal: Goal, *, quick: bool = False) -> tuple[Settings, Outcome]:
+def _tried(
+    sample: Sample, settings: Settings, way: Way, goal: Goal, *, quick: bool = False
+) -> tuple[Settings, Outcome]:
     """The transform by trial, and what it gives where the promise is kept, so that tiles are compared at equal quality."""
-    return solve(sample, choose_transform(sample, settings, goal.bounded(way), quick=quick)[0], way, goal, tries=3 if quick else 4)
+    return solve(
+        sample,
+        choose_transform(sample, settings, goal.bounded(way), quick=quick)[0],
+        way,
+        goal,
+        tries=3 if quick else 4,
+    )
 
 
 def _other_tiles(tiled: Blocks, size: int) -> list[Shape]:
@@ -209,7 +280,11 @@ def _other_tiles(tiled: Blocks, size: int) -> list[Shape]:
         found += [(steps, *whole[1:]), whole]
     if not tiled.complete and whole[0] <= LONGEST_TILE and tiled.grid[0] > 1:
         found.append(even_tile(whole, prod(tiled.grid), whole[0]))
-    return [tile for tile in dict.fromkeys(found) if prod(tile) <= MOST_TILE_VERTICES and tile != tiled.tile]
+    return [
+        tile
+        for tile in dict.fromkeys(found)
+        if prod(tile) <= MOST_TILE_VERTICES and tile != tiled.tile
+    ]
 
 
 def _first(sample: Sample, value_range: ValueRange, goal: Goal) -> Settings:
@@ -222,7 +297,10 @@ def _first(sample: Sample, value_range: ValueRange, goal: Goal) -> Settings:
         step = goal.data_range * 0.05
     center = value_range.low + goal.data_range / 2
     with np.errstate(all="ignore"):
-        means = [float(np.mean(values if care is None else values[care], dtype=np.float64)) for values, care in sample.tiles]
+        means = [
+            float(np.mean(values if care is None else values[care], dtype=np.float64))
+            for values, care in sample.tiles
+        ]
     mean = float(np.average(means, weights=sample.weights))
     center = mean if math.isfinite(mean) else center
     settings = Settings(

@@ -13,7 +13,13 @@ from fhash_codec.compact.blocks import Care, Values
 from fhash_codec.compact.choice import usual_transform
 from fhash_codec.compact.sample import Sample, pool
 from fhash_formats.transform.predict import encode_predicted, integers_of
-from fhash_formats.transform.predictor import LARGEST_WEIGHT, WEIGHT_UNIT, Pass, Predictor, passes_of
+from fhash_formats.transform.predictor import (
+    LARGEST_WEIGHT,
+    WEIGHT_UNIT,
+    Pass,
+    Predictor,
+    passes_of,
+)
 from fhash_formats.transform.settings import Settings
 
 ORDERS = ((0, 1, 2, 3), (0, 3, 2, 1), (3, 2, 1, 0))
@@ -34,15 +40,25 @@ Integers = npt.NDArray[np.int32]
 Four = tuple[int, int, int, int]
 
 
-def race(sample: Sample, settings: Settings, size: int, *, error: float, effort: int) -> tuple[Settings, int]:
+def race(
+    sample: Sample, settings: Settings, size: int, *, error: float, effort: int
+) -> tuple[Settings, int]:
     """Settings with a predictor, and the bytes of all tiles, where that is less than `size`; else as they were.
 
     error: the strict bound. The residual's quantum, which keeps it, is also the distance of predicted values.
     """
     whole = sample.blocks.dtype.kind in "iu" and error < WHOLE
     # Whole numbers stand at whole distances: those of an odd number keep the whole part of half of it.
-    step, origin = (2.0 * int(error) + 1.0, float(round(settings.center))) if whole else (settings.quantum, settings.center)
-    found = choose_predictor(sample, step=step, origin=origin, effort=effort, rival=size) if step > 0 else None
+    step, origin = (
+        (2.0 * int(error) + 1.0, float(round(settings.center)))
+        if whole
+        else (settings.quantum, settings.center)
+    )
+    found = (
+        choose_predictor(sample, step=step, origin=origin, effort=effort, rival=size)
+        if step > 0
+        else None
+    )
     if found is None or found[1] >= size:
         return settings, size
     # The transform is not used any more: one that needs no bytes.
@@ -50,7 +66,9 @@ def race(sample: Sample, settings: Settings, size: int, *, error: float, effort:
     return replace(settings, predictor=found[0], transform=plain, head=None), found[1]
 
 
-def fit(tiles: list[tuple[Integers, Care]], levels: Four, order: Four, reach: int, number: int = ROWS) -> tuple[int, ...]:
+def fit(
+    tiles: list[tuple[Integers, Care]], levels: Four, order: Four, reach: int, number: int = ROWS
+) -> tuple[int, ...]:
     """Weights of all taps, by least squares that count large errors little: what they cost grows with their logarithm.
 
     number: vertices of each pass that are learnt from.
@@ -62,13 +80,21 @@ def fit(tiles: list[tuple[Integers, Care]], levels: Four, order: Four, reach: in
         if part.axis >= 0:
             shift[part.axis] -= 1
         share = max(1, number // len(tiles))
-        rows = [_rows(integers, care, part, tuple(shift), share, generator) for integers, care in tiles]
+        rows = [
+            _rows(integers, care, part, tuple(shift), share, generator) for integers, care in tiles
+        ]
         found = _solve(np.concatenate(rows))
-        weights += np.clip(np.rint(found * WEIGHT_UNIT), -LARGEST_WEIGHT, LARGEST_WEIGHT).astype(int).tolist()
+        weights += (
+            np.clip(np.rint(found * WEIGHT_UNIT), -LARGEST_WEIGHT, LARGEST_WEIGHT)
+            .astype(int)
+            .tolist()
+        )
     return tuple(weights)
 
 
-def choose_predictor(sample: Sample, *, step: float, origin: float, effort: int, rival: float = math.inf) -> tuple[Predictor, int] | None:
+def choose_predictor(
+    sample: Sample, *, step: float, origin: float, effort: int, rival: float = math.inf
+) -> tuple[Predictor, int] | None:
     """The predictor whose streams are smallest, and the bytes of all tiles by it, roughly.
 
     None where the integers would be too large, and where a first trial says that more bytes than those of the rival will be needed.
@@ -81,19 +107,32 @@ def choose_predictor(sample: Sample, *, step: float, origin: float, effort: int,
     every = known
     if sample.blocks.held and prod(sample.blocks.shape) <= MOST_VERTICES:
         every = list(sample.map_all(lambda tile: _whole(tile[0], tile[1], plain)))
-    counting = [(integers, care) for integers, care in every if integers is not None and (care is None or care.any())]
+    counting = [
+        (integers, care)
+        for integers, care in every
+        if integers is not None and (care is None or care.any())
+    ]
     if not counting or any(integers is None for integers, _ in known):
         return None
     few = counting[:: -(-sum(integers.size for integers, _ in counting) // TRIED_VERTICES)]
 
-    ahead = sample.counted / sum(integers.size if care is None else int(np.count_nonzero(care)) for integers, care in few)
+    ahead = sample.counted / sum(
+        integers.size if care is None else int(np.count_nonzero(care)) for integers, care in few
+    )
 
     def sizes(tiles: list[tuple[Integers, Care]], predictor: Predictor) -> list[int]:
         with pool() as workers:
-            return list(workers.map(lambda tile: len(encode_predicted(tile[0], tile[1], predictor)[0]), tiles))
+            return list(
+                workers.map(
+                    lambda tile: len(encode_predicted(tile[0], tile[1], predictor)[0]), tiles
+                )
+            )
 
     def trial(levels: Four, order: Four, reach: int) -> tuple[float, Predictor]:
-        t, z, y, x = (min(level, (length - 1).bit_length()) for level, length in zip(levels, few[0][0].shape, strict=True))
+        t, z, y, x = (
+            min(level, (length - 1).bit_length())
+            for level, length in zip(levels, few[0][0].shape, strict=True)
+        )
         now = _predictor(step, origin, (t, z, y, x), order, reach, counting, TRIED_ROWS)
         return sum(sizes(few, now)) * ahead + len(now.to_dict()["weights"]), now
 
@@ -108,16 +147,26 @@ def choose_predictor(sample: Sample, *, step: float, origin: float, effort: int,
         best = min(best, trial(best[1].levels, best[1].order, taps), key=lambda pair: pair[0])
     predictor = _predictor(step, origin, best[1].levels, best[1].order, best[1].reach, counting)
     coded = sizes([(integers, care) for integers, care in known if integers is not None], predictor)
-    return predictor, sum(w * n for w, n in zip(sample.weights, coded, strict=True)) + len(predictor.to_dict()["weights"])
+    return predictor, sum(w * n for w, n in zip(sample.weights, coded, strict=True)) + len(
+        predictor.to_dict()["weights"]
+    )
 
 
 def _predictor(
-    step: float, origin: float, levels: Four, order: Four, reach: int, tiles: list[tuple[Integers, Care]] | None, number: int = ROWS
+    step: float,
+    origin: float,
+    levels: Four,
+    order: Four,
+    reach: int,
+    tiles: list[tuple[Integers, Care]] | None,
+    number: int = ROWS,
 ) -> Predictor:
     """Trained on tiles, or with weights of 0."""
     count = sum(len(part.taps) for part in passes_of(levels, order, reach))
     weights = (0,) * count if tiles is None else fit(tiles, levels, order, reach, number)
-    return Predictor(step=step, origin=origin, levels=levels, order=order, reach=reach, weights=weights)
+    return Predictor(
+        step=step, origin=origin, levels=levels, order=order, reach=reach, weights=weights
+    )
 
 
 def _whole(values: Values, care: Care, predictor: Predictor) -> tuple[Integers | None, Care]:
@@ -128,7 +177,12 @@ def _whole(values: Values, care: Care, predictor: Predictor) -> tuple[Integers |
 
 
 def _rows(
-    integers: Integers, care: Care, part: Pass, shift: tuple[int, ...], most: int, generator: np.random.Generator
+    integers: Integers,
+    care: Care,
+    part: Pass,
+    shift: tuple[int, ...],
+    most: int,
+    generator: np.random.Generator,
 ) -> npt.NDArray[np.float64]:
     """Some vertices of a pass: how far their taps and they themselves lie from the base, (n, taps + 1)."""
     fine = integers[tuple(slice(None, None, 1 << s) for s in shift)]
@@ -147,9 +201,13 @@ def _rows(
     if counts is not None:
         at = at[:, counts[tuple(at)]]
 
-    def take(offset: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+    def take(
+        offset: npt.NDArray[np.int64],
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
         place = at + offset[:, None]
-        there: npt.NDArray[np.bool_] = np.all((place >= 0) & (place < np.array(fine.shape)[:, None]), axis=0)
+        there: npt.NDArray[np.bool_] = np.all(
+            (place >= 0) & (place < np.array(fine.shape)[:, None]), axis=0
+        )
         place = np.where(there, place, 0)
         if counts is not None:
             there &= counts[tuple(place)]

@@ -66,7 +66,14 @@ def code(values: Values, care: Care, settings: Settings, way: Way) -> tuple[Code
     """Code one tile and measure it."""
     if way.exact:
         count = values.size if care is None else int(np.count_nonzero(care))
-        coded = exact_tile(values, occupied=None if settings.mask is None else np.ones(values.shape, bool) if care is None else care)
+        coded = exact_tile(
+            values,
+            occupied=None
+            if settings.mask is None
+            else np.ones(values.shape, bool)
+            if care is None
+            else care,
+        )
         return coded, Outcome(size=len(coded.data), squares=0.0, count=count, largest=0.0)
     coded = encode_tile(
         values,
@@ -83,7 +90,13 @@ def code(values: Values, care: Care, settings: Settings, way: Way) -> tuple[Code
     # Scaled, so that neither huge nor tiny ranges over- or underflow.
     scale = power_of_two(settings.high - settings.low)
     count, squares, largest = squared_errors(values, coded.decoded, care, scale)
-    outcome = Outcome(size=len(coded.data), squares=squares / scale**2, count=count, largest=largest / scale, nonzero=coded.nonzero)
+    outcome = Outcome(
+        size=len(coded.data),
+        squares=squares / scale**2,
+        count=count,
+        largest=largest / scale,
+        nonzero=coded.nonzero,
+    )
     return coded, outcome
 
 
@@ -131,7 +144,13 @@ class Sample:
         counted: vertices that count, of the whole series, roughly. blocks: the whole series.
     """
 
-    def __init__(self, blocks: Blocks, most_vertices: int, pool: ThreadPoolExecutor, costs: Sequence[float] | None = None) -> None:
+    def __init__(
+        self,
+        blocks: Blocks,
+        most_vertices: int,
+        pool: ThreadPoolExecutor,
+        costs: Sequence[float] | None = None,
+    ) -> None:
         """Tiles of at most so many vertices together, at least one.
 
         costs: what each tile costs, roughly, in C order; tiles are then chosen by it (`strata`), else spread evenly.
@@ -145,13 +164,25 @@ class Sample:
         else:
             # By the golden ratio, so that no row or column of the grid is preferred; then in C order, for the reader's sake.
             order = sorted(range(len(indices)), key=lambda number: number * GOLDEN % 1.0)
-            weights = [len(indices) * (place + 1) // wanted - len(indices) * place // wanted for place in range(wanted)]
+            weights = [
+                len(indices) * (place + 1) // wanted - len(indices) * place // wanted
+                for place in range(wanted)
+            ]
             chosen = list(zip(sorted(order[:wanted]), weights, strict=True))
-        found = [(indices[number], blocks.read(indices[number]), weight) for number, weight in chosen]
+        found = [
+            (indices[number], blocks.read(indices[number]), weight) for number, weight in chosen
+        ]
         found = [one for one in found if one[1][1] is None or one[1][1].any()] or found[:1]
-        self.indices, self.tiles, self.weights = [one[0] for one in found], [one[1] for one in found], [one[2] for one in found]
+        self.indices, self.tiles, self.weights = (
+            [one[0] for one in found],
+            [one[1] for one in found],
+            [one[2] for one in found],
+        )
         self.complete = wanted == len(indices)
-        self.counted = sum(weight * (values.size if care is None else int(np.count_nonzero(care))) for _, (values, care), weight in found)
+        self.counted = sum(
+            weight * (values.size if care is None else int(np.count_nonzero(care)))
+            for _, (values, care), weight in found
+        )
         self.blocks = blocks
         self._pool, self._costs, self._source = pool, costs, self.tiles
         self._filling: tuple[Settings, int] | None = None
@@ -169,7 +200,9 @@ class Sample:
             return self
         other = copy(self)
         other._filling = settings, density
-        other.tiles = list(self._pool.map(lambda tile: fill(tile[0], tile[1], settings, density), self._source))
+        other.tiles = list(
+            self._pool.map(lambda tile: fill(tile[0], tile[1], settings, density), self._source)
+        )
         return other
 
     def map(self, work: Callable[[tuple[Values, Care]], Result]) -> list[Result]:
@@ -183,7 +216,9 @@ class Sample:
             yield from self._pool.map(lambda index: work(self.blocks.read(index)), indices)
             return
         for start in range(0, len(indices), BATCH):
-            yield from self._pool.map(work, [self.blocks.read(index) for index in indices[start : start + BATCH]])
+            yield from self._pool.map(
+                work, [self.blocks.read(index) for index in indices[start : start + BATCH]]
+            )
 
     def run(self, settings: Settings, way: Way) -> Outcome:
         """Code the tiles; what coding the whole series would give."""
@@ -194,11 +229,16 @@ class Sample:
         jobs = [(tile, *trial) for trial in trials for tile in self.tiles]
         found = list(self._pool.map(lambda job: code(*job[0], *job[1:])[1], jobs))
         number = len(self.tiles)
-        return [total(found[start : start + number], self.weights) for start in range(0, len(found), number)]
+        return [
+            total(found[start : start + number], self.weights)
+            for start in range(0, len(found), number)
+        ]
 
     def decoded(self, settings: Settings, way: Way) -> list[npt.NDArray[np.float32]]:
         """What the tiles decode to, float32."""
-        return self.map(lambda tile: code(tile[0], tile[1], settings, way)[0].decoded.astype(np.float32))
+        return self.map(
+            lambda tile: code(tile[0], tile[1], settings, way)[0].decoded.astype(np.float32)
+        )
 
 
 def pool() -> ThreadPoolExecutor:

@@ -24,7 +24,9 @@ def secant(points: Sequence[tuple[float, float]], target: float, slope: float) -
     """
     log_step, reached = points[-1]
     if len(points) > 1 and abs(points[-2][0] - log_step) > LEAST_APART:
-        slope = min(max(-(reached - points[-2][1]) / (log_step - points[-2][0]), FLATTEST), STEEPEST)
+        slope = min(
+            max(-(reached - points[-2][1]) / (log_step - points[-2][0]), FLATTEST), STEEPEST
+        )
     return log_step + (reached - target) / slope
 
 
@@ -37,7 +39,11 @@ def exchange(points: Sequence[tuple[float, float]], usual: float) -> float:
 
 
 def cheapest(
-    run: Callable[[Sequence[int]], Sequence[tuple[float, Result] | None]], start: int, most: int, *, strides: Sequence[int]
+    run: Callable[[Sequence[int]], Sequence[tuple[float, Result] | None]],
+    start: int,
+    most: int,
+    *,
+    strides: Sequence[int],
 ) -> Result:
     """The result of the cheapest whole number from 0 to `most`: downhill from `start`, in strides that get smaller.
 

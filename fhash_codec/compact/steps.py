@@ -63,21 +63,42 @@ def with_step(settings: Settings, step: float, goal: Goal, rounding: float = 0.0
     data_range = settings.high - settings.low
     largest = max(abs(settings.low), abs(settings.high))
     # Integers beyond 2^30 cannot be coded. In a constant series the step only has to be small enough for the centre, a float32.
-    step = max(step, data_range * SMALLEST_STEP, largest * 2.0**-30 if data_range == 0 else 0.0, LEAST_STEP)
-    double = data_range / step > DOUBLE_STEPS or largest > step * DOUBLE_STEPS or largest > 1e37 or step < 1e-30
+    step = max(
+        step, data_range * SMALLEST_STEP, largest * 2.0**-30 if data_range == 0 else 0.0, LEAST_STEP
+    )
+    double = (
+        data_range / step > DOUBLE_STEPS
+        or largest > step * DOUBLE_STEPS
+        or largest > 1e37
+        or step < 1e-30
+    )
     # Half a quantum off, and then rounded to the type of the source, must still keep the bound: if not, a whole tile is stored exactly.
-    quantum = 0.0 if not goal.error else 2 * goal.error * (1 - SLACK - min(rounding * largest / goal.error, SLACK_OF_TYPE))
+    quantum = (
+        0.0
+        if not goal.error
+        else 2 * goal.error * (1 - SLACK - min(rounding * largest / goal.error, SLACK_OF_TYPE))
+    )
     return replace(settings, step=step, double=double, quantum=quantum)
 
 
 def nearer(settings: Settings, points: Sequence[tuple[float, float]], psnr: float) -> Settings:
     """The step at which a PSNR should be reached, from the points (log step, PSNR) that were tried, the last of them with `settings`."""
-    smallest, largest = (math.log((settings.high - settings.low) * part) for part in (SMALLEST_STEP, LARGEST_STEP))
-    return replace(settings, step=math.exp(min(max(secant(points, psnr, SLOPE), smallest), largest)))
+    smallest, largest = (
+        math.log((settings.high - settings.low) * part) for part in (SMALLEST_STEP, LARGEST_STEP)
+    )
+    return replace(
+        settings, step=math.exp(min(max(secant(points, psnr, SLOPE), smallest), largest))
+    )
 
 
 def solve(
-    sample: Sample, settings: Settings, way: Way, goal: Goal, *, tries: int = 5, tried: list[Outcome] | None = None
+    sample: Sample,
+    settings: Settings,
+    way: Way,
+    goal: Goal,
+    *,
+    tries: int = 5,
+    tried: list[Outcome] | None = None,
 ) -> tuple[Settings, Outcome]:
     """The step that keeps the promise on the sample, or for a bound the one that costs least; what it gives.
 
@@ -86,7 +107,9 @@ def solve(
     if goal.psnr is not None:
         if goal.data_range == 0:
             return settings, sample.run(settings, way)
-        return _solve_psnr(sample, settings, way, goal.psnr, goal.data_range, tries, [] if tried is None else tried)
+        return _solve_psnr(
+            sample, settings, way, goal.psnr, goal.data_range, tries, [] if tried is None else tried
+        )
     if goal.error is not None:
         if goal.error == 0:
             return settings, sample.run(settings, replace(way, error=0.0))
@@ -96,7 +119,13 @@ def solve(
 
 
 def _solve_psnr(
-    sample: Sample, settings: Settings, way: Way, psnr: float, data_range: float, tries: int, tried: list[Outcome]
+    sample: Sample,
+    settings: Settings,
+    way: Way,
+    psnr: float,
+    data_range: float,
+    tries: int,
+    tried: list[Outcome],
 ) -> tuple[Settings, Outcome]:
     psnr += AIM
     points: list[tuple[float, float]] = []
@@ -116,30 +145,48 @@ def _solve_psnr(
     return best[1], best[2]
 
 
-def _solve_bound(sample: Sample, settings: Settings, way: Way, goal: Goal, error: float, *, quick: bool) -> tuple[Settings, Outcome]:
+def _solve_bound(
+    sample: Sample, settings: Settings, way: Way, goal: Goal, error: float, *, quick: bool
+) -> tuple[Settings, Outcome]:
     """The step at which coefficients and residual together cost least."""
-    rounding = float(np.finfo(sample.blocks.dtype).eps) / 2 if sample.blocks.dtype.kind == "f" else 0.0
+    rounding = (
+        float(np.finfo(sample.blocks.dtype).eps) / 2 if sample.blocks.dtype.kind == "f" else 0.0
+    )
 
     def trial(number: int) -> Settings | None:
-        stepped = with_step(replace(settings, head=None), error * 2 ** (number / STEPS_TO_OCTAVE), goal, rounding)
+        stepped = with_step(
+            replace(settings, head=None), error * 2 ** (number / STEPS_TO_OCTAVE), goal, rounding
+        )
         if settings.head is not None:
             return None if stepped.double else replace(stepped, head=settings.head)
         return stepped
 
     def run(numbers: Sequence[int]) -> list[tuple[float, tuple[Settings, Outcome]] | None]:
         trials = [trial(number) for number in numbers]
-        outcomes = iter(sample.run_all([(one, replace(way, error=error)) for one in trials if one is not None]))
-        return [None if one is None else ((outcome := next(outcomes)).size, (one, outcome)) for one in trials]
+        outcomes = iter(
+            sample.run_all([(one, replace(way, error=error)) for one in trials if one is not None])
+        )
+        return [
+            None if one is None else ((outcome := next(outcomes)).size, (one, outcome))
+            for one in trials
+        ]
 
     # Upwards: with a head, a smaller step could need float64.
-    start = min(max(math.ceil(STEPS_TO_OCTAVE * math.log2(settings.step / error) - 1e-6), 0), LARGEST_OF_ERROR)
+    start = min(
+        max(math.ceil(STEPS_TO_OCTAVE * math.log2(settings.step / error) - 1e-6), 0),
+        LARGEST_OF_ERROR,
+    )
     return cheapest(run, start, LARGEST_OF_ERROR, strides=(2,) if quick else (2, 1))
 
 
-def _solve_size(sample: Sample, settings: Settings, way: Way, size: float, data_range: float, tries: int) -> tuple[Settings, Outcome]:
+def _solve_size(
+    sample: Sample, settings: Settings, way: Way, size: float, data_range: float, tries: int
+) -> tuple[Settings, Outcome]:
     """The step at which the tiles take so many bytes."""
     if size <= 0:
-        raise InputError("the ratio leaves no room for values: the rest of the file is larger already; ask for a smaller ratio")
+        raise InputError(
+            "the ratio leaves no room for values: the rest of the file is larger already; ask for a smaller ratio"
+        )
     if data_range == 0:
         return settings, sample.run(settings, way)
     low, high = math.log(max(data_range, 1e-300) * 2.0**-24), math.log(max(data_range, 1e-300) * 4)

@@ -21,11 +21,15 @@ def race(sample: Sample, settings: Settings, way: Way, goal: Goal, density: int)
     """The sample with the filling that takes the fewest bytes where the promise is kept, found with `density` (`fill`)."""
 
     def trial(part: float) -> tuple[float, float]:
-        filled = sample.filled(replace(settings, step=settings.step * (part or 1.0)), DENSITY if part else 0)
+        filled = sample.filled(
+            replace(settings, step=settings.step * (part or 1.0)), DENSITY if part else 0
+        )
         return _cost(solve(filled, settings, way, goal, tries=TRIES)[1], goal), part
 
     part = min(trial(part) for part in PARTS)[1]
-    return sample.filled(replace(settings, step=settings.step * (part or 1.0)), density if part else 0)
+    return sample.filled(
+        replace(settings, step=settings.step * (part or 1.0)), density if part else 0
+    )
 
 
 def _cost(outcome: Outcome, goal: Goal) -> float:

@@ -37,14 +37,18 @@ def parse_tile(text: str, shape: Shape) -> Shape | None:
     except ValueError:
         numbers = []
     if len(numbers) != 4 or min(numbers) < 1:
-        raise InputError(f"tile is '{text}'; allowed: auto, whole, or four whole numbers as in 4x32x32x32 (t, z, y, x)")
+        raise InputError(
+            f"tile is '{text}'; allowed: auto, whole, or four whole numbers as in 4x32x32x32 (t, z, y, x)"
+        )
     t, z, y, x = (min(n, length) for n, length in zip(numbers, shape, strict=True))
     return _allowed(text, (t, z, y, x))
 
 
 def _allowed(text: str, tile: Shape) -> Shape:
     if prod(tile) > MOST_TILE_VERTICES:
-        raise InputError(f"tile '{text}' has {prod(tile):,} vertices; at most {MOST_TILE_VERTICES:,} are decoded together; name another")
+        raise InputError(
+            f"tile '{text}' has {prod(tile):,} vertices; at most {MOST_TILE_VERTICES:,} are decoded together; name another"
+        )
     return tile
 
 
@@ -68,11 +72,21 @@ def even_tile(shape: Shape, tiles: int, steps: int) -> Shape:
         z, y, x = (n if p == 1 else n + n % 2 for n, p in zip(space, parts[1:], strict=True))
         count = prod(-(-n // length) for n, length in zip(shape, (t, z, y, x), strict=True))
         more = math.log(count / prod(wished))
-        if t > max(steps * 1.5, 1) or not 0.4 <= count / prod(wished) <= 1.5 or (more < 0 and t * z * y * x > LARGEST):
+        if (
+            t > max(steps * 1.5, 1)
+            or not 0.4 <= count / prod(wished) <= 1.5
+            or (more < 0 and t * z * y * x > LARGEST)
+        ):
             continue
         padding = count * t * z * y * x / prod(shape) - 1
-        short = sum(p > 1 and length < SHORTEST for p, length in zip(parts[1:], (z, y, x), strict=True))
-        price = PRICE_OF_PADDING * padding + PRICE_OF_SHORT * short + (PRICE_OF_MORE * more if more > 0 else -PRICE_OF_FEWER * more)
+        short = sum(
+            p > 1 and length < SHORTEST for p, length in zip(parts[1:], (z, y, x), strict=True)
+        )
+        price = (
+            PRICE_OF_PADDING * padding
+            + PRICE_OF_SHORT * short
+            + (PRICE_OF_MORE * more if more > 0 else -PRICE_OF_FEWER * more)
+        )
         if price < best - 1e-9:
             best, tile = price, (t, z, y, x)
     return tile
@@ -85,7 +99,10 @@ def first_tile(shape: Shape) -> Shape:
 
 def tile_for(shape: Shape, size: float) -> Shape:
     """Tiles of a series whose tiles take so many bytes together; more than FEWEST_TILES only where they get too large."""
-    tiles = max(int(min(size / TILE_BYTES, max(FEWEST_TILES, prod(shape) / TILE_VERTICES))), -(-prod(shape) // LARGEST))
+    tiles = max(
+        int(min(size / TILE_BYTES, max(FEWEST_TILES, prod(shape) / TILE_VERTICES))),
+        -(-prod(shape) // LARGEST),
+    )
     steps = shape[0]
     if tiles > 1:
         parts = -(-steps // TILE_STEPS) if tiles >= 16 else 1

@@ -49,7 +49,13 @@ class Engine(Protocol):
 
 
 def make_engine(
-    name: str, architecture: Architecture, coreset: Coreset, rates: npt.NDArray[np.float64], *, seed: int, device: torch.device
+    name: str,
+    architecture: Architecture,
+    coreset: Coreset,
+    rates: npt.NDArray[np.float64],
+    *,
+    seed: int,
+    device: torch.device,
 ) -> Engine:
     """The engine of this name; 'auto' is the fastest at hand. Raises InputError for an unknown name."""
     if name in ("auto", "slab"):

@@ -10,7 +10,9 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
 WINDOW = 200  # (BETA1 / sqrt(BETA2))**200 is 8e-10: later steps without a gradient no longer move a parameter
 
 
-def adam_step(parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: int, rate: float) -> None:
+def adam_step(
+    parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: int, rate: float
+) -> None:
     """Step number `step` (from 1 on) of Adam, in place; all tensors of one shape.
 
     torch.optim.Adam does the same, but loads torch's compiler on its first use, which takes as long as torch itself.
@@ -23,7 +25,12 @@ def adam_step(parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor,
 
 def catch_up(
     visited: npt.NDArray[np.int64], step: int, rates: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+) -> tuple[
+    npt.NDArray[np.float32],
+    npt.NDArray[np.float32],
+    npt.NDArray[np.float32],
+    npt.NDArray[np.float32],
+]:
     """What steps visited+1 .. step with zero gradients do to parameters whose last gradient came at `visited` (0: never), each (n,).
 
     Returns factor, epsilon, mean decay and square decay; with Adam's mean m and square v as they were at `visited`,

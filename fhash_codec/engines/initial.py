@@ -11,7 +11,9 @@ from torch import Tensor
 from fhash_codec.architecture import Architecture
 from fhash_codec.coreset import Coreset
 
-SPREAD = 1e-4  # of the initial embeddings, uniform in -SPREAD .. SPREAD (Mueller et al. 2022, section 4)
+SPREAD = (
+    1e-4  # of the initial embeddings, uniform in -SPREAD .. SPREAD (Mueller et al. 2022, section 4)
+)
 
 
 @dataclass(frozen=True)
@@ -30,15 +32,26 @@ class Parameters:
     def dense(self, architecture: Architecture) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
         """The coarse tables (buckets, E) and the layers (weight (out, in), bias (out,)), as views."""
         size = architecture.embedding_size
-        tables = torch.split(self.coarse, [prod(level) * size for level in architecture.levels[1:]]) if len(self.coarse) else ()
+        tables = (
+            torch.split(self.coarse, [prod(level) * size for level in architecture.levels[1:]])
+            if len(self.coarse)
+            else ()
+        )
         layers = layer_matrices(architecture, self.network)
-        return [table.view(-1, size) for table in tables], [(layer[:, :-1], layer[:, -1]) for layer in layers]
+        return [table.view(-1, size) for table in tables], [
+            (layer[:, :-1], layer[:, -1]) for layer in layers
+        ]
 
 
 def layer_matrices(architecture: Architecture, network: Tensor) -> list[Tensor]:
     """Views of the layers (out, in + 1) inside one vector."""
     shapes = [(outputs, inputs + 1) for outputs, inputs in architecture.layer_shapes]
-    return [part.view(shape) for part, shape in zip(torch.split(network, [prod(shape) for shape in shapes]), shapes, strict=True)]
+    return [
+        part.view(shape)
+        for part, shape in zip(
+            torch.split(network, [prod(shape) for shape in shapes]), shapes, strict=True
+        )
+    ]
 
 
 def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) -> Parameters:

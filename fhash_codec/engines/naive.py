@@ -33,12 +33,24 @@ class NaiveEngine:
         dtype: torch.dtype = torch.float32,
     ) -> None:
         """Fresh parameters from `seed`, the same as every other engine's; `rates` as in `engines.Engine`."""
-        self.architecture, self.coreset, self.rates, self.device, self.dtype = architecture, coreset, rates, device, dtype
+        self.architecture, self.coreset, self.rates, self.device, self.dtype = (
+            architecture,
+            coreset,
+            rates,
+            device,
+            dtype,
+        )
         start = initial_parameters(architecture, coreset, seed)
         self.buckets = torch.from_numpy(_finest_buckets(architecture, coreset))
-        self.mask = np.unpackbits(coreset.mask_bits, axis=1, count=prod(coreset.brick_shape)).astype(bool)
-        self.model = _model(architecture, start, self.buckets, torch.from_numpy(self.mask), dtype).to(device)
-        self.adam = torch.optim.Adam(self.model.parameters(), betas=(BETA1, BETA2), eps=EPSILON, fused=True)
+        self.mask = np.unpackbits(
+            coreset.mask_bits, axis=1, count=prod(coreset.brick_shape)
+        ).astype(bool)
+        self.model = _model(
+            architecture, start, self.buckets, torch.from_numpy(self.mask), dtype
+        ).to(device)
+        self.adam = torch.optim.Adam(
+            self.model.parameters(), betas=(BETA1, BETA2), eps=EPSILON, fused=True
+        )
         self.step = 0
 
     def train(self, chosen: npt.NDArray[np.int64]) -> Tensor:
@@ -73,8 +85,14 @@ class NaiveEngine:
         finest = finest * torch.from_numpy(self.mask).unsqueeze(1)
         coarse = [table.detach().flatten() for table in list(self.model.tables)[1:]]
         layers = zip(self.model.weights, self.model.biases, strict=True)
-        network = [torch.column_stack([weight.detach(), bias.detach()]).flatten() for weight, bias in layers]
-        joined = [torch.cat([*parts, finest.new_empty(0, device=self.device)]).cpu().float() for parts in (coarse, network)]
+        network = [
+            torch.column_stack([weight.detach(), bias.detach()]).flatten()
+            for weight, bias in layers
+        ]
+        joined = [
+            torch.cat([*parts, finest.new_empty(0, device=self.device)]).cpu().float()
+            for parts in (coarse, network)
+        ]
         return Parameters(fine=finest.float().contiguous(), coarse=joined[0], network=joined[1])
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
@@ -93,8 +111,14 @@ class NaiveEngine:
         self.step = int(state["step"])
         for name, parameter in self.model.named_parameters():
             parameter.copy_(torch.from_numpy(state[name]))
-            moments = {m: torch.from_numpy(state[f"{name}.{m}"].copy()).to(self.device) for m in ("exp_avg", "exp_avg_sq")}
-            self.adam.state[parameter] = {"step": torch.tensor(float(self.step), device=self.device), **moments}
+            moments = {
+                m: torch.from_numpy(state[f"{name}.{m}"].copy()).to(self.device)
+                for m in ("exp_avg", "exp_avg_sq")
+            }
+            self.adam.state[parameter] = {
+                "step": torch.tensor(float(self.step), device=self.device),
+                **moments,
+            }
 
     def _samples(self, chosen: npt.NDArray[np.int64]) -> tuple[Tensor, Tensor]:
         """Points (n, 4) and normalised values (n,) of the coreset vertices of bricks."""
@@ -106,7 +130,9 @@ class NaiveEngine:
 
 def _vertices(coreset: Coreset, chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Lattice positions (bricks, vertices, 4) in (key frame, z, y, x); past the end of the box the last vertex again."""
-    inside = np.stack(np.meshgrid(*(np.arange(n) for n in coreset.brick_shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = np.stack(
+        np.meshgrid(*(np.arange(n) for n in coreset.brick_shape), indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     bricks = coreset.bricks[chosen].astype(np.int64)
     space = bricks[:, None, 1:] * np.array(coreset.brick_shape) + inside
     last = np.array([high - low - 1 for low, high in coreset.box])
@@ -122,7 +148,9 @@ def _finest_buckets(architecture: Architecture, coreset: Coreset) -> npt.NDArray
     return buckets
 
 
-def _model(architecture: Architecture, start: Parameters, buckets: Tensor, mask: Tensor, dtype: torch.dtype) -> FHash:
+def _model(
+    architecture: Architecture, start: Parameters, buckets: Tensor, mask: Tensor, dtype: torch.dtype
+) -> FHash:
     """A dense model that holds the engines' common start; finest embeddings outside the coreset are zero."""
     finest = torch.zeros(prod(architecture.levels[0]), architecture.embedding_size)
     finest[buckets[mask]] = start.fine.transpose(1, 2)[mask]

@@ -36,10 +36,21 @@ class SlabEngine:
     name = "slab"
 
     def __init__(
-        self, architecture: Architecture, coreset: Coreset, rates: npt.NDArray[np.float64], *, seed: int, device: torch.device
+        self,
+        architecture: Architecture,
+        coreset: Coreset,
+        rates: npt.NDArray[np.float64],
+        *,
+        seed: int,
+        device: torch.device,
     ) -> None:
         """Fresh parameters from `seed`; `rates` as in `engines.Engine`; the coreset is copied to the device."""
-        self.architecture, self.coreset, self.rates, self.device = architecture, coreset, rates, device
+        self.architecture, self.coreset, self.rates, self.device = (
+            architecture,
+            coreset,
+            rates,
+            device,
+        )
         self.vertices = prod(coreset.brick_shape)
         self.bricks = torch.from_numpy(coreset.bricks.astype(np.int64)).to(device)
         self.mask_bits = torch.from_numpy(coreset.mask_bits).to(device)
@@ -55,8 +66,12 @@ class SlabEngine:
         self.step = self.settled = 0
         # What is used of the coarse tables, and the MLP, in one flat vector, of which layers and gradients are views.
         self.coarse = len(self.upsampling.used)
-        self.flat = torch.cat([start.coarse.to(device)[self.upsampling.used], start.network.to(device)])
-        self.flat_mean, self.flat_square, self.gradient = (torch.zeros_like(self.flat) for _ in range(3))
+        self.flat = torch.cat(
+            [start.coarse.to(device)[self.upsampling.used], start.network.to(device)]
+        )
+        self.flat_mean, self.flat_square, self.gradient = (
+            torch.zeros_like(self.flat) for _ in range(3)
+        )
         self.layers = layer_matrices(architecture, self.flat[self.coarse :])
         self.layer_gradients = layer_matrices(architecture, self.gradient[self.coarse :])
 
@@ -72,7 +87,9 @@ class SlabEngine:
         scale = 2.0 / max(int(np.diff(self.coreset.offsets)[chosen].sum()), 1)
         self.gradient.zero_()
         error, gradient = self._fit(inputs, target, mask, scale)
-        levels = gradient.view(-1, self.architecture.embedding_size, len(ids), *self.coreset.brick_shape)
+        levels = gradient.view(
+            -1, self.architecture.embedding_size, len(ids), *self.coreset.brick_shape
+        )
         lattices.add_transposed(self.gradient, levels[1:])
 
         rate = float(self.rates[self.step])
@@ -82,7 +99,14 @@ class SlabEngine:
         # In parts, so that what is computed on the way stays in the cache.
         for first in range(0, len(self.flat), ADAM_PART):
             held = slice(first, first + ADAM_PART)
-            adam_step(self.flat[held], self.gradient[held], self.flat_mean[held], self.flat_square[held], self.step, rate)
+            adam_step(
+                self.flat[held],
+                self.gradient[held],
+                self.flat_mean[held],
+                self.flat_square[held],
+                self.step,
+                rate,
+            )
         return error
 
     @torch.no_grad()
@@ -115,15 +139,26 @@ class SlabEngine:
         for first in range(0, len(self.fine), FLUSH):
             part = slice(first, first + FLUSH)
             self.fine[part].masked_fill_(self._mask(part).unsqueeze(1) == 0, 0.0)
-        coarse = torch.zeros(sum(prod(level) for level in self.architecture.levels[1:]) * self.architecture.embedding_size)
+        coarse = torch.zeros(
+            sum(prod(level) for level in self.architecture.levels[1:])
+            * self.architecture.embedding_size
+        )
         moved = (self.flat_mean != 0) | (self.flat_square != 0)
-        kept = torch.where(moved, self.flat, 0.0)[: self.coarse] if self.step else self.flat[: self.coarse]
+        kept = (
+            torch.where(moved, self.flat, 0.0)[: self.coarse]
+            if self.step
+            else self.flat[: self.coarse]
+        )
         coarse[self.upsampling.used.cpu()] = kept.cpu()
-        return Parameters(fine=self.fine.cpu(), coarse=coarse, network=self.flat[self.coarse :].cpu().clone())
+        return Parameters(
+            fine=self.fine.cpu(), coarse=coarse, network=self.flat[self.coarse :].cpu().clone()
+        )
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
         """Everything that the next step depends on, as arrays."""
-        return {"step": np.array(self.step)} | {name: getattr(self, name).cpu().numpy() for name in STATE}
+        return {"step": np.array(self.step)} | {
+            name: getattr(self, name).cpu().numpy() for name in STATE
+        }
 
     def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
         """Go on from `state`; raises KeyError or RuntimeError for a state of another model."""
@@ -192,7 +227,9 @@ class SlabEngine:
                 activations.append(hidden)
         return activations
 
-    def _fit(self, inputs: Tensor, target: Tensor, mask: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    def _fit(
+        self, inputs: Tensor, target: Tensor, mask: Tensor, scale: float
+    ) -> tuple[Tensor, Tensor]:
         """Sum of squared errors, and the gradient of `scale`/2 times it by the inputs; the MLP's gradients are added to theirs."""
         gradient = self._scratch("gradient", self.architecture.inputs, inputs.shape[1])
         error = torch.zeros((), dtype=torch.float64, device=self.device)
@@ -212,7 +249,9 @@ class SlabEngine:
                     down = self._scratch(f"back {number}", weight.shape[1], back.shape[1])
                     torch.mm(weight.T, back, out=down)
                     hidden = activations[number][:-1]
-                    back = torch.ops.aten.threshold_backward.grad_input(down, hidden, 0.0, grad_input=down)
+                    back = torch.ops.aten.threshold_backward.grad_input(
+                        down, hidden, 0.0, grad_input=down
+                    )
         return error, gradient
 
     def _scratch(self, name: str, rows: int, columns: int) -> Tensor:

@@ -11,7 +11,9 @@ from contextlib import contextmanager
 # microseconds, more than the pause between operations: on an idle machine the speed stays the same.
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
-VERTICES_A_THREAD = 12_000  # of a training step; with fewer, a further thread costs more than it brings
+VERTICES_A_THREAD = (
+    12_000  # of a training step; with fewer, a further thread costs more than it brings
+)
 
 
 @contextmanager

@@ -37,27 +37,46 @@ class Upsampling:
         numbers = 0
         starts, matrices, offsets, self.shapes = [], [], [], []
         for level in architecture.levels[1:]:
-            axes = [axis_matrices(s, r, n, c) for s, r, n, c in zip(architecture.sizes, level, lengths, counts, strict=True)]
+            axes = [
+                axis_matrices(s, r, n, c)
+                for s, r, n, c in zip(architecture.sizes, level, lengths, counts, strict=True)
+            ]
             stride = [prod(level[axis + 1 :]) * self.size for axis in range(4)]
             (start_t, wt), (start_z, wz), (start_y, wy), (start_x, wx) = axes
             start_tz = (start_t[:, None] * stride[0] + start_z * stride[1]).reshape(-1) + numbers
             # (key frames, coordinates z, vertices z, corners t, corners z)
             wtz = wt[:, None, :, :, None] * wz[None, :, :, None, :]
             starts.append([start_tz, start_y * stride[2], start_x * stride[3]])
-            matrices.append([wtz.reshape(len(start_tz), -1), wy.reshape(len(wy), -1), wx.reshape(len(wx), -1)])
-            self.shapes.append([(wz.shape[1], wt.shape[2] * wz.shape[2]), wy.shape[1:], wx.shape[1:]])
+            matrices.append(
+                [wtz.reshape(len(start_tz), -1), wy.reshape(len(wy), -1), wx.reshape(len(wx), -1)]
+            )
+            self.shapes.append(
+                [(wz.shape[1], wt.shape[2] * wz.shape[2]), wy.shape[1:], wx.shape[1:]]
+            )
             corners = [np.arange(w.shape[2]) * s for (_, w), s in zip(axes, stride, strict=True)]
-            t, z, x, y, e = np.ix_(corners[0], corners[1], corners[3], corners[2], np.arange(self.size))
+            t, z, x, y, e = np.ix_(
+                corners[0], corners[1], corners[3], corners[2], np.arange(self.size)
+            )
             offsets.append((t + z + x + y + e).reshape(-1))
             numbers += prod(level) * self.size
-        join = [np.concatenate(parts, axis=1) if parts else np.zeros((1, 0)) for parts in zip(*matrices, strict=True)]
-        self.starts = [torch.from_numpy(np.stack(parts, axis=1)).to(device) for parts in zip(*starts, strict=True)]
+        join = [
+            np.concatenate(parts, axis=1) if parts else np.zeros((1, 0))
+            for parts in zip(*matrices, strict=True)
+        ]
+        self.starts = [
+            torch.from_numpy(np.stack(parts, axis=1)).to(device)
+            for parts in zip(*starts, strict=True)
+        ]
         self.matrices = [torch.from_numpy(part.astype(np.float32)).to(device) for part in join]
         self.counts = [len(offset) for offset in offsets]
-        self.offset = torch.from_numpy(np.concatenate([*offsets, np.zeros(0, dtype=np.int64)])).to(device)
+        self.offset = torch.from_numpy(np.concatenate([*offsets, np.zeros(0, dtype=np.int64)])).to(
+            device
+        )
         self.level = torch.from_numpy(np.repeat(np.arange(len(offsets)), self.counts)).to(device)
         reached = torch.zeros(numbers, dtype=torch.bool, device=device)
-        for part in torch.split(torch.from_numpy(coreset.bricks.astype(np.int64)).to(device), BRICKS_AT_A_TIME):
+        for part in torch.split(
+            torch.from_numpy(coreset.bricks.astype(np.int64)).to(device), BRICKS_AT_A_TIME
+        ):
             reached[self._positions(self._coordinates(part))] = True
         self.used = reached.nonzero().squeeze(1)
         self.rank = (reached.cumsum(0, dtype=torch.int32) - 1) if len(self.used) < numbers else None
@@ -70,7 +89,10 @@ class Upsampling:
         """Where the sub-lattices of bricks lie in the flat tables (bricks, numbers)."""
         if not self.shapes:
             return self.offset.expand(len(coordinates[0]), 0)
-        base = sum((start[c] for start, c in zip(self.starts, coordinates, strict=True)), torch.zeros((), dtype=torch.int64))
+        base = sum(
+            (start[c] for start, c in zip(self.starts, coordinates, strict=True)),
+            torch.zeros((), dtype=torch.int64),
+        )
         return base[:, self.level] + self.offset
 
     def lattices(self, bricks: Tensor) -> Lattices:
@@ -85,7 +107,10 @@ class Upsampling:
             torch.split(matrices[c], [prod(shape[axis]) for shape in self.shapes], dim=1)
             for axis, (matrices, c) in enumerate(zip(self.matrices, coordinates, strict=True))
         ]
-        levels = [tuple(row[n].view(-1, *shape[axis]) for axis, row in enumerate(rows)) for n, shape in enumerate(self.shapes)]
+        levels = [
+            tuple(row[n].view(-1, *shape[axis]) for axis, row in enumerate(rows))
+            for n, shape in enumerate(self.shapes)
+        ]
         return Lattices(index=index, counts=self.counts, matrices=levels, size=self.size)
 
 
@@ -109,10 +134,16 @@ class Lattices:
         for level, (numbers, (wtz, wy, wx)) in enumerate(zip(parts, self.matrices, strict=True)):
             bricks = len(wtz)
             # (bricks, x y E, t z) by (t z, Z), then (y E Z, x) by (x, X), then (Y, y) by (y, E Z X); capitals are vertices.
-            values = torch.bmm(numbers.reshape(bricks, wtz.shape[2], -1).transpose(1, 2), wtz.transpose(1, 2))
-            values = torch.bmm(values.view(bricks, wx.shape[2], -1).transpose(1, 2), wx.transpose(1, 2))
+            values = torch.bmm(
+                numbers.reshape(bricks, wtz.shape[2], -1).transpose(1, 2), wtz.transpose(1, 2)
+            )
+            values = torch.bmm(
+                values.view(bricks, wx.shape[2], -1).transpose(1, 2), wx.transpose(1, 2)
+            )
             values = torch.bmm(wy, values.view(bricks, wy.shape[2], -1))
-            out[level].copy_(values.view(bricks, wy.shape[1], self.size, wtz.shape[1], -1).permute(2, 0, 3, 1, 4))
+            out[level].copy_(
+                values.view(bricks, wy.shape[1], self.size, wtz.shape[1], -1).permute(2, 0, 3, 1, 4)
+            )
 
     def add_transposed(self, flat: Tensor, gradient: Tensor) -> None:
         """Add to the flat tables' gradient what gradients (levels, E, bricks, z, y, x) of the embeddings give."""
@@ -121,13 +152,17 @@ class Lattices:
             bricks = len(wtz)
             values = gradient[level].permute(1, 3, 0, 2, 4).reshape(bricks, wy.shape[1], -1)
             values = torch.bmm(wy.transpose(1, 2), values).view(bricks, -1, wx.shape[1])
-            values = torch.bmm(wx.transpose(1, 2), values.transpose(1, 2)).view(bricks, -1, wtz.shape[1])
+            values = torch.bmm(wx.transpose(1, 2), values.transpose(1, 2)).view(
+                bricks, -1, wtz.shape[1]
+            )
             parts.append(torch.bmm(wtz.transpose(1, 2), values.transpose(1, 2)).view(bricks, -1))
         if parts:
             flat.index_add_(0, self.index.reshape(-1), torch.cat(parts, dim=1).view(-1))
 
 
-def axis_matrices(size: int, corners: int, length: int, count: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+def axis_matrices(
+    size: int, corners: int, length: int, count: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
     """First corner (count,) and weights (count, length, corners of a sub-lattice) for `count` runs of `length` vertices of an axis.
 
     The axis has `size` vertices and `corners` corners, aligned (tesseract.locate); vertices past its end repeat the last one.

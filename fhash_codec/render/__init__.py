@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 class _Package(ModuleType):
     """A package that is called as a function, which its name is better known as."""
 
-    def __call__(self, volume: Volume, scene: Scene | None = None, *, progress: Progress | None = None) -> Image:
+    def __call__(
+        self, volume: Volume, scene: Scene | None = None, *, progress: Progress | None = None
+    ) -> Image:
         """A picture of a volume, as `fhash_codec.render.render.render` makes it."""
         from fhash_codec.progress import silent
         from fhash_codec.render.render import render

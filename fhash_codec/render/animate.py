@@ -79,15 +79,23 @@ def animate(
     output = Path(output)
     suffix = output.suffix.lower()
     if suffix not in (".png", *FILMS):
-        raise InputError(f"{output}: an animation is written as .png (numbered), {' or '.join(FILMS)}; use such a name")
+        raise InputError(
+            f"{output}: an animation is written as .png (numbered), {' or '.join(FILMS)}; use such a name"
+        )
     if pictures is not None and (suffix == ".png" or Path(pictures).suffix.lower() != ".png"):
-        raise InputError(f"{pictures}: pictures beside a film are written as .png; use such a name, and .mp4 or .gif for the film")
+        raise InputError(
+            f"{pictures}: pictures beside a film are written as .png; use such a name, and .mp4 or .gif for the film"
+        )
     begun = time.perf_counter()
     scenes = animation.scenes(scene, volume)
     base = output if suffix == ".png" else None if pictures is None else Path(pictures)
     paths = [] if base is None else numbered(base, len(scenes))
     clear(paths)  # also beside the pictures that are kept, which no one writes anew
-    kept = [_kept(path, each, volume) for path, each in zip(paths, scenes, strict=bool(paths))] if paths else []
+    kept = (
+        [_kept(path, each, volume) for path, each in zip(paths, scenes, strict=bool(paths))]
+        if paths
+        else []
+    )
     if suffix != ".png":
         check_output(output, force, sources=[volume.path])
         check_film(suffix)
@@ -111,7 +119,12 @@ def animate(
                 following = number + 1 < len(scenes) and not (kept and kept[number + 1])
                 image = draw(each, upcoming=scenes[number + 1] if following else None)
                 counters.update(image.counters)
-                image = dataclasses.replace(image, scene=each.to_dict(), source=str(volume.path), digest=volume.container.digest)
+                image = dataclasses.replace(
+                    image,
+                    scene=each.to_dict(),
+                    source=str(volume.path),
+                    digest=volume.container.digest,
+                )
                 if paths:
                     image.save(paths[number], force=force)
                 yield image.to_uint8("#ffffff" if image.background == "transparent" else None)
@@ -137,7 +150,9 @@ def animate(
 def numbered(path: Path, count: int) -> list[Path]:
     """NAME.0000.png and so on for NAME.png, with as many digits as the last needs and no fewer than 4."""
     digits = max(4, len(str(count - 1)))
-    return [path.with_name(f"{path.stem}.{number:0{digits}}{path.suffix}") for number in range(count)]
+    return [
+        path.with_name(f"{path.stem}.{number:0{digits}}{path.suffix}") for number in range(count)
+    ]
 
 
 def _kept(path: Path, scene: Scene, volume: Volume) -> bool:
@@ -147,7 +162,9 @@ def _kept(path: Path, scene: Scene, volume: Volume) -> bool:
             file.seek(-len(END), 2)
             if file.read() != END:
                 return False
-        if not all(path.with_name(f"{path.stem}.{name}.npy").is_file() for name in scene.effects.buffers):
+        if not all(
+            path.with_name(f"{path.stem}.{name}.npy").is_file() for name in scene.effects.buffers
+        ):
             return False
         return digest_in_png(path) == volume.container.digest and scene_in_png(path) == scene
     except (OSError, InputError):
@@ -160,9 +177,16 @@ def _warn_of_others(paths: list[Path]) -> None:
         return
     stem = paths[0].stem.rpartition(".")[0]
     form = re.compile(re.escape(stem) + r"\.\d{4,}" + re.escape(paths[0].suffix))
-    others = sorted({path.name for path in paths[0].parent.iterdir() if form.fullmatch(path.name)} - {path.name for path in paths})
+    others = sorted(
+        {path.name for path in paths[0].parent.iterdir() if form.fullmatch(path.name)}
+        - {path.name for path in paths}
+    )
     if others:
-        warnings.warn(f"{others[0]} and {len(others) - 1} more are of another animation of this name", FhashWarning, stacklevel=3)
+        warnings.warn(
+            f"{others[0]} and {len(others) - 1} more are of another animation of this name",
+            FhashWarning,
+            stacklevel=3,
+        )
 
 
 def _pixels(path: Path) -> Pixels:

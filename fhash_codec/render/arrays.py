@@ -79,7 +79,11 @@ class Arrays:
         """Add values (m, k) to rows (m,) of an array (n, k), one after the other where a row is named more than once."""
         width = array.shape[1]
         # Along one axis numpy is some times faster.
-        np.add.at(array.reshape(-1), (rows[:, None] * width + np.arange(width)).reshape(-1), values.reshape(-1))
+        np.add.at(
+            array.reshape(-1),
+            (rows[:, None] * width + np.arange(width)).reshape(-1),
+            values.reshape(-1),
+        )
 
     @contextmanager
     def guarded(self) -> Iterator[None]:

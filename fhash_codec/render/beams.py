@@ -53,10 +53,20 @@ class Beams:
         number = rows.start * width * fine + arrays.range(len(rows) * width * fine)
         pixel, part = number // fine, number % fine
         u = 2 * (arrays.real(pixel % width) + (arrays.real(part % side) + 0.5) / side) / width - 1
-        w = 1 - 2 * (arrays.real(pixel // width) + (arrays.real(part // side) + 0.5) / side) / height
-        right, up, forward, eye, spacing = (arrays.array(part) for part in (rays.right, rays.up, rays.forward, rays.eye, rays.grid.spacing))
+        w = (
+            1
+            - 2 * (arrays.real(pixel // width) + (arrays.real(part // side) + 0.5) / side) / height
+        )
+        right, up, forward, eye, spacing = (
+            arrays.array(part)
+            for part in (rays.right, rays.up, rays.forward, rays.eye, rays.grid.spacing)
+        )
         across = u[:, None] * right + w[:, None] * up
-        eye, direction = (eye + across, forward + 0 * across) if rays.parallel else (eye + 0 * across, forward + across)
+        eye, direction = (
+            (eye + across, forward + 0 * across)
+            if rays.parallel
+            else (eye + 0 * across, forward + across)
+        )
         direction = direction / xp.sqrt(xp.sum((direction * spacing) ** 2, axis=1))[:, None]
         bounds = arrays.array(rays.grid.bounds)
         enter, leave = slab(eye, direction, bounds, arrays)
@@ -92,7 +102,9 @@ class Beams:
         """Places (n, ..., 3) at samples (n, ...) of rays (n,), within what the field has values of."""
         extra = (1,) * (at.ndim - 1)
         origin, pace = (part[rays].reshape(-1, *extra, 3) for part in (self.origin, self.pace))
-        return self.arrays.xp.clip(origin + at[..., None] * pace, self.bounds[:, 0], self.bounds[:, 1])
+        return self.arrays.xp.clip(
+            origin + at[..., None] * pace, self.bounds[:, 0], self.bounds[:, 1]
+        )
 
     def borders(self, rays: Array, at: Array) -> Array:
         """The same for where rays enter or leave: what rounding keeps off a face lies on it.

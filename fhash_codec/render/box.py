@@ -38,7 +38,11 @@ class Edge:
 def edges(rays: Rays) -> list[Edge]:
     """Those of the twelve edges that reach before the camera."""
     bounds = rays.grid.bounds
-    toward = np.array([[1.0], [-1.0]]) * rays.forward if rays.parallel else np.stack([bounds[:, 0] - rays.eye, rays.eye - bounds[:, 1]])
+    toward = (
+        np.array([[1.0], [-1.0]]) * rays.forward
+        if rays.parallel
+        else np.stack([bounds[:, 0] - rays.eye, rays.eye - bounds[:, 1]])
+    )
     looking = toward > 0  # (low or high face, axis)
     found = []
     for axis in range(3):
@@ -50,7 +54,9 @@ def edges(rays: Rays) -> list[Edge]:
                 ends[:, other] = bounds[other, side]
             clipped = _clipped(rays, ends)
             if clipped is not None:
-                fronts = sum(bool(looking[side, other]) for other, side in zip(others, sides, strict=True))
+                fronts = sum(
+                    bool(looking[side, other]) for other, side in zip(others, sides, strict=True)
+                )
                 pixels, _ = rays.project(clipped)
                 found.append(Edge(axis=axis, ends=pixels, fronts=fronts, whole=clipped is ends))
     return found
@@ -79,7 +85,17 @@ def outer_edges(rays: Rays) -> list[Edge]:
     """
     found = []
     for axis in range(3):
-        outline = [edge for edge in edges(rays) if edge.axis == axis and edge.fronts == 1 and edge.whole]
+        outline = [
+            edge for edge in edges(rays) if edge.axis == axis and edge.fronts == 1 and edge.whole
+        ]
         if outline:
-            found.append(max(outline, key=lambda edge: (round(float(edge.ends[:, 1].max()), 3), -float(edge.ends[:, 0].min()))))
+            found.append(
+                max(
+                    outline,
+                    key=lambda edge: (
+                        round(float(edge.ends[:, 1].max()), 3),
+                        -float(edge.ends[:, 0].min()),
+                    ),
+                )
+            )
     return found

@@ -78,7 +78,9 @@ class Bricks:
             return distance
         library = native.library()
         if library is not None:
-            library.fhash_march_distance((ctypes.c_int64 * 3)(*distance.shape), ctypes.c_void_p(distance.ctypes.data))
+            library.fhash_march_distance(
+                (ctypes.c_int64 * 3)(*distance.shape), ctypes.c_void_p(distance.ctypes.data)
+            )
             return distance
         near = matters
         for step in range(1, min(max(distance.shape), FARTHEST)):

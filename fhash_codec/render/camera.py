@@ -78,15 +78,30 @@ class Grid:
                 wrong = "are no positions along a line; vertices are drawn one unit apart"
             else:
                 spacing[number] = extent / (len(values) - 1)
-                if np.max(np.abs(values - np.linspace(values[0], values[-1], len(values)))) <= TOLERANCE * abs(extent):
+                if np.max(
+                    np.abs(values - np.linspace(values[0], values[-1], len(values)))
+                ) <= TOLERANCE * abs(extent):
                     continue
                 wrong = "are not evenly spaced; they are drawn as if they were"
-            warnings.warn(f"the coordinates {coords['xyz'[number]].name!r} of {'xyz'[number]} {wrong}", FhashWarning, stacklevel=2)
+            warnings.warn(
+                f"the coordinates {coords['xyz'[number]].name!r} of {'xyz'[number]} {wrong}",
+                FhashWarning,
+                stacklevel=2,
+            )
         flat = np.isnan(spacing)
-        factors = _proportions([coords[axis] for axis in "xyz"], np.abs(spacing)) if scale is None else np.array(scale, dtype=np.float64)
-        spacing[flat] = np.mean(np.abs(spacing * factors)[~flat]) / factors[flat] if not flat.all() else 1.0
+        factors = (
+            _proportions([coords[axis] for axis in "xyz"], np.abs(spacing))
+            if scale is None
+            else np.array(scale, dtype=np.float64)
+        )
+        spacing[flat] = (
+            np.mean(np.abs(spacing * factors)[~flat]) / factors[flat] if not flat.all() else 1.0
+        )
         spacing *= factors
-        longest, shortest = float(np.max(np.abs(spacing) * [len(values) for values in axes])), float(np.min(np.abs(spacing)))
+        longest, shortest = (
+            float(np.max(np.abs(spacing) * [len(values) for values in axes])),
+            float(np.min(np.abs(spacing))),
+        )
         if longest > FARTHEST * shortest:
             raise InputError(
                 f"the longest axis of the volume is {longest:.3g}, and vertices of the shortest are {shortest:.3g} apart: no ray can be "
@@ -107,7 +122,9 @@ class Grid:
     @property
     def bounds(self) -> Floats:
         """The box that is drawn in index space: float64 (3, 2), x, y, z."""
-        return np.array([[-0.5, 0.5] if count == 1 else [0.0, count - 1.0] for count in self.counts])
+        return np.array(
+            [[-0.5, 0.5] if count == 1 else [0.0, count - 1.0] for count in self.counts]
+        )
 
     @property
     def corners(self) -> Floats:
@@ -152,7 +169,9 @@ class Rays:
             distance = float(np.linalg.norm(away))
             # Below what float64 tells apart at these coordinates there is no direction either.
             if distance <= 1e-12 * max(radius, float(np.max(np.abs(focal)))):
-                raise InputError(f"camera: position and focal_point are the same, {_text(focal)}; move one of them")
+                raise InputError(
+                    f"camera: position and focal_point are the same, {_text(focal)}; move one of them"
+                )
         away = away / np.linalg.norm(away)
         turn, right = _upright(away, upward)
         away, right = (_turned(part, turn, camera.azimuth) for part in (away, right))
@@ -160,11 +179,19 @@ class Rays:
         away = _turned(away, -right, camera.elevation)
         up = np.cross(away, right)
         if camera.projection == "parallel":
-            half = camera.parallel_scale if camera.parallel_scale is not None else radius / min(aspect, 1.0)
+            half = (
+                camera.parallel_scale
+                if camera.parallel_scale is not None
+                else radius / min(aspect, 1.0)
+            )
         half /= camera.zoom
         spacing = grid.spacing
         # From the first vertex: where coordinates are large beside the volume, a sum with them would lose the eye's place.
-        begin = grid.bounds.mean(axis=1) * spacing if camera.focal_point is None else focal - grid.origin
+        begin = (
+            grid.bounds.mean(axis=1) * spacing
+            if camera.focal_point is None
+            else focal - grid.origin
+        )
         return cls(
             eye=(begin + away * distance) / spacing,
             right=right * half * aspect / spacing,
@@ -177,7 +204,10 @@ class Rays:
 
     def rays(self, u: npt.ArrayLike, w: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Origins and directions (..., 3) in index space of places in the picture, -1..1 to the right and upwards."""
-        across = np.asarray(u, dtype=np.float64)[..., None] * self.right + np.asarray(w, dtype=np.float64)[..., None] * self.up
+        across = (
+            np.asarray(u, dtype=np.float64)[..., None] * self.right
+            + np.asarray(w, dtype=np.float64)[..., None] * self.up
+        )
         if self.parallel:
             return self.eye + across, np.broadcast_to(self.forward, across.shape)
         return np.broadcast_to(self.eye, across.shape), self.forward + across
@@ -214,7 +244,15 @@ def _proportions(coords: Sequence[Coordinate], spacing: Floats) -> Floats:
     if len(set(known)) < 2 or "" in known:
         return factors
     usual = max(known, key=known.count)
-    across = float(np.mean([length for each, length in zip(units, spacing, strict=True) if each == usual and np.isfinite(length)]))
+    across = float(
+        np.mean(
+            [
+                length
+                for each, length in zip(units, spacing, strict=True)
+                if each == usual and np.isfinite(length)
+            ]
+        )
+    )
     for axis, (each, length) in enumerate(zip(units, spacing, strict=True)):
         if each != usual and np.isfinite(length):
             factors[axis] = across / length
@@ -223,14 +261,18 @@ def _proportions(coords: Sequence[Coordinate], spacing: Floats) -> Floats:
 
 def _upright(away: Floats, upward: Floats) -> tuple[Floats, Floats]:
     """Unit vectors: the upward direction as given, and the one to the right in the picture."""
-    unit = upward / max(float(np.abs(upward).max()), 1.0)  # first, since the squares of the largest numbers go beyond float64
+    unit = upward / max(
+        float(np.abs(upward).max()), 1.0
+    )  # first, since the squares of the largest numbers go beyond float64
     length = float(np.linalg.norm(unit))
     if not length > 0 or not np.isfinite(length):
         raise InputError("camera: view_up has no length; give a direction such as 0, 0, 1")
     unit = unit / length
     right = np.cross(unit, away)
     if np.linalg.norm(right) < PARALLEL:
-        raise InputError(f"camera: view_up {_text(upward)} is parallel to the direction of view; give another")
+        raise InputError(
+            f"camera: view_up {_text(upward)} is parallel to the direction of view; give another"
+        )
     return unit, right / np.linalg.norm(right)
 
 
@@ -238,7 +280,10 @@ def _turned(vector: Floats, axis: Floats, degrees: float) -> Floats:
     """A vector turned about a unit axis, by Rodrigues' formula."""
     angle = np.radians(degrees)
     return np.asarray(
-        vector * np.cos(angle) + np.cross(axis, vector) * np.sin(angle) + axis * (axis @ vector) * (1 - np.cos(angle)), dtype=np.float64
+        vector * np.cos(angle)
+        + np.cross(axis, vector) * np.sin(angle)
+        + axis * (axis @ vector) * (1 - np.cos(angle)),
+        dtype=np.float64,
     )
 
 

@@ -36,7 +36,13 @@ class Canvas:
     """
 
     def __init__(self, field: Field, task: Task, beams: Beams, palette: Palette | None) -> None:
-        self.field, self.task, self.beams, self.palette, self.arrays = field, task, beams, palette, field.arrays
+        self.field, self.task, self.beams, self.palette, self.arrays = (
+            field,
+            task,
+            beams,
+            palette,
+            field.arrays,
+        )
         count = len(beams.end)
         self.colour, self.clear = self.arrays.full((count, 3), 0.0), self.arrays.full(count, 1.0)
         self.depth, self.normal = self.arrays.full(count, np.inf), self.arrays.full((count, 3), 0.0)
@@ -51,11 +57,15 @@ class Canvas:
         arrays, xp = self.arrays, self.arrays.xp
         each = len(self._surfaces) + 1
         # Light behind each event; the first column is what was left before.
-        left = xp.cumprod(xp.concatenate([self.clear[alive][:, None], 1 - events.opacity], axis=1), axis=1)
+        left = xp.cumprod(
+            xp.concatenate([self.clear[alive][:, None], 1 - events.opacity], axis=1), axis=1
+        )
         # A ray ends after a sample, never between a surface and the sample behind it.
         ended = left[:, :-1:each] < self.task.threshold
         ended[:, 0] = False
-        ended = xp.broadcast_to(ended[..., None], (*ended.shape, each)).reshape(events.opacity.shape)
+        ended = xp.broadcast_to(ended[..., None], (*ended.shape, each)).reshape(
+            events.opacity.shape
+        )
         weight = xp.where(ended, 0.0, left[:, :-1] * events.opacity)
         after = xp.where(ended, np.inf, left[:, 1:])
         self.clear[alive] = xp.amin(after, axis=1)
@@ -63,7 +73,11 @@ class Canvas:
         if not len(row):
             return
         # One event of a ray after the other, as in any other number of passes.
-        arrays.add_rows(self.colour, alive[row], self._colours(alive[row], events, row, column) * weight[row, column][:, None])
+        arrays.add_rows(
+            self.colour,
+            alive[row],
+            self._colours(alive[row], events, row, column) * weight[row, column][:, None],
+        )
         if self.task.depth or self.task.normal:
             behind = after < 0.5
             new = xp.isinf(self.depth[alive]) & xp.any(behind, axis=1)
@@ -79,7 +93,9 @@ class Canvas:
         self.gradients += len(rays)
         slopes = self.field.slopes(self.beams.places(rays, at)) / self._spacing
         # Towards the eye, of unit length.
-        slopes = xp.where(xp.sum(slopes * self.beams.along[rays], axis=1)[:, None] > 0, -slopes, slopes)
+        slopes = xp.where(
+            xp.sum(slopes * self.beams.along[rays], axis=1)[:, None] > 0, -slopes, slopes
+        )
         length = xp.sqrt(xp.sum(slopes * slopes, axis=1))[:, None]
         self.normal[rays] = slopes / xp.where(length > 0, length, 1.0)
 
@@ -101,18 +117,28 @@ class Canvas:
         colours = arrays.full((len(rays), 3), 0.0)
         of_volume = which == surfaces
         if self.palette is not None:
-            colours[of_volume] = self.palette.colour(events.values[row[of_volume], column[of_volume] // (surfaces + 1)])
+            colours[of_volume] = self.palette.colour(
+                events.values[row[of_volume], column[of_volume] // (surfaces + 1)]
+            )
         for number, colour in enumerate(self._surfaces):
             colours[which == number] = colour
         (lit,) = arrays.nonzero(of_volume | ~of_volume if task.shaded else ~of_volume)
         if self._light is None and not len(lit):
             return colours
         places = self.beams.places(rays, events.at[row, column])
-        lamp, around = (arrays.full(len(rays), 1.0),) * 2 if self._light is None else self._light(places)
+        lamp, around = (
+            (arrays.full(len(rays), 1.0),) * 2 if self._light is None else self._light(places)
+        )
         result = colours * (lamp * around)[:, None]
         if len(lit):
             assert self._phong is not None
             self.gradients += len(lit)
-            slopes = central_slopes(self.field, places[lit]) if self._phong.lighting.central else self.field.slopes(places[lit])
-            result[lit] = self._phong(colours[lit], slopes, self.beams.along[rays[lit]], lamp[lit], around[lit])
+            slopes = (
+                central_slopes(self.field, places[lit])
+                if self._phong.lighting.central
+                else self.field.slopes(places[lit])
+            )
+            result[lit] = self._phong(
+                colours[lit], slopes, self.beams.along[rays[lit]], lamp[lit], around[lit]
+            )
         return result

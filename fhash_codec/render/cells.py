@@ -33,9 +33,16 @@ def limits_of(bricks: Bricks, task: Task) -> Single:
         table = task.table
         last = len(table.extinctions) - 1
         entries = np.linspace(table.low, table.high, last + 1)
-        steps = np.flatnonzero(np.diff(np.concatenate([[0], table.extinctions > 0, [0]]).astype(np.int8)))
+        steps = np.flatnonzero(
+            np.diff(np.concatenate([[0], table.extinctions > 0, [0]]).astype(np.int8))
+        )
         for first, stop in steps.reshape(-1, 2):
-            found.append((entries[first - 1] if first else -np.inf, entries[stop] if stop <= last else np.inf))
+            found.append(
+                (
+                    entries[first - 1] if first else -np.inf,
+                    entries[stop] if stop <= last else np.inf,
+                )
+            )
     slack = ROUNDING * max(abs(limit) for limit in bricks.value_range)
     found += [(surface.value - slack, surface.value + slack) for surface in task.surfaces]
     joined: list[tuple[float, float]] = []
@@ -47,12 +54,18 @@ def limits_of(bricks: Bricks, task: Task) -> Single:
     with np.errstate(over="ignore"):  # a surface beyond float32 lies at infinity, where no value is
         near = limits.astype(np.float32)
         # Outwards where float32 does not have them.
-        below = np.where(near[:, 0] > limits[:, 0], np.nextafter(near[:, 0], np.float32(-np.inf)), near[:, 0])
-        above = np.where(near[:, 1] < limits[:, 1], np.nextafter(near[:, 1], np.float32(np.inf)), near[:, 1])
+        below = np.where(
+            near[:, 0] > limits[:, 0], np.nextafter(near[:, 0], np.float32(-np.inf)), near[:, 0]
+        )
+        above = np.where(
+            near[:, 1] < limits[:, 1], np.nextafter(near[:, 1], np.float32(np.inf)), near[:, 1]
+        )
     return np.stack([below, above], axis=-1)
 
 
-def cells_of(library: ctypes.CDLL, bricks: Bricks, task: Task, distance: npt.NDArray[np.int32]) -> npt.NDArray[np.uint32] | None:
+def cells_of(
+    library: ctypes.CDLL, bricks: Bricks, task: Task, distance: npt.NDArray[np.int32]
+) -> npt.NDArray[np.uint32] | None:
     """A bit for each of the cells of each brick: uint32 (z, y, x, 2), low half first; None where in most of them something can be seen.
 
     distance: of the bricks, as `Bricks.distance` has it: those of 0 are looked into.
@@ -62,7 +75,10 @@ def cells_of(library: ctypes.CDLL, bricks: Bricks, task: Task, distance: npt.NDA
     if len(limits) > MOST_LIMITS or not len(numbers):
         return None
     cells = np.zeros((*distance.shape, 2), dtype=np.uint32)
-    shape, counts = (ctypes.c_int64 * 3)(*bricks.values.shape), (ctypes.c_int64 * 3)(*distance.shape)
+    shape, counts = (
+        (ctypes.c_int64 * 3)(*bricks.values.shape),
+        (ctypes.c_int64 * 3)(*distance.shape),
+    )
 
     def look(chosen: Numbers, first: int, stop: int) -> int:
         return int(

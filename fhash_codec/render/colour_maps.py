@@ -44,14 +44,18 @@ _ANCHORS = {
         "cb3e38 c0282f b40426"
     ),
     "grey": "000000 ffffff",
-    "rainbow": ("8000ff 6032fe 4062fa 208ef4 00b4ec 20d4e1 40ecd4 60fac5 80ffb4 9ffaa2 bfec8e dfd478 ffb462 ff8e4a ff6232 ff3219 ff0000"),
+    "rainbow": (
+        "8000ff 6032fe 4062fa 208ef4 00b4ec 20d4e1 40ecd4 60fac5 80ffb4 9ffaa2 bfec8e dfd478 ffb462 ff8e4a ff6232 ff3219 ff0000"
+    ),
     "hot": (
         "0b0000 200000 340000 490000 5e0000 730000 880000 9d0000 b20000 c70000 dc0000 f10000 ff0700 ff1c00 ff3000 "
         "ff4500 ff5a00 ff6f00 ff8400 ff9900 ffae00 ffc300 ffd800 ffed00 ffff04 ffff23 ffff43 ffff62 ffff81 ffffa1 "
         "ffffc0 ffffe0 ffffff"
     ),
     "bone": "000000 1c1c27 38384e 545574 707b8f 8ba1ab a8c7c7 d3e3e3 ffffff",
-    "copper": ("000000 140c08 271910 3b2518 4f3220 623e28 764b30 8a5738 9d643f b17047 c57d4f d98957 ec955f ffa267 ffae6f ffbb77 ffc77f"),
+    "copper": (
+        "000000 140c08 271910 3b2518 4f3220 623e28 764b30 8a5738 9d643f b17047 c57d4f d98957 ec955f ffa267 ffae6f ffbb77 ffc77f"
+    ),
     "blues": "f7fbff deebf7 c6dbef 9ecae1 6baed6 4292c6 2171b5 08519c 08306b",
     "greens": "f7fcf5 e5f5e0 c7e9c0 a1d99b 74c476 41ab5d 238b45 006d2c 00441b",
     "reds": "fff5f0 fee0d2 fcbba1 fc9272 fb6a4a ef3b2c cb181d a50f15 67000d",

@@ -15,7 +15,9 @@ Floats = npt.NDArray[np.float64]
 WHITE = (0.9505, 1.0, 1.089)
 """D65 as VTK rounds it."""
 TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-FROM_XYZ = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
+FROM_XYZ = np.array(
+    [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+)
 
 
 def rgb_to_hsv(rgb: Floats) -> Floats:
@@ -29,7 +31,10 @@ def rgb_to_hsv(rgb: Floats) -> Floats:
         ((green - blue) / safe) % 6,
         np.where(value == green, 2 + (blue - red) / safe, 4 + (red - green) / safe),
     )
-    return np.stack([np.where(spread > 0, hue / 6, 0.0), spread / np.where(value > 0, value, 1.0), value], axis=-1)
+    return np.stack(
+        [np.where(spread > 0, hue / 6, 0.0), spread / np.where(value > 0, value, 1.0), value],
+        axis=-1,
+    )
 
 
 def hsv_to_rgb(hsv: Floats) -> Floats:
@@ -55,8 +60,12 @@ def lab_to_rgb(lab: Floats) -> Floats:
     part = np.stack([y + a / 500, y, y - b / 200], axis=-1)
     part = np.where(part**3 > 0.008856, part**3, (part - 16 / 116) / 7.787) * WHITE
     light = part @ FROM_XYZ.T
-    rgb = np.where(light > 0.0031308, 1.055 * np.maximum(light, 0.0) ** (1 / 2.4) - 0.055, 12.92 * light)
-    return np.asarray(np.maximum(rgb / np.maximum(rgb.max(axis=-1, keepdims=True), 1.0), 0.0), dtype=np.float64)
+    rgb = np.where(
+        light > 0.0031308, 1.055 * np.maximum(light, 0.0) ** (1 / 2.4) - 0.055, 12.92 * light
+    )
+    return np.asarray(
+        np.maximum(rgb / np.maximum(rgb.max(axis=-1, keepdims=True), 1.0), 0.0), dtype=np.float64
+    )
 
 
 def mix_diverging(first: Floats, second: Floats, share: Floats) -> Floats:
@@ -69,7 +78,10 @@ def mix_diverging(first: Floats, second: Floats, share: Floats) -> Floats:
     turn = np.abs(one[..., 2] - two[..., 2])
     turn = np.where(turn > np.pi, 2 * np.pi - turn, turn)
     apart = (one[..., 1] > 0.05) & (two[..., 1] > 0.05) & (turn > 0.33 * np.pi)
-    white = np.stack([np.maximum(np.maximum(one[..., 0], two[..., 0]), 88.0), *[np.zeros_like(share)] * 2], axis=-1)
+    white = np.stack(
+        [np.maximum(np.maximum(one[..., 0], two[..., 0]), 88.0), *[np.zeros_like(share)] * 2],
+        axis=-1,
+    )
     lower = share < 0.5
     two = np.where((apart & lower)[..., None], white, two)
     one = np.where((apart & ~lower)[..., None], white, one)
@@ -82,12 +94,16 @@ def mix_diverging(first: Floats, second: Floats, share: Floats) -> Floats:
     )
     mixed = one + share[..., None] * (two - one)
     m, s, h = np.moveaxis(mixed, -1, 0)
-    return lab_to_rgb(np.stack([m * np.cos(s), m * np.sin(s) * np.cos(h), m * np.sin(s) * np.sin(h)], axis=-1))
+    return lab_to_rgb(
+        np.stack([m * np.cos(s), m * np.sin(s) * np.cos(h), m * np.sin(s) * np.sin(h)], axis=-1)
+    )
 
 
 def _lab_to_msh(lab: Floats) -> Floats:
     m = np.sqrt((lab**2).sum(axis=-1))
-    s = np.where(m > 0.001, np.arccos(np.clip(lab[..., 0] / np.where(m > 0.001, m, 1.0), -1.0, 1.0)), 0.0)
+    s = np.where(
+        m > 0.001, np.arccos(np.clip(lab[..., 0] / np.where(m > 0.001, m, 1.0), -1.0, 1.0)), 0.0
+    )
     h = np.where(s > 0.001, np.arctan2(lab[..., 2], lab[..., 1]), 0.0)
     return np.stack([m, s, h], axis=-1)
 
@@ -96,4 +112,7 @@ def _hue(msh: Floats, unsaturated: Floats) -> Floats:
     """The hue that a colour without saturation takes, so that the way to the saturated colour `msh` is even."""
     m, s, h = np.moveaxis(msh, -1, 0)
     spin = s * np.sqrt(np.maximum(unsaturated**2 - m**2, 0.0)) / np.maximum(m * np.sin(s), 1e-30)
-    return np.asarray(np.where(m >= unsaturated - 0.1, h, np.where(h > -0.3 * np.pi, h + spin, h - spin)), dtype=np.float64)
+    return np.asarray(
+        np.where(m >= unsaturated - 0.1, h, np.where(h > -0.3 * np.pi, h + spin, h - spin)),
+        dtype=np.float64,
+    )

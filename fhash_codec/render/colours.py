@@ -14,7 +14,13 @@ import numpy.typing as npt
 from PIL import ImageColor
 
 from fhash_codec.render.colour_maps import COLOUR_MAPS
-from fhash_codec.render.colour_spaces import hsv_to_rgb, lab_to_rgb, mix_diverging, rgb_to_hsv, rgb_to_lab
+from fhash_codec.render.colour_spaces import (
+    hsv_to_rgb,
+    lab_to_rgb,
+    mix_diverging,
+    rgb_to_hsv,
+    rgb_to_lab,
+)
 from fhash_formats.errors import InputError
 
 __all__ = ["SPACES", "ColourMap", "is_map", "named_map", "parse_colour"]
@@ -39,11 +45,17 @@ class ColourMap:
     def __call__(self, values: npt.ArrayLike) -> Floats:
         """Colours (..., 3), 0..1, of values of any shape; beyond the ends those of the ends, `nan` where there is no value."""
         array = np.asarray(values, dtype=np.float64)
-        known = np.clip(np.where(np.isnan(array), self.positions[0], array), self.positions[0], self.positions[-1])
+        known = np.clip(
+            np.where(np.isnan(array), self.positions[0], array),
+            self.positions[0],
+            self.positions[-1],
+        )
         if len(self.positions) == 1:
             mixed = np.broadcast_to(self.points[0], (*array.shape, 3)).copy()
         else:
-            before = np.clip(np.searchsorted(self.positions, known, side="right") - 1, 0, len(self.positions) - 2)
+            before = np.clip(
+                np.searchsorted(self.positions, known, side="right") - 1, 0, len(self.positions) - 2
+            )
             # Halved, so that the width of values of the whole range of float64 does not overflow.
             width = self.positions[before + 1] / 2 - self.positions[before] / 2
             share = (known / 2 - self.positions[before] / 2) / np.where(width > 0, width, 1.0)
@@ -60,7 +72,11 @@ class ColourMap:
             hsv = rgb_to_hsv(self.points)
             first, second = hsv[before], hsv[before + 1]
             # The shorter way round the circle of hues, as vtkColorTransferFunction goes.
-            turn = np.where(first[..., 0] - second[..., 0] > 0.5, 1.0, np.where(second[..., 0] - first[..., 0] > 0.5, -1.0, 0.0))
+            turn = np.where(
+                first[..., 0] - second[..., 0] > 0.5,
+                1.0,
+                np.where(second[..., 0] - first[..., 0] > 0.5, -1.0, 0.0),
+            )
             second[..., 0] += turn
             mixed = first + share * (second - first)
             mixed[..., 0] %= 1.0
@@ -73,11 +89,18 @@ class ColourMap:
         """The same colours from the other end over the same positions."""
         positions = (self.positions[0] + self.positions[-1]) - self.positions[::-1]
         positions[0], positions[-1] = self.positions[0], self.positions[-1]
-        return ColourMap(positions=positions, points=self.points[::-1], space=self.space, nan=self.nan)
+        return ColourMap(
+            positions=positions, points=self.points[::-1], space=self.space, nan=self.nan
+        )
 
     def rescaled(self, low: float, high: float) -> ColourMap:
         """The same colours over the values `low` to `high`."""
-        return ColourMap(positions=stretched(self.positions, low, high), points=self.points, space=self.space, nan=self.nan)
+        return ColourMap(
+            positions=stretched(self.positions, low, high),
+            points=self.points,
+            space=self.space,
+            nan=self.nan,
+        )
 
 
 def stretched(positions: Floats, low: float, high: float) -> Floats:
@@ -96,8 +119,12 @@ def named_map(name: str) -> ColourMap:
     """The colour map of a name over 0..1, with `_r` behind it from the other end; InputError names the nearest for an unknown one."""
     key, turned = _key(name), name.lower().endswith("_r")
     if key not in COLOUR_MAPS:
-        near = difflib.get_close_matches(key, COLOUR_MAPS, n=1, cutoff=0.0)[0] + ("_r" if turned else "")
-        raise InputError(f"colour map '{name[:60]}' is not known; did you mean '{near}'? Known: {', '.join(COLOUR_MAPS)}, each with _r too")
+        near = difflib.get_close_matches(key, COLOUR_MAPS, n=1, cutoff=0.0)[0] + (
+            "_r" if turned else ""
+        )
+        raise InputError(
+            f"colour map '{name[:60]}' is not known; did you mean '{near}'? Known: {', '.join(COLOUR_MAPS)}, each with _r too"
+        )
     points = np.array([parse_colour(f"#{point}") for point in COLOUR_MAPS[key]])
     found = ColourMap(positions=np.linspace(0.0, 1.0, len(points)), points=points)
     return found.reversed() if turned else found
@@ -118,4 +145,7 @@ def parse_colour(text: str) -> tuple[float, float, float]:
         red, green, blue = (int(code[i : i + 2], 16) / 255 for i in (1, 3, 5))
         return red, green, blue
     near = difflib.get_close_matches(text.lower(), ImageColor.colormap, n=1, cutoff=0.5)
-    raise InputError(f"colour {text[:60]!r} is not known; write '#rrggbb' or a name" + (f"; did you mean '{near[0]}'?" if near else ""))
+    raise InputError(
+        f"colour {text[:60]!r} is not known; write '#rrggbb' or a name"
+        + (f"; did you mean '{near[0]}'?" if near else "")
+    )

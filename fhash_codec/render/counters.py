@@ -32,4 +32,7 @@ def complete(*parts: Mapping[str, int]) -> dict[str, int]:
 
 def rows(counters: Mapping[str, int]) -> list[tuple[str, str, str]]:
     """Rows (name, count, what it counts) for people."""
-    return [(name.replace("_", " "), f"{counters.get(name, 0):,}", text) for name, text in COUNTERS.items()]
+    return [
+        (name.replace("_", " "), f"{counters.get(name, 0):,}", text)
+        for name, text in COUNTERS.items()
+    ]

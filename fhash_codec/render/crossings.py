@@ -30,7 +30,11 @@ class Crossings:
 
 
 def crossings(
-    values: Callable[[Array, Array], Array], at: Array, steps: Array, surfaces: Sequence[Surface], arrays: Arrays = NUMPY
+    values: Callable[[Array, Array], Array],
+    at: Array,
+    steps: Array,
+    surfaces: Sequence[Surface],
+    arrays: Arrays = NUMPY,
 ) -> Crossings:
     """The crossings of a pass.
 
@@ -47,7 +51,9 @@ def crossings(
         if not len(row):
             continue
 
-        def beyond(part: Array, place: Array, row: Array = row, value: float = surface.value) -> Array:
+        def beyond(
+            part: Array, place: Array, row: Array = row, value: float = surface.value
+        ) -> Array:
             return values(row[part], place) - value
 
         ends = before[row, column] - surface.value, now[row, column] - surface.value
@@ -60,7 +66,14 @@ def crossings(
     return Crossings(at=xp.where(xp.isfinite(places), places, 0.0), opacity=opacity, which=which)
 
 
-def _roots(function: Callable[[Array, Array], Array], near: Array, far: Array, at_near: Array, at_far: Array, arrays: Arrays) -> Array:
+def _roots(
+    function: Callable[[Array, Array], Array],
+    near: Array,
+    far: Array,
+    at_near: Array,
+    at_far: Array,
+    arrays: Arrays,
+) -> Array:
     """Roots between places near and far, where a function of (numbers, places) has values of two signs; NaN where it has none."""
     xp = arrays.xp
     near, far, at_near, at_far = (arrays.copy(part) for part in (near, far, at_near, at_far))
@@ -69,7 +82,9 @@ def _roots(function: Callable[[Array, Array], Array], near: Array, far: Array, a
     for _ in range(MOST_TURNS):
         if not len(going):
             break
-        place = far[going] - at_far[going] * (far[going] - near[going]) / (at_far[going] - at_near[going])
+        place = far[going] - at_far[going] * (far[going] - near[going]) / (
+            at_far[going] - at_near[going]
+        )
         found = function(going, place)
         root[going] = xp.where(xp.isnan(found), np.nan, place)
         same = (found < 0) == (at_far[going] < 0)
@@ -78,6 +93,11 @@ def _roots(function: Callable[[Array, Array], Array], near: Array, far: Array, a
         at_near[going] = xp.where(same, at_near[going] / 2, at_far[going])
         near[going] = xp.where(same, near[going], far[going])
         far[going], at_far[going] = place, found
-        open_ = (moved > CLOSE) & (xp.abs(far[going] - near[going]) > CLOSE) & (found != 0) & ~xp.isnan(found)
+        open_ = (
+            (moved > CLOSE)
+            & (xp.abs(far[going] - near[going]) > CLOSE)
+            & (found != 0)
+            & ~xp.isnan(found)
+        )
         going = going[open_]
     return root

@@ -23,7 +23,9 @@ WIDE = 1.6
 """Width of the whole over its height that the number of columns aims at."""
 
 
-def evolution(volume: Volume, scene: Scene, *, progress: Progress = silent, draw: Draw | None = None) -> Image:
+def evolution(
+    volume: Volume, scene: Scene, *, progress: Progress = silent, draw: Draw | None = None
+) -> Image:
     """The steps of `scene.evolution` in one picture, row by row, each with its time; a colour bar only in the last.
 
     draw: what renders, `Renderer(volume).render` if None. Raises InputError for a scene without steps and for too large a whole.
@@ -41,7 +43,9 @@ def evolution(volume: Volume, scene: Scene, *, progress: Progress = silent, draw
     gap = max(1, round(GAP * width))
     whole = columns * (width + gap) - gap, rows * (height + gap) - gap
     if max(whole) > LARGEST_SIDE:
-        raise InputError(f"{len(steps)} pictures make {whole[0]} x {whole[1]} pixels; at most {LARGEST_SIDE}: take fewer, or smaller ones")
+        raise InputError(
+            f"{len(steps)} pictures make {whole[0]} x {whole[1]} pixels; at most {LARGEST_SIDE}: take fewer, or smaller ones"
+        )
     if draw is None:
         from fhash_codec.render.render import Renderer
 
@@ -49,7 +53,9 @@ def evolution(volume: Volume, scene: Scene, *, progress: Progress = silent, draw
     plain = dataclasses.replace(scene.effects, time_label=True, colour_bar=False, buffers=())
     last = dataclasses.replace(plain, colour_bar=scene.effects.colour_bar)
     scenes = [
-        dataclasses.replace(scene, evolution=None, step=step, effects=plain if number < len(steps) - 1 else last)
+        dataclasses.replace(
+            scene, evolution=None, step=step, effects=plain if number < len(steps) - 1 else last
+        )
         for number, step in enumerate(steps)
     ]
     rgba = np.zeros((whole[1], whole[0], 4), dtype=np.float32)

@@ -17,21 +17,39 @@ def reasons(plan: Plan, volume: Volume) -> list[tuple[str, str]]:
     task, scene, effects = plan.task, plan.scene, plan.scene.effects
     width, height = scene.size
     found = [
-        ("picture", f"{width} x {height}, {scene.camera.projection}, {task.antialiasing**2} ray(s) for each pixel"),
+        (
+            "picture",
+            f"{width} x {height}, {scene.camera.projection}, {task.antialiasing**2} ray(s) for each pixel",
+        ),
         ("proportions", _scale_text(plan)),
-        ("time", f"step {plan.step:g}" + ("" if float(plan.step).is_integer() else ", between two: both are decoded")),
+        (
+            "time",
+            f"step {plan.step:g}"
+            + ("" if float(plan.step).is_integer() else ", between two: both are decoded"),
+        ),
         ("march", _mode_text(plan, volume)),
         ("value", _value_text(plan)),
         ("gradient", _gradient_text(plan)),
         ("secondary rays", _secondary_text(plan)),
         ("level of detail", f"{plan.lod}: {plan.why_lod}"),
-        ("region", "z {}:{}, y {}:{}, x {}:{}".format(*(end for part in plan.region for end in part)) + _region_text(plan, volume)),
+        (
+            "region",
+            "z {}:{}, y {}:{}, x {}:{}".format(*(end for part in plan.region for end in part))
+            + _region_text(plan, volume),
+        ),
         ("bricks", _brick_text(plan)),
-        ("rays end", f"where less than {task.threshold:.3g} of the light is left" if task.threshold > 0 else "behind the volume"),
+        (
+            "rays end",
+            f"where less than {task.threshold:.3g} of the light is left"
+            if task.threshold > 0
+            else "behind the volume",
+        ),
         ("step", f"{task.step:.6g}, {scene.march.step:g} of the distance between vertices"),
     ]
     buffers = [name for name, on in (("depth", task.depth), ("normal", task.normal)) if on]
-    around = [name for name in ("box", "axes", "colour_bar", "time_label") if getattr(effects, name)]
+    around = [
+        name for name in ("box", "axes", "colour_bar", "time_label") if getattr(effects, name)
+    ]
     if buffers:
         found.append(("buffers", ", ".join(buffers)))
     if around:
@@ -43,14 +61,22 @@ def _scale_text(plan: Plan) -> str:
     scale = plan.task.rays.grid.scale
     if scale == (1.0, 1.0, 1.0):
         return "those of the coordinates"
-    why = "as the scene says" if plan.scene.scale is not None else "an axis in other units than the rest has its vertices as far apart"
+    why = (
+        "as the scene says"
+        if plan.scene.scale is not None
+        else "an axis in other units than the rest has its vertices as far apart"
+    )
     return f"x, y, z are stretched by {', '.join(f'{factor:.4g}' for factor in scale)}: {why}"
 
 
 def _mode_text(plan: Plan, volume: Volume) -> str:
     if plan.mode == "cache":
         return "cache: decode once, then march what was decoded"
-    through = "the network, which has values of its own between vertices" if volume.profile == "paper" else "the lattice"
+    through = (
+        "the network, which has values of its own between vertices"
+        if volume.profile == "paper"
+        else "the lattice"
+    )
     if plan.mode == "stream":
         return f"stream: one sample of each ray in a pass, straight through {through}"
     budget = plan.scene.march.samples_per_pass
@@ -95,7 +121,10 @@ def _secondary_text(plan: Plan) -> str:
 def _region_text(plan: Plan, volume: Volume) -> str:
     if plan.lights:
         return " (all: light comes from everywhere)"
-    whole = all(high - low == length for (low, high), length in zip(plan.region, volume.shape[1:], strict=True))
+    whole = all(
+        high - low == length
+        for (low, high), length in zip(plan.region, volume.shape[1:], strict=True)
+    )
     return " (all)" if whole else " (what is in the picture)"
 
 
@@ -103,9 +132,16 @@ def _brick_text(plan: Plan) -> str:
     if not plan.task.skipping:
         return "all are marched: skipping is off"
     wanted = [
-        text for text, on in (("hold visible values", plan.task.table is not None), ("cross a surface", bool(plan.task.surfaces))) if on
+        text
+        for text, on in (
+            ("hold visible values", plan.task.table is not None),
+            ("cross a surface", bool(plan.task.surfaces)),
+        )
+        if on
     ]
     if plan.task.maximum:
         wanted = ["can hold a larger value than was met", *wanted[1:]]
-    rare = "" if plan.task.maximum or plan.mode != "cache" else "; all, where few could be passed over"
+    rare = (
+        "" if plan.task.maximum or plan.mode != "cache" else "; all, where few could be passed over"
+    )
     return f"only those that {' or '.join(wanted)}{rare}"

@@ -80,12 +80,16 @@ def central_slopes(field: Field, places: Array) -> Array:
         ends = []
         for way in (-field.stride, field.stride):
             moved = arrays.copy(places)
-            moved[:, axis] = xp.clip(xp.clip(places[:, axis], low[axis], high[axis]) + way, low[axis], high[axis])
+            moved[:, axis] = xp.clip(
+                xp.clip(places[:, axis], low[axis], high[axis]) + way, low[axis], high[axis]
+            )
             ends.append(field.values(moved))
         found[:, axis] = (ends[1] - ends[0]) / (2 * field.stride)
     (missing,) = arrays.nonzero(xp.any(xp.isnan(found), axis=1))
     if len(missing):
-        found[missing] = xp.where(xp.isnan(found[missing]), field.slopes(places[missing]), found[missing])
+        found[missing] = xp.where(
+            xp.isnan(found[missing]), field.slopes(places[missing]), found[missing]
+        )
     return found
 
 
@@ -95,10 +99,18 @@ class FrameField:
     def __init__(self, frame: Frame, grid: Grid, bricks: Bricks, arrays: Arrays = NUMPY) -> None:
         self.arrays, self.bricks = arrays, bricks
         self.stride = float(frame.stride)
-        first, counts = np.array(frame.first[::-1], dtype=np.float64), np.array(frame.values.shape[::-1])
+        first, counts = (
+            np.array(frame.first[::-1], dtype=np.float64),
+            np.array(frame.values.shape[::-1]),
+        )
         self.bounds, self.first = arrays.array(frame.bounds(grid)), arrays.array(first)
-        self.vertices = arrays.array(np.stack([first, first + (counts - 1) * frame.stride], axis=-1))
-        self._last, self._last_cell = arrays.array(counts - 1.0), arrays.array(np.maximum(counts - 2.0, 0.0))
+        self.vertices = arrays.array(
+            np.stack([first, first + (counts - 1) * frame.stride], axis=-1)
+        )
+        self._last, self._last_cell = (
+            arrays.array(counts - 1.0),
+            arrays.array(np.maximum(counts - 2.0, 0.0)),
+        )
         self._jumps = (1, int(counts[0]), int(counts[0] * counts[1]))
         self._wide = [bool(count > 1) for count in counts]
         with arrays.guarded():
@@ -112,16 +124,25 @@ class FrameField:
         found = []
         for start in range(0, max(len(self._values) - 1, 1), layers):
             values = self._values[start : start + layers + 1]
-            found.append(palette.visible(*(arrays.real(_of_cells(values, extreme)) for extreme in (xp.fmin, xp.fmax))))
+            found.append(
+                palette.visible(
+                    *(arrays.real(_of_cells(values, extreme)) for extreme in (xp.fmin, xp.fmax))
+                )
+            )
         return xp.concatenate(found)
 
     def values(self, places: Array) -> Array:
         """As `Field` has it."""
         result = self.arrays.empty((len(places),))
         for start in range(0, len(places), self.arrays.batch):
-            inside, low, share = self._located(places[start : start + self.arrays.batch], self._last)
+            inside, low, share = self._located(
+                places[start : start + self.arrays.batch], self._last
+            )
             # The corner after counts only where it has weight, so that a missing one beyond a vertex does not matter.
-            jumps = [self.arrays.whole(share[:, axis] > 0) * jump for axis, jump in enumerate(self._jumps)]
+            jumps = [
+                self.arrays.whole(share[:, axis] > 0) * jump
+                for axis, jump in enumerate(self._jumps)
+            ]
             corners = self._corners(low, jumps)
             along = corners[:, :, 0] + share[:, 0] * (corners[:, :, 1] - corners[:, :, 0])
             across = along[:, 0] + share[:, 1] * (along[:, 1] - along[:, 0])
@@ -134,16 +155,30 @@ class FrameField:
         xp = self.arrays.xp
         result = self.arrays.empty((len(places), 3))
         for start in range(0, len(places), self.arrays.batch):
-            _, low, share = self._located(places[start : start + self.arrays.batch], self._last_cell)
-            corners = self._corners(low, [jump if wide else 0 for jump, wide in zip(self._jumps, self._wide, strict=True)])
+            _, low, share = self._located(
+                places[start : start + self.arrays.batch], self._last_cell
+            )
+            corners = self._corners(
+                low,
+                [jump if wide else 0 for jump, wide in zip(self._jumps, self._wide, strict=True)],
+            )
             x, y, z = share.T
             steps = corners[:, :, 1] - corners[:, :, 0]
             along = corners[:, :, 0] + x * steps
             across = along[:, 0] + y * (along[:, 1] - along[:, 0])
             part = steps[:, 0] + y * (steps[:, 1] - steps[:, 0])
             rise = along[:, 1] - along[:, 0]
-            found = xp.stack([part[0] + z * (part[1] - part[0]), rise[0] + z * (rise[1] - rise[0]), across[1] - across[0]], axis=-1)
-            result[start : start + len(found)] = xp.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0) / self.stride
+            found = xp.stack(
+                [
+                    part[0] + z * (part[1] - part[0]),
+                    rise[0] + z * (rise[1] - rise[0]),
+                    across[1] - across[0],
+                ],
+                axis=-1,
+            )
+            result[start : start + len(found)] = (
+                xp.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0) / self.stride
+            )
         return result
 
     def _located(self, places: Array, most: Array) -> tuple[Array, Array, Array]:
@@ -162,7 +197,10 @@ class FrameField:
         """Values (z 2, y 2, x 2, n) around places; jumps, (n,) or one for all, to the vertices after them along x, y and z."""
         found = self.arrays.empty((2, 2, 2, len(low)))
         for corner in product((0, 1), repeat=3):
-            found[corner] = self.arrays.xp.take(self._flat, low + sum(jump for up, jump in zip(corner[::-1], jumps, strict=True) if up))
+            found[corner] = self.arrays.xp.take(
+                self._flat,
+                low + sum(jump for up, jump in zip(corner[::-1], jumps, strict=True) if up),
+            )
         return found
 
 
@@ -172,29 +210,50 @@ class NetworkField:
     def __init__(self, volume: Volume, step: float, units: Units, arrays: Arrays = NUMPY) -> None:
         model = volume._model
         if not isinstance(model, PaperModel):
-            raise InputError(f"{volume.path}: a file of the profile {volume.profile} has no network")
+            raise InputError(
+                f"{volume.path}: a file of the profile {volume.profile} has no network"
+            )
         self.arrays, self.stride = arrays, 1.0
-        self._low, self._high = (float(end) for end in units.to([volume.value_range.low, volume.value_range.high]))
+        self._low, self._high = (
+            float(end) for end in units.to([volume.value_range.low, volume.value_range.high])
+        )
         key = volume.key_times.key_index(step)
-        first, last = (np.array([float(ends[side]) for ends in volume.box][::-1]) for side in (0, 1))
+        first, last = (
+            np.array([float(ends[side]) for ends in volume.box][::-1]) for side in (0, 1)
+        )
         flat = np.array(volume.shape[:0:-1]) == 1
         ends = np.stack([first, last - 1], axis=-1)
-        self.vertices, self.bounds = arrays.array(ends), arrays.array(ends + np.where(flat[:, None], [-0.5, 0.5], 0.0))
-        self.first, self._last, self._flat = (arrays.array(part) for part in (first, last - 1 - first, flat))
+        self.vertices, self.bounds = (
+            arrays.array(ends),
+            arrays.array(ends + np.where(flat[:, None], [-0.5, 0.5], 0.0)),
+        )
+        self.first, self._last, self._flat = (
+            arrays.array(part) for part in (first, last - 1 - first, flat)
+        )
         occupied = np.ascontiguousarray(volume.occupancy(step, volume.box))
         network = model.network
         with arrays.guarded():
             self._occupied = arrays.array(occupied)
-            self._inference: Inference = PatchInference(network, key) if arrays is NUMPY else DenseInference(network, key, arrays)
+            self._inference: Inference = (
+                PatchInference(network, key)
+                if arrays is NUMPY
+                else DenseInference(network, key, arrays)
+            )
         self._jumps = (1, occupied.shape[2], occupied.shape[1] * occupied.shape[2])
         self.bricks = self._possible(occupied)
 
     def _possible(self, occupied: Array) -> Bricks:
         """What a brick of a network holds is not known before it is evaluated: any value, with a margin, where there is one at all."""
-        found = Bricks.of(Frame(values=np.where(occupied, np.float32(1), np.float32(np.nan)), first=(0, 0, 0)))
+        found = Bricks.of(
+            Frame(values=np.where(occupied, np.float32(1), np.float32(np.nan)), first=(0, 0, 0))
+        )
         low, high = np.float32(2 * self._low - self._high), np.float32(2 * self._high - self._low)
         known = found.low <= found.high
-        return replace(found, low=np.where(known, low, np.float32(np.inf)), high=np.where(known, high, np.float32(-np.inf)))
+        return replace(
+            found,
+            low=np.where(known, low, np.float32(np.inf)),
+            high=np.where(known, high, np.float32(-np.inf)),
+        )
 
     def visible(self, palette: Palette) -> Array:
         """As `Field` has it: where there is a vertex of the coreset."""
@@ -226,10 +285,14 @@ class NetworkField:
         at = xp.clip(at, 0 * last, last)
         low = arrays.whole(at)
         first = low[:, 0] + low[:, 1] * self._jumps[1] + low[:, 2] * self._jumps[2]
-        jumps = [arrays.whole(at[:, axis] > low[:, axis]) * jump for axis, jump in enumerate(self._jumps)]
+        jumps = [
+            arrays.whole(at[:, axis] > low[:, axis]) * jump for axis, jump in enumerate(self._jumps)
+        ]
         flat = self._occupied.reshape(-1)
         for corner in product((0, 1), repeat=3):
-            inside &= xp.take(flat, first + sum(jump for up, jump in zip(corner[::-1], jumps, strict=True) if up))
+            inside &= xp.take(
+                flat, first + sum(jump for up, jump in zip(corner[::-1], jumps, strict=True) if up)
+            )
         return at, inside
 
 

@@ -30,10 +30,14 @@ def check_film(suffix: str) -> str | None:
     try:
         return str(importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe())
     except (ImportError, RuntimeError) as error:
-        raise MissingDependencyError("an MP4 needs imageio-ffmpeg: pip install 'fhash[video]'; a GIF needs nothing more") from error
+        raise MissingDependencyError(
+            "an MP4 needs imageio-ffmpeg: pip install 'fhash[video]'; a GIF needs nothing more"
+        ) from error
 
 
-def film(path: Path, frames: Iterator[Pixels], size: tuple[int, int], rate: float, *, force: bool = False) -> None:
+def film(
+    path: Path, frames: Iterator[Pixels], size: tuple[int, int], rate: float, *, force: bool = False
+) -> None:
     """Write frames (H, W, 3) of `size` (W, H), at least one, as a film of `rate` pictures per second, complete or not at all.
 
     An MP4 is H.264 with 4:2:0 colours, as browsers play it; an odd side gets its last row or column twice. A GIF has 256 colours to a
@@ -54,20 +58,38 @@ def film(path: Path, frames: Iterator[Pixels], size: tuple[int, int], rate: floa
 def _write_gif(path: Path, frames: Iterator[Pixels], rate: float) -> None:
     from PIL import Image as Pictures
 
-    pictures = (Pictures.fromarray(frame).quantize(256, dither=Pictures.Dither.NONE) for frame in frames)
+    pictures = (
+        Pictures.fromarray(frame).quantize(256, dither=Pictures.Dither.NONE) for frame in frames
+    )
     first = next(pictures)
     hundredths = max(2, round(100 / rate))
     with path.open("xb") as file:
-        first.save(file, format="GIF", save_all=True, append_images=pictures, duration=10 * hundredths, loop=0)
+        first.save(
+            file,
+            format="GIF",
+            save_all=True,
+            append_images=pictures,
+            duration=10 * hundredths,
+            loop=0,
+        )
 
 
-def _write_mp4(ffmpeg: str, path: Path, temporary: Path, frames: Iterator[Pixels], size: tuple[int, int], rate: float) -> None:
+def _write_mp4(
+    ffmpeg: str,
+    path: Path,
+    temporary: Path,
+    frames: Iterator[Pixels],
+    size: tuple[int, int],
+    rate: float,
+) -> None:
     wide, high = (side + side % 2 for side in size)
     words = f"-y -loglevel error -f rawvideo -pix_fmt rgb24 -s {wide}x{high} -r {rate:.6g} -i - -an -c:v libx264 -pix_fmt yuv420p"
     # The name of a file on its way says nothing of its kind. The index comes first, so that a film plays before it is all there.
     words += f" -crf {QUALITY} -movflags +faststart -f mp4"
     with tempfile.TemporaryFile() as log:
-        with subprocess.Popen([ffmpeg, *words.split(), str(temporary)], stdin=subprocess.PIPE, stdout=log, stderr=log) as process:
+        with subprocess.Popen(
+            [ffmpeg, *words.split(), str(temporary)], stdin=subprocess.PIPE, stdout=log, stderr=log
+        ) as process:
             assert process.stdin is not None
             try:
                 for frame in frames:
@@ -81,5 +103,8 @@ def _write_mp4(ffmpeg: str, path: Path, temporary: Path, frames: Iterator[Pixels
                 raise
         if process.returncode != 0:
             log.seek(0)
-            reason = " ".join(log.read(2000).decode(errors="replace").split()) or f"it ended with {process.returncode}"
+            reason = (
+                " ".join(log.read(2000).decode(errors="replace").split())
+                or f"it ended with {process.returncode}"
+            )
             raise OutputError(f"{path}: ffmpeg failed: {reason[:200]}; take .gif, or numbered .png")

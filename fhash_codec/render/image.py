@@ -72,7 +72,9 @@ class Image:
             plain = np.minimum(colour / np.where(opacity > 0, opacity, np.float32(1)), 1.0)
             mixed = np.concatenate([plain, opacity], axis=-1)
         else:
-            mixed = np.minimum(colour + (1 - opacity) * np.array(parse_colour(name), dtype=np.float32), 1.0)
+            mixed = np.minimum(
+                colour + (1 - opacity) * np.array(parse_colour(name), dtype=np.float32), 1.0
+            )
         return np.asarray(np.rint(mixed * 255), dtype=np.uint8)
 
     def save(self, path: str | Path, *, force: bool = False) -> list[Path]:
@@ -98,7 +100,14 @@ class Image:
         if path.suffix.lower() != ".png":
             raise InputError(f"{path}: pictures are written as .png; use such a name")
         named = (("depth", self.depth), ("normal", self.normal))
-        return [*(path.with_name(f"{path.stem}.{name}.npy") for name, buffer in named if buffer is not None), path]
+        return [
+            *(
+                path.with_name(f"{path.stem}.{name}.npy")
+                for name, buffer in named
+                if buffer is not None
+            ),
+            path,
+        ]
 
     def _write_png(self, file: BinaryIO | io.BytesIO) -> None:
         from PIL import Image as Pictures

@@ -35,7 +35,13 @@ class Leaping:
             task = replace(task, table=replace(table, extinctions=np.ones_like(table.extinctions)))
         distance = bricks.distance(task)
         last = arrays.array(np.array(distance.shape[::-1]) - 1.0)
-        return cls(arrays=arrays, distance=arrays.array(distance, "int64"), last=last, first=first, side=SIDE * stride)
+        return cls(
+            arrays=arrays,
+            distance=arrays.array(distance, "int64"),
+            last=last,
+            first=first,
+            side=SIDE * stride,
+        )
 
     def matters(self, places: Array) -> Array:
         """Whether places (..., 3) lie in bricks that matter."""
@@ -57,9 +63,16 @@ class Leaping:
             pending, brick, away = pending[inside], brick[inside], away[inside][:, None]
             start, step = origin[pending], pace[pending]
             # The cube of bricks around this one in which none matters, on the side that the ray goes to.
-            face = self.arrays.real(xp.where(step > 0, brick + away, brick - away + 1)) * self.side + self.first
+            face = (
+                self.arrays.real(xp.where(step > 0, brick + away, brick - away + 1)) * self.side
+                + self.first
+            )
             with np.errstate(divide="ignore", invalid="ignore"):
-                reach = xp.clip(xp.amin(xp.where(step == 0, np.inf, (face - start) / step), axis=1), None, ENDLESS)
+                reach = xp.clip(
+                    xp.amin(xp.where(step == 0, np.inf, (face - start) / step), axis=1),
+                    None,
+                    ENDLESS,
+                )
             onward = xp.maximum(self.arrays.whole(xp.floor(reach)) + 1, sample[pending] + 1)
             sample[pending] = xp.minimum(onward, end[pending])
             leaps += len(pending)

@@ -29,7 +29,13 @@ Single = npt.NDArray[np.float32]
 
 MOST_STEPS = 16
 """From a point to the end of its surroundings."""
-SIDES = np.array([side for side in itertools.product((-1.0, 0.0, 1.0), repeat=3) if sum(map(abs, side)) in (1, 3)])
+SIDES = np.array(
+    [
+        side
+        for side in itertools.product((-1.0, 0.0, 1.0), repeat=3)
+        if sum(map(abs, side)) in (1, 3)
+    ]
+)
 """Directions of the surroundings: the 6 faces and the 8 corners of a cube."""
 SIDES /= np.linalg.norm(SIDES, axis=1, keepdims=True)
 
@@ -65,7 +71,12 @@ def light_grid(
     if shadows is not None and lamp is not None:
         step = np.asarray(lamp, dtype=np.float64) / (grid.spacing * cell)
         step /= np.abs(step).max()
-        passed = _passed(extinction, step, _steps_out(step, extinction.shape), float(np.linalg.norm(step * grid.spacing * cell)) / unit)
+        passed = _passed(
+            extinction,
+            step,
+            _steps_out(step, extinction.shape),
+            float(np.linalg.norm(step * grid.spacing * cell)) / unit,
+        )
         shares[..., 0] = 1 - np.float32(shadows.strength) * (1 - passed)
         rays += extinction.size
     if ambient_occlusion is not None:
@@ -73,8 +84,12 @@ def light_grid(
         around = np.zeros(extinction.shape, dtype=np.float32)
         for side in SIDES:
             step = side * ambient_occlusion.radius / (count * cell)
-            around += _passed(extinction, step, count, float(np.linalg.norm(step * grid.spacing * cell)) / unit)
-        shares[..., 1] = 1 - np.float32(ambient_occlusion.strength) * (1 - around / np.float32(len(SIDES)))
+            around += _passed(
+                extinction, step, count, float(np.linalg.norm(step * grid.spacing * cell)) / unit
+            )
+        shares[..., 1] = 1 - np.float32(ambient_occlusion.strength) * (
+            1 - around / np.float32(len(SIDES))
+        )
         rays += extinction.size * len(SIDES)
     return LightGrid(shares=np.clip(shares, 0, 1), first=first, cell=cell, secondary_rays=rays)
 
@@ -97,7 +112,13 @@ def _passed(extinction: Single, step: Floats, count: int, length: float) -> Sing
     _in_layers(
         extinction.shape[0],
         lambda z: library.fhash_march_sum(
-            _address(extinction), shape, along, ctypes.c_int64(count), ctypes.c_int64(z), ctypes.c_int64(z + 1), _address(sums)
+            _address(extinction),
+            shape,
+            along,
+            ctypes.c_int64(count),
+            ctypes.c_int64(z),
+            ctypes.c_int64(z + 1),
+            _address(sums),
         ),
     )
     return _left(sums, length)
@@ -123,7 +144,9 @@ def _add_shifted(extinction: Single, offset: Floats, sums: Single) -> None:
         weight = np.prod(np.where(corner, part, 1 - part))
         if weight > 0:
             moved = zip(begin + whole + corner, end + whole + corner, strict=True)
-            sums[to] += np.float32(weight) * extinction[tuple(slice(low, high) for low, high in moved)]
+            sums[to] += (
+                np.float32(weight) * extinction[tuple(slice(low, high) for low, high in moved)]
+            )
 
 
 def _extinction(values: Single, table: Table, across: int) -> Single:
@@ -132,7 +155,9 @@ def _extinction(values: Single, table: Table, across: int) -> Single:
     library = native.library()
     last = len(table.extinctions) - 1
     if library is None:
-        found = np.interp(np.nan_to_num(values), np.linspace(table.low, table.high, last + 1), table.extinctions)
+        found = np.interp(
+            np.nan_to_num(values), np.linspace(table.low, table.high, last + 1), table.extinctions
+        )
         extinction = np.where(np.isnan(values), 0, found)
         for axis, count in enumerate(points):
             places = np.arange(count)[:, None] * across + np.arange(1 - across, across)

@@ -17,7 +17,9 @@ from fhash_formats.errors import InputError
 __all__ = ["march"]
 
 
-def march(frame: Frame, task: Task, *, bricks: Bricks | None = None, threads: int | None = None) -> Marched:
+def march(
+    frame: Frame, task: Task, *, bricks: Bricks | None = None, threads: int | None = None
+) -> Marched:
     """The picture of a task.
 
     A sample of a last, shorter step that lies beyond the box is taken at the nearest place in it. Outside a frame smaller than the
@@ -36,7 +38,12 @@ def march(frame: Frame, task: Task, *, bricks: Bricks | None = None, threads: in
         bricks = Bricks.of(frame)
     if task.maximum and task.surfaces:
         return _over(
-            _march(frame, dataclasses.replace(task, maximum=False, table=None, shaded=False), bricks, threads),
+            _march(
+                frame,
+                dataclasses.replace(task, maximum=False, table=None, shaded=False),
+                bricks,
+                threads,
+            ),
             _march(frame, dataclasses.replace(task, surfaces=()), bricks, threads),
         )
     return _march(frame, task, bricks, threads)

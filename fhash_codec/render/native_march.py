@@ -92,7 +92,15 @@ class _March(ctypes.Structure):
     )
 
 
-def march_native(library: ctypes.CDLL, frame: Frame, task: Task, bricks: Bricks, threads: int | None = None, *, path: int = 0) -> Marched:
+def march_native(
+    library: ctypes.CDLL,
+    frame: Frame,
+    task: Task,
+    bricks: Bricks,
+    threads: int | None = None,
+    *,
+    path: int = 0,
+) -> Marched:
     """The picture of a task, as `march` describes it.
 
     path: of the processor: 0 the quickest that it has, 1 at most AVX2, 2 neither. Pictures agree within rounding.
@@ -101,7 +109,9 @@ def march_native(library: ctypes.CDLL, frame: Frame, task: Task, bricks: Bricks,
     table = task.table or empty_table(setting.low, setting.high)
     width, height = task.rays.size
     rgba = np.zeros((height, width, 4), dtype=np.float32)
-    depth = np.full((height, width), np.inf, dtype=np.float32) if task.depth or task.normal else None
+    depth = (
+        np.full((height, width), np.inf, dtype=np.float32) if task.depth or task.normal else None
+    )
     normal = np.zeros((height, width, 3), dtype=np.float32) if task.normal else None
     entries, extinctions = _entries(table, task.step)
     # A step longer than a brick could pass through one in which a surface lies, from one in which nothing does to another.
@@ -109,17 +119,32 @@ def march_native(library: ctypes.CDLL, frame: Frame, task: Task, bricks: Bricks,
     distance = bricks.distance(task) if task.skipping and not task.maximum and not leap else None
     cells = None
     # For the same reason no step is longer than a cell; rounding of places in float32 counts.
-    if distance is not None and not (task.surfaces and task.step > 0.99 * float(np.abs(setting.spacing).min())):
+    if distance is not None and not (
+        task.surfaces and task.step > 0.99 * float(np.abs(setting.spacing).min())
+    ):
         cells = cells_of(library, bricks, task, distance)
-    if distance is not None and cells is None and np.count_nonzero(distance) < LEAST_SKIPPED * distance.size:
+    if (
+        distance is not None
+        and cells is None
+        and np.count_nonzero(distance) < LEAST_SKIPPED * distance.size
+    ):
         distance = None
-    highest = bricks.high if task.skipping and task.maximum and setting.values is bricks.values else None
-    light = None if task.light is None else np.ascontiguousarray(task.light.shares, dtype=np.float32)
+    highest = (
+        bricks.high if task.skipping and task.maximum and setting.values is bricks.values else None
+    )
+    light = (
+        None if task.light is None else np.ascontiguousarray(task.light.shares, dtype=np.float32)
+    )
     lighting = task.lighting
     steep = max(1.0, lighting.specular_power / 16) if lighting is not None else 1.0
     cosines = np.maximum(1 - np.arange(POWERS + 2) / (POWERS * steep), 0.0)
-    powers = (cosines ** (lighting.specular_power if lighting is not None else 1.0)).astype(np.float32)
-    surfaces = [_Five(level, *surface.colour, surface.opacity) for level, surface in zip(setting.levels, task.surfaces, strict=True)]
+    powers = (cosines ** (lighting.specular_power if lighting is not None else 1.0)).astype(
+        np.float32
+    )
+    surfaces = [
+        _Five(level, *surface.colour, surface.opacity)
+        for level, surface in zip(setting.levels, task.surfaces, strict=True)
+    ]
     given = _March(
         values=_floats(setting.values),
         shape=setting.values.shape,
@@ -150,7 +175,13 @@ def march_native(library: ctypes.CDLL, frame: Frame, task: Task, bricks: Bricks,
         step=task.step,
         threshold=task.threshold,
         jitter=task.jitter,
-        lamp=_Three(*(lighting.lamp if lighting is not None and lighting.lamp is not None else (0.0, 0.0, 0.0))),
+        lamp=_Three(
+            *(
+                lighting.lamp
+                if lighting is not None and lighting.lamp is not None
+                else (0.0, 0.0, 0.0)
+            )
+        ),
         ambient=lighting.ambient if lighting is not None else 1.0,
         diffuse=lighting.diffuse if lighting is not None else 0.0,
         specular=lighting.specular if lighting is not None else 0.0,
@@ -184,7 +215,11 @@ def march_native(library: ctypes.CDLL, frame: Frame, task: Task, bricks: Bricks,
         return counters
 
     workers = max(1, min(threads or usable_threads(), len(spans)))
-    found = work(0) if workers == 1 else sum(in_threads(work, range(workers)), np.zeros(5, dtype=np.int64))
+    found = (
+        work(0)
+        if workers == 1
+        else sum(in_threads(work, range(workers)), np.zeros(5, dtype=np.int64))
+    )
     rays, passes, samples, gradients, skipped = (int(number) for number in found)
     counters = {
         "rays": rays,
@@ -207,9 +242,16 @@ def _spans(task: Task) -> list[tuple[int, int]]:
     left, top, right, bottom = 0, 0, across, down
     if np.isfinite(pixels).all() and (task.rays.parallel or np.all(depth > 1e-6 * depth.max())):
         # Rounding is far below a pixel.
-        low, high = np.floor((pixels.min(axis=0) - 1) / TILE), np.ceil((pixels.max(axis=0) + 1) / TILE)
-        left, top = (int(min(max(at, 0), most)) for at, most in zip(low, (across, down), strict=True))
-        right, bottom = (int(min(max(at, 0), most)) for at, most in zip(high, (across, down), strict=True))
+        low, high = (
+            np.floor((pixels.min(axis=0) - 1) / TILE),
+            np.ceil((pixels.max(axis=0) + 1) / TILE),
+        )
+        left, top = (
+            int(min(max(at, 0), most)) for at, most in zip(low, (across, down), strict=True)
+        )
+        right, bottom = (
+            int(min(max(at, 0), most)) for at, most in zip(high, (across, down), strict=True)
+        )
     rows = (range(row * across + left, row * across + right, GROUP) for row in range(top, bottom))
     return [(first, min(first + GROUP, row.stop)) for row in rows for first in row]
 

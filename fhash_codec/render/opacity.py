@@ -23,7 +23,17 @@ Range = tuple[float, float]
 Histogram = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
 """Edges (n + 1,), ascending, and counts (n,) of values."""
 
-PRESETS = ("auto", "feature", "linear", "linear_r", "geom", "geom_r", "sigmoid", "foreground", "opaque")
+PRESETS = (
+    "auto",
+    "feature",
+    "linear",
+    "linear_r",
+    "geom",
+    "geom_r",
+    "sigmoid",
+    "foreground",
+    "opaque",
+)
 FAINTEST = 1 / 255
 """Opacities below are 0, as in PyVista's tables of bytes, so that what they are of need not be marched through."""
 INTERVAL, SURFACE, BACKGROUND = 0.3, 0.6, 0.25
@@ -36,7 +46,14 @@ SHARES = np.linspace(0.0, 1.0, 65)
 ENDS = (-float(np.finfo(np.float64).max), float(np.finfo(np.float64).max))
 
 
-def opacity_preset(name: str, *, shown: Range, value_range: Range, features: Sequence[str], histogram: Histogram | None) -> Floats:
+def opacity_preset(
+    name: str,
+    *,
+    shown: Range,
+    value_range: Range,
+    features: Sequence[str],
+    histogram: Histogram | None,
+) -> Floats:
     """Points float64 (n, 2), values strictly ascending, of a preset by name.
 
     shown: the values that the colours reach over, and PyVista's presets. Raises InputError for an unknown name, offering the
@@ -44,13 +61,17 @@ def opacity_preset(name: str, *, shown: Range, value_range: Range, features: Seq
     """
     if name not in PRESETS:
         near = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.0)[0]
-        raise InputError(f"opacity '{name[:60]}' is not known; did you mean '{near}'? Known: {', '.join(PRESETS)}")
+        raise InputError(
+            f"opacity '{name[:60]}' is not known; did you mean '{near}'? Known: {', '.join(PRESETS)}"
+        )
     if name in ("auto", "feature"):
         points = _of_features(features, value_range)
         if points is not None:
             return points
         if name == "feature":
-            raise InputError("opacity 'feature' needs a file of an interval, an isosurface or a segmentation; use 'auto'")
+            raise InputError(
+                "opacity 'feature' needs a file of an interval, an isosurface or a segmentation; use 'auto'"
+            )
         if histogram is not None:
             return _away_from_background(histogram, value_range)
         return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
@@ -65,12 +86,18 @@ def opacity_preset(name: str, *, shown: Range, value_range: Range, features: Seq
     else:
         opacities = 1 / (1 + np.exp(-20 * SHARES + 10))
     opacities = np.where(opacities < FAINTEST, 0.0, opacities)
-    return _over(shown, np.linspace(0.0, 1.0, len(opacities)), opacities[::-1] if name.endswith("_r") else opacities)
+    return _over(
+        shown,
+        np.linspace(0.0, 1.0, len(opacities)),
+        opacities[::-1] if name.endswith("_r") else opacities,
+    )
 
 
 def shown_range(features: Sequence[str], value_range: Range) -> Range:
     """The values that colours reach over where the scene does not say: those of the intervals and segmentations, else all."""
-    found = [range_ for range_ in (_values(text, value_range) for text in features) if range_ is not None]
+    found = [
+        range_ for range_ in (_values(text, value_range) for text in features) if range_ is not None
+    ]
     low, high = value_range
     if found and len(found) == len(features):
         low, high = min(part[0] for part in found), max(part[1] for part in found)
@@ -119,15 +146,25 @@ def _of_feature(text: str, value_range: Range) -> Floats | None:
     if inside is None:
         # A feature of one value, or of none that the data have, is drawn as a surface.
         return (
-            _of_feature(f"isosurface:{feature.low}", value_range) if isinstance(feature, Interval) and math.isfinite(feature.low) else None
+            _of_feature(f"isosurface:{feature.low}", value_range)
+            if isinstance(feature, Interval) and math.isfinite(feature.low)
+            else None
         )
     edge = _part(EDGE, inside)
     if isinstance(feature, Segmentation):
         return np.array([[inside[0], 0.0], [inside[0] + edge, INTERVAL]])
     assert isinstance(feature, Interval)
     # An end that the data do not reach cuts nothing off, and needs no soft edge.
-    rise = [[inside[0], INTERVAL]] if feature.low < low else [[inside[0], 0.0], [inside[0] + edge, INTERVAL]]
-    fall = [[inside[1], INTERVAL]] if feature.high > high else [[inside[1] - edge, INTERVAL], [inside[1], 0.0]]
+    rise = (
+        [[inside[0], INTERVAL]]
+        if feature.low < low
+        else [[inside[0], 0.0], [inside[0] + edge, INTERVAL]]
+    )
+    fall = (
+        [[inside[1], INTERVAL]]
+        if feature.high > high
+        else [[inside[1] - edge, INTERVAL], [inside[1], 0.0]]
+    )
     return np.array(rise + fall)
 
 
@@ -144,7 +181,9 @@ def _largest(curves: list[Floats]) -> Floats:
         end = np.broadcast_to(values[1:], left.shape)[left * right < 0]
         crossings.append(begin * (1 - share) + end * share)
     values = np.unique(np.concatenate([values, *crossings]))
-    return np.stack([values, np.max([np.interp(values, *curve.T) for curve in curves], axis=0)], axis=-1)
+    return np.stack(
+        [values, np.max([np.interp(values, *curve.T) for curve in curves], axis=0)], axis=-1
+    )
 
 
 def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
@@ -170,8 +209,16 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
     half, most = np.minimum(np.searchsorted(share, [0.5, 0.995]), len(order) - 1)
     near = float(distance[order[half]]) + width
     far = max(float(distance[order[most]]), near + width)
-    rise = [[background + near, 0.0], [background + far, BACKGROUND]] if background + near < high else []
-    fall = [[background - far, BACKGROUND], [background - near, 0.0]] if background - near > low else []
+    rise = (
+        [[background + near, 0.0], [background + far, BACKGROUND]]
+        if background + near < high
+        else []
+    )
+    fall = (
+        [[background - far, BACKGROUND], [background - near, 0.0]]
+        if background - near > low
+        else []
+    )
     points = np.array(fall + rise or [[low, BACKGROUND]])
     points[:, 0] = np.clip(points[:, 0], ENDS[0] * scale, ENDS[1] * scale) / scale
     return points

@@ -82,7 +82,9 @@ def _share(mask: PicturesImage) -> Single:
 
 
 def _flat(colour: Floats, opacity: Single) -> Single:
-    return np.concatenate([opacity[..., None] * colour, opacity[..., None]], axis=-1).astype(np.float32)
+    return np.concatenate([opacity[..., None] * colour, opacity[..., None]], axis=-1).astype(
+        np.float32
+    )
 
 
 def _paint(picture: Single, colour: Floats, opacity: Single) -> None:
@@ -115,8 +117,19 @@ class _Pen:
         """A text with a halo, moved into the picture where it would reach out of it."""
         box = self._letter.textbbox(place, text, self.font, anchor=anchor, stroke_width=self.stroke)
         ends = zip(box[:2], box[2:], (self.width, self.height), strict=True)
-        left, top = (at + max(1 - low, 0) + min(size - 1 - high, 0) for at, (low, high, size) in zip(place, ends, strict=True))
-        self._halo.text((left, top), text, 255, self.font, anchor=anchor, stroke_width=self.stroke, stroke_fill=255)
+        left, top = (
+            at + max(1 - low, 0) + min(size - 1 - high, 0)
+            for at, (low, high, size) in zip(place, ends, strict=True)
+        )
+        self._halo.text(
+            (left, top),
+            text,
+            255,
+            self.font,
+            anchor=anchor,
+            stroke_width=self.stroke,
+            stroke_fill=255,
+        )
         self._letter.text((left, top), text, 255, self.font, anchor=anchor)
 
     def written(self) -> tuple[tuple[Floats, Single], ...]:
@@ -156,7 +169,11 @@ class _Pen:
         name = f"{coordinate.name} [{units}]" if units else coordinate.name
         first, last = (f"{value:.6g}" for value in coordinate.values[[0, -1]])
         gap = outward * self.size * (1.0 if anchor[0] == "m" else 0.6)
-        for place, text in ((edge.ends[0] + inward, first), (middle + gap * 0.6, name), (edge.ends[1] - inward, last)):
+        for place, text in (
+            (edge.ends[0] + inward, first),
+            (middle + gap * 0.6, name),
+            (edge.ends[1] - inward, last),
+        ):
             left, top = place + gap
             self.text((float(left), float(top)), text, anchor)
 
@@ -166,21 +183,60 @@ class _Pen:
         marks = ticks(low, high, max(2, round(0.55 * self.height / (4 * self.size))))
         thick, tall, margin = max(8, self.size), max(16, round(0.55 * self.height)), self.size // 2
         lengths = [thick + margin + self._letter.textlength(text, self.font) for _, text in marks]
-        left = max(1, self.width - self.size - math.ceil(max(self._letter.textlength(quantity, self.font), *lengths)))
+        left = max(
+            1,
+            self.width
+            - self.size
+            - math.ceil(max(self._letter.textlength(quantity, self.font), *lengths)),
+        )
         top = (self.height - tall) // 2 + margin
-        _fill(inks, cover, left - margin, top - 2 * self.size - margin, self.width - margin, top + tall + margin, self.paper, PANEL)
+        _fill(
+            inks,
+            cover,
+            left - margin,
+            top - 2 * self.size - margin,
+            self.width - margin,
+            top + tall + margin,
+            self.paper,
+            PANEL,
+        )
         _fill(inks, cover, left - 1, top - 1, left + thick + 1, top + tall + 1, self.ink)
         share = (np.arange(tall)[::-1, None] + 0.5) / tall
-        _fill(inks, cover, left, top, left + thick, top + tall, colours(low * (1 - share) + high * share))
+        _fill(
+            inks,
+            cover,
+            left,
+            top,
+            left + thick,
+            top + tall,
+            colours(low * (1 - share) + high * share),
+        )
         for value, text in marks:
             row = top + (tall - 1) * (1 - (value - low) / ((high - low) or 1.0))
             tick = round(row) - max(1, self.size // 12) // 2
-            _fill(inks, cover, left + thick, tick, left + thick + self.size // 4, tick + max(1, self.size // 12), self.ink)
+            _fill(
+                inks,
+                cover,
+                left + thick,
+                tick,
+                left + thick + self.size // 4,
+                tick + max(1, self.size // 12),
+                self.ink,
+            )
             self.text((left + thick + margin, row), text, "lm")
         self.text((left, top - self.size), quantity, "ls")
 
 
-def _fill(inks: Floats, cover: Single, left: int, top: int, right: int, bottom: int, colour: Floats, opacity: float = 1.0) -> None:
+def _fill(
+    inks: Floats,
+    cover: Single,
+    left: int,
+    top: int,
+    right: int,
+    bottom: int,
+    colour: Floats,
+    opacity: float = 1.0,
+) -> None:
     """Fill a rectangle of a layer; `colour` (..., 3) is one, or one for each row (rows, 1, 3)."""
     height, width = cover.shape
     first, last = max(top, 0), max(min(bottom, height), 0)
@@ -196,8 +252,13 @@ def ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
         return [(low, f"{low:.6g}")]
     rough = extent / max(count, 1)
     power = 10.0 ** math.floor(math.log10(rough))
-    step = power * next(part for part in STEPS if part * power >= rough * (1 - 1e-9) or part == STEPS[-1])
-    values = [number * step for number in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+    step = power * next(
+        part for part in STEPS if part * power >= rough * (1 - 1e-9) or part == STEPS[-1]
+    )
+    values = [
+        number * step
+        for number in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+    ]
     if not values:
         return [(low, f"{low:.6g}")]
     largest = max(abs(value) for value in values) or step

@@ -52,7 +52,9 @@ class Palette:
         """Whether some value between two has an extinction; False where they are NaN or the lower is above the higher."""
         xp, last = self.arrays.xp, len(self.extinctions) - 1
         known = low <= high
-        first, stop = (xp.clip(self._entry(xp.where(known, ends, 0.0)), 0, last) for ends in (low, high))
+        first, stop = (
+            xp.clip(self._entry(xp.where(known, ends, 0.0)), 0, last) for ends in (low, high)
+        )
         first, stop = self.arrays.whole(xp.floor(first)), self.arrays.whole(xp.ceil(stop))
         return known & (xp.take(self.seen, stop + 1) > xp.take(self.seen, first))
 

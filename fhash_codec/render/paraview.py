@@ -36,7 +36,10 @@ class Preset:
     @property
     def is_relative(self) -> bool:
         """Whether it reaches from 0 or -1 to 1, as ParaView's own do, and not from one value of the data to another."""
-        return float(self.colours.positions[0]) in (0.0, -1.0) and float(self.colours.positions[-1]) == 1.0
+        return (
+            float(self.colours.positions[0]) in (0.0, -1.0)
+            and float(self.colours.positions[-1]) == 1.0
+        )
 
     def rescaled(self, low: float, high: float) -> Preset:
         """The preset over the values `low` to `high`; the opacities move with the colours."""
@@ -82,15 +85,25 @@ def _preset(path: Path, preset: dict[str, Any]) -> Preset:
     space = SPACE_NAMES.get(str(stated).lower().replace("cielab", "lab"))
     if space is None:
         raise InputError(f"{path}: ColorSpace is '{stated!s:.40}'; allowed: {', '.join(SPACES)}")
-    nan = _rows(path, "NanColor", preset["NanColor"], columns=3)[0] if "NanColor" in preset else np.array(NAN)
-    colours = ColourMap(positions=positions, points=points, space=space, nan=tuple(np.clip(nan, 0.0, 1.0).tolist()))
-    opacity = _opacity(path, _rows(path, "Points", preset["Points"])) if preset.get("Points") else None
+    nan = (
+        _rows(path, "NanColor", preset["NanColor"], columns=3)[0]
+        if "NanColor" in preset
+        else np.array(NAN)
+    )
+    colours = ColourMap(
+        positions=positions, points=points, space=space, nan=tuple(np.clip(nan, 0.0, 1.0).tolist())
+    )
+    opacity = (
+        _opacity(path, _rows(path, "Points", preset["Points"])) if preset.get("Points") else None
+    )
     return Preset(name=str(preset.get("Name", path.stem)), colours=colours, opacity=opacity)
 
 
 def _rows(path: Path, key: str, values: Any, columns: int = 4) -> Floats:
     """The flat list of a preset's key as rows of finite numbers."""
-    plain = isinstance(values, list) and all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e300 for v in values)
+    plain = isinstance(values, list) and all(
+        isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e300 for v in values
+    )
     if not plain or not values or len(values) % columns:
         raise InputError(f"{path}: {key} is not a list of finite numbers, {columns} for each point")
     return np.array(values, dtype=np.float64).reshape(-1, columns)
@@ -107,9 +120,25 @@ def _opacity(path: Path, rows: Floats) -> Floats:
         if (first[2], first[3]) != (0.5, 0.0) and first[1] != second[1]:
             share = np.arange(1, PIECES) / PIECES
             values = first[0] * (1 - share) + second[0] * share
-            ascending = np.concatenate([[True], np.diff(values) > 0]) & (values > first[0]) & (values < second[0])
+            ascending = (
+                np.concatenate([[True], np.diff(values) > 0])
+                & (values > first[0])
+                & (values < second[0])
+            )
             result.append(
-                np.stack([values, _curve(share, float(first[1]), float(second[1]), float(first[2]), float(first[3]))], axis=-1)[ascending]
+                np.stack(
+                    [
+                        values,
+                        _curve(
+                            share,
+                            float(first[1]),
+                            float(second[1]),
+                            float(first[2]),
+                            float(first[3]),
+                        ),
+                    ],
+                    axis=-1,
+                )[ascending]
             )
         result.append(second[None, :2])
     return np.concatenate(result)
@@ -118,13 +147,19 @@ def _opacity(path: Path, rows: Floats) -> Floats:
 def _curve(share: Floats, first: float, second: float, midpoint: float, sharpness: float) -> Floats:
     """Opacities between two at shares 0..1 of the way, as vtkPiecewiseFunction::GetTable has them."""
     midpoint = min(max(midpoint, 1e-5), 1 - 1e-5)
-    share = np.where(share < midpoint, 0.5 * share / midpoint, 0.5 + 0.5 * (share - midpoint) / (1 - midpoint))
+    share = np.where(
+        share < midpoint, 0.5 * share / midpoint, 0.5 + 0.5 * (share - midpoint) / (1 - midpoint)
+    )
     if sharpness < 0.01:
         return first + share * (second - first)
     power = 1 + 10 * sharpness
     share = np.where(share < 0.5, 0.5 * (2 * share) ** power, 1 - 0.5 * (2 * (1 - share)) ** power)
     square, cube = share**2, share**3
     slope = (1 - sharpness) * (second - first)
-    mixed = (2 * cube - 3 * square + 1) * first + (3 * square - 2 * cube) * second + (cube - 2 * square + share) * slope
+    mixed = (
+        (2 * cube - 3 * square + 1) * first
+        + (3 * square - 2 * cube) * second
+        + (cube - 2 * square + share) * slope
+    )
     mixed += (cube - square) * slope
     return np.clip(mixed, min(first, second), max(first, second))

@@ -44,7 +44,9 @@ class Phong:
             floor=floor,
         )
 
-    def __call__(self, colours: Array, slopes: Array, along: Array, lamp: Array, around: Array) -> Array:
+    def __call__(
+        self, colours: Array, slopes: Array, along: Array, lamp: Array, around: Array
+    ) -> Array:
         """Lit colours (n, 3): ambient and scattered light in the colour, mirrored light in white.
 
         slopes: derivatives (n, 3) by x, y, z per vertex. along: unit vectors (n, 3) of the rays. lamp, around: shares (n,) of the light
@@ -59,7 +61,9 @@ class Phong:
         # Light from straight behind has no highlight.
         half = xp.where(length > 1e-6, half / xp.where(length > 1e-6, length, 1.0), 0.0)
         scattered = xp.clip(xp.abs(xp.sum(normal * towards, axis=1)), None, 1.0)
-        mirrored = xp.clip(xp.abs(xp.sum(normal * half, axis=1)), None, 1.0) ** lighting.specular_power
+        mirrored = (
+            xp.clip(xp.abs(xp.sum(normal * half, axis=1)), None, 1.0) ** lighting.specular_power
+        )
         share = around * lighting.ambient + lamp * scattered * lighting.diffuse
         return colours * share[:, None] + (lamp * mirrored * lighting.specular)[:, None]
 
@@ -69,7 +73,10 @@ class LightAt:
 
     def __init__(self, grid: LightGrid, arrays: Arrays) -> None:
         self._arrays, self._cell = arrays, float(grid.cell)
-        self._shares, self._first = arrays.array(grid.shares, "float64"), arrays.array(grid.first, "float64")
+        self._shares, self._first = (
+            arrays.array(grid.shares, "float64"),
+            arrays.array(grid.first, "float64"),
+        )
         self._last = arrays.array([count - 1.0 for count in grid.shares.shape[2::-1]])
 
     def __call__(self, places: Array) -> tuple[Array, Array]:
@@ -81,7 +88,13 @@ class LightAt:
         low, high = arrays.whole(before), arrays.whole(xp.minimum(before + 1, last))
         found = arrays.full((len(places), 2), 0.0)
         for corner in product((0, 1), repeat=3):
-            k, j, i = ((high if up else low)[:, axis] for up, axis in zip(corner, (2, 1, 0), strict=True))
-            weight = (z if corner[0] else 1 - z) * (y if corner[1] else 1 - y) * (x if corner[2] else 1 - x)
+            k, j, i = (
+                (high if up else low)[:, axis] for up, axis in zip(corner, (2, 1, 0), strict=True)
+            )
+            weight = (
+                (z if corner[0] else 1 - z)
+                * (y if corner[1] else 1 - y)
+                * (x if corner[2] else 1 - x)
+            )
             found += weight[:, None] * self._shares[k, j, i]
         return found[:, 0], found[:, 1]

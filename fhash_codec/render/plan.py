@@ -58,11 +58,15 @@ class Units:
         if volume.dtype == np.float32 and max(abs(low), abs(high)) <= LARGE_OFFSET * extent:
             return cls()
         exponent = math.frexp(extent)[1]
-        return cls(shift=low / 2 + high / 2, factor=math.ldexp(1.0, -max(-1000, min(1000, exponent))))
+        return cls(
+            shift=low / 2 + high / 2, factor=math.ldexp(1.0, -max(-1000, min(1000, exponent)))
+        )
 
     def to(self, values: npt.ArrayLike) -> Floats:
         """Data units to marched units, float64."""
-        return np.asarray((np.asarray(values, dtype=np.float64) - self.shift) * self.factor, dtype=np.float64)
+        return np.asarray(
+            (np.asarray(values, dtype=np.float64) - self.shift) * self.factor, dtype=np.float64
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,7 +98,14 @@ class Plan:
     reasons: tuple[tuple[str, str], ...]
 
     @classmethod
-    def of(cls, volume: Volume, scene: Scene, *, grid: Grid | None = None, histogram: Callable[[], Histogram] | None = None) -> Plan:
+    def of(
+        cls,
+        volume: Volume,
+        scene: Scene,
+        *,
+        grid: Grid | None = None,
+        histogram: Callable[[], Histogram] | None = None,
+    ) -> Plan:
         """The plan of a scene; `histogram` is called where the opacity depends on how frequent values are.
 
         Raises InputError for what cannot be drawn, RegionError for a step or time outside the series.
@@ -107,12 +118,18 @@ class Plan:
                 "take a smaller picture"
             )
         if scene.evolution is not None:
-            raise InputError("the scene is an evolution, of several pictures; leave 'evolution' out for one of them")
+            raise InputError(
+                "the scene is an evolution, of several pictures; leave 'evolution' out for one of them"
+            )
         parse_background(scene.background)
         if spec.nothing and not effects.isosurfaces:
-            raise InputError("the scene shows nothing: 'nothing' leaves the volume out and there is no isosurface")
+            raise InputError(
+                "the scene shows nothing: 'nothing' leaves the volume out and there is no isosurface"
+            )
         if effects.maximum_intensity and spec.nothing:
-            raise InputError("maximum_intensity shows the volume, which 'nothing' leaves out; take one of them")
+            raise InputError(
+                "maximum_intensity shows the volume, which 'nothing' leaves out; take one of them"
+            )
         step = _step_of(volume, scene)
         grid = grid or Grid.of(volume.coords, scene.scale)
         rays = Rays.of(scene.camera, grid, scene.size)
@@ -121,7 +138,11 @@ class Plan:
         stride = 1 << lod
         lit = effects.shading or (Shading() if effects.isosurfaces else None)
         shadows = effects.shadows if effects.shadows and effects.shadows.strength > 0 else None
-        occlusion = effects.ambient_occlusion if effects.ambient_occlusion and effects.ambient_occlusion.strength > 0 else None
+        occlusion = (
+            effects.ambient_occlusion
+            if effects.ambient_occlusion and effects.ambient_occlusion.strength > 0
+            else None
+        )
         if effects.maximum_intensity or spec.nothing:
             # Only the volume takes light away, and only from what is drawn of it or in it.
             shadows = occlusion = None
@@ -136,11 +157,17 @@ class Plan:
             threshold=march.threshold,
             table=table,
             lighting=None if lit is None else _lighting(lit, lamp),
-            shaded=effects.shading is not None and table is not None and not effects.maximum_intensity,
+            shaded=effects.shading is not None
+            and table is not None
+            and not effects.maximum_intensity,
             surfaces=tuple(
                 Surface(
                     value=float(units.to(each.value)),
-                    colour=np.array(parse_colour(each.colour) if each.colour is not None else function.colour(each.value)),
+                    colour=np.array(
+                        parse_colour(each.colour)
+                        if each.colour is not None
+                        else function.colour(each.value)
+                    ),
                     opacity=each.opacity,
                 )
                 for each in effects.isosurfaces
@@ -153,7 +180,9 @@ class Plan:
             jitter=effects.jitter,
             skipping=march.skipping,
         )
-        longest = float(np.linalg.norm(np.diff(grid.bounds, axis=1)[:, 0] * grid.spacing)) / task.step
+        longest = (
+            float(np.linalg.norm(np.diff(grid.bounds, axis=1)[:, 0] * grid.spacing)) / task.step
+        )
         if longest > LONG_RAY:
             line = (
                 f"a ray takes up to {longest:.3g} samples, since the axes are of very different lengths or the step is short; "
@@ -166,7 +195,9 @@ class Plan:
         if mode == "auto":
             mode = "arm" if march.device == "cuda" else "cache"
         if mode == "cache" and march.device == "cuda":
-            raise InputError("march 'cache' computes on the CPU; take 'arm' or 'stream' for device 'cuda'")
+            raise InputError(
+                "march 'cache' computes on the CPU; take 'arm' or 'stream' for device 'cuda'"
+            )
         # Light comes from all of the volume, seen or not.
         everything: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
         region = part_in_view(rays, volume) if shadows is None and occlusion is None else everything
@@ -225,22 +256,34 @@ def _time_of(volume: Volume, step: float) -> float:
     return float(np.interp(step, np.arange(len(times)), times))
 
 
-def _function(volume: Volume, scene: Scene, grid: Grid, histogram: Callable[[], Histogram] | None) -> TransferFunction:
+def _function(
+    volume: Volume, scene: Scene, grid: Grid, histogram: Callable[[], Histogram] | None
+) -> TransferFunction:
     features = tuple(str(text) for text in volume.container.header.get("features", ()))
     value_range = (volume.value_range.low, volume.value_range.high)
 
     def made(found: Histogram | None) -> TransferFunction:
         return TransferFunction.of(
-            scene.transfer_function, value_range=value_range, spacing=grid.vertex_spacing, features=features, histogram=found
+            scene.transfer_function,
+            value_range=value_range,
+            spacing=grid.vertex_spacing,
+            features=features,
+            histogram=found,
         )
 
     found = made(None)
-    if histogram is None or scene.transfer_function.opacity != "auto" or scene.transfer_function.nothing:
+    if (
+        histogram is None
+        or scene.transfer_function.opacity != "auto"
+        or scene.transfer_function.nothing
+    ):
         return found
     # What a histogram of one value would change tells whether the opacity depends on one at all.
     (low, high), scale = value_range, volume.value_range.scale
     edges = np.linspace(low * scale, high * scale, 9) / scale
-    probe = made((edges, np.array([0, 0, 0, 0, 1, 0, 0, 0], dtype=np.int64))) if low < high else found
+    probe = (
+        made((edges, np.array([0, 0, 0, 0, 1, 0, 0, 0], dtype=np.int64))) if low < high else found
+    )
     return found if np.array_equal(found.points, probe.points) else made(histogram())
 
 
@@ -256,12 +299,17 @@ def _level(volume: Volume, scene: Scene, rays: Rays) -> tuple[int, str]:
         if scene.march.lod > 0:
             volume.lod_vertices(scene.march.lod)
         if scene.march.lod > 0 and volume.profile != "compact":
-            raise InputError(f"{volume.path}: a file of the profile {volume.profile} has no levels of detail; leave 'lod' out")
+            raise InputError(
+                f"{volume.path}: a file of the profile {volume.profile} has no levels of detail; leave 'lod' out"
+            )
         return scene.march.lod, "as the scene says"
     if volume.profile != "compact":
         return 0, f"files of the profile {volume.profile} have but one"
     across = pixel_vertices(rays)
-    most = min((int(high - low - 1).bit_length() - 1 for low, high in volume.box if high - low > 1), default=0)
+    most = min(
+        (int(high - low - 1).bit_length() - 1 for low, high in volume.box if high - low > 1),
+        default=0,
+    )
     lod = max(0, min(math.floor(math.log2(across)) if across >= 2 else 0, most, MAX_LOD))
     return lod, f"the nearest pixel is {across:.3g} vertices wide"
 
@@ -271,19 +319,26 @@ def _lamp(rays: Rays, shading: Shading | None, shadows: Shadows | None) -> Float
     chosen = shading.light if shading is not None and shading.light is not None else None
     if shadows is not None and shadows.light is not None:
         if chosen is not None and chosen != shadows.light:
-            raise InputError("shading and shadows name different lights; there is one lamp: leave 'light' out of one of them")
+            raise InputError(
+                "shading and shadows name different lights; there is one lamp: leave 'light' out of one of them"
+            )
         chosen = shadows.light
     if chosen is not None:
         direction = np.array(chosen)
         largest = float(np.abs(direction).max())
         if not largest > 0:
             raise InputError("light has no length; give a direction such as 1, 1, 2")
-        direction = direction / largest  # first, since the squares of the largest numbers go beyond float64
+        direction = (
+            direction / largest
+        )  # first, since the squares of the largest numbers go beyond float64
         return np.asarray(direction / np.linalg.norm(direction), dtype=np.float64)
     if shadows is None:
         return None
     spacing = rays.grid.spacing
-    right, up, away = (part / np.linalg.norm(part) for part in (rays.right * spacing, rays.up * spacing, -rays.forward * spacing))
+    right, up, away = (
+        part / np.linalg.norm(part)
+        for part in (rays.right * spacing, rays.up * spacing, -rays.forward * spacing)
+    )
     lamp = SHOULDER[0] * right + SHOULDER[1] * up + SHOULDER[2] * away
     return np.asarray(lamp / np.linalg.norm(lamp), dtype=np.float64)
 

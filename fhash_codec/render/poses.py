@@ -43,14 +43,31 @@ class CameraPath:
             return self.cameras[int(exact[0])]
         before = self.cameras[int(np.searchsorted(self.at, share)) - 1]
         lens = self._lens(share)
-        if all(getattr(camera, name) == getattr(self.cameras[0], name) for camera in self.cameras for name in PLACED):
+        if all(
+            getattr(camera, name) == getattr(self.cameras[0], name)
+            for camera in self.cameras
+            for name in PLACED
+        ):
             # Angles are followed as they are given, whole turns included.
-            turned = pchip(self.at, np.array([[camera.azimuth, camera.elevation] for camera in self.cameras]), share)
-            return dataclasses.replace(before, azimuth=float(turned[0]), elevation=float(np.clip(turned[1], -90, 90)), **lens)
+            turned = pchip(
+                self.at,
+                np.array([[camera.azimuth, camera.elevation] for camera in self.cameras]),
+                share,
+            )
+            return dataclasses.replace(
+                before,
+                azimuth=float(turned[0]),
+                elevation=float(np.clip(turned[1], -90, 90)),
+                **lens,
+            )
         poses = [_pose(Rays.of(camera, self.grid, self.size), camera) for camera in self.cameras]
-        place = pchip(self.at, np.array([[*focal, np.log(distance)] for focal, distance, _ in poses]), share)
+        place = pchip(
+            self.at, np.array([[*focal, np.log(distance)] for focal, distance, _ in poses]), share
+        )
         turns, focal = np.array([turn for _, _, turn in poses]), place[:3]
-        away, up = self._upright(turns, share) or tuple(_matrix(_turning(self.at, turns, share)).T[[2, 1]])
+        away, up = self._upright(turns, share) or tuple(
+            _matrix(_turning(self.at, turns, share)).T[[2, 1]]
+        )
         return dataclasses.replace(
             before,
             azimuth=0.0,
@@ -66,7 +83,9 @@ class CameraPath:
 
         None where they have not, or where one looks along it.
         """
-        ups = np.array([camera.view_up or VIEWS[camera.view][1] for camera in self.cameras], dtype=np.float64)
+        ups = np.array(
+            [camera.view_up or VIEWS[camera.view][1] for camera in self.cameras], dtype=np.float64
+        )
         ups /= np.linalg.norm(ups, axis=1, keepdims=True)
         away = np.array([_matrix(turn)[:, 2] for turn in turns])
         up = ups[0]
@@ -78,7 +97,9 @@ class CameraPath:
         second = np.cross(up, first)
         around = np.unwrap(np.arctan2(away @ second, away @ first))
         angle, rise = pchip(self.at, np.stack([around, np.arcsin(heights)], axis=-1), share)
-        return np.cos(rise) * (np.cos(angle) * first + np.sin(angle) * second) + np.sin(rise) * up, up
+        return np.cos(rise) * (np.cos(angle) * first + np.sin(angle) * second) + np.sin(
+            rise
+        ) * up, up
 
     def _lens(self, share: float) -> dict[str, Any]:
         """What changes of zoom, angle, and the scale of a parallel projection, if every camera gives one."""
@@ -123,10 +144,22 @@ def pchip(at: Floats, values: Floats, share: float) -> Floats:
 def _pose(rays: Rays, camera: Camera) -> tuple[Floats, float, Floats]:
     """Focal point, distance from it, and direction as a quaternion (w, x, y, z), all physical."""
     spacing = rays.grid.spacing
-    eye, forward, up = rays.eye * spacing + rays.grid.origin, rays.forward * spacing, rays.up * spacing
-    focal = np.array(camera.focal_point) if camera.focal_point is not None else rays.grid.corners.mean(axis=1)
+    eye, forward, up = (
+        rays.eye * spacing + rays.grid.origin,
+        rays.forward * spacing,
+        rays.up * spacing,
+    )
+    focal = (
+        np.array(camera.focal_point)
+        if camera.focal_point is not None
+        else rays.grid.corners.mean(axis=1)
+    )
     up = up / np.linalg.norm(up)
-    return focal, float(np.linalg.norm(eye - focal)), _quaternion(np.stack([np.cross(forward, up), up, -forward], axis=1))
+    return (
+        focal,
+        float(np.linalg.norm(eye - focal)),
+        _quaternion(np.stack([np.cross(forward, up), up, -forward], axis=1)),
+    )
 
 
 def _turning(at: Floats, turns: Floats, share: float) -> Floats:
@@ -136,7 +169,12 @@ def _turning(at: Floats, turns: Floats, share: float) -> Floats:
         if turns[number] @ turns[number - 1] < 0:
             turns[number] *= -1
     width = np.diff(at)
-    speeds = np.array([_log(_product(_inverse(first), second)) for first, second in itertools.pairwise(turns)]) / width[:, None]
+    speeds = (
+        np.array(
+            [_log(_product(_inverse(first), second)) for first, second in itertools.pairwise(turns)]
+        )
+        / width[:, None]
+    )
     tangents = np.concatenate([speeds[:1], speeds])
     for number in range(1, len(speeds)):
         before, after = width[number - 1], width[number]
@@ -160,7 +198,9 @@ def _between(one: Floats, other: Floats, t: float) -> Floats:
 
 
 def _product(a: Floats, b: Floats) -> Floats:
-    return np.array([a[0] * b[0] - a[1:] @ b[1:], *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))])
+    return np.array(
+        [a[0] * b[0] - a[1:] @ b[1:], *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))]
+    )
 
 
 def _inverse(a: Floats) -> Floats:
@@ -170,7 +210,9 @@ def _inverse(a: Floats) -> Floats:
 def _log(a: Floats) -> Floats:
     """Half the turn of a unit quaternion as a vector along its axis."""
     sine = float(np.linalg.norm(a[1:]))
-    return np.asarray(a[1:] * (np.arctan2(sine, a[0]) / sine if sine > 1e-12 else 1.0), dtype=np.float64)
+    return np.asarray(
+        a[1:] * (np.arctan2(sine, a[0]) / sine if sine > 1e-12 else 1.0), dtype=np.float64
+    )
 
 
 def _exp(half: Floats) -> Floats:
@@ -184,8 +226,16 @@ def _quaternion(matrix: Floats) -> Floats:
     parts = np.array([trace, *np.diag(matrix)])
     largest = int(np.argmax(parts))
     whole = np.sqrt(max(1 - trace + 2 * parts[largest], 0.0)) if largest else np.sqrt(1 + trace)
-    wx, wy, wz = matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]
-    xy, xz, yz = matrix[0, 1] + matrix[1, 0], matrix[0, 2] + matrix[2, 0], matrix[1, 2] + matrix[2, 1]
+    wx, wy, wz = (
+        matrix[2, 1] - matrix[1, 2],
+        matrix[0, 2] - matrix[2, 0],
+        matrix[1, 0] - matrix[0, 1],
+    )
+    xy, xz, yz = (
+        matrix[0, 1] + matrix[1, 0],
+        matrix[0, 2] + matrix[2, 0],
+        matrix[1, 2] + matrix[2, 1],
+    )
     rows = ((0, wx, wy, wz), (wx, 0, xy, xz), (wy, xy, 0, yz), (wz, xz, yz, 0))
     found = np.array(rows[largest], dtype=np.float64) / (2 * whole)
     found[largest] = whole / 2

@@ -26,7 +26,9 @@ class Record:
     def __post_init__(self) -> None:
         hints = _hints(type(self))  # type: ignore[arg-type]
         for each in dataclasses.fields(self):  # type: ignore[arg-type]
-            object.__setattr__(self, each.name, _checked(each, hints[each.name], getattr(self, each.name)))
+            object.__setattr__(
+                self, each.name, _checked(each, hints[each.name], getattr(self, each.name))
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name, without those that are the default."""
@@ -40,12 +42,16 @@ class Record:
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """From `to_dict`'s values; raises InputError for an unknown name (offering the nearest) or a value that is not allowed."""
         if not isinstance(values, Mapping):
-            raise InputError(f"{cls.__name__.lower()} is {values!r:.40}; a table of settings is needed")
+            raise InputError(
+                f"{cls.__name__.lower()} is {values!r:.40}; a table of settings is needed"
+            )
         known = [each.name for each in dataclasses.fields(cls)]  # type: ignore[arg-type]
         for name in values:
             if name not in known:
                 near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.0)
-                raise InputError(f"unknown setting '{str(name)[:60]}' of {cls.__name__.lower()}; did you mean '{near[0]}'?")
+                raise InputError(
+                    f"unknown setting '{str(name)[:60]}' of {cls.__name__.lower()}; did you mean '{near[0]}'?"
+                )
         for each in dataclasses.fields(cls):  # type: ignore[arg-type]
             if each.name not in values and _default(each) is dataclasses.MISSING:
                 raise InputError(f"{each.name} is missing: {_wanted(each)} is needed")
@@ -56,7 +62,9 @@ class Record:
         """From a file: TOML by its suffix .toml, else JSON. what: it is, missing: what is said where there is none. Raises InputError."""
         try:
             text = path.read_text(encoding="utf-8")
-            return cls.from_dict(tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text))
+            return cls.from_dict(
+                tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+            )
         except FileNotFoundError as error:
             raise MissingInputError(f"{path}: {missing}") from error
         except (OSError, ValueError, RecursionError) as error:
@@ -65,9 +73,18 @@ class Record:
             raise InputError(f"{path}: not {what}: {error}") from error
 
 
-def limits(default: Any, help: str, *, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()) -> Any:
+def limits(
+    default: Any,
+    help: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
     """A field with its help (units and range included) and what it may be."""
-    return field(default=default, metadata={"help": help, "low": low, "high": high, "choices": choices})
+    return field(
+        default=default, metadata={"help": help, "low": low, "high": high, "choices": choices}
+    )
 
 
 @cache
@@ -76,7 +93,9 @@ def _hints(cls: type) -> dict[str, Any]:
 
 
 def _default(each: dataclasses.Field[Any]) -> Any:
-    return each.default_factory() if each.default_factory is not dataclasses.MISSING else each.default
+    return (
+        each.default_factory() if each.default_factory is not dataclasses.MISSING else each.default
+    )
 
 
 def _plain(value: Any) -> Any:
@@ -105,7 +124,8 @@ def _checked(each: dataclasses.Field[Any], hint: Any, value: Any) -> Any:
         if choices and isinstance(part, str) and part not in choices:
             near = difflib.get_close_matches(part, choices, n=1, cutoff=0.6)
             raise InputError(
-                f"{each.name} is '{part[:60]}'; allowed: {', '.join(choices)}" + (f"; did you mean '{near[0]}'?" if near else "")
+                f"{each.name} is '{part[:60]}'; allowed: {', '.join(choices)}"
+                + (f"; did you mean '{near[0]}'?" if near else "")
             )
     return found
 
@@ -146,5 +166,9 @@ def _fitted(hint: Any, value: Any) -> Any:
     if hint is bool or isinstance(value, bool):
         return value if hint is bool and isinstance(value, bool) else _WRONG
     if hint is float:
-        return float(value) if isinstance(value, int | float) and abs(value) <= sys.float_info.max else _WRONG
+        return (
+            float(value)
+            if isinstance(value, int | float) and abs(value) <= sys.float_info.max
+            else _WRONG
+        )
     return value if isinstance(value, hint) else _WRONG

@@ -84,7 +84,12 @@ class Renderer:
         return plan
 
     def render(
-        self, scene: Scene | None = None, *, plan: Plan | None = None, upcoming: Scene | None = None, progress: Progress = silent
+        self,
+        scene: Scene | None = None,
+        *,
+        plan: Plan | None = None,
+        upcoming: Scene | None = None,
+        progress: Progress = silent,
     ) -> Image:
         """A picture of a scene, or of a plan that was made for it.
 
@@ -96,14 +101,23 @@ class Renderer:
         plan = plan if plan is not None else self.plan(Scene() if scene is None else scene)
         task = plan.task
         lit: dict[str, int] = {}
-        frame = self._frame(plan, progress) if plan.mode == "cache" or plan.lights or self.volume.profile == "compact" else None
+        frame = (
+            self._frame(plan, progress)
+            if plan.mode == "cache" or plan.lights or self.volume.profile == "compact"
+            else None
+        )
         if upcoming is not None:
             self._prepare(upcoming)
         if plan.lights:
             assert frame is not None
             progress("lighting", 0, 1, "")
             light = light_grid(
-                frame.frame, task.rays.grid, task.table, shadows=plan.shadows, lamp=plan.lamp, ambient_occlusion=plan.occlusion
+                frame.frame,
+                task.rays.grid,
+                task.table,
+                shadows=plan.shadows,
+                lamp=plan.lamp,
+                ambient_occlusion=plan.occlusion,
             )
             task, lit = replace(task, light=light), {"secondary_rays": light.secondary_rays}
             progress("lighting", 1, 1, "")
@@ -119,7 +133,13 @@ class Renderer:
                 if frame is not None and self.volume.profile == "compact"
                 else NetworkField(self.volume, plan.step, plan.units, arrays)
             )
-            marched = stream(field, task, adaptive=plan.mode == "arm", budget=plan.scene.march.samples_per_pass, progress=progress)
+            marched = stream(
+                field,
+                task,
+                adaptive=plan.mode == "arm",
+                budget=plan.scene.march.samples_per_pass,
+                progress=progress,
+            )
         return self._finished(plan, marched, lit, begin)
 
     def histogram(self) -> Histogram:
@@ -130,7 +150,9 @@ class Renderer:
             last = volume.shape[0] - 1
             # By a power of two, 1 for every ordinary range, so that edges of denormals are apart and no width overflows.
             scale = volume.value_range.scale
-            edges = np.linspace(volume.value_range.low * scale, volume.value_range.high * scale, BINS + 1)
+            edges = np.linspace(
+                volume.value_range.low * scale, volume.value_range.high * scale, BINS + 1
+            )
             counts = np.zeros(BINS, dtype=np.int64)
             if volume.profile == "compact":
                 size = float(np.prod([high - low for low, high in volume.box]))
@@ -142,7 +164,9 @@ class Renderer:
                 frames = [volume.read(last // 2)]
             for frame in frames:
                 known = frame[np.isfinite(frame)]
-                counts += np.histogram(np.clip(known if scale == 1 else known * scale, edges[0], edges[-1]), edges)[0]
+                counts += np.histogram(
+                    np.clip(known if scale == 1 else known * scale, edges[0], edges[-1]), edges
+                )[0]
             self._histogram = edges / scale, counts
         return self._histogram
 
@@ -158,7 +182,10 @@ class Renderer:
             made = _decode(self.volume, plan)
         progress("decoding", 1, 1, "")
         self._decoded.pop(key, None)
-        while self._decoded and sum(each.nbytes for each in self._decoded.values()) + made.nbytes > self.memory:
+        while (
+            self._decoded
+            and sum(each.nbytes for each in self._decoded.values()) + made.nbytes > self.memory
+        ):
             self._decoded.popitem(last=False)
         if made.nbytes <= self.memory:
             self._decoded[key] = made
@@ -233,12 +260,17 @@ def _decode(volume: Volume, plan: Plan) -> _Decoded:
 def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Units) -> Frame:
     """The values of a region of the feature bounding box at a step, of every 2^lod-th vertex, as a marcher takes them."""
     inner: Box = tuple(  # type: ignore[assignment]
-        (max(low, first), min(high, last)) for (low, high), (first, last) in zip(region, volume.box, strict=True)
+        (max(low, first), min(high, last))
+        for (low, high), (first, last) in zip(region, volume.box, strict=True)
     )
     if any(low >= high for low, high in inner):
         # Nothing of the feature is in the picture.
         low, _ = zip(*volume.box, strict=True)
-        return Frame(values=np.full((1, 1, 1), np.nan, dtype=np.float32), first=(low[0], low[1], low[2]), stride=1 << lod)
+        return Frame(
+            values=np.full((1, 1, 1), np.nan, dtype=np.float32),
+            first=(low[0], low[1], low[2]),
+            stride=1 << lod,
+        )
     if lod == 0:
         values, first = volume.read(step, inner), [low for low, _ in inner]
     else:
@@ -249,7 +281,9 @@ def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Uni
         if after != before:
             share = volume.key_times.key_index(step) - volume.key_times.key_index(before)
             values = values * (1 - share) + volume.read_lod(after, lod, inner) * share
-    return Frame(values=_single(values, units), first=(first[0], first[1], first[2]), stride=1 << lod)
+    return Frame(
+        values=_single(values, units), first=(first[0], first[1], first[2]), stride=1 << lod
+    )
 
 
 def _single(values: npt.NDArray[np.floating], units: Units) -> npt.NDArray[np.float32]:

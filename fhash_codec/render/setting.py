@@ -64,8 +64,14 @@ class Setting:
         if largest > LARGEST or 0 < high - low < SMALLEST:
             middle, unit = low / 2 + high / 2, max(high / 2 - low / 2, largest * 1e-30, 5e-324)
             with np.errstate(over="ignore"):
-                values = (bricks.values.astype(np.float64) / unit - middle / unit).clip(-LARGEST, LARGEST).astype(np.float32)
-        low, high, least, most = (number / unit - middle / unit for number in (low, high, least, most))
+                values = (
+                    (bricks.values.astype(np.float64) / unit - middle / unit)
+                    .clip(-LARGEST, LARGEST)
+                    .astype(np.float32)
+                )
+        low, high, least, most = (
+            number / unit - middle / unit for number in (low, high, least, most)
+        )
         span, floor = flatness(low, high, least, most)
         light = task.light
         return cls(
@@ -111,4 +117,6 @@ def slope_scale(grid: Grid, span: float, least: float, most: float) -> Floats:
 
 def empty_table(low: float, high: float) -> Table:
     """A table of nothing, for surfaces alone."""
-    return Table(low=low, high=high, colours=np.zeros((2, 3), dtype=np.float32), extinctions=np.zeros(2))
+    return Table(
+        low=low, high=high, colours=np.zeros((2, 3), dtype=np.float32), extinctions=np.zeros(2)
+    )

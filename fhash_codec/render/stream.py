@@ -32,7 +32,14 @@ BAND = 1 << 20
 """Rays that are alive at a time; a larger picture is made in bands of rows."""
 
 
-def stream(field: Field, task: Task, *, adaptive: bool, budget: int | None = None, progress: Progress = silent) -> Marched:
+def stream(
+    field: Field,
+    task: Task,
+    *,
+    adaptive: bool,
+    budget: int | None = None,
+    progress: Progress = silent,
+) -> Marched:
     """March a task's rays through a field, where the field has its arrays.
 
     adaptive: adaptive ray marching with N_r = `budget` samples in a pass, the number of rays if None; else one sample of each ray.
@@ -48,11 +55,20 @@ def stream(field: Field, task: Task, *, adaptive: bool, budget: int | None = Non
     with arrays.guarded():
         for first in range(0, height, rows):
             band = slice(first, min(first + rows, height))
-            marcher = _Marcher(field, task, Beams.of(task, field.bounds, range(band.start, band.stop), arrays))
+            marcher = _Marcher(
+                field, task, Beams.of(task, field.bounds, range(band.start, band.stop), arrays)
+            )
             marcher.march(adaptive, budget, partial(_report, progress, first, height))
             counters = complete(counters, marcher.counters, {"gradients": marcher.canvas.gradients})
-            rgba[band], depth[band], normal[band] = _pixels(marcher.canvas, (band.stop - band.start, width, fine))
-    return Marched(rgba=rgba, depth=depth if task.depth else None, normal=normal if task.normal else None, counters=counters)
+            rgba[band], depth[band], normal[band] = _pixels(
+                marcher.canvas, (band.stop - band.start, width, fine)
+            )
+    return Marched(
+        rgba=rgba,
+        depth=depth if task.depth else None,
+        normal=normal if task.normal else None,
+        counters=counters,
+    )
 
 
 def _report(progress: Progress, first: int, height: int, done: int, total: int) -> None:
@@ -63,11 +79,19 @@ def _report(progress: Progress, first: int, height: int, done: int, total: int) 
 def _pixels(canvas: Canvas, shape: tuple[int, int, int]) -> tuple[Array, Array, Array]:
     """rgba, depth and normal of rays (rows, width, rays of a pixel) on the host: the mean colour, and what is nearest."""
     arrays, xp = canvas.arrays, canvas.arrays.xp
-    rgba = xp.concatenate([canvas.colour, 1 - canvas.clear[:, None]], axis=1).reshape(*shape, 4).mean(axis=2)
+    rgba = (
+        xp.concatenate([canvas.colour, 1 - canvas.clear[:, None]], axis=1)
+        .reshape(*shape, 4)
+        .mean(axis=2)
+    )
     depth = canvas.depth.reshape(shape)
     nearest = xp.argmin(depth, axis=2)[..., None]
     normal = arrays.take_along(canvas.normal.reshape(*shape, 3), nearest[..., None], 2)[:, :, 0]
-    return arrays.host(rgba), arrays.host(arrays.take_along(depth, nearest, 2)[..., 0]), arrays.host(normal)
+    return (
+        arrays.host(rgba),
+        arrays.host(arrays.take_along(depth, nearest, 2)[..., 0]),
+        arrays.host(normal),
+    )
 
 
 class _Marcher:
@@ -104,8 +128,14 @@ class _Marcher:
             alive = self._leapt(alive)
             if len(alive):
                 pace = int(min(max(budget // len(alive), 1), MOST_SAMPLES)) if adaptive else 1
-                self._pass(alive, min(pace, int((self.end[alive] - self.next[alive]).max())) if pace > 1 else 1)
-            alive = alive[(self.next[alive] < self.end[alive]) & (self.canvas.clear[alive] >= self.task.threshold)]
+                self._pass(
+                    alive,
+                    min(pace, int((self.end[alive] - self.next[alive]).max())) if pace > 1 else 1,
+                )
+            alive = alive[
+                (self.next[alive] < self.end[alive])
+                & (self.canvas.clear[alive] >= self.task.threshold)
+            ]
             report(total - len(alive), total)
         if self.task.maximum:
             self.canvas.show_peaks(self.peak, self.peak_at)
@@ -118,10 +148,14 @@ class _Marcher:
         if self.task.surfaces:
             # There may be one between the last place in a brick and the next one, which is no longer in it.
             near = ~self.arrays.xp.isnan(self.from_[alive])
-            near[self.arrays.nonzero(near)] = self.leaping.matters(self.beams.places(alive[near], self.from_[alive[near]]))
+            near[self.arrays.nonzero(near)] = self.leaping.matters(
+                self.beams.places(alive[near], self.from_[alive[near]])
+            )
             leapers = alive[~near]
         before = self.next[leapers]
-        reached, leaps = self.leaping.leap(self.beams.origin[leapers], self.beams.pace[leapers], before, self.end[leapers])
+        reached, leaps = self.leaping.leap(
+            self.beams.origin[leapers], self.beams.pace[leapers], before, self.end[leapers]
+        )
         self.counters["skipped_bricks"] += leaps
         gone = leapers[reached > before]
         self.before[gone], self.from_[gone] = np.nan, np.nan
@@ -149,7 +183,9 @@ class _Marcher:
         self.next[alive] += pace
         if task.maximum:
             best = xp.argmax(xp.where(xp.isnan(values), -np.inf, values), axis=1)[:, None]
-            value, at = (arrays.take_along(part, best, 1)[:, 0] for part in (values, arrays.real(sample)))
+            value, at = (
+                arrays.take_along(part, best, 1)[:, 0] for part in (values, arrays.real(sample))
+            )
             larger = value > self.peak[alive]
             self.peak[alive[larger]], self.peak_at[alive[larger]] = value[larger], at[larger]
         if task.surfaces or not task.maximum:
@@ -160,7 +196,9 @@ class _Marcher:
         assert self.cells is not None
         z, y, x = self.cells.shape
         at = self.arrays.whole((places - self.field.first) / self.field.stride)
-        i, j, k = (self.arrays.xp.clip(at[:, axis], 0, size - 1) for axis, size in enumerate((x, y, z)))
+        i, j, k = (
+            self.arrays.xp.clip(at[:, axis], 0, size - 1) for axis, size in enumerate((x, y, z))
+        )
         return self.arrays.xp.take(self.cells, (k * y + j) * x + i)
 
     def _looked_up(self, places: Array) -> Array:
@@ -174,14 +212,22 @@ class _Marcher:
         surfaces, rows = len(task.surfaces), len(alive)
         shape = (*sample.shape, surfaces + 1)
         opacity = arrays.full(shape, 0.0)
-        at, which = arrays.real(xp.broadcast_to(sample[..., None], shape)), xp.broadcast_to(arrays.range(surfaces + 1), shape)
+        at, which = (
+            arrays.real(xp.broadcast_to(sample[..., None], shape)),
+            xp.broadcast_to(arrays.range(surfaces + 1), shape),
+        )
         if task.surfaces:
             found = self._crossings(alive, sample, values)
             opacity[..., :-1], at[..., :-1] = found.opacity, found.at
             which = xp.concatenate([found.which, which[..., -1:]], axis=2)
         if self.palette is not None and not task.maximum:
             opacity[..., -1] = self._opacity(self.palette, alive, sample, values)
-        return Events(opacity=opacity.reshape(rows, -1), at=at.reshape(rows, -1), which=which.reshape(rows, -1), values=values)
+        return Events(
+            opacity=opacity.reshape(rows, -1),
+            at=at.reshape(rows, -1),
+            which=which.reshape(rows, -1),
+            values=values,
+        )
 
     def _crossings(self, alive: Array, sample: Array, values: Array) -> Crossings:
         """The surfaces before each sample; before the first of a ray from where it enters, behind the last to where it leaves."""
@@ -192,7 +238,9 @@ class _Marcher:
         beyond = (places >= leaving) & (sample < self.end[alive][:, None])
         values[beyond] = self._looked_up(beams.borders(alive, to)[beyond])
         rays = alive[xp.isnan(self.before[alive])]
-        self.from_[rays] = xp.maximum(arrays.real(self.next[rays] - sample.shape[1] - 1), beams.entered[rays])
+        self.from_[rays] = xp.maximum(
+            arrays.real(self.next[rays] - sample.shape[1] - 1), beams.entered[rays]
+        )
         self.before[rays] = self._looked_up(beams.borders(rays, self.from_[rays]))
         found = crossings(
             lambda row, at: self._looked_up(beams.places(alive[row], at)),
@@ -209,7 +257,12 @@ class _Marcher:
         arrays, xp = self.arrays, self.arrays.xp
         known = ~xp.isnan(values)
         row, column = arrays.nonzero(known)
-        length = xp.where(sample[row, column] == self.beams.last[alive][row], self.beams.rest[alive][row], 1.0) * self.task.step
+        length = (
+            xp.where(
+                sample[row, column] == self.beams.last[alive][row], self.beams.rest[alive][row], 1.0
+            )
+            * self.task.step
+        )
         opacity = arrays.full(values.shape, 0.0)
         opacity[row, column] = -xp.expm1(-palette.extinction(values[row, column]) * length)
         return opacity

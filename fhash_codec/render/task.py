@@ -16,7 +16,16 @@ import numpy.typing as npt
 
 from fhash_codec.render.camera import Grid, Rays
 
-__all__ = ["Frame", "LightGrid", "Lighting", "Marched", "Surface", "Table", "Task", "extinctions_in"]
+__all__ = [
+    "Frame",
+    "LightGrid",
+    "Lighting",
+    "Marched",
+    "Surface",
+    "Table",
+    "Task",
+    "extinctions_in",
+]
 
 Floats = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
@@ -85,7 +94,10 @@ class Frame:
 
         It reaches to the end of the domain where no more vertices of the frame would fit.
         """
-        first, counts = np.array(self.first[::-1], dtype=np.float64), np.array(self.values.shape[::-1])
+        first, counts = (
+            np.array(self.first[::-1], dtype=np.float64),
+            np.array(self.values.shape[::-1]),
+        )
         ends = first + counts * self.stride
         low = np.where(first == 0, grid.bounds[:, 0], first)
         high = np.where(ends > np.array(grid.counts) - 1, grid.bounds[:, 1], ends - self.stride)

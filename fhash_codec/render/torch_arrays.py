@@ -41,7 +41,12 @@ class TorchArrays(Arrays):
 
     def full(self, shape: Sequence[int] | int, value: float, kind: str = "float64") -> Array:
         """As `Arrays` has it."""
-        return torch.full((shape,) if isinstance(shape, int) else tuple(shape), value, dtype=getattr(torch, kind), device=self.device)
+        return torch.full(
+            (shape,) if isinstance(shape, int) else tuple(shape),
+            value,
+            dtype=getattr(torch, kind),
+            device=self.device,
+        )
 
     def range(self, count: int) -> Array:
         """As `Arrays` has it."""

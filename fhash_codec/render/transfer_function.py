@@ -34,7 +34,9 @@ ENTRIES = 4096
 
 def alpha(extinction: npt.ArrayLike, length: npt.ArrayLike) -> Floats:
     """Opacity 0..1 of a length, in float64: exact for tiny steps, where 1 - (1 - opacity)^length is 0 or noise."""
-    return np.asarray(-np.expm1(-np.multiply(extinction, length, dtype=np.float64)), dtype=np.float64)
+    return np.asarray(
+        -np.expm1(-np.multiply(extinction, length, dtype=np.float64)), dtype=np.float64
+    )
 
 
 def extinction_of(opacity: npt.ArrayLike, distance: float) -> Floats:
@@ -80,7 +82,9 @@ class TransferFunction:
         """
         low, high = value_range
         if spec.range is not None and spec.range[0] >= spec.range[1]:
-            raise InputError(f"range is {spec.range[0]:g} to {spec.range[1]:g}; the first value must be below the second")
+            raise InputError(
+                f"range is {spec.range[0]:g} to {spec.range[1]:g}; the first value must be below the second"
+            )
         shown = spec.range or shown_range(features, value_range)
         colours, preset = _colours(spec, shown)
         if spec.nothing:
@@ -90,7 +94,13 @@ class TransferFunction:
         elif spec.opacity == "auto" and preset is not None and preset.opacity is not None:
             points = preset.opacity
         else:
-            points = opacity_preset(spec.opacity, shown=shown, value_range=value_range, features=features, histogram=histogram)
+            points = opacity_preset(
+                spec.opacity,
+                shown=shown,
+                value_range=value_range,
+                features=features,
+                histogram=histogram,
+            )
         found = cls(
             colours=colours,
             points=points,
@@ -132,8 +142,13 @@ class TransferFunction:
         values = low * (1 - share) + high * share
         extinctions = self.extinction(values)
         scale = ValueRange(low, high).scale
-        places = np.clip(np.interp(self.points[:, 0] * scale, [low * scale, high * scale], [0, n - 1]), 0, n - 1)
-        around = np.maximum(extinctions[np.floor(places).astype(np.int64)], extinctions[np.ceil(places).astype(np.int64)])
+        places = np.clip(
+            np.interp(self.points[:, 0] * scale, [low * scale, high * scale], [0, n - 1]), 0, n - 1
+        )
+        around = np.maximum(
+            extinctions[np.floor(places).astype(np.int64)],
+            extinctions[np.ceil(places).astype(np.int64)],
+        )
         inside = (self.points[:, 0] >= low) & (self.points[:, 0] <= high)
         if np.any(inside & (self.points[:, 1] > 0) & (around == 0)) and self.density > 0:
             warnings.warn(
@@ -144,7 +159,9 @@ class TransferFunction:
             )
         return low, high, self.colour(values).astype(np.float32), extinctions
 
-    def visible(self, minimum: npt.ArrayLike, maximum: npt.ArrayLike, n: int = ENTRIES) -> npt.NDArray[np.bool_]:
+    def visible(
+        self, minimum: npt.ArrayLike, maximum: npt.ArrayLike, n: int = ENTRIES
+    ) -> npt.NDArray[np.bool_]:
         """Whether any value from `minimum` to `maximum` (arrays of one shape) has an extinction above 0, by a table of n too.
 
         Exact by the points, for an interval widened by one entry of the table on either side. False where either end is NaN or
@@ -175,7 +192,9 @@ class TransferFunction:
         }
 
 
-def _colours(spec: TransferFunctionSpec, shown: tuple[float, float]) -> tuple[ColourMap, Preset | None]:
+def _colours(
+    spec: TransferFunctionSpec, shown: tuple[float, float]
+) -> tuple[ColourMap, Preset | None]:
     """The colour map over data units, and the preset that it is from.
 
     A preset that reaches from 0 or -1 to 1 is stretched over `shown`; one over other values keeps them unless the scene has a range.
@@ -183,10 +202,14 @@ def _colours(spec: TransferFunctionSpec, shown: tuple[float, float]) -> tuple[Co
     if not isinstance(spec.colours, str):
         rows = [value for value, _ in spec.colours]
         if not rows or np.any(np.diff(rows) <= 0):
-            raise InputError("the values of 'colours' do not ascend; give at least one [value, '#rrggbb'], each value above the one before")
+            raise InputError(
+                "the values of 'colours' do not ascend; give at least one [value, '#rrggbb'], each value above the one before"
+            )
         points = np.array([parse_colour(colour) for _, colour in spec.colours])
         return ColourMap(positions=np.array(rows, dtype=np.float64), points=points), None
-    if is_map(spec.colours) or not (spec.colours.lower().endswith(".json") or os.path.isfile(spec.colours)):
+    if is_map(spec.colours) or not (
+        spec.colours.lower().endswith(".json") or os.path.isfile(spec.colours)
+    ):
         return named_map(spec.colours).rescaled(*shown), None
     preset = read_preset(spec.colours)
     if spec.range is not None or preset.is_relative:
@@ -197,17 +220,23 @@ def _colours(spec: TransferFunctionSpec, shown: tuple[float, float]) -> tuple[Co
 def _ascending(rows: Sequence[tuple[float, float]]) -> Floats:
     """Control points of the opacity, checked."""
     if not rows:
-        raise InputError("'opacity' has no points; give [value, opacity] pairs or the name of a preset")
+        raise InputError(
+            "'opacity' has no points; give [value, opacity] pairs or the name of a preset"
+        )
     points = np.array(rows, dtype=np.float64)
     if np.any(np.diff(points[:, 0]) <= 0):
         raise InputError("the values of 'opacity' do not ascend; each must be above the one before")
     wrong = points[(points[:, 1] < 0) | (points[:, 1] > 1)]
     if len(wrong):
-        raise InputError(f"opacity is {wrong[0, 1]:g} at the value {wrong[0, 0]:g}; allowed: 0 to 1")
+        raise InputError(
+            f"opacity is {wrong[0, 1]:g} at the value {wrong[0, 0]:g}; allowed: 0 to 1"
+        )
     return points
 
 
-def _span(points: Floats, colours: ColourMap, value_range: tuple[float, float]) -> tuple[float, float]:
+def _span(
+    points: Floats, colours: ColourMap, value_range: tuple[float, float]
+) -> tuple[float, float]:
     """The values that a table has to cover: no more than the data have, nor than is visible, so that its entries lie close."""
     low, high = value_range
     positive = np.flatnonzero(points[:, 1] > 0)
@@ -215,7 +244,9 @@ def _span(points: Floats, colours: ColourMap, value_range: tuple[float, float]) 
         first, last = positive[0], positive[-1]
         ends = colours.positions[[0, -1]]
         low = max(low, points[first - 1, 0] if first > 0 else min(points[0, 0], ends[0]))
-        high = min(high, points[last + 1, 0] if last + 1 < len(points) else max(points[-1, 0], ends[1]))
+        high = min(
+            high, points[last + 1, 0] if last + 1 < len(points) else max(points[-1, 0], ends[1])
+        )
     if not low < high:
         low, high = about(float(min(low, high)))
     return float(low), float(high)

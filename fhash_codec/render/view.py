@@ -22,7 +22,10 @@ WHOLE = 0.5
 def pixel_vertices(rays: Rays) -> float:
     """Width of a pixel in vertices where the volume is nearest to the camera, along the axis along which it is smallest; 0 inside."""
     bounds = rays.grid.bounds
-    across = np.minimum(np.abs(rays.right) * 2 / rays.size[0], np.inf), np.abs(rays.up) * 2 / rays.size[1]
+    across = (
+        np.minimum(np.abs(rays.right) * 2 / rays.size[0], np.inf),
+        np.abs(rays.up) * 2 / rays.size[1],
+    )
     lengths = [float(np.linalg.norm(part * rays.grid.spacing)) for part in across]
     width = min(lengths) / float(np.max(np.abs(rays.grid.spacing)))
     if rays.parallel:
@@ -30,7 +33,9 @@ def pixel_vertices(rays: Rays) -> float:
     nearest = np.clip(rays.eye, bounds[:, 0], bounds[:, 1])
     # The distance of the nearest plane across the view: forward has a physical length of 1.
     corners = np.array(list(itertools.product(*bounds)))
-    depth = float(np.min((corners - rays.eye) * rays.grid.spacing @ (rays.forward * rays.grid.spacing)))
+    depth = float(
+        np.min((corners - rays.eye) * rays.grid.spacing @ (rays.forward * rays.grid.spacing))
+    )
     return 0.0 if np.array_equal(nearest, rays.eye) else width * max(depth, 0.0)
 
 
@@ -40,12 +45,16 @@ def part_in_view(rays: Rays, volume: Volume) -> Box:
     One vertex where the picture shows nothing of the volume.
     """
     everything: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # of cameras at the ends of float64
+    with np.errstate(
+        over="ignore", divide="ignore", invalid="ignore"
+    ):  # of cameras at the ends of float64
         seen = _seen(rays)
     if seen is None:
         return ((0, 1), (0, 1), (0, 1))
     found = []
-    for low, high, length, chunk, (first, _) in zip(*seen[::-1].T, volume.shape[1:], volume.chunks[1:], volume.box, strict=True):
+    for low, high, length, chunk, (first, _) in zip(
+        *seen[::-1].T, volume.shape[1:], volume.chunks[1:], volume.box, strict=True
+    ):
         start, stop = max(int(np.floor(low)), 0), min(int(np.ceil(high)) + 1, length)
         # Chunks begin at the feature bounding box.
         start = max(first + (start - first) // chunk * chunk, 0)
@@ -69,7 +78,9 @@ def _seen(rays: Rays) -> Floats | None:
             # A plane holds the other direction and the ray at the picture's edge; the rest of the picture is on its inner side.
             along = middle if rays.parallel else middle + sign * side
             normal = np.cross(along, other)
-            normal = normal / np.abs(normal).max()  # first, since the squares of the largest scales go beyond float64
+            normal = (
+                normal / np.abs(normal).max()
+            )  # first, since the squares of the largest scales go beyond float64
             normal = normal / np.linalg.norm(normal)
             normal = -normal if normal @ side * sign > 0 else normal
             place = rays.eye + sign * side if rays.parallel else rays.eye
@@ -85,4 +96,6 @@ def _seen(rays: Rays) -> Floats | None:
     corners = list(places[np.all(places @ normal.T + offset >= -tolerance, axis=1)])
     if not rays.parallel and np.all((rays.eye >= bounds[:, 0]) & (rays.eye <= bounds[:, 1])):
         corners.append(rays.eye)
-    return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)], axis=-1) if corners else None
+    return (
+        np.stack([np.min(corners, axis=0), np.max(corners, axis=0)], axis=-1) if corners else None
+    )

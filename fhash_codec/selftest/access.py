@@ -31,7 +31,9 @@ def regions(run: Run) -> Iterator[Finding]:
         step = int(generator.integers(run.values.shape[0]))
         region = _region(generator, run.volume.shape[1:])
         wrong += _unlike(run.volume.read(step, region), crop(run.decoded[step], region))
-    t, z, y, x = (slice(*sorted(generator.integers(0, n + 1, 2).tolist())) for n in run.volume.shape)
+    t, z, y, x = (
+        slice(*sorted(generator.integers(0, n + 1, 2).tolist())) for n in run.volume.shape
+    )
     wrong += _unlike(run.volume[t, z, y, x], run.decoded[t, z, y, x])
     yield Finding(name="region = slice", worst=float(wrong), limit=0.0, unit="values")
 
@@ -61,14 +63,19 @@ def between(run: Run) -> Iterator[Finding]:
             read = run.volume.read(before + weight)
             lost += int(np.count_nonzero(np.isnan(read) == run.volume.occupancy(before + weight)))
             if run.volume.profile == "compact":
-                one, other, read = (frame.astype(np.float64) / scale for frame in (run.decoded[before], run.decoded[after], read))
+                one, other, read = (
+                    frame.astype(np.float64) / scale
+                    for frame in (run.decoded[before], run.decoded[after], read)
+                )
                 off = np.abs(read - (one * (1 - weight) + other * weight))
                 worst = max(worst, float(np.nanmax(off, initial=0.0)))
     yield Finding(name="finite between steps", worst=float(lost), limit=0.0, unit="values")
     if run.volume.profile == "compact":
         kind = np.finfo(run.decoded.dtype)
         limit = 4 * float(kind.eps) + float(kind.smallest_subnormal) / scale
-        yield Finding(name="even between steps", worst=worst, limit=limit, unit="of the largest value")
+        yield Finding(
+            name="even between steps", worst=worst, limit=limit, unit="of the largest value"
+        )
 
 
 def points(run: Run) -> Iterator[Finding]:
@@ -78,13 +85,21 @@ def points(run: Run) -> Iterator[Finding]:
     found = np.asarray(run.volume.sample(t=t, z=z, y=y, x=x))
     expected = run.decoded[t, z, y, x]
     yield Finding(
-        name="points: finite as read", worst=float(np.count_nonzero(np.isnan(found) != np.isnan(expected))), limit=0.0, unit="values"
+        name="points: finite as read",
+        worst=float(np.count_nonzero(np.isnan(found) != np.isnan(expected))),
+        limit=0.0,
+        unit="values",
     )
     if run.volume.profile == "compact":
         wrong = np.count_nonzero((found != expected) & ~np.isnan(expected))
         yield Finding(name="points = read", worst=float(wrong), limit=0.0, unit="values")
         return
-    yield Finding(name="points = read", worst=rounding(run, found, expected), limit=1.0, unit="of 1e-5 of the range")
+    yield Finding(
+        name="points = read",
+        worst=rounding(run, found, expected),
+        limit=1.0,
+        unit="of 1e-5 of the range",
+    )
 
 
 def levels_of_detail(run: Run) -> Iterator[Finding]:
@@ -96,7 +111,9 @@ def levels_of_detail(run: Run) -> Iterator[Finding]:
         wrong += _unlike(run.volume.read_lod(step, 0), crop(run.decoded[step], run.volume.box))
         for lod in (1, 2):
             coarse = run.volume.read_lod(step, lod)
-            known = np.isfinite(crop(run.decoded[step], run.volume.box)[(slice(None, None, 1 << lod),) * 3])
+            known = np.isfinite(
+                crop(run.decoded[step], run.volume.box)[(slice(None, None, 1 << lod),) * 3]
+            )
             lost += int(np.count_nonzero(np.isfinite(coarse) != known))
     yield Finding(name="level 0 = read", worst=float(wrong), limit=0.0, unit="values")
     yield Finding(name="coarse levels finite", worst=float(lost), limit=0.0, unit="values")
@@ -109,7 +126,11 @@ def rounding(run: Run, one: Values, other: Values) -> float:
     """The largest difference in parts of what the paper profile may round: 1e-5 of the range, and two last digits of the type."""
     kind = np.finfo(run.decoded.dtype)
     low, high = (end / 2 for end in (run.volume.value_range.low, run.volume.value_range.high))
-    allowed = ROUNDING * (high - low) + float(kind.eps) * max(abs(low), abs(high)) + float(kind.smallest_subnormal)
+    allowed = (
+        ROUNDING * (high - low)
+        + float(kind.eps) * max(abs(low), abs(high))
+        + float(kind.smallest_subnormal)
+    )
     # In halves, which do not overflow.
     off = np.abs(one.astype(np.float64) / 2 - other.astype(np.float64) / 2)
     return float(np.nanmax(off, initial=0.0)) / allowed
@@ -120,7 +141,11 @@ def _unlike(one: Values, other: Values) -> int:
     if one.shape != other.shape or one.dtype != other.dtype:
         return max(one.size, other.size, 1)
     kind = f"u{one.dtype.itemsize}"
-    return int(np.count_nonzero(np.ascontiguousarray(one).view(kind) != np.ascontiguousarray(other).view(kind)))
+    return int(
+        np.count_nonzero(
+            np.ascontiguousarray(one).view(kind) != np.ascontiguousarray(other).view(kind)
+        )
+    )
 
 
 def _generator(run: Run) -> np.random.Generator:

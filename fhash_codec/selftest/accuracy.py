@@ -22,8 +22,18 @@ Mask = npt.NDArray[np.bool_]
 def presence(run: Run) -> Iterator[Finding]:
     """Every vertex of the coreset is finite, every other one NaN: Inf of the source is missing just like NaN."""
     wanted = coreset(run)
-    yield Finding(name="finite in the coreset", worst=_count(wanted & ~np.isfinite(run.decoded)), limit=0.0, unit="values")
-    yield Finding(name="NaN outside of it", worst=_count(~wanted & ~np.isnan(run.decoded)), limit=0.0, unit="values")
+    yield Finding(
+        name="finite in the coreset",
+        worst=_count(wanted & ~np.isfinite(run.decoded)),
+        limit=0.0,
+        unit="values",
+    )
+    yield Finding(
+        name="NaN outside of it",
+        worst=_count(~wanted & ~np.isnan(run.decoded)),
+        limit=0.0,
+        unit="values",
+    )
 
 
 def bound(run: Run) -> Iterator[Finding]:
@@ -34,29 +44,47 @@ def bound(run: Run) -> Iterator[Finding]:
     worst = largest_difference(run.values, run.decoded, np.isfinite(run.decoded))
     if error == 0:
         same = run.values.astype(run.decoded.dtype) == run.decoded
-        yield Finding(name="lossless", worst=_count(~same & np.isfinite(run.decoded)), limit=0.0, unit="values")
+        yield Finding(
+            name="lossless",
+            worst=_count(~same & np.isfinite(run.decoded)),
+            limit=0.0,
+            unit="values",
+        )
     else:
-        yield Finding(name="strict bound", worst=float(worst / error), limit=1.0, unit="of the bound")
+        yield Finding(
+            name="strict bound", worst=float(worst / error), limit=1.0, unit="of the bound"
+        )
 
 
 def quality(run: Run) -> Iterator[Finding]:
     """The PSNR that was promised, and that the figures in the file are no better than the truth."""
     where = np.isfinite(run.decoded)
     reached = _psnr(run, where)
-    promised = promise(run.config).get("psnr") if run.config.profile == "compact" else run.config.psnr
+    promised = (
+        promise(run.config).get("psnr") if run.config.profile == "compact" else run.config.psnr
+    )
     if promised is not None and reached > 0:
-        yield Finding(name="promised PSNR", worst=promised / reached, limit=1.0, unit="of the dB reached")
+        yield Finding(
+            name="promised PSNR", worst=promised / reached, limit=1.0, unit="of the dB reached"
+        )
     stated = run.volume.container.header["quality"]
     worst = largest_difference(run.values, run.decoded, where)
     if stated["max_abs_error"]:
         # Differences of float64 are rounded while they are measured.
         beyond = max(float(worst / Fraction(stated["max_abs_error"]) - 1), 0.0)
-        yield Finding(name="beyond the stated error", worst=beyond, limit=1e-12, unit="of the stated error")
+        yield Finding(
+            name="beyond the stated error", worst=beyond, limit=1e-12, unit="of the stated error"
+        )
     else:
         beyond = float(worst) if stated["max_abs_error"] == 0 else 0.0
         yield Finding(name="beyond the stated error", worst=beyond, limit=0.0, unit="in data units")
     if stated["psnr"] is not None and reached > 0:
-        yield Finding(name="below the stated PSNR", worst=max(stated["psnr"] - reached, 0.0), limit=1e-6, unit="dB")
+        yield Finding(
+            name="below the stated PSNR",
+            worst=max(stated["psnr"] - reached, 0.0),
+            limit=1e-6,
+            unit="dB",
+        )
 
 
 def constants(run: Run) -> Iterator[Finding]:
@@ -64,7 +92,12 @@ def constants(run: Run) -> Iterator[Finding]:
     finite = run.values[np.isfinite(run.values)]
     if finite.min() == finite.max():
         same = run.values.astype(run.decoded.dtype) == run.decoded
-        yield Finding(name="exact constant", worst=_count(~same & np.isfinite(run.decoded)), limit=0.0, unit="values")
+        yield Finding(
+            name="exact constant",
+            worst=_count(~same & np.isfinite(run.decoded)),
+            limit=0.0,
+            unit="values",
+        )
 
 
 def within_range(run: Run) -> Iterator[Finding]:
@@ -74,10 +107,17 @@ def within_range(run: Run) -> Iterator[Finding]:
     decoded = run.decoded[np.isfinite(run.decoded)]
     if run.values.dtype.kind in "iu" and run.values.dtype.itemsize == 8:
         low, high = Fraction(float(low)), Fraction(float(high))
-    excess = max(low - Fraction(decoded.min().item()), Fraction(decoded.max().item()) - high, Fraction(0))
+    excess = max(
+        low - Fraction(decoded.min().item()), Fraction(decoded.max().item()) - high, Fraction(0)
+    )
     allowed = _bound_of(run) or Fraction(0)
     span = high - low if high > low else Fraction(1)
-    yield Finding(name="beyond the range", worst=float(excess / span), limit=float(allowed / span), unit="of the range")
+    yield Finding(
+        name="beyond the range",
+        worst=float(excess / span),
+        limit=float(allowed / span),
+        unit="of the range",
+    )
 
 
 CHECKS = (presence, bound, quality, constants, within_range)
@@ -123,7 +163,10 @@ def largest_difference(values: Values, decoded: Values, where: Mask) -> Fraction
     if not one.size:
         return Fraction(0)
     if one.dtype.kind in "iu" and one.dtype.itemsize == 8:
-        return max(abs(Fraction(a) - Fraction(b)) for a, b in zip(one.tolist(), other.tolist(), strict=True))
+        return max(
+            abs(Fraction(a) - Fraction(b))
+            for a, b in zip(one.tolist(), other.tolist(), strict=True)
+        )
     # Halves do not overflow; the few that look largest are compared exactly.
     rough = np.abs(one.astype(np.float64) / 2 - other.astype(np.float64) / 2)
     near = np.flatnonzero(rough >= rough.max() * (1 - 1e-12))[:8]
@@ -138,11 +181,20 @@ def _psnr(run: Run, where: Mask) -> float:
         return 0.0
     one, other = run.values[where], run.decoded[where]
     if one.dtype.kind in "iu" and one.dtype.itemsize == 8:
-        parts = np.array([float((a - Fraction(b)) / span) for a, b in zip(one.tolist(), other.tolist(), strict=True)])
+        parts = np.array(
+            [
+                float((a - Fraction(b)) / span)
+                for a, b in zip(one.tolist(), other.tolist(), strict=True)
+            ]
+        )
     else:
         # By a power of two, which is exact, so that differences neither overflow nor vanish.
-        exponent = math.frexp(float(max(abs(Fraction(finite.max().item())), abs(Fraction(finite.min().item())))))[1]
-        scaled = np.ldexp(one.astype(np.float64), -exponent) - np.ldexp(other.astype(np.float64), -exponent)
+        exponent = math.frexp(
+            float(max(abs(Fraction(finite.max().item())), abs(Fraction(finite.min().item()))))
+        )[1]
+        scaled = np.ldexp(one.astype(np.float64), -exponent) - np.ldexp(
+            other.astype(np.float64), -exponent
+        )
         parts = scaled / float(span / Fraction(2) ** exponent)
     mean = float(np.mean(np.square(parts))) if parts.size else 0.0
     return -10 * math.log10(mean) if mean > 0 else math.inf

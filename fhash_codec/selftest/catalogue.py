@@ -16,10 +16,21 @@ __all__ = ["cases", "chosen"]
 @cache
 def cases() -> tuple[Case, ...]:
     """Every case, group by group."""
-    return (*values.CASES, *shapes.CASES, *fronts.CASES, *features.CASES, *times.CASES, *networks.CASES, *rays.CASES, *invariance.CASES)
+    return (
+        *values.CASES,
+        *shapes.CASES,
+        *fronts.CASES,
+        *features.CASES,
+        *times.CASES,
+        *networks.CASES,
+        *rays.CASES,
+        *invariance.CASES,
+    )
 
 
-def chosen(*, names: Sequence[str] = (), groups: Sequence[str] = (), everything: bool = False) -> tuple[Case, ...]:
+def chosen(
+    *, names: Sequence[str] = (), groups: Sequence[str] = (), everything: bool = False
+) -> tuple[Case, ...]:
     """The cases of these names and groups; all quick ones where none is given, or all with `everything`.
 
     Raises InputError for an unknown name or group, and offers the nearest.

@@ -21,7 +21,14 @@ INSIDE = "interval:10:30"
 """What `_marked` lifts there."""
 
 
-def _case(name: str, about: str, make: Callable[[], Values], features: tuple[str, ...] = (INSIDE,), dilation: int = 0, **rest: Any) -> Case:
+def _case(
+    name: str,
+    about: str,
+    make: Callable[[], Values],
+    features: tuple[str, ...] = (INSIDE,),
+    dilation: int = 0,
+    **rest: Any,
+) -> Case:
     settings: Settings = rest.pop("settings", QUICK)
     return Case(
         name=name,
@@ -70,9 +77,13 @@ KEYS = EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0,2,3", tabl
 
 CASES: tuple[Case, ...] = (
     _case("at-every-border", "a feature that is the surface of the domain", _marked(_borders)),
-    _case("at-every-border-grown", "the same, grown beyond the domain", _marked(_borders), dilation=64),
+    _case(
+        "at-every-border-grown", "the same, grown beyond the domain", _marked(_borders), dilation=64
+    ),
     _case("one-vertex", "a feature of one vertex that moves", _marked(_vertex)),
-    _case("one-vertex-grown", "a feature of one vertex, grown by one", _marked(_vertex), dilation=1),
+    _case(
+        "one-vertex-grown", "a feature of one vertex, grown by one", _marked(_vertex), dilation=1
+    ),
     _case("opposite-corners", "in opposite corners in turns", _marked(_corners)),
     _case("whole-box", "two vertices whose bounding box is the domain", _marked(_ends)),
     _case("everything", "an interval that holds all values", waves, ("interval:-1:2",)),
@@ -82,14 +93,44 @@ CASES: tuple[Case, ...] = (
         _marked(lambda t, z, y, x: (t == 2) & (x > 3)),
         settings={**QUICK, "paper-keys": KEYS},
     ),
-    _case("one-key-frame-filled", "the feature is there at the last step alone", _marked(lambda t, z, y, x: (t == 3) & (y == 2))),
-    _case("every-second-vertex", "no two vertices of the feature touch", _marked(lambda t, z, y, x: (t + z + y + x) % 2 == 0)),
+    _case(
+        "one-key-frame-filled",
+        "the feature is there at the last step alone",
+        _marked(lambda t, z, y, x: (t == 3) & (y == 2)),
+    ),
+    _case(
+        "every-second-vertex",
+        "no two vertices of the feature touch",
+        _marked(lambda t, z, y, x: (t + z + y + x) % 2 == 0),
+    ),
     _case("beside-missing", "a feature that meets missing values", _with_holes, dilation=1),
     _case("open-interval", "an interval without ends", waves, ("interval:-inf:inf",)),
-    _case("one-value", "an interval of one value", lambda: np.rint(10 * waves()), ("interval:5:5",)),
-    _case("surface-on-vertices", "an isosurface through vertices", lambda: np.rint(10 * waves()), ("isosurface:5",)),
+    _case(
+        "one-value", "an interval of one value", lambda: np.rint(10 * waves()), ("interval:5:5",)
+    ),
+    _case(
+        "surface-on-vertices",
+        "an isosurface through vertices",
+        lambda: np.rint(10 * waves()),
+        ("isosurface:5",),
+    ),
     _case("surface-at-the-end", "an isosurface at the largest value", waves, ("isosurface:1",)),
-    _case("two-features", "two features that overlap", waves, ("interval:0.2:0.6", "isosurface:0.6")),
-    _case("segmented-step", "a threshold found in values of two kinds", _marked(lambda t, z, y, x: x > 5), ("segmentation",), 1),
-    _case("nothing-selected", "refused: the feature is nowhere", waves, ("interval:5:6",), more={}, refused="selects nothing"),
+    _case(
+        "two-features", "two features that overlap", waves, ("interval:0.2:0.6", "isosurface:0.6")
+    ),
+    _case(
+        "segmented-step",
+        "a threshold found in values of two kinds",
+        _marked(lambda t, z, y, x: x > 5),
+        ("segmentation",),
+        1,
+    ),
+    _case(
+        "nothing-selected",
+        "refused: the feature is nowhere",
+        waves,
+        ("interval:5:6",),
+        more={},
+        refused="selects nothing",
+    ),
 )

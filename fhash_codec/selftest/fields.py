@@ -38,10 +38,21 @@ def noise(shape: Four = SHAPE, seed: int = 0) -> Floats:
 
 
 def series(
-    values: npt.NDArray[np.generic], *, times: Sequence[float] | npt.NDArray[np.float64] | None = None, units: str = "1", **axes: Floats
+    values: npt.NDArray[np.generic],
+    *,
+    times: Sequence[float] | npt.NDArray[np.float64] | None = None,
+    units: str = "1",
+    **axes: Floats,
 ) -> ArraySeries:
     """A series in memory. times: of its steps. axes: positions along z, y or x; those left out are 0, 1, 2, ..."""
-    coords = {axis: Coordinate(name=AXIS_NAMES[axis], values=np.asarray(positions, dtype=np.float64)) for axis, positions in axes.items()}
+    coords = {
+        axis: Coordinate(name=AXIS_NAMES[axis], values=np.asarray(positions, dtype=np.float64))
+        for axis, positions in axes.items()
+    }
     if times is not None:
-        coords["t"] = Coordinate(name="time", values=np.asarray(times, dtype=np.float64), attributes={"units": "hours since 2000-01-01"})
+        coords["t"] = Coordinate(
+            name="time",
+            values=np.asarray(times, dtype=np.float64),
+            attributes={"units": "hours since 2000-01-01"},
+        )
     return ArraySeries(values, name="hard", units=units, coords=coords)

@@ -17,11 +17,20 @@ __all__ = ["CASES"]
 Values = npt.NDArray[Any]
 
 
-def _case(name: str, about: str, make: Callable[[], Values], settings: Settings = QUICK, dtype: str = "float32", **rest: Any) -> Case:
+def _case(
+    name: str,
+    about: str,
+    make: Callable[[], Values],
+    settings: Settings = QUICK,
+    dtype: str = "float32",
+    **rest: Any,
+) -> Case:
     def made() -> Any:
         return series(make().astype(dtype))
 
-    return Case(name=name, group="fronts", about=about, make=made, settings=settings, more=MORE, **rest)
+    return Case(
+        name=name, group="fronts", about=about, make=made, settings=settings, more=MORE, **rest
+    )
 
 
 def _checkerboard() -> Values:
@@ -37,7 +46,9 @@ def _spike() -> Values:
 
 def _spikes() -> Values:
     t, z, y, x = lattice()
-    return np.where((z % 4 == 0) & (y % 4 == 1) & (x % 4 == 2) & (t % 2 == 0), 1e6, 0.0) * np.where(x > 5, 1, -1)
+    return np.where((z % 4 == 0) & (y % 4 == 1) & (x % 4 == 2) & (t % 2 == 0), 1e6, 0.0) * np.where(
+        x > 5, 1, -1
+    )
 
 
 def _step(place: float) -> Callable[[], Values]:
@@ -63,17 +74,42 @@ def _shell() -> Values:
 
 CASES: tuple[Case, ...] = (
     _case("checkerboard", "0 and 1 alternate along every axis", _checkerboard, {**QUICK, **EXACT}),
-    _case("checkerboard-uint8", "0 and 1 alternate along every axis", _checkerboard, {**QUICK, **EXACT}, dtype="uint8"),
-    _case("flicker", "the sign changes with every step", lambda: (-1) ** lattice()[0] * (1 + lattice()[3])),
+    _case(
+        "checkerboard-uint8",
+        "0 and 1 alternate along every axis",
+        _checkerboard,
+        {**QUICK, **EXACT},
+        dtype="uint8",
+    ),
+    _case(
+        "flicker",
+        "the sign changes with every step",
+        lambda: (-1) ** lattice()[0] * (1 + lattice()[3]),
+    ),
     _case("white-noise", "nothing can be foretold", noise),
     _case("white-noise-float64", "nothing can be foretold", noise, dtype="float64", quick=False),
-    _case("white-noise-int16", "nothing can be foretold", lambda: 1e4 * noise(), {**QUICK, **EXACT}, dtype="int16"),
+    _case(
+        "white-noise-int16",
+        "nothing can be foretold",
+        lambda: 1e4 * noise(),
+        {**QUICK, **EXACT},
+        dtype="int16",
+    ),
     _case("spike", "one value of 1e6, all others 0", _spike),
     _case("spikes", "values of 1e6 and -1e6, four vertices apart", _spikes),
     _case("step-on-vertex", "a step whose middle is on a vertex", _step(5.0)),
     _case("step-between", "a step between two vertices", _step(5.5)),
-    _case("slow-front", "a front narrower than a vertex that moves 0.3 vertices a step", _front(0.3, 0.05)),
-    _case("creeping-front", "a front that moves 0.001 vertices a step", _front(0.001, 0.05), quick=False),
+    _case(
+        "slow-front",
+        "a front narrower than a vertex that moves 0.3 vertices a step",
+        _front(0.3, 0.05),
+    ),
+    _case(
+        "creeping-front",
+        "a front that moves 0.001 vertices a step",
+        _front(0.001, 0.05),
+        quick=False,
+    ),
     _case("fast-front", "a front that moves 4 vertices a step", _front(4.0, 0.05), quick=False),
     _case("thin-shell", "a shell one vertex thick that grows 0.3 vertices a step", _shell),
 )

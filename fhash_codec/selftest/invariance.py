@@ -47,8 +47,20 @@ def powers_of_two(run: Run) -> Iterator[Finding]:
     for factor in POWERS:
         other, size = _encoded(run, values * np.float32(factor), factor)
         unlike = np.count_nonzero((other.astype(np.float64) / factor - values) != error)
-        yield Finding(name="times a power of two", worst=float(unlike), limit=0.0, unit="errors", under=f"{factor:g}")
-        yield Finding(name="times a power of two, size", worst=float(abs(size - _size(run))), limit=0.0, unit="bytes", under=f"{factor:g}")
+        yield Finding(
+            name="times a power of two",
+            worst=float(unlike),
+            limit=0.0,
+            unit="errors",
+            under=f"{factor:g}",
+        )
+        yield Finding(
+            name="times a power of two, size",
+            worst=float(abs(size - _size(run))),
+            limit=0.0,
+            unit="bytes",
+            under=f"{factor:g}",
+        )
 
 
 def affine(run: Run) -> Iterator[Finding]:
@@ -63,17 +75,33 @@ def affine(run: Run) -> Iterator[Finding]:
             error = (run.decoded - run.values.astype(np.float64)) / run.data_range
             apart = np.abs((other - values.astype(np.float64)) / _range(values) - error)
             worst = float(np.quantile(apart, 0.99))
-            yield Finding(name="scaled and shifted, errors", worst=worst, limit=1e-5, unit="of the range", under=under)
+            yield Finding(
+                name="scaled and shifted, errors",
+                worst=worst,
+                limit=1e-5,
+                unit="of the range",
+                under=under,
+            )
 
 
 def guises(run: Run) -> Iterator[Finding]:
     """Values negated, flipped along each axis, and with axes exchanged: the same quality, and nearly the same size."""
-    seeds = [_quality(run.values, _encoded(run, run.values, 1.0, seed=seed)[0]) for seed in SEEDS] if run.config.profile == "paper" else []
+    seeds = (
+        [_quality(run.values, _encoded(run, run.values, 1.0, seed=seed)[0]) for seed in SEEDS]
+        if run.config.profile == "paper"
+        else []
+    )
     for under, values in _guises(run.values):
         other, size = _encoded(run, np.ascontiguousarray(values), 1.0)
         if seeds:
             least = min(*seeds, _quality(run.values, run.decoded)) - BELOW_SEEDS
-            yield Finding(name="flipped, PSNR", worst=least - _quality(values, other), limit=0.0, unit="dB below other seeds", under=under)
+            yield Finding(
+                name="flipped, PSNR",
+                worst=least - _quality(values, other),
+                limit=0.0,
+                unit="dB below other seeds",
+                under=under,
+            )
         else:
             yield from _alike(run, values, other, size, under)
 
@@ -82,20 +110,40 @@ def _guises(values: Values) -> Iterator[tuple[str, Values]]:
     yield "negated", -values
     for axis, name in enumerate("tzyx"):
         yield f"{name} flipped", np.flip(values, axis)
-    for name, order in (("z and y exchanged", (0, 2, 1, 3)), ("z and x exchanged", (0, 3, 2, 1)), ("turned", (0, 2, 3, 1))):
+    for name, order in (
+        ("z and y exchanged", (0, 2, 1, 3)),
+        ("z and x exchanged", (0, 3, 2, 1)),
+        ("turned", (0, 2, 3, 1)),
+    ):
         yield name, values.transpose(order)
 
 
 def _alike(run: Run, values: Values, other: Values, size: int, under: str) -> Iterator[Finding]:
     """Quality and size beside those of the run; a bound is kept strictly, which the figures of every encoding say."""
     apart = abs(_quality(values, other) - _quality(run.values, run.decoded))
-    yield Finding(name="same PSNR in any guise", worst=apart, limit=DECIBELS, unit="dB", under=under)
-    allowed = SEARCHED_BYTES if run.config.effort >= 2 and run.config.profile == "compact" else BYTES
-    yield Finding(name="same size in any guise", worst=abs(size / _size(run) - 1), limit=allowed, unit="of the size", under=under)
+    yield Finding(
+        name="same PSNR in any guise", worst=apart, limit=DECIBELS, unit="dB", under=under
+    )
+    allowed = (
+        SEARCHED_BYTES if run.config.effort >= 2 and run.config.profile == "compact" else BYTES
+    )
+    yield Finding(
+        name="same size in any guise",
+        worst=abs(size / _size(run) - 1),
+        limit=allowed,
+        unit="of the size",
+        under=under,
+    )
     bound = run.config.max_error_rel
     if bound is not None:
         worst = float(np.abs(other - values.astype(np.float64)).max()) / (bound * _range(values))
-        yield Finding(name="bound in any guise", worst=worst, limit=1.0 + 1e-12, unit="of the bound", under=under)
+        yield Finding(
+            name="bound in any guise",
+            worst=worst,
+            limit=1.0 + 1e-12,
+            unit="of the bound",
+            under=under,
+        )
 
 
 def _encoded(run: Run, values: Values, factor: float, **changes: Any) -> tuple[Values, int]:

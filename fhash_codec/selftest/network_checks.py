@@ -19,7 +19,16 @@ from fhash_codec.storage import NumberType
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
 
-__all__ = ["constant_tables", "devices", "diverged", "ends_of_half_precision", "engines", "kinks", "large_tables", "recovered"]
+__all__ = [
+    "constant_tables",
+    "devices",
+    "diverged",
+    "ends_of_half_precision",
+    "engines",
+    "kinks",
+    "large_tables",
+    "recovered",
+]
 
 ENGINES_APART, DEVICES_APART = 1e-5, 1e-3
 """Of the range, by which two engines may differ after 90 steps, and two devices, whose products round differently at each of them. Adam
@@ -32,18 +41,31 @@ HALF_LARGEST = 65504.0
 def recovered(run: Run) -> Iterator[Finding]:
     """However high the rate was: the training says how often it began again, and what it made is better than a constant."""
     training, values = run.volume.container.header["training"], run.values.astype(np.float64)
-    rate, restarts = training.get("learning_rate", run.config.learning_rate), training.get("restarts", 0)
+    rate, restarts = (
+        training.get("learning_rate", run.config.learning_rate),
+        training.get("restarts", 0),
+    )
     told = rate == run.config.learning_rate * 0.25**restarts
-    yield Finding(name="rate and restarts told", worst=float(not told), limit=0.0, unit="of them wrong")
+    yield Finding(
+        name="rate and restarts told", worst=float(not told), limit=0.0, unit="of them wrong"
+    )
     yield Finding(name="rate at the end", worst=rate, limit=run.config.learning_rate, unit="")
     error = float(np.sqrt(np.mean((run.decoded - values) ** 2)))
-    yield Finding(name="better than a constant", worst=error / float(values.std()), limit=0.98, unit="of the deviation")
+    yield Finding(
+        name="better than a constant",
+        worst=error / float(values.std()),
+        limit=0.98,
+        unit="of the deviation",
+    )
 
 
 def diverged(run: Run) -> Iterator[Finding]:
     """A rate at which this training cannot stay is found out."""
     yield Finding(
-        name="divergence not found", worst=float(not run.volume.container.header["training"].get("restarts", 0)), limit=0.0, unit=""
+        name="divergence not found",
+        worst=float(not run.volume.container.header["training"].get("restarts", 0)),
+        limit=0.0,
+        unit="",
     )
 
 
@@ -73,10 +95,17 @@ def ends_of_half_precision(run: Run) -> Iterator[Finding]:
             except InputError:
                 continue
             accepted += 1
-    yield Finding(name="too large for float16", worst=float(accepted), limit=0.0, unit="tables accepted")
+    yield Finding(
+        name="too large for float16", worst=float(accepted), limit=0.0, unit="tables accepted"
+    )
     ends = np.array([HALF_LARGEST, -HALF_LARGEST], np.float32)
     kept = NumberType.of(ends, "float16").stored(ends)
-    yield Finding(name="largest of float16", worst=float(np.count_nonzero(np.abs(kept) != HALF_LARGEST)), limit=0.0, unit="values")
+    yield Finding(
+        name="largest of float16",
+        worst=float(np.count_nonzero(np.abs(kept) != HALF_LARGEST)),
+        limit=0.0,
+        unit="values",
+    )
 
 
 def large_tables(run: Run) -> Iterator[Finding]:
@@ -86,15 +115,27 @@ def large_tables(run: Run) -> Iterator[Finding]:
         table[0, 0] = -largest
         network = _linear([table], weight=1 / (2 * largest), bias=0.5)
         oracle = Oracle(network)
-        places = np.array(list(itertools.product((0.0,), (0.0, 0.3, 1.0, 2.0), (0.0, 0.7, 2.0), (1.1,)))).T
+        places = np.array(
+            list(itertools.product((0.0,), (0.0, 0.3, 1.0, 2.0), (0.0, 0.7, 2.0), (1.1,)))
+        ).T
         found = sample_points(network, *places)
         answers = [oracle.at(point) for point in places.T]
-        off = np.abs(found.astype(np.float64) - [answer.value for answer in answers]) / [answer.rounding for answer in answers]
+        off = np.abs(found.astype(np.float64) - [answer.value for answer in answers]) / [
+            answer.rounding for answer in answers
+        ]
         name = np.dtype(dtype).name
-        yield Finding(name="large tables", worst=float(off.max()), limit=1.0, unit="of the rounding of float32", under=name)
+        yield Finding(
+            name="large tables",
+            worst=float(off.max()),
+            limit=1.0,
+            unit="of the rounding of float32",
+            under=name,
+        )
         frame = decode_region(network, 0.0, ((0, 3), (0, 3), (0, 3)))
         worst = float(np.abs(frame[:, 0, 0] - [0.0, 0.5, 1.0]).max())
-        yield Finding(name="large tables, vertices", worst=worst, limit=1e-6, unit="of the range", under=name)
+        yield Finding(
+            name="large tables, vertices", worst=worst, limit=1e-6, unit="of the range", under=name
+        )
 
 
 def constant_tables(run: Run) -> Iterator[Finding]:
@@ -115,8 +156,12 @@ def constant_tables(run: Run) -> Iterator[Finding]:
             table = np.full(4, value, np.float32)
             numbers = NumberType.of(table, kind)
             back = numbers.stored(table).astype(np.float64) * numbers.scale + numbers.offset
-            off = max(off, float(np.abs(back - np.float32(value)).max()) / max(abs(value) / 255, 6e-8))
-        yield Finding(name="constant tables, stored", worst=off, limit=1.0, unit="of a step", under=kind)
+            off = max(
+                off, float(np.abs(back - np.float32(value)).max()) / max(abs(value) / 255, 6e-8)
+            )
+        yield Finding(
+            name="constant tables, stored", worst=off, limit=1.0, unit="of a step", under=kind
+        )
 
 
 def kinks(run: Run) -> Iterator[Finding]:
@@ -129,32 +174,50 @@ def kinks(run: Run) -> Iterator[Finding]:
         first = (np.float32(rises) * one, np.array([-0.5 * rises], np.float32))
         layers = (first, (one, zero), (one, zero)) if deep else (first, (one, zero))
         network = Network(
-            levels=((1, 1, 1, 5),), embedding_size=1, tables=[ArrayTable(ramp)], layers=layers, box_size=(1, 1, 5), key_frames=1
+            levels=((1, 1, 1, 5),),
+            embedding_size=1,
+            tables=[ArrayTable(ramp)],
+            layers=layers,
+            box_size=(1, 1, 5),
+            key_frames=1,
         )
         oracle = Oracle(network)
         x = np.array([0.5, 1.0, 2.0 - 2.0**-10, 2.0, 2.0 + 2.0**-10, 2.5, 4.0])
         values, slopes = sample_points(network, 0.0, 0.0, 0.0, x, gradient=True)
         expected = np.where((x - 2.0) * rises > 0, rises / 4, 0.0)
-        wrong += int(np.count_nonzero(slopes[:, 3] != expected)) + int(np.count_nonzero(slopes[:, :3]))
+        wrong += int(np.count_nonzero(slopes[:, 3] != expected)) + int(
+            np.count_nonzero(slopes[:, :3])
+        )
         for place, value, slope in zip(x, values, slopes[:, 3], strict=True):
             off = max(off, abs(float(value) - oracle.at((0, 0, 0, place)).value))
             # Towards the flat side, and away from it, where one does not step over the kink.
             for step in (-(2.0**-12), 2.0**-12):
                 if (place == 2.0 and step * rises > 0) or not 0 <= place + step <= 4:
                     continue
-                change = (oracle.at((0, 0, 0, place + step)).value - oracle.at((0, 0, 0, place)).value) / step
+                change = (
+                    oracle.at((0, 0, 0, place + step)).value - oracle.at((0, 0, 0, place)).value
+                ) / step
                 off = max(off, abs(change - float(slope)))
     yield Finding(name="derivatives about kinks", worst=float(wrong), limit=0.0, unit="wrong")
-    yield Finding(name="derivatives about kinks, differences", worst=off, limit=1e-6, unit="of the range")
+    yield Finding(
+        name="derivatives about kinks, differences", worst=off, limit=1e-6, unit="of the range"
+    )
 
 
 def _linear(tables: Sequence[npt.NDArray[Any]], *, weight: float, bias: float) -> Network:
     """A linear readout of tables over a box of 3 x 3 x 3 vertices and one key frame."""
     size = sum(table.shape[4] for table in tables)
     layer = (np.full((1, size), weight, np.float32), np.array([bias], np.float32))
-    levels = tuple((int(t), int(z), int(y), int(x)) for t, z, y, x, _ in (table.shape for table in tables))
+    levels = tuple(
+        (int(t), int(z), int(y), int(x)) for t, z, y, x, _ in (table.shape for table in tables)
+    )
     return Network(
-        levels=levels, embedding_size=1, tables=[ArrayTable(table) for table in tables], layers=(layer,), box_size=(3, 3, 3), key_frames=1
+        levels=levels,
+        embedding_size=1,
+        tables=[ArrayTable(table) for table in tables],
+        layers=(layer,),
+        box_size=(3, 3, 3),
+        key_frames=1,
     )
 
 

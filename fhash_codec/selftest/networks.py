@@ -48,26 +48,45 @@ def _spike() -> ArraySeries:
 
 
 def _case(name: str, about: str, settings: Settings, *checks: Check, **more: Any) -> Case:
-    return Case(name=name, group="networks", about=about, **{"make": _waves, "settings": settings, "checks": checks, **more})
+    return Case(
+        name=name,
+        group="networks",
+        about=about,
+        **{"make": _waves, "settings": settings, "checks": checks, **more},
+    )
 
 
 def _sizes(field: str, sizes: Sequence[int]) -> Settings:
-    changes: dict[str, dict[str, Any]] = {f"{field.replace('_', '-')}-{size}": {field: size} for size in sizes}
+    changes: dict[str, dict[str, Any]] = {
+        f"{field.replace('_', '-')}-{size}": {field: size} for size in sizes
+    }
     return {name: replace(PLAIN, **change) for name, change in changes.items()}
 
 
 WILD = {
-    f"{layers}-layers-rate-{rate:g}": replace(PLAIN, hidden_layers=layers, width=64, learning_rate=rate)
+    f"{layers}-layers-rate-{rate:g}": replace(
+        PLAIN, hidden_layers=layers, width=64, learning_rate=rate
+    )
     for layers, rate in itertools.product((0, 1, 2), (1.0, 0.3))
 }
 STEADY = {f"{name}-constant": replace(config, schedule="constant") for name, config in WILD.items()}
 
 CASES = (
     _case(
-        "folds", "every fold from 2 to 8: few levels or many", _sizes("fold", (2, 8)), agrees, gradients, more=_sizes("fold", range(3, 8))
+        "folds",
+        "every fold from 2 to 8: few levels or many",
+        _sizes("fold", (2, 8)),
+        agrees,
+        gradients,
+        more=_sizes("fold", range(3, 8)),
     ),
     _case(
-        "layers", "0, 1 and 2 hidden layers", _sizes("hidden_layers", (0, 1, 2)), agrees, gradients, more=_sizes("hidden_layers", (3, 8))
+        "layers",
+        "0, 1 and 2 hidden layers",
+        _sizes("hidden_layers", (0, 1, 2)),
+        agrees,
+        gradients,
+        more=_sizes("hidden_layers", (3, 8)),
     ),
     _case(
         "embeddings",
@@ -91,22 +110,36 @@ CASES = (
         recovered,
         diverged,
         agrees,
-        more={name: config for name, config in {**WILD, **STEADY}.items() if "rate-1" in name and name != "2-layers-rate-1"},
+        more={
+            name: config
+            for name, config in {**WILD, **STEADY}.items()
+            if "rate-1" in name and name != "2-layers-rate-1"
+        },
     ),
     _case(
         "rates-on-the-edge",
         "rates that may diverge or not: what is written is better than a constant",
         {"1-layers-rate-0.3": WILD["1-layers-rate-0.3"]},
         recovered,
-        more={name: WILD[name] for name in WILD if name.endswith("0.3") and name != "1-layers-rate-0.3"},
+        more={
+            name: WILD[name]
+            for name in WILD
+            if name.endswith("0.3") and name != "1-layers-rate-0.3"
+        },
         make=_noise,
     ),
     _case(
         "barely-trained",
         "embeddings as small as at the start",
-        {tables: replace(PLAIN, epochs=1, learning_rate=1e-8, tables=tables) for tables in ("float16", "uint8")},
+        {
+            tables: replace(PLAIN, epochs=1, learning_rate=1e-8, tables=tables)
+            for tables in ("float16", "uint8")
+        },
         agrees,
-        more={tables: replace(PLAIN, epochs=1, learning_rate=1e-8, tables=tables) for tables in ("float32", "transform")},
+        more={
+            tables: replace(PLAIN, epochs=1, learning_rate=1e-8, tables=tables)
+            for tables in ("float32", "transform")
+        },
     ),
     _case(
         "ends-of-tables",
@@ -116,7 +149,13 @@ CASES = (
         large_tables,
         constant_tables,
     ),
-    _case("kinks", "derivatives at a ReLU's kink and beside it", {"2-layers": replace(PLAIN, hidden_layers=2)}, kinks, gradients),
+    _case(
+        "kinks",
+        "derivatives at a ReLU's kink and beside it",
+        {"2-layers": replace(PLAIN, hidden_layers=2)},
+        kinks,
+        gradients,
+    ),
     _case(
         "engines",
         "two engines and two devices train one network",
@@ -138,5 +177,11 @@ CASES = (
         make=_noise,
         quick=False,
     ),
-    _case("spike-in-a-network", "one vertex apart from all others", {"2-layers": replace(PLAIN, hidden_layers=2)}, agrees, make=_spike),
+    _case(
+        "spike-in-a-network",
+        "one vertex apart from all others",
+        {"2-layers": replace(PLAIN, hidden_layers=2)},
+        agrees,
+        make=_spike,
+    ),
 )

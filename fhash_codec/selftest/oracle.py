@@ -49,13 +49,19 @@ class Oracle:
     def __init__(self, network: Network) -> None:
         self.network = network
         self.sizes = (network.key_frames, *network.box_size)
-        self.layers = [(weight.astype(np.float64), bias.astype(np.float64)) for weight, bias in network.layers]
+        self.layers = [
+            (weight.astype(np.float64), bias.astype(np.float64)) for weight, bias in network.layers
+        ]
 
     @cached_property
     def tables(self) -> list[Floats]:
         """Of each level (t, z, y, x, embedding)."""
-        parts = [tuple(slice(0, length) for length in table.shape[:4]) for table in self.network.tables]
-        return [self.network.read(level, part).astype(np.float64) for level, part in enumerate(parts)]
+        parts = [
+            tuple(slice(0, length) for length in table.shape[:4]) for table in self.network.tables
+        ]
+        return [
+            self.network.read(level, part).astype(np.float64) for level, part in enumerate(parts)
+        ]
 
     def at(self, point: Sequence[float]) -> Answer:
         """The value at (key index, z, y, x), in vertices of the box."""
@@ -74,7 +80,9 @@ class Oracle:
                 hidden = np.maximum(hidden, 0.0)
             terms = np.abs(weight) @ np.abs(hidden) + np.abs(bias)
             # A sum of n + 1 products in any order; what was rounded before goes through the weights, and a ReLU lets through no more of it.
-            rounding = np.abs(weight) @ rounding + (weight.shape[1] + 2) * UNIT * (terms + np.abs(weight) @ rounding)
+            rounding = np.abs(weight) @ rounding + (weight.shape[1] + 2) * UNIT * (
+                terms + np.abs(weight) @ rounding
+            )
             hidden = weight @ hidden + bias
         return Answer(value=float(hidden[0]), rounding=float(rounding[0]), active=tuple(active))
 
@@ -91,7 +99,10 @@ class Oracle:
             factor = 1.0
             for up, part in zip(corner, share, strict=True):
                 factor *= part if up else 1.0 - part
-            at = tuple(min(first + up, length - 1) for first, up, length in zip(before, corner, table.shape, strict=False))
+            at = tuple(
+                min(first + up, length - 1)
+                for first, up, length in zip(before, corner, table.shape, strict=False)
+            )
             value += factor * table[at]
             magnitude = np.maximum(magnitude, np.abs(table[at]))
         return value, magnitude
@@ -118,9 +129,19 @@ def agrees(run: Run) -> Iterator[Finding]:
         expected = [oracle.at(point) for point in points.T]
         off = np.abs(found.astype(np.float64) - [answer.value for answer in expected])
         allowed = np.array([answer.rounding for answer in expected])
-        yield Finding(name="float64 oracle", worst=float(np.max(off / allowed)), limit=1.0, unit="of the rounding of float32", under=name)
         yield Finding(
-            name="float64 oracle, error", worst=float(off.max()), limit=max(NEAR, float(allowed.max())), unit="of the range", under=name
+            name="float64 oracle",
+            worst=float(np.max(off / allowed)),
+            limit=1.0,
+            unit="of the rounding of float32",
+            under=name,
+        )
+        yield Finding(
+            name="float64 oracle, error",
+            worst=float(off.max()),
+            limit=max(NEAR, float(allowed.max())),
+            unit="of the range",
+            under=name,
         )
 
 
@@ -153,5 +174,12 @@ def gradients(run: Run) -> Iterator[Finding]:
                 continue
             difference = (-3 * here.value + 4 * one.value - two.value) / (2 * step)
             worst = max(worst, abs(difference - float(slope[axis])) / scale)
-    yield Finding(name="gradient = differences", worst=worst, limit=1e-3, unit="of the largest derivative")
-    yield Finding(name="derivatives beside kinks", worst=over / (4 * POINTS), limit=0.25, unit="of all, not compared")
+    yield Finding(
+        name="gradient = differences", worst=worst, limit=1e-3, unit="of the largest derivative"
+    )
+    yield Finding(
+        name="derivatives beside kinks",
+        worst=over / (4 * POINTS),
+        limit=0.25,
+        unit="of all, not compared",
+    )

@@ -22,14 +22,24 @@ MODES = ("stream", "arm")
 def picture(run: Run) -> Iterator[Finding]:
     """Halfway to the second step, where there is one, since there the step before and after must not show through."""
     shown = _rendered(run, "cache")
-    yield Finding(name="finite pixels", worst=float(np.count_nonzero(~np.isfinite(shown))), limit=0.0, unit="channels")
+    yield Finding(
+        name="finite pixels",
+        worst=float(np.count_nonzero(~np.isfinite(shown))),
+        limit=0.0,
+        unit="channels",
+    )
     beyond = max(-float(np.nanmin(shown)), float(np.nanmax(shown)) - 1.0, 0.0)
     yield Finding(name="pixels in 0..1", worst=beyond, limit=0.0, unit="of a channel")
     if run.volume.profile != "compact":
         # What lies between vertices is the network's there, and what the cache holds is not.
         for mode in MODES:
             other = _rendered(run, mode)
-            yield Finding(name=f"finite pixels, {mode}", worst=float(np.count_nonzero(~np.isfinite(other))), limit=0.0, unit="channels")
+            yield Finding(
+                name=f"finite pixels, {mode}",
+                worst=float(np.count_nonzero(~np.isfinite(other))),
+                limit=0.0,
+                unit="channels",
+            )
         return
     for mode in MODES:
         off = np.max(np.abs(_rendered(run, mode) - shown))
@@ -37,7 +47,9 @@ def picture(run: Run) -> Iterator[Finding]:
     if native.library() is not None:
         with environment(FHASH_NATIVE="0"):
             off = np.max(np.abs(_rendered(run, "cache") - shown))
-        yield Finding(name="native = portable march", worst=float(off), limit=NEAR, unit="of a channel")
+        yield Finding(
+            name="native = portable march", worst=float(off), limit=NEAR, unit="of a channel"
+        )
 
 
 CHECKS = (picture,)

@@ -31,11 +31,24 @@ SAME = ("cache", "stream", "arm")
 def scene(**parts: Any) -> Scene:
     """A scene from its JSON values, small, over nothing, whose rays do not end early; lit from everywhere, so that colours stay."""
     march_ = {"threshold": 0.0, "lod": 0, **parts.pop("march", {})}
-    effects = {"shading": {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0}, **parts.pop("effects", {})}
-    return Scene.from_dict({"size": [16, 16], "background": "transparent", **parts, "march": march_, "effects": effects})
+    effects = {
+        "shading": {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
+        **parts.pop("effects", {}),
+    }
+    return Scene.from_dict(
+        {
+            "size": [16, 16],
+            "background": "transparent",
+            **parts,
+            "march": march_,
+            "effects": effects,
+        }
+    )
 
 
-def scenes(chosen: Mapping[str, Scene], *, modes: tuple[str, ...] = SAME, oracle: bool = True) -> Check:
+def scenes(
+    chosen: Mapping[str, Scene], *, modes: tuple[str, ...] = SAME, oracle: bool = True
+) -> Check:
     """Every one of these scenes: finite, within 0..1, the float64 picture, and the same by each mode, natively and without."""
 
     def check(run: Run) -> Iterator[Finding]:
@@ -55,11 +68,15 @@ def closed_form(chosen: Mapping[str, Scene], value: float) -> Check:
             plan = renderer.plan(one)
             table, picture = plan.task.table, renderer.render(one).rgba
             assert table is not None
-            extinction = np.interp(value, np.linspace(table.low, table.high, len(table.extinctions)), table.extinctions)
+            extinction = np.interp(
+                value, np.linspace(table.low, table.high, len(table.extinctions)), table.extinctions
+            )
             path = _path(plan)
             exact = -np.expm1(-extinction * path)
             worst = float(np.abs(picture[..., 3] - exact).max())
-            yield Finding(name="closed form", worst=worst, limit=NEAR, unit="of a channel", under=name)
+            yield Finding(
+                name="closed form", worst=worst, limit=NEAR, unit="of a channel", under=name
+            )
             yield _shown(float(path.max()), name)
 
     return check
@@ -76,7 +93,13 @@ def blocks(run: Run) -> Iterator[Finding]:
         front = march(Frame(values=frame.values[cut:], first=(cut, 0, 0)), plan.task).rgba
         back = march(Frame(values=frame.values[: cut + 1], first=(0, 0, 0)), plan.task).rgba
         worst = float(np.abs(front + (1 - front[..., 3:]) * back - whole).max())
-        yield Finding(name="blocks = whole", worst=worst, limit=2e-6, unit="of a channel", under=f"cut at {cut}")
+        yield Finding(
+            name="blocks = whole",
+            worst=worst,
+            limit=2e-6,
+            unit="of a channel",
+            under=f"cut at {cut}",
+        )
         yield _shown(float(min(front[..., 3].max(), back[..., 3].max())), f"cut at {cut}")
 
 
@@ -88,41 +111,78 @@ def key_times(run: Run) -> Iterator[Finding]:
         at_step = renderer.render(scene(step=step, transfer_function=FOG)).rgba
         at_time = renderer.render(scene(time=float(times[step]), transfer_function=FOG)).rgba
         unlike = float(np.count_nonzero(at_step != at_time))
-        yield Finding(name="picture at a key time", worst=unlike, limit=0.0, unit="channels", under=f"step {step}")
+        yield Finding(
+            name="picture at a key time",
+            worst=unlike,
+            limit=0.0,
+            unit="channels",
+            under=f"step {step}",
+        )
         beside = [place for place in (step - 1e-9, step + 1e-9) if 0 <= place <= len(times) - 1]
         for place in beside:
-            off = float(np.abs(renderer.render(scene(step=place, transfer_function=FOG)).rgba - at_step).max())
-            yield Finding(name="picture beside a key time", worst=off, limit=1e-5, unit="of a channel", under=f"step {step}")
+            off = float(
+                np.abs(
+                    renderer.render(scene(step=place, transfer_function=FOG)).rgba - at_step
+                ).max()
+            )
+            yield Finding(
+                name="picture beside a key time",
+                worst=off,
+                limit=1e-5,
+                unit="of a channel",
+                under=f"step {step}",
+            )
 
 
 FOG = {"opacity": [[0.0, 0.0], [1.0, 0.3]]}
 
 
-def _pictures(run: Run, renderer: Renderer, name: str, one: Scene, modes: tuple[str, ...], oracle: bool) -> Iterator[Finding]:
-    by_mode = {mode: renderer.render(replace(one, march=replace(one.march, mode=mode))).rgba for mode in modes}
+def _pictures(
+    run: Run, renderer: Renderer, name: str, one: Scene, modes: tuple[str, ...], oracle: bool
+) -> Iterator[Finding]:
+    by_mode = {
+        mode: renderer.render(replace(one, march=replace(one.march, mode=mode))).rgba
+        for mode in modes
+    }
     if native.library() is not None:
         with environment(FHASH_NATIVE="0"):
             by_mode["portable"] = Renderer(run.volume).render(one).rgba
     bad = sum(int(np.count_nonzero(~np.isfinite(picture))) for picture in by_mode.values())
     yield Finding(name="finite pixels", worst=float(bad), limit=0.0, unit="channels", under=name)
-    beyond = max(max(-float(picture.min()), float(picture.max()) - 1.0, 0.0) for picture in by_mode.values())
+    beyond = max(
+        max(-float(picture.min()), float(picture.max()) - 1.0, 0.0) for picture in by_mode.values()
+    )
     yield Finding(name="pixels in 0..1", worst=beyond, limit=1e-6, unit="of a channel", under=name)
     first = by_mode[modes[0]]
     for mode, picture in by_mode.items():
         if mode != modes[0]:
-            yield Finding(name=f"{mode} = {modes[0]}", worst=_off(picture, first), limit=NEAR, unit="of a channel", under=name)
+            yield Finding(
+                name=f"{mode} = {modes[0]}",
+                worst=_off(picture, first),
+                limit=NEAR,
+                unit="of a channel",
+                under=name,
+            )
     if oracle:
         plan = renderer.plan(one)
         frame = decoded_frame(run.volume, plan.step, 0, _everything(run), plan.units)
         expected = drawn(frame, plan.task)
-        yield Finding(name="float64 picture", worst=_off(first, expected), limit=NEAR, unit="of a channel", under=name)
+        yield Finding(
+            name="float64 picture",
+            worst=_off(first, expected),
+            limit=NEAR,
+            unit="of a channel",
+            under=name,
+        )
         if not name.startswith("nothing"):
             yield _shown(float(expected[..., 3].max()), name)
 
 
 def _shown(most: float, name: str) -> Finding:
     """That a comparison is one of something."""
-    return Finding(name="empty pictures", worst=float(not most > 0), limit=0.0, unit="pictures", under=name)
+    return Finding(
+        name="empty pictures", worst=float(not most > 0), limit=0.0, unit="pictures", under=name
+    )
 
 
 def _off(one: Picture, other: Picture) -> float:
@@ -136,7 +196,9 @@ def _path(plan: Plan) -> npt.NDArray[np.float64]:
     directions = directions / np.linalg.norm(directions * rays.grid.spacing, axis=-1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = (rays.grid.bounds - eyes[..., None]) / directions[..., None]
-    path = np.nanmin(ends.max(axis=-1), axis=-1) - np.maximum(np.nanmax(ends.min(axis=-1), axis=-1), 0.0)
+    path = np.nanmin(ends.max(axis=-1), axis=-1) - np.maximum(
+        np.nanmax(ends.min(axis=-1), axis=-1), 0.0
+    )
     return np.asarray(np.maximum(path, 0.0), dtype=np.float64)
 
 

@@ -44,28 +44,48 @@ def _ray(frame: Frame, task: Task, eye: Floats, direction: Floats) -> Floats:
     # Surfaces begin where the frame does.
     counts = np.array(frame.values.shape[::-1])
     first = np.array(frame.first[::-1], dtype=np.float64)
-    seen = np.where((counts == 1)[:, None], grid.bounds, np.stack([first, first + (counts - 1) * frame.stride], axis=-1))
+    seen = np.where(
+        (counts == 1)[:, None],
+        grid.bounds,
+        np.stack([first, first + (counts - 1) * frame.stride], axis=-1),
+    )
     entered, left_at = _within(eye, direction, seen)
 
     def value(distances: npt.NDArray[np.floating[Any]]) -> Floats:
-        return _trilinear(frame, np.clip(eye + distances[:, None] * direction, grid.bounds[:, 0], grid.bounds[:, 1]))
+        return _trilinear(
+            frame,
+            np.clip(eye + distances[:, None] * direction, grid.bounds[:, 0], grid.bounds[:, 1]),
+        )
 
     colour, left = np.zeros(3), 1.0
     values = value(at)
-    ends = np.concatenate([[entered], np.clip(at, entered, max(entered, left_at)), [max(entered, left_at)]])
+    ends = np.concatenate(
+        [[entered], np.clip(at, entered, max(entered, left_at)), [max(entered, left_at)]]
+    )
     found = [_crossings(value, ends, value(ends), surface.value) for surface in task.surfaces]
     for sample in range(count + 1):
         # The surfaces between the sample before and this one, the nearest first, then the sample.
-        between = sorted((places[sample], number) for number, places in enumerate(found) if np.isfinite(places[sample]))
+        between = sorted(
+            (places[sample], number)
+            for number, places in enumerate(found)
+            if np.isfinite(places[sample])
+        )
         for _, number in between:
             surface = task.surfaces[number]
-            colour, left = colour + left * surface.opacity * surface.colour, left * (1 - surface.opacity)
+            colour, left = (
+                colour + left * surface.opacity * surface.colour,
+                left * (1 - surface.opacity),
+            )
         if sample < count and task.table is not None and not np.isnan(values[sample]):
             table = task.table
-            entry = np.clip((values[sample] - table.low) / (table.high - table.low), 0, 1) * (len(table.extinctions) - 1)
+            entry = np.clip((values[sample] - table.low) / (table.high - table.low), 0, 1) * (
+                len(table.extinctions) - 1
+            )
             numbers = np.arange(len(table.extinctions))
             opacity = -np.expm1(-np.interp(entry, numbers, table.extinctions) * lengths[sample])
-            own = np.array([np.interp(entry, numbers, table.colours[:, channel]) for channel in range(3)])
+            own = np.array(
+                [np.interp(entry, numbers, table.colours[:, channel]) for channel in range(3)]
+            )
             colour, left = colour + left * opacity * own, left * (1 - opacity)
     return np.array([*colour, 1 - left])
 
@@ -78,12 +98,16 @@ def _within(eye: Floats, direction: Floats, bounds: Floats) -> tuple[float, floa
             if not low <= eye[axis] <= high:
                 return 0.0, 0.0
             continue
-        one, two = sorted(((low - eye[axis]) / direction[axis], (high - eye[axis]) / direction[axis]))
+        one, two = sorted(
+            ((low - eye[axis]) / direction[axis], (high - eye[axis]) / direction[axis])
+        )
         enter, leave = max(enter, float(one)), min(leave, float(two))
     return (enter, leave) if enter < leave else (0.0, 0.0)
 
 
-def _crossings(value: Callable[[Floats], Floats], ends: Floats, values: Floats, level: float) -> Floats:
+def _crossings(
+    value: Callable[[Floats], Floats], ends: Floats, values: Floats, level: float
+) -> Floats:
     """Where a level lies between two places each (n - 1,), infinite where it does not, or where there is no value."""
     places = np.full(len(ends) - 1, np.inf)
     below = values < level
@@ -113,7 +137,9 @@ def _trilinear(frame: Frame, places: Floats) -> Floats:
     share = local - before
     after = np.minimum(before + 1, counts - 1)
     xs, ys, zs = (np.stack([before[:, axis], after[:, axis]]) for axis in range(3))
-    corners = frame.values[zs[:, None, None], ys[None, :, None], xs[None, None, :]].astype(np.float64)
+    corners = frame.values[zs[:, None, None], ys[None, :, None], xs[None, None, :]].astype(
+        np.float64
+    )
     # One axis after the other as a + s (b - a): between two equal values stands exactly that value.
     for axis in (2, 1, 0):
         corners = _between(corners[0], corners[1], share[:, axis])

@@ -33,7 +33,9 @@ def _of(values: Callable[[], np.ndarray[Any, Any]], **axes: Any) -> Callable[[],
     return lambda: series(values(), **axes)
 
 
-def _scaled(factor: float, offset: float, dtype: type[np.floating[Any]]) -> Callable[[], ArraySeries]:
+def _scaled(
+    factor: float, offset: float, dtype: type[np.floating[Any]]
+) -> Callable[[], ArraySeries]:
     return lambda: series((waves(SHAPE) * factor + offset).astype(dtype))
 
 
@@ -64,18 +66,39 @@ def _holes() -> ArraySeries:
     return series(values)
 
 
-def _case(name: str, about: str, *checks: Check, make: Callable[[], ArraySeries] = _waves, settings: Settings = BOUND, **rest: Any) -> Case:
-    return Case(name=name, group="rays", about=about, make=make, settings=settings, checks=checks, **rest)
+def _case(
+    name: str,
+    about: str,
+    *checks: Check,
+    make: Callable[[], ArraySeries] = _waves,
+    settings: Settings = BOUND,
+    **rest: Any,
+) -> Case:
+    return Case(
+        name=name, group="rays", about=about, make=make, settings=settings, checks=checks, **rest
+    )
 
 
 def _grid_camera(view: str) -> dict[str, Any]:
     """Seen along an axis with a parallel projection of 9 x 9 pixels, one vertex apart: rays through vertices, along edges and faces."""
     across = {"x": 5, "y": 6, "z": 7}
-    return {"view": view, "projection": "parallel", "parallel_scale": 4.5, "focal_point": [(across[axis] - 1) // 2 for axis in "xyz"]}
+    return {
+        "view": view,
+        "projection": "parallel",
+        "parallel_scale": 4.5,
+        "focal_point": [(across[axis] - 1) // 2 for axis in "xyz"],
+    }
 
 
-def _towards(position: tuple[float, float, float], focal: tuple[float, float, float], **more: Any) -> dict[str, Any]:
-    return {"position": list(position), "focal_point": list(focal), "view_up": [0.3, 0.1, 1.0], **more}
+def _towards(
+    position: tuple[float, float, float], focal: tuple[float, float, float], **more: Any
+) -> dict[str, Any]:
+    return {
+        "position": list(position),
+        "focal_point": list(focal),
+        "view_up": [0.3, 0.1, 1.0],
+        **more,
+    }
 
 
 FAR = 1e6 * 10.0
@@ -87,7 +110,9 @@ CAMERAS = {
     "on-an-edge": _towards((0.0, 0.0, 3.0), (4.0, 5.0, 3.0)),
     "on-a-corner": _towards((4.0, 5.0, 6.0), (0.0, 0.0, 0.0)),
     "far": _towards((FAR, FAR, FAR), (2.0, 2.5, 3.0), zoom=1e6),
-    "far-parallel": _towards((FAR, -FAR, FAR), (2.0, 2.5, 3.0), projection="parallel", parallel_scale=5.0),
+    "far-parallel": _towards(
+        (FAR, -FAR, FAR), (2.0, 2.5, 3.0), projection="parallel", parallel_scale=5.0
+    ),
     "wide": _towards((2.1, 2.7, 3.2), (4.0, 1.0, 6.0), view_angle=170.0),
 }
 CORNERS = {
@@ -98,7 +123,10 @@ CORNERS = {
     "along-an-edge": _towards((0.0, 0.0, -5.0), (0.0, 0.0, 3.0), view_up=[1.0, 0.3, 0.0]),
 }
 SURFACES = {
-    name: scene(transfer_function={"nothing": True}, effects={"isosurfaces": [{"value": value, "opacity": opacity, "colour": "#ff8000"}]})
+    name: scene(
+        transfer_function={"nothing": True},
+        effects={"isosurfaces": [{"value": value, "opacity": opacity, "colour": "#ff8000"}]},
+    )
     for name, value, opacity in (
         ("nothing-below-the-least", 0.0, 1.0),
         ("2", 2.0, 1.0),
@@ -120,8 +148,12 @@ CASES = (
         scenes(
             {
                 "everywhere": scene(transfer_function={"opacity": [[0.0, 1.0]]}),
-                "a-step": scene(transfer_function={"opacity": [[0.0, 0.0], [0.5, 0.0], [0.6, 1.0], [1.0, 1.0]]}),
-                "dense": scene(transfer_function={"opacity": [[0.0, 0.9], [1.0, 1.0]], "density": 1e6}),
+                "a-step": scene(
+                    transfer_function={"opacity": [[0.0, 0.0], [0.5, 0.0], [0.6, 1.0], [1.0, 1.0]]}
+                ),
+                "dense": scene(
+                    transfer_function={"opacity": [[0.0, 0.9], [1.0, 1.0]], "density": 1e6}
+                ),
             }
         ),
     ),
@@ -131,8 +163,12 @@ CASES = (
         scenes(
             {
                 "thin": scene(transfer_function={"opacity": [[0.0, 0.0], [1.0, 1e-9]]}),
-                "rare": scene(transfer_function={"opacity": [[0.0, 0.0], [1.0, 1.0]], "density": 1e-6}),
-                "clear-surface": scene(transfer_function=FOG, effects={"isosurfaces": [{"value": 0.5, "opacity": 0.0}]}),
+                "rare": scene(
+                    transfer_function={"opacity": [[0.0, 0.0], [1.0, 1.0]], "density": 1e-6}
+                ),
+                "clear-surface": scene(
+                    transfer_function=FOG, effects={"isosurfaces": [{"value": 0.5, "opacity": 0.0}]}
+                ),
             }
         ),
     ),
@@ -141,12 +177,27 @@ CASES = (
         "a million samples a ray add up to what they stand for",
         closed_form(
             {
-                "step-1e-6": scene(size=[2, 2], camera=FRONT, transfer_function={"opacity": [[0.0, 0.5]]}, march={"step": 1e-6}),
-                "step-1e-6-thin": scene(size=[2, 2], camera=FRONT, transfer_function={"opacity": [[0.0, 1e-3]]}, march={"step": 1e-6}),
-                "step-1e-3-stream": scene(
-                    size=[2, 2], camera=FRONT, transfer_function={"opacity": [[0.0, 0.5]]}, march={"step": 1e-3, "mode": "arm"}
+                "step-1e-6": scene(
+                    size=[2, 2],
+                    camera=FRONT,
+                    transfer_function={"opacity": [[0.0, 0.5]]},
+                    march={"step": 1e-6},
                 ),
-                "step-64": scene(size=[4, 4], transfer_function={"opacity": [[0.0, 0.5]]}, march={"step": 64.0}),
+                "step-1e-6-thin": scene(
+                    size=[2, 2],
+                    camera=FRONT,
+                    transfer_function={"opacity": [[0.0, 1e-3]]},
+                    march={"step": 1e-6},
+                ),
+                "step-1e-3-stream": scene(
+                    size=[2, 2],
+                    camera=FRONT,
+                    transfer_function={"opacity": [[0.0, 0.5]]},
+                    march={"step": 1e-3, "mode": "arm"},
+                ),
+                "step-64": scene(
+                    size=[4, 4], transfer_function={"opacity": [[0.0, 0.5]]}, march={"step": 64.0}
+                ),
             },
             1.0,
         ),
@@ -155,17 +206,29 @@ CASES = (
     _case(
         "rays-along-faces",
         "rays parallel to an axis, through vertices, along edges and faces",
-        scenes({view: scene(size=[9, 9], camera=_grid_camera(view), transfer_function=FOG) for view in AXES}),
+        scenes(
+            {
+                view: scene(size=[9, 9], camera=_grid_camera(view), transfer_function=FOG)
+                for view in AXES
+            }
+        ),
     ),
     _case(
         "rays-through-corners",
         "rays through corners and edges, and along diagonals",
-        scenes({name: scene(size=[9, 9], camera=camera, transfer_function=FOG) for name, camera in CORNERS.items()}),
+        scenes(
+            {
+                name: scene(size=[9, 9], camera=camera, transfer_function=FOG)
+                for name, camera in CORNERS.items()
+            }
+        ),
     ),
     _case(
         "cameras",
         "the camera inside, on a face, an edge, a corner, and a million sizes away",
-        scenes({name: scene(camera=camera, transfer_function=FOG) for name, camera in CAMERAS.items()}),
+        scenes(
+            {name: scene(camera=camera, transfer_function=FOG) for name, camera in CAMERAS.items()}
+        ),
     ),
     *(
         _case(
@@ -174,11 +237,21 @@ CASES = (
             # An odd number of pixels: a ray through the middle hits the thinnest side. Long steps: a needle has 10^7 of the usual ones.
             scenes(
                 {
-                    view: scene(size=[15, 15], camera={"view": view, "projection": "parallel"}, transfer_function=FOG, march={"step": step})
+                    view: scene(
+                        size=[15, 15],
+                        camera={"view": view, "projection": "parallel"},
+                        transfer_function=FOG,
+                        march={"step": step},
+                    )
                     for view in ("xy", "xz", "yz", "iso")
                 }
             ),
-            make=_of(lambda: waves(SHAPE).astype(np.float32), z=_even(0, dz, 7), y=_even(0, dy, 6), x=_even(0, dx, 5)),
+            make=_of(
+                lambda: waves(SHAPE).astype(np.float32),
+                z=_even(0, dz, 7),
+                y=_even(0, dy, 6),
+                x=_even(0, dx, 5),
+            ),
             quick=name != "needles",
         )
         for name, dz, dy, dx, step in (
@@ -192,7 +265,12 @@ CASES = (
         "far-origin",
         "positions whose offset is large beside the volume",
         scenes({"iso": scene(transfer_function=FOG)}),
-        make=_of(lambda: waves(SHAPE).astype(np.float32), z=_even(1e8, 1.0, 7), y=_even(-1e8, 0.5, 6), x=_even(1e8, -1.0, 5)),
+        make=_of(
+            lambda: waves(SHAPE).astype(np.float32),
+            z=_even(1e8, 1.0, 7),
+            y=_even(-1e8, 0.5, 6),
+            x=_even(1e8, -1.0, 5),
+        ),
     ),
     *(
         _case(
@@ -220,7 +298,14 @@ CASES = (
     _case(
         "surface-on-a-face",
         "a surface of the value that a whole face of the volume has",
-        scenes({"6": scene(transfer_function={"nothing": True}, effects={"isosurfaces": [{"value": 6.0, "colour": "#ff8000"}]})}),
+        scenes(
+            {
+                "6": scene(
+                    transfer_function={"nothing": True},
+                    effects={"isosurfaces": [{"value": 6.0, "colour": "#ff8000"}]},
+                )
+            }
+        ),
         make=_stairs,
         settings=EXACT,
     ),
@@ -230,8 +315,12 @@ CASES = (
         scenes(
             {
                 "iso": scene(transfer_function=FOG),
-                "other-side": scene(camera={"azimuth": 190.0, "elevation": -20.0}, transfer_function=FOG),
-                "surface": scene(transfer_function={"nothing": True}, effects={"isosurfaces": [{"value": 0.5}]}),
+                "other-side": scene(
+                    camera={"azimuth": 190.0, "elevation": -20.0}, transfer_function=FOG
+                ),
+                "surface": scene(
+                    transfer_function={"nothing": True}, effects={"isosurfaces": [{"value": 0.5}]}
+                ),
             }
         ),
         make=_holes,
@@ -240,11 +329,26 @@ CASES = (
         _case(
             f"thin-{axis}",
             "a volume of one vertex along an axis",
-            scenes({"iso": scene(transfer_function=FOG), "side": scene(camera={"view": "xz"}, transfer_function=FOG)}),
+            scenes(
+                {
+                    "iso": scene(transfer_function=FOG),
+                    "side": scene(camera={"view": "xz"}, transfer_function=FOG),
+                }
+            ),
             make=_shaped(shape),
         )
-        for axis, shape in {"z": (2, 1, 6, 5), "y": (2, 7, 1, 5), "x": (2, 7, 6, 1), "all": (2, 1, 1, 1)}.items()
+        for axis, shape in {
+            "z": (2, 1, 6, 5),
+            "y": (2, 7, 1, 5),
+            "x": (2, 7, 6, 1),
+            "all": (2, 1, 1, 1),
+        }.items()
     ),
     _case("blocks", "a volume cut in two at every layer, and put together again", blocks),
-    _case("pictures-at-key-times", "pictures of steps by number and by time", key_times, settings={**BOUND, **NETWORK}),
+    _case(
+        "pictures-at-key-times",
+        "pictures of steps by number and by time",
+        key_times,
+        settings={**BOUND, **NETWORK},
+    ),
 )

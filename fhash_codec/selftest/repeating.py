@@ -27,7 +27,9 @@ def same_bytes(run: Run) -> Iterator[Finding]:
     again = run.folder / "again.fhz"
     if run.config.profile == "paper":
         encode(run.series, again, run.config, force=True)
-        yield Finding(name="same bytes again", worst=_unlike(written, again), limit=0.0, unit="bytes")
+        yield Finding(
+            name="same bytes again", worst=_unlike(written, again), limit=0.0, unit="bytes"
+        )
         return
     wrong = 0.0
     turn = zlib.crc32(f"{run.case.name} {run.under}".encode()) % len(THREADS)
@@ -40,12 +42,22 @@ def same_bytes(run: Run) -> Iterator[Finding]:
 
 def portable_encoder(run: Run) -> Iterator[Finding]:
     """In the long set: a compact file of effort 1 has the same bytes without the native library, which takes its time with more effort."""
-    if native.library() is None or not run.thorough or run.config.profile != "compact" or run.config.effort > 1:
+    if (
+        native.library() is None
+        or not run.thorough
+        or run.config.profile != "compact"
+        or run.config.effort > 1
+    ):
         return
     again = run.folder / "portable.fhz"
     with environment(FHASH_NATIVE="0"):
         encode(run.series, again, run.config)
-    yield Finding(name="same bytes, portable encoder", worst=_unlike(run.path.read_bytes(), again), limit=0.0, unit="bytes")
+    yield Finding(
+        name="same bytes, portable encoder",
+        worst=_unlike(run.path.read_bytes(), again),
+        limit=0.0,
+        unit="bytes",
+    )
 
 
 def portable(run: Run) -> Iterator[Finding]:
@@ -61,12 +73,22 @@ def portable(run: Run) -> Iterator[Finding]:
         return
     lost = float(np.count_nonzero(np.isnan(other) != np.isnan(run.decoded)))
     yield Finding(name="portable: finite as native", worst=lost, limit=0.0, unit="values")
-    yield Finding(name="portable = native", worst=rounding(run, other, run.decoded), limit=1.0, unit="of 1e-5 of the range")
+    yield Finding(
+        name="portable = native",
+        worst=rounding(run, other, run.decoded),
+        limit=1.0,
+        unit="of 1e-5 of the range",
+    )
 
 
 def sound(run: Run) -> Iterator[Finding]:
     """The file passes `verify`, which raises where it does not."""
-    yield Finding(name="verify", worst=0.0 if run.volume.verify() > 0 else 1.0, limit=0.0, unit="damaged parts")
+    yield Finding(
+        name="verify",
+        worst=0.0 if run.volume.verify() > 0 else 1.0,
+        limit=0.0,
+        unit="damaged parts",
+    )
 
 
 CHECKS = (same_bytes, portable_encoder, portable, sound)
@@ -75,5 +97,8 @@ CHECKS = (same_bytes, portable_encoder, portable, sound)
 def _unlike(written: bytes, path: Path) -> float:
     """How many bytes differ."""
     other = path.read_bytes()
-    one, two = (np.frombuffer(data[: min(len(written), len(other))], dtype=np.uint8) for data in (written, other))
+    one, two = (
+        np.frombuffer(data[: min(len(written), len(other))], dtype=np.uint8)
+        for data in (written, other)
+    )
     return float(np.count_nonzero(one != two) + abs(len(written) - len(other)))

@@ -25,25 +25,50 @@ def markdown(summary: Summary, *, options: str = "", where: str = "") -> str:
     options: of the command that made it. where: a sentence on machine and time.
     """
     failures = summary.failures
-    verdict = "Everything holds." if summary.holds else "1 does not hold." if len(failures) == 1 else f"{len(failures)} do not hold."
-    parts = [HEAD.format(options=options, cases=len(summary.results), verdict=verdict, where=where and f"\n\n{where}")]
+    verdict = (
+        "Everything holds."
+        if summary.holds
+        else "1 does not hold."
+        if len(failures) == 1
+        else f"{len(failures)} do not hold."
+    )
+    parts = [
+        HEAD.format(
+            options=options,
+            cases=len(summary.results),
+            verdict=verdict,
+            where=where and f"\n\n{where}",
+        )
+    ]
     if failures:
-        parts.append("## What does not hold\n\n" + "\n".join(f"- {_plain(line)}" for line in failures) + "\n")
+        parts.append(
+            "## What does not hold\n\n" + "\n".join(f"- {_plain(line)}" for line in failures) + "\n"
+        )
     worst = summary.worst()
     parts.append("## The worst of every property\n")
-    rows = [(name, _figure(one), _limit(one), result.name, one.under) for name, (result, one) in sorted(worst.items())]
+    rows = [
+        (name, _figure(one), _limit(one), result.name, one.under)
+        for name, (result, one) in sorted(worst.items())
+    ]
     parts.append(_table(("property", "worst", "limit", "case", "settings"), rows))
     for group, results in summary.groups.items():
         parts.append(f"## {group.capitalize()}\n")
         parts.append(
-            _table(("case", "what is hard", "settings", "nearest to its limit", "figure", "limit"), [_row(one) for one in results])
+            _table(
+                ("case", "what is hard", "settings", "nearest to its limit", "figure", "limit"),
+                [_row(one) for one in results],
+            )
         )
     return "\n".join(parts)
 
 
 def _row(result: CaseResult) -> tuple[str, ...]:
     worst = result.worst
-    shown = ("-", "-", "-") if worst is None else (f"{worst.name} ({worst.under})", _figure(worst), _limit(worst))
+    shown = (
+        ("-", "-", "-")
+        if worst is None
+        else (f"{worst.name} ({worst.under})", _figure(worst), _limit(worst))
+    )
     if result.errors:
         shown = (result.errors[0], "-", "-")
     return (result.name, result.about, ", ".join(result.under), *shown)
@@ -59,7 +84,9 @@ def _limit(finding: Finding) -> str:
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(_plain(cell) for cell in line) + " |" for line in lines) + "\n"
+    return (
+        "\n".join("| " + " | ".join(_plain(cell) for cell in line) + " |" for line in lines) + "\n"
+    )
 
 
 def _plain(text: str) -> str:

@@ -15,7 +15,11 @@ __all__ = ["CaseResult", "Summary", "relative"]
 def relative(finding: Finding) -> float:
     """The figure in parts of its limit: above 1 where it does not hold, infinite where the limit is 0 and it is more."""
     if not finding.holds:
-        return math.inf if finding.limit <= 0 or math.isnan(finding.worst) else finding.worst / finding.limit
+        return (
+            math.inf
+            if finding.limit <= 0 or math.isnan(finding.worst)
+            else finding.worst / finding.limit
+        )
     return max(finding.worst, 0.0) / finding.limit if finding.limit > 0 else 0.0
 
 
@@ -48,7 +52,13 @@ class CaseResult:
     def failures(self) -> list[str]:
         """A line for each thing that is wrong."""
         broken = [one for one in self.findings if not one.holds]
-        return [*self.errors, *(f"{one.under}: {one.name} is {one.worst:.6g} {one.unit}, at most {one.limit:.6g}" for one in broken)]
+        return [
+            *self.errors,
+            *(
+                f"{one.under}: {one.name} is {one.worst:.6g} {one.unit}, at most {one.limit:.6g}"
+                for one in broken
+            ),
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values; a figure that is not finite is text."""
@@ -66,11 +76,19 @@ class CaseResult:
     def from_dict(cls, values: Mapping[str, Any]) -> CaseResult:
         """From `to_dict`'s values."""
         findings = tuple(
-            Finding(name=one["name"], worst=float(one["worst"]), limit=float(one["limit"]), unit=one["unit"], under=one["under"])
+            Finding(
+                name=one["name"],
+                worst=float(one["worst"]),
+                limit=float(one["limit"]),
+                unit=one["unit"],
+                under=one["under"],
+            )
             for one in values["findings"]
         )
         plain = {name: values[name] for name in ("name", "group", "about")}
-        return cls(**plain, under=tuple(values["under"]), findings=findings, errors=tuple(values["errors"]))
+        return cls(
+            **plain, under=tuple(values["under"]), findings=findings, errors=tuple(values["errors"])
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,15 +120,30 @@ class Summary:
         found: dict[str, tuple[CaseResult, Finding]] = {}
         for result in self.results:
             for finding in result.findings:
-                if finding.name not in found or relative(finding) > relative(found[finding.name][1]):
+                if finding.name not in found or relative(finding) > relative(
+                    found[finding.name][1]
+                ):
                     found[finding.name] = result, finding
         return found
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values."""
-        return {"holds": self.holds, "cases": [result.to_dict() for result in self.results], "failures": self.failures}
+        return {
+            "holds": self.holds,
+            "cases": [result.to_dict() for result in self.results],
+            "failures": self.failures,
+        }
 
 
 def _finding_dict(finding: Finding) -> dict[str, Any]:
-    figures = {name: value if math.isfinite(value) else str(value) for name, value in (("worst", finding.worst), ("limit", finding.limit))}
-    return {"name": finding.name, **figures, "unit": finding.unit, "under": finding.under, "holds": finding.holds}
+    figures = {
+        name: value if math.isfinite(value) else str(value)
+        for name, value in (("worst", finding.worst), ("limit", finding.limit))
+    }
+    return {
+        "name": finding.name,
+        **figures,
+        "unit": finding.unit,
+        "under": finding.under,
+        "holds": finding.holds,
+    }

@@ -23,7 +23,9 @@ from fhash_formats.series import Series
 __all__ = ["run_case"]
 
 
-def run_case(case: Case, *, everything: bool = False, checks: Sequence[Check] = EVERY) -> CaseResult:
+def run_case(
+    case: Case, *, everything: bool = False, checks: Sequence[Check] = EVERY
+) -> CaseResult:
     """What is found of a case, under the settings of the long set too with `everything`; nothing is raised but KeyboardInterrupt.
 
     checks: what every run has to keep, besides the checks of the case. A RuntimeWarning of numpy (an overflow, an invalid operation) counts
@@ -42,8 +44,18 @@ def run_case(case: Case, *, everything: bool = False, checks: Sequence[Check] = 
             settings = {}
         for under, config in settings.items():
             with tempfile.TemporaryDirectory(prefix="fhash-selftest-") as folder:
-                found, wrong = _run(case, series, under, replace(config, timings=False), Path(folder), checks, everything)
-            findings += [replace(one, under=f"{under}, {one.under}" if one.under else under) for one in found]
+                found, wrong = _run(
+                    case,
+                    series,
+                    under,
+                    replace(config, timings=False),
+                    Path(folder),
+                    checks,
+                    everything,
+                )
+            findings += [
+                replace(one, under=f"{under}, {one.under}" if one.under else under) for one in found
+            ]
             errors += wrong
     return CaseResult(
         name=case.name,
@@ -56,7 +68,13 @@ def run_case(case: Case, *, everything: bool = False, checks: Sequence[Check] = 
 
 
 def _run(
-    case: Case, series: Series, under: str, config: EncodeConfig, folder: Path, checks: Sequence[Check], thorough: bool
+    case: Case,
+    series: Series,
+    under: str,
+    config: EncodeConfig,
+    folder: Path,
+    checks: Sequence[Check],
+    thorough: bool,
 ) -> tuple[list[Finding], list[str]]:
     """Findings and errors of a case under one of its settings."""
     path = folder / "case.fhz"
@@ -95,15 +113,21 @@ def _checked(run: Run, checks: Sequence[Check]) -> tuple[list[Finding], list[str
     return findings, errors
 
 
-def _refused(wanted: str, series: Series, under: str, config: EncodeConfig, path: Path) -> tuple[list[Finding], list[str]]:
+def _refused(
+    wanted: str, series: Series, under: str, config: EncodeConfig, path: Path
+) -> tuple[list[Finding], list[str]]:
     """Whether the encoding is refused as it must be, and leaves nothing; one that misses its promise leaves its file, as it says."""
     try:
         encode(series, path, config)
     except (InputError, QualityError) as error:
         if wanted not in str(error):
             return [], [f"{under}: refused with '{error}', which does not say '{wanted}'"]
-        left = {entry.name for entry in path.parent.iterdir()} - ({path.name} if isinstance(error, QualityError) else set())
-        return [Finding(name="refused, nothing left", worst=float(len(left)), limit=0.0, unit="files")], []
+        left = {entry.name for entry in path.parent.iterdir()} - (
+            {path.name} if isinstance(error, QualityError) else set()
+        )
+        return [
+            Finding(name="refused, nothing left", worst=float(len(left)), limit=0.0, unit="files")
+        ], []
     except Exception as error:
         return [], [_line(under, error)]
     return [], [f"{under}: was encoded; it should have been refused with '{wanted}'"]

@@ -24,8 +24,12 @@ MORE: Settings = {
     "head": EncodeConfig(psnr=60.0, effort=5),
     "bound-tight": EncodeConfig(max_error_rel=1e-6, effort=4),
     "tiles": EncodeConfig(max_error_rel=1e-2, effort=1, tile="2x3x4x5"),
-    "paper-float32": EncodeConfig(profile="paper", width=16, hidden_layers=2, epochs=20, tables="float32"),
-    "paper-uint8": EncodeConfig(profile="paper", width=4, embedding_size=1, epochs=20, tables="uint8"),
+    "paper-float32": EncodeConfig(
+        profile="paper", width=16, hidden_layers=2, epochs=20, tables="float32"
+    ),
+    "paper-uint8": EncodeConfig(
+        profile="paper", width=4, embedding_size=1, epochs=20, tables="uint8"
+    ),
     "paper-transform": EncodeConfig(profile="paper", width=8, epochs=20, tables="transform"),
 }
 """Of the long set."""

@@ -23,7 +23,12 @@ LONGEST = 600.0
 
 
 def run_cases(
-    cases: Sequence[Case], *, everything: bool = False, processes: int | None = None, longest: float = LONGEST, progress: Progress = silent
+    cases: Sequence[Case],
+    *,
+    everything: bool = False,
+    processes: int | None = None,
+    longest: float = LONGEST,
+    progress: Progress = silent,
 ) -> Summary:
     """The results of cases of the catalogue, in their order; with `everything` under the settings of the long set too.
 
@@ -108,7 +113,13 @@ class _Worker:
 
 
 def _broken(case: Case, line: str) -> CaseResult:
-    return CaseResult(name=case.name, group=case.group, about=case.about, under=tuple(case.settings), errors=(line,))
+    return CaseResult(
+        name=case.name,
+        group=case.group,
+        about=case.about,
+        under=tuple(case.settings),
+        errors=(line,),
+    )
 
 
 def _serve(pipe: Connection, everything: bool) -> None:

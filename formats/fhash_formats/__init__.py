@@ -3,4 +3,12 @@
 from fhash_formats.readers import RawLayout, open_mask, open_series, parse_shape
 from fhash_formats.writers import Region, save_check, save_region
 
-__all__ = ["RawLayout", "Region", "open_mask", "open_series", "parse_shape", "save_check", "save_region"]
+__all__ = [
+    "RawLayout",
+    "Region",
+    "open_mask",
+    "open_series",
+    "parse_shape",
+    "save_check",
+    "save_region",
+]

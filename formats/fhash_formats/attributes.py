@@ -27,7 +27,9 @@ class _Unknown(Exception):
     pass
 
 
-def json_attributes(attributes: Mapping[str, Any], *, without: frozenset[str] = PLUMBING) -> dict[str, Any]:
+def json_attributes(
+    attributes: Mapping[str, Any], *, without: frozenset[str] = PLUMBING
+) -> dict[str, Any]:
     """The attributes as JSON values: numbers, text, lists. Bytes are UTF-8; not-a-number and infinities become text, as in zarr.
 
     References, compound values and whatever else JSON cannot say are dropped, and so are the names in `without`.
@@ -61,7 +63,11 @@ def _json_value(value: Any) -> Any:
         return text_of(value)
     if isinstance(value, float):
         # float() strips numpy's float64, which is a float too
-        return float(value) if math.isfinite(value) else {math.inf: "Infinity", -math.inf: "-Infinity"}.get(value, "NaN")
+        return (
+            float(value)
+            if math.isfinite(value)
+            else {math.inf: "Infinity", -math.inf: "-Infinity"}.get(value, "NaN")
+        )
     if isinstance(value, np.ndarray | np.generic):
         if value.dtype.kind in "biufSUTO":
             return _json_value(value.tolist())

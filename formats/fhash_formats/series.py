@@ -93,7 +93,12 @@ class Series(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self.close()
 
 
@@ -102,7 +107,9 @@ class StepsSeries(Series):
 
     def __init__(self, whole: Series, steps: Sequence[int]) -> None:
         if not steps:
-            raise InputError(f"{whole.source}: the selection of steps is empty; the series has {whole.shape[0]} steps")
+            raise InputError(
+                f"{whole.source}: the selection of steps is empty; the series has {whole.shape[0]} steps"
+            )
         for step in steps:
             whole.require_step(step)
         time = whole.coords["t"]
@@ -111,7 +118,9 @@ class StepsSeries(Series):
         self.source, self.name, self.units = whole.source, whole.name, whole.units
         self.dtype, self.attributes, self.files = whole.dtype, whole.attributes, whole.files
         self.shape = (len(self.steps), *whole.shape[1:])
-        chosen = Coordinate(name=time.name, values=time.values[list(self.steps)], attributes=time.attributes)
+        chosen = Coordinate(
+            name=time.name, values=time.values[list(self.steps)], attributes=time.attributes
+        )
         self.coords = {**whole.coords, "t": chosen}
 
     def read(self, step: int) -> npt.NDArray[Any]:
@@ -132,7 +141,12 @@ class ArraySeries(Series):
     """
 
     def __init__(
-        self, array: npt.ArrayLike, *, name: str = "values", units: str = "", coords: Mapping[str, Coordinate] | None = None
+        self,
+        array: npt.ArrayLike,
+        *,
+        name: str = "values",
+        units: str = "",
+        coords: Mapping[str, Coordinate] | None = None,
     ) -> None:
         values = _unmasked(array)
         self.source, self.name, self.units, self.attributes = "array", name, units, {}
@@ -141,7 +155,9 @@ class ArraySeries(Series):
         self.shape = check_values(self.source, values.shape, values.dtype)
         self.dtype = values.dtype.newbyteorder("=")
         self.values = values
-        self.coords = {axis: index_coordinate(axis, n) for axis, n in zip(AXES, self.shape, strict=True)} | dict(coords or {})
+        self.coords = {
+            axis: index_coordinate(axis, n) for axis, n in zip(AXES, self.shape, strict=True)
+        } | dict(coords or {})
         check_coords(self.source, self.coords, self.shape)
 
     def read(self, step: int) -> npt.NDArray[Any]:
@@ -149,26 +165,38 @@ class ArraySeries(Series):
         return np.ascontiguousarray(self.values[step], dtype=self.dtype)
 
 
-def check_values(what: str, shape: Sequence[int], dtype: np.dtype[Any]) -> tuple[int, int, int, int]:
+def check_values(
+    what: str, shape: Sequence[int], dtype: np.dtype[Any]
+) -> tuple[int, int, int, int]:
     """The shape (t, z, y, x) if an array of this shape and type can be a series, or an InputError that says why not."""
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
-        raise InputError(f"{what}: values of type {dtype} cannot be encoded; integers and floats up to 64 bits can")
+        raise InputError(
+            f"{what}: values of type {dtype} cannot be encoded; integers and floats up to 64 bits can"
+        )
     if len(shape) != 4:
-        raise InputError(f"{what}: {len(shape)} dimensions {tuple(shape)}; a series has 4 (t, z, y, x), or 3 (z, y, x) for one step")
+        raise InputError(
+            f"{what}: {len(shape)} dimensions {tuple(shape)}; a series has 4 (t, z, y, x), or 3 (z, y, x) for one step"
+        )
     if min(shape) < 1:
         raise InputError(f"{what}: an axis is empty, shape {tuple(shape)} in (t, z, y, x)")
     t, z, y, x = (int(n) for n in shape)
     return t, z, y, x
 
 
-def check_coords(what: str, coords: Mapping[str, Coordinate], shape: tuple[int, int, int, int]) -> None:
+def check_coords(
+    what: str, coords: Mapping[str, Coordinate], shape: tuple[int, int, int, int]
+) -> None:
     """Raise InputError unless there is a coordinate for each of t, z, y, x, float64 and as long as its axis."""
     if set(coords) != set(AXES):
-        raise InputError(f"{what}: coordinates of {sorted(coords)}; exactly those of t, z, y and x are needed")
+        raise InputError(
+            f"{what}: coordinates of {sorted(coords)}; exactly those of t, z, y and x are needed"
+        )
     for axis, length in zip(AXES, shape, strict=True):
         values = coords[axis].values
         if values.shape != (length,) or values.dtype != np.float64:
-            raise InputError(f"{what}: the coordinate of {axis} is {values.dtype} {values.shape}; float64 ({length},) is needed")
+            raise InputError(
+                f"{what}: the coordinate of {axis} is {values.dtype} {values.shape}; float64 ({length},) is needed"
+            )
 
 
 def _unmasked(array: npt.ArrayLike) -> npt.NDArray[Any]:
@@ -177,6 +205,8 @@ def _unmasked(array: npt.ArrayLike) -> npt.NDArray[Any]:
         return np.asarray(array)
     masked: np.ma.MaskedArray[Any, Any] = np.ma.asarray(array)
     if masked.dtype.kind != "f":
-        raise InputError(f"array: masked values of type {masked.dtype}, which has no NaN; convert it to float32 or float64 first")
+        raise InputError(
+            f"array: masked values of type {masked.dtype}, which has no NaN; convert it to float32 or float64 first"
+        )
     filled: npt.NDArray[Any] = masked.filled(np.nan)
     return filled

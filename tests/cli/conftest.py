@@ -26,7 +26,9 @@ def invoke(*words: object) -> Result:
 def tiny_values() -> np.ndarray:
     """A blob that moves along x, (t, z, y, x) float32."""
     t, z, y, x = np.meshgrid(*map(np.arange, SHAPE), indexing="ij", sparse=True)
-    return (1 + 9 * np.exp(-((z - 2.5) ** 2 + (y - 3) ** 2 + (x - 2 - 2 * t) ** 2) / 6)).astype(np.float32)
+    return (1 + 9 * np.exp(-((z - 2.5) ** 2 + (y - 3) ** 2 + (x - 2 - 2 * t) ** 2) / 6)).astype(
+        np.float32
+    )
 
 
 def write_tiny(path: Path) -> None:
@@ -34,7 +36,12 @@ def write_tiny(path: Path) -> None:
         data = file.create_dataset("density", data=tiny_values())
         data.attrs["units"] = "kg m-3"
         for number, (name, values) in enumerate(
-            {"time": [0.0, 1.0, 4.0], "z": np.arange(6) * 0.5, "y": np.arange(7.0), "x": 10 - np.arange(8.0)}.items()
+            {
+                "time": [0.0, 1.0, 4.0],
+                "z": np.arange(6) * 0.5,
+                "y": np.arange(7.0),
+                "x": 10 - np.arange(8.0),
+            }.items()
         ):
             scale = file.create_dataset(name, data=np.asarray(values, dtype=float))
             scale.make_scale(name)
@@ -59,14 +66,19 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A container of part of the tiny series: there are vertices outside the coreset."""
     path = tmp_path_factory.mktemp("run") / "tiny.fhz"
-    result = invoke("encode", data, "-o", path, "--feature", "interval:6:99", "--dilation", "0", *SMALL)
+    result = invoke(
+        "encode", data, "-o", path, "--feature", "interval:6:99", "--dilation", "0", *SMALL
+    )
     assert result.exit_code == 0, result.stderr
     return path
 
 
 def listing(folder: Path) -> dict[str, bytes | None]:
     """Everything below a folder with its bytes (None for a folder), to see whether a command left a trace."""
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
 
 
 @pytest.fixture

@@ -37,7 +37,9 @@ def render(run: str, output: str, force: bool, several: AnimationOptions) -> Non
     with fhash_codec.open(run) as volume, Progress(quiet=True) as progress:
         scene = several.over(SMALL, volume)
         if several.several(scene):
-            result, text = run_animation(volume, scene, several, output, force=force, progress=progress)
+            result, text = run_animation(
+                volume, scene, several, output, force=force, progress=progress
+            )
         else:
             result, text = tracking(volume, SMALL, several, progress).to_dict(), ""
     click.echo(json.dumps({"result": result, "text": text}))
@@ -65,7 +67,9 @@ def done(*words: object) -> dict[str, Any]:
 def test_numbered_pictures_go_on(run: Path, tmp_path: Path) -> None:
     words = (run, "-o", tmp_path / "a.png", "--animate", "steps,orbit=90", "--frames", "4")
     first = done(*words)
-    assert [Path(path).name for path in first["result"]["paths"]] == [f"a.000{number}.png" for number in range(4)]
+    assert [Path(path).name for path in first["result"]["paths"]] == [
+        f"a.000{number}.png" for number in range(4)
+    ]
     assert (first["result"]["rendered"], first["result"]["kept"]) == (4, 0)
     assert first["result"]["counters"]["rays"] > 0
     (tmp_path / "a.0002.png").unlink()
@@ -78,15 +82,42 @@ def test_numbered_pictures_go_on(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_film_and_its_pictures(run: Path, tmp_path: Path) -> None:
-    done(run, "-o", tmp_path / "a.gif", "--animate", "orbit", "--frames", "3", "--fps", "5", "--pictures", tmp_path / "p.png")
+    done(
+        run,
+        "-o",
+        tmp_path / "a.gif",
+        "--animate",
+        "orbit",
+        "--frames",
+        "3",
+        "--fps",
+        "5",
+        "--pictures",
+        tmp_path / "p.png",
+    )
     with Pictures.open(tmp_path / "a.gif") as picture:
         assert picture.info["duration"] == 200
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.gif", "p.0000.png", "p.0001.png", "p.0002.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "a.gif",
+        "p.0000.png",
+        "p.0001.png",
+        "p.0002.png",
+    ]
 
 
 def test_an_evolution_with_features(run: Path, tmp_path: Path) -> None:
     found = done(
-        run, "-o", tmp_path / "a.png", "--evolution", "::2", "--columns", "2", "--track", "interval:6:8=#ff0000", "--track", "isosurface:9"
+        run,
+        "-o",
+        tmp_path / "a.png",
+        "--evolution",
+        "::2",
+        "--columns",
+        "2",
+        "--track",
+        "interval:6:8=#ff0000",
+        "--track",
+        "isosurface:9",
     )
     assert found["result"]["steps"] == [0, 2]
     with Pictures.open(tmp_path / "a.png") as picture:
@@ -115,12 +146,17 @@ def test_a_single_picture_of_the_features_of_the_file(run: Path, tmp_path: Path)
         (["-o", "{}/a.png", "--animate", "{}/none.toml"], "no such animation"),
         (["-o", "{}/a.png", "--evolution", "7:9"], "steps 0 to 2"),
         (["-o", "{}/a.png", "--animate", "orbit", "--track", "blob:3"], "not known"),
-        (["-o", "{}/a.png", "--animate", "orbit", "--track", "own", "--track", "isosurface:8"], "own"),
+        (
+            ["-o", "{}/a.png", "--animate", "orbit", "--track", "own", "--track", "isosurface:8"],
+            "own",
+        ),
         (["-o", "{}/no/a.png", "--animate", "orbit"], "does not exist"),
         (["-o", "{}/a.gif", "--animate", "orbit", "--pictures", "{}/no/a.png"], "does not exist"),
     ],
 )
-def test_one_line_and_nothing_written(words: list[str], part: str, run: Path, tmp_path: Path) -> None:
+def test_one_line_and_nothing_written(
+    words: list[str], part: str, run: Path, tmp_path: Path
+) -> None:
     result = invoke(run, *(word.format(tmp_path) for word in words))
     assert result.exit_code == 2
     assert part in result.stderr

@@ -80,18 +80,45 @@ INPUTS = [
     ("many.h5", [], "--var"),
     ("many.h5", ["--var", "good?"], "good"),
     ("many.h5", ["--var", "group"], "group"),
-    *(("many.h5", ["--var", name], name) for name in ("line", "sheet", "five", "complex", "text", "words", "pairs", "empty", "hollow")),
+    *(
+        ("many.h5", ["--var", name], name)
+        for name in (
+            "line",
+            "sheet",
+            "five",
+            "complex",
+            "text",
+            "words",
+            "pairs",
+            "empty",
+            "hollow",
+        )
+    ),
     ("many.h5", ["--var", "nowhere"], "nowhere"),
     ("many.h5", ["--var", "endless"], "endless"),
 ]
 
 
 @pytest.mark.parametrize("command", ["encode", "diff", "bench"])
-@pytest.mark.parametrize(("name", "words", "message"), INPUTS, ids=lambda value: "-".join(value) if isinstance(value, list) else str(value))
-def test_unsuitable_input(refused: Refused, inputs: Path, run: Path, command: str, name: str, words: list[str], message: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "words", "message"),
+    INPUTS,
+    ids=lambda value: "-".join(value) if isinstance(value, list) else str(value),
+)
+def test_unsuitable_input(
+    refused: Refused,
+    inputs: Path,
+    run: Path,
+    command: str,
+    name: str,
+    words: list[str],
+    message: str,
+) -> None:
     match command:
         case "encode":
-            line = refused(2, "encode", inputs / name, "-o", inputs.parent / "out.fhz", *words, *SMALL)
+            line = refused(
+                2, "encode", inputs / name, "-o", inputs.parent / "out.fhz", *words, *SMALL
+            )
         case "diff":
             line = refused(2, "diff", inputs / name, run, *words)
             if name == "many.h5" and words in (["--var", "nowhere"], ["--var", "endless"]):
@@ -121,10 +148,16 @@ SETTINGS = [
     (["--epochs", "3"], "epochs belongs to --profile paper"),
     (["--tables", "uint8"], "tables belongs to --profile paper"),
     (["--engine", "slab"], "engine belongs to --profile paper"),
-    (["--profile", "paper", "--effort", "1"], "effort belongs to --profile compact; the profile is paper"),
+    (
+        ["--profile", "paper", "--effort", "1"],
+        "effort belongs to --profile compact; the profile is paper",
+    ),
     (["--profile", "paper", "--max-error", "1"], "max-error belongs to --profile compact"),
     (["--profile", "paper", "--tile", "whole"], "tile belongs to --profile compact"),
-    (["--psnr", "40", "--max-error-rel", "0.1"], "psnr and max-error-rel are given; promise one of them"),
+    (
+        ["--psnr", "40", "--max-error-rel", "0.1"],
+        "psnr and max-error-rel are given; promise one of them",
+    ),
     (["--ratio", "40", "--max-error", "0.1"], "max-error and ratio are given; promise one of them"),
     (["--ratio", "0.5"], "--ratio"),
     (["--ratio", "1e6"], "ratio leaves no room"),
@@ -152,9 +185,15 @@ SETTINGS = [
 ]
 
 
-@pytest.mark.parametrize(("words", "message"), SETTINGS, ids=lambda value: "-".join(value) if isinstance(value, list) else None)
+@pytest.mark.parametrize(
+    ("words", "message"),
+    SETTINGS,
+    ids=lambda value: "-".join(value) if isinstance(value, list) else None,
+)
 def test_unsuitable_setting(refused: Refused, inputs: Path, words: list[str], message: str) -> None:
-    line = refused(2, "encode", inputs / "good.npy", "-o", inputs.parent / "out.fhz", "--quiet", *words)
+    line = refused(
+        2, "encode", inputs / "good.npy", "-o", inputs.parent / "out.fhz", "--quiet", *words
+    )
     assert message in line
 
 
@@ -193,8 +232,14 @@ REGIONS = [
 ]
 
 
-@pytest.mark.parametrize(("words", "message"), REGIONS, ids=lambda value: "-".join(value) if isinstance(value, list) else None)
-def test_unsuitable_region(refused: Refused, run: Path, tmp_path: Path, words: list[str], message: str) -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    REGIONS,
+    ids=lambda value: "-".join(value) if isinstance(value, list) else None,
+)
+def test_unsuitable_region(
+    refused: Refused, run: Path, tmp_path: Path, words: list[str], message: str
+) -> None:
     assert message in refused(2, "decode", run, "-o", tmp_path / "out.npy", *words)
 
 
@@ -209,41 +254,57 @@ def outputs(data: Path, run: Path, folder: Path) -> dict[str, list[object]]:
 
 
 @pytest.mark.parametrize("kind", ["encode", "decode", "zarr", "steps"])
-def test_output_in_a_missing_folder(refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str) -> None:
+def test_output_in_a_missing_folder(
+    refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str
+) -> None:
     assert "does not exist" in refused(2, *outputs(data, run, tmp_path / "missing")[kind])
 
 
 @pytest.mark.parametrize("kind", ["encode", "decode", "zarr", "steps"])
-def test_output_in_a_folder_that_is_a_file(refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str) -> None:
+def test_output_in_a_folder_that_is_a_file(
+    refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str
+) -> None:
     (tmp_path / "file").write_text("")
     refused(2, *outputs(data, run, tmp_path / "file")[kind])
 
 
 @pytest.mark.parametrize("kind", ["encode", "decode", "zarr", "steps"])
-def test_existing_output(refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str) -> None:
+def test_existing_output(
+    refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str
+) -> None:
     words = outputs(data, run, tmp_path)[kind]
     Path(str(words[-1])).write_text("old")
     assert "--force" in refused(2, *words)
 
 
 @pytest.mark.parametrize("kind", ["encode", "decode", "steps"])
-def test_output_that_is_a_folder_is_refused_with_force(refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str) -> None:
+def test_output_that_is_a_folder_is_refused_with_force(
+    refused: Refused, data: Path, run: Path, tmp_path: Path, kind: str
+) -> None:
     words = outputs(data, run, tmp_path)[kind]
     Path(str(words[-1])).mkdir()
     assert "directory" in refused(2, *words, "--force")
 
 
 def test_output_is_checked_before_the_input_is_read(refused: Refused, tmp_path: Path) -> None:
-    assert "missing-folder" in refused(2, "encode", tmp_path / "no.h5", "-o", tmp_path / "missing-folder" / "out.fhz")
-    assert "missing-folder" in refused(2, "decode", tmp_path / "no.fhz", "-o", tmp_path / "missing-folder" / "out.npy")
+    assert "missing-folder" in refused(
+        2, "encode", tmp_path / "no.h5", "-o", tmp_path / "missing-folder" / "out.fhz"
+    )
+    assert "missing-folder" in refused(
+        2, "decode", tmp_path / "no.fhz", "-o", tmp_path / "missing-folder" / "out.npy"
+    )
 
 
 @pytest.mark.parametrize("name", ["out", "out.xyz"])
-def test_output_of_an_unknown_format_lists_the_formats(refused: Refused, run: Path, tmp_path: Path, name: str) -> None:
+def test_output_of_an_unknown_format_lists_the_formats(
+    refused: Refused, run: Path, tmp_path: Path, name: str
+) -> None:
     assert ".npy" in refused(2, "decode", run, "-o", tmp_path / name)
 
 
-def test_full_disk_while_encoding(refused: Refused, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_while_encoding(
+    refused: Refused, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(self: ContainerWriter, *_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -265,9 +326,15 @@ def small_files(limit: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("suffix", ["fhz", "npy", "h5", "raw", "vti", "zarr"])
-def test_a_write_that_fails_half_way_leaves_nothing(refused: Refused, data: Path, run: Path, tmp_path: Path, suffix: str) -> None:
+def test_a_write_that_fails_half_way_leaves_nothing(
+    refused: Refused, data: Path, run: Path, tmp_path: Path, suffix: str
+) -> None:
     output = tmp_path / f"out.{suffix}"
-    words = ["encode", data, "-o", output, *SMALL] if suffix == "fhz" else ["decode", run, "--t", "0", "-o", output]
+    words = (
+        ["encode", data, "-o", output, *SMALL]
+        if suffix == "fhz"
+        else ["decode", run, "--t", "0", "-o", output]
+    )
     with small_files(200 if suffix == "zarr" else 1000):
         assert str(output) in refused(1, *words)
     old = b"the old file"
@@ -279,7 +346,9 @@ def test_a_write_that_fails_half_way_leaves_nothing(refused: Refused, data: Path
 
 
 @pytest.mark.parametrize("link", [False, True])
-def test_force_never_replaces_the_input(refused: Refused, data: Path, run: Path, tmp_path: Path, link: bool) -> None:
+def test_force_never_replaces_the_input(
+    refused: Refused, data: Path, run: Path, tmp_path: Path, link: bool
+) -> None:
     series, container = tmp_path / "tiny.h5", tmp_path / "tiny_0000.vti"
     shutil.copy(data, series)
     shutil.copy(run, container)
@@ -290,4 +359,6 @@ def test_force_never_replaces_the_input(refused: Refused, data: Path, run: Path,
     assert "is the input itself" in refused(2, "encode", series, "-o", output, *SMALL)
     refused(2, "encode", tmp_path / "tin*.h5", "-o", output, "--force", *SMALL)
     assert "is the input itself" in refused(2, "decode", container, "-o", container, "--force")
-    assert "is the input itself" in refused(2, "decode", container, "-o", tmp_path / "tiny.vti", "--force")
+    assert "is the input itself" in refused(
+        2, "decode", container, "-o", tmp_path / "tiny.vti", "--force"
+    )

@@ -26,7 +26,9 @@ def test_bench_train_measures_each_engine(fhash: Fhash, data: Path) -> None:
 
 
 def test_bench_train_prints_a_table(fhash: Fhash, data: Path) -> None:
-    result = fhash("bench", "train", data, "--seconds", "0.2", "--engines", "slab", "--width", "4", "-q")
+    result = fhash(
+        "bench", "train", data, "--seconds", "0.2", "--engines", "slab", "--width", "4", "-q"
+    )
     assert result.exit_code == 0
     header, row, _ = result.stdout.splitlines()
     assert header.startswith("engine")
@@ -37,11 +39,29 @@ RATE = ["--profile", "paper", "--epochs", "1", "--width", "4", "-q"]
 
 
 def test_bench_rate_prints_one_json_object(fhash: Fhash, data: Path) -> None:
-    result = fhash("bench", "rate", data, "--target", "40", "--bound", "0.02", "--peer", "SZ3", "--peer", "Blosc", *RATE, "--json")
+    result = fhash(
+        "bench",
+        "rate",
+        data,
+        "--target",
+        "40",
+        "--bound",
+        "0.02",
+        "--peer",
+        "SZ3",
+        "--peer",
+        "Blosc",
+        *RATE,
+        "--json",
+    )
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     asked = {(point["codec"], point["goal"], point["asked"]) for point in report["points"]}
-    assert asked == {(codec, *goal) for codec in ("SZ3", "Blosc", "fhash paper") for goal in (("psnr", 40.0), ("bound", 0.02))}
+    assert asked == {
+        (codec, *goal)
+        for codec in ("SZ3", "Blosc", "fhash paper")
+        for goal in (("psnr", 40.0), ("bound", 0.02))
+    }
     assert [row["peer"] for row in report["best_peers"]] == ["SZ3", "SZ3"]
     assert len(report["speeds"]) == 3
     assert report["shape"] == [3, 6, 7, 8]
@@ -49,7 +69,20 @@ def test_bench_rate_prints_one_json_object(fhash: Fhash, data: Path) -> None:
 
 
 def test_bench_rate_prints_tables(fhash: Fhash, data: Path) -> None:
-    result = fhash("bench", "rate", data, "--t", ":2", "--target", "40", "--bound", "0.05", "--peer", "SZ3", *RATE)
+    result = fhash(
+        "bench",
+        "rate",
+        data,
+        "--t",
+        ":2",
+        "--target",
+        "40",
+        "--bound",
+        "0.05",
+        "--peer",
+        "SZ3",
+        *RATE,
+    )
     assert result.exit_code == 0
     lines = result.stdout.splitlines()
     assert lines[0].split("  ")[0] == "bytes"
@@ -61,7 +94,20 @@ def test_bench_rate_prints_tables(fhash: Fhash, data: Path) -> None:
 
 
 def test_bench_rate_measures_size_alone_and_no_profile(fhash: Fhash, data: Path) -> None:
-    result = fhash("bench", "rate", data, "--target", "40", "--peer", "ZFP", "--profile", "none", "--no-speed", "-q", "--json")
+    result = fhash(
+        "bench",
+        "rate",
+        data,
+        "--target",
+        "40",
+        "--peer",
+        "ZFP",
+        "--profile",
+        "none",
+        "--no-speed",
+        "-q",
+        "--json",
+    )
     assert result.exit_code == 0
     report = json.loads(result.stdout)
     assert [point["codec"] for point in report["points"]] == ["ZFP"]
@@ -70,7 +116,21 @@ def test_bench_rate_measures_size_alone_and_no_profile(fhash: Fhash, data: Path)
 
 def test_bench_rate_draws(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     picture = tmp_path / "rate.png"
-    words = ["bench", "rate", data, "--target", "40", "--peer", "SZ3", "--profile", "none", "--no-speed", "-q", "--plot", picture]
+    words = [
+        "bench",
+        "rate",
+        data,
+        "--target",
+        "40",
+        "--peer",
+        "SZ3",
+        "--profile",
+        "none",
+        "--no-speed",
+        "-q",
+        "--plot",
+        picture,
+    ]
     assert fhash(*words).exit_code == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
     again = fhash(*words)
@@ -78,8 +138,14 @@ def test_bench_rate_draws(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     assert "exists; use --force" in again.stderr
 
 
-def test_bench_rate_refuses_what_is_unknown(refused: Callable[..., str], data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "'zip' is no peer; allowed: SZ3, SPERR" in refused(2, "bench", "rate", data, "--peer", "zip")
-    assert "'tiny' is no profile; allowed: " in refused(2, "bench", "rate", data, "--profile", "tiny")
+def test_bench_rate_refuses_what_is_unknown(
+    refused: Callable[..., str], data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "'zip' is no peer; allowed: SZ3, SPERR" in refused(
+        2, "bench", "rate", data, "--peer", "zip"
+    )
+    assert "'tiny' is no profile; allowed: " in refused(
+        2, "bench", "rate", data, "--profile", "tiny"
+    )
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
     assert "fhash[bench]" in refused(2, "bench", "rate", data, "--target", "40")

@@ -15,10 +15,25 @@ QUICK = ["--size", "16", "--turns", "1", "-q"]
 
 
 def test_prints_tables(fhash: Fhash, run: Path) -> None:
-    result = fhash("bench", "render", run, *QUICK, "--part", "accelerations", "--part", "exactness", "--part", "streams")
+    result = fhash(
+        "bench",
+        "render",
+        run,
+        *QUICK,
+        "--part",
+        "accelerations",
+        "--part",
+        "exactness",
+        "--part",
+        "streams",
+    )
     assert (result.exit_code, result.stderr) == (0, "")
     lines = result.stdout.splitlines()
-    assert [line.split("  ")[0] for line in lines if "PSNR" in line][:3] == ["acceleration", "march", "VTK on software OpenGL"]
+    assert [line.split("  ")[0] for line in lines if "PSNR" in line][:3] == [
+        "acceleration",
+        "march",
+        "VTK on software OpenGL",
+    ]
     assert any(line.startswith("early termination  ") for line in lines)
     assert any("medians of 1" in line for line in lines)
 
@@ -26,11 +41,16 @@ def test_prints_tables(fhash: Fhash, run: Path) -> None:
 def test_prints_one_json_object_of_a_scene(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text("step = 1.5\n")
-    result = fhash("bench", "render", run, *QUICK, "--part", "accelerations", "--scene", scene, "--json")
+    result = fhash(
+        "bench", "render", run, *QUICK, "--part", "accelerations", "--scene", scene, "--json"
+    )
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     assert report["step"] == 1.5
-    assert [entry["name"] for entry in report["accelerations"]][:2] == ["skipping", "early termination"]
+    assert [entry["name"] for entry in report["accelerations"]][:2] == [
+        "skipping",
+        "early termination",
+    ]
     assert report["curves"] == []
 
 
@@ -50,5 +70,7 @@ def test_draws(fhash: Fhash, run: Path, tmp_path: Path) -> None:
         (["--plot", "none/a.png"], "does not exist"),
     ],
 )
-def test_refuses_in_one_line(words: list[str], part: str, refused: Callable[..., str], run: Path) -> None:
+def test_refuses_in_one_line(
+    words: list[str], part: str, refused: Callable[..., str], run: Path
+) -> None:
     assert part in refused(2, "bench", "render", run, "-q", *words)

@@ -57,21 +57,43 @@ def test_a_region_is_that_part_of_the_whole(
     np.testing.assert_array_equal(saved(fhash, run, tmp_path / "out.npy", *words), whole[index])
 
 
-def test_a_time_between_steps_is_the_volume_at_that_step(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+def test_a_time_between_steps_is_the_volume_at_that_step(
+    fhash: Fhash, run: Path, tmp_path: Path
+) -> None:
     with fhash_codec.open(run) as volume:
         expected = volume.read(1.5)
-    np.testing.assert_array_equal(saved(fhash, run, tmp_path / "out.npy", "--time", "2.5"), expected[None])
+    np.testing.assert_array_equal(
+        saved(fhash, run, tmp_path / "out.npy", "--time", "2.5"), expected[None]
+    )
 
 
-def test_outside_background_leaves_no_nan(fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path) -> None:
+def test_outside_background_leaves_no_nan(
+    fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path
+) -> None:
     filled = saved(fhash, run, tmp_path / "out.npy", "--outside", "background")
     assert np.isnan(whole).any()
     assert not np.isnan(filled).any()
     np.testing.assert_array_equal(filled[~np.isnan(whole)], whole[~np.isnan(whole)])
 
 
-def test_coordinates_and_attributes_travel_with_the_region(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    assert fhash("decode", run, "-o", tmp_path / "out.h5", "--time", "0.5", "--time", "2.5", "--roi", "1:3,:,2:5").exit_code == 0
+def test_coordinates_and_attributes_travel_with_the_region(
+    fhash: Fhash, run: Path, tmp_path: Path
+) -> None:
+    assert (
+        fhash(
+            "decode",
+            run,
+            "-o",
+            tmp_path / "out.h5",
+            "--time",
+            "0.5",
+            "--time",
+            "2.5",
+            "--roi",
+            "1:3,:,2:5",
+        ).exit_code
+        == 0
+    )
     with h5py.File(tmp_path / "out.h5") as file:
         values = file["density"]
         assert values.shape == (2, 2, 7, 3)
@@ -80,8 +102,13 @@ def test_coordinates_and_attributes_travel_with_the_region(fhash: Fhash, run: Pa
     assert got == [[0.5, 2.5], [0.5, 1.0], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [8.0, 7.0, 6.0]]
 
 
-@pytest.mark.parametrize("name", ["out.npy", "out.h5", "out.nc", "out.zarr", "out.raw", "out.vti", "out.pvd", "out.vtkhdf"])
-def test_every_format_is_written_and_named(fhash: Fhash, run: Path, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    "name",
+    ["out.npy", "out.h5", "out.nc", "out.zarr", "out.raw", "out.vti", "out.pvd", "out.vtkhdf"],
+)
+def test_every_format_is_written_and_named(
+    fhash: Fhash, run: Path, tmp_path: Path, name: str
+) -> None:
     result = fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3", "--json")
     assert (result.exit_code, result.stderr) == (0, "")
     paths = [Path(path) for path in json.loads(result.stdout)["paths"]]
@@ -91,15 +118,25 @@ def test_every_format_is_written_and_named(fhash: Fhash, run: Path, tmp_path: Pa
     assert fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3", "--force").exit_code == 0
 
 
-def test_statistics_are_those_of_the_region(fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path) -> None:
+def test_statistics_are_those_of_the_region(
+    fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path
+) -> None:
     report = json.loads(fhash("decode", run, "--t", "1", "--roi", "2:5,:,:", "--json").stdout)
     part = whole[1:2, 2:5]
     assert report["min"] == np.nanmin(part)
     assert report["max"] == np.nanmax(part)
     assert report["mean"] == pytest.approx(np.nanmean(part, dtype=float))
     assert report["inside_fraction"] == (~np.isnan(part)).mean()
-    assert (report["shape"], report["steps"], report["region"]) == ([1, 3, 7, 8], [1.0], [[2, 5], [0, 7], [0, 8]])
-    filled = json.loads(fhash("decode", run, "--t", "1", "--roi", "2:5,:,:", "--outside", "background", "--json").stdout)
+    assert (report["shape"], report["steps"], report["region"]) == (
+        [1, 3, 7, 8],
+        [1.0],
+        [[2, 5], [0, 7], [0, 8]],
+    )
+    filled = json.loads(
+        fhash(
+            "decode", run, "--t", "1", "--roi", "2:5,:,:", "--outside", "background", "--json"
+        ).stdout
+    )
     assert filled["inside_fraction"] == report["inside_fraction"]
     assert list(tmp_path.iterdir()) == []
 
@@ -113,7 +150,9 @@ def test_statistics_of_nothing_have_no_numbers(fhash: Fhash, run: Path) -> None:
 
 def test_dtype_rounds_to_integers(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     exact = saved(fhash, run, tmp_path / "exact.npy", "--outside", "background")
-    rounded = saved(fhash, run, tmp_path / "rounded.npy", "--outside", "background", "--dtype", "uint8")
+    rounded = saved(
+        fhash, run, tmp_path / "rounded.npy", "--outside", "background", "--dtype", "uint8"
+    )
     assert rounded.dtype == np.uint8
     np.testing.assert_array_equal(rounded, np.rint(exact))
 
@@ -141,27 +180,46 @@ def test_statistics_of_huge_values_do_not_overflow() -> None:
     statistics = Statistics()
     for _ in range(3):
         statistics.add(np.array([[5e307, 1.5e308, np.nan]]), 2)
-    assert statistics.result() == {"min": 5e307, "max": 1.5e308, "mean": 1e308, "inside_fraction": 2 / 3}
+    assert statistics.result() == {
+        "min": 5e307,
+        "max": 1.5e308,
+        "mean": 1e308,
+        "inside_fraction": 2 / 3,
+    }
 
 
 def test_huge_values_are_decoded_to_valid_json(fhash: Fhash, tmp_path: Path) -> None:
     np.save(tmp_path / "huge.npy", np.linspace(-5e307, 5e307, 120).reshape(2, 3, 4, 5))
-    assert fhash("encode", tmp_path / "huge.npy", "-o", tmp_path / "run.fhz", "--effort", "1", "-q").exit_code == 0
+    assert (
+        fhash(
+            "encode", tmp_path / "huge.npy", "-o", tmp_path / "run.fhz", "--effort", "1", "-q"
+        ).exit_code
+        == 0
+    )
     result = fhash("decode", tmp_path / "run.fhz", "--json")
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     assert report["min"] <= report["mean"] <= report["max"]
 
 
-def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(refused: Callable[..., str], fhash: Fhash, tmp_path: Path) -> None:
+def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(
+    refused: Callable[..., str], fhash: Fhash, tmp_path: Path
+) -> None:
     with pytest.raises(InputError, match="the data have no value") as caught:
         convert(np.array([1.0, np.nan]), np.dtype(np.uint8), filled=True)
     assert "--outside" not in str(caught.value)
     values = np.arange(120, dtype=np.float32).reshape(2, 3, 4, 5)
     values[0, 0, 0, 0] = np.nan
     np.save(tmp_path / "gap.npy", values)
-    assert fhash("encode", tmp_path / "gap.npy", "-o", tmp_path / "run.fhz", "--effort", "1", "-q").exit_code == 0
-    assert "the data have no value" in refused(2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8")
+    assert (
+        fhash(
+            "encode", tmp_path / "gap.npy", "-o", tmp_path / "run.fhz", "--effort", "1", "-q"
+        ).exit_code
+        == 0
+    )
+    assert "the data have no value" in refused(
+        2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8"
+    )
 
 
 @pytest.mark.parametrize(
@@ -174,9 +232,14 @@ def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(refused: Callable
         ([3.0, 2.0, 1.0, 0.0], (1.0, 2.0), (1, 3)),
     ],
 )
-def test_a_box_never_gives_vertices_outside_it(positions: list[float], box: tuple[float, float], expected: tuple[int, int] | None) -> None:
+def test_a_box_never_gives_vertices_outside_it(
+    positions: list[float], box: tuple[float, float], expected: tuple[int, int] | None
+) -> None:
     coordinate = Coordinate(name="x", values=np.array(positions))
-    volume = cast(fhash_codec.Volume, SimpleNamespace(coords={"x": coordinate, "y": coordinate, "z": coordinate}))
+    volume = cast(
+        fhash_codec.Volume,
+        SimpleNamespace(coords={"x": coordinate, "y": coordinate, "z": coordinate}),
+    )
     if expected is None:
         with pytest.raises(RegionError, match=r"neither ascend nor descend.*--roi"):
             region_of_box(volume, [(None, None), (None, None), box])
@@ -187,7 +250,9 @@ def test_a_box_never_gives_vertices_outside_it(positions: list[float], box: tupl
 def test_a_box_outside_by_little_says_by_how_much() -> None:
     coordinate = Coordinate(name="x", values=347921.0 + np.arange(3) / 1000)
     volume = cast(fhash_codec.Volume, SimpleNamespace(coords=dict.fromkeys("zyx", coordinate)))
-    with pytest.raises(RegionError, match=r"347921:347921\.003; the domain has positions 347921 to 347921\.002"):
+    with pytest.raises(
+        RegionError, match=r"347921:347921\.003; the domain has positions 347921 to 347921\.002"
+    ):
         region_of_box(volume, [(347921.0, 347921.003), (None, None), (None, None)])
 
 
@@ -197,7 +262,9 @@ def test_an_output_name_that_is_no_utf8(fhash: Fhash, run: Path, tmp_path: Path)
     assert (tmp_path / "\udcff.npy").exists()
 
 
-def test_a_level_of_detail_has_every_second_position(fhash: Fhash, refused: Callable[..., str], data: Path, tmp_path: Path) -> None:
+def test_a_level_of_detail_has_every_second_position(
+    fhash: Fhash, refused: Callable[..., str], data: Path, tmp_path: Path
+) -> None:
     run, out = tmp_path / "run.fhz", tmp_path / "out.h5"
     assert fhash("encode", data, "-o", run, "--effort", "1", "-q").exit_code == 0
     result = fhash("decode", run, "--lod", "1", "--t", "1:3", "-o", out, "--json", "-q")
@@ -207,9 +274,13 @@ def test_a_level_of_detail_has_every_second_position(fhash: Fhash, refused: Call
         assert series.shape == (2, 3, 4, 4)
         np.testing.assert_array_equal(series.read(0), volume.read_lod(1, 1))
         for axis in "zyx":
-            np.testing.assert_array_equal(series.coords[axis].values, volume.coords[axis].values[::2])
+            np.testing.assert_array_equal(
+                series.coords[axis].values, volume.coords[axis].values[::2]
+            )
     part = tmp_path / "part.h5"
-    result = fhash("decode", run, "--lod", "1", "--t", "1", "--roi", "1:5,:,3:7", "-o", part, "--json", "-q")
+    result = fhash(
+        "decode", run, "--lod", "1", "--t", "1", "--roi", "1:5,:,3:7", "-o", part, "--json", "-q"
+    )
     assert (result.exit_code, result.stderr) == (0, "")
     assert json.loads(result.stdout)["shape"] == [1, 2, 4, 2]
     assert json.loads(result.stdout)["region"][0] == [2, 5]
@@ -223,8 +294,12 @@ def test_a_level_of_detail_has_every_second_position(fhash: Fhash, refused: Call
 
 
 @pytest.mark.parametrize("suffix", ["vtp", "ply"])
-def test_an_isosurface_is_written_in_physical_positions(fhash: Fhash, run: Path, tmp_path: Path, suffix: str) -> None:
-    result = fhash("decode", run, "--t", "1", "--isosurface", "8", "-o", tmp_path / f"s.{suffix}", "--json")
+def test_an_isosurface_is_written_in_physical_positions(
+    fhash: Fhash, run: Path, tmp_path: Path, suffix: str
+) -> None:
+    result = fhash(
+        "decode", run, "--t", "1", "--isosurface", "8", "-o", tmp_path / f"s.{suffix}", "--json"
+    )
     assert (result.exit_code, result.stderr) == (0, "")
     assert json.loads(result.stdout)["paths"] == [str(tmp_path / f"s.{suffix}")]
     if suffix == "ply":
@@ -236,7 +311,13 @@ def test_an_isosurface_is_written_in_physical_positions(fhash: Fhash, run: Path,
                 ends = np.sort(volume.coords[axis].values[[0, -1]])
                 assert np.all((vertices[:, column] >= ends[0]) & (vertices[:, column] <= ends[1]))
             z, y, x = (
-                np.interp(vertices[:, column], *(part[:: -1 if axis == "x" else 1] for part in (volume.coords[axis].values, np.arange(n))))
+                np.interp(
+                    vertices[:, column],
+                    *(
+                        part[:: -1 if axis == "x" else 1]
+                        for part in (volume.coords[axis].values, np.arange(n))
+                    ),
+                )
                 for column, axis, n in ((2, "z", 6), (1, "y", 7), (0, "x", 8))
             )
             np.testing.assert_allclose(volume.sample(t=1, z=z, y=y, x=x), 8, rtol=0, atol=1e-3)
@@ -253,9 +334,16 @@ def test_an_isosurface_is_written_in_physical_positions(fhash: Fhash, run: Path,
     ],
 )
 def test_isosurfaces_that_cannot_be_written(
-    refused: Callable[..., str], run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], message: str
+    refused: Callable[..., str],
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert message in refused(2, "decode", run, "--isosurface", "8", *words)
-    assert "no surface of the value 1000" in refused(2, "decode", run, "--isosurface", "1000", "--t", "0", "-o", "s.ply")
+    assert "no surface of the value 1000" in refused(
+        2, "decode", run, "--isosurface", "1000", "--t", "0", "-o", "s.ply"
+    )
     assert list(tmp_path.iterdir()) == []

@@ -30,16 +30,22 @@ def test_demo_makes_data_container_and_picture(fhash: Fhash, tmp_path: Path, sce
     result = fhash("demo", "--scene", scene, "-o", folder, "--json", "-q")
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
-    assert sorted(path.name for path in folder.iterdir()) == [f"{scene}.{suffix}" for suffix in ("fhz", "h5", "png")]
+    assert sorted(path.name for path in folder.iterdir()) == [
+        f"{scene}.{suffix}" for suffix in ("fhz", "h5", "png")
+    ]
     with Image.open(report["picture"]) as picture:
         assert 900 < picture.width < 1400
     again = json.loads(fhash("diff", report["data"], report["path"], "--json").stdout)
-    assert [again[name] for name in ("psnr", "bytes", "max_abs_error")] == [report[name] for name in ("psnr", "bytes", "max_abs_error")]
+    assert [again[name] for name in ("psnr", "bytes", "max_abs_error")] == [
+        report[name] for name in ("psnr", "bytes", "max_abs_error")
+    ]
     assert fhash("demo", "--scene", scene, "-o", folder).exit_code == 2
     assert fhash("demo", "--scene", scene, "-o", folder, "--force", "-q").stdout.startswith("data")
 
 
-def test_demo_in_a_folder_that_cannot_be_is_refused(refused: Callable[..., str], tmp_path: Path) -> None:
+def test_demo_in_a_folder_that_cannot_be_is_refused(
+    refused: Callable[..., str], tmp_path: Path
+) -> None:
     assert "No such file or directory" in refused(2, "demo", "-o", tmp_path / "no" / "demo")
     (tmp_path / "file").write_text("")
     refused(2, "demo", "-o", tmp_path / "file")

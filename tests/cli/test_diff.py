@@ -25,7 +25,9 @@ def report(data: Path, run: Path) -> dict[str, float]:
     return json.loads(result.stdout)
 
 
-def test_diff_agrees_with_what_the_encoder_measured(fhash: Fhash, run: Path, report: dict[str, float]) -> None:
+def test_diff_agrees_with_what_the_encoder_measured(
+    fhash: Fhash, run: Path, report: dict[str, float]
+) -> None:
     stored = json.loads(fhash("info", run, "--json").stdout)["quality"]
     for name in ("psnr", "rmse", "max_abs_error", "psnr_domain"):
         # The file has six digits of it, rounded to the worse side.
@@ -33,7 +35,9 @@ def test_diff_agrees_with_what_the_encoder_measured(fhash: Fhash, run: Path, rep
         assert (report[name] >= stored[name]) == name.startswith("psnr")
 
 
-@pytest.mark.parametrize(("gate", "figure", "sign"), [("--min-psnr", "psnr", 1), ("--max-error", "max_abs_error", -1)])
+@pytest.mark.parametrize(
+    ("gate", "figure", "sign"), [("--min-psnr", "psnr", 1), ("--max-error", "max_abs_error", -1)]
+)
 def test_a_gate_closes_just_beyond_the_figure(
     fhash: Fhash, data: Path, run: Path, report: dict[str, float], gate: str, figure: str, sign: int
 ) -> None:
@@ -47,7 +51,9 @@ def test_a_gate_closes_just_beyond_the_figure(
 def test_an_exact_file_passes_every_gate(fhash: Fhash, tmp_path: Path) -> None:
     np.save(tmp_path / "flat.npy", np.full((2, 3, 4, 5), 7.0, dtype=np.float32))
     assert fhash("encode", tmp_path / "flat.npy", "-o", tmp_path / "run.fhz", *SMALL).exit_code == 0
-    result = fhash("diff", tmp_path / "flat.npy", tmp_path / "run.fhz", "--min-psnr", "200", "--max-error", "0")
+    result = fhash(
+        "diff", tmp_path / "flat.npy", tmp_path / "run.fhz", "--min-psnr", "200", "--max-error", "0"
+    )
     assert (result.exit_code, result.stderr) == (0, "")
     assert "PSNR, coreset   exact" in result.stdout
 
@@ -60,10 +66,26 @@ def test_other_data_are_refused(refused: Callable[..., str], run: Path, tmp_path
 @pytest.mark.parametrize(
     ("figures", "words", "missed"),
     [
-        ({"psnr": None, "rmse": 0.0, "max_abs_error": 0.0}, ["--min-psnr", "200", "--max-error", "0"], ""),
-        ({"psnr": None, "rmse": 0.1, "max_abs_error": 0.1}, ["--min-psnr", "1"], "no PSNR is defined in the coreset; at least 1 dB"),
-        ({"psnr": None, "rmse": None, "max_abs_error": None}, ["--min-psnr", "1"], "no PSNR is defined in the coreset"),
-        ({"psnr": None, "rmse": None, "max_abs_error": None}, ["--max-error", "1"], "no value can be compared in the coreset; at most 1"),
+        (
+            {"psnr": None, "rmse": 0.0, "max_abs_error": 0.0},
+            ["--min-psnr", "200", "--max-error", "0"],
+            "",
+        ),
+        (
+            {"psnr": None, "rmse": 0.1, "max_abs_error": 0.1},
+            ["--min-psnr", "1"],
+            "no PSNR is defined in the coreset; at least 1 dB",
+        ),
+        (
+            {"psnr": None, "rmse": None, "max_abs_error": None},
+            ["--min-psnr", "1"],
+            "no PSNR is defined in the coreset",
+        ),
+        (
+            {"psnr": None, "rmse": None, "max_abs_error": None},
+            ["--max-error", "1"],
+            "no value can be compared in the coreset; at most 1",
+        ),
     ],
 )
 def test_a_figure_that_is_not_defined_meets_no_gate(

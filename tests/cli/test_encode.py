@@ -25,8 +25,12 @@ KEYS = {
 }  # fmt: skip
 
 
-def test_json_is_one_object_with_the_figures_of_the_file(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    result = fhash("encode", data, "-o", tmp_path / "run.fhz", "--feature", "interval:6:99", "--json", *PAPER)
+def test_json_is_one_object_with_the_figures_of_the_file(
+    fhash: Fhash, data: Path, tmp_path: Path
+) -> None:
+    result = fhash(
+        "encode", data, "-o", tmp_path / "run.fhz", "--feature", "interval:6:99", "--json", *PAPER
+    )
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     assert set(report) >= KEYS
@@ -45,7 +49,9 @@ def test_table_says_what_was_written(fhash: Fhash, data: Path, tmp_path: Path) -
     assert "100.000% of the domain, in z 0:6, y 0:7, x 0:8" in result.stdout
 
 
-def test_coded_tables_are_reported_with_their_loss(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+def test_coded_tables_are_reported_with_their_loss(
+    fhash: Fhash, data: Path, tmp_path: Path
+) -> None:
     for name, tables in {"plain": "float32", "coded": "transform"}.items():
         result = fhash("encode", data, "-o", tmp_path / name, *PAPER, "--tables", tables)
         assert (result.exit_code, result.stderr) == (0, "")
@@ -60,7 +66,9 @@ def test_coded_tables_are_reported_with_their_loss(fhash: Fhash, data: Path, tmp
     assert fhash("diff", data, tmp_path / "coded", "--json").exit_code == 0
 
 
-def test_same_command_gives_the_same_bytes_without_timings(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+def test_same_command_gives_the_same_bytes_without_timings(
+    fhash: Fhash, data: Path, tmp_path: Path
+) -> None:
     for name in ("a", "b"):
         assert fhash("encode", data, "-o", tmp_path / name, "--no-timings", *SMALL).exit_code == 0
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
@@ -70,11 +78,23 @@ def test_series_options_reach_the_reader(fhash: Fhash, tmp_path: Path) -> None:
     values = np.arange(4 * 5 * 6 * 7, dtype=">u2").reshape(4, 5, 6, 7)
     (tmp_path / "values.bin").write_bytes(values.tobytes())
     layout = ["--shape", "x=7,y=6,z=5,t=4", "--dtype", "uint16", "--endian", "big"]
-    words = ["encode", tmp_path / "values.bin", "-o", tmp_path / "run.fhz", *layout, "--t", "1:4:2", *SMALL]
+    words = [
+        "encode",
+        tmp_path / "values.bin",
+        "-o",
+        tmp_path / "run.fhz",
+        *layout,
+        "--t",
+        "1:4:2",
+        *SMALL,
+    ]
     assert fhash(*words).exit_code == 0
     with fhash_codec.open(tmp_path / "run.fhz") as volume:
         assert volume.shape == (2, 5, 6, 7)
-        assert (volume.value_range.low, volume.value_range.high) == (values[1].min(), values[3].max())
+        assert (volume.value_range.low, volume.value_range.high) == (
+            values[1].min(),
+            values[3].max(),
+        )
 
 
 def test_force_replaces(fhash: Fhash, data: Path, tmp_path: Path) -> None:
@@ -86,12 +106,16 @@ def test_force_replaces(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     assert output.read_bytes() != b"old"
 
 
-def test_what_each_stage_bought_is_in_the_table_and_in_json(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+def test_what_each_stage_bought_is_in_the_table_and_in_json(
+    fhash: Fhash, data: Path, tmp_path: Path
+) -> None:
     words = ["encode", data, "-o", tmp_path / "run.fhz", "--effort", "2", "--force", "-q"]
     report = json.loads(fhash(*words, "--json").stdout)
     assert set(report) >= {*KEYS, "gains"}
     assert report["profile"] == "compact"
-    assert [set(gain) for gain in report["gains"]] == [{"what", "bytes", "seconds"}] * len(report["gains"])
+    assert [set(gain) for gain in report["gains"]] == [{"what", "bytes", "seconds"}] * len(
+        report["gains"]
+    )
     lines = fhash(*words).stdout.splitlines()
     for gain in report["gains"]:
         assert sum(line.startswith(f"  {gain['what']}  ") for line in lines) == 1
@@ -101,10 +125,20 @@ def test_what_each_stage_bought_is_in_the_table_and_in_json(fhash: Fhash, data: 
     assert fhash(*words, "--no-timings").exit_code == 0
 
 
-@pytest.mark.parametrize("words", [["--max-error", "0.125"], ["--max-error-rel", "0.01"], ["--tile", "2x4x4x4", "--psnr", "35"]], ids=str)
-def test_promises_of_the_compact_profile_are_kept(fhash: Fhash, data: Path, tmp_path: Path, words: list[str]) -> None:
-    report = json.loads(fhash("encode", data, "-o", tmp_path / "run.fhz", *words, "--json", *SMALL).stdout)
-    bound = {"--max-error": 0.125, "--max-error-rel": 0.01 * report["data_range"]}.get(words[0], np.inf)
+@pytest.mark.parametrize(
+    "words",
+    [["--max-error", "0.125"], ["--max-error-rel", "0.01"], ["--tile", "2x4x4x4", "--psnr", "35"]],
+    ids=str,
+)
+def test_promises_of_the_compact_profile_are_kept(
+    fhash: Fhash, data: Path, tmp_path: Path, words: list[str]
+) -> None:
+    report = json.loads(
+        fhash("encode", data, "-o", tmp_path / "run.fhz", *words, "--json", *SMALL).stdout
+    )
+    bound = {"--max-error": 0.125, "--max-error-rel": 0.01 * report["data_range"]}.get(
+        words[0], np.inf
+    )
     assert 0 < report["max_abs_error"] <= bound
     assert report["psnr"] >= 35
     with fhash_codec.open(tmp_path / "run.fhz") as volume:
@@ -116,7 +150,9 @@ def test_missed_promise_writes_the_file_prints_the_figures_and_exits_with_3(
     fhash: Fhash, data: Path, tmp_path: Path, as_json: bool
 ) -> None:
     output = tmp_path / "run.fhz"
-    result = fhash("encode", data, "-o", output, "--psnr", "300", *(["--json"] if as_json else []), *PAPER)
+    result = fhash(
+        "encode", data, "-o", output, "--psnr", "300", *(["--json"] if as_json else []), *PAPER
+    )
     assert result.exit_code == 3
     assert len(result.stderr.splitlines()) == 1
     assert "300 dB" in result.stderr
@@ -149,7 +185,17 @@ def test_a_warning_is_one_line_on_stderr(fhash: Fhash, tmp_path: Path) -> None:
 def test_ctrl_c_saves_a_checkpoint_and_the_same_command_ends_as_if_nothing_had_been(
     fhash: Fhash, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["encode", data, "--no-timings", "--feature", "interval:2:99", *PAPER, "--epochs", "6", "-o"]
+    words = [
+        "encode",
+        data,
+        "--no-timings",
+        "--feature",
+        "interval:2:99",
+        *PAPER,
+        "--epochs",
+        "6",
+        "-o",
+    ]
     assert fhash(*words, tmp_path / "whole.fhz").exit_code == 0
     listen = Progress.__call__
 

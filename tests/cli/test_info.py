@@ -28,7 +28,9 @@ def test_info_says_what_the_file_holds(fhash: Fhash, run: Path) -> None:
         assert text in result.stdout
 
 
-def test_info_of_a_paper_file_says_how_it_was_trained(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+def test_info_of_a_paper_file_says_how_it_was_trained(
+    fhash: Fhash, data: Path, tmp_path: Path
+) -> None:
     assert fhash("encode", data, "-o", tmp_path / "run.fhz", *PAPER).exit_code == 0
     result = fhash("info", tmp_path / "run.fhz")
     assert (result.exit_code, result.stderr) == (0, "")
@@ -38,10 +40,27 @@ def test_info_of_a_paper_file_says_how_it_was_trained(fhash: Fhash, data: Path, 
 
 @pytest.mark.filterwarnings("ignore:training diverged")
 def test_info_says_that_a_training_diverged(fhash: Fhash, data: Path, tmp_path: Path) -> None:
-    wild = ["--profile", "paper", "--epochs", "3", "--width", "64", "--hidden-layers", "2", "--learning-rate", "1", "--quiet"]
+    wild = [
+        "--profile",
+        "paper",
+        "--epochs",
+        "3",
+        "--width",
+        "64",
+        "--hidden-layers",
+        "2",
+        "--learning-rate",
+        "1",
+        "--quiet",
+    ]
     assert fhash("encode", data, "-o", tmp_path / "run.fhz", *wild).exit_code == 0
-    assert "it diverged, and came to its end at a learning rate of 0." in fhash("info", tmp_path / "run.fhz").stdout
-    assert json.loads(fhash("info", tmp_path / "run.fhz", "--json").stdout)["training"]["restarts"] > 0
+    assert (
+        "it diverged, and came to its end at a learning rate of 0."
+        in fhash("info", tmp_path / "run.fhz").stdout
+    )
+    assert (
+        json.loads(fhash("info", tmp_path / "run.fhz", "--json").stdout)["training"]["restarts"] > 0
+    )
 
 
 def test_info_as_json_is_one_object(fhash: Fhash, run: Path) -> None:
@@ -60,7 +79,9 @@ def test_verify_counts_the_arrays(fhash: Fhash, run: Path) -> None:
 
 
 @pytest.mark.parametrize("place", [0.02, 0.3, 0.5, 0.7, 0.9])
-def test_a_flipped_bit_is_found(refused: Callable[..., str], run: Path, tmp_path: Path, place: float) -> None:
+def test_a_flipped_bit_is_found(
+    refused: Callable[..., str], run: Path, tmp_path: Path, place: float
+) -> None:
     damaged = bytearray(run.read_bytes())
     damaged[int(len(damaged) * place)] ^= 16
     (tmp_path / "bad.fhz").write_bytes(damaged)
@@ -69,12 +90,16 @@ def test_a_flipped_bit_is_found(refused: Callable[..., str], run: Path, tmp_path
 
 @pytest.mark.parametrize("command", ["info", "verify", "decode"])
 @pytest.mark.parametrize("kept", [0, 1, 30, 1000, -1])
-def test_a_cut_file_is_found(refused: Callable[..., str], run: Path, tmp_path: Path, command: str, kept: int) -> None:
+def test_a_cut_file_is_found(
+    refused: Callable[..., str], run: Path, tmp_path: Path, command: str, kept: int
+) -> None:
     (tmp_path / "cut.fhz").write_bytes(run.read_bytes()[:kept])
     refused(4, command, tmp_path / "cut.fhz")
 
 
 @pytest.mark.parametrize("command", ["info", "verify", "decode"])
-def test_what_is_no_container_is_refused(refused: Callable[..., str], data: Path, tmp_path: Path, command: str) -> None:
+def test_what_is_no_container_is_refused(
+    refused: Callable[..., str], data: Path, tmp_path: Path, command: str
+) -> None:
     refused(4, command, data)
     refused(2, command, tmp_path / "missing.fhz")

@@ -58,20 +58,31 @@ def test_without_a_command_help_goes_to_stderr(fhash: Fhash) -> None:
         (["encode", "x"], "Missing option '-o'"),
         (["info", "x", "--jsn"], "No such option"),
         (["info", "x", "y"], "unexpected extra argument"),
-        (["bench", "train", "x", "--engines", "slab,fast"], "'fast' is no engine; allowed, separated by commas: slab, naive"),
+        (
+            ["bench", "train", "x", "--engines", "slab,fast"],
+            "'fast' is no engine; allowed, separated by commas: slab, naive",
+        ),
     ],
 )
-def test_usage_errors_are_one_line(refused: Callable[..., str], words: list[str], message: str) -> None:
+def test_usage_errors_are_one_line(
+    refused: Callable[..., str], words: list[str], message: str
+) -> None:
     assert message in refused(2, *words)
 
 
-def test_ctrl_c_is_one_line_and_130(fhash: Fhash, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_is_one_line_and_130(
+    fhash: Fhash, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def stopped(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(fhash_codec.Volume, "read", stopped)
     result = fhash("decode", run)
-    assert (result.exit_code, result.stdout, result.stderr) == (130, "", "fhash: error: interrupted\n")
+    assert (result.exit_code, result.stdout, result.stderr) == (
+        130,
+        "",
+        "fhash: error: interrupted\n",
+    )
 
 
 def test_an_error_of_ours_asks_for_a_report_and_shows_its_origin_only_on_request(
@@ -93,14 +104,18 @@ def test_an_error_of_ours_asks_for_a_report_and_shows_its_origin_only_on_request
 def test_a_pipe_that_closes_ends_quietly(run: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
-    done = subprocess.run([*MAIN, "info", run], stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    done = subprocess.run(
+        [*MAIN, "info", run], stdout=writing, stderr=subprocess.PIPE, text=True, check=False
+    )
     os.close(writing)
     assert (done.returncode, done.stderr) == (1, "")
 
 
 def test_a_full_stdout_is_one_line(run: Path) -> None:
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run([*MAIN, "info", run], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        done = subprocess.run(
+            [*MAIN, "info", run], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
     assert (done.returncode, done.stderr) == (1, "fhash: error: No space left on device\n")
 
 
@@ -111,7 +126,9 @@ def test_info_loads_nothing_slow(run: Path) -> None:
         "    try:\n        program(words)\n    except SystemExit as end:\n        assert not end.code\n"
         "print([name for name in ('torch', 'xarray', 'zarr', 'h5py', 'matplotlib') if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code, run], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, run], capture_output=True, text=True, check=True
+    )
     assert done.stdout.splitlines()[-1] == "[]"
 
 
@@ -135,13 +152,28 @@ main.main()
 @pytest.mark.skipif(os.name == "nt", reason="no SIGHUP there")
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 @pytest.mark.parametrize("command", ["encode", "encode paper", "decode"])
-def test_a_signal_leaves_nothing_half_written(data: Path, run: Path, tmp_path: Path, command: str, name: str) -> None:
+def test_a_signal_leaves_nothing_half_written(
+    data: Path, run: Path, tmp_path: Path, command: str, name: str
+) -> None:
     words = {
         "encode": ["encode", data, "-o", tmp_path / "out.fhz", "--effort", "1"],
-        "encode paper": ["encode", data, "-o", tmp_path / "out.fhz", "--profile", "paper", "--epochs", "1", "--width", "4"],
+        "encode paper": [
+            "encode",
+            data,
+            "-o",
+            tmp_path / "out.fhz",
+            "--profile",
+            "paper",
+            "--epochs",
+            "1",
+            "--width",
+            "4",
+        ],
         "decode": ["decode", run, "-o", tmp_path / "out.npy"],
     }[command]
-    with subprocess.Popen([sys.executable, "-c", SLOW_DISK, *words], stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", SLOW_DISK, *words], stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stderr is not None
         lines = iter(process.stderr)
         assert "ready\n" in lines
@@ -162,7 +194,9 @@ def test_a_signal_that_is_ignored_stays_ignored(run: Path) -> None:
 def closed(words: list[object], streams: str) -> subprocess.CompletedProcess[str]:
     """The program run with some streams closed, as a shell's `>&-` does."""
     shell = ["sh", "-c", f'exec "$@" {streams}', "sh"]
-    return subprocess.run([*shell, *map(str, [*MAIN, *words])], capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [*shell, *map(str, [*MAIN, *words])], capture_output=True, text=True, check=False
+    )
 
 
 @pytest.mark.parametrize("json_or_not", [[], ["--json"]])

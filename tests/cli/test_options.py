@@ -13,7 +13,9 @@ from fhash_cli.options import IntervalsType, RealRange, SliceType, parse_slice
 from fhash_codec.config import EncodeConfig
 
 
-@pytest.mark.parametrize("text", ["0", "4", "-1", "-3", "2:5", ":", "::2", "1::3", ":-2", "-4:-1", " 1 : 4 "])
+@pytest.mark.parametrize(
+    "text", ["0", "4", "-1", "-3", "2:5", ":", "::2", "1::3", ":-2", "-4:-1", " 1 : 4 "]
+)
 def test_slice_means_what_it_means_in_python(text: str) -> None:
     numbers = list(range(7))
     picked = eval(f"numbers[{text}]")
@@ -33,18 +35,24 @@ def test_slice_of_another_form_says_the_form(text: str) -> None:
         ("0.5:1e3, :2 ,-1:", float, ((0.5, 1000.0), (None, 2.0), (-1.0, None))),
     ],
 )
-def test_intervals(text: str, number: type[int] | type[float], expected: tuple[object, ...]) -> None:
+def test_intervals(
+    text: str, number: type[int] | type[float], expected: tuple[object, ...]
+) -> None:
     assert IntervalsType(number).convert(text, None, None) == expected
 
 
-@pytest.mark.parametrize("text", ["", "1:2", "1:2,3:4", "1:2,3:4,5:6,7:8", "1,2,3", "a:b,:,:", "1:2:3,:,:", "0.5:1,:,:"])
+@pytest.mark.parametrize(
+    "text", ["", "1:2", "1:2,3:4", "1:2,3:4,5:6,7:8", "1,2,3", "a:b,:,:", "1:2:3,:,:", "0.5:1,:,:"]
+)
 def test_intervals_of_another_form_say_the_form(text: str) -> None:
     with pytest.raises(click.BadParameter, match="z0:z1,y0:y1,x0:x1"):
         IntervalsType(int).convert(text, None, None)
 
 
 @pytest.mark.parametrize("field", dataclasses.fields(EncodeConfig), ids=lambda field: field.name)
-def test_every_setting_is_an_option_with_its_help_and_default(field: dataclasses.Field[object]) -> None:
+def test_every_setting_is_an_option_with_its_help_and_default(
+    field: dataclasses.Field[object],
+) -> None:
     option = next(param for param in encode.params if param.name == field.name)
     assert isinstance(option, click.Option)
     assert option.default == field.default
@@ -68,8 +76,24 @@ def test_settings_reach_the_encoding_as_a_config() -> None:
         seen.append(config)
 
     probe.main([], standalone_mode=False)
-    probe.main(["--feature", "all", "--feature", "isosurface:2", "--no-timings", "--psnr", "40", "--effort", "2"], standalone_mode=False)
-    assert seen == [EncodeConfig(), EncodeConfig(features=("all", "isosurface:2"), timings=False, psnr=40.0, effort=2)]
+    probe.main(
+        [
+            "--feature",
+            "all",
+            "--feature",
+            "isosurface:2",
+            "--no-timings",
+            "--psnr",
+            "40",
+            "--effort",
+            "2",
+        ],
+        standalone_mode=False,
+    )
+    assert seen == [
+        EncodeConfig(),
+        EncodeConfig(features=("all", "isosurface:2"), timings=False, psnr=40.0, effort=2),
+    ]
 
 
 @pytest.mark.parametrize("text", ["nan", "NaN", "-1", "0.05", "3601", "-inf", "inf"])

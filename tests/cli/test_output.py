@@ -8,7 +8,17 @@ import click
 import pytest
 
 from fhash_cli import output
-from fhash_cli.output import Progress, apart, compared, describe_error, emit, listed, number, size, table
+from fhash_cli.output import (
+    Progress,
+    apart,
+    compared,
+    describe_error,
+    emit,
+    listed,
+    number,
+    size,
+    table,
+)
 from fhash_formats.errors import DamagedFileError, InputError, QualityError
 
 
@@ -30,7 +40,9 @@ class Terminal:
         pass
 
 
-def reports(monkeypatch: pytest.MonkeyPatch, *, seconds: float, terminal: bool = False, quiet: bool = False) -> str:
+def reports(
+    monkeypatch: pytest.MonkeyPatch, *, seconds: float, terminal: bool = False, quiet: bool = False
+) -> str:
     """What is printed of a stage of 40 parts of `seconds` each, after one that took no time."""
     screen, now = Terminal(terminal), [0.0]
     monkeypatch.setattr("sys.stderr", screen)
@@ -61,7 +73,10 @@ def test_without_a_terminal_there_is_a_line_every_tenth(monkeypatch: pytest.Monk
 
 
 def test_what_passed_before_the_first_report_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert reports(monkeypatch, seconds=120.0).splitlines()[0] == "fhash: training 10%, 4 dB, 1:12:00 left"
+    assert (
+        reports(monkeypatch, seconds=120.0).splitlines()[0]
+        == "fhash: training 10%, 4 dB, 1:12:00 left"
+    )
 
 
 def test_on_a_terminal_a_bar_is_drawn_in_place_and_removed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,19 +92,38 @@ def test_table_aligns_its_columns() -> None:
 
 
 @pytest.mark.parametrize(
-    ("count", "text"), [(0, "0 B"), (999, "999 B"), (1000, "1 kB"), (98_600, "98.6 kB"), (4.7e9, "4.7 GB"), (2e15, "2e+03 TB")]
+    ("count", "text"),
+    [
+        (0, "0 B"),
+        (999, "999 B"),
+        (1000, "1 kB"),
+        (98_600, "98.6 kB"),
+        (4.7e9, "4.7 GB"),
+        (2e15, "2e+03 TB"),
+    ],
 )
 def test_size(count: float, text: str) -> None:
     assert size(count) == text
 
 
 def test_number_has_its_unit_or_is_a_dash() -> None:
-    assert [number(45.218, "dB"), number(None, "dB"), number(0.5), number(0.5, "1")] == ["45.22 dB", "-", "0.5", "0.5"]
+    assert [number(45.218, "dB"), number(None, "dB"), number(0.5), number(0.5, "1")] == [
+        "45.22 dB",
+        "-",
+        "0.5",
+        "0.5",
+    ]
 
 
 def test_compared_says_larger_where_it_is() -> None:
-    assert compared({"bytes": 100_000, "raw_bytes": 4_720_000, "ratio": 47.2}) == "100 kB of 4.72 MB, 47.2x smaller"
-    assert compared({"bytes": 11_800, "raw_bytes": 480, "ratio": 480 / 11_800}) == "11.8 kB of 480 B, 24.6x larger"
+    assert (
+        compared({"bytes": 100_000, "raw_bytes": 4_720_000, "ratio": 47.2})
+        == "100 kB of 4.72 MB, 47.2x smaller"
+    )
+    assert (
+        compared({"bytes": 11_800, "raw_bytes": 480, "ratio": 480 / 11_800})
+        == "11.8 kB of 480 B, 24.6x larger"
+    )
 
 
 def test_listed_leaves_out_the_middle() -> None:
@@ -114,11 +148,33 @@ class OutOfMemoryError(RuntimeError):
         (DamagedFileError("broken"), "broken", 4),
         (MemoryError(), "out of memory; take fewer", 1),
         (OutOfMemoryError("CUDA"), "out of memory; take fewer", 1),
-        (RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: 8 bytes"), "out of memory; take", 1),
-        (RuntimeError("Can't decrement id ref count (memory allocation failed for pipeline)"), "out of memory; take fewer", 1),
-        (RuntimeError("can't start new thread"), "no thread can be started: no memory is left, or no process (ulimit -u)", 1),
-        (RuntimeError("no memory of it"), "unexpected RuntimeError: no memory of it; please report", 1),
-        (OSError(errno.ENOSPC, "No space left on device", "x.npy"), "No space left on device: x.npy", 1),
+        (
+            RuntimeError(
+                "[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: 8 bytes"
+            ),
+            "out of memory; take",
+            1,
+        ),
+        (
+            RuntimeError("Can't decrement id ref count (memory allocation failed for pipeline)"),
+            "out of memory; take fewer",
+            1,
+        ),
+        (
+            RuntimeError("can't start new thread"),
+            "no thread can be started: no memory is left, or no process (ulimit -u)",
+            1,
+        ),
+        (
+            RuntimeError("no memory of it"),
+            "unexpected RuntimeError: no memory of it; please report",
+            1,
+        ),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "x.npy"),
+            "No space left on device: x.npy",
+            1,
+        ),
         (click.UsageError("Bad."), "Bad", 2),
         (KeyError("k"), "unexpected KeyError: 'k'; please report this", 1),
     ],

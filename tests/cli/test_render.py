@@ -24,7 +24,20 @@ marched = pytest.mark.skipif(native.library() is None, reason="marched natively"
 @marched
 def test_a_picture_is_that_of_the_library(fhash: Fhash, run: Path, tmp_path: Path) -> None:
     view = tmp_path / "view.png"
-    words = ["--t", "1", "--size", "60x48", "--azimuth", "30", "--cmap", "plasma", "--effect", "shading", "--isosurface", "7,red,0.5"]
+    words = [
+        "--t",
+        "1",
+        "--size",
+        "60x48",
+        "--azimuth",
+        "30",
+        "--cmap",
+        "plasma",
+        "--effect",
+        "shading",
+        "--isosurface",
+        "7,red,0.5",
+    ]
     result = fhash("render", run, "-o", view, *words, "--json")
     assert (result.exit_code, result.stderr) == (0, "")
     said = json.loads(result.stdout)
@@ -36,36 +49,87 @@ def test_a_picture_is_that_of_the_library(fhash: Fhash, run: Path, tmp_path: Pat
     scene = scene_in_png(view)
     assert scene.effects.isosurfaces[0].colour == "red"
     with fhash_codec.open(run) as volume:
-        np.testing.assert_array_equal(np.asarray(Pictures.open(view)), fhash_codec.render(volume, scene).to_uint8())
+        np.testing.assert_array_equal(
+            np.asarray(Pictures.open(view)), fhash_codec.render(volume, scene).to_uint8()
+        )
 
 
 @marched
 def test_a_picture_is_replayed_and_changed(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    first, again, scene, changed = (tmp_path / name for name in ("a.png", "b.png", "s.json", "c.png"))
-    assert fhash("render", run, "-o", first, "--size", "32", "--time", "0.5", "--effect", "shading", "--save-scene", scene).exit_code == 0
+    first, again, scene, changed = (
+        tmp_path / name for name in ("a.png", "b.png", "s.json", "c.png")
+    )
+    assert (
+        fhash(
+            "render",
+            run,
+            "-o",
+            first,
+            "--size",
+            "32",
+            "--time",
+            "0.5",
+            "--effect",
+            "shading",
+            "--save-scene",
+            scene,
+        ).exit_code
+        == 0
+    )
     for source in (first, scene, again):
         assert fhash("render", run, "-o", again, "--scene", source, "--force").exit_code == 0
         assert again.read_bytes() == first.read_bytes()
-    words = ["--t", "-1", "--set", "effects.shading=false", "--set", "camera.zoom=2", "--effect", "time-label"]
+    words = [
+        "--t",
+        "-1",
+        "--set",
+        "effects.shading=false",
+        "--set",
+        "camera.zoom=2",
+        "--effect",
+        "time-label",
+    ]
     assert fhash("render", run, "-o", changed, "--scene", first, *words).exit_code == 0
     found = scene_in_png(changed)
-    assert (found.step, found.time, found.effects.shading, found.camera.zoom, found.effects.time_label) == (2, None, None, 2, True)
+    assert (
+        found.step,
+        found.time,
+        found.effects.shading,
+        found.camera.zoom,
+        found.effects.time_label,
+    ) == (2, None, None, 2, True)
 
 
 @marched
-def test_explain_says_what_is_done_and_what_it_took(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+def test_explain_says_what_is_done_and_what_it_took(
+    fhash: Fhash, run: Path, tmp_path: Path
+) -> None:
     view = tmp_path / "v.png"
     result = fhash("render", run, "-o", view, "--explain", "--size", "24", "--march", "arm")
     assert result.exit_code == 0
     assert "none: no effect asks for it" in result.stdout
     assert "evaluations" in result.stdout
-    plan = json.loads(fhash("render", run, "-o", view, "--explain", "--json", "--size", "24", "--force").stdout)["plan"]
+    plan = json.loads(
+        fhash("render", run, "-o", view, "--explain", "--json", "--size", "24", "--force").stdout
+    )["plan"]
     assert plan["march"].startswith("cache")
 
 
 @marched
 def test_buffers_stand_beside_the_picture(fhash: Fhash, run: Path, tmp_path: Path) -> None:
-    result = fhash("render", run, "-o", tmp_path / "v.png", "--size", "24x20", "--depth", "--normal", "--json", "--opacity", "5:0,6:0.9")
+    result = fhash(
+        "render",
+        run,
+        "-o",
+        tmp_path / "v.png",
+        "--size",
+        "24x20",
+        "--depth",
+        "--normal",
+        "--json",
+        "--opacity",
+        "5:0,6:0.9",
+    )
     assert result.exit_code == 0, result.stderr
     names = [Path(path).name for path in json.loads(result.stdout)["paths"]]
     assert names == ["v.depth.npy", "v.normal.npy", "v.png"]
@@ -74,7 +138,9 @@ def test_buffers_stand_beside_the_picture(fhash: Fhash, run: Path, tmp_path: Pat
 
 
 @marched
-def test_without_a_name_the_picture_is_called_as_the_run(fhash: Fhash, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_name_the_picture_is_called_as_the_run(
+    fhash: Fhash, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert fhash("render", run, "--size", "16").exit_code == 0
     assert (tmp_path / "tiny.png").is_file()
@@ -121,7 +187,9 @@ def test_a_bad_scene_is_one_line_and_nothing_is_written(
     assert said in refused(2, "render", run, "-o", tmp_path / "view.png", *words)
 
 
-def test_outputs_are_checked_before_any_work(refused: Callable[..., str], run: Path, tmp_path: Path) -> None:
+def test_outputs_are_checked_before_any_work(
+    refused: Callable[..., str], run: Path, tmp_path: Path
+) -> None:
     (tmp_path / "view.png").write_bytes(b"mine")
     assert "--force" in refused(2, "render", run, "-o", tmp_path / "view.png")
     assert ".png" in refused(2, "render", run, "-o", tmp_path / "view.jpg")
@@ -129,10 +197,14 @@ def test_outputs_are_checked_before_any_work(refused: Callable[..., str], run: P
     (tmp_path / "v.depth.npy").write_bytes(b"mine")
     assert "--force" in refused(2, "render", run, "-o", tmp_path / "v.png", "--depth")
     (tmp_path / "run.png").write_bytes(run.read_bytes())
-    assert "input itself" in refused(2, "render", tmp_path / "run.png", "-o", tmp_path / "run.png", "--force")
+    assert "input itself" in refused(
+        2, "render", tmp_path / "run.png", "-o", tmp_path / "run.png", "--force"
+    )
 
 
-def test_a_file_that_is_missing_or_damaged_keeps_its_exit_code(refused: Callable[..., str], tmp_path: Path) -> None:
+def test_a_file_that_is_missing_or_damaged_keeps_its_exit_code(
+    refused: Callable[..., str], tmp_path: Path
+) -> None:
     assert "no such" in refused(2, "render", tmp_path / "none.fhz", "-o", tmp_path / "v.png")
     (tmp_path / "bad.fhz").write_bytes(b"not a container")
     refused(4, "render", tmp_path / "bad.fhz", "-o", tmp_path / "v.png")

@@ -19,11 +19,22 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     """Puts a figure in place of every case: {"worst": figure}; what was asked for is added."""
     asked: dict[str, float] = {"worst": 0.5}
 
-    def run(cases: list[Case], *, everything: bool, processes: int | None, progress: object) -> Summary:
+    def run(
+        cases: list[Case], *, everything: bool, processes: int | None, progress: object
+    ) -> Summary:
         asked.update(cases=len(cases), everything=everything, processes=processes or 0)
         found = Finding(name="bound", worst=asked["worst"], limit=1.0, unit="of it", under="psnr")
         return Summary(
-            results=[CaseResult(name=one.name, group=one.group, about=one.about, under=("psnr",), findings=(found,)) for one in cases]
+            results=[
+                CaseResult(
+                    name=one.name,
+                    group=one.group,
+                    about=one.about,
+                    under=("psnr",),
+                    findings=(found,),
+                )
+                for one in cases
+            ]
         )
 
     monkeypatch.setattr(workers, "run_cases", run)
@@ -74,12 +85,20 @@ def test_all_runs_more(fhash, measured):
 def test_the_report_is_written_once(fhash, measured, tmp_path: Path):
     path = tmp_path / "stability.md"
     assert fhash("selftest", "--case", "spike", "--report", path, "--quiet").exit_code == 0
-    assert f"minutes with fhash {version('fhash')}, Python {platform.python_version()}," in path.read_text()
-    assert "| spike | one value of 1e6, all others 0 | psnr | bound (psnr) | 0.5 of it | 1 |" in path.read_text()
+    assert (
+        f"minutes with fhash {version('fhash')}, Python {platform.python_version()},"
+        in path.read_text()
+    )
+    assert (
+        "| spike | one value of 1e6, all others 0 | psnr | bound (psnr) | 0.5 of it | 1 |"
+        in path.read_text()
+    )
     again = fhash("selftest", "--case", "spike", "--report", path)
     assert again.exit_code == 2
     assert "--force" in again.stderr
-    assert fhash("selftest", "--case", "spike", "--report", path, "--force", "--quiet").exit_code == 0
+    assert (
+        fhash("selftest", "--case", "spike", "--report", path, "--force", "--quiet").exit_code == 0
+    )
 
 
 @pytest.mark.parametrize(

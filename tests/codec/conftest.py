@@ -20,6 +20,8 @@ def encoded(tmp_path_factory):
     """A field with a feature that leaves a part of the box out, three of five steps as key frames, and its container's path."""
     field = waves()
     path = tmp_path_factory.mktemp("encoded") / "waves.fhz"
-    config = EncodeConfig(profile="paper", features=("interval:0.5:2",), key_frames="0,2,4", epochs=40, width=16)
+    config = EncodeConfig(
+        profile="paper", features=("interval:0.5:2",), key_frames="0,2,4", epochs=40, width=16
+    )
     fhash_codec.encode(field, path, config)
     return field, path

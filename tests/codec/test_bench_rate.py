@@ -12,7 +12,16 @@ import pytest
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.bench.own import PROFILES, Own, promised
-from fhash_codec.bench.peers import LADDER, filled, peers, read_all, read_region, stored, stored_bytes, touched_bytes
+from fhash_codec.bench.peers import (
+    LADDER,
+    filled,
+    peers,
+    read_all,
+    read_region,
+    stored,
+    stored_bytes,
+    touched_bytes,
+)
 from fhash_codec.bench.rate import bench_rate
 from fhash_codec.bench.rate_plot import plot
 from fhash_codec.bench.results import PEERS, Point, RateBench
@@ -37,14 +46,20 @@ def codec(slope: float, offset: float, noise: float = 0.0):
 
     def measure(level: float) -> Trial:
         psnr = slope * level + offset + noise * np.sin(40 * level)
-        return Trial(level=level, bytes=round(100 * 2 ** (psnr / 6)), psnr=psnr, max_error=10 ** (-psnr / 20))
+        return Trial(
+            level=level, bytes=round(100 * 2 ** (psnr / 6)), psnr=psnr, max_error=10 ** (-psnr / 20)
+        )
 
     return measure
 
 
-@pytest.mark.parametrize(("slope", "offset", "noise"), [(1, 4.8, 0), (0.5, 20, 0), (2.5, -30, 0), (1, 0, 0.03)])
+@pytest.mark.parametrize(
+    ("slope", "offset", "noise"), [(1, 4.8, 0), (0.5, 20, 0), (2.5, -30, 0), (1, 0, 0.03)]
+)
 @pytest.mark.parametrize("goal", ["psnr", "bound"])
-def test_search_ends_just_above_what_is_asked(slope: float, offset: float, noise: float, goal: str) -> None:
+def test_search_ends_just_above_what_is_asked(
+    slope: float, offset: float, noise: float, goal: str
+) -> None:
     search = Search(codec(slope, offset, noise))
     for asked in (35.0, 45.0, 40.0):
         before = len(search.trials)
@@ -62,8 +77,12 @@ def test_search_on_a_ladder_ends_at_the_first_step_that_reaches_it() -> None:
 
 
 def test_search_of_what_cannot_be_set_tries_once() -> None:
-    search = Search(lambda level: Trial(level=level, bytes=9, psnr=EXACT, max_error=0.0), fixed=True)
-    assert [search.find(goal, 40.0, first=30.0, slack=0.05, most=8) for goal in ("psnr", "bound")] == list(search.trials.values()) * 2
+    search = Search(
+        lambda level: Trial(level=level, bytes=9, psnr=EXACT, max_error=0.0), fixed=True
+    )
+    assert [
+        search.find(goal, 40.0, first=30.0, slack=0.05, most=8) for goal in ("psnr", "bound")
+    ] == list(search.trials.values()) * 2
 
 
 def test_search_says_that_nothing_reached_it() -> None:
@@ -91,22 +110,42 @@ def test_a_peer_returns_the_region_of_what_it_returns(variant) -> None:
         assert total < values.nbytes
 
 
-@pytest.mark.parametrize("variant", [variant for variant in VARIANTS if variant.mode == "tolerance"], ids=lambda variant: variant.name)
+@pytest.mark.parametrize(
+    "variant",
+    [variant for variant in VARIANTS if variant.mode == "tolerance"],
+    ids=lambda variant: variant.name,
+)
 def test_a_level_is_a_tolerance(variant) -> None:
     values = field()
     with stored(values, variant, 3.0, 40.0) as file:
-        assert np.abs(read_all(file, variant).astype(np.float64) - values).max() <= 0.03 * (1 + 1e-4)
+        assert np.abs(read_all(file, variant).astype(np.float64) - values).max() <= 0.03 * (
+            1 + 1e-4
+        )
 
 
 def test_sperr_is_given_the_axes_in_its_own_order() -> None:
     """A field that is smooth along x and y and noise along t costs far more where the axes are taken for others."""
     import hdf5plugin
 
-    values = np.broadcast_to(np.random.default_rng(0).normal(size=(2, 3, 1, 1)), (2, 3, 40, 90)).astype(np.float32)
+    values = np.broadcast_to(
+        np.random.default_rng(0).normal(size=(2, 3, 1, 1)), (2, 3, 40, 90)
+    ).astype(np.float32)
     values = values + np.sin(np.linspace(0, 3, 90, dtype=np.float32))
-    variant = next(variant for variant in peers()["SPERR"] if variant.layout == "frame" and variant.mode == "tolerance")
-    other = replace(variant, setting=lambda part, data_range, level: hdf5plugin.Sperr(absolute=data_range * 10 ** (-level / 20)))
-    with stored(values, variant, 6.0, 50.0) as file, stored(values.copy(), other, 6.0, 50.0) as file_without:
+    variant = next(
+        variant
+        for variant in peers()["SPERR"]
+        if variant.layout == "frame" and variant.mode == "tolerance"
+    )
+    other = replace(
+        variant,
+        setting=lambda part, data_range, level: hdf5plugin.Sperr(
+            absolute=data_range * 10 ** (-level / 20)
+        ),
+    )
+    with (
+        stored(values, variant, 6.0, 50.0) as file,
+        stored(values.copy(), other, 6.0, 50.0) as file_without,
+    ):
         assert stored_bytes(file) < 0.8 * stored_bytes(file_without)
 
 
@@ -131,7 +170,11 @@ def result() -> RateBench:
 
 
 def test_every_codec_has_a_point_for_everything_asked(result: RateBench) -> None:
-    expected = {(codec, *goal) for codec in (*PEERS, "fhash paper") for goal in (("psnr", 35.0), ("psnr", 50.0), ("bound", 0.02))}
+    expected = {
+        (codec, *goal)
+        for codec in (*PEERS, "fhash paper")
+        for goal in (("psnr", 35.0), ("psnr", 50.0), ("bound", 0.02))
+    }
     assert {(point.codec, point.goal, point.asked) for point in result.points} == expected
     assert len(result.points) == len(expected)
     assert result.refused == {}
@@ -142,25 +185,47 @@ def test_points_that_reached_it_did(result: RateBench) -> None:
     assert all(point.reached for point in peers_of)
     for point in result.points:
         assert point.bytes > 0
-        quality = point.max_error <= point.asked if point.goal == "bound" else point.psnr is None or point.psnr >= point.asked
+        quality = (
+            point.max_error <= point.asked
+            if point.goal == "bound"
+            else point.psnr is None or point.psnr >= point.asked
+        )
         assert quality == point.reached
     fine = {point.codec: point for point in peers_of if (point.goal, point.asked) == ("psnr", 50.0)}
-    coarse = {point.codec: point for point in peers_of if (point.goal, point.asked) == ("psnr", 35.0)}
-    assert all(coarse[name].bytes < fine[name].bytes for name in ("SZ3", "SPERR", "ZFP", "BitRound"))
+    coarse = {
+        point.codec: point for point in peers_of if (point.goal, point.asked) == ("psnr", 35.0)
+    }
+    assert all(
+        coarse[name].bytes < fine[name].bytes for name in ("SZ3", "SPERR", "ZFP", "BitRound")
+    )
     assert all(fine[name].psnr < 50.06 for name in ("SZ3", "SPERR"))
     assert (fine["Blosc"].psnr, fine["Blosc"].max_error) == (None, 0.0)
 
 
 def test_tolerances_are_checked_for_bounds_alone(result: RateBench) -> None:
     kept = {point.codec: point.as_asked for point in result.points if point.goal == "bound"}
-    assert kept == {"SZ3": True, "SPERR": True, "ZFP": True, "BitRound": None, "Blosc": None, "fhash paper": None}
+    assert kept == {
+        "SZ3": True,
+        "SPERR": True,
+        "ZFP": True,
+        "BitRound": None,
+        "Blosc": None,
+        "fhash paper": None,
+    }
     assert all(point.as_asked is None for point in result.points if point.goal == "psnr")
 
 
 def test_speed_and_access_are_those_of_the_target_nearest_to_50_db(result: RateBench) -> None:
-    found = {point.codec: point.bytes for point in result.points if (point.goal, point.asked) == ("psnr", 50.0)}
+    found = {
+        point.codec: point.bytes
+        for point in result.points
+        if (point.goal, point.asked) == ("psnr", 50.0)
+    }
     assert [speed.codec for speed in result.speeds] == list(found)
-    assert all(speed.encode_mb_s > 0 and speed.decode_mb_s > 0 and speed.encode_runs == 3 for speed in result.speeds)
+    assert all(
+        speed.encode_mb_s > 0 and speed.decode_mb_s > 0 and speed.encode_runs == 3
+        for speed in result.speeds
+    )
     assert {entry.codec: entry.bytes for entry in result.access} == found
     for entry in result.access:
         assert entry.region == (6, 16, 16)
@@ -215,7 +280,9 @@ def test_missing_values_do_not_count() -> None:
     values[1, :, 3:9, 4:11] = np.nan
     values[2, 0, 0, 0] = -np.inf
     config = {"epochs": 1, "width": 4}
-    result = bench_rate(values, config, targets=(40.0,), bounds=(0.01,), profiles=("paper",), speed=False)
+    result = bench_rate(
+        values, config, targets=(40.0,), bounds=(0.01,), profiles=("paper",), speed=False
+    )
     assert result.missing == 6 * 6 * 7 + 1
     assert all(point.reached for point in result.points if point.codec in PEERS)
     assert result.refused == {}
@@ -224,7 +291,9 @@ def test_missing_values_do_not_count() -> None:
 
 def test_integers_are_compared_as_they_are() -> None:
     values = np.round(100 * field()).astype(np.int16)
-    result = bench_rate(values, targets=(40.0,), bounds=(0.05,), names=("SZ3", "Blosc"), profiles=(), speed=False)
+    result = bench_rate(
+        values, targets=(40.0,), bounds=(0.05,), names=("SZ3", "Blosc"), profiles=(), speed=False
+    )
     assert result.raw_bytes == values.nbytes
     assert all(point.reached for point in result.points)
     assert all(point.bytes < values.nbytes for point in result.points)
@@ -232,7 +301,9 @@ def test_integers_are_compared_as_they_are() -> None:
 
 def test_what_a_filter_refuses_is_said() -> None:
     values = field((1, 1, 1, 64))
-    result = bench_rate(values, targets=(40.0,), bounds=(0.01,), names=("SPERR", "ZFP"), profiles=(), speed=False)
+    result = bench_rate(
+        values, targets=(40.0,), bounds=(0.01,), names=("SPERR", "ZFP"), profiles=(), speed=False
+    )
     assert {point.codec for point in result.points} == {"ZFP"}
     assert all(name.startswith("SPERR ") for name in result.refused)
     assert len(result.refused) == 6
@@ -267,7 +338,9 @@ def test_peers_need_hdf5plugin(monkeypatch: pytest.MonkeyPatch) -> None:
         bench_rate(field())
 
 
-def test_the_plot_needs_matplotlib(monkeypatch: pytest.MonkeyPatch, result: RateBench, tmp_path: Path) -> None:
+def test_the_plot_needs_matplotlib(
+    monkeypatch: pytest.MonkeyPatch, result: RateBench, tmp_path: Path
+) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'fhash\[bench\]'"):
         plot(result, tmp_path / "rate.png")
@@ -277,7 +350,10 @@ def test_the_plot_has_a_panel_for_each_kind_of_quality(result: RateBench, tmp_pa
     from PIL import Image
 
     plot(result, tmp_path / "both.png")
-    plot(replace(result, points=tuple(point for point in result.points if point.goal == "psnr")), tmp_path / "one.png")
+    plot(
+        replace(result, points=tuple(point for point in result.points if point.goal == "psnr")),
+        tmp_path / "one.png",
+    )
     with Image.open(tmp_path / "both.png") as both, Image.open(tmp_path / "one.png") as one:
         assert both.width > 1.5 * one.width
         assert len(both.convert("RGB").getcolors(2**24)) > 50
@@ -286,13 +362,34 @@ def test_the_plot_has_a_panel_for_each_kind_of_quality(result: RateBench, tmp_pa
 def test_ratios_are_to_the_best_peer_that_reached_it(result: RateBench) -> None:
     def point(codec: str, count: int, reached: bool) -> Point:
         return Point(
-            codec=codec, goal="psnr", asked=45.0, reached=reached, bytes=count, psnr=45.0, max_error=0.1, setting="", as_asked=None
+            codec=codec,
+            goal="psnr",
+            asked=45.0,
+            reached=reached,
+            bytes=count,
+            psnr=45.0,
+            max_error=0.1,
+            setting="",
+            as_asked=None,
         )
 
-    points = (point("SZ3", 300, True), point("ZFP", 100, False), point("SPERR", 200, True), point("fhash compact", 80, True))
-    row = {"goal": "psnr", "asked": 45.0, "peer": "SPERR", "bytes": 200, "ratios": {"fhash compact": 2.5}}
+    points = (
+        point("SZ3", 300, True),
+        point("ZFP", 100, False),
+        point("SPERR", 200, True),
+        point("fhash compact", 80, True),
+    )
+    row = {
+        "goal": "psnr",
+        "asked": 45.0,
+        "peer": "SPERR",
+        "bytes": 200,
+        "ratios": {"fhash compact": 2.5},
+    }
     assert replace(result, points=points).best_peers() == [row]
     unreached = replace(result, points=(*points[:3], point("fhash compact", 80, False)))
     assert unreached.best_peers() == [row | {"ratios": {"fhash compact": None}}]
     alone = replace(result, points=points[3:])
-    assert alone.best_peers() == [row | {"peer": None, "bytes": None, "ratios": {"fhash compact": None}}]
+    assert alone.best_peers() == [
+        row | {"peer": None, "bytes": None, "ratios": {"fhash compact": None}}
+    ]

@@ -37,13 +37,23 @@ def field() -> np.ndarray:
     """Two blobs of which one moves along x, on 0; the small one tells mirrored axes apart."""
     t, z, y, x = np.meshgrid(*map(np.arange, SHAPE), indexing="ij", sparse=True)
     large = np.exp(-((z - 5) ** 2 + (y - 6) ** 2 + (x - 6 - t) ** 2) / 12)
-    return (large + 0.7 * np.exp(-((z - 9) ** 2 + (y - 3) ** 2 + (x - 13) ** 2) / 4) + 0 * t).astype(np.float32)
+    return (
+        large + 0.7 * np.exp(-((z - 9) ** 2 + (y - 3) ** 2 + (x - 13) ** 2) / 4) + 0 * t
+    ).astype(np.float32)
 
 
 def axes() -> dict[str, Coordinate]:
     """Spacings that differ, y descending."""
-    values = {"t": np.arange(4.0), "z": 3 + 1.5 * np.arange(12), "y": 20 - np.arange(14.0), "x": 0.8 * np.arange(16)}
-    return {axis: Coordinate(name=axis, values=positions, attributes={}) for axis, positions in values.items()}
+    values = {
+        "t": np.arange(4.0),
+        "z": 3 + 1.5 * np.arange(12),
+        "y": 20 - np.arange(14.0),
+        "x": 0.8 * np.arange(16),
+    }
+    return {
+        axis: Coordinate(name=axis, values=positions, attributes={})
+        for axis, positions in values.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -64,12 +74,28 @@ def task(camera: Camera, *, shaded: bool, step: float) -> Task:
         extinctions=0.5 * np.clip(values - 0.1, 0, None),
     )
     rays = Rays.of(camera, Grid.of(axes()), SIZE)
-    return Task(rays=rays, step=step, threshold=0.0, table=table, lighting=LIGHTING if shaded else None, shaded=shaded)
+    return Task(
+        rays=rays,
+        step=step,
+        threshold=0.0,
+        table=table,
+        lighting=LIGHTING if shaded else None,
+        shaded=shaded,
+    )
 
 
 def drawn(asked: Task, values: np.ndarray, mapper: str = "gpu") -> np.ndarray:
     assert asked.table is not None
-    peer = VtkPeer(values, asked.rays.grid, asked.table, unit=1.0, size=SIZE, step=asked.step, mapper=mapper, lighting=asked.lighting)
+    peer = VtkPeer(
+        values,
+        asked.rays.grid,
+        asked.table,
+        unit=1.0,
+        size=SIZE,
+        step=asked.step,
+        mapper=mapper,
+        lighting=asked.lighting,
+    )
     try:
         peer.look(asked.rays)
         peer.draw()
@@ -156,8 +182,12 @@ def test_transfer_functions_are_of_the_values() -> None:
     assert np.all(np.diff(feature[:, 0]) > 0)
     inside = (values > feature[0, 0]) & (values < feature[-1, 0])
     assert 0.01 < inside.mean() < 0.2
-    np.testing.assert_allclose(found["fog"].opacity, [(values.min(), 0), (values.max(), 0.02)], atol=1e-6)
-    flat = np.array(transfer_functions(np.full((2, 2, 2), 3.0, dtype=np.float32), Units())["feature"].opacity)
+    np.testing.assert_allclose(
+        found["fog"].opacity, [(values.min(), 0), (values.max(), 0.02)], atol=1e-6
+    )
+    flat = np.array(
+        transfer_functions(np.full((2, 2, 2), 3.0, dtype=np.float32), Units())["feature"].opacity
+    )
     assert np.all(np.diff(flat[:, 0]) > 0)
 
 
@@ -179,7 +209,10 @@ def test_every_part_has_its_figures(result: RenderBench) -> None:
     assert effects["shading"]["counters_on"]["gradients"] > 0
     assert effects["shadows"]["counters_off"]["secondary_rays"] == 0
     assert effects["shadows"]["counters_on"]["secondary_rays"] > 0
-    assert all(entry["off_ms"] > 0 and entry["on_ms"] > 0 and entry["ratio"] > 0 for entry in report["effects"])
+    assert all(
+        entry["off_ms"] > 0 and entry["on_ms"] > 0 and entry["ratio"] > 0
+        for entry in report["effects"]
+    )
     for entry in report["accelerations"]:
         assert entry["counters_on"]["samples"] <= entry["counters_off"]["samples"], entry["name"]
     streams = {(entry["mode"], entry["budget"]): entry for entry in report["streams"]}
@@ -192,10 +225,19 @@ def test_every_part_has_its_figures(result: RenderBench) -> None:
     assert all(entry["ours_ms"] > 0 and entry["window_ms"] > 0 for entry in report["against"])
     assert all(entry["psnr"] is None or entry["psnr"] > 25 for entry in report["against"])
     for entry in report["exactness"]:
-        assert entry["psnr"] is None or entry["psnr"] > {"": 50, "cell": 25, "central": 42}[entry["gradient"]], entry
+        assert (
+            entry["psnr"] is None
+            or entry["psnr"] > {"": 50, "cell": 25, "central": 42}[entry["gradient"]]
+        ), entry
         assert entry["explained"] is None or entry["explained"] > 50, entry
     assert [entry["steps"] for entry in report["playback"]] == [3] * 4
-    assert report["summary"].keys() == {"unshaded_median", "unshaded_least", "shaded_median", "shaded_least", "playback_median"}
+    assert report["summary"].keys() == {
+        "unshaded_median",
+        "unshaded_least",
+        "shaded_median",
+        "shaded_least",
+        "playback_median",
+    }
 
 
 def test_quality_rises_with_finer_steps(result: RenderBench) -> None:
@@ -223,7 +265,9 @@ def test_without_vtk_its_parts_say_so(volume, monkeypatch: pytest.MonkeyPatch) -
     assert len(found.accelerations) == 4
 
 
-@pytest.mark.parametrize("arguments", [{"parts": ("speed",)}, {"parts": ()}, {"turns": 0}, {"size": 3}])
+@pytest.mark.parametrize(
+    "arguments", [{"parts": ("speed",)}, {"parts": ()}, {"turns": 0}, {"size": 3}]
+)
 def test_what_cannot_be_measured(arguments: dict, volume) -> None:
     with pytest.raises(InputError):
         bench_render(volume, **arguments)
@@ -232,7 +276,9 @@ def test_what_cannot_be_measured(arguments: dict, volume) -> None:
 def test_a_comparison_is_of_the_whole_domain(tmp_path: Path) -> None:
     path = tmp_path / "part.fhz"
     series = ArraySeries(field(), name="density", units="", coords=axes())
-    fhash_codec.encode(series, path, EncodeConfig(features=("interval:0.5:2",), effort=1, max_error=0.002))
+    fhash_codec.encode(
+        series, path, EncodeConfig(features=("interval:0.5:2",), effort=1, max_error=0.002)
+    )
     with fhash_codec.open(path) as opened:
         found = Comparison(opened, Scene(size=(16, 16)), 1, lambda *report: None)
     assert found.values.shape == SHAPE[1:]

@@ -56,7 +56,10 @@ def pair(request, tmp_path_factory):
     config = replace(CODED, **more)
     found = {}
     for name, tables in {"exact": "float32", "coded": "transform"}.items():
-        found[name] = fhash_codec.encode(field(), folder / f"{name}.fhz", replace(config, tables=tables)), folder / f"{name}.fhz"
+        found[name] = (
+            fhash_codec.encode(field(), folder / f"{name}.fhz", replace(config, tables=tables)),
+            folder / f"{name}.fhz",
+        )
     return found
 
 
@@ -81,7 +84,11 @@ def test_the_loss_is_within_its_limit_and_what_is_said(pair):
             np.testing.assert_array_equal(volume.occupancy(t), other.occupancy(t))
 
 
-@pytest.mark.parametrize("index", [np.s_[3], np.s_[1:4, 2:7, 3:11, 5:17], np.s_[:, 8, ::-2, 19], np.s_[4, 3:5, 4:6, 7:9]], ids=str)
+@pytest.mark.parametrize(
+    "index",
+    [np.s_[3], np.s_[1:4, 2:7, 3:11, 5:17], np.s_[:, 8, ::-2, 19], np.s_[4, 3:5, 4:6, 7:9]],
+    ids=str,
+)
 def test_a_region_is_that_slice_of_the_whole_bit_for_bit(pair, index):
     path = pair["coded"][1]
     whole = decoded(path)
@@ -91,7 +98,9 @@ def test_a_region_is_that_slice_of_the_whole_bit_for_bit(pair, index):
 
 def test_points_and_times_between_are_as_smooth_as_before(pair):
     random = np.random.default_rng(0)
-    points = {axis: random.random(300) * (n - 1) for axis, n in zip("tzyx", field().shape, strict=True)}
+    points = {
+        axis: random.random(300) * (n - 1) for axis, n in zip("tzyx", field().shape, strict=True)
+    }
     with fhash_codec.open(pair["coded"][1]) as volume, fhash_codec.open(pair["exact"][1]) as other:
         values, slopes = volume.sample(**points, gradient=True)
         expected = other.sample(**points)
@@ -117,7 +126,9 @@ def test_a_promise_is_kept_and_no_more(tmp_path):
     assert missed.value.figures["tables_loss_db"] <= MOST_LOSS + 1e-4
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 1, 1), (3, 1, 1, 1), (1, 1, 1, 7), (2, 2, 2, 2), (7, 3, 5, 11)])
+@pytest.mark.parametrize(
+    "shape", [(1, 1, 1, 1), (3, 1, 1, 1), (1, 1, 1, 7), (2, 2, 2, 2), (7, 3, 5, 11)]
+)
 def test_every_shape_comes_back(tmp_path, shape):
     source = np.random.default_rng(0).random(shape, dtype=np.float32)
     figures = fhash_codec.encode(source, tmp_path / "a.fhz", CODED)
@@ -135,7 +146,9 @@ def test_a_constant_series_comes_back_exactly(tmp_path):
 
 def test_the_same_input_gives_the_same_bytes(tmp_path):
     for name in ("a.fhz", "b.fhz"):
-        fhash_codec.encode(field((3, 6, 7, 8)), tmp_path / name, replace(CODED, epochs=2, timings=False))
+        fhash_codec.encode(
+            field((3, 6, 7, 8)), tmp_path / name, replace(CODED, epochs=2, timings=False)
+        )
     assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
 
 
@@ -152,7 +165,9 @@ def test_it_is_read_without_torch_and_without_native_code_to_the_same_tables(tmp
     subprocess.run(command, env={**os.environ, "FHASH_NATIVE": "0"}, check=True)
     with np.load(tmp_path / "a.npz") as found, fhash_codec.open(path) as volume:
         table = volume._model.network.tables[0]
-        np.testing.assert_array_equal(found["arr_0"], table.read(tuple(slice(0, n) for n in table.shape)))
+        np.testing.assert_array_equal(
+            found["arr_0"], table.read(tuple(slice(0, n) for n in table.shape))
+        )
         np.testing.assert_array_equal(found["arr_1"], volume.read(1))
 
 
@@ -179,7 +194,11 @@ def test_coded_or_not_the_components_mean_the_same(tmp_path, small):
     np.testing.assert_array_equal(decoded(tmp_path / "a.fhz"), decoded(small))
 
 
-@pytest.mark.parametrize("mixing", [{}, {"mixing": 1.0}, {"mixing": [1.0]}, {"mixing": [1.0, "2"]}, {"mixing": [1.0, 2.0, 3.0]}], ids=str)
+@pytest.mark.parametrize(
+    "mixing",
+    [{}, {"mixing": 1.0}, {"mixing": [1.0]}, {"mixing": [1.0, "2"]}, {"mixing": [1.0, 2.0, 3.0]}],
+    ids=str,
+)
 def test_a_mixing_of_other_numbers_is_refused(tmp_path, small, mixing):
     with pytest.raises(InputError, match="array tables/level_1/component_2 attribute mixing"):
         rewritten(small, tmp_path / "a.fhz", mixing)
@@ -187,14 +206,22 @@ def test_a_mixing_of_other_numbers_is_refused(tmp_path, small, mixing):
 
 def test_a_mixing_beyond_float32_is_damage(tmp_path, small):
     rewritten(small, tmp_path / "a.fhz", {"mixing": [1e308, 0.0]})
-    with fhash_codec.open(tmp_path / "a.fhz") as volume, pytest.raises(DamagedFileError, match="not finite"):
+    with (
+        fhash_codec.open(tmp_path / "a.fhz") as volume,
+        pytest.raises(DamagedFileError, match="not finite"),
+    ):
         volume.read(0)
 
 
 def test_mixing_adds_the_components_from_the_first_on():
     random = np.random.default_rng(0)
-    parts, mixing = [random.random((3, 4), dtype=np.float32) for _ in range(3)], random.random((3, 3), dtype=np.float32)
-    expected = np.stack([(parts[0] * m[0] + parts[1] * m[1]) + parts[2] * m[2] for m in mixing.T], axis=-1)
+    parts, mixing = (
+        [random.random((3, 4), dtype=np.float32) for _ in range(3)],
+        random.random((3, 3), dtype=np.float32),
+    )
+    expected = np.stack(
+        [(parts[0] * m[0] + parts[1] * m[1]) + parts[2] * m[2] for m in mixing.T], axis=-1
+    )
     np.testing.assert_array_equal(mixed(parts, mixing), expected)
     assert mixed(parts, mixing).dtype == np.float32
 
@@ -212,7 +239,9 @@ def test_corners_and_weights_are_those_of_the_interpolation(length, resolution):
     assert squared_weights(length, resolution) == pytest.approx((weights**2).sum(axis=1).mean())
     for seed in range(5):
         mask = np.random.default_rng(seed).random((2, length)) < 0.3
-        np.testing.assert_array_equal(spread(mask, 1, resolution), ((weights > 0).T[None] & mask[:, None]).any(axis=2))
+        np.testing.assert_array_equal(
+            spread(mask, 1, resolution), ((weights > 0).T[None] & mask[:, None]).any(axis=2)
+        )
 
 
 def test_nothing_that_counts_is_left_out(tmp_path):
@@ -223,12 +252,21 @@ def test_nothing_that_counts_is_left_out(tmp_path):
     architecture, coreset = selected.architecture, selected.coreset
     random = np.random.default_rng(0)
     size = architecture.embedding_size
-    fine = random.random((len(coreset.bricks), size, math.prod(coreset.brick_shape)), dtype=np.float32)
-    tables = [random.random((math.prod(level), size), dtype=np.float32) for level in architecture.levels[1:]]
+    fine = random.random(
+        (len(coreset.bricks), size, math.prod(coreset.brick_shape)), dtype=np.float32
+    )
+    tables = [
+        random.random((math.prod(level), size), dtype=np.float32)
+        for level in architecture.levels[1:]
+    ]
     bricks = Bricks(coreset)
     trained = trained_tables(architecture, coreset, bricks, fine, tables)
     layers = tuple(
-        (random.standard_normal(shape).astype(np.float32), random.random(shape[0], dtype=np.float32)) for shape in architecture.layer_shapes
+        (
+            random.standard_normal(shape).astype(np.float32),
+            random.random(shape[0], dtype=np.float32),
+        )
+        for shape in architecture.layer_shapes
     )
 
     def network(fill: float) -> Network:
@@ -257,10 +295,17 @@ def test_nothing_that_counts_is_left_out(tmp_path):
             inner = tuple(slice(*span) for span in part)
             np.testing.assert_array_equal(bricks.mask(key, part), mask[inner])
             np.testing.assert_array_equal(bricks.samples(key, part), values[inner])
-            np.testing.assert_array_equal(bricks.embeddings(fine, key, part), finest_frame(coreset, fine, key)[inner])
-        np.testing.assert_array_equal(decode_region(one, key, box)[mask], decode_region(other, key, box)[mask])
+            np.testing.assert_array_equal(
+                bricks.embeddings(fine, key, part), finest_frame(coreset, fine, key)[inner]
+            )
+        np.testing.assert_array_equal(
+            decode_region(one, key, box)[mask], decode_region(other, key, box)[mask]
+        )
         (z0, z1), (y0, y1), (x0, x1) = coreset.box
-        np.testing.assert_array_equal(values[mask], selected.scanned.value_range.to_unit(field()[key, z0:z1, y0:y1, x0:x1][mask]))
+        np.testing.assert_array_equal(
+            values[mask],
+            selected.scanned.value_range.to_unit(field()[key, z0:z1, y0:y1, x0:x1][mask]),
+        )
     squares, count = samples.squares(one, list(samples.counts))
     assert count == coreset.values.size == sum(int(bricks.mask(key, box).sum()) for key in range(5))
     direct = 0.0
@@ -271,13 +316,19 @@ def test_nothing_that_counts_is_left_out(tmp_path):
     assert squares == pytest.approx(direct)
     assert sum(samples.counts.values()) == count
     some = samples.chosen(count // 3)
-    assert 0 < sum(samples.counts[index] for index in some) <= max(count // 3, max(samples.counts.values()))
+    assert (
+        0
+        < sum(samples.counts[index] for index in some)
+        <= max(count // 3, max(samples.counts.values()))
+    )
 
 
 def test_slopes_by_the_embeddings_are_differences():
     architecture = Architecture.for_box((4, 6, 9), 3, width=8)
     random = np.random.default_rng(0)
-    tables = [random.standard_normal((*level, 2)).astype(np.float32) for level in architecture.levels]
+    tables = [
+        random.standard_normal((*level, 2)).astype(np.float32) for level in architecture.levels
+    ]
     layers = tuple(
         (random.standard_normal((n, m)).astype(np.float32) / 4, random.random(n, dtype=np.float32))
         for m, n in pairwise([architecture.inputs, 8, 1])
@@ -286,7 +337,14 @@ def test_slopes_by_the_embeddings_are_differences():
     def network() -> Network:
         sources = [ArrayTable(table) for table in tables]
         levels, box = architecture.levels, architecture.box_size
-        return Network(levels=levels, embedding_size=2, tables=sources, layers=layers, box_size=box, key_frames=3)
+        return Network(
+            levels=levels,
+            embedding_size=2,
+            tables=sources,
+            layers=layers,
+            box_size=box,
+            key_frames=3,
+        )
 
     points = np.array([[0, 1, 2, 2], [3, 0, 1, 2], [5, 4, 0, 1], [8, 0, 3, 7]], dtype=np.float64)
     slopes = feature_slopes(network(), points)
@@ -298,7 +356,12 @@ def test_slopes_by_the_embeddings_are_differences():
             values = []
             for shift in (1e-3, -1e-3):
                 table[..., e] += np.float32(shift)
-                values.append([decode_region(network(), key, box)[z, y, x] for key, z, y, x in points.T.astype(int)])
+                values.append(
+                    [
+                        decode_region(network(), key, box)[z, y, x]
+                        for key, z, y, x in points.T.astype(int)
+                    ]
+                )
                 table[..., e] -= np.float32(shift)
             difference = np.subtract(*values) / 2e-3
             close = np.isclose(slopes[2 * number + e], difference, atol=5e-3, rtol=0.02)
@@ -311,4 +374,6 @@ def test_other_readers_see_what_is_needed(pair):
         size = container.header["model"]["embedding_size"]
         names = [name for name in container.arrays if name.startswith("tables/")]
         assert len(names) == size * len(container.header["model"]["levels"])
-        assert container.arrays["tables/level_1/component_1"].shape == tuple(container.header["model"]["levels"][0])
+        assert container.arrays["tables/level_1/component_1"].shape == tuple(
+            container.header["model"]["levels"][0]
+        )

@@ -81,7 +81,12 @@ def test_a_wider_sample_has_more_tiles_of_the_same_series():
     with ThreadPoolExecutor(1) as workers:
         narrow = Sample(Sixteen(), 4_000_000, workers)
         wide = narrow.wider(8_000_000)
-        assert (len(narrow.tiles), narrow.weights, len(wide.tiles), wide.weights) == (4, [4] * 4, 8, [2] * 8)
+        assert (len(narrow.tiles), narrow.weights, len(wide.tiles), wide.weights) == (
+            4,
+            [4] * 4,
+            8,
+            [2] * 8,
+        )
         whole = Sample(Eight(), 8_000_000, workers)
         assert whole.complete
         assert whole.wider(16_000_000) is whole
@@ -98,7 +103,13 @@ def test_a_dear_tile_stands_for_itself_and_a_cheap_one_for_many():
         assert sum(sample.weights) == 16
         assert sample.counted == 16_000_000
         assert (
-            sample.run(Settings(transform=usual_transform(Eight.tile), step=1.0, center=0.0, low=0.0, high=16.0), Way()).count == 16_000_000
+            sample.run(
+                Settings(
+                    transform=usual_transform(Eight.tile), step=1.0, center=0.0, low=0.0, high=16.0
+                ),
+                Way(),
+            ).count
+            == 16_000_000
         )
 
 
@@ -132,7 +143,9 @@ class Hats(Eight):
 
 
 def test_hats_are_transformed_by_5_3():
-    settings = Settings(transform=usual_transform(Hats.tile), step=1e-3, center=0.0, low=-5.0, high=5.0)
+    settings = Settings(
+        transform=usual_transform(Hats.tile), step=1e-3, center=0.0, low=-5.0, high=5.0
+    )
     with ThreadPoolExecutor(1) as workers:
         chosen, _ = choose_transform(Sample(Hats(), 1 << 20, workers), settings, Way())
     assert [axis.kind for axis in chosen.transform.axes] == ["none", "none", "5/3", "5/3"]
@@ -140,17 +153,23 @@ def test_hats_are_transformed_by_5_3():
 
 def fronts() -> np.ndarray:
     """Two plateaus with a travelling, slanted and curved border: what a wavelet smears and a head sharpens."""
-    t, z, y, x = np.meshgrid(np.arange(8), np.arange(24), np.arange(48), np.arange(48), indexing="ij")
+    t, z, y, x = np.meshgrid(
+        np.arange(8), np.arange(24), np.arange(48), np.arange(48), indexing="ij"
+    )
     distance = x + 0.6 * y - 2 * t + 4 * np.sin(z / 5 + t / 4) - 30
     return (1 / (1 + np.exp(-2 * distance))).astype(np.float32)
 
 
 def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(tmp_path, monkeypatch):
     # Prediction would be smaller still.
-    monkeypatch.setattr("fhash_codec.compact.prediction.race", lambda sample, settings, size, **_: (settings, size))
+    monkeypatch.setattr(
+        "fhash_codec.compact.prediction.race", lambda sample, settings, size, **_: (settings, size)
+    )
     source, sizes = fronts(), {}
     for effort in (4, 5):
-        figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(effort=effort, max_error=0.01), force=True)
+        figures = fhash_codec.encode(
+            source, tmp_path / "a.fhz", EncodeConfig(effort=effort, max_error=0.01), force=True
+        )
         with fhash_codec.open(tmp_path / "a.fhz") as volume:
             assert np.abs(volume[...].astype(np.float64) - source).max() <= 0.01
             assert (volume.info["model"]["head"] is not None) == (effort == 5)
@@ -161,10 +180,18 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(tmp_path
 @pytest.mark.parametrize(("rounding", "exact"), [(2.0**-24, False), (0.0, True)])
 def test_rounding_to_the_type_of_the_source_stores_no_tile_exactly(rounding, exact):
     """A float32 near 1000 is 3e-5 off at most: a residual of nearly twice the bound must leave room for that."""
-    source = (1000 + np.random.default_rng(0).normal(size=(2, 16, 32, 32)).cumsum(axis=3)).astype(np.float32)
+    source = (1000 + np.random.default_rng(0).normal(size=(2, 16, 32, 32)).cumsum(axis=3)).astype(
+        np.float32
+    )
     low, high, error = float(source.min()), float(source.max()), 0.002
-    begun = Settings(transform=usual_transform(source.shape), step=1.0, center=1000.0, low=low, high=high)
-    coded = encode_tile(source, with_step(begun, 4 * error, Goal(error=error, data_range=high - low), rounding), error=error)
+    begun = Settings(
+        transform=usual_transform(source.shape), step=1.0, center=1000.0, low=low, high=high
+    )
+    coded = encode_tile(
+        source,
+        with_step(begun, 4 * error, Goal(error=error, data_range=high - low), rounding),
+        error=error,
+    )
     assert np.abs(coded.decoded.astype(np.float64) - source).max() <= error
     assert np.array_equal(coded.decoded, source) == exact
 

@@ -12,7 +12,9 @@ from fhash_formats.errors import InputError
     "config",
     [
         EncodeConfig(),
-        EncodeConfig(features=("interval:0:1", "isosurface:3"), max_error=0.5, effort=3, tile="4x8x8x8"),
+        EncodeConfig(
+            features=("interval:0:1", "isosurface:3"), max_error=0.5, effort=3, tile="4x8x8x8"
+        ),
         EncodeConfig(profile="paper", key_frames="0,4,9", psnr=45.0, epochs=0, learning_rate=1e-3),
     ],
     ids=["default", "changed", "paper"],
@@ -36,7 +38,10 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered():
     ("values", "message"),
     [
         ({"engine": "warp"}, "engine is 'warp'; allowed: auto, slab, naive"),
-        ({"profile": "paper", "max_error": 1.0}, "max-error belongs to --profile compact; the profile is paper"),
+        (
+            {"profile": "paper", "max_error": 1.0},
+            "max-error belongs to --profile compact; the profile is paper",
+        ),
         ({"profile": "paper", "max_error_rel": 0.1}, "max-error-rel belongs to --profile compact"),
         ({"profile": "paper", "ratio": 9.0}, "ratio belongs to --profile compact"),
         ({"profile": "paper", "effort": 1}, "effort belongs to --profile compact"),
@@ -57,7 +62,10 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered():
                 "engine": "naive",
             }.items()
         ),
-        ({"psnr": 40.0, "max_error": 1.0, "ratio": 3.0}, "psnr and max-error and ratio are given; promise one of them"),
+        (
+            {"psnr": 40.0, "max_error": 1.0, "ratio": 3.0},
+            "psnr and max-error and ratio are given; promise one of them",
+        ),
         ({"effort": 2.5}, "effort is 2.5; a whole number"),
         ({"fold": 1}, "fold is 1; allowed: 2 to 64"),
         ({"fold": 2.5}, "fold is 2.5; a whole number"),

@@ -27,7 +27,9 @@ def unpack_frame(coreset, key):
     tiles = np.full((*grid, *shape), np.nan, dtype=np.float32)
     _, z, y, x = coreset.bricks[first:last].T
     tiles[z, y, x] = held.reshape(-1, *shape)
-    whole = tiles.transpose(0, 3, 1, 4, 2, 5).reshape([count * step for count, step in zip(grid, shape, strict=True)])
+    whole = tiles.transpose(0, 3, 1, 4, 2, 5).reshape(
+        [count * step for count, step in zip(grid, shape, strict=True)]
+    )
     z_size, y_size, x_size = box_size(coreset.box)
     return whole[:z_size, :y_size, :x_size]
 
@@ -35,7 +37,10 @@ def unpack_frame(coreset, key):
 def smooth(steps, shape, dtype=np.float32, low=0.0, span=1.0):
     """Blobs that drift with the steps."""
     axes = np.meshgrid(*((np.arange(size) + 0.5) / size * 2 - 1 for size in shape), indexing="ij")
-    frames = [np.exp(-6 * sum((axis - 0.3 * np.sin(step + k)) ** 2 for k, axis in enumerate(axes))) for step in range(steps)]
+    frames = [
+        np.exp(-6 * sum((axis - 0.3 * np.sin(step + k)) ** 2 for k, axis in enumerate(axes)))
+        for step in range(steps)
+    ]
     return (low + span * np.stack(frames)).astype(dtype)
 
 
@@ -48,18 +53,32 @@ def build(array, features=EVERYTHING, keys=None, dilation=1, **kwargs):
 
 def check_against_direct_crop(array, features, keys, dilation, **kwargs):
     coreset, seen = build(array, features, keys, dilation, **kwargs)
-    selected = [np.any([feature.select(array[step], step) for feature in features], axis=0) for step in keys]
-    masks = [dilate(mask, dilation) & np.isfinite(array[step]) for mask, step in zip(selected, keys, strict=True)]
+    selected = [
+        np.any([feature.select(array[step], step) for feature in features], axis=0) for step in keys
+    ]
+    masks = [
+        dilate(mask, dilation) & np.isfinite(array[step])
+        for mask, step in zip(selected, keys, strict=True)
+    ]
     everywhere = np.argwhere(np.any(masks, axis=0))
-    assert coreset.box == tuple(zip(everywhere.min(axis=0), everywhere.max(axis=0) + 1, strict=True))
+    assert coreset.box == tuple(
+        zip(everywhere.min(axis=0), everywhere.max(axis=0) + 1, strict=True)
+    )
     for key, (step, mask) in enumerate(zip(keys, masks, strict=True)):
         expected = np.where(mask, seen.value_range.to_unit(array[step]), np.float32(np.nan))
         np.testing.assert_array_equal(unpack_frame(coreset, key), crop(expected, coreset.box))
-        np.testing.assert_array_equal(unpack(coreset.occupancy[key], box_size(coreset.box)), crop(mask, coreset.box))
+        np.testing.assert_array_equal(
+            unpack(coreset.occupancy[key], box_size(coreset.box)), crop(mask, coreset.box)
+        )
     assert coreset.fraction == pytest.approx(np.mean(masks))
-    left = [array[step][~mask & np.isfinite(array[step])] for step, mask in zip(keys, masks, strict=True)]
+    left = [
+        array[step][~mask & np.isfinite(array[step])]
+        for step, mask in zip(keys, masks, strict=True)
+    ]
     left = np.concatenate(left).astype(np.float64)
-    assert coreset.background / 2 == pytest.approx((left / 2 / left.size).sum() if left.size else seen.mean / 2, rel=1e-12)
+    assert coreset.background / 2 == pytest.approx(
+        (left / 2 / left.size).sum() if left.size else seen.mean / 2, rel=1e-12
+    )
     check_structure(coreset)
     return coreset
 
@@ -71,19 +90,27 @@ def check_structure(coreset):
     assert (np.diff(coreset.offsets) == counts).all()
     assert (coreset.offsets[0], coreset.offsets[-1]) == (0, coreset.values.size)
     assert coreset.mask_bits.shape == (len(coreset.bricks), -(-vertices // 8))
-    assert [array.dtype for array in (coreset.bricks, coreset.mask_bits, coreset.values, coreset.offsets)] == ["i4", "u1", "f4", "i8"]
+    assert [
+        array.dtype
+        for array in (coreset.bricks, coreset.mask_bits, coreset.values, coreset.offsets)
+    ] == ["i4", "u1", "f4", "i8"]
     assert ((coreset.values >= 0) & (coreset.values <= 1)).all()
     assert (coreset.bricks.max(axis=0) < (len(coreset.key_frames), *coreset.brick_grid)).all()
     order = np.ravel_multi_index(coreset.bricks.T, (len(coreset.key_frames), *coreset.brick_grid))
     assert (np.diff(order) > 0).all()
-    grid = tuple(-(-size // step) for size, step in zip(box_size(coreset.box), coreset.brick_shape, strict=True))
+    grid = tuple(
+        -(-size // step)
+        for size, step in zip(box_size(coreset.box), coreset.brick_shape, strict=True)
+    )
     assert coreset.brick_grid == grid
 
 
 @pytest.mark.filterwarnings("ignore:feature .* selects nothing")
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(
-    "features", [(Everything(),), (Interval(0.3, 0.9),), (Isosurface(0.4), Segmentation(0.44))], ids=["all", "interval", "two"]
+    "features",
+    [(Everything(),), (Interval(0.3, 0.9),), (Isosurface(0.4), Segmentation(0.44))],
+    ids=["all", "interval", "two"],
 )
 @pytest.mark.parametrize("dilation", [0, 1, 2])
 def test_bricks_hold_the_direct_crop(shape, features, dilation):
@@ -93,12 +120,20 @@ def test_bricks_hold_the_direct_crop(shape, features, dilation):
 
 @pytest.mark.parametrize("brick", [(1, 1, 1), (4, 2, 8), (16, 16, 16), (3, 5, 7)])
 def test_any_brick_shape_holds_the_same(brick):
-    coreset = check_against_direct_crop(smooth(2, (11, 13, 19)), (Interval(0.3, 0.8),), (0, 1), 1, brick=brick)
+    coreset = check_against_direct_crop(
+        smooth(2, (11, 13, 19)), (Interval(0.3, 0.8),), (0, 1), 1, brick=brick
+    )
     assert coreset.brick_shape == brick
 
 
 @pytest.mark.parametrize(
-    ("dtype", "low", "span"), [(np.uint8, 0, 200), (np.int16, -300, 500), (np.float64, 1e8, 1e-3), (np.float64, -1.7e308, 1.7e308)]
+    ("dtype", "low", "span"),
+    [
+        (np.uint8, 0, 200),
+        (np.int16, -300, 500),
+        (np.float64, 1e8, 1e-3),
+        (np.float64, -1.7e308, 1.7e308),
+    ],
 )
 def test_number_types_and_narrow_ranges(dtype, low, span):
     array = smooth(2, (5, 6, 7), dtype, low, span)
@@ -121,7 +156,10 @@ def test_a_key_frame_without_the_feature_is_fine_and_none_at_all_is_not():
     coreset = check_against_direct_crop(array, (Interval(0.5, 1.0),), (0, 1, 2), 1)
     assert coreset.box == ((1, 4), (1, 4), (1, 4))
     assert len(coreset.occupancy) == 3
-    with pytest.raises(InputError, match=r"feature interval:2:3, isosurface:9 selects nothing; values range from 0 to 1"):
+    with pytest.raises(
+        InputError,
+        match=r"feature interval:2:3, isosurface:9 selects nothing; values range from 0 to 1",
+    ):
         build(array, (Interval(2.0, 3.0), Isosurface(9.0)))
 
 
@@ -156,7 +194,10 @@ def test_default_bricks_have_at_most_1024_vertices_and_few_beyond_the_box():
         brick = brick_shape(size)
         counts = [-(-length // edge) for edge, length in zip(brick, size, strict=True)]
         assert prod(brick) <= 1024
-        assert all(count * edge - length < count for edge, length, count in zip(brick, size, counts, strict=True))
+        assert all(
+            count * edge - length < count
+            for edge, length, count in zip(brick, size, counts, strict=True)
+        )
         assert prod(brick) >= 200 or prod(counts) < 40
 
 
@@ -166,14 +207,30 @@ def test_boxes_are_the_smallest_and_their_fusion_holds_all():
     assert fuse([None, None]) is None
     mask[1, 2, 3] = mask[4, 2, 6] = True
     assert bounding_box(mask) == ((1, 5), (2, 3), (3, 7))
-    assert fuse([((1, 5), (2, 3), (3, 7)), None, ((0, 2), (4, 6), (3, 4))]) == ((0, 5), (2, 6), (3, 7))
+    assert fuse([((1, 5), (2, 3), (3, 7)), None, ((0, 2), (4, 6), (3, 4))]) == (
+        (0, 5),
+        (2, 6),
+        (3, 7),
+    )
 
 
 def test_progress_has_two_stages():
     calls = []
     series = ArraySeries(smooth(3, (2, 2, 2)))
-    build_coreset(series, scan(series, silent), (0, 2), (Everything(),), 0, lambda *call: calls.append(call[:3]))
-    assert calls == [("selecting", 1, 2), ("selecting", 2, 2), ("gathering", 1, 2), ("gathering", 2, 2)]
+    build_coreset(
+        series,
+        scan(series, silent),
+        (0, 2),
+        (Everything(),),
+        0,
+        lambda *call: calls.append(call[:3]),
+    )
+    assert calls == [
+        ("selecting", 1, 2),
+        ("selecting", 2, 2),
+        ("gathering", 1, 2),
+        ("gathering", 2, 2),
+    ]
 
 
 def test_a_feature_that_selects_nothing_beside_others_is_warned_of():

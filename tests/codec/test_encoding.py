@@ -45,7 +45,21 @@ def decoded(path) -> np.ndarray:
 
 @BOTH
 @pytest.mark.parametrize(
-    "dtype", ["uint8", "int16", "uint16", "int32", "int64", "uint64", "float16", "float32", "float64", ">f4", ">i2", ">f8"]
+    "dtype",
+    [
+        "uint8",
+        "int16",
+        "uint16",
+        "int32",
+        "int64",
+        "uint64",
+        "float16",
+        "float32",
+        "float64",
+        ">f4",
+        ">i2",
+        ">f8",
+    ],
 )
 def test_every_number_type_comes_back(tmp_path, dtype, config):
     source = ((field() + 110) * 0.7).astype(dtype)
@@ -62,7 +76,17 @@ def test_every_number_type_comes_back(tmp_path, dtype, config):
 @BOTH
 @pytest.mark.parametrize(
     "shape",
-    [(1, 8, 10, 18), (4, 1, 10, 18), (4, 8, 1, 18), (4, 8, 10, 1), (2, 2, 2, 2), (1, 1, 1, 7), (3, 1, 1, 1), (1, 1, 1, 1), (7, 3, 5, 11)],
+    [
+        (1, 8, 10, 18),
+        (4, 1, 10, 18),
+        (4, 8, 1, 18),
+        (4, 8, 10, 1),
+        (2, 2, 2, 2),
+        (1, 1, 1, 7),
+        (3, 1, 1, 1),
+        (1, 1, 1, 1),
+        (7, 3, 5, 11),
+    ],
 )
 def test_every_shape_comes_back(tmp_path, shape, config):
     source = np.random.default_rng(0).random(shape, dtype=np.float32)
@@ -93,7 +117,10 @@ def test_missing_values_stay_out_of_range_coreset_and_figures(tmp_path):
         assert np.isfinite(figures["rmse"])
         assert figures["psnr"] > 15
         with fhash_codec.open(tmp_path / "a.fhz") as volume:
-            assert volume.info["value_range"] == [float(source[~holes].min()), float(source[~holes].max())]
+            assert volume.info["value_range"] == [
+                float(source[~holes].min()),
+                float(source[~holes].max()),
+            ]
             whole = volume[...]
             assert np.isnan(whole[holes]).all()
             filled = np.stack([volume.read(t, outside="background") for t in range(4)])
@@ -111,12 +138,16 @@ def test_the_figures_are_those_of_the_file(tmp_path):
     error = (back - source)[inside]
     span = float(source.max()) - float(source.min())
     assert figures["rmse"] == pytest.approx(np.sqrt((error**2).mean()), rel=1e-6)
-    assert figures["psnr"] == pytest.approx(20 * np.log10(span / np.sqrt((error**2).mean())), abs=1e-4)
+    assert figures["psnr"] == pytest.approx(
+        20 * np.log10(span / np.sqrt((error**2).mean())), abs=1e-4
+    )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         everywhere = np.where(inside, back, volume.background) - source
         assert volume.background == pytest.approx(source[~inside].mean(), rel=1e-5)
         assert figures["psnr"] * (1 - 1e-5) <= volume.info["quality"]["psnr"] <= figures["psnr"]
-    assert figures["psnr_domain"] == pytest.approx(20 * np.log10(span / np.sqrt((everywhere**2).mean())), abs=1e-4)
+    assert figures["psnr_domain"] == pytest.approx(
+        20 * np.log10(span / np.sqrt((everywhere**2).mean())), abs=1e-4
+    )
     assert figures["bytes"] == (tmp_path / "a.fhz").stat().st_size
     assert figures["ratio"] == source.nbytes / figures["bytes"]
     assert figures["coreset_fraction"] == pytest.approx(inside.mean())
@@ -129,7 +160,11 @@ def test_the_figures_are_those_of_the_file(tmp_path):
 
 def test_figures_count_the_steps_between_key_frames(tmp_path):
     source = field((5, 6, 8, 10))
-    figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(profile="paper", key_frames="every:2", epochs=30, width=16))
+    figures = fhash_codec.encode(
+        source,
+        tmp_path / "a.fhz",
+        EncodeConfig(profile="paper", key_frames="every:2", epochs=30, width=16),
+    )
     steps = {point["step"]: point["psnr"] for point in figures["quality"]["per_step"]}
     assert sorted(steps) == [0, 1, 2, 3, 4]
     assert figures["key_frames"] == [0, 2, 4]
@@ -139,10 +174,18 @@ def test_figures_count_the_steps_between_key_frames(tmp_path):
 @pytest.mark.parametrize(("tables", "loss"), [("float32", 0), ("float16", 1e-3), ("uint8", 0.05)])
 def test_tables_are_stored_as_asked_and_cost_what_they_cost(tmp_path, tables, loss):
     source = field()
-    exact = fhash_codec.encode(source, tmp_path / "exact.fhz", EncodeConfig(profile="paper", epochs=6, width=16, tables="float32"))
-    figures = fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=6, width=16, tables=tables))
+    exact = fhash_codec.encode(
+        source,
+        tmp_path / "exact.fhz",
+        EncodeConfig(profile="paper", epochs=6, width=16, tables="float32"),
+    )
+    figures = fhash_codec.encode(
+        source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=6, width=16, tables=tables)
+    )
     span = float(np.ptp(source))
-    assert np.abs(decoded(tmp_path / "a.fhz") - decoded(tmp_path / "exact.fhz")).max() <= loss * span
+    assert (
+        np.abs(decoded(tmp_path / "a.fhz") - decoded(tmp_path / "exact.fhz")).max() <= loss * span
+    )
     with Container.open(tmp_path / "a.fhz") as container:
         assert container.arrays["tables/level_1"].dtype == np.dtype(tables)
     assert (figures["bytes"] < 0.75 * exact["bytes"]) == (tables != "float32")
@@ -152,17 +195,28 @@ def test_the_file_decodes_to_what_the_torch_model_gives(tmp_path):
     import torch
 
     source = field()
-    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=6, width=16, tables="float32", key_frames="0,1,3"))
+    fhash_codec.encode(
+        source,
+        tmp_path / "a.fhz",
+        EncodeConfig(profile="paper", epochs=6, width=16, tables="float32", key_frames="0,1,3"),
+    )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         network = volume._model.network
         from fhash_codec.architecture import Architecture
 
         architecture = Architecture.for_box((8, 10, 18), 3, width=16)
         assert network.levels == architecture.levels
-        tables = [torch.from_numpy(table.array.read().reshape(-1, 2)).double() for table in network.tables]
-        layers = [(torch.from_numpy(w).double(), torch.from_numpy(b).double()) for w, b in network.layers]
+        tables = [
+            torch.from_numpy(table.array.read().reshape(-1, 2)).double() for table in network.tables
+        ]
+        layers = [
+            (torch.from_numpy(w).double(), torch.from_numpy(b).double()) for w, b in network.layers
+        ]
         model = FHash(architecture, tables, layers)
-        points = np.stack(np.meshgrid([0.0, 0.5, 1.0, 1.75, 2.0], range(8), range(10), range(18), indexing="ij"), axis=-1)
+        points = np.stack(
+            np.meshgrid([0.0, 0.5, 1.0, 1.75, 2.0], range(8), range(10), range(18), indexing="ij"),
+            axis=-1,
+        )
         with torch.no_grad():
             unit = model(torch.from_numpy(points.reshape(-1, 4))).numpy().reshape(points.shape[:-1])
         low, high = volume.info["value_range"]
@@ -177,7 +231,11 @@ def test_the_same_input_gives_the_same_bytes_without_timings(tmp_path):
     for name in ("a.fhz", "b.fhz"):
         fhash_codec.encode(field(), tmp_path / name, config)
     assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
-    fhash_codec.encode(field(), tmp_path / "c.fhz", EncodeConfig(profile="paper", epochs=3, width=16, timings=False, seed=1))
+    fhash_codec.encode(
+        field(),
+        tmp_path / "c.fhz",
+        EncodeConfig(profile="paper", epochs=3, width=16, timings=False, seed=1),
+    )
     assert (tmp_path / "a.fhz").read_bytes() != (tmp_path / "c.fhz").read_bytes()
 
 
@@ -201,7 +259,9 @@ def test_ctrl_c_saves_and_the_same_call_goes_on_to_the_same_bytes(tmp_path, mome
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.fhz", "whole.fhz"]
 
 
-WILD = EncodeConfig(profile="paper", epochs=3, hidden_layers=2, learning_rate=1.0, tables="float32", timings=False)
+WILD = EncodeConfig(
+    profile="paper", epochs=3, hidden_layers=2, learning_rate=1.0, tables="float32", timings=False
+)
 
 
 def test_a_training_that_diverges_begins_again_at_a_lower_rate_and_says_so(tmp_path):
@@ -297,14 +357,25 @@ def test_a_missing_folder_is_named_before_any_work(tmp_path, config):
 
 def test_a_promise_that_is_missed_is_an_error_but_the_file_is_there(tmp_path):
     with pytest.raises(QualityError, match="150 dB were asked for; the file is written"):
-        fhash_codec.encode(field(), tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=1, width=16, psnr=150.0))
+        fhash_codec.encode(
+            field(),
+            tmp_path / "a.fhz",
+            EncodeConfig(profile="paper", epochs=1, width=16, psnr=150.0),
+        )
     assert decoded(tmp_path / "a.fhz").shape == field().shape
-    figures = fhash_codec.encode(field(), tmp_path / "b.fhz", EncodeConfig(profile="paper", epochs=1, width=16, psnr=5.0))
+    figures = fhash_codec.encode(
+        field(), tmp_path / "b.fhz", EncodeConfig(profile="paper", epochs=1, width=16, psnr=5.0)
+    )
     assert figures["psnr"] > 5
 
 
 def test_quality_improves_with_training(tmp_path):
-    psnr = [fhash_codec.encode(field(), tmp_path / f"{n}.fhz", EncodeConfig(profile="paper", epochs=n))["psnr"] for n in (1, 5, 25)]
+    psnr = [
+        fhash_codec.encode(field(), tmp_path / f"{n}.fhz", EncodeConfig(profile="paper", epochs=n))[
+            "psnr"
+        ]
+        for n in (1, 5, 25)
+    ]
     assert psnr[0] < psnr[1] < psnr[2]
     assert psnr[2] > 40
 
@@ -315,7 +386,14 @@ def test_diff_refuses_another_shape(encoded):
 
 
 def test_a_deep_network_that_diverges_at_every_other_rate_is_trained_in_the_end(tmp_path):
-    config = EncodeConfig(profile="paper", epochs=20, learning_rate=1.0, schedule="constant", hidden_layers=8, width=64)
+    config = EncodeConfig(
+        profile="paper",
+        epochs=20,
+        learning_rate=1.0,
+        schedule="constant",
+        hidden_layers=8,
+        width=64,
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FhashWarning)
         figures = fhash_codec.encode(field(), tmp_path / "a.fhz", config)
@@ -329,13 +407,20 @@ def test_the_input_is_never_replaced(tmp_path, config):
     kept = (tmp_path / "a.npy").read_bytes()
     (tmp_path / "link.fhz").symlink_to("a.npy")
     for output in ("a.npy", "link.fhz"):
-        with pytest.raises(InputError, match=r"a container is not a \.npy file|is the input itself"):
+        with pytest.raises(
+            InputError, match=r"a container is not a \.npy file|is the input itself"
+        ):
             fhash_codec.encode(tmp_path / "a.npy", tmp_path / output, config, force=True)
     mask = tmp_path / "mask.fhz"
     np.save(tmp_path / "mask.npy", field() > 50)
     mask.symlink_to("mask.npy")
     with pytest.raises(InputError, match="is the input itself"):
-        fhash_codec.encode(tmp_path / "a.npy", mask, EncodeConfig(features=(f"mask:{tmp_path / 'mask.npy'}",)), force=True)
+        fhash_codec.encode(
+            tmp_path / "a.npy",
+            mask,
+            EncodeConfig(features=(f"mask:{tmp_path / 'mask.npy'}",)),
+            force=True,
+        )
     assert (tmp_path / "a.npy").read_bytes() == kept
 
 
@@ -357,9 +442,15 @@ def test_a_mask_in_memory_is_a_feature(tmp_path):
 def test_labelled_arrays_keep_their_labels(tmp_path, config):
     import xarray
 
-    times = np.array(["2000-01-01", "2000-01-02", "2000-01-04", "2000-01-05"], dtype="datetime64[s]")
+    times = np.array(
+        ["2000-01-01", "2000-01-02", "2000-01-04", "2000-01-05"], dtype="datetime64[s]"
+    )
     labelled = xarray.DataArray(
-        field(), dims=("time", "lev", "lat", "lon"), coords={"time": times, "lev": 2.0 * np.arange(8)}, name="theta", attrs={"units": "K"}
+        field(),
+        dims=("time", "lev", "lat", "lon"),
+        coords={"time": times, "lev": 2.0 * np.arange(8)},
+        name="theta",
+        attrs={"units": "K"},
     )
     fhash_codec.encode(labelled, tmp_path / "a.fhz", config)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
@@ -370,7 +461,9 @@ def test_labelled_arrays_keep_their_labels(tmp_path, config):
 
 
 # A float64 of that size is a multiple of 256: no decoded value can be nearer.
-@pytest.mark.parametrize("config", [QUICK, EncodeConfig(effort=1, psnr=10.0)], ids=["paper", "compact"])
+@pytest.mark.parametrize(
+    "config", [QUICK, EncodeConfig(effort=1, psnr=10.0)], ids=["paper", "compact"]
+)
 def test_64_bit_integers_are_compared_exactly(tmp_path, config):
     source = 2**60 + np.arange(1344).reshape(4, 6, 7, 8)
     figures = fhash_codec.encode(source, tmp_path / "a.fhz", config)
@@ -383,8 +476,14 @@ def test_64_bit_integers_are_compared_exactly(tmp_path, config):
 def test_a_promise_cannot_hold_where_the_psnr_is_unknown(tmp_path):
     source = (2 * np.random.default_rng(0).random((2, 4, 5, 6)) - 1) * 1.7e308
     with pytest.raises(QualityError, match="an unknown PSNR"):
-        fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=1, psnr=300.0))
-    figures = fhash_codec.encode(np.zeros((2, 4, 5, 6)), tmp_path / "b.fhz", EncodeConfig(profile="paper", epochs=1, psnr=300.0))
+        fhash_codec.encode(
+            source, tmp_path / "a.fhz", EncodeConfig(profile="paper", epochs=1, psnr=300.0)
+        )
+    figures = fhash_codec.encode(
+        np.zeros((2, 4, 5, 6)),
+        tmp_path / "b.fhz",
+        EncodeConfig(profile="paper", epochs=1, psnr=300.0),
+    )
     assert figures["rmse"] == 0
 
 
@@ -402,7 +501,9 @@ def test_a_failure_after_the_training_leaves_its_checkpoint(tmp_path, monkeypatc
     with pytest.raises(KeyboardInterrupt):
         fhash_codec.encode(field(), tmp_path / "run.fhz", config, progress=interrupt)
     trained.clear()
-    fhash_codec.encode(field(), tmp_path / "run.fhz", config, progress=lambda stage, *rest: trained.append(stage))
+    fhash_codec.encode(
+        field(), tmp_path / "run.fhz", config, progress=lambda stage, *rest: trained.append(stage)
+    )
     assert "training" not in trained
     assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.fhz", "whole.fhz"]
@@ -421,7 +522,9 @@ def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_training(tmp_path
 
 def test_long_names_and_detours_in_paths_work(tmp_path):
     for path in (tmp_path / f"{'a' * 245}.fhz", tmp_path / "none" / ".." / "b.fhz"):
-        fhash_codec.encode(field(), path, EncodeConfig(profile="paper", epochs=1, width=16, timings=False))
+        fhash_codec.encode(
+            field(), path, EncodeConfig(profile="paper", epochs=1, width=16, timings=False)
+        )
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -433,15 +536,28 @@ def test_settings_may_be_given_as_python_values():
 
 
 def test_figures_in_a_file_are_brief_and_never_better_than_they_are():
-    steps = [{"step": 0, "psnr": 45.129876, "rmse": 0.00123456789, "max_abs_error": 0.25}, dict.fromkeys(("psnr", "rmse", "max_abs_error"))]
-    quality = {"psnr": 44.9999999, "rmse": 1.23456701, "max_abs_error": 0.1234561, "ssim": None, "ssim_window": {"window": 11}}
+    steps = [
+        {"step": 0, "psnr": 45.129876, "rmse": 0.00123456789, "max_abs_error": 0.25},
+        dict.fromkeys(("psnr", "rmse", "max_abs_error")),
+    ]
+    quality = {
+        "psnr": 44.9999999,
+        "rmse": 1.23456701,
+        "max_abs_error": 0.1234561,
+        "ssim": None,
+        "ssim_window": {"window": 11},
+    }
     assert brief_quality({**quality, "per_step": steps}) == {
         "psnr": 44.9999,
         "rmse": 1.23457,
         "max_abs_error": 0.123457,
         "ssim": None,
         "ssim_window": {"window": 11},
-        "per_step": {"psnr": [45.129, None], "rmse": [0.0012346, None], "max_abs_error": [0.25, None]},
+        "per_step": {
+            "psnr": [45.129, None],
+            "rmse": [0.0012346, None],
+            "max_abs_error": [0.25, None],
+        },
     }
 
 
@@ -450,7 +566,17 @@ def test_history_in_a_file_is_brief():
     brief = brief_history(points, timings=True)
     assert len(brief) == 24
     assert brief[-1] == {"seconds": 12.345, "epoch": 100, "psnr": 40.12}
-    assert brief_history(points[:2], timings=False) == [{"epoch": 1, "psnr": 40.12}, {"epoch": 2, "psnr": 40.12}]
+    assert brief_history(points[:2], timings=False) == [
+        {"epoch": 1, "psnr": 40.12},
+        {"epoch": 2, "psnr": 40.12},
+    ]
     assert brief_history([], timings=True) == []
-    expected = [{"seconds": None, "epoch": 1, "psnr": 2.5}, {"seconds": None, "epoch": 2, "psnr": 3}]
-    assert curve({"epoch": [1, 2], "psnr": [2.5, 3]}) == curve([{"epoch": 1, "psnr": 2.5}, {"epoch": 2, "psnr": 3}]) == expected
+    expected = [
+        {"seconds": None, "epoch": 1, "psnr": 2.5},
+        {"seconds": None, "epoch": 2, "psnr": 3},
+    ]
+    assert (
+        curve({"epoch": [1, 2], "psnr": [2.5, 3]})
+        == curve([{"epoch": 1, "psnr": 2.5}, {"epoch": 2, "psnr": 3}])
+        == expected
+    )

@@ -24,11 +24,21 @@ from fhash_formats.series import ArraySeries
 CPU = torch.device("cpu")
 CASES = [
     pytest.param((5, 9, 20, 35), {"embedding_size": 2, "hidden_layers": 1}, id="plain"),
-    pytest.param((1, 17, 16, 16), {"embedding_size": 1, "hidden_layers": 0, "fold": 3}, id="one key frame, linear readout"),
-    pytest.param((3, 1, 33, 2), {"embedding_size": 3, "hidden_layers": 2}, id="thin axes, two hidden layers"),
+    pytest.param(
+        (1, 17, 16, 16),
+        {"embedding_size": 1, "hidden_layers": 0, "fold": 3},
+        id="one key frame, linear readout",
+    ),
+    pytest.param(
+        (3, 1, 33, 2), {"embedding_size": 3, "hidden_layers": 2}, id="thin axes, two hidden layers"
+    ),
     pytest.param((2, 5, 1, 1), {"embedding_size": 2, "hidden_layers": 1}, id="a column"),
     pytest.param((2, 1, 1, 1), {"embedding_size": 2, "hidden_layers": 1}, id="one voxel"),
-    pytest.param((3, 30, 40, 50), {"embedding_size": 2, "hidden_layers": 1, "low": 0.9999}, id="a few vertices far apart"),
+    pytest.param(
+        (3, 30, 40, 50),
+        {"embedding_size": 2, "hidden_layers": 1, "low": 0.9999},
+        id="a few vertices far apart",
+    ),
 ]
 
 
@@ -58,7 +68,9 @@ def test_slab_equals_the_oracle_before_training(shape, settings):
     coreset, slab, oracle = engines_of(shape, settings)
     every = np.arange(len(coreset.bricks))
     mask = inside(coreset)
-    np.testing.assert_allclose(slab.infer(every).numpy()[mask], oracle.infer(every).numpy()[mask], atol=2e-7)
+    np.testing.assert_allclose(
+        slab.infer(every).numpy()[mask], oracle.infer(every).numpy()[mask], atol=2e-7
+    )
     assert slab.squared_error(every) == pytest.approx(oracle.squared_error(every), rel=1e-5)
 
 
@@ -72,7 +84,11 @@ def test_slab_trains_like_a_dense_adam_though_it_visits_few_bricks_a_step(shape,
         assert error == pytest.approx(float(oracle.train(chosen)), rel=1e-3, abs=1e-6)
     ours, theirs = slab.parameters(), oracle.parameters()
     # Median and count, not maximum: near a ReLU's kink float32 may take the other side, in torch's own Adam as well.
-    for a, b in ((ours.fine, theirs.fine), (ours.coarse, theirs.coarse), (ours.network, theirs.network)):
+    for a, b in (
+        (ours.fine, theirs.fine),
+        (ours.coarse, theirs.coarse),
+        (ours.network, theirs.network),
+    ):
         if not a.numel():
             continue
         # What no sample moved is 0 in ours and still at its start in the oracle's.
@@ -124,15 +140,24 @@ def test_catching_up_equals_stepping_without_gradient():
     visited = np.array([0, 1, 5, 100, 250, 299])
     for scale in (1e-2, 1e-6, 1e-9):
         m, v, p = 0.3 * scale, scale**2, 0.0
-        factor, epsilon, mean_decay, square_decay = (column.astype(float) for column in catch_up(visited, 299, rates))
+        factor, epsilon, mean_decay, square_decay = (
+            column.astype(float) for column in catch_up(visited, 299, rates)
+        )
         for number, first in enumerate(visited):
             mean, square, moved = m, v, p
             for step in range(first + 1, 300) if first else ():
                 mean, square = BETA1 * mean, BETA2 * square
-                moved -= rates[step] * mean / (1 - BETA1**step) / ((square / (1 - BETA2**step)) ** 0.5 + EPSILON)
+                moved -= (
+                    rates[step]
+                    * mean
+                    / (1 - BETA1**step)
+                    / ((square / (1 - BETA2**step)) ** 0.5 + EPSILON)
+                )
             ours = -factor[number] * m / (v**0.5 + epsilon[number])
             # The one approximation shows only where sqrt(v) is near eps within Adam's first steps, while its correction still moves.
-            assert ours == pytest.approx(moved, rel=0.05 if scale < 1e-8 and first < 100 else 2e-3, abs=1e-12)
+            assert ours == pytest.approx(
+                moved, rel=0.05 if scale < 1e-8 and first < 100 else 2e-3, abs=1e-12
+            )
             assert mean_decay[number] == pytest.approx(mean / m, rel=1e-5, abs=1e-37)
             assert square_decay[number] == pytest.approx(square / v, rel=1e-5)
 
@@ -157,13 +182,18 @@ def test_the_start_depends_on_the_seed_alone():
     assert torch.equal(one.coarse, same.coarse)
     assert torch.equal(one.network, same.network)
     assert not torch.equal(one.network, other.network)
-    assert one.coarse.numel() + one.network.numel() + prod(architecture.levels[0]) * 2 == architecture.parameters
+    assert (
+        one.coarse.numel() + one.network.numel() + prod(architecture.levels[0]) * 2
+        == architecture.parameters
+    )
 
 
 def test_unknown_engines_and_devices_are_refused():
     coreset = coreset_of((1, 2, 2, 2))
     with pytest.raises(InputError, match="unknown engine 'quick'"):
-        make_engine("quick", Architecture.for_box((2, 2, 2), 1), coreset, np.zeros(1), seed=0, device=CPU)
+        make_engine(
+            "quick", Architecture.for_box((2, 2, 2), 1), coreset, np.zeros(1), seed=0, device=CPU
+        )
     if not torch.cuda.is_available():
         with pytest.raises(InputError, match="no CUDA device"):
             choose_device("cuda")

@@ -90,18 +90,28 @@ def brute_force_isosurface(frame, value):
 @pytest.mark.parametrize("value", [5.0, 3.3, -1.0])
 def test_isosurface_takes_both_ends_of_every_crossed_edge(shape, dtype, value):
     frame = random_frame(shape, dtype)
-    np.testing.assert_array_equal(Isosurface(value).select(frame, 0), brute_force_isosurface(frame, value))
+    np.testing.assert_array_equal(
+        Isosurface(value).select(frame, 0), brute_force_isosurface(frame, value)
+    )
 
 
 def test_isosurface_does_not_cross_to_a_missing_neighbour():
     frame = np.array([[[0, np.inf, 0, np.nan, 0, 2]]])
-    np.testing.assert_array_equal(Isosurface(1.0).select(frame, 0)[0, 0], [False, False, False, False, True, True])
+    np.testing.assert_array_equal(
+        Isosurface(1.0).select(frame, 0)[0, 0], [False, False, False, False, True, True]
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 @pytest.mark.parametrize(
     "feature",
-    [Everything(), Interval(-np.inf, np.inf), Isosurface(1.0), Segmentation(-5.0), Mask("m", lambda step: np.ones((1, 1, 4), bool))],
+    [
+        Everything(),
+        Interval(-np.inf, np.inf),
+        Isosurface(1.0),
+        Segmentation(-5.0),
+        Mask("m", lambda step: np.ones((1, 1, 4), bool)),
+    ],
     ids=str,
 )
 def test_missing_vertices_are_never_selected(feature, dtype):
@@ -111,11 +121,19 @@ def test_missing_vertices_are_never_selected(feature, dtype):
 
 def test_the_ends_of_an_interval_belong_to_it_and_a_threshold_does_not():
     frame = np.array([[[0.1, 0.2, 0.3, 0.4]]], dtype=np.float32)
-    np.testing.assert_array_equal(Interval(0.2, 0.3).select(frame, 0)[0, 0], [False, True, True, False])
-    np.testing.assert_array_equal(Segmentation(0.2).select(frame, 0)[0, 0], [False, False, True, True])
+    np.testing.assert_array_equal(
+        Interval(0.2, 0.3).select(frame, 0)[0, 0], [False, True, True, False]
+    )
+    np.testing.assert_array_equal(
+        Segmentation(0.2).select(frame, 0)[0, 0], [False, False, True, True]
+    )
     np.testing.assert_array_equal(Interval(-1e300, 1e300).select(frame, 0), True)
-    np.testing.assert_array_equal(Interval(0.5, 1.5).select(np.array([[[0, 1, 2]]], np.uint8), 0)[0, 0], [False, True, False])
-    np.testing.assert_array_equal(Interval(-1.0, 300.0).select(np.array([[[0, 255]]], np.uint8), 0), True)
+    np.testing.assert_array_equal(
+        Interval(0.5, 1.5).select(np.array([[[0, 1, 2]]], np.uint8), 0)[0, 0], [False, True, False]
+    )
+    np.testing.assert_array_equal(
+        Interval(-1.0, 300.0).select(np.array([[[0, 255]]], np.uint8), 0), True
+    )
 
 
 def test_selecting_leaves_the_frame_and_the_mask_alone():
@@ -172,7 +190,11 @@ def brute_force_otsu(counts, edges):
     scores = []
     for split in range(1, len(counts)):
         low, high = numbers[numbers < split], numbers[numbers >= split]
-        scores.append(low.size * high.size * (low.mean() - high.mean()) ** 2 if low.size and high.size else 0.0)
+        scores.append(
+            low.size * high.size * (low.mean() - high.mean()) ** 2
+            if low.size and high.size
+            else 0.0
+        )
     best = np.flatnonzero(np.isclose(scores, max(scores), rtol=1e-12))
     return edges[best[best.size // 2] + 1]
 
@@ -223,6 +245,8 @@ def test_masks_are_opened_with_the_shape_of_the_series():
         return lambda step: np.full(shape[1:], step == 1)
 
     series = ArraySeries(np.ones((2, 3, 4, 5)))
-    (feature,) = resolve_features(["mask:m.npy"], series, (0, 1), ValueRange(0.0, 1.0), silent, open_mask)
+    (feature,) = resolve_features(
+        ["mask:m.npy"], series, (0, 1), ValueRange(0.0, 1.0), silent, open_mask
+    )
     assert asked == [("m.npy", (2, 3, 4, 5))]
     assert [feature.select(series.read(step), step).all() for step in (0, 1)] == [False, True]

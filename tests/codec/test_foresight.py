@@ -27,7 +27,9 @@ def test_the_error_is_that_of_a_dead_zone_and_uniform_rounding():
     seen = magnitudes(coefficients)
     for step in (0.01, 0.5, 4.0):
         dead = np.abs(coefficients) < 0.8 * step
-        expected = np.square(coefficients[dead], dtype=np.float64).sum() + 0.1 * step**2 * np.count_nonzero(~dead)
+        expected = np.square(
+            coefficients[dead], dtype=np.float64
+        ).sum() + 0.1 * step**2 * np.count_nonzero(~dead)
         assert seen.error(step) == pytest.approx(expected, rel=0.02)
         assert seen.step(seen.error(step), 1e-6) == pytest.approx(step, rel=1e-3)
 
@@ -42,18 +44,24 @@ def test_of_zeros_nothing_is_foreseen():
 def test_the_foreseen_step_reaches_the_psnr(tile):
     rng = np.random.default_rng(0)
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (6, 20, 40, 40)), indexing="ij")
-    source = np.tanh(9 * (x + 0.4 * np.sin(5 * y + 2 * t) - 0.5 - 0.2 * z)) + 0.02 * rng.standard_normal(t.shape)
+    source = np.tanh(
+        9 * (x + 0.4 * np.sin(5 * y + 2 * t) - 0.5 - 0.2 * z)
+    ) + 0.02 * rng.standard_normal(t.shape)
     source = source.astype(np.float32)
     series = ArraySeries(source)
     found = find(series, EncodeConfig(), silent)
     blocks = Blocks(series, found.extent, tile)
     low, high = float(source.min()), float(source.max())
-    settings = Settings(transform=usual_transform(tile), step=1.0, center=0.0, low=low, high=high, offsets=OFFSETS)
+    settings = Settings(
+        transform=usual_transform(tile), step=1.0, center=0.0, low=low, high=high, offsets=OFFSETS
+    )
     way = Way(filled=True)
     with ThreadPoolExecutor(2) as workers:
         sample = Sample(blocks, source.size, workers)
         for psnr in (40.0, 55.0):
-            step = foreseen_step(blocks, settings, way, psnr=psnr, data_range=high - low, workers=workers)
+            step = foreseen_step(
+                blocks, settings, way, psnr=psnr, data_range=high - low, workers=workers
+            )
             reached = sample.run(Settings(**{**vars(settings), "step": step}), way).psnr(high - low)
             assert reached == pytest.approx(psnr, abs=0.6)
 

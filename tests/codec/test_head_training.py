@@ -15,7 +15,9 @@ from fhash_formats.errors import InputError
 @pytest.fixture(scope="module")
 def front():
     """A travelling step between two plateaus, and what a smoothing codec leaves of it: a three-voxel mean with a ripple and noise."""
-    t, z, y, x = np.meshgrid(np.arange(3), np.arange(12), np.arange(14), np.arange(40), indexing="ij")
+    t, z, y, x = np.meshgrid(
+        np.arange(3), np.arange(12), np.arange(14), np.arange(40), indexing="ij"
+    )
     original = np.where(x + 0.4 * y - 2 * t + 0.3 * z > 18, 2.0, -1.0).astype(np.float32)
     wide = np.pad(original, ((0, 0), (0, 0), (0, 0), (1, 1)), mode="edge")
     decoded = (wide[..., :-2] + wide[..., 1:-1] + wide[..., 2:]) / 3 + 0.05 * np.sin(x)
@@ -30,7 +32,9 @@ def mse(first, second):
 def test_a_front_is_sharpened_by_what_the_gain_says(front):
     decoded, original = front
     trained = train_head([(decoded, original, None)], low=-1.0, high=2.0, steps=300, device="cpu")
-    gained = 10 * np.log10(mse(np.clip(decoded, -1, 2), original) / mse(trained.head.apply(decoded), original))
+    gained = 10 * np.log10(
+        mse(np.clip(decoded, -1, 2), original) / mse(trained.head.apply(decoded), original)
+    )
     assert trained.gain_db > 6
     assert gained == pytest.approx(trained.gain_db, abs=1.0)
     assert trained.history[-1][1:] == (300, trained.gain_db)
@@ -47,7 +51,14 @@ def far():
 
 
 def test_a_cross_sees_farther(far):
-    settings = {"low": -8.0, "high": 8.0, "hidden": (8, 8), "samples": 100_000, "steps": 400, "device": "cpu"}
+    settings = {
+        "low": -8.0,
+        "high": 8.0,
+        "hidden": (8, 8),
+        "samples": 100_000,
+        "steps": 400,
+        "device": "cpu",
+    }
     near, cross = (train_head([(*far, None)], cross=cross, **settings) for cross in (False, True))
     assert cross.gain_db > near.gain_db + 0.3
     gained = 10 * np.log10(mse(*far) / mse(cross.head.apply(far[0]), far[1]))
@@ -65,8 +76,18 @@ def test_noise_gains_nothing_much():
 
 @pytest.mark.parametrize("cross", [False, True])
 def test_the_same_seed_gives_the_same_head(front, cross):
-    settings = {"low": -1.0, "high": 2.0, "hidden": (4, 4), "cross": cross, "samples": 40_000, "steps": 60, "device": "cpu"}
-    runs = [train_head([(*front, None)], seed=seed, **settings).head.to_bytes() for seed in (4, 4, 5)]
+    settings = {
+        "low": -1.0,
+        "high": 2.0,
+        "hidden": (4, 4),
+        "cross": cross,
+        "samples": 40_000,
+        "steps": 60,
+        "device": "cpu",
+    }
+    runs = [
+        train_head([(*front, None)], seed=seed, **settings).head.to_bytes() for seed in (4, 4, 5)
+    ]
     assert runs[0] == runs[1] != runs[2]
 
 
@@ -75,7 +96,10 @@ def test_voxels_that_do_not_count_do_not_matter(front):
     care = np.zeros(original.shape, dtype=bool)
     care[:, 2:9] = True
     other = np.where(care, original, np.nan).astype(np.float32)
-    heads = [train_head([(decoded, values, care)], low=-1.0, high=2.0, steps=60, device="cpu").head for values in (original, other)]
+    heads = [
+        train_head([(decoded, values, care)], low=-1.0, high=2.0, steps=60, device="cpu").head
+        for values in (original, other)
+    ]
     assert heads[0].to_bytes() == heads[1].to_bytes()
 
 
@@ -86,14 +110,25 @@ def test_several_tiles_of_several_shapes_and_a_tile_that_does_not_count(front):
         (decoded[:1, :5, :, :7], original[:1, :5, :, :7], None),
         (decoded, original * np.float32(np.nan), np.zeros(original.shape, dtype=bool)),
     ]
-    trained = train_head(pairs, low=-1.0, high=2.0, hidden=(6, 4), cross=True, samples=100_000, steps=200, device="cpu")
+    trained = train_head(
+        pairs,
+        low=-1.0,
+        high=2.0,
+        hidden=(6, 4),
+        cross=True,
+        samples=100_000,
+        steps=200,
+        device="cpu",
+    )
     assert trained.head.hidden == (6, 4)
     assert trained.gain_db > 3
 
 
 def test_seconds_end_the_training_and_progress_reaches_one(front):
     parts: list[float] = []
-    trained = train_head([(*front, None)], low=-1.0, high=2.0, seconds=0.3, device="cpu", progress=parts.append)
+    trained = train_head(
+        [(*front, None)], low=-1.0, high=2.0, seconds=0.3, device="cpu", progress=parts.append
+    )
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
     assert trained.history[-1][0] >= 0.3
@@ -118,7 +153,9 @@ def test_two_trainings_at_once_give_what_each_gives_alone_and_leave_torch_as_it_
     before = torch.get_num_threads()
 
     def trained(seed):
-        return train_head([(decoded, original, None)], low=-1.0, high=2.0, steps=60, seed=seed, device="cpu").head.to_bytes()
+        return train_head(
+            [(decoded, original, None)], low=-1.0, high=2.0, steps=60, seed=seed, device="cpu"
+        ).head.to_bytes()
 
     with ThreadPoolExecutor(2) as workers:
         together = list(workers.map(trained, (1, 2)))

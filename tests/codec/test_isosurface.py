@@ -14,8 +14,14 @@ from fhash_formats.writers.mesh import Mesh
 
 
 def coords(turned: str = "") -> dict[str, Coordinate]:
-    values = {axis: np.linspace(-extent, extent, count) for axis, extent, count in (("x", 1.5, 31), ("y", 1.6, 33), ("z", 1.7, 35))}
-    return {axis: Coordinate(name=axis, values=at[::-1].copy() if axis in turned else at) for axis, at in values.items()}
+    values = {
+        axis: np.linspace(-extent, extent, count)
+        for axis, extent, count in (("x", 1.5, 31), ("y", 1.6, 33), ("z", 1.7, 35))
+    }
+    return {
+        axis: Coordinate(name=axis, values=at[::-1].copy() if axis in turned else at)
+        for axis, at in values.items()
+    }
 
 
 def distance(axes: dict[str, Coordinate]) -> np.ndarray:
@@ -37,15 +43,21 @@ def test_a_sphere_is_one_closed_surface_seen_from_the_lower_values(turned: str) 
     assert (mesh.name, mesh.value, mesh.time) == ("d", -1.0, 3.0)
     assert np.all(outwards(mesh))
     assert not np.any(outwards(isosurface(distance(axes), 1.0, axes)))
-    edges = np.sort(np.concatenate([mesh.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1)
+    edges = np.sort(
+        np.concatenate([mesh.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]), axis=1
+    )
     assert np.all(np.unique(edges, axis=0, return_counts=True)[1] == 2)
 
 
 def test_uneven_coordinates_keep_their_places() -> None:
     axes = coords()
-    axes["x"] = Coordinate(name="x", values=np.sort(np.random.default_rng(0).uniform(-1.5, 1.5, 31)))
+    axes["x"] = Coordinate(
+        name="x", values=np.sort(np.random.default_rng(0).uniform(-1.5, 1.5, 31))
+    )
     frame = np.broadcast_to(axes["x"].values, (35, 33, 31))
-    np.testing.assert_allclose(isosurface(frame, 0.25, axes).vertices[:, 0], 0.25, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        isosurface(frame, 0.25, axes).vertices[:, 0], 0.25, rtol=0, atol=1e-6
+    )
 
 
 def test_cells_without_a_value_are_left_out() -> None:
@@ -68,7 +80,11 @@ def test_values_that_float32_does_not_tell_apart(factor: float, offset: float) -
 @pytest.mark.parametrize(
     ("frame", "value", "message"),
     [
-        (np.zeros((4, 4, 4)), 1.0, "no surface of the value 1 in the region: its values run from 0 to 0"),
+        (
+            np.zeros((4, 4, 4)),
+            1.0,
+            "no surface of the value 1 in the region: its values run from 0 to 0",
+        ),
         (np.zeros((4, 4, 4)), 0.0, "no surface of the value 0"),
         (np.arange(64.0).reshape(4, 4, 4), 64.0, "from 0 to 63"),
         (np.full((4, 4, 4), np.nan), 1.0, "no vertex of the region has a value"),

@@ -28,14 +28,22 @@ def series_of(steps, seed=0, shape=(2, 3, 4)):
 
 
 def pick(spec, series, times=None):
-    return select_key_frames(spec, series, np.arange(series.shape[0], dtype=float) if times is None else times, silent)
+    return select_key_frames(
+        spec, series, np.arange(series.shape[0], dtype=float) if times is None else times, silent
+    )
 
 
 def interpolation_error(array, times, keys):
     """Summed squared error of all frames, straight from the definition."""
     flat = array.reshape(len(array), -1)
     sign = -1 if times[-1] < times[0] else 1
-    rebuilt = np.stack([np.interp(sign * times, sign * times[list(keys)], column[list(keys)]) for column in flat.T], axis=1)
+    rebuilt = np.stack(
+        [
+            np.interp(sign * times, sign * times[list(keys)], column[list(keys)])
+            for column in flat.T
+        ],
+        axis=1,
+    )
     return ((rebuilt - flat) ** 2).sum()
 
 
@@ -85,7 +93,9 @@ def test_what_a_spec_may_not_be(spec, message):
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 6, 7])
-@pytest.mark.parametrize("times", [np.arange(8.0), UNEVEN, -UNEVEN, UNEVEN * 1e-300, UNEVEN * 1e300, 1e9 + UNEVEN])
+@pytest.mark.parametrize(
+    "times", [np.arange(8.0), UNEVEN, -UNEVEN, UNEVEN * 1e-300, UNEVEN * 1e300, 1e9 + UNEVEN]
+)
 def test_auto_is_the_best_of_all_subsets(count, times):
     series = series_of(8, seed=count)
     chosen = pick(f"auto:{count}", series, times)
@@ -137,7 +147,8 @@ def test_costs_of_segments_are_the_definition():
 
 
 @pytest.mark.parametrize(
-    ("shape", "limit", "stride"), [((4, 4, 4), 64, 1), ((4, 4, 4), 63, 2), ((1, 1, 1000), 100, 10), ((64,) * 3, 2**16, 2)]
+    ("shape", "limit", "stride"),
+    [((4, 4, 4), 64, 1), ((4, 4, 4), 63, 2), ((1, 1, 1000), 100, 10), ((64,) * 3, 2**16, 2)],
 )
 def test_the_lattice_is_the_finest_that_fits(shape, limit, stride):
     assert lattice_stride(shape, limit) == stride
@@ -161,7 +172,11 @@ def test_strictly_monotonic(times, expected):
     np.testing.assert_array_equal(time_axis(times), times if expected else np.arange(times.size))
 
 
-@pytest.mark.parametrize("times", [UNEVEN, -UNEVEN, UNEVEN[::-1].copy(), 1e9 + UNEVEN], ids=["up", "down", "back", "late"])
+@pytest.mark.parametrize(
+    "times",
+    [UNEVEN, -UNEVEN, UNEVEN[::-1].copy(), 1e9 + UNEVEN],
+    ids=["up", "down", "back", "late"],
+)
 @pytest.mark.parametrize("key_frames", [(0, 7), (0, 2, 3, 7), (1, 4, 5), tuple(range(8)), (3,)])
 def test_key_index_is_whole_at_key_frames_and_linear_in_time_between(times, key_frames):
     keys = KeyTimes(times=times, key_frames=key_frames)
@@ -174,13 +189,19 @@ def test_key_index_is_whole_at_key_frames_and_linear_in_time_between(times, key_
         for step in np.linspace(a, b, 7):
             time = np.interp(step, range(8), times)
             inside = (time - times[a]) / (times[b] - times[a])
-            assert keys.key_index(step) - key_frames.index(a) == pytest.approx(inside, abs=1e-6 if times[0] > 1e6 else 1e-12)
+            assert keys.key_index(step) - key_frames.index(a) == pytest.approx(
+                inside, abs=1e-6 if times[0] > 1e6 else 1e-12
+            )
 
 
 def test_steps_beyond_the_end_keys_clamp_and_a_single_key_is_everywhere():
     keys = KeyTimes(times=UNEVEN, key_frames=(2, 5))
     assert [keys.key_index(step) for step in (0, 1.5, 2, 5, 6.5, 7)] == [0, 0, 0, 1, 1, 1]
-    assert [KeyTimes(times=UNEVEN, key_frames=(4,)).key_index(step) for step in (0, 3.3, 7)] == [0, 0, 0]
+    assert [KeyTimes(times=UNEVEN, key_frames=(4,)).key_index(step) for step in (0, 3.3, 7)] == [
+        0,
+        0,
+        0,
+    ]
     assert KeyTimes(times=np.array([5.0]), key_frames=(0,)).key_index(0) == 0
 
 

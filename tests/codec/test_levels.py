@@ -8,7 +8,9 @@ from fhash_codec.levels import axis_resolutions, ceil_log, level_resolutions, pa
 
 
 @pytest.mark.parametrize(
-    ("box", "parameters"), [((54, 110, 200), 25_374_176), ((185, 183, 156), 112_857_968)], ids=["combustion", "supernova"]
+    ("box", "parameters"),
+    [((54, 110, 200), 25_374_176), ((185, 183, 156), 112_857_968)],
+    ids=["combustion", "supernova"],
 )
 def test_the_papers_parameter_counts(box, parameters):
     assert parameter_count(level_resolutions(box, 10, 2), 2) == parameters
@@ -23,7 +25,9 @@ def test_ceil_log_is_exact_around_every_power(base):
 
 
 @pytest.mark.parametrize("fold", [2, 3, 5])
-@pytest.mark.parametrize("box", [(1, 1, 1), (1, 7, 250), (128, 128, 128), (54, 110, 200), (2, 3, 4)])
+@pytest.mark.parametrize(
+    "box", [(1, 1, 1), (1, 7, 250), (128, 128, 128), (54, 110, 200), (2, 3, 4)]
+)
 @pytest.mark.parametrize("key_frames", [1, 2, 10, 600])
 def test_levels_follow_the_papers_rule(fold, box, key_frames):
     levels = level_resolutions(box, key_frames, fold)

@@ -51,7 +51,9 @@ def test_values_that_are_not_finite_do_not_count():
     errors = added(Errors(1.0), original, decoded)
     known = np.isfinite(original)
     assert errors.count == known.sum() == original.size - 3
-    assert errors.rmse == pytest.approx(math.sqrt(np.mean((original - decoded)[known] ** 2)), rel=1e-12)
+    assert errors.rmse == pytest.approx(
+        math.sqrt(np.mean((original - decoded)[known] ** 2)), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("factor", [2.0**-1040, 2.0**-900, 2.0**900, 2.0**1023])
@@ -85,7 +87,9 @@ def test_a_range_that_overflows_leaves_only_psnr_unknown():
     assert errors.max_abs_error == pytest.approx(1e300, rel=1e-6)
 
 
-@pytest.mark.parametrize(("data_range", "rmse"), [(0.0, 1.0), (1.0, 0.0), (1.0, None), (math.inf, 1.0)])
+@pytest.mark.parametrize(
+    ("data_range", "rmse"), [(0.0, 1.0), (1.0, 0.0), (1.0, None), (math.inf, 1.0)]
+)
 def test_psnr_is_none_where_it_has_no_finite_value(data_range, rmse):
     assert psnr(data_range, rmse) is None
 
@@ -99,7 +103,12 @@ def test_a_frame_of_which_nothing_counts_has_no_figures():
     original, decoded = frames(1)
     errors = Errors(1.0)
     figures = errors.add(4, original[0], decoded[0], np.zeros(original[0].shape, bool))
-    assert (figures.step, figures.psnr, figures.rmse, figures.max_abs_error) == (4, None, None, None)
+    assert (figures.step, figures.psnr, figures.rmse, figures.max_abs_error) == (
+        4,
+        None,
+        None,
+        None,
+    )
     assert (errors.count, errors.psnr, errors.rmse, errors.max_abs_error) == (0, None, None, None)
 
 
@@ -123,20 +132,44 @@ def test_quality_measures_the_coreset_and_the_domain():
     decoded[outside] = np.nan
     original[0, 0, 0, :2] = np.nan
     calls = []
-    quality = measure_quality(original.__getitem__, decoded.__getitem__, 4, 1.0, 0.5, lambda *call: calls.append(call))
+    quality = measure_quality(
+        original.__getitem__, decoded.__getitem__, 4, 1.0, 0.5, lambda *call: calls.append(call)
+    )
     known = np.isfinite(original)
     inside = known & ~outside
     filled = np.where(outside, np.float32(0.5), decoded)
-    assert quality.rmse == pytest.approx(math.sqrt(np.mean((original - decoded)[inside].astype(float) ** 2)), rel=1e-5)
-    assert quality.rmse_domain == pytest.approx(math.sqrt(np.mean((original - filled)[known].astype(float) ** 2)), rel=1e-5)
+    assert quality.rmse == pytest.approx(
+        math.sqrt(np.mean((original - decoded)[inside].astype(float) ** 2)), rel=1e-5
+    )
+    assert quality.rmse_domain == pytest.approx(
+        math.sqrt(np.mean((original - filled)[known].astype(float) ** 2)), rel=1e-5
+    )
     assert quality.psnr == pytest.approx(-20 * math.log10(quality.rmse))
     assert quality.psnr_domain == pytest.approx(-20 * math.log10(quality.rmse_domain))
-    assert quality.max_abs_error == pytest.approx(np.abs(original - decoded)[inside].max(), rel=1e-5)
-    assert quality.max_abs_error_domain == pytest.approx(np.abs(original - filled)[known].max(), rel=1e-5)
+    assert quality.max_abs_error == pytest.approx(
+        np.abs(original - decoded)[inside].max(), rel=1e-5
+    )
+    assert quality.max_abs_error_domain == pytest.approx(
+        np.abs(original - filled)[known].max(), rel=1e-5
+    )
     assert 0.9 < quality.ssim < 1
-    assert quality.ssim_window == {"sigma": 1.5, "window": 11, "data_range": 1.0, "steps": [0, 1, 2, 3]}
+    assert quality.ssim_window == {
+        "sigma": 1.5,
+        "window": 11,
+        "data_range": 1.0,
+        "steps": [0, 1, 2, 3],
+    }
     figures = json.loads(json.dumps(quality.to_dict(), allow_nan=False))
-    overall = {"psnr", "rmse", "max_abs_error", "ssim", "ssim_window", "psnr_domain", "rmse_domain", "max_abs_error_domain"}
+    overall = {
+        "psnr",
+        "rmse",
+        "max_abs_error",
+        "ssim",
+        "ssim_window",
+        "psnr_domain",
+        "rmse_domain",
+        "max_abs_error_domain",
+    }
     assert set(figures) == overall | {"per_step"}
     assert [step["step"] for step in figures["per_step"]] == [0, 1, 2, 3]
     assert figures["per_step"][2] == {"step": 2, "psnr": None, "rmse": None, "max_abs_error": None}
@@ -155,8 +188,15 @@ def test_quality_of_a_constant_or_overflowing_series_is_valid_json(data_range, v
 
 def test_quality_of_nothing_kept():
     original, _ = frames(2)
-    quality = measure_quality(original.__getitem__, lambda step: np.full_like(original[step], np.nan), 2, 1.0, 0.5)
-    assert (quality.psnr, quality.rmse, quality.max_abs_error, quality.ssim) == (None, None, None, None)
+    quality = measure_quality(
+        original.__getitem__, lambda step: np.full_like(original[step], np.nan), 2, 1.0, 0.5
+    )
+    assert (quality.psnr, quality.rmse, quality.max_abs_error, quality.ssim) == (
+        None,
+        None,
+        None,
+        None,
+    )
     assert quality.rmse_domain == pytest.approx(math.sqrt(np.mean((original - 0.5) ** 2)))
 
 
@@ -165,7 +205,14 @@ def test_steps_are_counted_in_order_whatever_is_held(monkeypatch, held):
     monkeypatch.setattr("fhash_codec.metrics.FRAMES_HELD", held)
     original, decoded = frames(9)
     calls = []
-    quality = measure_quality(lambda step: original[step], lambda step: decoded[step], 9, 1.0, 0.0, lambda *call: calls.append(call))
+    quality = measure_quality(
+        lambda step: original[step],
+        lambda step: decoded[step],
+        9,
+        1.0,
+        0.0,
+        lambda *call: calls.append(call),
+    )
     assert [(call[1], call[2]) for call in calls] == [(step + 1, 9) for step in range(9)]
     assert [step.step for step in quality.per_step] == list(range(9))
     assert quality.max_abs_error == pytest.approx(np.abs(original - decoded).max())

@@ -19,9 +19,15 @@ def model_of(box=(5, 9, 17), key_frames=4, seed=0, **settings) -> FHash:
     architecture = Architecture.for_box(box, key_frames, width=16, **settings)
     random = torch.Generator().manual_seed(seed)
     size = architecture.embedding_size
-    tables = [torch.randn(t * z * y * x, size, generator=random, dtype=DOUBLE) for t, z, y, x in architecture.levels]
+    tables = [
+        torch.randn(t * z * y * x, size, generator=random, dtype=DOUBLE)
+        for t, z, y, x in architecture.levels
+    ]
     layers = [
-        (torch.randn(o, i, generator=random, dtype=DOUBLE) / i**0.5, torch.randn(o, generator=random, dtype=DOUBLE))
+        (
+            torch.randn(o, i, generator=random, dtype=DOUBLE) / i**0.5,
+            torch.randn(o, generator=random, dtype=DOUBLE),
+        )
         for o, i in architecture.layer_shapes
     ]
     return FHash(architecture, tables, layers)
@@ -29,7 +35,9 @@ def model_of(box=(5, 9, 17), key_frames=4, seed=0, **settings) -> FHash:
 
 def points_of(model: FHash, count: int, seed=1) -> torch.Tensor:
     sizes = torch.tensor(model.architecture.sizes, dtype=DOUBLE)
-    return torch.rand(count, 4, generator=torch.Generator().manual_seed(seed), dtype=DOUBLE) * (sizes - 1)
+    return torch.rand(count, 4, generator=torch.Generator().manual_seed(seed), dtype=DOUBLE) * (
+        sizes - 1
+    )
 
 
 @pytest.mark.parametrize("resolution", [(1, 1, 1, 1), (2, 3, 5, 7), (1, 4, 1, 2)])
@@ -40,7 +48,10 @@ def test_bucket_index_is_a_bijection(resolution):
 
 def test_bucket_index_is_the_papers_linearisation():
     t, z, y, x, (_, rz, ry, rx) = 3, 2, 4, 1, (5, 6, 7, 8)
-    assert int(bucket_index(torch.tensor([t, z, y, x]), (5, rz, ry, rx))) == t * rx * ry * rz + z * rx * ry + y * rx + x
+    assert (
+        int(bucket_index(torch.tensor([t, z, y, x]), (5, rz, ry, rx)))
+        == t * rx * ry * rz + z * rx * ry + y * rx + x
+    )
 
 
 def test_vertices_of_the_finest_level_are_corners_exactly():
@@ -67,7 +78,9 @@ def test_interpolation_reproduces_a_multilinear_function():
         return ((1 + p[:, 0]) * (2 - p[:, 1]) * (0.5 + p[:, 2]) * (1 + 0.1 * p[:, 3])).unsqueeze(1)
 
     points = torch.rand(200, 4, dtype=DOUBLE) * (torch.tensor(sizes) - 1)
-    torch.testing.assert_close(interpolate(function(corners), points, sizes, resolution), function(points))
+    torch.testing.assert_close(
+        interpolate(function(corners), points, sizes, resolution), function(points)
+    )
 
 
 def test_an_axis_of_one_vertex_does_not_matter():
@@ -110,13 +123,19 @@ def test_analytic_gradient_equals_autograd_and_differences(box, key_frames, sett
 
 def test_values_are_continuous_across_cells_and_key_frames():
     model = model_of()
-    corners = torch.tensor(list(product(range(1, 3), range(1, 4), range(1, 8), range(1, 16))), dtype=DOUBLE)
+    corners = torch.tensor(
+        list(product(range(1, 3), range(1, 4), range(1, 8), range(1, 16))), dtype=DOUBLE
+    )
     with torch.no_grad():
         for sign in (-1, 1):
-            torch.testing.assert_close(model(corners + sign * 1e-9), model(corners), atol=1e-6, rtol=0)
+            torch.testing.assert_close(
+                model(corners + sign * 1e-9), model(corners), atol=1e-6, rtol=0
+            )
 
 
-@pytest.mark.parametrize("settings", [{}, {"hidden_layers": 0, "embedding_size": 1}, {"hidden_layers": 3}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"hidden_layers": 0, "embedding_size": 1}, {"hidden_layers": 3}]
+)
 def test_parameter_count(settings):
     model = model_of(**settings)
     counted = sum(p.numel() for p in model.parameters())

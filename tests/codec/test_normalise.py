@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fhash_codec.normalise import PIECE, Mean, ValueRange, pieces, position_index, power_of_two, unit_position
+from fhash_codec.normalise import (
+    PIECE,
+    Mean,
+    ValueRange,
+    pieces,
+    position_index,
+    power_of_two,
+    unit_position,
+)
 from fhash_formats.errors import InputError
 
 RANGES = [
@@ -57,21 +65,29 @@ def test_error_law_for_any_values(numbers):
 @pytest.mark.parametrize("level", [0.0, -3.5, 1.7e308, 5e-324])
 def test_a_constant_range_gives_zero_and_comes_back_exactly(level):
     whole = ValueRange(level, level)
-    np.testing.assert_array_equal(whole.to_unit(np.full((2, 3), level)), np.zeros((2, 3), np.float32))
+    np.testing.assert_array_equal(
+        whole.to_unit(np.full((2, 3), level)), np.zeros((2, 3), np.float32)
+    )
     np.testing.assert_array_equal(whole.from_unit([0.0, 0.3, 1.0]), [level] * 3)
 
 
 def test_missing_values_become_nan_and_stay_so():
     whole = ValueRange(-1.0, 1.0)
     unit = whole.to_unit([np.nan, np.inf, -np.inf, 0.0, 7.0, -7.0])
-    np.testing.assert_array_equal(unit, np.array([np.nan, np.nan, np.nan, 0.5, 1.0, 0.0], np.float32))
-    np.testing.assert_array_equal(whole.from_unit([np.nan, 0.5, 1.5, -0.5]), [np.nan, 0.0, 1.0, -1.0])
+    np.testing.assert_array_equal(
+        unit, np.array([np.nan, np.nan, np.nan, 0.5, 1.0, 0.0], np.float32)
+    )
+    np.testing.assert_array_equal(
+        whole.from_unit([np.nan, 0.5, 1.5, -0.5]), [np.nan, 0.0, 1.0, -1.0]
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int64, np.uint64, np.float16, np.float32])
 def test_every_number_type(dtype):
     values = np.array([[0, 1], [50, 100]], dtype=dtype)
-    np.testing.assert_allclose(ValueRange(0.0, 100.0).to_unit(values), [[0, 0.01], [0.5, 1]], rtol=1e-7)
+    np.testing.assert_allclose(
+        ValueRange(0.0, 100.0).to_unit(values), [[0, 0.01], [0.5, 1]], rtol=1e-7
+    )
 
 
 def test_pieces_do_not_change_the_result():

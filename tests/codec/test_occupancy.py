@@ -13,7 +13,11 @@ SHAPES = [
 
 def brute_force_index(z, y, x, shape):
     """Take bits from x, y, z in turn while the axis has any."""
-    axes = [[x, (shape[2] - 1).bit_length()], [y, (shape[1] - 1).bit_length()], [z, (shape[0] - 1).bit_length()]]
+    axes = [
+        [x, (shape[2] - 1).bit_length()],
+        [y, (shape[1] - 1).bit_length()],
+        [z, (shape[0] - 1).bit_length()],
+    ]
     index = place = 0
     while any(left for _, left in axes):
         for axis in axes:
@@ -33,7 +37,9 @@ def random_mask(shape, seed=0):
 def test_bits_lie_where_the_definition_says(shape):
     mask, vertices = random_mask(shape), np.indices(shape)
     index = morton_index(*vertices, shape)
-    assert index.ravel().tolist() == [brute_force_index(*(int(v) for v in vertex), shape) for vertex in vertices.reshape(3, -1).T]
+    assert index.ravel().tolist() == [
+        brute_force_index(*(int(v) for v in vertex), shape) for vertex in vertices.reshape(3, -1).T
+    ]
     expected = np.zeros(8 * packed_bytes(shape), dtype=bool)
     expected[index] = mask
     np.testing.assert_array_equal(pack(mask), np.packbits(expected))

@@ -24,7 +24,9 @@ def test_lightness_of_viridis_rises_evenly() -> None:
 
 def test_nothing_decoded_is_grey_and_no_error_is_the_middle() -> None:
     assert tuple(colours(np.nan, 0.0, 1.0, VIRIDIS)) == OUTSIDE
-    assert tuple(colours(0.0, -1.0, 1.0, BALANCE)) == tuple(bytes.fromhex(BALANCE[len(BALANCE) // 2]))
+    assert tuple(colours(0.0, -1.0, 1.0, BALANCE)) == tuple(
+        bytes.fromhex(BALANCE[len(BALANCE) // 2])
+    )
 
 
 @pytest.mark.parametrize("shape", [(48, 48), (7, 31), (1, 1), (300, 400)])
@@ -32,7 +34,12 @@ def test_picture_shows_original_decoded_and_error_of_each_pair(shape: tuple[int,
     original = np.linspace(0.0, 1.0, shape[0] * shape[1]).reshape(shape)
     decoded = np.full(shape, np.nan)
     decoded[-1, 0] = original[-1, 0]
-    image = compare([Pair(label=f"t = {n}", original=original, decoded=decoded) for n in range(3)], title="a", subtitle="b", quantity="c")
+    image = compare(
+        [Pair(label=f"t = {n}", original=original, decoded=decoded) for n in range(3)],
+        title="a",
+        subtitle="b",
+        quantity="c",
+    )
     pixels = np.asarray(image)
     lowest, highest = (np.array(list(bytes.fromhex(VIRIDIS[end]))) for end in (0, -1))
     columns = [x for x in range(image.width) if (pixels[:, x] == OUTSIDE).all(axis=-1).any()]
@@ -45,7 +52,14 @@ def test_picture_shows_original_decoded_and_error_of_each_pair(shape: tuple[int,
 
 def test_a_row_of_high_y_is_drawn_above_one_of_low_y() -> None:
     original = np.array([[0.0, 0.0], [1.0, 1.0]])
-    pixels = np.asarray(compare([Pair(label="", original=original, decoded=original)], title="", subtitle="", quantity=""))
+    pixels = np.asarray(
+        compare(
+            [Pair(label="", original=original, decoded=original)],
+            title="",
+            subtitle="",
+            quantity="",
+        )
+    )
     low, high = (np.array(list(bytes.fromhex(VIRIDIS[end]))) for end in (0, -1))
     column = pixels[:, pixels.shape[1] // 2]
     first_high = np.flatnonzero((column == high).all(axis=-1))[0]
@@ -55,5 +69,16 @@ def test_a_row_of_high_y_is_drawn_above_one_of_low_y() -> None:
 
 def test_picture_of_nothing_decoded_and_of_a_constant_has_no_invalid_number() -> None:
     flat = np.full((6, 5), 3.0)
-    compare([Pair(label="", original=flat, decoded=np.full((6, 5), np.nan))], title="", subtitle="", quantity="")
-    compare([Pair(label="", original=flat, decoded=flat)], title="", subtitle="", quantity="", footer="x")
+    compare(
+        [Pair(label="", original=flat, decoded=np.full((6, 5), np.nan))],
+        title="",
+        subtitle="",
+        quantity="",
+    )
+    compare(
+        [Pair(label="", original=flat, decoded=flat)],
+        title="",
+        subtitle="",
+        quantity="",
+        footer="x",
+    )

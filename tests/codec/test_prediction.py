@@ -20,7 +20,9 @@ def _rough(dtype):
 @pytest.mark.parametrize("dtype", ["float32", "float64", "uint16"])
 def test_a_file_by_prediction_keeps_the_bound(tmp_path, monkeypatch, dtype):
     choose = prediction.choose_predictor
-    monkeypatch.setattr(prediction, "choose_predictor", lambda *given, **named: (choose(*given, **named)[0], 0))
+    monkeypatch.setattr(
+        prediction, "choose_predictor", lambda *given, **named: (choose(*given, **named)[0], 0)
+    )
     values = _rough(dtype)
     path = tmp_path / "a.fhz"
     report = fhash_codec.encode(values, path, fhash_codec.EncodeConfig(max_error=100.5, effort=3))
@@ -33,10 +35,14 @@ def test_a_file_by_prediction_keeps_the_bound(tmp_path, monkeypatch, dtype):
 def test_trained_weights_beat_none():
     y, x = np.meshgrid(np.arange(48), np.arange(48), indexing="ij")
     frame = 3000 * np.sin(x / 7 + y / 11) + 2000 * np.cos(x / 5 - y / 6)
-    integers = np.rint(np.stack([frame * (1 + 0.1 * t) for t in range(4)])).astype(np.int32)[:, None]
+    integers = np.rint(np.stack([frame * (1 + 0.1 * t) for t in range(4)])).astype(np.int32)[
+        :, None
+    ]
     levels, order, sizes = (0, 0, 3, 3), (0, 1, 2, 3), []
     nothing = (0,) * sum(len(part.taps) for part in passes_of(levels, order, 1))
     for weights in (fit([(integers, None)], levels, order, 1), nothing):
-        predictor = Predictor(step=1.0, origin=0.0, levels=levels, order=order, reach=1, weights=weights)
+        predictor = Predictor(
+            step=1.0, origin=0.0, levels=levels, order=order, reach=1, weights=weights
+        )
         sizes.append(len(encode_predicted(integers, None, predictor)[0]))
     assert sizes[0] < 0.8 * sizes[1]

@@ -9,7 +9,9 @@ from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.uint64, np.float16, np.float32, np.float64])
+@pytest.mark.parametrize(
+    "dtype", [np.uint8, np.int32, np.uint64, np.float16, np.float32, np.float64]
+)
 def test_range_and_mean_are_numpys(dtype):
     array = (np.random.default_rng(0).random((3, 4, 5, 6)) * 100).astype(dtype)
     seen = scan(ArraySeries(array), silent)
@@ -26,7 +28,10 @@ def test_missing_values_are_left_out_and_known_by_step():
     finite = np.isfinite(array)
     assert sorted(seen.missing) == [1, 3]
     assert seen.finite_count == finite.sum()
-    assert (seen.value_range.low, seen.value_range.high) == (array[finite].min(), array[finite].max())
+    assert (seen.value_range.low, seen.value_range.high) == (
+        array[finite].min(),
+        array[finite].max(),
+    )
     assert seen.mean == pytest.approx(array[finite].mean(dtype=np.float64))
     for step in range(5):
         mask = seen.finite(step, (3, 4, 5))
@@ -43,7 +48,9 @@ def test_a_mask_that_stays_is_kept_once():
     assert missing[3] is not missing[2]
 
 
-@pytest.mark.parametrize(("low", "high"), [(1e8, 1e8 + 1e-3), (-1.7e308, 1.7e308), (5e-324, 1e-322)])
+@pytest.mark.parametrize(
+    ("low", "high"), [(1e8, 1e8 + 1e-3), (-1.7e308, 1.7e308), (5e-324, 1e-322)]
+)
 def test_extreme_ranges_are_exact(low, high):
     seen = scan(ArraySeries(np.array([low, high, low, high]).reshape(2, 1, 1, 2)), silent)
     assert (seen.value_range.low, seen.value_range.high) == (low, high)

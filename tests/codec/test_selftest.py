@@ -58,7 +58,9 @@ def test_names_are_unique_and_every_case_says_what_is_hard() -> None:
         assert case.name == case.name.lower().replace(" ", "-")
         assert case.about
         assert case.settings
-        assert not set(case.settings) & {name for name, config in case.more.items() if case.settings.get(name, config) != config}
+        assert not set(case.settings) & {
+            name for name, config in case.more.items() if case.settings.get(name, config) != config
+        }
 
 
 def test_a_series_is_the_same_on_every_call() -> None:
@@ -87,7 +89,10 @@ def _ends(run: Run) -> Iterator[Finding]:
 def test_a_property_that_does_not_hold_and_one_that_ends_with_an_error_are_failures() -> None:
     result = run_case(replace(CASE, checks=(found(2.0), _ends)))
     assert not result.holds
-    assert result.failures == ["bound: _ends: ValueError: and it ends", "bound: broken is 2 a|b, at most 1"]
+    assert result.failures == [
+        "bound: _ends: ValueError: and it ends",
+        "bound: broken is 2 a|b, at most 1",
+    ]
     assert result.worst is not None
     assert relative(result.worst) == 2
 
@@ -99,12 +104,23 @@ def test_a_figure_that_is_no_number_does_not_hold() -> None:
 
 @pytest.mark.parametrize(
     ("spoiled", "property_name"),
-    [("value", "strict bound"), ("missing", "finite in the coreset"), ("filled", "NaN outside of it"), ("value", "region = slice")],
+    [
+        ("value", "strict bound"),
+        ("missing", "finite in the coreset"),
+        ("filled", "NaN outside of it"),
+        ("value", "region = slice"),
+    ],
 )
-def test_a_value_that_decodes_wrongly_is_found(monkeypatch: pytest.MonkeyPatch, spoiled: str, property_name: str) -> None:
+def test_a_value_that_decodes_wrongly_is_found(
+    monkeypatch: pytest.MonkeyPatch, spoiled: str, property_name: str
+) -> None:
     def decoded(run: Run) -> np.ndarray:
         values = run.volume[...]
-        values[1:, 2:7, 3:8, 4:9] = {"value": values[1:, 2:7, 3:8, 4:9] + 0.02, "missing": np.nan, "filled": 0.5}[spoiled]
+        values[1:, 2:7, 3:8, 4:9] = {
+            "value": values[1:, 2:7, 3:8, 4:9] + 0.02,
+            "missing": np.nan,
+            "filled": 0.5,
+        }[spoiled]
         return values
 
     def make() -> object:
@@ -127,7 +143,9 @@ def test_bytes_that_depend_on_the_threads_are_found(monkeypatch: pytest.MonkeyPa
         return encode(source, path, replace(config, seed=int(os.environ["FHASH_THREADS"])), **rest)
 
     monkeypatch.setattr(repeating, "encode", other)
-    assert [one.name for one in run_case(CASE).findings if not one.holds] == ["same bytes by other threads"]
+    assert [one.name for one in run_case(CASE).findings if not one.holds] == [
+        "same bytes by other threads"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -135,11 +153,16 @@ def test_bytes_that_depend_on_the_threads_are_found(monkeypatch: pytest.MonkeyPa
     [
         ({"make": lambda: 1 / 0}, "making the series: ZeroDivisionError: division by zero"),
         ({"make": nothing}, "bound: InputError: array: 'hard' has no finite value"),
-        ({"refused": "no finite value"}, "bound: was encoded; it should have been refused with 'no finite value'"),
+        (
+            {"refused": "no finite value"},
+            "bound: was encoded; it should have been refused with 'no finite value'",
+        ),
         ({"make": nothing, "refused": "nowhere"}, "which does not say 'nowhere'"),
     ],
 )
-def test_whatever_goes_wrong_is_a_line_of_the_result(change: dict[str, object], failure: str) -> None:
+def test_whatever_goes_wrong_is_a_line_of_the_result(
+    change: dict[str, object], failure: str
+) -> None:
     result = run_case(replace(CASE, **change))
     assert not result.holds
     assert len(result.failures) == 1
@@ -148,7 +171,9 @@ def test_whatever_goes_wrong_is_a_line_of_the_result(change: dict[str, object], 
 
 def test_a_numeric_warning_is_a_failure() -> None:
     result = run_case(replace(CASE, checks=(lambda run: [np.float64(1e308) * 10],)))
-    assert result.errors == ("bound: <lambda>: RuntimeWarning: overflow encountered in scalar multiply",)
+    assert result.errors == (
+        "bound: <lambda>: RuntimeWarning: overflow encountered in scalar multiply",
+    )
 
 
 def test_differences_are_exact() -> None:
@@ -180,14 +205,20 @@ def test_the_environment_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_results_survive_json() -> None:
     one = Finding(name="a", worst=float("inf"), limit=0.0, unit="values", under="bound")
-    result = CaseResult(name="x", group="values", about="y", under=("bound",), findings=(one,), errors=("z",))
+    result = CaseResult(
+        name="x", group="values", about="y", under=("bound",), findings=(one,), errors=("z",)
+    )
     assert CaseResult.from_dict(result.to_dict()) == result
 
 
 def test_cases_run_in_processes_in_their_order() -> None:
     picked = [*chosen(names=["threes"]), *chosen(names=["nothing-finite"]), *chosen(names=["twos"])]
     seen: list[str] = []
-    summary = run_cases(picked, processes=2, progress=lambda stage, done, total, note: seen.append(f"{stage} {done}/{total}"))
+    summary = run_cases(
+        picked,
+        processes=2,
+        progress=lambda stage, done, total, note: seen.append(f"{stage} {done}/{total}"),
+    )
     assert [result.name for result in summary.results] == ["threes", "nothing-finite", "twos"]
     assert summary.failures == []
     assert seen == ["testing 1/3", "testing 2/3", "testing 3/3"]
@@ -207,7 +238,11 @@ def test_an_interruption_ends_the_processes() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_cases([*chosen(names=["nothing-finite"]), *chosen(groups=["times"])], processes=1, progress=stop)
+        run_cases(
+            [*chosen(names=["nothing-finite"]), *chosen(groups=["times"])],
+            processes=1,
+            progress=stop,
+        )
     assert multiprocessing.active_children() == []
 
 

@@ -15,7 +15,16 @@ from fhash_codec.metrics import ssim, ssim_steps
 from fhash_formats import native
 from fhash_formats.errors import InputError
 
-SHAPES = [(11, 11, 11), (12, 64, 70), (25, 40, 33), (1, 60, 70), (1, 1, 90), (5, 30, 2), (3, 4, 5), (1, 1, 1)]
+SHAPES = [
+    (11, 11, 11),
+    (12, 64, 70),
+    (25, 40, 33),
+    (1, 60, 70),
+    (1, 1, 90),
+    (5, 30, 2),
+    (3, 4, 5),
+    (1, 1, 1),
+]
 
 
 def pair(shape, seed=0):
@@ -30,7 +39,9 @@ def blurred(field):
     weights /= weights.sum()
     for axis in range(3):
         size = field.shape[axis]
-        padded = np.pad(field, [(5, 5) if a == axis else (0, 0) for a in range(3)], mode="symmetric")
+        padded = np.pad(
+            field, [(5, 5) if a == axis else (0, 0) for a in range(3)], mode="symmetric"
+        )
         field = sum(w * padded.take(range(i, i + size), axis) for i, w in enumerate(weights))
     return field
 
@@ -48,7 +59,12 @@ def similarity(a, b, data_range):
 def test_agrees_with_scikit_image(shape, offset):
     original, decoded = (field + offset for field in pair(shape))
     expected = metrics.structural_similarity(
-        original.squeeze(), decoded.squeeze(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.2
+        original.squeeze(),
+        decoded.squeeze(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.2,
     )
     total, count = ssim(original, decoded, 1.2)
     assert total / count == pytest.approx(expected, abs=1e-6)
@@ -78,16 +94,25 @@ def test_a_mask_counts_its_vertices_and_hides_the_rest(shape):
 
 def test_a_mask_of_everything_is_no_mask():
     original, decoded = pair((12, 20, 13))
-    assert ssim(original, decoded, 1.0, np.ones(original.shape, bool)) == ssim(original, decoded, 1.0)
+    assert ssim(original, decoded, 1.0, np.ones(original.shape, bool)) == ssim(
+        original, decoded, 1.0
+    )
 
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_vertices_that_are_not_finite_do_not_count(masked):
     original, decoded = pair((6, 7, 40))
     bad = np.random.default_rng(5).random(original.shape) < 0.1
-    mask = np.random.default_rng(6).random(original.shape) < 0.5 if masked else np.ones(original.shape, bool)
+    mask = (
+        np.random.default_rng(6).random(original.shape) < 0.5
+        if masked
+        else np.ones(original.shape, bool)
+    )
     mean = original[~bad].mean()
-    one, other = np.where(bad, mean, original), np.where(bad, mean, np.where(mask, decoded, original))
+    one, other = (
+        np.where(bad, mean, original),
+        np.where(bad, mean, np.where(mask, decoded, original)),
+    )
     counts = mask & ~bad
     if not masked:
         counts[..., :5] = counts[..., -5:] = False
@@ -196,7 +221,10 @@ except MemoryError as error:
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux" or native.library() is None, reason="needs the native library and Linux's limits on memory")
+@pytest.mark.skipif(
+    sys.platform != "linux" or native.library() is None,
+    reason="needs the native library and Linux's limits on memory",
+)
 def test_no_memory_for_a_tile_is_said_and_ends_no_process():
     done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

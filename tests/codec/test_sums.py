@@ -9,7 +9,9 @@ from fhash_codec.compact.foresight import magnitudes
 from fhash_codec.sums import range_and_sum, squared_errors
 from fhash_formats import native
 
-needs_native = pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
+needs_native = pytest.mark.skipif(
+    native.library() is None, reason="the native library was not built here"
+)
 SIZES = [1, 255, 256, 257, 16383, 16384, 16385, 50_000]
 
 
@@ -43,16 +45,27 @@ def test_zeros_have_no_sign_and_sums_may_be_infinite(monkeypatch, library):
         assert not np.signbit([low, high]).any()
     largest = np.finfo(np.float64).max
     assert range_and_sum(np.full(1000, largest)) == (1000, largest, largest, np.inf)
-    assert range_and_sum(np.full(1000, largest), 2.0**-20)[3] == pytest.approx(largest * (1000 * 2.0**-20))
+    assert range_and_sum(np.full(1000, largest), 2.0**-20)[3] == pytest.approx(
+        largest * (1000 * 2.0**-20)
+    )
 
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize(
-    "dtypes", [(np.float32, np.float32), (np.float64, np.float64), (np.uint8, np.float32), (np.float32, np.float64)], ids=str
+    "dtypes",
+    [
+        (np.float32, np.float32),
+        (np.float64, np.float64),
+        (np.uint8, np.float32),
+        (np.float32, np.float64),
+    ],
+    ids=str,
 )
 @pytest.mark.parametrize("size", SIZES)
 def test_errors_are_those_of_numpy(size, dtypes, masked):
-    original, decoded = (part.astype(dtype) for part, dtype in zip(pair(size, np.float64), dtypes, strict=True))
+    original, decoded = (
+        part.astype(dtype) for part, dtype in zip(pair(size, np.float64), dtypes, strict=True)
+    )
     mask = np.random.default_rng(1).random(size) < 0.5 if masked else None
     difference = (original.astype(np.float64) - decoded)[slice(None) if mask is None else mask] / 8
     count, squares, largest = squared_errors(original, decoded, mask, 0.125)
@@ -102,7 +115,9 @@ def test_what_is_not_finite_is_told(monkeypatch, choice, value):
 def test_arrays_need_not_be_contiguous():
     original, decoded = (part.reshape(10, 20, 25) for part in pair(5000, np.float32))
     mask = original > 0
-    assert squared_errors(original[::2, :, ::-1], decoded[::2, :, ::-1], mask[::2, :, ::-1], 1.0) == squared_errors(
+    assert squared_errors(
+        original[::2, :, ::-1], decoded[::2, :, ::-1], mask[::2, :, ::-1], 1.0
+    ) == squared_errors(
         original[::2, :, ::-1].copy(), decoded[::2, :, ::-1].copy(), mask[::2, :, ::-1].copy(), 1.0
     )
     assert range_and_sum(original[:, ::3]) == range_and_sum(original[:, ::3].copy())

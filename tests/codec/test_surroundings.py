@@ -17,13 +17,19 @@ from fhash_codec.compact.steps import Goal
 from fhash_formats.transform.settings import Settings
 
 SHAPE = (4, 12, 20, 24)
-SETTINGS = Settings(transform=usual_transform(SHAPE), step=0.05, center=0.5, low=0.0, high=1.0, offsets=OFFSETS)
+SETTINGS = Settings(
+    transform=usual_transform(SHAPE), step=0.05, center=0.5, low=0.0, high=1.0, offsets=OFFSETS
+)
 
 
 def wave(dtype=np.float32):
     t, z, y, x = np.indices(SHAPE)
     noise = np.random.default_rng(3).normal(size=SHAPE)
-    return (0.5 + 0.3 * np.sin(0.3 * x + 0.2 * t) * np.cos(0.2 * y) + 0.15 * noise * (z > 6)).clip(0, 1).astype(dtype)
+    return (
+        (0.5 + 0.3 * np.sin(0.3 * x + 0.2 * t) * np.cos(0.2 * y) + 0.15 * noise * (z > 6))
+        .clip(0, 1)
+        .astype(dtype)
+    )
 
 
 CARE = np.indices(SHAPE)[1] <= 6
@@ -49,7 +55,9 @@ def test_what_counts_stays_and_all_else_has_a_value(dtype, density):
     if dtype != np.uint8:
         values[:, 9, 3:6] = np.nan
         values[:, 2, 2, 2] = np.inf
-    settings = SETTINGS if dtype != np.uint8 else replace(SETTINGS, high=200.0, center=100.0, step=10.0)
+    settings = (
+        SETTINGS if dtype != np.uint8 else replace(SETTINGS, high=200.0, center=100.0, step=10.0)
+    )
     found, counts = fill(values, CARE, settings, density)
     assert found.dtype == values.dtype
     assert np.isfinite(found).all()
@@ -91,7 +99,11 @@ def test_the_race_is_never_lost_to_the_values_that_are_there():
 def test_a_feature_of_whole_numbers_keeps_its_bound(tmp_path):
     values = np.round(wave(np.float64) * 200).astype(np.uint8)
     feature = "interval:150:255"
-    fhash_codec.encode(values, tmp_path / "a.fhz", fhash_codec.EncodeConfig(max_error=3.0, features=(feature,), effort=4))
+    fhash_codec.encode(
+        values,
+        tmp_path / "a.fhz",
+        fhash_codec.EncodeConfig(max_error=3.0, features=(feature,), effort=4),
+    )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         inside = volume.occupancy(1)
         assert inside[values[1] >= 150].all()

@@ -24,7 +24,11 @@ def test_scene_is_a_finite_float32_series_with_coordinates_in_si_units(name: str
 
 @pytest.mark.parametrize("name", SCENES)
 def test_same_seed_same_values_other_seed_other_values(name: str) -> None:
-    first, again, other = simulate(name, SMALL), simulate(name, SMALL), simulate(name, SMALL, seed=1)
+    first, again, other = (
+        simulate(name, SMALL),
+        simulate(name, SMALL),
+        simulate(name, SMALL, seed=1),
+    )
     np.testing.assert_array_equal(first.values, again.values)
     assert not np.array_equal(first.values, other.values)
 
@@ -47,13 +51,20 @@ def test_vortex_keeps_the_amount_of_tracer_and_mixes_it() -> None:
 
 def test_front_moves_outwards() -> None:
     series = simulate("front")
-    _, z, y, x = np.meshgrid([0], *(series.coords[axis].values - 0.5 for axis in "zyx"), indexing="ij")
+    _, z, y, x = np.meshgrid(
+        [0], *(series.coords[axis].values - 0.5 for axis in "zyx"), indexing="ij"
+    )
     radius = np.sqrt(z**2 + y**2 + x**2)[0]
     means = [float(radius[frame > 0.4].mean()) for frame in series.frames()]
     assert np.all(np.diff(means) > 0)
 
 
-@pytest.mark.parametrize(("name", "shape", "message"), [("fire", SMALL, "vortex, front"), ("front", (1, 8, 8, 8), "at least 2 steps")])
-def test_unsuitable_request_says_what_is_allowed(name: str, shape: tuple[int, int, int, int], message: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "shape", "message"),
+    [("fire", SMALL, "vortex, front"), ("front", (1, 8, 8, 8), "at least 2 steps")],
+)
+def test_unsuitable_request_says_what_is_allowed(
+    name: str, shape: tuple[int, int, int, int], message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         simulate(name, shape)

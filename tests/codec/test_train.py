@@ -36,9 +36,15 @@ def coreset():
 
 
 def setup(coreset, epochs=4, **settings):
-    plan = plan_training(coreset, **{"epochs": epochs, "learning_rate": 0.01, "schedule": "cosine", "batch": 0, "seed": 5} | settings)
+    plan = plan_training(
+        coreset,
+        **{"epochs": epochs, "learning_rate": 0.01, "schedule": "cosine", "batch": 0, "seed": 5}
+        | settings,
+    )
     architecture = Architecture.for_box(box_size(coreset.box), 3, width=16)
-    return plan, make_engine("slab", architecture, coreset, plan.rates, seed=5, device=torch.device("cpu"))
+    return plan, make_engine(
+        "slab", architecture, coreset, plan.rates, seed=5, device=torch.device("cpu")
+    )
 
 
 def test_every_epoch_visits_every_brick_once_in_an_order_of_its_own(coreset):
@@ -80,7 +86,10 @@ def test_history_tells_seconds_epoch_and_psnr_that_rises(coreset):
     seen = []
     assert train(engine, plan, coreset, course, progress=lambda *step: seen.append(step))
     assert [point["epoch"] for point in course.history] == list(range(1, 13))
-    assert all(a["seconds"] < b["seconds"] for a, b in zip(course.history, course.history[1:], strict=False))
+    assert all(
+        a["seconds"] < b["seconds"]
+        for a, b in zip(course.history, course.history[1:], strict=False)
+    )
     assert course.history[-1]["psnr"] > course.history[0]["psnr"] + 5
     assert course.history[-1]["psnr"] > 30
     assert [done for _, done, _, _ in seen] == list(range(1, 12 * plan.batches + 1))
@@ -97,7 +106,15 @@ def test_going_on_from_a_checkpoint_ends_at_the_same_bits(coreset, tmp_path, mom
     def ask(stage, done, total, note):
         stop.asked = done >= moment
 
-    assert not train(engine, plan, coreset, course, stop=stop, save=lambda c: save_checkpoint(path, engine.state(), c), progress=ask)
+    assert not train(
+        engine,
+        plan,
+        coreset,
+        course,
+        stop=stop,
+        save=lambda c: save_checkpoint(path, engine.state(), c),
+        progress=ask,
+    )
     state, later = load_checkpoint(path)
     _, resumed = setup(coreset)
     resumed.restore(state)
@@ -118,7 +135,9 @@ def test_a_checkpoint_belongs_to_its_coreset_and_settings(coreset, tmp_path):
     output = tmp_path / "run.fhz"
     one = checkpoint_path(output, coreset, EncodeConfig(profile="paper"))
     assert one.parent == tmp_path
-    assert one == checkpoint_path(output, coreset, EncodeConfig(profile="paper", psnr=50.0, tables="float32", timings=False))
+    assert one == checkpoint_path(
+        output, coreset, EncodeConfig(profile="paper", psnr=50.0, tables="float32", timings=False)
+    )
     assert one != checkpoint_path(output, coreset, EncodeConfig(profile="paper", epochs=3))
     series = ArraySeries(smooth() + 0.5 * smooth() ** 2)
     other = build_coreset(series, scan(series, silent), range(3), [Everything()], 0, silent)
@@ -144,8 +163,12 @@ def test_training_that_diverges_is_an_error(coreset):
 @pytest.mark.parametrize("hidden_layers", [0, 1, 2])
 def test_an_error_of_more_than_twice_the_range_is_seen_at_its_batch(coreset, hidden_layers):
     plan = plan_training(coreset, epochs=4, learning_rate=1.0, schedule="constant", batch=0, seed=5)
-    architecture = Architecture.for_box(box_size(coreset.box), 3, width=64, hidden_layers=hidden_layers)
-    engine = make_engine("slab", architecture, coreset, plan.rates, seed=5, device=torch.device("cpu"))
+    architecture = Architecture.for_box(
+        box_size(coreset.box), 3, width=64, hidden_layers=hidden_layers
+    )
+    engine = make_engine(
+        "slab", architecture, coreset, plan.rates, seed=5, device=torch.device("cpu")
+    )
     course = Course()
     with pytest.raises(Diverged, match="training diverged in epoch 1: the error reached"):
         train(engine, plan, coreset, course)

@@ -23,7 +23,13 @@ def volume(encoded):
 
 def test_it_looks_like_an_array(encoded, volume):
     field, path = encoded
-    assert (volume.shape, volume.dtype, volume.ndim, volume.size, len(volume)) == (field.shape, np.float32, 4, field.size, 5)
+    assert (volume.shape, volume.dtype, volume.ndim, volume.size, len(volume)) == (
+        field.shape,
+        np.float32,
+        4,
+        field.size,
+        5,
+    )
     assert volume.dims == ("t", "z", "y", "x")
     assert volume.path == path
     assert np.asarray(volume).shape == field.shape
@@ -105,12 +111,23 @@ def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t):
     field = np.arange(5 * 6 * 7 * 8, dtype=np.float32).reshape(5, 6, 7, 8) % 317
     field[2, 3:, 4] = np.nan
     short = {"epochs": 1, "width": 4} if profile == "paper" else {"effort": 1, "tile": "2x3x4x5"}
-    fhash_codec.encode(field, tmp_path / "a.fhz", EncodeConfig(profile=profile, features=("interval:100:150",), dilation=0, **short))
+    fhash_codec.encode(
+        field,
+        tmp_path / "a.fhz",
+        EncodeConfig(profile=profile, features=("interval:100:150",), dilation=0, **short),
+    )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         whole = volume.occupancy(t)
         assert 0 < whole.mean() < 0.5
-        for region in (((0, 6), (0, 7), (0, 8)), ((2, 5), (1, 6), (3, 4)), ((5, 6), (6, 7), (7, 8)), ((0, 1), (0, 1), (0, 1))):
-            np.testing.assert_array_equal(volume.occupancy(t, region), whole[tuple(slice(*part) for part in region)])
+        for region in (
+            ((0, 6), (0, 7), (0, 8)),
+            ((2, 5), (1, 6), (3, 4)),
+            ((5, 6), (6, 7), (7, 8)),
+            ((0, 1), (0, 1), (0, 1)),
+        ):
+            np.testing.assert_array_equal(
+                volume.occupancy(t, region), whole[tuple(slice(*part) for part in region)]
+            )
         with pytest.raises(RegionError, match="axis x"):
             volume.occupancy(t, ((0, 6), (0, 7), (0, 9)))
 
@@ -168,17 +185,27 @@ def test_gradients_are_per_vertex_and_per_step(volume):
     step = 1e-3
     for axis, name in enumerate("tzyx"):
         at = dict(zip("tzyx", (t, z, y, x), strict=True))
-        high, low = (volume.sample(**{**at, name: np.clip(at[name] + s, 0, volume.shape[axis] - 1)}) for s in (step, -step))
+        high, low = (
+            volume.sample(**{**at, name: np.clip(at[name] + s, 0, volume.shape[axis] - 1)})
+            for s in (step, -step)
+        )
         difference = (high - low) / (2 * step)
-        close = np.isclose(gradient[:, axis], difference, rtol=0.05, atol=5e-3)[inside & np.isfinite(difference)]
+        close = np.isclose(gradient[:, axis], difference, rtol=0.05, atol=5e-3)[
+            inside & np.isfinite(difference)
+        ]
         # A kink of the network or the border of a cell may lie between the two points.
         assert close.mean() > 0.9, name
 
 
 @pytest.mark.parametrize("times", [[2.0, 3.0, 4.0, 30.0, 31.0], [31.0, 30.0, 4.0, 3.0, 2.0]])
 def test_physical_times_may_be_uneven_and_descend(tmp_path, times):
-    field = np.linspace(0, 1, 5, dtype=np.float32)[:, None, None, None] * np.ones((5, 2, 3, 4), np.float32)
-    series = ArraySeries(field, coords={"t": Coordinate(name="time", values=np.array(times), attributes={"units": "h"})})
+    field = np.linspace(0, 1, 5, dtype=np.float32)[:, None, None, None] * np.ones(
+        (5, 2, 3, 4), np.float32
+    )
+    series = ArraySeries(
+        field,
+        coords={"t": Coordinate(name="time", values=np.array(times), attributes={"units": "h"})},
+    )
     fhash_codec.encode(series, tmp_path / "t.fhz", EncodeConfig(effort=1))
     with fhash_codec.open(tmp_path / "t.fhz") as volume:
         assert volume.coords["t"].attributes == {"units": "h"}
@@ -190,7 +217,8 @@ def test_physical_times_may_be_uneven_and_descend(tmp_path, times):
 
 def test_times_that_do_not_ascend_are_warned_of_and_steps_stand_for_them(tmp_path):
     series = ArraySeries(
-        np.random.default_rng(0).random((3, 2, 3, 4)), coords={"t": Coordinate(name="time", values=np.array([0.0, 0.0, 1.0]))}
+        np.random.default_rng(0).random((3, 2, 3, 4)),
+        coords={"t": Coordinate(name="time", values=np.array([0.0, 0.0, 1.0]))},
     )
     with pytest.warns(fhash_codec.FhashWarning, match="do not strictly ascend"):
         fhash_codec.encode(series, tmp_path / "t.fhz", EncodeConfig(effort=1))
@@ -211,7 +239,11 @@ def test_decoding_a_frame_reads_only_its_time_nodes(encoded, monkeypatch):
         read = []
         array_type = type(volume.container.arrays["tables/level_1"])
         decode = array_type._decode
-        monkeypatch.setattr(array_type, "_decode", lambda self, index, lod: read.append((self.name, index[0])) or decode(self, index, lod))
+        monkeypatch.setattr(
+            array_type,
+            "_decode",
+            lambda self, index, lod: read.append((self.name, index[0])) or decode(self, index, lod),
+        )
         volume.read(2)
         assert {node for name, node in read if name == "tables/level_1"} == {1}
         assert {node for name, node in read if name == "occupancy/bits"} == {1}
@@ -291,7 +323,12 @@ def test_what_a_compact_file_leaves_out(tmp_path, stored):
             "parameters": 0,
             "head": None,
         },
-        "coordinates": {"time": {"values": [1, 5]}, "z": {}, "y": {"start": 2}, "x": {"step": 0.5, "name": "lon"}},
+        "coordinates": {
+            "time": {"values": [1, 5]},
+            "z": {},
+            "y": {"start": 2},
+            "x": {"step": 0.5, "name": "lon"},
+        },
         "config": {},
         "training": {"seconds": None, "epochs": 0, "device": "cpu"},
         "quality": {},

@@ -28,7 +28,11 @@ def model(request, tmp_path_factory):
     field = np.random.default_rng(0).random((4, 7, 8, 9))
     field[:, [0, -1]], field[:, :, [0, -1]], field[..., [0, -1]] = -1, -1, -1
     path = tmp_path_factory.mktemp("model") / "a.fhz"
-    fhash_codec.encode(field, path, EncodeConfig(features=("interval:0.2:1",), dilation=0, **SETTINGS[request.param]))
+    fhash_codec.encode(
+        field,
+        path,
+        EncodeConfig(features=("interval:0.2:1",), dilation=0, **SETTINGS[request.param]),
+    )
     with Container.open(path) as container:
         yield request.param, open_model(container)
 
@@ -39,7 +43,9 @@ def test_each_profile_has_its_model(model):
     assert tuple(found.chunks) == ((2, 3, 4, 4) if name == "compact" else (1, 7, 8, 9))
     for method, wanted in inspect.getmembers(VolumeModel, inspect.isfunction):
         if not method.startswith("_"):
-            assert len(inspect.signature(getattr(type(found), method)).parameters) == len(inspect.signature(wanted).parameters)
+            assert len(inspect.signature(getattr(type(found), method)).parameters) == len(
+                inspect.signature(wanted).parameters
+            )
 
 
 @pytest.mark.parametrize("region", REGIONS, ids=str)
@@ -74,7 +80,9 @@ def test_levels_of_detail_are_given_or_refused(model):
     name, found = model
     if name == "compact":
         whole = found.coarse(1, 1, ((0, 3), (0, 3), (0, 4)))
-        np.testing.assert_array_equal(found.coarse(1, 1, ((1, 3), (2, 3), (0, 2))), whole[1:3, 2:3, 0:2])
+        np.testing.assert_array_equal(
+            found.coarse(1, 1, ((1, 3), (2, 3), (0, 2))), whole[1:3, 2:3, 0:2]
+        )
     else:
         with pytest.raises(InputError, match="no levels of detail"):
             found.coarse(1, 1, ((0, 3), (0, 3), (0, 4)))

@@ -37,16 +37,24 @@ def test_a_damaged_library_is_a_plain_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
-def test_a_library_of_other_sources_is_a_plain_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    built = next(path for suffix in EXTENSION_SUFFIXES if (path := SOURCES / f"_core{suffix}").is_file())
+def test_a_library_of_other_sources_is_a_plain_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built = next(
+        path for suffix in EXTENSION_SUFFIXES if (path := SOURCES / f"_core{suffix}").is_file()
+    )
     copy = tmp_path / built.name
     shutil.copy(built, copy)
     assert native._load(tmp_path) is not None
     monkeypatch.setattr(native, "ABI_VERSION", native.ABI_VERSION + 1)
-    message = f"has ABI {native.ABI_VERSION - 1}, this version of the package needs {native.ABI_VERSION}"
+    message = (
+        f"has ABI {native.ABI_VERSION - 1}, this version of the package needs {native.ABI_VERSION}"
+    )
     with pytest.raises(MissingDependencyError, match=message):
         native._load(tmp_path)
 
 
 def test_the_sources_and_the_loader_agree_on_the_abi() -> None:
-    assert f"FHASH_ABI = {native.ABI_VERSION};" in (SOURCES / "core.hpp").read_text(encoding="utf-8")
+    assert f"FHASH_ABI = {native.ABI_VERSION};" in (SOURCES / "core.hpp").read_text(
+        encoding="utf-8"
+    )

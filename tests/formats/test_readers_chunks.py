@@ -32,7 +32,9 @@ def save_zarr(path: Path, values: np.ndarray, chunks: tuple[int, ...]) -> None:
     zarr.create_array(path, shape=values.shape, dtype=values.dtype, chunks=chunks)[...] = values
 
 
-each = pytest.mark.parametrize(("suffix", "save"), [(".h5", save_hdf5), (".nc", save_netcdf), (".zarr", save_zarr)])
+each = pytest.mark.parametrize(
+    ("suffix", "save"), [(".h5", save_hdf5), (".nc", save_netcdf), (".zarr", save_zarr)]
+)
 
 
 @each
@@ -52,7 +54,12 @@ def test_one_frame_is_read_at_a_time(tmp_path: Path, suffix: str, save: Save) ->
 @each
 @pytest.mark.parametrize(("limit", "held"), [(2**20, 3), (1000, 2), (1, None)])
 def test_a_chunk_of_many_steps_is_kept_as_far_as_it_fits(
-    tmp_path: Path, suffix: str, save: Save, limit: int, held: int | None, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    suffix: str,
+    save: Save,
+    limit: int,
+    held: int | None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("fhash_formats.readers.lattice.SLAB_BYTES", limit)
     values = np.random.default_rng(0).normal(size=(4, 3, 5, 6)).astype(np.float32)

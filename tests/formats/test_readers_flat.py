@@ -41,18 +41,27 @@ def frames(path: Path, **options: Any) -> np.ndarray:
 )
 @settings(max_examples=60, deadline=None)
 def test_a_part_of_a_flat_array_is_that_part(
-    tmp_path_factory: pytest.TempPathFactory, shape: list[int], place: int, part: tuple[int, int], block: int, run: int
+    tmp_path_factory: pytest.TempPathFactory,
+    shape: list[int],
+    place: int,
+    part: tuple[int, int],
+    block: int,
+    run: int,
 ) -> None:
     place = place % len(shape)
     start, stop = sorted(min(edge, shape[place]) for edge in part)
     values = np.arange(np.prod(shape), dtype=">i4").reshape(shape)
     path = tmp_path_factory.mktemp("flat") / "a"
     path.write_bytes(b"head" + values.tobytes())
-    ranges = tuple(slice(start, stop) if at == place else slice(0, length) for at, length in enumerate(shape))
+    ranges = tuple(
+        slice(start, stop) if at == place else slice(0, length) for at, length in enumerate(shape)
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flat, "BLOCK_BYTES", block)
         patch.setattr(flat, "SHORTEST_RUN", run)
-        np.testing.assert_array_equal(FlatArray(path, tuple(shape), values.dtype, offset=4).read(ranges), values[ranges])
+        np.testing.assert_array_equal(
+            FlatArray(path, tuple(shape), values.dtype, offset=4).read(ranges), values[ranges]
+        )
 
 
 @pytest.mark.parametrize("dtype", ["f4", ">f4", "f8", "f2", "u1", ">i2", "u8"])
@@ -78,7 +87,10 @@ def test_npy_recognised_by_its_magic(tmp_path: Path) -> None:
     os.rename(tmp_path / "a.npy", tmp_path / "a.data")
     with open_series(tmp_path / "a.data") as series:
         assert (series.name, series.units, series.attributes) == ("a", "", {})
-        assert all(np.array_equal(series.coords[axis].values, np.arange(length)) for axis, length in zip("tzyx", VALUES.shape, strict=True))
+        assert all(
+            np.array_equal(series.coords[axis].values, np.arange(length))
+            for axis, length in zip("tzyx", VALUES.shape, strict=True)
+        )
 
 
 @pytest.mark.parametrize(
@@ -161,14 +173,18 @@ def test_raw_layout_from_the_user(tmp_path: Path, suffix: str) -> None:
     path.write_bytes(VALUES.astype(">f8").tobytes())
     np.testing.assert_array_equal(frames(path, raw=RawLayout(SHAPE, "float64", "big")), VALUES)
     path.write_bytes(VALUES[:, 0].tobytes())
-    np.testing.assert_array_equal(frames(path, raw=RawLayout({"t": 4, "y": 5, "x": 6}, "f4")), VALUES[:, :1])
+    np.testing.assert_array_equal(
+        frames(path, raw=RawLayout({"t": 4, "y": 5, "x": 6}, "f4")), VALUES[:, :1]
+    )
 
 
 def test_the_user_overrides_the_name(tmp_path: Path) -> None:
     path = tmp_path / "a_6x5x3x4_uint32_le.raw"
     path.write_bytes(VALUES.astype(">f4").tobytes())
     np.testing.assert_array_equal(frames(path, raw=RawLayout(dtype="f4", endian="big")), VALUES)
-    np.testing.assert_array_equal(frames(path, raw=RawLayout())[0], VALUES.astype(">f4").view("<u4")[0])
+    np.testing.assert_array_equal(
+        frames(path, raw=RawLayout())[0], VALUES.astype(">f4").view("<u4")[0]
+    )
 
 
 def test_raw_in_another_order(tmp_path: Path) -> None:
@@ -189,17 +205,27 @@ def test_raw_bytes_that_look_like_another_format(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "layout", "words"),
     [
-        ("a.raw", None, r"shape and type of the raw values is not known; name the file name_XxYxZ.*--shape"),
+        (
+            "a.raw",
+            None,
+            r"shape and type of the raw values is not known; name the file name_XxYxZ.*--shape",
+        ),
         ("a.bin", RawLayout(shape=SHAPE), "the type of the raw values"),
         ("a.dat", RawLayout(dtype="f4"), "the shape of the raw values"),
         ("a_6x5x3x4_float33.raw", None, "'float33' is not a number type; allowed: uint8,"),
-        ("a_6x5x3x4_f8.raw", None, r"has 1440 bytes; 4x3x5x6 \(t,z,y,x\) of float64 need exactly 2880"),
+        (
+            "a_6x5x3x4_f8.raw",
+            None,
+            r"has 1440 bytes; 4x3x5x6 \(t,z,y,x\) of float64 need exactly 2880",
+        ),
         ("a_6x5x3_f4.raw", None, "need exactly 360; with t=4 the size would fit"),
         ("a_6x5x3x5_f4.raw", None, "has 1440 bytes.*exactly 1800"),
         ("a_6x5x0x4_f4.raw", None, "z=0; a length is at least 1"),
     ],
 )
-def test_raw_that_does_not_fit_is_refused(tmp_path: Path, name: str, layout: RawLayout | None, words: str) -> None:
+def test_raw_that_does_not_fit_is_refused(
+    tmp_path: Path, name: str, layout: RawLayout | None, words: str
+) -> None:
     (tmp_path / name).write_bytes(VALUES.tobytes())
     with pytest.raises(InputError, match=words):
         open_series(tmp_path / name, raw=layout)
@@ -226,7 +252,9 @@ def test_parse_shape() -> None:
     assert list(parse_shape("t=1,x=2,y=3")) == ["t", "x", "y"]
 
 
-@pytest.mark.parametrize("text", ["", "64,64,32", "x=64,x=3", "w=1", "x=-1", "x=1.5", "x=\u00b2", "x", "x=1,,y=2"])
+@pytest.mark.parametrize(
+    "text", ["", "64,64,32", "x=64,x=3", "w=1", "x=-1", "x=1.5", "x=\u00b2", "x", "x=1,,y=2"]
+)
 def test_parse_shape_refuses(text: str) -> None:
     with pytest.raises(InputError, match=r"write each axis once, such as x=64,y=64,z=32,t=10"):
         parse_shape(text)
@@ -235,7 +263,12 @@ def test_parse_shape_refuses(text: str) -> None:
 @pytest.mark.parametrize("kind", ["npy", "raw"])
 def test_a_file_that_changes_is_refused(tmp_path: Path, kind: str) -> None:
     path = tmp_path / f"a_6x5x3x4_f4.{kind}"
-    for change in (lambda: os.truncate(path, 500), path.unlink, lambda: os.truncate(path, 5000), lambda: os.utime(path, ns=(1, 1))):
+    for change in (
+        lambda: os.truncate(path, 500),
+        path.unlink,
+        lambda: os.truncate(path, 5000),
+        lambda: os.utime(path, ns=(1, 1)),
+    ):
         if kind == "npy":
             np.save(path, VALUES)
         else:
@@ -251,11 +284,15 @@ def test_a_file_cut_during_a_read_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a"
     path.write_bytes(VALUES.tobytes()[:-1])
     with pytest.raises(InputError, match="ends after 1439 bytes, 1440 are needed"):
-        FlatArray(path, VALUES.shape, VALUES.dtype).read((slice(3, 4), slice(0, 3), slice(0, 5), slice(0, 6)))
+        FlatArray(path, VALUES.shape, VALUES.dtype).read(
+            (slice(3, 4), slice(0, 3), slice(0, 5), slice(0, 6))
+        )
 
 
 @pytest.mark.parametrize("order", ["t,z,y,x", "z,t,y,x"])
-def test_one_frame_is_read_at_a_time(tmp_path: Path, order: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_frame_is_read_at_a_time(
+    tmp_path: Path, order: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("fhash_formats.readers.lattice.SLAB_BYTES", 1)
     values = np.zeros((40, 40, 64, 64), np.float32)
     np.save(tmp_path / "a.npy", values)
@@ -280,7 +317,9 @@ def test_one_frame_is_read_at_a_time(tmp_path: Path, order: str, monkeypatch: py
     assert peak < 3 * values[0].nbytes
 
 
-def test_a_short_run_among_many_others_is_read_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_run_among_many_others_is_read_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     values = np.random.default_rng(0).integers(0, 9, (2, 5000, 4, 4), np.uint8)  # (z, t, y, x)
     monkeypatch.setattr(flat, "BLOCK_BYTES", 1000)
     np.save(tmp_path / "a.npy", values)

@@ -39,10 +39,18 @@ def assert_frames(path: Path, expected: np.ndarray, **options: Any) -> None:
 
 @pytest.mark.parametrize("dtype", ["f4", ">f4", "f8", ">f8", "f2", "u1", ">u2", "i4", ">i8", "u8"])
 @pytest.mark.parametrize("chunks", [None, (1, 3, 5, 6), (2, 2, 3, 4), (4, 3, 5, 6)])
-def test_every_frame_of_every_type_and_chunking(tmp_path: Path, dtype: str, chunks: tuple[int, ...] | None) -> None:
+def test_every_frame_of_every_type_and_chunking(
+    tmp_path: Path, dtype: str, chunks: tuple[int, ...] | None
+) -> None:
     values = (VALUES * 50 + 100).astype(dtype)
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("v", data=values, chunks=chunks, compression="gzip" if chunks else None, shuffle=bool(chunks))
+        file.create_dataset(
+            "v",
+            data=values,
+            chunks=chunks,
+            compression="gzip" if chunks else None,
+            shuffle=bool(chunks),
+        )
     assert_frames(tmp_path / "a.h5", values)
 
 
@@ -56,14 +64,22 @@ def test_any_order_of_axes(tmp_path: Path, order: tuple[str, ...], chunked: bool
 
 
 @pytest.mark.parametrize(
-    ("axes", "shape"), [("t,y,x", (4, 1, 5, 6)), ("x,y,t", (6, 1, 5, 4)), ("z,y,x", (1, 4, 5, 6)), ("t,z,x", (4, 5, 1, 6))]
+    ("axes", "shape"),
+    [
+        ("t,y,x", (4, 1, 5, 6)),
+        ("x,y,t", (6, 1, 5, 4)),
+        ("z,y,x", (1, 4, 5, 6)),
+        ("t,z,x", (4, 5, 1, 6)),
+    ],
 )
 def test_axes_left_out_have_length_1(tmp_path: Path, axes: str, shape: tuple[int, ...]) -> None:
     path = write(tmp_path / "a.h5", v=VALUES[:, 0])
     with open_series(path, axes=axes) as series:
         assert series.shape == shape
         letters = [axis for axis in "tzyx" if axis in axes]
-        expected = VALUES[:, 0].transpose([axes.split(",").index(axis) for axis in letters]).reshape(shape)
+        expected = (
+            VALUES[:, 0].transpose([axes.split(",").index(axis) for axis in letters]).reshape(shape)
+        )
         np.testing.assert_array_equal(np.stack(list(series.frames())), expected)
 
 
@@ -86,7 +102,13 @@ def test_attributes_and_units(tmp_path: Path) -> None:
         dataset.attrs["none"] = h5py.Empty("f4")
     with open_series(tmp_path / "a.h5") as series:
         assert (series.name, series.units) == ("speed", "m/s")
-        assert series.attributes == {"units": "m/s", "level": 0.5, "odd": "NaN", "sizes": [0, 1, 2], "note": "caf\u00e9"}
+        assert series.attributes == {
+            "units": "m/s",
+            "level": 0.5,
+            "odd": "NaN",
+            "sizes": [0, 1, 2],
+            "note": "caf\u00e9",
+        }
 
 
 def test_coordinates_from_dimension_scales(tmp_path: Path) -> None:
@@ -108,13 +130,21 @@ def test_coordinates_from_dimension_scales(tmp_path: Path) -> None:
 def test_coordinates_beside_the_dataset_then_in_the_root(tmp_path: Path) -> None:
     times = np.array([347921.1, 347921.2, 347921.3, 347999.0])
     path = write(
-        tmp_path / "a.h5", run__v=VALUES, time=times, run__x1v=np.arange(6.0) * 2, x2v=np.zeros(9), lev=np.arange(3), x=np.arange(5)
+        tmp_path / "a.h5",
+        run__v=VALUES,
+        time=times,
+        run__x1v=np.arange(6.0) * 2,
+        x2v=np.zeros(9),
+        lev=np.arange(3),
+        x=np.arange(5),
     )
     with open_series(path) as series:
         np.testing.assert_array_equal(series.coords["t"].values, times)
         assert series.coords["x"].name == "x1v"
         np.testing.assert_array_equal(series.coords["z"].values, [0, 1, 2])
-        np.testing.assert_array_equal(series.coords["y"].values, np.arange(5))  # x2v has another length
+        np.testing.assert_array_equal(
+            series.coords["y"].values, np.arange(5)
+        )  # x2v has another length
         assert series.coords["y"].name == "y"
         assert all(series.coords[axis].values.dtype == np.float64 for axis in "tzyx")
 
@@ -140,11 +170,16 @@ def test_integers_that_floats_cannot_tell_apart_are_refused_as_coordinates(tmp_p
 
 def test_several_datasets_need_a_choice(tmp_path: Path) -> None:
     path = write(tmp_path / "a.h5", density=VALUES, gas__pressure=VALUES * 2, time=np.arange(4.0))
-    with pytest.raises(InputError, match=r"holds 2 variables: density \(4, 3, 5, 6\), gas/pressure \(4, 3, 5, 6\); choose one with --var"):
+    with pytest.raises(
+        InputError,
+        match=r"holds 2 variables: density \(4, 3, 5, 6\), gas/pressure \(4, 3, 5, 6\); choose one with --var",
+    ):
         open_series(path)
     for name in ("gas/pressure", "/gas/pressure", "pressure"):
         assert_frames(path, VALUES * 2, var=name)
-    with pytest.raises(InputError, match=r"no variable 'presure'; it holds gas/pressure .*, density"):
+    with pytest.raises(
+        InputError, match=r"no variable 'presure'; it holds gas/pressure .*, density"
+    ):
         open_series(path, var="presure")
     path = write(tmp_path / "b.h5", a__v=VALUES, b__v=VALUES)
     with pytest.raises(InputError, match="means 2 variables"):
@@ -214,7 +249,10 @@ def test_fill_values_and_packing_mean_nothing_in_plain_hdf5(tmp_path: Path) -> N
         file["v"] = VALUES
         file["v"].attrs["_FillValue"] = VALUES[0, 0, 0, 0]
         file["v"].attrs["scale_factor"] = 2.0
-    with pytest.warns(UserWarning, match="v has the attributes scale_factor, _FillValue; its values are read as they stand"):
+    with pytest.warns(
+        UserWarning,
+        match="v has the attributes scale_factor, _FillValue; its values are read as they stand",
+    ):
         assert_frames(tmp_path / "a.h5", VALUES)
 
 
@@ -274,10 +312,14 @@ def test_a_missing_filter_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(h5py.h5z, "filter_avail", lambda code: False)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "hdf5plugin", None)
-        with pytest.raises(MissingDependencyError, match=r"filter deflate \(id 1\).*fhash\[formats\]"):
+        with pytest.raises(
+            MissingDependencyError, match=r"filter deflate \(id 1\).*fhash\[formats\]"
+        ):
             open_series(tmp_path / "a.h5")
     monkeypatch.setitem(sys.modules, "hdf5plugin", sys)
-    with pytest.raises(InputError, match=r"deflate \(id 1\), which neither h5py nor hdf5plugin has"):
+    with pytest.raises(
+        InputError, match=r"deflate \(id 1\), which neither h5py nor hdf5plugin has"
+    ):
         open_series(tmp_path / "a.h5")
 
 
@@ -316,12 +358,16 @@ def test_a_source_of_a_virtual_dataset_that_changes_is_refused(tmp_path: Path) -
                 look()
 
 
-def test_a_chunk_of_many_steps_is_decompressed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_chunk_of_many_steps_is_decompressed_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("v", data=VALUES, chunks=(3, 3, 5, 6), compression="gzip")
     asked = []
     original = h5py.Dataset.__getitem__
-    monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda self, args: asked.append(args) or original(self, args))
+    monkeypatch.setattr(
+        h5py.Dataset, "__getitem__", lambda self, args: asked.append(args) or original(self, args)
+    )
     with open_series(tmp_path / "a.h5") as series:
         asked.clear()
         frames = list(series.frames())
@@ -329,7 +375,9 @@ def test_a_chunk_of_many_steps_is_decompressed_once(tmp_path: Path, monkeypatch:
     np.testing.assert_array_equal(np.stack(frames), VALUES)
 
 
-def test_what_is_kept_of_a_chunk_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_kept_of_a_chunk_is_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("fhash_formats.readers.lattice.SLAB_BYTES", 2 * VALUES[0].nbytes + 1)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("v", data=VALUES, chunks=(4, 3, 5, 6))
@@ -344,9 +392,16 @@ def test_what_is_kept_of_a_chunk_is_bounded(tmp_path: Path, monkeypatch: pytest.
 def test_packing_in_plain_hdf5_is_warned_of(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["v"] = np.arange(24, dtype="i2").reshape(2, 3, 4)
-        file["v"].attrs.update({"scale_factor": 0.5, "missing_value": np.int16(3), "add_offset": 0.0})
-    with pytest.warns(UserWarning, match=r"^v has the attributes scale_factor, missing_value; .* a file named \.nc is unpacked$"):
+        file["v"].attrs.update(
+            {"scale_factor": 0.5, "missing_value": np.int16(3), "add_offset": 0.0}
+        )
+    with pytest.warns(
+        UserWarning,
+        match=r"^v has the attributes scale_factor, missing_value; .* a file named \.nc is unpacked$",
+    ):
         open_series(tmp_path / "a.h5").close()
     with h5py.File(tmp_path / "a.h5", "a") as file:
-        file["v"].attrs.update({"scale_factor": 1, "missing_value": np.nan, "_FillValue": np.array([np.nan])})
+        file["v"].attrs.update(
+            {"scale_factor": 1, "missing_value": np.nan, "_FillValue": np.array([np.nan])}
+        )
     open_series(tmp_path / "a.h5").close()

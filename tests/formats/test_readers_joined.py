@@ -34,7 +34,16 @@ def h5(path: Path, values: np.ndarray, **beside: Any) -> None:
 
 def test_natural_order() -> None:
     names = ["f_10", "f_9", "f_09b", "f_1", "g_0", "f_", "f_1_2", "f_1_10"]
-    assert sorted(names, key=natural_order) == ["f_", "f_1", "f_1_2", "f_1_10", "f_9", "f_09b", "f_10", "g_0"]
+    assert sorted(names, key=natural_order) == [
+        "f_",
+        "f_1",
+        "f_1_2",
+        "f_1_10",
+        "f_9",
+        "f_09b",
+        "f_10",
+        "g_0",
+    ]
 
 
 @pytest.mark.parametrize("kind", ["npy", "raw", "layout", "h5"])
@@ -58,7 +67,12 @@ def test_one_step_per_file_in_the_order_of_numbers(tmp_path: Path, kind: str) ->
 
 
 def test_several_steps_per_file_and_character_classes(tmp_path: Path) -> None:
-    for name, part in (("a1", VALUES[:5]), ("a2", VALUES[5:6]), ("a10", VALUES[6:]), ("b1", VALUES)):
+    for name, part in (
+        ("a1", VALUES[:5]),
+        ("a2", VALUES[5:6]),
+        ("a10", VALUES[6:]),
+        ("b1", VALUES),
+    ):
         np.save(tmp_path / f"{name}.npy", part)
     np.testing.assert_array_equal(stacked(tmp_path / "a*.npy"), VALUES)
     np.testing.assert_array_equal(stacked(tmp_path / "[a]?.npy"), VALUES[:6])
@@ -71,15 +85,24 @@ def test_a_name_with_brackets_is_a_file(tmp_path: Path) -> None:
 
 def test_times_of_the_files(tmp_path: Path) -> None:
     for step in range(3):
-        h5(tmp_path / f"f{step}.h5", VALUES[2 * step : 2 * step + 2], time=[347921.0 + step, 347921.5 + step], x=np.arange(6.0) * 2)
+        h5(
+            tmp_path / f"f{step}.h5",
+            VALUES[2 * step : 2 * step + 2],
+            time=[347921.0 + step, 347921.5 + step],
+            x=np.arange(6.0) * 2,
+        )
     with open_series(tmp_path / "f*.h5") as series:
         np.testing.assert_array_equal(series.coords["t"].values, 347921 + np.arange(6) / 2)
         np.testing.assert_array_equal(series.coords["x"].values, np.arange(6) * 2)
     h5(tmp_path / "f3.h5", VALUES[:2], time=[0.0, 1.0], x=np.arange(6.0) * 2)
-    with pytest.raises(InputError, match=r"times do not increase.*0 in .*f3.h5 after 347924 in .*f2.h5"):
+    with pytest.raises(
+        InputError, match=r"times do not increase.*0 in .*f3.h5 after 347924 in .*f2.h5"
+    ):
         open_series(tmp_path / "f*.h5")
     h5(tmp_path / "f3.h5", VALUES[:2], x=np.arange(6.0) * 2)
-    with pytest.raises(InputError, match=r"the time in .*f3.h5 has not the units of the time in .*f0.h5"):
+    with pytest.raises(
+        InputError, match=r"the time in .*f3.h5 has not the units of the time in .*f0.h5"
+    ):
         open_series(tmp_path / "f*.h5")
     h5(tmp_path / "f3.h5", VALUES[:2], time=[400000.0, 400001.0], x=np.arange(6.0) * 3)
     with pytest.raises(InputError, match=r"f3.h5 has other coordinates along x than .*f0.h5"):

@@ -24,7 +24,9 @@ def save(path: Path, values: np.ndarray) -> Path:
     elif path.suffix == ".zarr":
         zarr.create_array(path, shape=values.shape, dtype=values.dtype)[...] = values
     else:
-        path = path.with_name(f"m_{'x'.join(str(length) for length in reversed(values.shape))}_{values.dtype.name}.raw")
+        path = path.with_name(
+            f"m_{'x'.join(str(length) for length in reversed(values.shape))}_{values.dtype.name}.raw"
+        )
         path.write_bytes(values.tobytes())
     return path
 

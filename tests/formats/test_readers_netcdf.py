@@ -36,7 +36,18 @@ def frames(path: Path, **options: Any) -> np.ndarray:
 def test_frames_coordinates_and_attributes(tmp_path: Path, suffix: str) -> None:
     times = np.array([347921.16666667, 347921.33333333, 347921.5, 347922.0])
     dataset = xr.Dataset(
-        {"theta": (DIMS, VALUES, {"units": "K", "long_name": "temperature", "valid_range": [0.0, 0.1], "level": np.int16(3)})},
+        {
+            "theta": (
+                DIMS,
+                VALUES,
+                {
+                    "units": "K",
+                    "long_name": "temperature",
+                    "valid_range": [0.0, 0.1],
+                    "level": np.int16(3),
+                },
+            )
+        },
         coords={
             "time": ("time", times, {"units": "hours since 1970-01-01", "calendar": "gregorian"}),
             "lat": ("lat", np.linspace(-1, 1, 5).astype("f4"), {"units": "degrees_north"}),
@@ -45,10 +56,18 @@ def test_frames_coordinates_and_attributes(tmp_path: Path, suffix: str) -> None:
     )
     path = save(tmp_path / f"a{suffix}", dataset)
     with open_series(path) as series:
-        assert (series.name, series.units, series.shape, series.dtype) == ("theta", "K", (4, 3, 5, 6), np.float32)
+        assert (series.name, series.units, series.shape, series.dtype) == (
+            "theta",
+            "K",
+            (4, 3, 5, 6),
+            np.float32,
+        )
         assert series.attributes == {"units": "K", "long_name": "temperature", "level": 3}
         np.testing.assert_array_equal(series.coords["t"].values, times)
-        assert series.coords["t"].attributes == {"units": "hours since 1970-01-01", "calendar": "gregorian"}
+        assert series.coords["t"].attributes == {
+            "units": "hours since 1970-01-01",
+            "calendar": "gregorian",
+        }
         np.testing.assert_array_equal(series.coords["y"].values, np.linspace(-1, 1, 5).astype("f4"))
         np.testing.assert_array_equal(series.coords["x"].values, np.arange(6))
     np.testing.assert_array_equal(frames(path), VALUES)  # valid_range hides nothing
@@ -65,7 +84,9 @@ def test_times_stay_numbers_in_any_calendar(tmp_path: Path, calendar: str) -> No
 
 
 def test_dates_become_the_numbers_that_are_stored(tmp_path: Path) -> None:
-    dates = np.array(["2020-01-01T00:00", "2020-01-01T06:00", "2020-01-02T00:00", "2020-02-01T00:00"], "M8[ns]")
+    dates = np.array(
+        ["2020-01-01T00:00", "2020-01-01T06:00", "2020-01-02T00:00", "2020-02-01T00:00"], "M8[ns]"
+    )
     path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}, coords={"time": dates}))
     with open_series(path) as series:
         np.testing.assert_array_equal(series.coords["t"].values, [0, 6, 24, 31 * 24])
@@ -90,11 +111,19 @@ def stored_as(path: Path, raw: np.ndarray, attributes: dict[str, object]) -> Pat
 
 
 @pytest.mark.parametrize(("stored", "expected"), [("i2", "f8"), ("u1", "f8"), ("i4", "f8")])
-def test_packing_is_undone_and_fill_values_are_nan(tmp_path: Path, stored: str, expected: str) -> None:
+def test_packing_is_undone_and_fill_values_are_nan(
+    tmp_path: Path, stored: str, expected: str
+) -> None:
     fill = 200 if stored == "u1" else -99
     raw = np.random.default_rng(1).integers(0, 100, VALUES.shape).astype(stored)
     raw[1, 2, 3, 4] = fill
-    got = frames(stored_as(tmp_path / "a.nc", raw, {"_FillValue": raw.dtype.type(fill), "scale_factor": 0.25, "add_offset": 10.0}))
+    got = frames(
+        stored_as(
+            tmp_path / "a.nc",
+            raw,
+            {"_FillValue": raw.dtype.type(fill), "scale_factor": 0.25, "add_offset": 10.0},
+        )
+    )
     assert got.dtype == expected
     np.testing.assert_array_equal(got, np.where(raw == fill, np.nan, raw * 0.25 + 10.0))
 
@@ -115,7 +144,9 @@ def test_neighbours_of_a_fill_value_that_float64_does_not_tell_from_it_are_value
     raw[0, 0, 0, :3] = np.array([fill, fill + 1, 7], stored)
     got = frames(stored_as(tmp_path / "a.nc", raw, {"_FillValue": raw.dtype.type(fill), **packing}))
     numbers = raw.view("u8") if "_Unsigned" in packing else raw
-    expected = numbers.astype(np.float64) * packing.get("scale_factor", 1) + packing.get("add_offset", 0)
+    expected = numbers.astype(np.float64) * packing.get("scale_factor", 1) + packing.get(
+        "add_offset", 0
+    )
     expected[0, 0, 0, 0] = np.nan
     np.testing.assert_array_equal(got, expected)
 
@@ -123,7 +154,9 @@ def test_neighbours_of_a_fill_value_that_float64_does_not_tell_from_it_are_value
 def test_fill_values_of_floats(tmp_path: Path) -> None:
     values = VALUES.copy()
     values[0, 1, 2, 3] = np.nan
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, values)}), encoding={"v": {"_FillValue": -1e30}})
+    path = save(
+        tmp_path / "a.nc", xr.Dataset({"v": (DIMS, values)}), encoding={"v": {"_FillValue": -1e30}}
+    )
     got = frames(path)
     assert got.dtype == np.float32
     np.testing.assert_array_equal(got, values)
@@ -139,7 +172,12 @@ def test_plain_integers_stay_integers(tmp_path: Path) -> None:
 def roles(path: Path, sizes: str, **coords: Any) -> str:
     """The axes found for a variable with the dimensions a, b, c, d of different lengths, as letters in file order."""
     values = VALUES[tuple(slice(None) if at < len(sizes) else 0 for at in range(4))]
-    save(path, xr.Dataset({"v": (tuple(sizes), values)}, coords={name: coord for name, coord in coords.items()}))
+    save(
+        path,
+        xr.Dataset(
+            {"v": (tuple(sizes), values)}, coords={name: coord for name, coord in coords.items()}
+        ),
+    )
     with open_series(path) as series:
         return "".join("tzyx"[series.shape.index(length)] for length in values.shape)
 
@@ -152,7 +190,15 @@ def along(dimension: str, **attributes: str) -> tuple[str, np.ndarray, dict[str,
     ("coords", "expected"),
     [
         ({}, "tzyx"),
-        ({"a": along("a", axis="X"), "b": along("b", axis="Y"), "c": along("c", axis="Z"), "d": along("d", axis="T")}, "xyzt"),
+        (
+            {
+                "a": along("a", axis="X"),
+                "b": along("b", axis="Y"),
+                "c": along("c", axis="Z"),
+                "d": along("d", axis="T"),
+            },
+            "xyzt",
+        ),
         (
             {
                 "a": along("a", standard_name="projection_x_coordinate"),
@@ -162,13 +208,32 @@ def along(dimension: str, **attributes: str) -> tuple[str, np.ndarray, dict[str,
             },
             "xyzt",
         ),
-        ({"a": along("a", units="degrees_east"), "b": along("b", units="hours since 2000-01-01"), "c": along("c", units="hPa")}, "xtzy"),
+        (
+            {
+                "a": along("a", units="degrees_east"),
+                "b": along("b", units="hours since 2000-01-01"),
+                "c": along("c", units="hPa"),
+            },
+            "xtzy",
+        ),
         ({"a": along("a", positive="down"), "b": along("b", axis="T")}, None),
-        ({"a": along("a", positive="down"), "b": along("b", axis="T"), "c": along("c", axis="Y")}, "ztyx"),
-        ({"when": along("d", axis="T"), "c": along("c", axis="Z"), "b": along("b", axis="Y")}, "xyzt"),
+        (
+            {
+                "a": along("a", positive="down"),
+                "b": along("b", axis="T"),
+                "c": along("c", axis="Y"),
+            },
+            "ztyx",
+        ),
+        (
+            {"when": along("d", axis="T"), "c": along("c", axis="Z"), "b": along("b", axis="Y")},
+            "xyzt",
+        ),
     ],
 )
-def test_axes_by_cf_attributes(tmp_path: Path, coords: dict[str, Any], expected: str | None) -> None:
+def test_axes_by_cf_attributes(
+    tmp_path: Path, coords: dict[str, Any], expected: str | None
+) -> None:
     if expected is None:
         with pytest.raises(InputError, match=r"not clear.*--axes"):
             roles(tmp_path / "a.nc", "abcd", **coords)
@@ -186,7 +251,9 @@ def test_axes_by_cf_attributes(tmp_path: Path, coords: dict[str, Any], expected:
         (("member", "south_north", "west_east"), (1, 4, 3, 5)),
     ],
 )
-def test_three_dimensions_by_name(tmp_path: Path, dims: tuple[str, ...], shape: tuple[int, ...]) -> None:
+def test_three_dimensions_by_name(
+    tmp_path: Path, dims: tuple[str, ...], shape: tuple[int, ...]
+) -> None:
     path = save(tmp_path / "a.nc", xr.Dataset({"v": (dims, VALUES[:, :, :, 0])}))
     with open_series(path) as series:
         assert series.shape == shape
@@ -194,7 +261,10 @@ def test_three_dimensions_by_name(tmp_path: Path, dims: tuple[str, ...], shape: 
 
 def test_two_dimensions_of_one_meaning_are_refused(tmp_path: Path) -> None:
     path = save(tmp_path / "a.nc", xr.Dataset({"v": (("time", "lev", "height", "lon"), VALUES)}))
-    with pytest.raises(InputError, match=r"two dimensions of \(time=4, lev=3, height=5, lon=6\) mean the same axis.*--axes"):
+    with pytest.raises(
+        InputError,
+        match=r"two dimensions of \(time=4, lev=3, height=5, lon=6\) mean the same axis.*--axes",
+    ):
         open_series(path)
     np.testing.assert_array_equal(frames(path, axes="t,z,y,x"), VALUES)
 
@@ -241,7 +311,9 @@ def test_several_variables_need_a_choice(tmp_path: Path) -> None:
 
 
 def test_groups(tmp_path: Path) -> None:
-    xr.Dataset(coords={"time": ("time", np.arange(4.0) + 7)}).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    xr.Dataset(coords={"time": ("time", np.arange(4.0) + 7)}).to_netcdf(
+        tmp_path / "a.nc", engine="h5netcdf"
+    )
     inner = xr.Dataset({"v": (("time", "lev", "lat", "lon"), VALUES)})
     inner.to_netcdf(tmp_path / "a.nc", engine="h5netcdf", group="model/run", mode="a")
     np.testing.assert_array_equal(frames(tmp_path / "a.nc"), VALUES)
@@ -274,7 +346,9 @@ def test_boolean_variables_are_refused(tmp_path: Path) -> None:
 
 
 def test_classic_netcdf3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = xr.Dataset({"v": (DIMS, VALUES)}, coords={"time": ("time", np.arange(4) / 3 + 347921)})
+    dataset = xr.Dataset(
+        {"v": (DIMS, VALUES)}, coords={"time": ("time", np.arange(4) / 3 + 347921)}
+    )
     dataset.to_netcdf(tmp_path / "a.nc", engine="scipy", format="NETCDF3_64BIT")
     with open_series(tmp_path / "a.nc") as series:
         assert series.dtype.isnative
@@ -297,7 +371,9 @@ def test_cdf5_says_how_to_convert(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("library", ["xarray", "h5netcdf"])
-def test_missing_libraries_name_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str) -> None:
+def test_missing_libraries_name_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
+) -> None:
     path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(MissingDependencyError, match=r"fhash\[formats\]"):
@@ -322,8 +398,12 @@ def test_a_file_that_changes_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_missing_filter_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}), encoding={"v": {"zlib": True}})
+    path = save(
+        tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}), encoding={"v": {"zlib": True}}
+    )
     monkeypatch.setattr(h5py.h5z, "filter_avail", lambda code: False)
     monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    with pytest.raises(MissingDependencyError, match=r"v is compressed with the HDF5 filter .*fhash\[formats\]"):
+    with pytest.raises(
+        MissingDependencyError, match=r"v is compressed with the HDF5 filter .*fhash\[formats\]"
+    ):
         open_series(path)

@@ -38,8 +38,12 @@ def test_formats_are_told_by_their_first_bytes(tmp_path: Path) -> None:
             np.testing.assert_array_equal(series.read(3), VALUES[3])
 
 
-@pytest.mark.parametrize(("name", "words"), [("a.h5", "HDF5"), ("a.nc", "NetCDF"), ("a.npy", r"\.npy"), ("a.zip", "ZIP")])
-def test_a_suffix_without_the_bytes_is_a_damaged_file(tmp_path: Path, name: str, words: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "words"), [("a.h5", "HDF5"), ("a.nc", "NetCDF"), ("a.npy", r"\.npy"), ("a.zip", "ZIP")]
+)
+def test_a_suffix_without_the_bytes_is_a_damaged_file(
+    tmp_path: Path, name: str, words: str
+) -> None:
     (tmp_path / name).write_bytes(b"nothing of the kind " * 100)
     with pytest.raises(InputError, match=f"cannot be read as (a )?{words}") as caught:
         open_series(tmp_path / name)
@@ -97,7 +101,16 @@ def test_a_raw_layout_is_for_files(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "steps", [slice(None), slice(2, 5), slice(None, None, 3), slice(None, None, -1), slice(-2, None), slice(5, 100), slice(6, 1, -2)]
+    "steps",
+    [
+        slice(None),
+        slice(2, 5),
+        slice(None, None, 3),
+        slice(None, None, -1),
+        slice(-2, None),
+        slice(5, 100),
+        slice(6, 1, -2),
+    ],
 )
 def test_steps_are_a_slice(path: Path, steps: slice) -> None:
     with open_series(path, steps=steps) as series:
@@ -105,7 +118,10 @@ def test_steps_are_a_slice(path: Path, steps: slice) -> None:
         np.testing.assert_array_equal(series.coords["t"].values, np.arange(7)[steps])
 
 
-@pytest.mark.parametrize(("steps", "words"), [(slice(0, 5, 0), "stride of 0"), (slice(3, 3), "empty"), (slice(10, 20), "empty")])
+@pytest.mark.parametrize(
+    ("steps", "words"),
+    [(slice(0, 5, 0), "stride of 0"), (slice(3, 3), "empty"), (slice(10, 20), "empty")],
+)
 def test_steps_that_select_nothing(path: Path, steps: slice, words: str) -> None:
     with pytest.raises(InputError, match=words):
         open_series(path, steps=steps)
@@ -142,7 +158,14 @@ def refusal(path: Path) -> str:
 def test_every_refusal_is_of_the_one_tree(tmp_path: Path) -> None:
     chance = np.random.default_rng(0)
     for size in (1, 7, 8, 30, 4096):
-        for head in (b"", b"\x89HDF\r\n\x1a\n", b"PK\x03\x04", b"\x93NUMPY", b"CDF\x01", b"CDF\x02"):
+        for head in (
+            b"",
+            b"\x89HDF\r\n\x1a\n",
+            b"PK\x03\x04",
+            b"\x93NUMPY",
+            b"CDF\x01",
+            b"CDF\x02",
+        ):
             for name in ("a", "a.nc", "a.zip", "a_2x2x2_u1.raw"):
                 (tmp_path / name).write_bytes((head + chance.bytes(size))[: max(size, len(head))])
                 message = refusal(tmp_path / name)
@@ -155,10 +178,13 @@ def test_the_public_names() -> None:
 
 
 def test_an_import_is_cheap() -> None:
-    script = (
-        "import fhash_formats.readers, sys; print([name for name in ('h5py', 'zarr', 'xarray', 'torch', 'scipy') if name in sys.modules])"
+    script = "import fhash_formats.readers, sys; print([name for name in ('h5py', 'zarr', 'xarray', 'torch', 'scipy') if name in sys.modules])"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", script], check=True, capture_output=True, text=True
+        ).stdout.strip()
+        == "[]"
     )
-    assert subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout.strip() == "[]"
 
 
 def test_axes_in_any_case(path: Path) -> None:
@@ -167,16 +193,26 @@ def test_axes_in_any_case(path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".h5", ".nc", ".zip"])
-def test_a_raw_layout_is_not_for_files_of_another_format(path: Path, tmp_path: Path, suffix: str) -> None:
+def test_a_raw_layout_is_not_for_files_of_another_format(
+    path: Path, tmp_path: Path, suffix: str
+) -> None:
     named = tmp_path / f"named{suffix}"
     named.write_bytes(path.read_bytes())
-    for layout in (RawLayout(dtype="f4"), RawLayout({"x": 1, "y": 1, "z": 1}), RawLayout(endian="big")):
-        with pytest.raises(InputError, match="--shape, --dtype and --endian are for raw files only"):
+    for layout in (
+        RawLayout(dtype="f4"),
+        RawLayout({"x": 1, "y": 1, "z": 1}),
+        RawLayout(endian="big"),
+    ):
+        with pytest.raises(
+            InputError, match="--shape, --dtype and --endian are for raw files only"
+        ):
             open_series(named, raw=layout)
 
 
 @pytest.mark.parametrize("place", ["exists", "is_dir", "is_file"])
-def test_what_may_not_be_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str) -> None:
+def test_what_may_not_be_looked_into(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
     import zarr
 
     zarr.create_array(tmp_path / "a.zarr", shape=(2, 2, 2), dtype="f4")
@@ -189,10 +225,16 @@ def test_what_may_not_be_looked_into(tmp_path: Path, monkeypatch: pytest.MonkeyP
         open_series(tmp_path / "a.zarr")
 
 
-@pytest.mark.parametrize("name", ["a\udcff.npy", "a\udcff_6x5x3_float32.raw", "a\udcff_*.npy", "a\udcff.zarr"])
+@pytest.mark.parametrize(
+    "name", ["a\udcff.npy", "a\udcff_6x5x3_float32.raw", "a\udcff_*.npy", "a\udcff.zarr"]
+)
 def test_names_are_text_whatever_the_file_is_called(tmp_path: Path, name: str) -> None:
     frame = np.zeros((3, 5, 6), np.float32)
-    for part in [tmp_path / name.replace("*", str(step)) for step in range(2)] if "*" in name else [tmp_path / name]:
+    for part in (
+        [tmp_path / name.replace("*", str(step)) for step in range(2)]
+        if "*" in name
+        else [tmp_path / name]
+    ):
         if name.endswith(".raw"):
             part.write_bytes(frame.tobytes())
         elif name.endswith(".npy"):

@@ -21,13 +21,17 @@ VALUES = np.random.default_rng(0).normal(size=(4, 3, 5, 6)).astype(np.float32)
 DIMS = ["time", "z", "y", "x"]
 
 
-def create(path: Path, values: np.ndarray, *, name: str | None = None, zarr_format: int = 3, **options: Any) -> Any:
+def create(
+    path: Path, values: np.ndarray, *, name: str | None = None, zarr_format: int = 3, **options: Any
+) -> Any:
     """An array at a path (or in the group there, if named)."""
     where: Any = zarr.open_group(path, mode="a", zarr_format=zarr_format) if name else path
     if name:
         array = where.create_array(name, shape=values.shape, dtype=values.dtype, **options)
     else:
-        array = zarr.create_array(where, shape=values.shape, dtype=values.dtype, zarr_format=zarr_format, **options)
+        array = zarr.create_array(
+            where, shape=values.shape, dtype=values.dtype, zarr_format=zarr_format, **options
+        )
     array[...] = values
     return array
 
@@ -67,7 +71,9 @@ def test_shards(tmp_path: Path) -> None:
 @pytest.mark.parametrize("zarr_format", [2, 3])
 def test_a_zipped_group(tmp_path: Path, inside: str, zarr_format: int) -> None:
     create(tmp_path / "a.zarr", VALUES, name="v", zarr_format=zarr_format)
-    np.testing.assert_array_equal(frames(zipped(tmp_path / "a.zarr", tmp_path / "a.zarr.zip", inside=inside)), VALUES)
+    np.testing.assert_array_equal(
+        frames(zipped(tmp_path / "a.zarr", tmp_path / "a.zarr.zip", inside=inside)), VALUES
+    )
 
 
 def test_groups_and_choices(tmp_path: Path) -> None:
@@ -75,7 +81,9 @@ def test_groups_and_choices(tmp_path: Path) -> None:
     create(path, VALUES, name="gas/density")
     create(path, VALUES * 2, name="pressure")
     create(path, np.zeros((3, 4)), name="flat")
-    with pytest.raises(InputError, match=r"holds 2 variables: gas/density \(4, 3, 5, 6\), pressure .*--var"):
+    with pytest.raises(
+        InputError, match=r"holds 2 variables: gas/density \(4, 3, 5, 6\), pressure .*--var"
+    ):
         open_series(path)
     np.testing.assert_array_equal(frames(path, var="pressure"), VALUES * 2)
     np.testing.assert_array_equal(frames(path, var="density"), VALUES)
@@ -90,7 +98,11 @@ def test_groups_and_choices(tmp_path: Path) -> None:
 def test_dimension_names_give_axes_and_coordinates(tmp_path: Path, zarr_format: int) -> None:
     path = tmp_path / "a.zarr"
     stored = VALUES.transpose(3, 2, 1, 0)
-    named = {"dimension_names": DIMS[::-1]} if zarr_format == 3 else {"attributes": {"_ARRAY_DIMENSIONS": DIMS[::-1]}}
+    named = (
+        {"dimension_names": DIMS[::-1]}
+        if zarr_format == 3
+        else {"attributes": {"_ARRAY_DIMENSIONS": DIMS[::-1]}}
+    )
     create(path, stored, name="v", zarr_format=zarr_format, **named)
     times = np.array([2.0, 3.0, 30.0, 347921.1666])
     create(path, times, name="time", zarr_format=zarr_format, attributes={"units": "hours"})
@@ -109,7 +121,13 @@ def test_coordinates_by_cf_and_along_a_dimension_of_another_name(tmp_path: Path)
     path = tmp_path / "a.zarr"
     create(path, VALUES, name="v", dimension_names=["a", "b", "c", "d"])
     create(path, np.arange(6.0), name="d", dimension_names=["d"], attributes={"axis": "T"})
-    create(path, np.arange(4.0), name="a", dimension_names=["a"], attributes={"standard_name": "longitude"})
+    create(
+        path,
+        np.arange(4.0),
+        name="a",
+        dimension_names=["a"],
+        attributes={"standard_name": "longitude"},
+    )
     create(path, np.arange(3.0), name="b", dimension_names=["b"], attributes={"axis": "Y"})
     create(path, np.arange(5.0) * 100, name="height", dimension_names=["c"])
     with open_series(path) as series:
@@ -131,15 +149,29 @@ def test_conventional_coordinates_where_dimensions_have_no_names(tmp_path: Path)
 
 @pytest.mark.parametrize("unit", ["s", "ns"])
 def test_dates_are_counted_from_the_first(tmp_path: Path, unit: str) -> None:
-    dates = np.array(["2020-01-01T00:00:00", "2020-01-01T06:00:00", "2020-01-02T00:00:00", "2020-01-03T00:00:00"], f"M8[{unit}]")
+    dates = np.array(
+        [
+            "2020-01-01T00:00:00",
+            "2020-01-01T06:00:00",
+            "2020-01-02T00:00:00",
+            "2020-01-03T00:00:00",
+        ],
+        f"M8[{unit}]",
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the type has no specification yet
         create(tmp_path / "a.zarr", VALUES, name="v", dimension_names=DIMS)
         create(tmp_path / "a.zarr", dates, name="time", dimension_names=["time"])
     with open_series(tmp_path / "a.zarr") as series:
         ticks = 1 if unit == "s" else 10**9
-        np.testing.assert_array_equal(series.coords["t"].values, np.array([0, 6, 24, 48]) * 3600.0 * ticks)
-        assert series.coords["t"].attributes["units"].startswith("seconds since 2020" if unit == "s" else "nanoseconds since 2020")
+        np.testing.assert_array_equal(
+            series.coords["t"].values, np.array([0, 6, 24, 48]) * 3600.0 * ticks
+        )
+        assert (
+            series.coords["t"]
+            .attributes["units"]
+            .startswith("seconds since 2020" if unit == "s" else "nanoseconds since 2020")
+        )
 
 
 ENCODINGS: list[dict[str, Any]] = [
@@ -156,13 +188,17 @@ ENCODINGS: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("zarr_format", [2, 3])
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_what_xarray_writes_is_read_as_xarray_reads_it(tmp_path: Path, zarr_format: int, encoding: dict[str, Any]) -> None:
+def test_what_xarray_writes_is_read_as_xarray_reads_it(
+    tmp_path: Path, zarr_format: int, encoding: dict[str, Any]
+) -> None:
     import xarray as xr
 
     values = np.round(np.clip(VALUES, -1.9, 2), 2)
     values[1, 2, 3, 4] = np.nan
     dates = np.array(["2020-01-01T00", "2020-01-01T06", "2020-01-02T00", "2020-02-01T00"], "M8[ns]")
-    dataset = xr.Dataset({"q": (DIMS, values, {"units": "kg"})}, coords={"time": dates, "z": [1.5, 2.5, 7.0]})
+    dataset = xr.Dataset(
+        {"q": (DIMS, values, {"units": "kg"})}, coords={"time": dates, "z": [1.5, 2.5, 7.0]}
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of consolidated metadata in format 3
         dataset.to_zarr(tmp_path / "a.zarr", zarr_format=zarr_format, encoding={"q": encoding})
@@ -182,14 +218,26 @@ def test_zarrs_own_fill_value_hides_nothing_unless_xarray_wrote_it(tmp_path: Pat
     values = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
     create(tmp_path / "a.zarr", values, zarr_format=2, fill_value=0)
     np.testing.assert_array_equal(frames(tmp_path / "a.zarr")[0], values)
-    create(tmp_path / "b.zarr", values, zarr_format=3, fill_value=0, dimension_names=["z", "y", "x"])
+    create(
+        tmp_path / "b.zarr", values, zarr_format=3, fill_value=0, dimension_names=["z", "y", "x"]
+    )
     np.testing.assert_array_equal(frames(tmp_path / "b.zarr")[0], values)
-    create(tmp_path / "c.zarr", values, zarr_format=2, fill_value=0, attributes={"_ARRAY_DIMENSIONS": ["z", "y", "x"]})
-    np.testing.assert_array_equal(frames(tmp_path / "c.zarr")[0], np.where(values == 0, np.nan, values.astype("f4")))
+    create(
+        tmp_path / "c.zarr",
+        values,
+        zarr_format=2,
+        fill_value=0,
+        attributes={"_ARRAY_DIMENSIONS": ["z", "y", "x"]},
+    )
+    np.testing.assert_array_equal(
+        frames(tmp_path / "c.zarr")[0], np.where(values == 0, np.nan, values.astype("f4"))
+    )
 
 
 def test_chunks_never_written_are_the_fill_value(tmp_path: Path) -> None:
-    array = zarr.create_array(tmp_path / "a.zarr", shape=VALUES.shape, dtype="f4", chunks=(1, 3, 5, 6), fill_value=np.nan)
+    array = zarr.create_array(
+        tmp_path / "a.zarr", shape=VALUES.shape, dtype="f4", chunks=(1, 3, 5, 6), fill_value=np.nan
+    )
     array[2] = VALUES[2]
     got = frames(tmp_path / "a.zarr")
     np.testing.assert_array_equal(got[2], VALUES[2])
@@ -207,7 +255,9 @@ def test_chunks_never_written_are_the_fill_value(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("zarr_format", [2, 3])
-def test_unsuitable_arrays_are_described(tmp_path: Path, array: np.ndarray, words: str, zarr_format: int) -> None:
+def test_unsuitable_arrays_are_described(
+    tmp_path: Path, array: np.ndarray, words: str, zarr_format: int
+) -> None:
     create(tmp_path / "a.zarr", array, name="odd", zarr_format=zarr_format)
     with pytest.raises(InputError, match=f"odd: .*{words}"):
         open_series(tmp_path / "a.zarr")
@@ -246,7 +296,9 @@ def test_neighbours_that_cannot_be_opened_bar_nothing(tmp_path: Path, zarr_forma
     (path / "notes.txt").write_text("stray")
     metadata = path / "odd" / ("zarr.json" if zarr_format == 3 else ".zarray")
     content = json.loads(metadata.read_text())
-    content |= {"codecs": [{"name": "mycodec"}]} if zarr_format == 3 else {"compressor": {"id": "mycodec"}}
+    content |= (
+        {"codecs": [{"name": "mycodec"}]} if zarr_format == 3 else {"compressor": {"id": "mycodec"}}
+    )
     metadata.write_text(json.dumps(content))
     np.testing.assert_array_equal(frames(path), VALUES)
     with pytest.raises(InputError, match=r"odd has what cannot be opened.*mycodec"):
@@ -259,7 +311,9 @@ def test_unsigned_values_stored_as_signed(tmp_path: Path) -> None:
     values = np.array([0, 1, 127, 128, 254, 255], np.uint8).reshape(1, 2, 3)
     attributes = {"_Unsigned": "true", "_FillValue": -1, "missing_value": 300}
     create(tmp_path / "a.zarr", values.view(np.int8), attributes=attributes)
-    np.testing.assert_array_equal(frames(tmp_path / "a.zarr")[0], np.where(values == 255, np.nan, values.astype("f4")))
+    np.testing.assert_array_equal(
+        frames(tmp_path / "a.zarr")[0], np.where(values == 255, np.nan, values.astype("f4"))
+    )
 
 
 def test_a_packed_coordinate_is_unpacked_and_says_no_more_of_it(tmp_path: Path) -> None:
@@ -316,7 +370,9 @@ def test_a_hierarchy_that_changes_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", ["write", "touch", "delete", "add", "gone"])
-def test_chunks_that_change_are_noticed_by_the_check_of_the_whole(tmp_path: Path, change: str) -> None:
+def test_chunks_that_change_are_noticed_by_the_check_of_the_whole(
+    tmp_path: Path, change: str
+) -> None:
     path = tmp_path / "a.zarr"
     create(path, VALUES, name="v", chunks=(1, 3, 5, 6))
     with open_series(path, steps=slice(1, None)) as series:
@@ -334,7 +390,9 @@ def test_chunks_that_change_are_noticed_by_the_check_of_the_whole(tmp_path: Path
             (chunk.parent / "1").write_bytes(b"x")
         else:
             shutil.rmtree(path)
-        with pytest.raises(InputError, match=r"changed while it was being read|cannot be read") as caught:
+        with pytest.raises(
+            InputError, match=r"changed while it was being read|cannot be read"
+        ) as caught:
             series.check()
         assert "\n" not in str(caught.value)
 

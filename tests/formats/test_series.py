@@ -43,7 +43,9 @@ def test_three_axes_are_one_step() -> None:
 
 def test_masked_values_are_nan_and_never_what_is_under_the_mask() -> None:
     masked = np.ma.masked_greater(VALUES, 0)
-    np.testing.assert_array_equal(np.stack(list(ArraySeries(masked).frames())), np.where(VALUES > 0, np.nan, VALUES))
+    np.testing.assert_array_equal(
+        np.stack(list(ArraySeries(masked).frames())), np.where(VALUES > 0, np.nan, VALUES)
+    )
     whole = (VALUES * 9).astype(np.int16)
     np.testing.assert_array_equal(ArraySeries(np.ma.asarray(whole)).read(1), whole[1])
     with pytest.raises(InputError, match="masked values of type int16, which has no NaN"):
@@ -56,8 +58,16 @@ def test_masked_values_are_nan_and_never_what_is_under_the_mask() -> None:
         (VALUES[0, 0], {}, "2 dimensions"),
         (VALUES > 0, {}, "type bool"),
         (VALUES[:0], {}, "an axis is empty"),
-        (VALUES, {"t": Coordinate(name="t", values=np.zeros(3))}, r"coordinate of t is float64 \(3,\); float64 \(4,\)"),
-        (VALUES, {"x": Coordinate(name="x", values=np.zeros(5, np.float32))}, "coordinate of x is float32"),
+        (
+            VALUES,
+            {"t": Coordinate(name="t", values=np.zeros(3))},
+            r"coordinate of t is float64 \(3,\); float64 \(4,\)",
+        ),
+        (
+            VALUES,
+            {"x": Coordinate(name="x", values=np.zeros(5, np.float32))},
+            "coordinate of x is float32",
+        ),
         (VALUES, {"w": Coordinate(name="w", values=np.zeros(5))}, "exactly those of t, z, y and x"),
     ],
 )

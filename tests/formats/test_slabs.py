@@ -28,7 +28,11 @@ def test_slabs(shape: tuple[int, ...], itemsize: int, limit: int, chunk: tuple[i
     assert slab_shape(shape, itemsize, limit) == chunk
 
 
-@given(st.lists(st.integers(1, 10**6), max_size=5), st.sampled_from([1, 2, 4, 8]), st.integers(8, 10**9))
+@given(
+    st.lists(st.integers(1, 10**6), max_size=5),
+    st.sampled_from([1, 2, 4, 8]),
+    st.integers(8, 10**9),
+)
 def test_slabs_keep_the_limit_and_use_it(shape: list[int], itemsize: int, limit: int) -> None:
     chunk = slab_shape(shape, itemsize, limit)
     size = prod(chunk) * itemsize

@@ -17,7 +17,14 @@ import numpy as np
 import pytest
 
 from fhash_formats import Region, open_series, save_check, save_region
-from fhash_formats.errors import FhashError, InputError, MissingDependencyError, MissingInputError, OutputError, OutputExistsError
+from fhash_formats.errors import (
+    FhashError,
+    InputError,
+    MissingDependencyError,
+    MissingInputError,
+    OutputError,
+    OutputExistsError,
+)
 from fhash_formats.series import Coordinate
 from fhash_formats.writers.registry import WRITERS
 
@@ -37,7 +44,9 @@ def region(dtype: Any = "f4", shape: tuple[int, int, int, int] = SHAPE) -> Regio
 
 
 def values(dtype: Any = "f4", shape: tuple[int, int, int, int] = SHAPE) -> np.ndarray:
-    made = (np.random.default_rng(7).normal(size=shape) * 40).astype("i8" if np.dtype(dtype).kind != "f" else dtype)
+    made = (np.random.default_rng(7).normal(size=shape) * 40).astype(
+        "i8" if np.dtype(dtype).kind != "f" else dtype
+    )
     if made.dtype.kind == "f":
         made[0, 0, 0, :3] = np.nan, np.inf, -0.0
     return made.astype(dtype)
@@ -51,7 +60,11 @@ def vtk_frames(paths: list[Path]) -> np.ndarray:
         kind = head.partition(b"<PointData")[2].partition(b'type="')[2].partition(b'"')[0].decode()
         extent = np.array(head.partition(b'WholeExtent="')[2].partition(b'"')[0].split(), dtype=int)
         size = int.from_bytes(rest[:8], "little")
-        frames.append(np.frombuffer(rest[8 : 8 + size], np.dtype(kind.lower()).newbyteorder("<")).reshape(extent[[5, 3, 1]] + 1))
+        frames.append(
+            np.frombuffer(rest[8 : 8 + size], np.dtype(kind.lower()).newbyteorder("<")).reshape(
+                extent[[5, 3, 1]] + 1
+            )
+        )
     return np.stack(frames)
 
 
@@ -65,14 +78,20 @@ def read_hdf5(paths: list[Path]) -> np.ndarray:
 def read_xarray(paths: list[Path]) -> np.ndarray:
     import xarray
 
-    with xarray.open_dataset(paths[0], decode_times=False, engine="zarr" if paths[0].suffix == ".zarr" else "h5netcdf") as data:
+    with xarray.open_dataset(
+        paths[0], decode_times=False, engine="zarr" if paths[0].suffix == ".zarr" else "h5netcdf"
+    ) as data:
         return np.asarray(data["wind"].values)
 
 
 def read_raw(paths: list[Path]) -> np.ndarray:
     header = dict(line.split(": ", 1) for line in paths[1].read_text().splitlines() if ": " in line)
-    dtype = np.dtype({"float": "f4", "double": "f8"}.get(header["type"], header["type"])).newbyteorder("<")
-    read = np.fromfile(paths[0].parent / header["data file"], dtype).reshape([int(n) for n in header["sizes"].split()][::-1])
+    dtype = np.dtype(
+        {"float": "f4", "double": "f8"}.get(header["type"], header["type"])
+    ).newbyteorder("<")
+    read = np.fromfile(paths[0].parent / header["data file"], dtype).reshape(
+        [int(n) for n in header["sizes"].split()][::-1]
+    )
     return read if read.ndim == 4 else read[None]
 
 
@@ -103,14 +122,18 @@ def names(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-@pytest.mark.parametrize("dtype", ["f4", "f8", "f2", ">f4", "i1", "u1", ">i2", "u2", "i4", "u4", "i8", "u8"])
+@pytest.mark.parametrize(
+    "dtype", ["f4", "f8", "f2", ">f4", "i1", "u1", ">i2", "u2", "i4", "u4", "i8", "u8"]
+)
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_the_values_come_back_exactly(tmp_path: Path, suffix: str, dtype: str) -> None:
     data = values(dtype)
     paths = save_region(tmp_path / f"out{suffix}", region(dtype), iter(data))
     read = READ[suffix](paths)
     kept = np.dtype(dtype).newbyteorder("=")
-    assert read.dtype.newbyteorder("=") == (kept if kept != np.float16 or suffix in HALF else np.float32)
+    assert read.dtype.newbyteorder("=") == (
+        kept if kept != np.float16 or suffix in HALF else np.float32
+    )
     np.testing.assert_array_equal(read, data)
     if kept.kind == "f":
         assert np.signbit(read[0, 0, 0, 2])
@@ -118,7 +141,9 @@ def test_the_values_come_back_exactly(tmp_path: Path, suffix: str, dtype: str) -
     assert not [name for name in names(tmp_path) if name.startswith(".")]
 
 
-@pytest.mark.parametrize("name", ["out.npy", "out.h5", "out.nc", "out.zarr", "wind_6x5x4x3_float32.raw"])
+@pytest.mark.parametrize(
+    "name", ["out.npy", "out.h5", "out.nc", "out.zarr", "wind_6x5x4x3_float32.raw"]
+)
 def test_our_own_readers_give_back_the_region(tmp_path: Path, name: str) -> None:
     made = replace(region(), units="m/s", attributes={"standard_name": "wind_speed"})
     (path,) = save_region(tmp_path / name, made, values())
@@ -126,7 +151,11 @@ def test_our_own_readers_give_back_the_region(tmp_path: Path, name: str) -> None
         assert (series.shape, series.dtype) == (made.shape, made.dtype)
         np.testing.assert_array_equal(np.stack(list(series.frames())), values())
         if path.suffix not in (".npy", ".raw"):
-            assert (series.name, series.units, series.attributes["standard_name"]) == ("wind", "m/s", "wind_speed")
+            assert (series.name, series.units, series.attributes["standard_name"]) == (
+                "wind",
+                "m/s",
+                "wind_speed",
+            )
             for axis, coordinate in made.coords.items():
                 assert series.coords[axis].name == coordinate.name
                 np.testing.assert_array_equal(series.coords[axis].values, coordinate.values)
@@ -153,7 +182,13 @@ def test_the_same_region_gives_the_same_bytes(tmp_path: Path, suffix: str) -> No
     for folder in (tmp_path / "a", tmp_path / "b"):
         folder.mkdir()
         save_region(folder / f"out{suffix}", region(), values())
-        written.append([(name, (folder / name).read_bytes()) for name in names(folder) if (folder / name).is_file()])
+        written.append(
+            [
+                (name, (folder / name).read_bytes())
+                for name in names(folder)
+                if (folder / name).is_file()
+            ]
+        )
     assert written[0] == written[1]
 
 
@@ -216,7 +251,9 @@ def test_an_interruption_leaves_what_was_there(
     ],
 )
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_frames_that_do_not_fit_are_never_a_short_file(tmp_path: Path, suffix: str, frames: Any, message: str) -> None:
+def test_frames_that_do_not_fit_are_never_a_short_file(
+    tmp_path: Path, suffix: str, frames: Any, message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         save_region(tmp_path / f"out{suffix}", region(), frames())
     assert names(tmp_path) == []
@@ -248,14 +285,20 @@ def test_force_replaces_and_only_force(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize(
     ("name", "error", "message"),
     [
-        ("out.tiff", InputError, r"cannot write the suffix '\.tiff'; use one of \.npy, \.h5, .*\.pvd"),
+        (
+            "out.tiff",
+            InputError,
+            r"cannot write the suffix '\.tiff'; use one of \.npy, \.h5, .*\.pvd",
+        ),
         ("out", InputError, "a name without a suffix; use one of"),
         ("missing/out.npy", OutputError, r"the folder .*missing does not exist"),
         ("folder.npy", OutputError, "is a directory"),
         ("folder.zarr", OutputError, "is a directory but no Zarr store"),
     ],
 )
-def test_what_can_be_refused_at_once(tmp_path: Path, name: str, error: type[FhashError], message: str) -> None:
+def test_what_can_be_refused_at_once(
+    tmp_path: Path, name: str, error: type[FhashError], message: str
+) -> None:
     (tmp_path / "folder.npy").mkdir()
     (tmp_path / "folder.zarr").mkdir()
     with pytest.raises(error, match=message):
@@ -269,14 +312,20 @@ def test_a_suffix_in_capitals(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.load(path), values())
 
 
-def test_a_missing_library_is_named_before_any_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_named_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "h5netcdf", None)
-    with pytest.raises(MissingDependencyError, match=r"NetCDF needs h5netcdf: pip install 'fhash\[formats\]'"):
+    with pytest.raises(
+        MissingDependencyError, match=r"NetCDF needs h5netcdf: pip install 'fhash\[formats\]'"
+    ):
         save_check(tmp_path / "out.nc")
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_full_disk_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+def test_a_full_disk_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
     paths = save_region(tmp_path / f"out{suffix}", region(), values())
     before = names(tmp_path)
 
@@ -316,11 +365,20 @@ print(json.dumps(seen))
 @pytest.mark.parametrize("limit", [0, 1000, 8192])
 def test_writes_that_the_system_refuses(tmp_path: Path, limit: int) -> None:
     # In a process of its own, and to its end: HDF5 used to bring it down only when it closed its files at exit.
-    done = subprocess.run([sys.executable, "-c", FULL, str(tmp_path), str(limit), *SUFFIXES], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, str(tmp_path), str(limit), *SUFFIXES],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     assert done.returncode == 0, done.stderr
     seen = json.loads(done.stdout)
     assert set(seen) == set(SUFFIXES)
-    assert all(message.startswith("OutputError: ") and message.endswith("cannot be written: File too large") for message in seen.values())
+    assert all(
+        message.startswith("OutputError: ")
+        and message.endswith("cannot be written: File too large")
+        for message in seen.values()
+    )
     assert names(tmp_path) == []
 
 
@@ -341,8 +399,19 @@ def test_importing_the_writers_is_cheap() -> None:
         ({"shape": (3, 0, 5, 6)}, "an axis is empty"),
         ({"shape": (2, 4, 5, 6)}, r"coordinate of t is float64 \(3,\); float64 \(2,\) is needed"),
         ({"coords": {}}, r"coordinates of \[\]; exactly those of t, z, y and x"),
-        ({"coords": {**region().coords, "x": Coordinate(name="x", values=np.arange(6, dtype="f4"))}}, "coordinate of x is float32"),
-        ({"coords": {**region().coords, "w": region().coords["x"]}}, r"\['t', 'w', 'x', 'y', 'z'\]"),
+        (
+            {
+                "coords": {
+                    **region().coords,
+                    "x": Coordinate(name="x", values=np.arange(6, dtype="f4")),
+                }
+            },
+            "coordinate of x is float32",
+        ),
+        (
+            {"coords": {**region().coords, "w": region().coords["x"]}},
+            r"\['t', 'w', 'x', 'y', 'z'\]",
+        ),
     ],
 )
 def test_a_region_that_is_none(changes: dict[str, Any], message: str) -> None:
@@ -365,4 +434,6 @@ def test_no_file_that_is_written_may_be_a_source(tmp_path: Path, suffix: str) ->
         with pytest.raises(InputError, match="is the input itself"):
             save_region(tmp_path / f"out{suffix}", region(), iter(data), force=True, sources=[path])
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
-    save_region(tmp_path / f"out{suffix}", region(), iter(data), force=True, sources=[tmp_path / "other"])
+    save_region(
+        tmp_path / f"out{suffix}", region(), iter(data), force=True, sources=[tmp_path / "other"]
+    )

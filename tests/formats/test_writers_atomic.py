@@ -17,7 +17,10 @@ from fhash_formats.writers.atomic import check_output, replacing, replacing_all
 
 def tree(folder: Path) -> dict[str, bytes | None]:
     """Every path below a folder with its bytes."""
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
 
 
 def store(path: Path, text: str = "old") -> Path:
@@ -33,7 +36,9 @@ def no_links(*_: Any) -> None:
 
 @pytest.mark.parametrize("links", [True, False])
 @pytest.mark.parametrize("old", [None, "old"])
-def test_a_file_takes_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str | None, links: bool) -> None:
+def test_a_file_takes_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str | None, links: bool
+) -> None:
     if not links:
         monkeypatch.setattr(os, "link", no_links)
     path = tmp_path / "out.npy"
@@ -51,19 +56,32 @@ def test_a_directory_takes_its_name(tmp_path: Path) -> None:
     with replacing(path, force=True, directory=True) as temporary:
         store(temporary, "new")
         assert (path / "c" / "0").read_text() == "old"
-    assert tree(tmp_path) == {"out.zarr": None, "out.zarr/c": None, "out.zarr/c/0": b"new", "out.zarr/zarr.json": b"{}"}
+    assert tree(tmp_path) == {
+        "out.zarr": None,
+        "out.zarr/c": None,
+        "out.zarr/c/0": b"new",
+        "out.zarr/zarr.json": b"{}",
+    }
     with replacing(tmp_path / "second.zarr", force=False, directory=True) as temporary:
         store(temporary, "new")
     assert (tmp_path / "second.zarr" / "c" / "0").read_text() == "new"
 
 
 @pytest.mark.parametrize(
-    "error", [KeyboardInterrupt(), ValueError("no"), InputError("no"), OSError(errno.ENOSPC, "No space left on device")]
+    "error",
+    [
+        KeyboardInterrupt(),
+        ValueError("no"),
+        InputError("no"),
+        OSError(errno.ENOSPC, "No space left on device"),
+    ],
 )
 @pytest.mark.parametrize("written", [True, False])
 @pytest.mark.parametrize("old", [True, False])
 @pytest.mark.parametrize("directory", [True, False])
-def test_a_failure_changes_nothing(tmp_path: Path, error: BaseException, written: bool, old: bool, directory: bool) -> None:
+def test_a_failure_changes_nothing(
+    tmp_path: Path, error: BaseException, written: bool, old: bool, directory: bool
+) -> None:
     path = tmp_path / "out.zarr"
     if old:
         store(path) if directory else path.write_text("old")
@@ -82,7 +100,9 @@ def test_a_failure_changes_nothing(tmp_path: Path, error: BaseException, written
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_a_disk_that_fills_up_at_the_end_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+def test_a_disk_that_fills_up_at_the_end_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
     path = tmp_path / "out.npy"
     path.write_text("old")
 
@@ -103,7 +123,9 @@ def test_a_disk_that_fills_up_at_the_end_changes_nothing(tmp_path: Path, monkeyp
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
+def test_a_file_that_appears_meanwhile_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
+) -> None:
     if not links:
         monkeypatch.setattr(os, "link", no_links)
     path = tmp_path / "out.npy"
@@ -119,7 +141,9 @@ def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("directory", [True, False])
-def test_a_folder_that_appears_meanwhile_is_kept_even_with_force(tmp_path: Path, directory: bool) -> None:
+def test_a_folder_that_appears_meanwhile_is_kept_even_with_force(
+    tmp_path: Path, directory: bool
+) -> None:
     path = tmp_path / "out.zarr"
 
     def save() -> None:
@@ -134,7 +158,9 @@ def test_a_folder_that_appears_meanwhile_is_kept_even_with_force(tmp_path: Path,
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_of_several_outputs_all_or_none_take_their_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool) -> None:
+def test_of_several_outputs_all_or_none_take_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool
+) -> None:
     if not links:
         monkeypatch.setattr(os, "link", no_links)
     paths = [tmp_path / name for name in ("a", "b", "c")]
@@ -177,7 +203,9 @@ def test_another_writer_between_moving_aside_and_replacing_is_kept(
         if directory:
             store(path, "somebody else's")
         else:
-            path.write_text("somebody else's") if not path.exists() else store_file(path, "somebody else's")
+            path.write_text("somebody else's") if not path.exists() else store_file(
+                path, "somebody else's"
+            )
             raise OSError(errno.EIO, "Input/output error")
         os.rename(source, target)
 
@@ -187,13 +215,18 @@ def test_another_writer_between_moving_aside_and_replacing_is_kept(
         with replacing(path, force=True, directory=directory) as temporary:
             store(temporary, "new") if directory else temporary.write_text("new")
 
-    with pytest.raises(OutputError, match="another process wrote it meanwhile" if directory else "Input/output error"):
+    with pytest.raises(
+        OutputError,
+        match="another process wrote it meanwhile" if directory else "Input/output error",
+    ):
         save()
     assert [found.name for found in tmp_path.iterdir()] == ["out.zarr"]
     assert (path / "c" / "0" if directory else path).read_text() == "somebody else's"
 
 
-def test_a_folder_that_appears_at_the_last_moment_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_appears_at_the_last_moment_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, rename = tmp_path / "out.zarr", os.rename
 
     def late(source: Path, target: Path) -> None:
@@ -220,7 +253,10 @@ def store_file(path: Path, text: str) -> None:
 
 def test_an_output_that_exists_stops_all_before_anything_is_written(tmp_path: Path) -> None:
     (tmp_path / "b").write_text("old")
-    with pytest.raises(OutputExistsError), replacing_all([tmp_path / "a", tmp_path / "b"], force=False):
+    with (
+        pytest.raises(OutputExistsError),
+        replacing_all([tmp_path / "a", tmp_path / "b"], force=False),
+    ):
         pytest.fail("the block must not run")
     assert tree(tmp_path) == {"b": b"old"}
 
@@ -247,7 +283,9 @@ def test_a_name_as_long_as_the_file_system_takes(tmp_path: Path) -> None:
         check_output(tmp_path / ("n" * 300), False)
 
 
-def test_an_old_output_that_cannot_be_deleted_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_old_output_that_cannot_be_deleted_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = store(tmp_path / "out.zarr")
 
     def save() -> None:
@@ -255,7 +293,9 @@ def test_an_old_output_that_cannot_be_deleted_is_named(tmp_path: Path, monkeypat
             store(temporary, "new")
 
     monkeypatch.setattr(shutil, "rmtree", no_links)
-    with pytest.raises(OutputError, match=r"is written, but the older one could not be deleted; delete .*\.old"):
+    with pytest.raises(
+        OutputError, match=r"is written, but the older one could not be deleted; delete .*\.old"
+    ):
         save()
     assert (path / "c" / "0").read_text() == "new"
 
@@ -278,17 +318,31 @@ def pipe(path: Path) -> Path:
 @pytest.mark.parametrize(
     ("make", "force", "directory", "error", "message"),
     [
-        (file, False, False, OutputExistsError, r"out exists; use --force \(force=True\) to replace it"),
+        (
+            file,
+            False,
+            False,
+            OutputExistsError,
+            r"out exists; use --force \(force=True\) to replace it",
+        ),
         (store, False, True, OutputExistsError, r"out exists; use --force"),
         (folder, False, False, OutputError, "out is a directory; give the name of a file"),
         (store, True, False, OutputError, "out is a directory; give the name of a file"),
         (folder, True, True, OutputError, "is a directory but no Zarr store"),
         (pipe, True, False, OutputError, "is not an ordinary file"),
-        (lambda path: path / "x.npy", True, False, OutputError, r"the folder .*out does not exist; create it first"),
+        (
+            lambda path: path / "x.npy",
+            True,
+            False,
+            OutputError,
+            r"the folder .*out does not exist; create it first",
+        ),
         (lambda path: file(path) / "x.npy", True, False, OutputError, r"out is not a folder"),
     ],
 )
-def test_what_may_not_be_replaced(tmp_path: Path, make: Any, force: bool, directory: bool, error: type[Exception], message: str) -> None:
+def test_what_may_not_be_replaced(
+    tmp_path: Path, make: Any, force: bool, directory: bool, error: type[Exception], message: str
+) -> None:
     path = make(tmp_path / "out")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(error, match=message) as caught:
@@ -298,14 +352,23 @@ def test_what_may_not_be_replaced(tmp_path: Path, make: Any, force: bool, direct
 
 
 @pytest.mark.parametrize(
-    ("make", "directory"), [(lambda path: path, False), (lambda path: path, True), (file, False), (store, True), (file, True)]
+    ("make", "directory"),
+    [
+        (lambda path: path, False),
+        (lambda path: path, True),
+        (file, False),
+        (store, True),
+        (file, True),
+    ],
 )
 def test_what_may_be_written_with_force(tmp_path: Path, make: Any, directory: bool) -> None:
     check_output(make(tmp_path / "out"), True, directory=directory)
 
 
 def test_a_folder_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "access", lambda *_: False)  # the tests may run as root, whom no mode stops
+    monkeypatch.setattr(
+        os, "access", lambda *_: False
+    )  # the tests may run as root, whom no mode stops
     with pytest.raises(OutputError, match="no permission to write in"):
         check_output(tmp_path / "out", False)
 
@@ -383,18 +446,27 @@ def test_no_output_is_its_own_input(tmp_path: Path, make: Any, words: str, force
         with pytest.raises(InputError, match=words) as caught:
             check_output(path, force, directory=path.is_dir(), sources=[tmp_path / "other", name])
         assert "--force" not in str(caught.value)
-    check_output(path.with_name("out.npy") if make is not inside else tmp_path / "out", False, sources=[tmp_path / "a.npy"])
+    check_output(
+        path.with_name("out.npy") if make is not inside else tmp_path / "out",
+        False,
+        sources=[tmp_path / "a.npy"],
+    )
 
 
 def test_a_link_into_a_folder_that_is_not_there(tmp_path: Path) -> None:
     (tmp_path / "out.npy").symlink_to(tmp_path / "gone" / "out.npy")
-    with pytest.raises(OutputError, match=r"out.npy is a link to .*, and the folder .*gone does not exist; create it"):
+    with pytest.raises(
+        OutputError,
+        match=r"out.npy is a link to .*, and the folder .*gone does not exist; create it",
+    ):
         check_output(tmp_path / "out.npy", True)
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
 @pytest.mark.parametrize("links", [True, False])
-def test_the_permissions_of_what_is_replaced_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int, links: bool) -> None:
+def test_the_permissions_of_what_is_replaced_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int, links: bool
+) -> None:
     if not links:
         monkeypatch.setattr(os, "link", no_links)
     path = file(tmp_path / "out.npy")

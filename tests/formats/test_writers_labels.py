@@ -14,17 +14,33 @@ import numpy as np
 import pytest
 
 from fhash_formats.series import Coordinate
-from fhash_formats.writers.labels import coordinate_attributes, hdf5_value, safe_name, safe_names, variable_attributes
+from fhash_formats.writers.labels import (
+    coordinate_attributes,
+    hdf5_value,
+    safe_name,
+    safe_names,
+    variable_attributes,
+)
 from fhash_formats.writers.region import Region
 from fhash_formats.writers.signals import signals_held
 from fhash_formats.writers.spacing import even_spacing
 from fhash_formats.writers.writer import CHUNK_BYTES, chunk_shape
 
 
-def region(shape: tuple[int, int, int, int] = (1, 1, 1, 1), dtype: str = "f4", names: str = "tzyx", **changes: Any) -> Region:
+def region(
+    shape: tuple[int, int, int, int] = (1, 1, 1, 1),
+    dtype: str = "f4",
+    names: str = "tzyx",
+    **changes: Any,
+) -> Region:
     # One value that is shared: a test of chunks needs long axes and no memory.
-    coords = {axis: Coordinate(name=name, values=np.zeros(n)) for axis, name, n in zip("tzyx", names, shape, strict=True)}
-    return Region(**{"name": "wind", "dtype": np.dtype(dtype), "shape": shape, "coords": coords, **changes})
+    coords = {
+        axis: Coordinate(name=name, values=np.zeros(n))
+        for axis, name, n in zip("tzyx", names, shape, strict=True)
+    }
+    return Region(
+        **{"name": "wind", "dtype": np.dtype(dtype), "shape": shape, "coords": coords, **changes}
+    )
 
 
 @pytest.mark.parametrize(
@@ -64,17 +80,62 @@ def test_all_names_of_a_file_differ(names: Any, expected: str) -> None:
 
 
 def test_no_attribute_that_changes_the_values_is_kept() -> None:
-    packing = {name: 1 for name in ("scale_factor", "add_offset", "_FillValue", "missing_value", "valid_range", "valid_min", "valid_max")}
-    references = {name: "x" for name in ("coordinates", "grid_mapping", "bounds", "DIMENSION_LIST", "_Netcdf4Dimid", "CLASS")}
+    packing = {
+        name: 1
+        for name in (
+            "scale_factor",
+            "add_offset",
+            "_FillValue",
+            "missing_value",
+            "valid_range",
+            "valid_min",
+            "valid_max",
+        )
+    }
+    references = {
+        name: "x"
+        for name in (
+            "coordinates",
+            "grid_mapping",
+            "bounds",
+            "DIMENSION_LIST",
+            "_Netcdf4Dimid",
+            "CLASS",
+        )
+    }
     made = region(
-        name="group/wind", units="m s-1", attributes={**packing, **references, "standard_name": "wind_speed", "units": "knots", "": 1}
+        name="group/wind",
+        units="m s-1",
+        attributes={
+            **packing,
+            **references,
+            "standard_name": "wind_speed",
+            "units": "knots",
+            "": 1,
+        },
     )
-    assert variable_attributes(made) == {"standard_name": "wind_speed", "units": "m s-1", "long_name": "group/wind"}
+    assert variable_attributes(made) == {
+        "standard_name": "wind_speed",
+        "units": "m s-1",
+        "long_name": "group/wind",
+    }
     time = Coordinate(
-        name="t", values=np.zeros(1), attributes={"units": "hours since 1970-01-01", "calendar": "gregorian", "bounds": "time_bnds"}
+        name="t",
+        values=np.zeros(1),
+        attributes={
+            "units": "hours since 1970-01-01",
+            "calendar": "gregorian",
+            "bounds": "time_bnds",
+        },
     )
-    assert coordinate_attributes("t", time) == {"axis": "T", "units": "hours since 1970-01-01", "calendar": "gregorian"}
-    assert coordinate_attributes("z", Coordinate(name="z", values=np.zeros(1), attributes={"axis": "z", "positive": "up"})) == {
+    assert coordinate_attributes("t", time) == {
+        "axis": "T",
+        "units": "hours since 1970-01-01",
+        "calendar": "gregorian",
+    }
+    assert coordinate_attributes(
+        "z", Coordinate(name="z", values=np.zeros(1), attributes={"axis": "z", "positive": "up"})
+    ) == {
         "axis": "z",
         "positive": "up",
     }
@@ -93,7 +154,16 @@ def test_attributes_are_json_and_what_cannot_be_is_left_out() -> None:
         "i": True,
     }
     kept = variable_attributes(region(attributes=odd))
-    assert kept == {"a": 1.5, "b": [0, 1, 2], "c": [1, "x"], "d": "NaN", "e": "raw", "e2": "?", "f": {"g": None}, "i": True}
+    assert kept == {
+        "a": 1.5,
+        "b": [0, 1, 2],
+        "c": [1, "x"],
+        "d": "NaN",
+        "e": "raw",
+        "e2": "?",
+        "f": {"g": None},
+        "i": True,
+    }
     assert json.loads(json.dumps(kept, allow_nan=False)) == kept
 
 
@@ -158,9 +228,19 @@ def test_even_spacing(values: Any, step: float | None) -> None:
 
 @pytest.mark.parametrize("dtype", ["u1", "f4", "f8"])
 @pytest.mark.parametrize(
-    "shape", [(1, 1, 1, 1), (100, 64, 64, 64), (3, 256, 256, 256), (2, 3, 5000, 5000), (1, 1, 1, 10**8), (1, 7, 1, 3 * 10**7)]
+    "shape",
+    [
+        (1, 1, 1, 1),
+        (100, 64, 64, 64),
+        (3, 256, 256, 256),
+        (2, 3, 5000, 5000),
+        (1, 1, 1, 10**8),
+        (1, 7, 1, 3 * 10**7),
+    ],
 )
-def test_chunks_are_bounded_and_never_span_steps(shape: tuple[int, int, int, int], dtype: str) -> None:
+def test_chunks_are_bounded_and_never_span_steps(
+    shape: tuple[int, int, int, int], dtype: str
+) -> None:
     made = region((1, 1, 1, 1), dtype)
     object.__setattr__(made, "shape", shape)
     chunk = chunk_shape(made)

@@ -23,7 +23,9 @@ def gone() -> int:
 
 
 def leftover(target: Path, process: int, kind: str = ".partial", text: str = "half") -> Path:
-    path = target.with_name(new_stem(target.name).replace(f"-{os.getpid()}-", f"-{process}-") + kind)
+    path = target.with_name(
+        new_stem(target.name).replace(f"-{os.getpid()}-", f"-{process}-") + kind
+    )
     path.write_text(text)
     return path
 
@@ -33,7 +35,9 @@ def names(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("name", ["out.npy", "x" * 60 + ".npy", "é" * 100, "a\nb"])
-def test_the_next_writer_clears_what_a_killed_one_left(tmp_path: Path, gone: int, name: str) -> None:
+def test_the_next_writer_clears_what_a_killed_one_left(
+    tmp_path: Path, gone: int, name: str
+) -> None:
     target = tmp_path / name
     leftover(target, gone)
     leftover(target, gone)
@@ -51,11 +55,19 @@ def test_a_folder_is_cleared_too(tmp_path: Path, gone: int) -> None:
     assert names(tmp_path) == []
 
 
-def test_nothing_of_a_living_writer_is_touched(tmp_path: Path, gone: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_of_a_living_writer_is_touched(
+    tmp_path: Path, gone: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     target = tmp_path / "out.npy"
     target.write_text("new")
-    with subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE) as process:
-        kept = [leftover(target, process.pid), leftover(target, os.getpid()), leftover(target, process.pid, ".old")]
+    with subprocess.Popen(
+        [sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE
+    ) as process:
+        kept = [
+            leftover(target, process.pid),
+            leftover(target, os.getpid()),
+            leftover(target, process.pid, ".old"),
+        ]
         foreign = leftover(target, gone)
         elsewhere = foreign.with_name(foreign.name.replace(leftovers._machine(), "0123abcd"))
         foreign.rename(elsewhere)
@@ -88,14 +100,21 @@ def test_nothing_of_another_output_is_touched(tmp_path: Path, gone: int) -> None
     long = "y" * 50
     for name in ("out", "npy", "out.npy.x", ".out.npy", "aout.npy", f"{long}1"):
         leftover(tmp_path / name, gone)
-    for name in (".out.npy.partial", ".out.npy.0123abcd.partial", "out.npy.partial", ".out.npy.old"):
+    for name in (
+        ".out.npy.partial",
+        ".out.npy.0123abcd.partial",
+        "out.npy.partial",
+        ".out.npy.old",
+    ):
         (tmp_path / name).write_text("somebody else's")
     before = names(tmp_path)
     clear([tmp_path / "out.npy", tmp_path / f"{long}2"])
     assert names(tmp_path) == before
 
 
-def test_an_output_that_was_moved_aside_comes_back_and_is_not_replaced_without_leave(tmp_path: Path, gone: int) -> None:
+def test_an_output_that_was_moved_aside_comes_back_and_is_not_replaced_without_leave(
+    tmp_path: Path, gone: int
+) -> None:
     target = tmp_path / "out.zarr"
     aside = leftover(target, gone, ".old")
     aside.unlink()
@@ -116,7 +135,9 @@ def test_an_older_output_that_was_replaced_goes(tmp_path: Path, gone: int) -> No
     assert target.read_text() == "new"
 
 
-def test_many_outputs_are_cleared_with_one_look_at_their_folder(tmp_path: Path, gone: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_outputs_are_cleared_with_one_look_at_their_folder(
+    tmp_path: Path, gone: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     targets = [tmp_path / f"a_{number}.vti" for number in range(5)]
     for target in targets:
         leftover(target, gone)

@@ -42,7 +42,9 @@ def test_ply(tmp_path: Path) -> None:
 
 def test_vtp(tmp_path: Path) -> None:
     save_mesh(tmp_path / "s.vtp", MESH)
-    head, mark, rest = (tmp_path / "s.vtp").read_bytes().partition(b'<AppendedData encoding="raw">\n_')
+    head, mark, rest = (
+        (tmp_path / "s.vtp").read_bytes().partition(b'<AppendedData encoding="raw">\n_')
+    )
     appended, _, tail = rest.rpartition(b"\n</AppendedData>\n</VTKFile>\n")
     assert tail == b""
     root = ElementTree.fromstring(head + mark + b"</AppendedData></VTKFile>")
@@ -53,31 +55,42 @@ def test_vtp(tmp_path: Path) -> None:
             assert offset == end
             end = offset + 8 + int.from_bytes(appended[offset : offset + 8], "little")
             kind = array.get("type", "").lower()
-            found[array.get("Name")] = np.frombuffer(appended[offset + 8 : end], np.dtype(kind).newbyteorder("<"))
+            found[array.get("Name")] = np.frombuffer(
+                appended[offset + 8 : end], np.dtype(kind).newbyteorder("<")
+            )
     assert end == len(appended)
     np.testing.assert_array_equal(found["Points"], MESH.vertices.ravel())
     np.testing.assert_array_equal(found["connectivity"], MESH.triangles.ravel())
     assert found["offsets"].tolist() == [3, 6]
     assert found['a<b & "c"_d'].tolist() == [0.1] * 4
-    assert [field.text for field in root.iter("DataArray") if field.get("Name") == "TimeValue"] == ["2.5"]
+    assert [field.text for field in root.iter("DataArray") if field.get("Name") == "TimeValue"] == [
+        "2.5"
+    ]
     (piece,) = root.findall("PolyData/Piece")
     assert (piece.get("NumberOfPoints"), piece.get("NumberOfPolys")) == ("4", "2")
 
 
 @pytest.mark.parametrize("suffix", ["vtp", "ply"])
 def test_vtk_reads_them(tmp_path: Path, suffix: str) -> None:
-    module, name = {"vtp": ("vtkmodules.vtkIOXML", "vtkXMLPolyDataReader"), "ply": ("vtkmodules.vtkIOPLY", "vtkPLYReader")}[suffix]
+    module, name = {
+        "vtp": ("vtkmodules.vtkIOXML", "vtkXMLPolyDataReader"),
+        "ply": ("vtkmodules.vtkIOPLY", "vtkPLYReader"),
+    }[suffix]
     reader = getattr(pytest.importorskip(module), name)()
     save_mesh(tmp_path / f"s.{suffix}", MESH)
     reader.SetFileName(str(tmp_path / f"s.{suffix}"))
     reader.Update()
     surface = reader.GetOutput()
     assert (surface.GetNumberOfPoints(), surface.GetNumberOfPolys()) == (4, 2)
-    np.testing.assert_allclose([surface.GetPoint(number) for number in range(4)], MESH.vertices, rtol=1e-6)
+    np.testing.assert_allclose(
+        [surface.GetPoint(number) for number in range(4)], MESH.vertices, rtol=1e-6
+    )
 
 
 def test_what_stands_in_the_way(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"surface with the suffix '\.stl'; use one of \.vtp, \.ply"):
+    with pytest.raises(
+        InputError, match=r"surface with the suffix '\.stl'; use one of \.vtp, \.ply"
+    ):
         check_mesh_output(tmp_path / "s.stl")
     save_mesh(tmp_path / "s.PLY", MESH)
     with pytest.raises(OutputExistsError, match="exists"):

@@ -12,14 +12,27 @@ from fhash_formats import Region, open_series, save_region
 from fhash_formats.errors import InputError, OutputExistsError
 from fhash_formats.series import Coordinate
 
-POSITIONS = {"t": [347921.000277, 347922.0], "z": [0.0, 0.25], "y": [3.0, 2.0, 1.0], "x": [1.0, 1.1, 1.2, 1.3]}
+POSITIONS = {
+    "t": [347921.000277, 347922.0],
+    "z": [0.0, 0.25],
+    "y": [3.0, 2.0, 1.0],
+    "x": [1.0, 1.1, 1.2, 1.3],
+}
 DATA = np.arange(48, dtype="f4").reshape(2, 2, 3, 4)
 
 
 def region(positions: dict[str, list[float]] = POSITIONS, **changes: Any) -> Region:
-    coords = {axis: Coordinate(name=f"{axis} name", values=np.array(values)) for axis, values in positions.items()}
+    coords = {
+        axis: Coordinate(name=f"{axis} name", values=np.array(values))
+        for axis, values in positions.items()
+    }
     coords["t"] = Coordinate(name="time", values=coords["t"].values, attributes={"units": "hours"})
-    made = {"name": "wind", "dtype": np.dtype("f4"), "shape": tuple(len(coords[axis].values) for axis in "tzyx"), "coords": coords}
+    made = {
+        "name": "wind",
+        "dtype": np.dtype("f4"),
+        "shape": tuple(len(coords[axis].values) for axis in "tzyx"),
+        "coords": coords,
+    }
     return Region(**{**made, **changes})
 
 
@@ -51,16 +64,28 @@ def test_a_type_that_there_is_not_is_refused(tmp_path: Path) -> None:
 
 def test_one_step_may_be_left_out_of_the_name(tmp_path: Path) -> None:
     (path,) = save_region(
-        tmp_path / "run_4x3x2_float16.raw", region({**POSITIONS, "t": [0.0]}, dtype=np.dtype("f2")), DATA[:1].astype("f2")
+        tmp_path / "run_4x3x2_float16.raw",
+        region({**POSITIONS, "t": [0.0]}, dtype=np.dtype("f2")),
+        DATA[:1].astype("f2"),
     )
     np.testing.assert_array_equal(np.fromfile(path, "<f2"), DATA[0].ravel())
 
 
 @pytest.mark.parametrize(
-    "name", ["run_2x2x3x4_float32.raw", "run_4x3x2_float32.raw", "run_4x3x2x2_float64.raw", "run_4x3x2x2_uint8.raw", "4x4x4_float32.raw"]
+    "name",
+    [
+        "run_2x2x3x4_float32.raw",
+        "run_4x3x2_float32.raw",
+        "run_4x3x2x2_float64.raw",
+        "run_4x3x2x2_uint8.raw",
+        "4x4x4_float32.raw",
+    ],
 )
 def test_a_name_that_says_another_layout_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match=r"the name says another layout than the values have; use \*_4x3x2x2_float32\.raw"):
+    with pytest.raises(
+        InputError,
+        match=r"the name says another layout than the values have; use \*_4x3x2x2_float32\.raw",
+    ):
         save_region(tmp_path / name, region(), DATA)
     assert list(tmp_path.iterdir()) == []
 
@@ -95,9 +120,15 @@ def test_a_header_beside_any_other_name(tmp_path: Path) -> None:
 
 
 def test_one_step_is_a_plain_volume_and_uneven_axes_have_no_place(tmp_path: Path) -> None:
-    paths = save_region(tmp_path / "out.raw", region({**POSITIONS, "t": [0.5], "y": [0.0, 1.0, 3.0]}), DATA[:1])
+    paths = save_region(
+        tmp_path / "out.raw", region({**POSITIONS, "t": [0.5], "y": [0.0, 1.0, 3.0]}), DATA[:1]
+    )
     found = header(paths[1])
-    assert (found["dimension"], found["sizes"], found["kinds"]) == ("3", "4 3 2", "space space space")
+    assert (found["dimension"], found["sizes"], found["kinds"]) == (
+        "3",
+        "4 3 2",
+        "space space space",
+    )
     assert not [field for field in found if field.startswith("space")]
     assert found["coordinates_y"] == "0.0 1.0 3.0"
 

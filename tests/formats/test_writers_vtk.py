@@ -13,14 +13,27 @@ from fhash_formats import Region, save_check, save_region
 from fhash_formats.errors import InputError, OutputExistsError
 from fhash_formats.series import Coordinate
 
-EVEN = {"t": [0.1, 0.4, 347921.000277], "z": [2.0], "y": [-1.0, 0.0, 1.0, 2.0], "x": [10.0, 10.5, 11.0]}
+EVEN = {
+    "t": [0.1, 0.4, 347921.000277],
+    "z": [2.0],
+    "y": [-1.0, 0.0, 1.0, 2.0],
+    "x": [10.0, 10.5, 11.0],
+}
 UNEVEN = {**EVEN, "x": [1.0, 2.0, 4.0]}
 DATA = np.arange(36, dtype="f4").reshape(3, 1, 4, 3)
 
 
 def region(positions: dict[str, list[float]] = EVEN, **changes: Any) -> Region:
-    coords = {axis: Coordinate(name=axis, values=np.array(values, dtype="f8")) for axis, values in positions.items()}
-    made = {"name": "wind", "dtype": np.dtype("f4"), "shape": tuple(len(coords[axis].values) for axis in "tzyx"), "coords": coords}
+    coords = {
+        axis: Coordinate(name=axis, values=np.array(values, dtype="f8"))
+        for axis, values in positions.items()
+    }
+    made = {
+        "name": "wind",
+        "dtype": np.dtype("f4"),
+        "shape": tuple(len(coords[axis].values) for axis in "tzyx"),
+        "coords": coords,
+    }
     return Region(**{**made, **changes})
 
 
@@ -34,14 +47,23 @@ def parse(path: Path) -> tuple[ElementTree.Element, list[np.ndarray]]:
     appended, _, tail = rest.rpartition(b"\n</AppendedData>\n</VTKFile>\n")
     assert tail == b""
     root = ElementTree.fromstring(head + mark + b"</AppendedData></VTKFile>")
-    assert (root.get("byte_order"), root.get("header_type"), root.get("version")) == ("LittleEndian", "UInt64", "1.0")
+    assert (root.get("byte_order"), root.get("header_type"), root.get("version")) == (
+        "LittleEndian",
+        "UInt64",
+        "1.0",
+    )
     arrays, end = [], 0
     for array in root.iter("DataArray"):
         if array.get("format") == "appended":
             offset = int(array.get("offset", ""))
             assert offset == end
             end = offset + 8 + int.from_bytes(appended[offset : offset + 8], "little")
-            arrays.append(np.frombuffer(appended[offset + 8 : end], np.dtype(array.get("type", "").lower()).newbyteorder("<")))
+            arrays.append(
+                np.frombuffer(
+                    appended[offset + 8 : end],
+                    np.dtype(array.get("type", "").lower()).newbyteorder("<"),
+                )
+            )
     assert end == len(appended)
     return root, arrays
 
@@ -51,18 +73,29 @@ def test_an_image(tmp_path: Path) -> None:
     assert paths == [tmp_path / "out.vti"]
     root, (values,) = parse(paths[0])
     (image,) = root.findall("ImageData")
-    assert image.attrib == {"WholeExtent": "0 2 0 3 0 0", "Origin": "10.0 -1.0 2.0", "Spacing": "0.5 1.0 1.0"}
+    assert image.attrib == {
+        "WholeExtent": "0 2 0 3 0 0",
+        "Origin": "10.0 -1.0 2.0",
+        "Spacing": "0.5 1.0 1.0",
+    }
     assert [piece.get("Extent") for piece in image.findall("Piece")] == ["0 2 0 3 0 0"]
     assert [points.get("Scalars") for points in image.findall("Piece/PointData")] == ["wind"]
-    assert [key.text for key in image.findall("Piece/PointData/DataArray/InformationKey")] == ["m/s"]
-    assert [field.text for field in image.findall("FieldData/DataArray[@Name='TimeValue']")] == ["3.5"]
+    assert [key.text for key in image.findall("Piece/PointData/DataArray/InformationKey")] == [
+        "m/s"
+    ]
+    assert [field.text for field in image.findall("FieldData/DataArray[@Name='TimeValue']")] == [
+        "3.5"
+    ]
     np.testing.assert_array_equal(values, DATA[0].ravel())  # x fastest
 
 
 @pytest.mark.parametrize("suffix", [".vti", ".vtr"])
 def test_several_steps_are_a_collection_with_their_times(tmp_path: Path, suffix: str) -> None:
     paths = save_region(tmp_path / f"my run{suffix}", region(), DATA)
-    assert [path.name for path in paths] == [*(f"my run_000{step}{suffix}" for step in range(3)), "my run.pvd"]
+    assert [path.name for path in paths] == [
+        *(f"my run_000{step}{suffix}" for step in range(3)),
+        "my run.pvd",
+    ]
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
     rows = ElementTree.parse(paths[-1]).getroot().findall("Collection/DataSet")
     assert [row.get("file") for row in rows] == [path.name for path in paths[:-1]]
@@ -70,11 +103,17 @@ def test_several_steps_are_a_collection_with_their_times(tmp_path: Path, suffix:
     for step, path in enumerate(paths[:-1]):
         root, arrays = parse(path)
         np.testing.assert_array_equal(arrays[0], DATA[step].ravel())
-        assert [float(field.text or "") for field in root.iter("DataArray") if field.get("Name") == "TimeValue"] == [EVEN["t"][step]]
+        assert [
+            float(field.text or "")
+            for field in root.iter("DataArray")
+            if field.get("Name") == "TimeValue"
+        ] == [EVEN["t"][step]]
 
 
 @pytest.mark.parametrize(("positions", "suffix"), [(EVEN, ".vti"), (UNEVEN, ".vtr")])
-def test_a_collection_by_name_takes_the_grid_that_fits(tmp_path: Path, positions: dict[str, list[float]], suffix: str) -> None:
+def test_a_collection_by_name_takes_the_grid_that_fits(
+    tmp_path: Path, positions: dict[str, list[float]], suffix: str
+) -> None:
     paths = save_region(tmp_path / "out.pvd", one(positions), DATA[:1])
     assert [path.name for path in paths] == [f"out_0000{suffix}", "out.pvd"]
 
@@ -83,7 +122,9 @@ def test_a_rectilinear_grid_keeps_uneven_positions_exactly(tmp_path: Path) -> No
     (path,) = save_region(tmp_path / "out.vtr", one(UNEVEN), DATA[:1])
     root, (values, x, y, z) = parse(path)
     assert root[0].attrib == {"WholeExtent": "0 2 0 3 0 0"}
-    assert [axis.get("Name") for axis in root.findall("RectilinearGrid/Piece/Coordinates/DataArray")] == ["x", "y", "z"]
+    assert [
+        axis.get("Name") for axis in root.findall("RectilinearGrid/Piece/Coordinates/DataArray")
+    ] == ["x", "y", "z"]
     np.testing.assert_array_equal(values, DATA[0].ravel())
     for found, axis in ((x, "x"), (y, "y"), (z, "z")):
         np.testing.assert_array_equal(found, UNEVEN[axis])
@@ -95,7 +136,9 @@ def test_descending_axes_are_turned_round(tmp_path: Path, suffix: str, turned: s
     ascending = {**EVEN, "t": [3.5], "z": [2.0, 2.5]}
     data = np.arange(24, dtype="f4").reshape(1, 2, 4, 3)
     (plain,) = save_region(tmp_path / f"plain{suffix}", region(ascending), data)
-    descending = {axis: values[::-1] if axis in turned else values for axis, values in ascending.items()}
+    descending = {
+        axis: values[::-1] if axis in turned else values for axis, values in ascending.items()
+    }
     flipped = data[:, *(slice(None, None, -1 if axis in turned else 1) for axis in "zyx")]
     (path,) = save_region(tmp_path / f"turned{suffix}", region(descending), flipped)
     assert path.read_bytes() == plain.read_bytes()
@@ -108,7 +151,9 @@ def test_names_and_units_are_escaped(tmp_path: Path) -> None:
     assert array.get("Name") == "a<b & \"c'_"
     assert [key.text for key in array] == ["<m>"]
     paths = save_region(tmp_path / "<&\"'>.pvd", one(), DATA[:1])
-    assert [row.get("file") for row in ElementTree.parse(paths[1]).getroot().iter("DataSet")] == [paths[0].name]
+    assert [row.get("file") for row in ElementTree.parse(paths[1]).getroot().iter("DataSet")] == [
+        paths[0].name
+    ]
 
 
 @pytest.mark.parametrize(
@@ -122,7 +167,9 @@ def test_names_and_units_are_escaped(tmp_path: Path) -> None:
         ({**EVEN, "t": [0.0, np.nan, 1.0]}, ".vti", "times are not all finite"),
     ],
 )
-def test_grids_that_vtk_has_not(tmp_path: Path, positions: dict[str, list[float]], suffix: str, message: str) -> None:
+def test_grids_that_vtk_has_not(
+    tmp_path: Path, positions: dict[str, list[float]], suffix: str, message: str
+) -> None:
     with pytest.raises(InputError, match=message) as caught:
         save_region(tmp_path / f"out{suffix}", region(positions), DATA)
     assert "\n" not in str(caught.value)

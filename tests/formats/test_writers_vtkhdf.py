@@ -18,7 +18,9 @@ DATA = np.arange(72, dtype="f4").reshape(3, 2, 4, 3)
 
 def region(dtype: str = "f4", name: str = "wind", **axes: list[float]) -> Region:
     positions = {**EVEN, **axes}
-    coords = {axis: Coordinate(name=axis, values=np.array(values)) for axis, values in positions.items()}
+    coords = {
+        axis: Coordinate(name=axis, values=np.array(values)) for axis, values in positions.items()
+    }
     t, z, y, x = (len(positions[axis]) for axis in "tzyx")
     return Region(name=name, units="m/s", dtype=np.dtype(dtype), shape=(t, z, y, x), coords=coords)
 
@@ -30,7 +32,11 @@ def test_the_structure_of_the_specification(tmp_path: Path) -> None:
         assert group.attrs["Version"].tolist() == [2, 0]
         assert group.attrs["Type"] == b"ImageData"
         kind = h5py.h5a.open(group.id, b"Type").get_type()
-        assert (kind.is_variable_str(), kind.get_cset(), kind.get_size()) == (False, h5py.h5t.CSET_ASCII, 9)
+        assert (kind.is_variable_str(), kind.get_cset(), kind.get_size()) == (
+            False,
+            h5py.h5t.CSET_ASCII,
+            9,
+        )
         assert group.attrs["WholeExtent"].tolist() == [0, 2, 0, 3, 0, 1]
         assert group.attrs["Origin"].tolist() == [10.0, -1.0, 2.0]
         assert group.attrs["Spacing"].tolist() == [0.5, 1.0, 0.5]
@@ -63,7 +69,9 @@ def test_descending_axes_are_turned_round(tmp_path: Path, turned: str) -> None:
         ({"t": [0.0, np.nan, 1.0]}, "times are not all finite"),
     ],
 )
-def test_grids_that_it_cannot_hold(tmp_path: Path, axes: dict[str, list[float]], message: str) -> None:
+def test_grids_that_it_cannot_hold(
+    tmp_path: Path, axes: dict[str, list[float]], message: str
+) -> None:
     for act in (
         lambda: save_region(tmp_path / "out.vtkhdf", region(**axes), DATA),
         lambda: save_check(tmp_path / "out.vtkhdf", False, region(**axes)),
@@ -77,7 +85,9 @@ def test_grids_that_it_cannot_hold(tmp_path: Path, axes: dict[str, list[float]],
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "u1", "i2", "i8"])
 def test_vtk_reads_every_step(tmp_path: Path, dtype: str) -> None:
     io = pytest.importorskip("vtkmodules.vtkIOHDF")
-    pipeline = pytest.importorskip("vtkmodules.vtkCommonExecutionModel").vtkStreamingDemandDrivenPipeline
+    pipeline = pytest.importorskip(
+        "vtkmodules.vtkCommonExecutionModel"
+    ).vtkStreamingDemandDrivenPipeline
     arrays = pytest.importorskip("vtkmodules.util.numpy_support")
     data = DATA.astype(dtype)
     save_region(tmp_path / "out.vtkhdf", region(dtype, name="a/b"), data)
@@ -97,7 +107,9 @@ def test_vtk_reads_every_step(tmp_path: Path, dtype: str) -> None:
 
 
 def test_one_step_of_one_vertex(tmp_path: Path) -> None:
-    save_region(tmp_path / "out.vtkhdf", region(t=[1.0], z=[1.0], y=[2.0], x=[3.0]), DATA[:1, :1, :1, :1])
+    save_region(
+        tmp_path / "out.vtkhdf", region(t=[1.0], z=[1.0], y=[2.0], x=[3.0]), DATA[:1, :1, :1, :1]
+    )
     with h5py.File(tmp_path / "out.vtkhdf") as file:
         assert file["VTKHDF"].attrs["Spacing"].tolist() == [1, 1, 1]
         assert file["VTKHDF/PointData/wind"].shape == (1, 1, 1, 1)

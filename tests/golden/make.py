@@ -19,21 +19,45 @@ TOLERANCE = 1e-5  # of the range: float32 arithmetic in another order
 GOLDENS = {
     "paper-1.0-plain": EncodeConfig(profile="paper", width=8, timings=False, tables="float32"),
     "paper-1.0-feature": EncodeConfig(
-        profile="paper", width=8, timings=False, features=("interval:0.5:2", "isosurface:0"), key_frames="0,1,4", tables="float16"
+        profile="paper",
+        width=8,
+        timings=False,
+        features=("interval:0.5:2", "isosurface:0"),
+        key_frames="0,1,4",
+        tables="float16",
     ),
     "paper-1.0-linear-uint8": EncodeConfig(
-        profile="paper", hidden_layers=0, embedding_size=1, fold=3, timings=False, key_frames="every:2", tables="uint8"
+        profile="paper",
+        hidden_layers=0,
+        embedding_size=1,
+        fold=3,
+        timings=False,
+        key_frames="every:2",
+        tables="uint8",
     ),
     "compact-1.1-psnr": EncodeConfig(psnr=50.0, effort=4, timings=False),
-    "compact-1.1-bound": EncodeConfig(max_error=0.01, effort=2, tile="3x4x7x5", timings=False, features=("interval:0.5:2",)),
-    "compact-1.1-mask": EncodeConfig(psnr=50.0, effort=4, timings=False, features=("interval:0.5:2",)),
+    "compact-1.1-bound": EncodeConfig(
+        max_error=0.01, effort=2, tile="3x4x7x5", timings=False, features=("interval:0.5:2",)
+    ),
+    "compact-1.1-mask": EncodeConfig(
+        psnr=50.0, effort=4, timings=False, features=("interval:0.5:2",)
+    ),
     "compact-1.1-predictor": EncodeConfig(max_error=2.0, effort=3, timings=False),
     "paper-1.1-transform": EncodeConfig(
-        profile="paper", width=8, timings=False, features=("interval:0.5:2",), tables="transform", psnr=60.0
+        profile="paper",
+        width=8,
+        timings=False,
+        features=("interval:0.5:2",),
+        tables="transform",
+        psnr=60.0,
     ),
 }
 
-TIME = Coordinate(name="time", values=np.array([0.0, 0.5, 2.0, 2.25, 9.0]), attributes={"units": "hours since 2000-01-01"})
+TIME = Coordinate(
+    name="time",
+    values=np.array([0.0, 0.5, 2.0, 2.25, 9.0]),
+    attributes={"units": "hours since 2000-01-01"},
+)
 
 
 def series() -> ArraySeries:
@@ -47,7 +71,9 @@ def series() -> ArraySeries:
 
 def fronts() -> ArraySeries:
     """Noise beside a flat part, with a sharp edge that moves, and a hole: what is coded by prediction."""
-    t, z, y, x = np.meshgrid(np.arange(6), np.arange(16), np.arange(24), np.arange(24), indexing="ij")
+    t, z, y, x = np.meshgrid(
+        np.arange(6), np.arange(16), np.arange(24), np.arange(24), indexing="ij"
+    )
     inside = (x - 12) ** 2 + (y - 12) ** 2 + (z - 8) ** 2 < (4 + t) ** 2
     noise = np.random.default_rng(0).normal(0, 3, t.shape)
     values = np.where(inside, 800 + 40 * np.sin(x / 3) + noise, 20.0).astype(np.float32)
@@ -69,7 +95,9 @@ def main() -> None:
         fhash_codec.encode(SERIES.get(name, series)(), path, config)
         with fhash_codec.open(path) as volume:
             between = np.stack([volume.read(t) for t in (0.5, 3.75)])
-            np.savez_compressed(HERE / f"{name}.npz", whole=volume[...], between=between, tolerance=TOLERANCE)
+            np.savez_compressed(
+                HERE / f"{name}.npz", whole=volume[...], between=between, tolerance=TOLERANCE
+            )
 
 
 if __name__ == "__main__":

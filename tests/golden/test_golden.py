@@ -13,12 +13,21 @@ import fhash_codec
 
 HERE = Path(__file__).parent
 COMPACT = ["compact-1.1-bound", "compact-1.1-mask", "compact-1.1-predictor", "compact-1.1-psnr"]
-NAMES = ["paper-1.0-plain", "paper-1.0-feature", "paper-1.0-linear-uint8", "paper-1.1-transform", *COMPACT]
+NAMES = [
+    "paper-1.0-plain",
+    "paper-1.0-feature",
+    "paper-1.0-linear-uint8",
+    "paper-1.1-transform",
+    *COMPACT,
+]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_golden_containers_decode_to_their_values(name):
-    with np.load(HERE / f"{name}.npz") as expected, fhash_codec.open(HERE / f"{name}.fhz") as volume:
+    with (
+        np.load(HERE / f"{name}.npz") as expected,
+        fhash_codec.open(HERE / f"{name}.fhz") as volume,
+    ):
         low, high = volume.info["value_range"]
         tolerance = float(expected["tolerance"]) * (high - low)
         np.testing.assert_allclose(volume[...], expected["whole"], atol=tolerance, rtol=0)
@@ -33,7 +42,10 @@ def test_golden_containers_decode_to_their_values(name):
 @pytest.mark.parametrize("name", COMPACT)
 def test_compact_goldens_decode_to_the_same_bits_on_every_engine(name, native, monkeypatch):
     monkeypatch.setenv("FHASH_NATIVE", native)
-    with np.load(HERE / f"{name}.npz") as expected, fhash_codec.open(HERE / f"{name}.fhz") as volume:
+    with (
+        np.load(HERE / f"{name}.npz") as expected,
+        fhash_codec.open(HERE / f"{name}.fhz") as volume,
+    ):
         np.testing.assert_array_equal(volume[...], expected["whole"])
 
 

@@ -30,7 +30,9 @@ class BytesSource:
 def unpack(data: bytes) -> Parts:
     """The members of a sound container, documents inflated."""
     source = BytesSource(data)
-    return [(name, bytes(read_member(source, member))) for name, member in read_members(source).items()]
+    return [
+        (name, bytes(read_member(source, member))) for name, member in read_members(source).items()
+    ]
 
 
 def pack(parts: Iterable[tuple[str, bytes]]) -> bytes:

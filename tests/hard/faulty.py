@@ -28,7 +28,10 @@ def values(seed: int = 0) -> np.ndarray:
 
 def listing(folder: Path) -> Listing:
     """Everything below a folder with its bytes (None for a folder)."""
-    return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
 
 
 def moments(count: int, most: int = 6) -> list[int]:
@@ -45,17 +48,25 @@ class Bench:
         for number in range(2):
             (folder / str(number)).mkdir()
             np.save(self._place("in", number), values(number))
-            self._succeed(["encode", self._place("in", number), "-o", self._place("run", number), *COMPACT])
+            self._succeed(
+                ["encode", self._place("in", number), "-o", self._place("run", number), *COMPACT]
+            )
         self._known: dict[str, tuple[Listing, Listing, int]] = {}
 
     def words(self, name: str, number: int = 0) -> list[str]:
         """The command line of COMMANDS[name]; number: 1 for that of the older output."""
-        places = {"in": self._place("in", number), "run": self._place("run", number), "out": self.out}
+        places = {
+            "in": self._place("in", number),
+            "run": self._place("run", number),
+            "out": self.out,
+        }
         return [word.format_map(places) for word in COMMANDS[name]]
 
     def run(self, name: str, *inject: Injection, force: bool = True) -> Ended:
         """Run a command; without `force` it is one that replaces nothing."""
-        return self.server.run(*(word for word in self.words(name) if force or word != "--force"), inject=inject)
+        return self.server.run(
+            *(word for word in self.words(name) if force or word != "--force"), inject=inject
+        )
 
     def start(self, name: str, *inject: Injection, number: int = 0) -> Running:
         """Start a command."""
@@ -107,15 +118,56 @@ class Bench:
         assert ended.code == 0, ended.output
 
     def _place(self, kind: str, number: int) -> Path:
-        return self.folder / str(number) / ("in.npy" if kind == "in" else "run.fhz")  # the variable is called after the file
+        return (
+            self.folder / str(number) / ("in.npy" if kind == "in" else "run.fhz")
+        )  # the variable is called after the file
 
 
 COMMANDS = {
-    **{f"encode {name}": ("encode", "{in}", "-o", "{out}/a.fhz", "--force", *words) for name, words in PROFILES.items()},
-    **{f"decode {suffix}": ("decode", "{run}", "-o", f"{{out}}/a.{suffix}", "--force", "-q") for suffix in FORMATS},
-    "decode vtp": ("decode", "{run}", "--isosurface", "5", "--t", "0", "-o", "{out}/a.vtp", "--force", "-q"),
+    **{
+        f"encode {name}": ("encode", "{in}", "-o", "{out}/a.fhz", "--force", *words)
+        for name, words in PROFILES.items()
+    },
+    **{
+        f"decode {suffix}": ("decode", "{run}", "-o", f"{{out}}/a.{suffix}", "--force", "-q")
+        for suffix in FORMATS
+    },
+    "decode vtp": (
+        "decode",
+        "{run}",
+        "--isosurface",
+        "5",
+        "--t",
+        "0",
+        "-o",
+        "{out}/a.vtp",
+        "--force",
+        "-q",
+    ),
     "render png": ("render", "{run}", "-o", "{out}/a.png", "--size", "40x30", "--force", "-q"),
-    "render gif": ("render", "{run}", "-o", "{out}/a.gif", "--animate", "steps", "--size", "40x30", "--force", "-q"),
-    "render pictures": ("render", "{run}", "-o", "{out}/a.png", "--animate", "steps", "--size", "20x16", "--force", "-q"),
+    "render gif": (
+        "render",
+        "{run}",
+        "-o",
+        "{out}/a.gif",
+        "--animate",
+        "steps",
+        "--size",
+        "40x30",
+        "--force",
+        "-q",
+    ),
+    "render pictures": (
+        "render",
+        "{run}",
+        "-o",
+        "{out}/a.png",
+        "--animate",
+        "steps",
+        "--size",
+        "20x16",
+        "--force",
+        "-q",
+    ),
 }
 """Command lines by name; {in}, {run} and {out} stand for the series, a container and the folder of the outputs."""

@@ -20,8 +20,23 @@ import fhash_cli.encode
 import fhash_cli.render  # noqa: F401 - imported for the forks
 from fhash_cli.main import main
 
-MODULES = ("fhash_codec", "fhash_codec.encoding", "fhash_codec.compact.encoder", "fhash_codec.isosurface", "fhash_codec.render.render")
-OTHERS = ("h5py", "zarr", "xarray", "h5netcdf", "PIL.PngImagePlugin", "PIL.GifImagePlugin", "fhash_formats.container", "scipy.special")
+MODULES = (
+    "fhash_codec",
+    "fhash_codec.encoding",
+    "fhash_codec.compact.encoder",
+    "fhash_codec.isosurface",
+    "fhash_codec.render.render",
+)
+OTHERS = (
+    "h5py",
+    "zarr",
+    "xarray",
+    "h5netcdf",
+    "PIL.PngImagePlugin",
+    "PIL.GifImagePlugin",
+    "fhash_formats.container",
+    "scipy.special",
+)
 TRAINING = ("torch", "fhash_codec.engines.portable", "fhash_codec.checkpoint", "fhash_codec.train")
 
 

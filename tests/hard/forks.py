@@ -56,7 +56,9 @@ class Running:
         """Until it ends."""
         code = self.server.ask({"wait": self.pid})
         # Killed before it had begun, it has none.
-        return Ended(code=code, output=self.log.read_text(errors="replace") if self.log.exists() else "")
+        return Ended(
+            code=code, output=self.log.read_text(errors="replace") if self.log.exists() else ""
+        )
 
 
 class Server:
@@ -68,7 +70,9 @@ class Server:
         if faults is not None:
             environment["LD_PRELOAD"] = str(faults)
         words = [sys.executable, str(HERE / "fork_server.py")]
-        self.process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment)
+        self.process = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
         assert self._answer() == "ready"
 
     def _answer(self) -> str:

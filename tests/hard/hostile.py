@@ -44,7 +44,9 @@ class Report:
         for end in answer["ends"]:
             self.ends.setdefault(end["command"], Counter())[end["end"]] += 1
             self.kinds.setdefault(answer["kind"], Counter())[end["end"]] += 1
-            self.worst_seconds = max(self.worst_seconds, (end["seconds"], f"{name}, {end['command']}"))
+            self.worst_seconds = max(
+                self.worst_seconds, (end["seconds"], f"{name}, {end['command']}")
+            )
             self.worst_bytes = max(self.worst_bytes, (end["bytes"], f"{name}, {end['command']}"))
             if end["wrong"]:
                 self.wrong.append(f"{name}, {end['command']}: {end['wrong']}")
@@ -70,7 +72,9 @@ def trials(numbers: Iterable[int], processes: int, folder: Path) -> Report:
         waiting.put(number)
     report = Report()
     with ThreadPoolExecutor(processes) as pool:
-        for answers in pool.map(lambda at: list(_answers(waiting, folder / str(at))), range(processes)):
+        for answers in pool.map(
+            lambda at: list(_answers(waiting, folder / str(at))), range(processes)
+        ):
             for answer in answers:
                 report.add(answer)
     return report
@@ -92,7 +96,11 @@ def _answers(waiting: SimpleQueue[int], folder: Path) -> Iterator[dict[str, Any]
         process.kill()
         code = _left(process)
         process = None
-        how = f"the process ended by {signal.Signals(-code).name}" if code < 0 else f"the process ended with exit code {code}"
+        how = (
+            f"the process ended by {signal.Signals(-code).name}"
+            if code < 0
+            else f"the process ended with exit code {code}"
+        )
         yield _crashed(number, how)
     if process is not None:
         _left(process)
@@ -115,7 +123,14 @@ def _started(folder: Path) -> subprocess.Popen[str]:
     environment = {**os.environ, **checks, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(Path(__file__).with_name("hostile_trial.py")), str(folder)]
     with (folder / "log").open("a") as log:
-        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=environment)
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            env=environment,
+        )
 
 
 def _asked(process: subprocess.Popen[str], number: int) -> str:

@@ -58,7 +58,9 @@ class Trial:
             with Container.open(self.path) as container:
                 return tuple(container.header["domain"]["shape"])
         except FhashError:
-            return tuple(mutations.header_of(mutations.goldens()[self.mutation.golden][1])["domain"]["shape"])
+            return tuple(
+                mutations.header_of(mutations.goldens()[self.mutation.golden][1])["domain"]["shape"]
+            )
         except Exception:  # which the first command will report
             return (5, 6, 7, 9)
 
@@ -67,18 +69,37 @@ class Trial:
         run, region = str(self.path), self._region()
         roi = ",".join(f"{low}:{high}" for low, high in region[1:])
         steps = f"{region[0][0]}:{region[0][1]}"
-        whole, part, picture = (str(self.folder / name) for name in ("whole.npy", "part.npy", "picture.png"))
+        whole, part, picture = (
+            str(self.folder / name) for name in ("whole.npy", "part.npy", "picture.png")
+        )
         self._command("info", ["info", run])
         self._command("info --json", ["info", run, "--json"])
         self._command("verify", ["verify", run, "-q"])
         if self._small():
-            self._command("decode", ["decode", run, "-o", whole, "--force", "-q"], lambda: self._values(whole, self.shape, "whole"))
+            self._command(
+                "decode",
+                ["decode", run, "-o", whole, "--force", "-q"],
+                lambda: self._values(whole, self.shape, "whole"),
+            )
         sizes = [high - low for low, high in region]
         check = lambda: self._values(part, sizes, "part", region)  # noqa: E731
-        self._command("decode region", ["decode", run, "--roi", roi, "--t", steps, "-o", part, "--force", "-q"], check)
+        self._command(
+            "decode region",
+            ["decode", run, "--roi", roi, "--t", steps, "-o", part, "--force", "-q"],
+            check,
+        )
         self._end("sample", self._sample)
-        self._command("render", ["render", run, "-o", picture, "--size", "32x32", "--force", "-q"], lambda: self._picture(picture))
-        return {"number": self.mutation.number, "kind": self.mutation.kind, "golden": self.mutation.golden, "ends": self.ends}
+        self._command(
+            "render",
+            ["render", run, "-o", picture, "--size", "32x32", "--force", "-q"],
+            lambda: self._picture(picture),
+        )
+        return {
+            "number": self.mutation.number,
+            "kind": self.mutation.kind,
+            "golden": self.mutation.golden,
+            "ends": self.ends,
+        }
 
     def _small(self) -> bool:
         return prod(self.shape) <= LARGE
@@ -91,7 +112,9 @@ class Trial:
             found.append((low, min(length, low + 3)))
         return found
 
-    def _command(self, name: str, arguments: list[str], check: Callable[[], str | None] | None = None) -> None:
+    def _command(
+        self, name: str, arguments: list[str], check: Callable[[], str | None] | None = None
+    ) -> None:
         def work() -> str | None:
             try:
                 fhash_cli.main.program.main(args=arguments, prog_name="fhash")
@@ -108,7 +131,11 @@ class Trial:
         _reset_peak()
         before, start = _resident("VmRSS"), time.process_time()
         _bound_time()
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
+        with (
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+            warnings.catch_warnings(),
+        ):
             warnings.showwarning = _warned
             try:
                 wrong = work()
@@ -123,8 +150,12 @@ class Trial:
             wrong = self._judged(name, code, said)
         if wrong is None and seconds > SECONDS:
             wrong = f"{seconds:.1f} s of processor time"
-        end = {0: "decoded", 4: "refused", 1: "too large", 2: "nothing to show"}.get(code, f"exit {code}")
-        self.ends.append({"command": name, "end": end, "seconds": seconds, "bytes": peak, "wrong": wrong})
+        end = {0: "decoded", 4: "refused", 1: "too large", 2: "nothing to show"}.get(
+            code, f"exit {code}"
+        )
+        self.ends.append(
+            {"command": name, "end": end, "seconds": seconds, "bytes": peak, "wrong": wrong}
+        )
 
     def _judged(self, name: str, code: int, said: str) -> str | None:
         """What may not be about an exit code and what was printed with it."""
@@ -132,13 +163,21 @@ class Trial:
         if code == 0:
             if lines:
                 return f"success, but it says {said[:200]!r}"
-            if name == "verify" and not self.mutation.sealed and self.mutation.data != self._golden():
+            if (
+                name == "verify"
+                and not self.mutation.sealed
+                and self.mutation.data != self._golden()
+            ):
                 return "a damaged file is called sound"
             return None
         if len(lines) != 1 or not lines[0].startswith("fhash: error: "):
             return f"exit code {code} and {len(lines)} lines: {said[:300]!r}"
         # A sound file may hold more than there is memory for.
-        if code == 1 and self.mutation.sealed and lines[0].startswith("fhash: error: out of memory"):
+        if (
+            code == 1
+            and self.mutation.sealed
+            and lines[0].startswith("fhash: error: out of memory")
+        ):
             return None
         # Of a sound file with strange values, the usual scene may have nothing to show.
         if code == 2 and self.mutation.sealed and name == "render":
@@ -148,7 +187,13 @@ class Trial:
     def _golden(self) -> bytes:
         return mutations.goldens()[self.mutation.golden][0]
 
-    def _values(self, path: str, shape: Iterable[int], what: str, region: list[tuple[int, int]] | None = None) -> str | None:
+    def _values(
+        self,
+        path: str,
+        shape: Iterable[int],
+        what: str,
+        region: list[tuple[int, int]] | None = None,
+    ) -> str | None:
         """What is wrong with decoded values: finite and of the declared shape, those of the golden where nothing was sealed."""
         values = np.load(path)
         os.unlink(path)
@@ -178,7 +223,9 @@ class Trial:
             say(f"error: {line}")
             raise SystemExit(code) from error
         # A derivative may well be larger than its type holds.
-        return "infinities" if np.isinf(values).any() or slopes.shape != (*values.shape, 4) else None
+        return (
+            "infinities" if np.isinf(values).any() or slopes.shape != (*values.shape, 4) else None
+        )
 
     def _picture(self, path: str) -> str | None:
         with Image.open(path) as image:
@@ -190,7 +237,9 @@ class Trial:
 
 def _warned(message: Warning | str, category: type[Warning], *_: Any) -> None:
     """A warning as the command line shows it, those that are meant for users apart from those of the libraries below."""
-    say(f"{'warning' if issubclass(category, FhashWarning) else category.__name__}: {' '.join(str(message).split())}")
+    say(
+        f"{'warning' if issubclass(category, FhashWarning) else category.__name__}: {' '.join(str(message).split())}"
+    )
 
 
 @cache
@@ -215,7 +264,10 @@ def _reset_peak() -> None:
 def _bound_time() -> None:
     """End the process where the next command takes more than a few times what it may."""
     used = resource.getrusage(resource.RUSAGE_SELF)
-    resource.setrlimit(resource.RLIMIT_CPU, (int(used.ru_utime + used.ru_stime + 3 * SECONDS) + 1, resource.RLIM_INFINITY))
+    resource.setrlimit(
+        resource.RLIMIT_CPU,
+        (int(used.ru_utime + used.ru_stime + 3 * SECONDS) + 1, resource.RLIM_INFINITY),
+    )
 
 
 def worker(folder: Path) -> None:
@@ -225,7 +277,9 @@ def worker(folder: Path) -> None:
     for golden in mutations.goldens():
         expected_values(golden)
         warm = Trial(0, folder)
-        warm.mutation = mutations.Mutation(number=0, golden=golden, kind="none", sealed=True, data=mutations.goldens()[golden][0])
+        warm.mutation = mutations.Mutation(
+            number=0, golden=golden, kind="none", sealed=True, data=mutations.goldens()[golden][0]
+        )
         warm.path.write_bytes(warm.mutation.data)
         warm.shape = warm._declared()
         wrong = [end for end in warm.run()["ends"] if end["wrong"]]

@@ -20,7 +20,9 @@ def at_operation(folder: str, number: int, code: int, counted: str = "") -> None
     """
     library = ctypes.CDLL(os.environ["FHASH_FAULTS"])
     library.fhash_fault_count.restype = ctypes.c_long
-    library.fhash_faults(os.path.realpath(folder).encode(), ctypes.c_long(number), ctypes.c_int(code))
+    library.fhash_faults(
+        os.path.realpath(folder).encode(), ctypes.c_long(number), ctypes.c_int(code)
+    )
     if counted:
         leave = sys.exit
 

@@ -13,14 +13,66 @@ from containers import Parts
 
 DOCUMENT = "zarr.json"
 LARGE = (
-    *(2**16, 2**20, 2**24, 2**28, 2**31 - 1, 2**31, 2**32, 2**40, 2**53 + 1, 2**60, 2**62, 2**63 - 1, 2**63, 2**64 - 1, 2**64),
+    *(
+        2**16,
+        2**20,
+        2**24,
+        2**28,
+        2**31 - 1,
+        2**31,
+        2**32,
+        2**40,
+        2**53 + 1,
+        2**60,
+        2**62,
+        2**63 - 1,
+        2**63,
+        2**64 - 1,
+        2**64,
+    ),
     *(10**30, 10**400),
 )
 NUMBERS: tuple[Any, ...] = (0, 1, 2, 3, 5, 7, 10, 11, 64, -1, -(2**60), -(2**63), *LARGE)
-FLOATS = (0.5, -0.5, -0.0, 1.5, 1e-12, 1e308, -1e308, 1.7976931348623157e308, 2.3e-308, 5e-324, 3.4e38, -3.4e38, 1e-45, 1e39, 1e16)
+FLOATS = (
+    0.5,
+    -0.5,
+    -0.0,
+    1.5,
+    1e-12,
+    1e308,
+    -1e308,
+    1.7976931348623157e308,
+    2.3e-308,
+    5e-324,
+    3.4e38,
+    -3.4e38,
+    1e-45,
+    1e39,
+    1e16,
+)
 SPECIAL = (math.nan, math.inf, -math.inf)
 OTHERS: tuple[Any, ...] = (
-    *(True, False, None, "", "x", "9/7", "klt", "\x00", "../x", "1", "\ud7ff", "\n", "NaN", "x" * 70_000, [], [0], [[]], {}, {"a": 1}),
+    *(
+        True,
+        False,
+        None,
+        "",
+        "x",
+        "9/7",
+        "klt",
+        "\x00",
+        "../x",
+        "1",
+        "\ud7ff",
+        "\n",
+        "NaN",
+        "x" * 70_000,
+        [],
+        [0],
+        [[]],
+        {},
+        {"a": 1},
+    ),
     *([1] * 70_000, [None] * 5, {"must_understand": False}, {str(n): n for n in range(3000)}),
 )
 
@@ -37,15 +89,46 @@ def hostile(chance: random.Random, old: Any) -> Any:
     turn = chance.random()
     if isinstance(old, int) and not isinstance(old, bool) and turn < 0.6:
         return chance.choice(
-            (*NUMBERS, old + 1, old - 1, -old, 2 * old, old * old + 1 if old < 2**80 else 0, float(old) if old < 2**80 else 1e300)
+            (
+                *NUMBERS,
+                old + 1,
+                old - 1,
+                -old,
+                2 * old,
+                old * old + 1 if old < 2**80 else 0,
+                float(old) if old < 2**80 else 1e300,
+            )
         )
     if isinstance(old, float) and turn < 0.6:
-        return chance.choice((*FLOATS, *SPECIAL, -old, old * 1e6, old * 1e-6, old * 1e30, int(old) if math.isfinite(old) else 0))
+        return chance.choice(
+            (
+                *FLOATS,
+                *SPECIAL,
+                -old,
+                old * 1e6,
+                old * 1e-6,
+                old * 1e30,
+                int(old) if math.isfinite(old) else 0,
+            )
+        )
     if isinstance(old, list) and old and turn < 0.6:
-        return chance.choice((old[:-1], [*old, old[-1]], old[::-1], [*old] * 2, [old], [old[0]] * len(old), [], sorted(old, key=str)))
+        return chance.choice(
+            (
+                old[:-1],
+                [*old, old[-1]],
+                old[::-1],
+                [*old] * 2,
+                [old],
+                [old[0]] * len(old),
+                [],
+                sorted(old, key=str),
+            )
+        )
     if isinstance(old, str) and turn < 0.4:
         return chance.choice((old[:-1], old + "x", old.upper(), old * 2, old[::-1]))
-    return chance.choice((*OTHERS, *NUMBERS, *FLOATS, *SPECIAL, _nest(chance.choice((10, 60, 70, 400)))))
+    return chance.choice(
+        (*OTHERS, *NUMBERS, *FLOATS, *SPECIAL, _nest(chance.choice((10, 60, 70, 400))))
+    )
 
 
 Place = tuple[Any, Any]
@@ -54,12 +137,16 @@ Place = tuple[Any, Any]
 
 def places(value: Any) -> Iterator[Place]:
     """Every value of a document."""
-    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+    for key in (
+        value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    ):
         yield value, key
         yield from places(value[key])
 
 
-def _changed(chance: random.Random, parts: Parts, change: Callable[[dict[str, Any]], None], name: str = "") -> Parts:
+def _changed(
+    chance: random.Random, parts: Parts, change: Callable[[dict[str, Any]], None], name: str = ""
+) -> Parts:
     """One document changed; a random one where none is named, the root as often as all others."""
     documents = [other for other, _ in parts if other.endswith(DOCUMENT)]
     name = name or (DOCUMENT if chance.random() < 0.4 else chance.choice(documents))
@@ -92,7 +179,10 @@ def _key(chance: random.Random, parts: Parts) -> Parts:
     """A key that is missing, is there besides, or is called otherwise."""
 
     def change(values: dict[str, Any]) -> None:
-        objects = [values, *(holder[key] for holder, key in places(values) if isinstance(holder[key], dict))]
+        objects = [
+            values,
+            *(holder[key] for holder, key in places(values) if isinstance(holder[key], dict)),
+        ]
         chosen = chance.choice([one for one in objects if one])
         key, turn = chance.choice(list(chosen)), chance.random()
         if turn < 0.5:
@@ -100,7 +190,11 @@ def _key(chance: random.Random, parts: Parts) -> Parts:
         elif turn < 0.75:
             chosen[key + chance.choice(("x", "_", " "))] = chosen.pop(key)
         else:
-            chosen[chance.choice(("novelty", "storage_transformers", "consolidated_metadata", "must_understand"))] = chance.choice(OTHERS)
+            chosen[
+                chance.choice(
+                    ("novelty", "storage_transformers", "consolidated_metadata", "must_understand")
+                )
+            ] = chance.choice(OTHERS)
 
     return _changed(chance, parts, change)
 
@@ -138,7 +232,9 @@ def _lengths(chance: random.Random, parts: Parts) -> Parts:
 
 def _rule(chance: random.Random) -> dict[str, Any]:
     numbers = (0, 1, -1, 1e308, -1e308, 1e-308, 5e-324, 1e-12, 3.5e5, 3.4e38, -0.0, 2**53, 1e16)
-    rule: dict[str, Any] = {key: chance.choice(numbers) for key in ("start", "step", "last") if chance.random() < 0.5}
+    rule: dict[str, Any] = {
+        key: chance.choice(numbers) for key in ("start", "step", "last") if chance.random() < 0.5
+    }
     if chance.random() < 0.4:
         rule["dtype"] = chance.choice(("float32", "float32", "float64", "float16"))
     return rule
@@ -151,8 +247,14 @@ def _coordinates(chance: random.Random, parts: Parts) -> Parts:
         header = values["attributes"]["fhash"]
         for axis in chance.sample(("time", "z", "y", "x"), chance.choice((1, 1, 2, 4))):
             length = header["domain"]["shape"][("time", "z", "y", "x").index(axis)]
-            listed = {"values": [chance.choice((0, 1, -1, 1e308, -1e308, 5e-324, 2.5)) for _ in range(length)]}
-            header.setdefault("coordinates", {})[axis] = listed if chance.random() < 0.4 else _rule(chance)
+            listed = {
+                "values": [
+                    chance.choice((0, 1, -1, 1e308, -1e308, 5e-324, 2.5)) for _ in range(length)
+                ]
+            }
+            header.setdefault("coordinates", {})[axis] = (
+                listed if chance.random() < 0.4 else _rule(chance)
+            )
 
     return _changed(chance, parts, change, DOCUMENT)
 
@@ -169,22 +271,53 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
         elif turn == 1:
             header["background"] = chance.choice(FLOATS)
         elif turn == 2:
-            header["variable"]["dtype"] = chance.choice(("int8", "uint8", "int64", "uint64", "float16", "float64", "int32"))
+            header["variable"]["dtype"] = chance.choice(
+                ("int8", "uint8", "int64", "uint64", "float16", "float64", "int32")
+            )
         elif turn == 3:
             low = [chance.randrange(n) for n in shape[1:]]
-            header["feature_bounding_box"] = [[a, chance.randrange(a + 1, n + 1)] for a, n in zip(low, shape[1:], strict=True)]
+            header["feature_bounding_box"] = [
+                [a, chance.randrange(a + 1, n + 1)] for a, n in zip(low, shape[1:], strict=True)
+            ]
         elif turn == 4:
-            header["format_version"] = chance.choice(([1, 0], [1, 1], [1, 2], [1, 9999], [2, 0], [0, 1], [1, -1], [10**9, 0]))
+            header["format_version"] = chance.choice(
+                ([1, 0], [1, 1], [1, 2], [1, 9999], [2, 0], [0, 1], [1, -1], [10**9, 0])
+            )
         elif turn == 5:
             names = ("transform", "mask", "predictor", "cross", "novelty", "")
             header["required_features"] = chance.sample(names, chance.randrange(len(names)))
         elif turn == 6:
             header["features"] = chance.choice(
-                ([], ["all"], ["interval:2:0.5"], ["isosurface:nan"], ["isosurface:1e300"], ["x"] * 9, ["\n"])
+                (
+                    [],
+                    ["all"],
+                    ["interval:2:0.5"],
+                    ["isosurface:nan"],
+                    ["isosurface:1e300"],
+                    ["x"] * 9,
+                    ["\n"],
+                )
             )
         else:
-            header["history"] = chance.choice(([], {}, {"epoch": []}, {"epoch": [1] * 70_000}, [{}] * 1000, {"epoch": [1], "psnr": [None]}))
-            header["quality"] = chance.choice(({}, {"psnr": None}, {"psnr": 1e308, "rmse": 0}, {"per_step": []}, {"per_step": {"psnr": 3}}))
+            header["history"] = chance.choice(
+                (
+                    [],
+                    {},
+                    {"epoch": []},
+                    {"epoch": [1] * 70_000},
+                    [{}] * 1000,
+                    {"epoch": [1], "psnr": [None]},
+                )
+            )
+            header["quality"] = chance.choice(
+                (
+                    {},
+                    {"psnr": None},
+                    {"psnr": 1e308, "rmse": 0},
+                    {"per_step": []},
+                    {"per_step": {"psnr": 3}},
+                )
+            )
 
     return _changed(chance, parts, change, DOCUMENT)
 
@@ -196,16 +329,45 @@ def _array(chance: random.Random, parts: Parts) -> Parts:
     def change(values: dict[str, Any]) -> None:
         grid = values["chunk_grid"]["configuration"]["chunk_shape"]
         codec = values["codecs"][0]
-        lists = [values["shape"], grid, *([codec["configuration"]["chunk_shape"]] if codec["name"] == "sharding_indexed" else [])]
+        lists = [
+            values["shape"],
+            grid,
+            *(
+                [codec["configuration"]["chunk_shape"]]
+                if codec["name"] == "sharding_indexed"
+                else []
+            ),
+        ]
         turn = chance.random()
         if turn < 0.25:
             values["data_type"] = chance.choice(
-                ("int8", "uint8", "int16", "int64", "uint64", "float16", "float32", "float64", "bool", "complex64")
+                (
+                    "int8",
+                    "uint8",
+                    "int16",
+                    "int64",
+                    "uint64",
+                    "float16",
+                    "float32",
+                    "float64",
+                    "bool",
+                    "complex64",
+                )
             )
         elif turn < 0.75:
             for chosen in chance.sample(lists, chance.randrange(1, len(lists) + 1)):
                 axis = chance.randrange(len(chosen))
-                chosen[axis] = chance.choice((1, 2, chosen[axis] + 1, chosen[axis] - 1, 2 * chosen[axis], 3 * chosen[axis], *LARGE))
+                chosen[axis] = chance.choice(
+                    (
+                        1,
+                        2,
+                        chosen[axis] + 1,
+                        chosen[axis] - 1,
+                        2 * chosen[axis],
+                        3 * chosen[axis],
+                        *LARGE,
+                    )
+                )
         else:
             codecs = values["codecs"]
             codecs.insert(chance.randrange(len(codecs) + 1), deepcopy(chance.choice(codecs)))
@@ -220,7 +382,17 @@ def _text(chance: random.Random, parts: Parts) -> Parts:
     documents = [name for name, _ in parts if name.endswith(DOCUMENT)]
     name = DOCUMENT if chance.random() < 0.4 else chance.choice(documents)
     snippets = (
-        *(b"NaN", b"1e999", b'"a":1,"a":2,', b"\xff", b"\x00", b"[" * 70, b"[" * 200_000, b'{"a":' * 100_000, b"9" * 5000),
+        *(
+            b"NaN",
+            b"1e999",
+            b'"a":1,"a":2,',
+            b"\xff",
+            b"\x00",
+            b"[" * 70,
+            b"[" * 200_000,
+            b'{"a":' * 100_000,
+            b"9" * 5000,
+        ),
         *(b'"\\ud800"', b"-", b"//"),
     )
 

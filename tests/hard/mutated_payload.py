@@ -38,14 +38,22 @@ Change = Callable[[random.Random, bytes], bytes]
 
 def documents_of(parts: Parts) -> dict[str, Any]:
     """Metadata of the arrays by name."""
-    found = {name.rpartition("/")[0]: json.loads(data) for name, data in parts if name.endswith(DOCUMENT)}
+    found = {
+        name.rpartition("/")[0]: json.loads(data) for name, data in parts if name.endswith(DOCUMENT)
+    }
     return {name: values for name, values in found.items() if values["node_type"] == "array"}
 
 
-def chosen(chance: random.Random, parts: Parts, coded: bool | None = None) -> tuple[str, dict[str, Any], str, bytes]:
+def chosen(
+    chance: random.Random, parts: Parts, coded: bool | None = None
+) -> tuple[str, dict[str, Any], str, bytes]:
     """An array, its metadata, and one of its members; coded: by `fhash.transform`, or not, or whichever."""
     documents = documents_of(parts)
-    fitting = [(name, data) for name, data in parts if "/c/" in name and (coded is None or is_coded(documents[_array_of(name)]) == coded)]
+    fitting = [
+        (name, data)
+        for name, data in parts
+        if "/c/" in name and (coded is None or is_coded(documents[_array_of(name)]) == coded)
+    ]
     name, data = chance.choice(fitting)
     return _array_of(name), documents[_array_of(name)], name, data
 
@@ -83,7 +91,9 @@ def damaged(chance: random.Random, data: bytes) -> bytes:
     return bytes(changed)
 
 
-def inner_chunks(document: dict[str, Any], member: str, data: bytes) -> tuple[Sharding, np.ndarray[Any, Any], list[bytes]]:
+def inner_chunks(
+    document: dict[str, Any], member: str, data: bytes
+) -> tuple[Sharding, np.ndarray[Any, Any], list[bytes]]:
     """The sharding of an array, which inner chunks of a shard are present, and these with their CRC-32C."""
     metadata = ArrayMetadata.from_dict(document)
     sharding = metadata.sharding
@@ -120,8 +130,22 @@ def _index(chance: random.Random, parts: Parts) -> Parts:
     table = list(struct.unpack(f"<{2 * prod(sharding.counts)}Q", data[start:-4]))
     for _ in range(chance.choice((1, 1, 2))):
         at = chance.randrange(len(table))
-        table[at] = chance.choice((0, 1, start, start + 1, 2**64 - 1, 2**63, 2**32, max(table[at], 1) - 1, chance.choice(table)))
-    return replaced(parts, {member: data[:start] + with_crc(struct.pack(f"<{len(table)}Q", *table))})
+        table[at] = chance.choice(
+            (
+                0,
+                1,
+                start,
+                start + 1,
+                2**64 - 1,
+                2**63,
+                2**32,
+                max(table[at], 1) - 1,
+                chance.choice(table),
+            )
+        )
+    return replaced(
+        parts, {member: data[:start] + with_crc(struct.pack(f"<{len(table)}Q", *table))}
+    )
 
 
 SPECIAL = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-45, 1e38, -3.4e38, 1e300, -1e308, 5e-324)
@@ -136,9 +160,20 @@ def values_changed(chance: random.Random, parts: Parts) -> Parts:
         for _ in range(chance.choice((1, 2, len(values)))):
             at = chance.randrange(len(values))
             if dtype.kind == "f":
-                values[at] = chance.choice((*SPECIAL, float(values[at]) * 1e6, -float(values[at]), float(values[0])))
+                values[at] = chance.choice(
+                    (*SPECIAL, float(values[at]) * 1e6, -float(values[at]), float(values[0]))
+                )
             else:
-                values[at] = chance.choice((0, 1, np.iinfo(dtype).min, np.iinfo(dtype).max, int(values[at]) ^ 1, 255 & int(values[at]) + 1))
+                values[at] = chance.choice(
+                    (
+                        0,
+                        1,
+                        np.iinfo(dtype).min,
+                        np.iinfo(dtype).max,
+                        int(values[at]) ^ 1,
+                        255 & int(values[at]) + 1,
+                    )
+                )
     if chance.random() < 0.2:
         values[:] = chance.choice(SPECIAL) if dtype.kind == "f" else chance.choice((0, 255))
     return replaced(parts, {member: with_crc(compress(values.tobytes(), 1))})
@@ -161,7 +196,9 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
     return replaced(parts, {member: shard_of(sharding, present, chunks)})
 
 
-def _restreamed(chance: random.Random, stream: bytes, settings: Settings, shape: tuple[int, ...]) -> bytes:
+def _restreamed(
+    chance: random.Random, stream: bytes, settings: Settings, shape: tuple[int, ...]
+) -> bytes:
     parts = parts_of(stream)
     flags, sections = parts.flags, parts.sections()
     if not parts.coded:
@@ -169,25 +206,35 @@ def _restreamed(chance: random.Random, stream: bytes, settings: Settings, shape:
     first = bool(flags & OWN) + bool(flags & MISSING)
     at = chance.randrange(first, len(sections))
     sections[at] = damaged(chance, sections[at])
-    if chance.random() < 0.15 and not flags & RESIDUAL and not parts.predicted:  # a residual where none was
+    if (
+        chance.random() < 0.15 and not flags & RESIDUAL and not parts.predicted
+    ):  # a residual where none was
         flags |= RESIDUAL
         sections.insert(first + 1, chance.randbytes(chance.randrange(200)))
     try:
         if parts.predicted and settings.predictor is not None:
             integers = decode_predicted(sections[first], shape, settings.predictor)
         else:
-            integers = decode_integers(sections[first], shape, band_table(settings.transform, shape))
+            integers = decode_integers(
+                sections[first], shape, band_table(settings.transform, shape)
+            )
         digest = zlib.crc32(little(integers))
         if flags & RESIDUAL:
-            digest = zlib.crc32(little(decode_integers(sections[first + 1], shape, single_band(shape))), digest)
+            digest = zlib.crc32(
+                little(decode_integers(sections[first + 1], shape, single_band(shape))), digest
+            )
         if parts.masked and settings.mask is not None and sections[-1]:
-            sections[-1] = _mask_section(sections[-1][2:], integers, settings, shape, parts.predicted)
+            sections[-1] = _mask_section(
+                sections[-1][2:], integers, settings, shape, parts.predicted
+            )
     except FhashError:
         digest = chance.getrandbits(32)
     return bytes([flags]) + digest.to_bytes(4, "little") + b"".join(map(section, sections))
 
 
-def _mask_section(coded: bytes, integers: Any, settings: Settings, shape: tuple[int, ...], predicted: bool) -> bytes:
+def _mask_section(
+    coded: bytes, integers: Any, settings: Settings, shape: tuple[int, ...], predicted: bool
+) -> bytes:
     """A coded mask behind the digest of what it decodes to."""
     assert settings.mask is not None
     with np.errstate(all="ignore"):

@@ -50,7 +50,9 @@ def _flags(chance: random.Random, parts: Parts) -> Parts:
     else:
         configuration = json.loads(json.dumps(configuration_of(document)))
         _settings_changed(chance, configuration, sharding.chunk_shape)
-        text = zlib.compress(chance.choice((dumped(configuration), b"[" * 100_000, b" " * (1 << 24), b"{}", b"3")))
+        text = zlib.compress(
+            chance.choice((dumped(configuration), b"[" * 100_000, b" " * (1 << 24), b"{}", b"3"))
+        )
         head = 1 if stream[0] & (EXACT | EMPTY) else 5
         stream = bytes([stream[0] | OWN]) + stream[1:head] + section(text) + stream[head:]
     chunks[at] = with_crc(stream)
@@ -65,13 +67,19 @@ def _settings(chance: random.Random, parts: Parts) -> Parts:
         return values_changed(chance, parts)
     name = chance.choice(coded)
     document = documents[name]
-    _settings_changed(chance, configuration_of(document), tuple(document["codecs"][0]["configuration"]["chunk_shape"]))
+    _settings_changed(
+        chance,
+        configuration_of(document),
+        tuple(document["codecs"][0]["configuration"]["chunk_shape"]),
+    )
     root = json.loads(dict(parts)[DOCUMENT])
     root["attributes"]["fhash"]["required_features"] = ["transform", "mask", "predictor", "cross"]
     return replaced(parts, {f"{name}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 
-def _settings_changed(chance: random.Random, settings: dict[str, Any], shape: tuple[int, ...]) -> None:
+def _settings_changed(
+    chance: random.Random, settings: dict[str, Any], shape: tuple[int, ...]
+) -> None:
     turn = chance.randrange(9)
     numbers = (1e-300, 1e-38, 1.2e-38, 1e-12, 1.0, 1e12, 3.3e38, 1e300, 1.7e308)
     if turn == 0:
@@ -85,16 +93,31 @@ def _settings_changed(chance: random.Random, settings: dict[str, Any], shape: tu
         settings["offsets"] = [chance.choice((-128, 128, 0, 129)) for _ in range(3)]
     elif turn == 3:
         axis = chance.choice("tzyx")
-        kinds = ("none", ["haar", 1], ["haar", 10], ["5/3", 10], ["9/7", 10], ["9/7", 0], ["9/7", 11], ["klt", 1])
+        kinds = (
+            "none",
+            ["haar", 1],
+            ["haar", 10],
+            ["5/3", 10],
+            ["9/7", 10],
+            ["9/7", 0],
+            ["9/7", 11],
+            ["klt", 1],
+        )
         settings["transform"][axis] = chance.choice(kinds)
     elif turn == 4:
         settings["transform"][chance.choice("tzyx")] = {"klt": _basis(chance, shape)}
     elif turn == 5:
         settings["head"] = _head(chance)
     elif turn == 6:
-        edges = sorted(chance.choices((*numbers, -1.0, 0.0, 0.25, 0.5, 0.75), k=chance.randrange(16)))
+        edges = sorted(
+            chance.choices((*numbers, -1.0, 0.0, 0.25, 0.5, 0.75), k=chance.randrange(16))
+        )
         scores = [chance.choice((0, 1, 2048, 4095, 4096)) for _ in range(len(edges) + 1)]
-        settings["mask"] = {"edges": edges, "scores": scores, "reach": chance.choice((0, 1, 64, 65))}
+        settings["mask"] = {
+            "edges": edges,
+            "scores": scores,
+            "reach": chance.choice((0, 1, 64, 65)),
+        }
     elif turn == 7:
         settings["predictor"] = _predictor(chance)
     else:
@@ -110,7 +133,10 @@ def _basis(chance: random.Random, shape: tuple[int, ...]) -> str:
     integers[:, 0] = 1
     packed = Basis(integers=integers, exponents=(0,) * rank).to_bytes()
     if chance.random() < 0.5:
-        packed = struct.pack("<HH", chance.choice((n, 0, 513, 65535)), chance.choice((rank, 0, 65535))) + packed[4:]
+        packed = (
+            struct.pack("<HH", chance.choice((n, 0, 513, 65535)), chance.choice((rank, 0, 65535)))
+            + packed[4:]
+        )
     return base64.b64encode(damaged(chance, packed) if chance.random() < 0.3 else packed).decode()
 
 
@@ -130,7 +156,10 @@ def _head(chance: random.Random) -> str:
         )
         for width, columns in zip([*hidden, 1], inputs, strict=True)
     )
-    ends = sorted(float(np.float32(value)) for value in chance.choices((-3.4e38, -1.0, 0.0, 1e-45, 1.0, 2.0, 3.4e38), k=2))
+    ends = sorted(
+        float(np.float32(value))
+        for value in chance.choices((-3.4e38, -1.0, 0.0, 1e-45, 1.0, 2.0, 3.4e38), k=2)
+    )
     sigma = float(np.float32(chance.choice((2.0**-100, 1e-6, 1.0, 2.0**100))))
     packed = Head(layers=layers, sigma=sigma, low=ends[0], high=ends[1], cross=cross).to_bytes()
     return base64.b64encode(damaged(chance, packed) if chance.random() < 0.3 else packed).decode()
@@ -165,13 +194,19 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
     if header["model"]["profile"] != "compact":
         return values_changed(chance, parts)
     kind = chance.choice(list(DTYPES))
-    room, chunk = (1 << chance.choice((20, 24, 28, 30, 31))) // np.dtype(kind).itemsize, [1, 1, 1, 1]
+    room, chunk = (
+        (1 << chance.choice((20, 24, 28, 30, 31))) // np.dtype(kind).itemsize,
+        [1, 1, 1, 1],
+    )
     for axis in chance.sample(range(4), 4):
         chunk[axis] = 1 << chance.randrange(21)
         while prod(chunk) > room:
             chunk[axis] //= 2
     counts = [chance.choice((1, 1, 1, 2)) for _ in range(4)]
-    shape = [min(1 << 20, n * count - chance.choice((0, 0, n // 3))) for n, count in zip(chunk, counts, strict=True)]
+    shape = [
+        min(1 << 20, n * count - chance.choice((0, 0, n // 3)))
+        for n, count in zip(chunk, counts, strict=True)
+    ]
     shape = [max(n, 1) for n in shape]
     domain = [max(n, chance.choice((1, n, 2**20))) for n in shape]
     domain[0] = shape[0]
@@ -189,7 +224,12 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
     configuration["chunk_shape"] = chunk
     plain = dict.fromkeys("tzyx", "none")
     if chance.random() < 0.7:
-        configuration["codecs"][0]["configuration"] = {"transform": plain, "step": 1.0, "center": 0.5, "range": [0.0, 1.0]}
+        configuration["codecs"][0]["configuration"] = {
+            "transform": plain,
+            "step": 1.0,
+            "center": 0.5,
+            "range": [0.0, 1.0],
+        }
     elif chance.random() < 0.5:
         configuration["codecs"][0]["configuration"]["transform"] = plain
     sharding = Sharding(shard_shape=tuple(shard), chunk_shape=tuple(chunk), codecs=())
@@ -198,7 +238,9 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
     if chance.random() < 0.5:
         sections = [b""] * chance.choice((1, 2, 3))
         stream = (
-            bytes([chance.choice((FORMAT, MASKED, PREDICTED))]) + zlib.crc32(b"").to_bytes(4, "little") + b"".join(map(section, sections))
+            bytes([chance.choice((FORMAT, MASKED, PREDICTED))])
+            + zlib.crc32(b"").to_bytes(4, "little")
+            + b"".join(map(section, sections))
         )
     present = sharding.present((0, 0, 0, 0), shape)
     chunks = [with_crc(stream)] * int(present.sum())
@@ -207,7 +249,11 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
         f"tables/level_1/{DOCUMENT}": dumped(document),
         DOCUMENT: dumped(root),
     }
-    kept = [(name, data) for name, data in parts if not name.startswith(("missing/", "occupancy/", "tables/level_1/c"))]
+    kept = [
+        (name, data)
+        for name, data in parts
+        if not name.startswith(("missing/", "occupancy/", "tables/level_1/c"))
+    ]
     return [*replaced(kept, new), ("tables/level_1/c/0/0/0/0", new["tables/level_1/c/0/0/0/0"])]
 
 

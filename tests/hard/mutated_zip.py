@@ -14,12 +14,72 @@ from numcodecs.zstd import compress
 
 from fhash_formats.container.layout import ENTRY, comment, deflated
 
-NUMBERS = (0, 1, 7, 8, 20, 63, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 0x10000, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF)
-NAMES = (
-    *("../x", "a/../../x", "/etc/passwd", "..", ".", "", "a\\x", "C:x", "c:/x", "x/", "x//y", "./x", "~/x", "a b", "a\nb", "a\x00b", ".x"),
-    *("x/.y", "%2e%2e/x", "CON", "x:y", "x" * 512, "x" * 513, "x" * 65535, "x/" * 250 + "y", "zarr.json/zarr.json", "c/0", "tables/c/0"),
+NUMBERS = (
+    0,
+    1,
+    7,
+    8,
+    20,
+    63,
+    255,
+    256,
+    0x7FFF,
+    0x8000,
+    0xFFFF,
+    0x10000,
+    0x7FFFFFFF,
+    0x80000000,
+    0xFFFFFFFE,
+    0xFFFFFFFF,
 )
-FIELDS = ((0, "I"), (4, "H"), (6, "H"), (8, "H"), (10, "H"), (12, "H"), (14, "H"), (16, "I"), (20, "I"), (24, "I"), (28, "H"), (30, "H"))
+NAMES = (
+    *(
+        "../x",
+        "a/../../x",
+        "/etc/passwd",
+        "..",
+        ".",
+        "",
+        "a\\x",
+        "C:x",
+        "c:/x",
+        "x/",
+        "x//y",
+        "./x",
+        "~/x",
+        "a b",
+        "a\nb",
+        "a\x00b",
+        ".x",
+    ),
+    *(
+        "x/.y",
+        "%2e%2e/x",
+        "CON",
+        "x:y",
+        "x" * 512,
+        "x" * 513,
+        "x" * 65535,
+        "x/" * 250 + "y",
+        "zarr.json/zarr.json",
+        "c/0",
+        "tables/c/0",
+    ),
+)
+FIELDS = (
+    (0, "I"),
+    (4, "H"),
+    (6, "H"),
+    (8, "H"),
+    (10, "H"),
+    (12, "H"),
+    (14, "H"),
+    (16, "I"),
+    (20, "I"),
+    (24, "I"),
+    (28, "H"),
+    (30, "H"),
+)
 LATER_FIELDS = ((32, "H"), (34, "H"), (36, "H"), (38, "I"), (42, "I"))
 END_FIELDS = ((0, "I"), (4, "H"), (6, "H"), (8, "H"), (10, "H"), (12, "I"), (16, "I"), (20, "H"))
 
@@ -60,21 +120,37 @@ def _end(chance: random.Random, parts: Parts) -> bytes:
     start, end = directory_of(bytes(data)), len(data) - len(comment(b"")) - 22
     if chance.random() < 0.3:
         record = struct.pack(
-            "<4sQ2H2I4Q", b"PK\x06\x06", 44, 45, 45, 0, 0, *(chance.choice((*NUMBERS, 2**60, 2**63, 2**64 - 1)) for _ in range(4))
+            "<4sQ2H2I4Q",
+            b"PK\x06\x06",
+            44,
+            45,
+            45,
+            0,
+            0,
+            *(chance.choice((*NUMBERS, 2**60, 2**63, 2**64 - 1)) for _ in range(4)),
         )
         locator = struct.pack("<4sIQI", b"PK\x06\x07", 0, chance.choice((end, 0, 2**63)), 1)
         struct.pack_into("<I", data, end + 16, 0xFFFFFFFF)
         return resealed(bytes(data[:end]) + record + locator + bytes(data[end:]), start)
     at, form = chance.choice(END_FIELDS)
-    struct.pack_into(f"<{form}", data, end + at, _number(chance, form, struct.unpack_from(f"<{form}", data, end + at)[0]))
+    struct.pack_into(
+        f"<{form}",
+        data,
+        end + at,
+        _number(chance, form, struct.unpack_from(f"<{form}", data, end + at)[0]),
+    )
     return resealed(bytes(data), start)
 
 
 def _signature(chance: random.Random, parts: Parts) -> bytes:
     """Another version in the comment, or another text."""
     data = pack(parts)
-    new = chance.choice((b"fhash 0", b"fhash 1", b"fhash 3", b"fhash 9999", b"fhash -", b"FHASH 2", b"fhash 02"))
-    return data.replace(b"fhash 2", new) if chance.random() < 0.8 else data[:-1] + chance.randbytes(1)
+    new = chance.choice(
+        (b"fhash 0", b"fhash 1", b"fhash 3", b"fhash 9999", b"fhash -", b"FHASH 2", b"fhash 02")
+    )
+    return (
+        data.replace(b"fhash 2", new) if chance.random() < 0.8 else data[:-1] + chance.randbytes(1)
+    )
 
 
 def _named(chance: random.Random, parts: Parts) -> bytes:
@@ -111,11 +187,22 @@ def _shuffled(chance: random.Random, parts: Parts) -> bytes:
 
 def _nested(chance: random.Random, parts: Parts) -> bytes:
     """Nodes within nodes: an array in an array, groups hundreds deep, a whole hierarchy below one of its own arrays."""
-    prefix = chance.choice(("coords/time", "tables/level_1", "tables", "tables/level_1/c", "a/" * chance.choice((1, 60, 200)) + "a"))
+    prefix = chance.choice(
+        (
+            "coords/time",
+            "tables/level_1",
+            "tables",
+            "tables/level_1/c",
+            "a/" * chance.choice((1, 60, 200)) + "a",
+        )
+    )
     below = [(f"{prefix}/{name}", data) for name, data in parts if len(prefix) + len(name) < 512]
     if chance.random() < 0.5:
         path = prefix.split("/")
-        below += [("/".join(path[:n]) + "/zarr.json", b'{"zarr_format":3,"node_type":"group"}') for n in range(1, len(path) + 1)]
+        below += [
+            ("/".join(path[:n]) + "/zarr.json", b'{"zarr_format":3,"node_type":"group"}')
+            for n in range(1, len(path) + 1)
+        ]
     return pack([*dict([*below, *parts]).items()])
 
 
@@ -135,11 +222,15 @@ def _bomb(chance: random.Random, parts: Parts) -> bytes:
         text = chance.choice((b" ", b"[", b'{"a":', b"0", b'"'))
         small = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
         block = text * ((1 << 20) // len(text))
-        stored = b"".join(small.compress(block) for _ in range(min(size, 1 << 26) >> 20)) + small.flush()
+        stored = (
+            b"".join(small.compress(block) for _ in range(min(size, 1 << 26) >> 20)) + small.flush()
+        )
         declared = chance.choice((size, len(data), 16 << 20, (16 << 20) + 1, 2**32 - 1)) % (1 << 32)
         bomb = (name, stored, declared, zlib.crc32(data))
     else:
-        frame = _zeros(min(size, 1 << 30), declared=chance.choice((None, size, 64, 2**63, 2**64 - 1)))
+        frame = _zeros(
+            min(size, 1 << 30), declared=chance.choice((None, size, 64, 2**63, 2**64 - 1))
+        )
         stored = with_crc(frame)
         bomb = (name, stored, None, zlib.crc32(stored))
     plain = [(other, content, None, zlib.crc32(content)) for other, content in parts]
@@ -148,7 +239,11 @@ def _bomb(chance: random.Random, parts: Parts) -> bytes:
 
 def _zeros(size: int, declared: int | None) -> bytes:
     """A zstd frame of zeros in blocks of one repeated byte: 128 KiB from 4 bytes."""
-    head = struct.pack("<IB", 0xFD2FB528, 0x00) + b"\x88" if declared is None else struct.pack("<IBBQ", 0xFD2FB528, 0xC0, 0x88, declared)
+    head = (
+        struct.pack("<IB", 0xFD2FB528, 0x00) + b"\x88"
+        if declared is None
+        else struct.pack("<IBBQ", 0xFD2FB528, 0xC0, 0x88, declared)
+    )
     blocks = -(-size // (1 << 17))
     body = struct.pack("<I", (1 << 17) << 3 | 2)[:3] + b"\0"
     return head + body * (blocks - 1) + struct.pack("<I", (1 << 17) << 3 | 3)[:3] + b"\0"
@@ -169,15 +264,34 @@ def _extra(chance: random.Random, parts: Parts) -> bytes:
     shape = [chance.choice((1, 2, 2**20, 2**31, 2**60)) for _ in range(chance.choice((1, 2, 4, 8)))]
     chunk = [chance.choice((1, n, min(n, 2**28))) for n in shape]
     document = {
-        **{"zarr_format": 3, "node_type": "array", "shape": shape, "data_type": "uint8", "fill_value": 0},
+        **{
+            "zarr_format": 3,
+            "node_type": "array",
+            "shape": shape,
+            "data_type": "uint8",
+            "fill_value": 0,
+        },
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
         "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "codecs": [{"name": "bytes"}, {"name": "zstd", "configuration": {"level": 1, "checksum": False}}, {"name": "crc32c"}],
+        "codecs": [
+            {"name": "bytes"},
+            {"name": "zstd", "configuration": {"level": 1, "checksum": False}},
+            {"name": "crc32c"},
+        ],
     }
-    name = chance.choice(("extra", "missing/bits", "occupancy/bits", "occupancy/mask", "key_frames", "coords/time"))
+    name = chance.choice(
+        ("extra", "missing/bits", "occupancy/bits", "occupancy/mask", "key_frames", "coords/time")
+    )
     size = min(1 << 28, max(1, prod(chunk)))
-    data = with_crc(_zeros(size, declared=size) if chance.random() < 0.5 else compress(bytes(min(size, 1 << 20)), 1))
-    members = {f"{name}/zarr.json": json.dumps(document).encode(), f"{name}/c/" + "/".join("0" * len(shape)): data}
+    data = with_crc(
+        _zeros(size, declared=size)
+        if chance.random() < 0.5
+        else compress(bytes(min(size, 1 << 20)), 1)
+    )
+    members = {
+        f"{name}/zarr.json": json.dumps(document).encode(),
+        f"{name}/c/" + "/".join("0" * len(shape)): data,
+    }
     if "/" in name:
         members[f"{name.split('/')[0]}/zarr.json"] = b'{"zarr_format":3,"node_type":"group"}'
     return pack([*{**dict(parts), **members}.items()])

@@ -37,7 +37,10 @@ class Mutation:
 @cache
 def goldens() -> dict[str, tuple[bytes, Parts]]:
     """Bytes and members of each golden by name."""
-    return {path.stem: (data := path.read_bytes(), unpack(data)) for path in sorted(GOLDENS.glob("*.fhz"))}
+    return {
+        path.stem: (data := path.read_bytes(), unpack(data))
+        for path in sorted(GOLDENS.glob("*.fhz"))
+    }
 
 
 def mutation(number: int) -> Mutation:
@@ -47,8 +50,12 @@ def mutation(number: int) -> Mutation:
     golden, kind = names[number % len(names)], kinds[number // len(names) % len(kinds)]
     data, parts = goldens()[golden]
     if kind in DAMAGES:
-        return Mutation(number=number, golden=golden, kind=kind, sealed=False, data=DAMAGES[kind](chance, data))
-    return Mutation(number=number, golden=golden, kind=kind, sealed=True, data=SEALED[kind](chance, parts))
+        return Mutation(
+            number=number, golden=golden, kind=kind, sealed=False, data=DAMAGES[kind](chance, data)
+        )
+    return Mutation(
+        number=number, golden=golden, kind=kind, sealed=True, data=SEALED[kind](chance, parts)
+    )
 
 
 def _flip(chance: random.Random, data: bytes) -> bytes:
@@ -111,14 +118,20 @@ DAMAGES: dict[str, Callable[[random.Random, bytes], bytes]] = {
 }
 
 
-def _packed(change: Callable[[random.Random, Parts], Parts]) -> Callable[[random.Random, Parts], bytes]:
+def _packed(
+    change: Callable[[random.Random, Parts], Parts],
+) -> Callable[[random.Random, Parts], bytes]:
     """A change of members as one of the file."""
     return lambda chance, parts: pack(change(chance, parts))
 
 
 SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
     **mutated_zip.KINDS,
-    **{name: _packed(change) for module in (mutated_json, mutated_payload, mutated_settings) for name, change in module.KINDS.items()},
+    **{
+        name: _packed(change)
+        for module in (mutated_json, mutated_payload, mutated_settings)
+        for name, change in module.KINDS.items()
+    },
 }
 KINDS = (*DAMAGES, *SEALED)
 

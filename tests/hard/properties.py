@@ -25,11 +25,17 @@ def looking(few: int, many: int = 2000) -> settings:
         print_blob=True,
         # What fails in the quick set fails again; looking for the smallest example takes minutes and is for the long set.
         phases=list(Phase) if LONG else [Phase.explicit, Phase.generate],
-        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture],
+        suppress_health_check=[
+            HealthCheck.too_slow,
+            HealthCheck.data_too_large,
+            HealthCheck.function_scoped_fixture,
+        ],
     )
 
 
-def arrays(dtypes: tuple[str, ...] = NUMBERS, *, dims: tuple[int, int] = (4, 4), side: int = 6) -> st.SearchStrategy[np.ndarray]:
+def arrays(
+    dtypes: tuple[str, ...] = NUMBERS, *, dims: tuple[int, int] = (4, 4), side: int = 6
+) -> st.SearchStrategy[np.ndarray]:
     """Arrays of any numbers, NaN, infinities, denormals and signed zeros among them."""
     shapes = hnp.array_shapes(min_dims=dims[0], max_dims=dims[1], min_side=1, max_side=side)
     return st.sampled_from(dtypes).flatmap(lambda dtype: hnp.arrays(np.dtype(dtype), shapes))
@@ -46,7 +52,12 @@ def same(one: np.ndarray, other: np.ndarray) -> bool:
         return False
     if one.dtype.kind != "f":
         return bool((one == other).all())
-    return bool((((one == other) & (np.signbit(one) == np.signbit(other))) | (np.isnan(one) & np.isnan(other))).all())
+    return bool(
+        (
+            ((one == other) & (np.signbit(one) == np.signbit(other)))
+            | (np.isnan(one) & np.isnan(other))
+        ).all()
+    )
 
 
 def one_line(error: Exception) -> None:

@@ -33,21 +33,31 @@ def hdf5(folder: Path, values: np.ndarray) -> Written:
 def netcdf(folder: Path, values: np.ndarray) -> Written:
     import xarray
 
-    xarray.Dataset({"v": (("time", "z", "y", "x"), values)}).to_netcdf(folder / "a.nc", engine="h5netcdf")
+    xarray.Dataset({"v": (("time", "z", "y", "x"), values)}).to_netcdf(
+        folder / "a.nc", engine="h5netcdf"
+    )
     return folder / "a.nc", [str(folder / "a.nc")]
 
 
 def netcdf3(folder: Path, values: np.ndarray) -> Written:
     import xarray
 
-    xarray.Dataset({"v": (("time", "z", "y", "x"), values)}).to_netcdf(folder / "a3.nc", engine="scipy")
+    xarray.Dataset({"v": (("time", "z", "y", "x"), values)}).to_netcdf(
+        folder / "a3.nc", engine="scipy"
+    )
     return folder / "a3.nc", [str(folder / "a3.nc")]
 
 
 def zarr(folder: Path, values: np.ndarray) -> Written:
     import zarr as library
 
-    array = library.create_array(folder / "a.zarr", shape=values.shape, dtype=values.dtype, chunks=(1, *values.shape[1:]), overwrite=True)
+    array = library.create_array(
+        folder / "a.zarr",
+        shape=values.shape,
+        dtype=values.dtype,
+        chunks=(1, *values.shape[1:]),
+        overwrite=True,
+    )
     array[...] = values
     return folder / "a.zarr", [str(folder / "a.zarr")]
 
@@ -56,7 +66,9 @@ def zipped(folder: Path, values: np.ndarray) -> Written:
     import zarr as library
 
     with library.storage.ZipStore(folder / "a.zip", mode="w") as store:
-        array = library.create_array(store, shape=values.shape, dtype=values.dtype, chunks=(1, *values.shape[1:]))
+        array = library.create_array(
+            store, shape=values.shape, dtype=values.dtype, chunks=(1, *values.shape[1:])
+        )
         array[...] = values
     return folder / "a.zip", [str(folder / "a.zip")]
 
@@ -82,7 +94,11 @@ def virtual(folder: Path, values: np.ndarray) -> Written:
 def mask(folder: Path, values: np.ndarray) -> Written:
     np.save(folder / "data.npy", values)
     np.save(folder / "mask.npy", values > 2)
-    return folder / "mask.npy", [str(folder / "data.npy"), "--feature", f"mask:{folder / 'mask.npy'}"]
+    return folder / "mask.npy", [
+        str(folder / "data.npy"),
+        "--feature",
+        f"mask:{folder / 'mask.npy'}",
+    ]
 
 
 FORMS: dict[str, Callable[[Path, np.ndarray], Written]] = {

@@ -40,7 +40,10 @@ def text(records: list[dict[str, Any]]) -> str:
     parts = ["## Hostile files and faults\n\nMade by `make hard`.\n"]
     for case, records_of_case in cases.items():
         about = ABOUT.get(case, "")
-        plain = [{name: value for name, value in record.items() if not isinstance(value, dict)} for record in records_of_case]
+        plain = [
+            {name: value for name, value in record.items() if not isinstance(value, dict)}
+            for record in records_of_case
+        ]
         tables = [_table(plain)]
         for record in records_of_case:
             tables += [
@@ -48,13 +51,20 @@ def text(records: list[dict[str, Any]]) -> str:
                 for name, value in record.items()
                 if isinstance(value, dict)
             ]
-        parts.append("\n\n".join([f"### {case[0].upper()}{case[1:]}", *([about] if about else []), *tables]) + "\n")
+        parts.append(
+            "\n\n".join([f"### {case[0].upper()}{case[1:]}", *([about] if about else []), *tables])
+            + "\n"
+        )
     return "\n".join(parts)
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    lines = [columns, ["---"] * len(columns), *([_cell(row.get(name, "")) for name in columns] for row in rows)]
+    lines = [
+        columns,
+        ["---"] * len(columns),
+        *([_cell(row.get(name, "")) for name in columns] for row in rows),
+    ]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 

@@ -28,18 +28,27 @@ def test_a_disk_that_fills_up_at_any_operation_changes_nothing(bench: Bench, nam
         assert "no space left on the disk" in ended.line, number
         if name in EACH_ALONE:
             assert now.keys() == before.keys()
-            assert all(data in (before[place], bench.new(name)[place]) for place, data in now.items()), number
+            assert all(
+                data in (before[place], bench.new(name)[place]) for place, data in now.items()
+            ), number
         else:
             assert now == before, number
     assert failed
-    record("a full disk", {"command": name, "operations": count, "tried": len(moments(count)), "refused": failed})
+    record(
+        "a full disk",
+        {"command": name, "operations": count, "tried": len(moments(count)), "refused": failed},
+    )
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_file_that_may_not_become_so_long_changes_nothing(bench: Bench, name: str) -> None:
     before = bench.old(name)
     longest = max(len(data) for data in bench.new(name).values() if data is not None)
-    for size in {longest - 1, longest // 2, min(700, longest // 4)}:  # the message itself goes to a file
+    for size in {
+        longest - 1,
+        longest // 2,
+        min(700, longest // 4),
+    }:  # the message itself goes to a file
         ended = bench.run(name, ("file_limit", size))
         assert ended.code == 1, (size, ended.output)
         assert ended.line.startswith("fhash: error: "), size

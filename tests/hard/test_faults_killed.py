@@ -12,7 +12,15 @@ from faulty import COMMANDS, PROFILES, Bench, Listing, moments
 from reporting import LONG, record
 
 KILLED = (
-    ("encode compact", "encode paper", "decode h5", "decode zarr", "decode vti", "render png", "render pictures")
+    (
+        "encode compact",
+        "encode paper",
+        "decode h5",
+        "decode zarr",
+        "decode vti",
+        "render png",
+        "render pictures",
+    )
     if not LONG
     else tuple(COMMANDS)
 )
@@ -20,7 +28,9 @@ KILLED = (
 
 def leftovers(now: Listing) -> set[str]:
     """The temporaries in a folder, by name."""
-    return {place.split("/")[0] for place in now if place.split("/")[0].endswith((".partial", ".old"))}
+    return {
+        place.split("/")[0] for place in now if place.split("/")[0].endswith((".partial", ".old"))
+    }
 
 
 def check_killed(bench: Bench, name: str, before: Listing) -> None:
@@ -34,15 +44,23 @@ def check_killed(bench: Bench, name: str, before: Listing) -> None:
         assert name == "decode zarr"
         assert not kept
         assert len(aside) == 1
-        assert {"a.zarr" + place.removeprefix(aside[0]): data for place, data in now.items() if place.startswith(aside[0])} == before
+        assert {
+            "a.zarr" + place.removeprefix(aside[0]): data
+            for place, data in now.items()
+            if place.startswith(aside[0])
+        } == before
     elif name in ("decode vti", "decode vtr", "decode pvd", "decode raw", "render pictures"):
-        assert all(data in (before[place], after[place]) for place, data in kept.items())  # several outputs, each whole
+        assert all(
+            data in (before[place], after[place]) for place, data in kept.items()
+        )  # several outputs, each whole
     else:
         assert kept in (before, after)
 
 
 @pytest.mark.parametrize("name", KILLED)
-def test_a_kill_at_any_operation_loses_nothing_and_the_next_call_clears_up(bench: Bench, name: str) -> None:
+def test_a_kill_at_any_operation_loses_nothing_and_the_next_call_clears_up(
+    bench: Bench, name: str
+) -> None:
     killed = moments(bench.operations(name))
     left = 0
     for number in killed:
@@ -55,7 +73,9 @@ def test_a_kill_at_any_operation_loses_nothing_and_the_next_call_clears_up(bench
         assert ended.code == 0, (number, ended.output)
         assert bench.now() == bench.new(name), number
     assert left
-    record("kill -9 at an operation", {"command": name, "kills": len(killed), "left something": left})
+    record(
+        "kill -9 at an operation", {"command": name, "kills": len(killed), "left something": left}
+    )
 
 
 def test_a_folder_that_was_moved_aside_comes_back_before_anything_else(bench: Bench) -> None:
@@ -96,13 +116,18 @@ def test_a_kill_at_a_random_moment_loses_nothing(bench: Bench, profile: str) -> 
         kills += 1
         now = bench.now()
         assert now["a.fhz"] in (before["a.fhz"], bench.new(name)["a.fhz"])
-        assert all(place == "a.fhz" or place.endswith((".partial", ".old", ".checkpoint")) for place in now)
+        assert all(
+            place == "a.fhz" or place.endswith((".partial", ".old", ".checkpoint")) for place in now
+        )
         checkpoints += any(place.endswith(".checkpoint") for place in now)
         ended = bench.run(name, *eager)  # goes on from the checkpoint, if there is one
         assert ended.code == 0, ended.output
         assert bench.now() == bench.new(name)
     assert kills >= 4
-    record("kill -9 at a random moment", {"profile": profile, "kills": kills, "with a checkpoint": checkpoints})
+    record(
+        "kill -9 at a random moment",
+        {"profile": profile, "kills": kills, "with a checkpoint": checkpoints},
+    )
 
 
 def test_a_kill_while_a_checkpoint_is_written_loses_neither_it_nor_the_output(bench: Bench) -> None:
@@ -141,7 +166,9 @@ def test_a_living_writer_is_not_disturbed_by_another(bench: Bench, name: str) ->
         ended = stopped.wait()
         assert other.code == 0, other.output
         if ended.code == 0:
-            assert bench.now() in (bench.new(name), bench.old(name)), number  # whichever took the name last
+            assert bench.now() in (bench.new(name), bench.old(name)), (
+                number
+            )  # whichever took the name last
         else:  # a folder cannot take a name that another took since it moved the older one aside
             assert (ended.code, name) == (1, "decode zarr"), ended.output
             assert "another process wrote it meanwhile" in ended.line

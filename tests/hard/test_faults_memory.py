@@ -22,7 +22,11 @@ from fhash_codec import EncodeConfig
 from fhash_formats.series import AXES, Series, index_coordinate
 
 MIB = 2**20
-LIMITS = (1, 2, 4, 8, 12, 16, 20, 24, 28, 32, 40, 48, 64, 80, 96, 128, 192, 256, 400) if LONG else (2, 128)
+LIMITS = (
+    (1, 2, 4, 8, 12, 16, 20, 24, 28, 32, 40, 48, 64, 80, 96, 128, 192, 256, 400)
+    if LONG
+    else (2, 128)
+)
 """MiB of data that a command may take beside what the interpreter and the libraries have already."""
 SHAPE = (12, 48, 64, 80)
 
@@ -77,7 +81,15 @@ def test_any_limit_gives_a_result_or_one_line(bench: Bench, larger: Path, name: 
         assert bench.now() == {}, limit
     assert done
     assert died <= 3
-    record("little memory", {"command": name, "limits": len(LIMITS), "done": done, "the interpreter died or hung": died})
+    record(
+        "little memory",
+        {
+            "command": name,
+            "limits": len(LIMITS),
+            "done": done,
+            "the interpreter died or hung": died,
+        },
+    )
 
 
 def data_of(pid: int) -> int:
@@ -92,13 +104,19 @@ class Streamed(Series):
     def __init__(self, shape: tuple[int, int, int, int]) -> None:
         self.source, self.name, self.units, self.attributes = "streamed", "wave", "", {}
         self.dtype, self.shape = np.dtype(np.float32), shape
-        self.coords = {axis: index_coordinate(axis, length) for axis, length in zip(AXES, shape, strict=True)}
-        z, y, x = np.meshgrid(*(np.linspace(0, 6, n, dtype=np.float32) for n in shape[1:]), indexing="ij", sparse=True)
+        self.coords = {
+            axis: index_coordinate(axis, length) for axis, length in zip(AXES, shape, strict=True)
+        }
+        z, y, x = np.meshgrid(
+            *(np.linspace(0, 6, n, dtype=np.float32) for n in shape[1:]), indexing="ij", sparse=True
+        )
         self.still, self.moving = np.sin(3 * x) * np.cos(2 * y), np.cos(z + y)
 
     def read(self, step: int) -> np.ndarray[Any, Any]:
         self.require_step(step)
-        return np.ascontiguousarray(self.still + np.float32(np.sin(0.2 * step)) * self.moving, dtype=np.float32)
+        return np.ascontiguousarray(
+            self.still + np.float32(np.sin(0.2 * step)) * self.moving, dtype=np.float32
+        )
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +127,15 @@ def huge(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int, 
     raw = 4 * int(np.prod(series.shape))
     begun = time.perf_counter()
     figures = fhash_codec.encode(series, path, EncodeConfig(effort=1, psnr=40))
-    record("a large series", {"bytes": raw, "container": figures["bytes"], "psnr": figures["psnr"], "seconds": time.perf_counter() - begun})
+    record(
+        "a large series",
+        {
+            "bytes": raw,
+            "container": figures["bytes"],
+            "psnr": figures["psnr"],
+            "seconds": time.perf_counter() - begun,
+        },
+    )
     yield path, raw, figures["max_abs_error"]
     path.unlink()
 
@@ -129,16 +155,31 @@ finally:
 
 @pytest.mark.skipif(not LONG, reason="minutes, and 3 GiB of disk: FHASH_HARD=1")
 @pytest.mark.parametrize("suffix", ["raw", "npy", "h5", "zarr", "nc", "vti", "statistics", "png"])
-def test_a_large_file_is_decoded_within_one_gibibyte(huge: tuple[Path, int, float], tmp_path: Path, suffix: str) -> None:
+def test_a_large_file_is_decoded_within_one_gibibyte(
+    huge: tuple[Path, int, float], tmp_path: Path, suffix: str
+) -> None:
     path, raw, error = huge
     output, peak = tmp_path / f"out.{suffix}", tmp_path / "peak"
     words = ["decode", str(path), "-q"] + ([] if suffix == "statistics" else ["-o", str(output)])
     if suffix == "png":
         words = ["render", str(path), "--size", "300x300", "-o", str(output), "-q"]
     script = LIMITED.replace("PEAK", repr(str(peak)))
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "FHASH_THREADS": "2"}
-    done = subprocess.run([sys.executable, "-c", script, "-", *words], capture_output=True, text=True, env=environment, check=False)
-    if suffix == "zarr" and done.returncode:  # its threads reserve much more than they use, and the limit is on what is reserved
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "FHASH_THREADS": "2",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", script, "-", *words],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=False,
+    )
+    if (
+        suffix == "zarr" and done.returncode
+    ):  # its threads reserve much more than they use, and the limit is on what is reserved
         assert done.returncode in (1, 4)
         assert len(done.stderr.splitlines()) == 1
         assert "memory" in done.stderr
@@ -146,7 +187,10 @@ def test_a_large_file_is_decoded_within_one_gibibyte(huge: tuple[Path, int, floa
         return
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    record("a large decode within 1 GiB", {"output": suffix, "bytes": raw, "peak resident bytes": 1024 * int(peak.read_text())})
+    record(
+        "a large decode within 1 GiB",
+        {"output": suffix, "bytes": raw, "peak resident bytes": 1024 * int(peak.read_text())},
+    )
     if suffix in ("raw", "npy"):
         offset = output.stat().st_size - raw
         series = Streamed((48, 256, 256, 256))

@@ -13,7 +13,16 @@ from reporting import LONG, record
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 EACH_ALONE = ("render pictures",)
 """Commands with several outputs, each of which is complete or absent by itself."""
-COMMITTED = ("encode compact", "encode paper", "decode npy", "decode h5", "decode zarr", "decode pvd", "render png", "render gif")
+COMMITTED = (
+    "encode compact",
+    "encode paper",
+    "decode npy",
+    "decode h5",
+    "decode zarr",
+    "decode pvd",
+    "render png",
+    "render gif",
+)
 
 
 def stages(bench: Bench, name: str, noted: Path) -> list[tuple[str, int]]:
@@ -22,7 +31,10 @@ def stages(bench: Bench, name: str, noted: Path) -> list[tuple[str, int]]:
     words = [word for word in bench.words(name) if word != "-q"]
     ended = bench.server.run(*words, inject=[("note_stages", noted)])
     assert ended.code == 0, ended.output
-    found = [(line.rpartition(" ")[0], int(line.rpartition(" ")[2])) for line in noted.read_text().splitlines()]
+    found = [
+        (line.rpartition(" ")[0], int(line.rpartition(" ")[2]))
+        for line in noted.read_text().splitlines()
+    ]
     chosen = []
     for _, group in itertools.groupby(dict.fromkeys(found), key=lambda report: report[0]):
         reports = list(group)
@@ -31,12 +43,18 @@ def stages(bench: Bench, name: str, noted: Path) -> list[tuple[str, int]]:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_signal_at_each_stage_leaves_the_older_output(bench: Bench, name: str, tmp_path: Path) -> None:
+def test_a_signal_at_each_stage_leaves_the_older_output(
+    bench: Bench, name: str, tmp_path: Path
+) -> None:
     bench.old(name)
     found = stages(bench, name, tmp_path / "stages")
     assert found or name.startswith("decode vtp")
     if name in [f"encode {profile}" for profile in PROFILES]:
-        assert {stage for stage, _ in found} >= {"scanning", "measuring", "training" if "paper" in name else "coding"}
+        assert {stage for stage, _ in found} >= {
+            "scanning",
+            "measuring",
+            "training" if "paper" in name else "coding",
+        }
     for turn, (stage, done) in enumerate(found):
         number = SIGNALS[turn % len(SIGNALS)]
         before = bench.old(name)
@@ -47,11 +65,17 @@ def test_a_signal_at_each_stage_leaves_the_older_output(bench: Bench, name: str,
         kept = {place: data for place, data in now.items() if not place.endswith(".checkpoint")}
         assert kept.keys() == before.keys(), (stage, done)
         assert name in EACH_ALONE or kept == before, (stage, done)
-        assert len(now) == len(kept) or stage in ("training", "coding tables", "measuring"), (stage, done)
+        assert len(now) == len(kept) or stage in ("training", "coding tables", "measuring"), (
+            stage,
+            done,
+        )
     ended = bench.run(name)  # goes on from the checkpoint, if there is one
     assert ended.code == 0, ended.output
     assert bench.now() == bench.new(name)
-    record("a signal at each stage", {"command": name, "stages": len({stage for stage, _ in found}), "signals": len(found)})
+    record(
+        "a signal at each stage",
+        {"command": name, "stages": len({stage for stage, _ in found}), "signals": len(found)},
+    )
 
 
 @pytest.mark.parametrize("name", COMMITTED)
@@ -68,4 +92,7 @@ def test_a_signal_at_any_operation_leaves_one_of_the_two_outputs(bench: Bench, n
         assert ended.line.startswith("fhash: error: interrupted"), place
         kept = {name: data for name, data in now.items() if not name.endswith(".checkpoint")}
         assert kept in (before, bench.new(name)), place
-    record("a signal at an operation", {"command": name, "operations": count, "signals": len(moments(count, 6))})
+    record(
+        "a signal at an operation",
+        {"command": name, "operations": count, "signals": len(moments(count, 6))},
+    )

@@ -64,7 +64,12 @@ def check(bench: Bench, folder: Path, form: str, profile: str, stage: str, how: 
     )
     assert ended.code == 2, (what, ended.output)
     assert ended.line.startswith("fhash: error: "), what
-    assert "changed while it was being read" in ended.line or "cannot be read" in ended.line, (what, ended.line)
+    assert "changed while it was being read" in ended.line or "cannot be read" in ended.line, (
+        what,
+        ended.line,
+    )
     assert "please report" not in ended.line
-    assert {place: data for place, data in bench.now().items() if not place.endswith(".checkpoint")} == before, what
+    assert {
+        place: data for place, data in bench.now().items() if not place.endswith(".checkpoint")
+    } == before, what
     shutil.rmtree(folder)

@@ -27,7 +27,10 @@ def test_two_at_once_leave_the_whole_output_of_one(bench: Bench, name: str, forc
     codes = []
     for _ in range(20 if LONG else 2):
         bench.old(name) if force else bench.empty()
-        words = [[word for word in bench.words(name, number) if force or word != "--force"] for number in (1, 0)]
+        words = [
+            [word for word in bench.words(name, number) if force or word != "--force"]
+            for number in (1, 0)
+        ]
         running = [bench.server.start(*words[0])]
         time.sleep(chance.uniform(0, 0.02))
         running.append(bench.server.start(*words[1]))
@@ -47,12 +50,19 @@ def test_two_at_once_leave_the_whole_output_of_one(bench: Bench, name: str, forc
             assert now in (first, second)
     record(
         "two at once",
-        {"command": name, "force": force, "both wrote": codes.count((0, 0)), "one was refused": len(codes) - codes.count((0, 0))},
+        {
+            "command": name,
+            "force": force,
+            "both wrote": codes.count((0, 0)),
+            "one was refused": len(codes) - codes.count((0, 0)),
+        },
     )
 
 
 @pytest.mark.parametrize("name", ["encode compact", "decode zarr"])
-def test_what_appears_while_it_is_made_is_not_replaced_without_leave(bench: Bench, name: str) -> None:
+def test_what_appears_while_it_is_made_is_not_replaced_without_leave(
+    bench: Bench, name: str
+) -> None:
     """Stopped at each operation, while another writes the same output."""
     bench.old(name)
     kept = bench.now()
@@ -60,9 +70,15 @@ def test_what_appears_while_it_is_made_is_not_replaced_without_leave(bench: Benc
     for number in moments(bench.operations(name), 5):
         bench.empty()
         words = [word for word in bench.words(name) if word != "--force"]
-        stopped = bench.server.start(*words, inject=[("at_operation", bench.out, number, -signal.SIGSTOP)])
+        stopped = bench.server.start(
+            *words, inject=[("at_operation", bench.out, number, -signal.SIGSTOP)]
+        )
         code = None
-        while code is None and Path(f"/proc/{stopped.pid}/stat").read_text().rpartition(")")[2].split()[0] not in "TZ":
+        while (
+            code is None
+            and Path(f"/proc/{stopped.pid}/stat").read_text().rpartition(")")[2].split()[0]
+            not in "TZ"
+        ):
             time.sleep(0.005)
         other = bench.server.run(*[word for word in bench.words(name, 1) if word != "--force"])
         stopped.kill(signal.SIGCONT)
@@ -97,12 +113,21 @@ def locked(bench: Bench) -> Iterator[Path]:
 
 @pytest.mark.parametrize("old", [False, True])
 @pytest.mark.parametrize("command", ["encode", "decode", "render"])
-def test_a_folder_that_cannot_be_written_is_said_in_one_line(bench: Bench, locked: Path, command: str, old: bool) -> None:
+def test_a_folder_that_cannot_be_written_is_said_in_one_line(
+    bench: Bench, locked: Path, command: str, old: bool
+) -> None:
     stem = "old" if old else "new"
     words: dict[str, tuple[object, ...]] = {
         "encode": ("encode", locked / "in.npy", "-o", locked / "out" / f"{stem}.fhz", *COMPACT),
         "decode": ("decode", locked / "run.fhz", "-o", locked / "out" / f"{stem}.npy"),
-        "render": ("render", locked / "run.fhz", "-o", locked / "out" / f"{stem}.png", "--size", "20x20"),
+        "render": (
+            "render",
+            locked / "run.fhz",
+            "-o",
+            locked / "out" / f"{stem}.png",
+            "--size",
+            "20x20",
+        ),
     }
     inject = [("user", NOBODY)] if os.geteuid() == 0 else []  # permissions do not stop root
     before = listing(locked)
@@ -114,13 +139,17 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_line(bench: Bench, locke
 
 
 @pytest.mark.parametrize("folder", [False, True])
-def test_a_source_that_may_not_be_read_is_said_in_one_line(bench: Bench, locked: Path, folder: bool) -> None:
+def test_a_source_that_may_not_be_read_is_said_in_one_line(
+    bench: Bench, locked: Path, folder: bool
+) -> None:
     if os.geteuid() != 0:
         pytest.skip("only root can become somebody who may not read what the test wrote")
     target = locked if folder else locked / "in.npy"
     mode = target.stat().st_mode
     target.chmod(0)
-    ended = bench.server.run("encode", locked / "in.npy", "-o", bench.out / "a.fhz", inject=[("user", NOBODY)])
+    ended = bench.server.run(
+        "encode", locked / "in.npy", "-o", bench.out / "a.fhz", inject=[("user", NOBODY)]
+    )
     target.chmod(mode)
     assert ended.code in (1, 2), ended.output
     assert ended.line.startswith("fhash: error: ")
@@ -158,7 +187,9 @@ def test_no_memory_anywhere_is_one_line(bench: Bench, name: str, module: str, pl
 
 @pytest.mark.parametrize("name", ["encode compact", "encode paper", "decode zarr", "render gif"])
 def test_no_memory_at_any_stage_is_one_line(bench: Bench, name: str) -> None:
-    stage = {"encode compact": "coding", "encode paper": "training"}.get(name, "decoding" if "decode" in name else "rendering")
+    stage = {"encode compact": "coding", "encode paper": "training"}.get(
+        name, "decoding" if "decode" in name else "rendering"
+    )
     before = bench.old(name)
     ended = bench.run(name, ("no_memory_at", stage, 1))
     assert (ended.code, ended.line[:27]) == (1, "fhash: error: out of memory"), ended.output

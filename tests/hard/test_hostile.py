@@ -19,7 +19,9 @@ from reporting import LONG, record
 QUICK, MANY = 560, 12_000
 """Mutations; all kinds of all goldens take turns."""
 
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits on memory and time are those of Linux")
+pytestmark = pytest.mark.skipif(
+    sys.platform != "linux", reason="limits on memory and time are those of Linux"
+)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +49,10 @@ def test_damage_is_refused_and_much_of_what_is_sealed_reaches_the_decoders(repor
         refused[kind] += ends["refused"]
         decoded[kind] += ends["decoded"]
     assert all(refused[kind] > 0 for kind in mutations.DAMAGES)
-    assert all(decoded[kind] > 0 for kind in ("stream", "settings", "values", "coordinates", "header", "giant", "shuffled"))
+    assert all(
+        decoded[kind] > 0
+        for kind in ("stream", "settings", "values", "coordinates", "header", "giant", "shuffled")
+    )
     # A mutation that is sealed gets past the checksums: it is refused for what it says.
     assert sum(decoded.values()) > 0.1 * (sum(decoded.values()) + sum(refused.values()))
 

@@ -34,7 +34,14 @@ def header(**changes: Any) -> dict[str, Any]:
         "features": ["all"],
         "dilation": 1,
         "coreset_fraction": 1.0,
-        "model": {"profile": "compact", "levels": [list(SHAPE)], "embedding_size": 1, "tables": "float32", "parameters": 1, "head": None},
+        "model": {
+            "profile": "compact",
+            "levels": [list(SHAPE)],
+            "embedding_size": 1,
+            "tables": "float32",
+            "parameters": 1,
+            "head": None,
+        },
         "coordinates": {AXIS_NAMES[axis]: {} for axis in AXES},
         "config": {},
         "training": {"seconds": None, "epochs": 0, "device": "cpu"},
@@ -64,16 +71,26 @@ def write(path: Path, extra: Any, **changes: Any) -> None:
     settings = Settings(transform=spec, step=0.1, center=0.5, low=0.0, high=400.0)
     codecs = [{**TABLE, "configuration": settings.to_dict()}, {"name": "crc32c"}]
     with ContainerWriter(path) as writer:
-        writer.add_whole("tables/level_1", table(), chunk_shape=SHAPE, codecs=codecs, dimension_names=AXES)
+        writer.add_whole(
+            "tables/level_1", table(), chunk_shape=SHAPE, codecs=codecs, dimension_names=AXES
+        )
         extra(writer)
         writer.commit(header(**{"required_features": ["transform"], **changes}))
 
 
-PARTS = st.text("abcXYZ019._-", min_size=1, max_size=6).filter(lambda part: not part.startswith(".") and part != "zarr.json")
+PARTS = st.text("abcXYZ019._-", min_size=1, max_size=6).filter(
+    lambda part: not part.startswith(".") and part != "zarr.json"
+)
 NAMES = st.lists(PARTS, min_size=1, max_size=3).map(lambda parts: "extra/" + "/".join(parts))
 JSON = st.recursive(
-    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=6),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=6),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3)
+    ),
     max_leaves=8,
 )
 TABLES = st.dictionaries(st.text(min_size=1, max_size=6), JSON, max_size=4)
@@ -85,15 +102,23 @@ TABLES = st.dictionaries(st.text(min_size=1, max_size=6), JSON, max_size=4)
     attributes=TABLES,
     data=st.data(),
 )
-def test_any_arrays_come_back_by_any_part(values: dict[str, np.ndarray], attributes: dict[str, Any], data: Draw) -> None:
+def test_any_arrays_come_back_by_any_part(
+    values: dict[str, np.ndarray], attributes: dict[str, Any], data: Draw
+) -> None:
     names = list(values)
-    values = {name: values[name] for name in names if not any(other != name and other.startswith(name + "/") for other in names)}
+    values = {
+        name: values[name]
+        for name in names
+        if not any(other != name and other.startswith(name + "/") for other in names)
+    }
     cut = {name: data.draw(chunks(array.shape)) for name, array in values.items()}
 
     def extra(writer: ContainerWriter) -> None:
         for name, array in values.items():
             labels = [None if n % 2 else f"axis {n}" for n in range(array.ndim)]
-            writer.add_whole(name, array, chunk_shape=cut[name], attributes=attributes, dimension_names=labels)
+            writer.add_whole(
+                name, array, chunk_shape=cut[name], attributes=attributes, dimension_names=labels
+            )
 
     with places() as (path, again):
         write(path, extra)
@@ -105,7 +130,10 @@ def test_any_arrays_come_back_by_any_part(values: dict[str, np.ndarray], attribu
                 stored = container.arrays[name]
                 assert same(stored.read(), array)
                 assert dict(stored.attributes) == attributes
-                spans = [sorted(data.draw(st.tuples(st.integers(0, n), st.integers(0, n)))) for n in array.shape]
+                spans = [
+                    sorted(data.draw(st.tuples(st.integers(0, n), st.integers(0, n))))
+                    for n in array.shape
+                ]
                 if all(low < high for low, high in spans):
                     part = tuple(slice(low, high) for low, high in spans)
                     assert same(stored.read(part), np.ascontiguousarray(array[part]))
@@ -117,10 +145,20 @@ def test_any_shards_come_back(values: np.ndarray, data: Draw) -> None:
     inner = data.draw(chunks(values.shape))
     shard = tuple(n * data.draw(st.integers(1, 3)) for n in inner)
     order = list(shard_order(values.shape, inner, shard))
-    pieces = [values[tuple(slice(i * n, (i + 1) * n) for i, n in zip(index, inner, strict=True))] for index in order]
+    pieces = [
+        values[tuple(slice(i * n, (i + 1) * n) for i, n in zip(index, inner, strict=True))]
+        for index in order
+    ]
 
     def extra(writer: ContainerWriter) -> None:
-        writer.add_sharded("extra/v", shape=values.shape, dtype=values.dtype, chunk_shape=inner, shard_shape=shard, chunks=iter(pieces))
+        writer.add_sharded(
+            "extra/v",
+            shape=values.shape,
+            dtype=values.dtype,
+            chunk_shape=inner,
+            shard_shape=shard,
+            chunks=iter(pieces),
+        )
 
     with places() as (path, _):
         write(path, extra)
@@ -139,7 +177,12 @@ def test_any_shards_come_back(values: np.ndarray, data: Draw) -> None:
     unknown=TABLES,
 )
 def test_any_header_comes_back_or_is_refused_before_it_is_written(
-    attributes: dict[str, Any], name: str, units: str, config: dict[str, Any], features: list[str], unknown: dict[str, Any]
+    attributes: dict[str, Any],
+    name: str,
+    units: str,
+    config: dict[str, Any],
+    features: list[str],
+    unknown: dict[str, Any],
 ) -> None:
     variable = {"name": name, "units": units, "dtype": "float32", "attributes": attributes}
     changes = {"variable": variable, "config": config, "features": features, "later": unknown}
@@ -159,14 +202,23 @@ def test_any_header_comes_back_or_is_refused_before_it_is_written(
 
 @looking(30)
 @given(
-    values=st.tuples(*(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=n, max_size=n) for n in SHAPE)),
+    values=st.tuples(
+        *(
+            st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=n, max_size=n)
+            for n in SHAPE
+        )
+    ),
     even=st.tuples(*(st.booleans(),) * 4),
     start=st.floats(-1e6, 1e6),
     spacing=st.floats(1e-12, 1e6),
     single=st.booleans(),
 )
 def test_any_positions_come_back_to_the_last_bit(
-    values: tuple[list[float], ...], even: tuple[bool, ...], start: float, spacing: float, single: bool
+    values: tuple[list[float], ...],
+    even: tuple[bool, ...],
+    start: float,
+    spacing: float,
+    single: bool,
 ) -> None:
     coords = {}
     for axis, given_values, ruled in zip(AXES, values, even, strict=True):
@@ -177,13 +229,19 @@ def test_any_positions_come_back_to_the_last_bit(
             with np.errstate(over="ignore"):
                 positions = positions.astype(np.float32).astype(np.float64)
             positions = np.nan_to_num(positions)
-        coords[axis] = Coordinate(name=AXIS_NAMES[axis], values=positions, attributes={"units": "m"})
+        coords[axis] = Coordinate(
+            name=AXIS_NAMES[axis], values=positions, attributes={"units": "m"}
+        )
     described = describe_coordinates(coords)
 
     def extra(writer: ContainerWriter) -> None:
         for axis, stored in AXIS_NAMES.items():
             if stored not in described:
-                writer.add_whole(f"coords/{stored}", coords[axis].values, attributes={"name": stored, "units": "m"})
+                writer.add_whole(
+                    f"coords/{stored}",
+                    coords[axis].values,
+                    attributes={"name": stored, "units": "m"},
+                )
 
     with places() as (path, _):
         write(path, extra, coordinates=described)

@@ -32,7 +32,9 @@ def waves(chance: np.random.Generator, shape: Shape) -> np.ndarray:
 def front(chance: np.random.Generator, shape: Shape) -> np.ndarray:
     """A step that moves along x by part of a vertex a step."""
     t, x = np.arange(shape[0])[:, None, None, None], np.arange(shape[3])
-    return np.broadcast_to(np.where(x > chance.uniform(0, shape[3]) + 0.3 * t, 1.0, 0.0), shape).copy()
+    return np.broadcast_to(
+        np.where(x > chance.uniform(0, shape[3]) + 0.3 * t, 1.0, 0.0), shape
+    ).copy()
 
 
 def spikes(chance: np.random.Generator, shape: Shape) -> np.ndarray:
@@ -47,8 +49,12 @@ KINDS = {
     "spikes": spikes,
     "constant": lambda chance, shape: np.full(shape, chance.normal()),
     "heavy tails": lambda chance, shape: chance.standard_cauchy(shape),
-    "in time alone": lambda chance, shape: np.broadcast_to(chance.normal(0, 1, (shape[0], 1, 1, 1)), shape).copy(),
-    "waves and noise": lambda chance, shape: waves(chance, shape) + 0.01 * chance.normal(0, 1, shape),
+    "in time alone": lambda chance, shape: np.broadcast_to(
+        chance.normal(0, 1, (shape[0], 1, 1, 1)), shape
+    ).copy(),
+    "waves and noise": lambda chance, shape: (
+        waves(chance, shape) + 0.01 * chance.normal(0, 1, shape)
+    ),
 }
 
 
@@ -63,7 +69,9 @@ def fields(draw: Draw) -> np.ndarray:
         limits = np.iinfo(dtype)
         values = values - values.min()
         share = values / (values.max() or 1.0)
-        return np.rint(limits.min + share * (limits.max - limits.min) * draw(st.sampled_from([1.0, 0.3, 1e-2]))).astype(dtype)
+        return np.rint(
+            limits.min + share * (limits.max - limits.min) * draw(st.sampled_from([1.0, 0.3, 1e-2]))
+        ).astype(dtype)
     power = draw(st.integers(-4, 3) if dtype.itemsize == 2 else st.integers(-30, 30))
     offset = draw(st.sampled_from([0.0, 0.0, 1.0, -1e3]))
     with np.errstate(over="ignore"):  # what is beyond float16 is infinite, as in other files
@@ -78,10 +86,20 @@ def settings(draw: Draw, values: np.ndarray) -> EncodeConfig:
     """Settings that do not contradict themselves; features and bounds about as large as the values."""
     finite = values[np.isfinite(values)].astype(np.float64)
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    common: dict[str, Any] = {"seed": draw(st.integers(0, 2**63 - 1)), "timings": False, "dilation": draw(st.integers(0, 2))}
+    common: dict[str, Any] = {
+        "seed": draw(st.integers(0, 2**63 - 1)),
+        "timings": False,
+        "dilation": draw(st.integers(0, 2)),
+    }
     if draw(st.integers(0, 2)) == 0:
         ends = sorted(low + (high - low) * draw(st.floats(-0.2, 1.2)) for _ in range(2))
-        common["features"] = (draw(st.sampled_from([f"interval:{ends[0]!r}:{ends[1]!r}", f"isosurface:{ends[0]!r}", "segmentation"])),)
+        common["features"] = (
+            draw(
+                st.sampled_from(
+                    [f"interval:{ends[0]!r}:{ends[1]!r}", f"isosurface:{ends[0]!r}", "segmentation"]
+                )
+            ),
+        )
     if draw(st.integers(0, 3)) == 0:
         common["tables"] = draw(st.sampled_from(["float32", "float16", "uint8", "transform"]))
         common["key_frames"] = draw(st.sampled_from(["all", "every:2", "0"]))
@@ -90,7 +108,12 @@ def settings(draw: Draw, values: np.ndarray) -> EncodeConfig:
         common["hidden_layers"] = draw(st.integers(0, 2))
         common["width"] = draw(st.integers(1, 16))
         common["learning_rate"] = draw(st.sampled_from([1e-8, 0.01, 1.0]))
-        return EncodeConfig(profile="paper", epochs=draw(st.integers(1, 3)), psnr=draw(st.sampled_from([None, None, 20.0])), **common)
+        return EncodeConfig(
+            profile="paper",
+            epochs=draw(st.integers(1, 3)),
+            psnr=draw(st.sampled_from([None, None, 20.0])),
+            **common,
+        )
     promise = draw(
         st.sampled_from(
             [
@@ -117,7 +140,9 @@ def tasks(draw: Draw) -> tuple[np.ndarray, EncodeConfig]:
 @looking(30, 1000)
 @given(task=tasks())
 @example(task=(np.zeros((1, 1, 1, 1)), EncodeConfig(max_error_rel=0.0)))
-def test_any_settings_keep_their_promise_or_are_refused_in_one_line(task: tuple[np.ndarray, EncodeConfig]) -> None:
+def test_any_settings_keep_their_promise_or_are_refused_in_one_line(
+    task: tuple[np.ndarray, EncodeConfig],
+) -> None:
     values, config = task
     with tempfile.TemporaryDirectory(prefix="fhash-") as folder, warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
@@ -141,13 +166,21 @@ def test_any_settings_keep_their_promise_or_are_refused_in_one_line(task: tuple[
     check(values, config, decoded, figures, missed)
 
 
-def check(values: np.ndarray, config: EncodeConfig, decoded: np.ndarray, figures: dict[str, Any], missed: str) -> None:
+def check(
+    values: np.ndarray,
+    config: EncodeConfig,
+    decoded: np.ndarray,
+    figures: dict[str, Any],
+    missed: str,
+) -> None:
     """What was promised, and what is said of the file, against the values themselves."""
     given, finite, found = values.astype(np.float64), np.isfinite(values), np.isfinite(decoded)
     assert decoded.shape == values.shape
     assert not np.isinf(decoded).any()
     assert not found[~finite].any()
-    if config.key_frames != "all":  # of other steps the model knows what is between them, where they have values
+    if (
+        config.key_frames != "all"
+    ):  # of other steps the model knows what is between them, where they have values
         pass
     elif config.features == ("all",):
         assert (found == finite).all()
@@ -157,7 +190,10 @@ def check(values: np.ndarray, config: EncodeConfig, decoded: np.ndarray, figures
     errors = np.abs(decoded[found] - given[found])
     span = float(given[finite].max() - given[finite].min())
     largest, squares = float(errors.max()), float(np.sqrt(np.mean((errors / (span or 1.0)) ** 2)))
-    assert math.isclose(largest, figures["max_abs_error"], rel_tol=1e-9), (largest, figures["max_abs_error"])
+    assert math.isclose(largest, figures["max_abs_error"], rel_tol=1e-9), (
+        largest,
+        figures["max_abs_error"],
+    )
     psnr = math.inf if squares == 0 else -20 * math.log10(squares)
     stated = math.inf if figures["rmse"] == 0 else figures["psnr"]
     if span > 0:

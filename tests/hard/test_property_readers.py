@@ -34,7 +34,9 @@ def read(path: Path, **options: object) -> np.ndarray:
             series.check()
             frames = np.stack(list(series.frames()))
             assert frames.shape == series.shape
-            assert all(same(series.read(step), frames[step]) for step in reversed(range(series.shape[0])))
+            assert all(
+                same(series.read(step), frames[step]) for step in reversed(range(series.shape[0]))
+            )
             return frames
 
 
@@ -48,7 +50,9 @@ def turned(values: np.ndarray, order: list[str]) -> np.ndarray:
 def test_npy(values: np.ndarray, order: list[str], swapped: bool, fortran: bool) -> None:
     stored = turned(values, order).astype(values.dtype.newbyteorder("S" if swapped else "="))
     with folder() as place:
-        np.save(place / "a.npy", np.asfortranarray(stored) if fortran else np.ascontiguousarray(stored))
+        np.save(
+            place / "a.npy", np.asfortranarray(stored) if fortran else np.ascontiguousarray(stored)
+        )
         assert same(read(place / "a.npy", axes=",".join(order)), values)
 
 
@@ -63,16 +67,34 @@ def test_raw(values: np.ndarray, order: list[str], endian: str) -> None:
 
 
 @looking(15)
-@given(values=arrays(), order=ORDERS, swapped=st.booleans(), packed=st.sampled_from([None, "gzip", "lzf"]), data=st.data())
-def test_hdf5(values: np.ndarray, order: list[str], swapped: bool, packed: str | None, data: Draw) -> None:
+@given(
+    values=arrays(),
+    order=ORDERS,
+    swapped=st.booleans(),
+    packed=st.sampled_from([None, "gzip", "lzf"]),
+    data=st.data(),
+)
+def test_hdf5(
+    values: np.ndarray, order: list[str], swapped: bool, packed: str | None, data: Draw
+) -> None:
     import h5py
 
     stored = turned(values, order)
-    chunk = data.draw(st.one_of(st.none(), chunks(stored.shape))) if packed is None else data.draw(chunks(stored.shape))
+    chunk = (
+        data.draw(st.one_of(st.none(), chunks(stored.shape)))
+        if packed is None
+        else data.draw(chunks(stored.shape))
+    )
     with folder() as place:
         with h5py.File(place / "a.h5", "w") as file:
             kind = stored.dtype.newbyteorder("S" if swapped else "=")
-            file.create_dataset("v", data=stored.astype(kind), chunks=chunk, compression=packed, shuffle=packed is not None)
+            file.create_dataset(
+                "v",
+                data=stored.astype(kind),
+                chunks=chunk,
+                compression=packed,
+                shuffle=packed is not None,
+            )
         assert same(read(place / "a.h5", axes=",".join(order)), values)
 
 
@@ -86,7 +108,14 @@ def test_zarr(values: np.ndarray, order: list[str], form: int, data: Draw) -> No
     names = {} if form == 2 else {"dimension_names": order}
     with folder() as place, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of float16 and the like
-        array = zarr.create_array(place / "a.zarr", shape=stored.shape, dtype=stored.dtype, chunks=chunk, zarr_format=form, **names)
+        array = zarr.create_array(
+            place / "a.zarr",
+            shape=stored.shape,
+            dtype=stored.dtype,
+            chunks=chunk,
+            zarr_format=form,
+            **names,
+        )
         array[...] = stored
         assert same(read(place / "a.zarr", axes=",".join(order)), values)
 
@@ -105,7 +134,14 @@ def test_zarr_without_some_of_its_chunks(values: np.ndarray, order: list[str], d
     expected[corner] = stored[corner]
     with folder() as place, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        array = zarr.create_array(place / "a.zarr", shape=stored.shape, dtype=stored.dtype, chunks=chunk, fill_value=fill, zarr_format=3)
+        array = zarr.create_array(
+            place / "a.zarr",
+            shape=stored.shape,
+            dtype=stored.dtype,
+            chunks=chunk,
+            fill_value=fill,
+            zarr_format=3,
+        )
         array[corner] = stored[corner]
         back = expected.transpose([order.index(axis) for axis in AXES])
         assert same(read(place / "a.zarr", axes=",".join(order)), back)
@@ -124,7 +160,11 @@ def test_netcdf_with_fill_values(values: np.ndarray, order: list[str], data: Dra
     names = dict(zip(AXES, ("time", "z", "y", "x"), strict=True))
     expected = values
     if fill is not None and not np.isnan(fill):
-        kind = values.dtype if values.dtype.kind == "f" else np.dtype("float32" if values.dtype.itemsize <= 2 else "float64")
+        kind = (
+            values.dtype
+            if values.dtype.kind == "f"
+            else np.dtype("float32" if values.dtype.itemsize <= 2 else "float64")
+        )
         expected = np.where(values == fill, np.nan, values.astype(kind)).astype(kind)
     elif fill is not None and values.dtype.kind != "f":
         return
@@ -132,7 +172,9 @@ def test_netcdf_with_fill_values(values: np.ndarray, order: list[str], data: Dra
         with h5netcdf.File(place / "a.nc", "w") as file:
             file.dimensions = {names[axis]: stored.shape[order.index(axis)] for axis in order}
             dimensions = tuple(names[axis] for axis in order)
-            variable = file.create_variable("v", dimensions, stored.dtype, data=stored, fillvalue=fill, chunks=chunk)
+            variable = file.create_variable(
+                "v", dimensions, stored.dtype, data=stored, fillvalue=fill, chunks=chunk
+            )
             assert variable.shape == stored.shape
         found = read(place / "a.nc")
         np.testing.assert_array_equal(found.astype(expected.dtype), expected)
@@ -141,7 +183,11 @@ def test_netcdf_with_fill_values(values: np.ndarray, order: list[str], data: Dra
 
 
 @looking(15)
-@given(values=arrays(NUMBERS), suffix=st.sampled_from(["npy", "h5", "nc", "zarr", "raw"]), data=st.data())
+@given(
+    values=arrays(NUMBERS),
+    suffix=st.sampled_from(["npy", "h5", "nc", "zarr", "raw"]),
+    data=st.data(),
+)
 def test_what_a_writer_wrote_a_reader_reads(values: np.ndarray, suffix: str, data: Draw) -> None:
     """With ascending coordinates of any spacing, and a name and units of any letters."""
     steps = st.floats(1e-6, 1e6)
@@ -159,7 +205,9 @@ def test_what_a_writer_wrote_a_reader_reads(values: np.ndarray, suffix: str, dat
         if suffix == "raw":
             stored = "float32" if values.dtype == np.float16 else values.dtype.name
             layout = RawLayout(dict(zip(AXES, values.shape, strict=True)), stored, "little")
-        with open_series(path, raw=layout, axes=None if suffix in ("h5", "nc", "zarr") else "t,z,y,x") as series:
+        with open_series(
+            path, raw=layout, axes=None if suffix in ("h5", "nc", "zarr") else "t,z,y,x"
+        ) as series:
             found = np.stack(list(series.frames()))
             exact = values.astype(series.dtype)
             assert same(found, exact)

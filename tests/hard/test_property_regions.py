@@ -22,9 +22,18 @@ from fhash_formats.errors import InputError
 SHAPE = (5, 7, 9, 11)
 SETTINGS = {
     "compact": EncodeConfig(effort=1, tile="2x3x4x5"),
-    "compact, a feature": EncodeConfig(effort=1, tile="4x4x4x4", features=("interval:0.2:2",), dilation=0),
+    "compact, a feature": EncodeConfig(
+        effort=1, tile="4x4x4x4", features=("interval:0.2:2",), dilation=0
+    ),
     "paper": EncodeConfig(profile="paper", epochs=1, width=4),
-    "paper, a feature": EncodeConfig(profile="paper", epochs=1, width=4, features=("interval:0.2:2",), dilation=0, key_frames="0,2,4"),
+    "paper, a feature": EncodeConfig(
+        profile="paper",
+        epochs=1,
+        width=4,
+        features=("interval:0.2:2",),
+        dilation=0,
+        key_frames="0,2,4",
+    ),
 }
 
 
@@ -37,7 +46,9 @@ def field(shape: tuple[int, ...] = SHAPE) -> np.ndarray:
 
 
 @pytest.fixture(scope="module", params=SETTINGS)
-def volume(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Volume, np.ndarray]]:
+def volume(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Volume, np.ndarray]]:
     """An open volume and the whole of it."""
     path = tmp_path_factory.mktemp("regions") / "a.fhz"
     fhash_codec.encode(field(), path, SETTINGS[request.param])
@@ -47,7 +58,14 @@ def volume(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 def boxes(shape: tuple[int, ...]) -> st.SearchStrategy[tuple[tuple[int, int], ...]]:
     """Regions (z, y, x) with at least one vertex."""
-    return st.tuples(*(st.integers(0, n - 1).flatmap(lambda low, n=n: st.tuples(st.just(low), st.integers(low + 1, n))) for n in shape))
+    return st.tuples(
+        *(
+            st.integers(0, n - 1).flatmap(
+                lambda low, n=n: st.tuples(st.just(low), st.integers(low + 1, n))
+            )
+            for n in shape
+        )
+    )
 
 
 @looking(150)
@@ -60,8 +78,14 @@ def test_any_index_is_numpys(volume: tuple[Volume, np.ndarray], index: object) -
 
 
 @looking(100)
-@given(index=st.lists(st.one_of(st.integers(-13, 13), st.slices(12), st.just(Ellipsis)), max_size=6).map(tuple))
-def test_what_numpy_refuses_is_an_index_error(volume: tuple[Volume, np.ndarray], index: tuple[object, ...]) -> None:
+@given(
+    index=st.lists(
+        st.one_of(st.integers(-13, 13), st.slices(12), st.just(Ellipsis)), max_size=6
+    ).map(tuple)
+)
+def test_what_numpy_refuses_is_an_index_error(
+    volume: tuple[Volume, np.ndarray], index: tuple[object, ...]
+) -> None:
     try:
         expected = volume[1][index]
     except IndexError:
@@ -73,12 +97,18 @@ def test_what_numpy_refuses_is_an_index_error(volume: tuple[Volume, np.ndarray],
 
 
 @looking(80)
-@given(region=boxes(SHAPE[1:]), t=st.floats(0, SHAPE[0] - 1), outside=st.sampled_from(["nan", "background"]))
+@given(
+    region=boxes(SHAPE[1:]),
+    t=st.floats(0, SHAPE[0] - 1),
+    outside=st.sampled_from(["nan", "background"]),
+)
 def test_a_region_is_that_part_of_the_frame_at_any_time(
     volume: tuple[Volume, np.ndarray], region: tuple[tuple[int, int], ...], t: float, outside: str
 ) -> None:
     place = tuple(slice(*span) for span in region)
-    assert same(volume[0].read(t, region, outside=outside), volume[0].read(t, outside=outside)[place])
+    assert same(
+        volume[0].read(t, region, outside=outside), volume[0].read(t, outside=outside)[place]
+    )
     assert (volume[0].occupancy(t, region) == volume[0].occupancy(t)[place]).all()
 
 
@@ -98,18 +128,29 @@ def test_a_region_of_a_level_of_detail_is_that_part_of_it(
     except IndexError:
         with pytest.raises(IndexError):
             opened.read_lod(step, lod, region)
-        assert any(not set(every) & set(range(*span)) for every, span in zip(all_of_it, region, strict=True))
+        assert any(
+            not set(every) & set(range(*span))
+            for every, span in zip(all_of_it, region, strict=True)
+        )
         return
-    place = tuple(slice(every.index(part[0]), every.index(part[-1]) + 1) for every, part in zip(all_of_it, vertices, strict=True))
+    place = tuple(
+        slice(every.index(part[0]), every.index(part[-1]) + 1)
+        for every, part in zip(all_of_it, vertices, strict=True)
+    )
     assert same(opened.read_lod(step, lod, region), whole[place])
 
 
 @looking(40)
 @given(data=st.data())
-def test_points_on_vertices_have_the_values_there(volume: tuple[Volume, np.ndarray], data: Draw) -> None:
+def test_points_on_vertices_have_the_values_there(
+    volume: tuple[Volume, np.ndarray], data: Draw
+) -> None:
     opened, whole = volume
     count = data.draw(st.integers(1, 8))
-    t, z, y, x = (np.array(data.draw(st.lists(st.integers(0, n - 1), min_size=count, max_size=count))) for n in SHAPE)
+    t, z, y, x = (
+        np.array(data.draw(st.lists(st.integers(0, n - 1), min_size=count, max_size=count)))
+        for n in SHAPE
+    )
     found, expected = opened.sample(t=t, z=z, y=y, x=x), whole[t, z, y, x]
     assert (np.isnan(found) == np.isnan(expected)).all()
     np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-6)
@@ -143,10 +184,17 @@ def test_any_series_of_any_tiles_keeps_its_bound_and_its_regions(
         assume(np.isfinite(values).any())
     else:
         limits = np.iinfo(kind)
-        least, most = max(limits.min, -(2**53)), min(limits.max, 2**53)  # a volume decodes integers to floats
+        least, most = (
+            max(limits.min, -(2**53)),
+            min(limits.max, 2**53),
+        )  # a volume decodes integers to floats
         values = random.integers(least, most, shape, dtype=kind, endpoint=True)
     tile = "x".join(str(data.draw(st.integers(1, 12))) for _ in range(4))
-    config = EncodeConfig(effort=1, tile=tile, max_error_rel=bound) if bound else EncodeConfig(effort=1, tile=tile, max_error=0.0)
+    config = (
+        EncodeConfig(effort=1, tile=tile, max_error_rel=bound)
+        if bound
+        else EncodeConfig(effort=1, tile=tile, max_error=0.0)
+    )
     with encoded(values, config) as opened:
         whole = opened[...]
         index = data.draw(hnp.basic_indices(shape, allow_newaxis=False))
@@ -154,6 +202,9 @@ def test_any_series_of_any_tiles_keeps_its_bound_and_its_regions(
         finite = np.isfinite(values)
         assert (np.isfinite(whole) == finite).all()
         exact = [float(value) for value in values[finite]]
-        error = max((abs(float(found) - value) for found, value in zip(whole[finite], exact, strict=True)), default=0.0)
+        error = max(
+            (abs(float(found) - value) for found, value in zip(whole[finite], exact, strict=True)),
+            default=0.0,
+        )
         rounding = max(map(abs, exact)) * np.finfo(opened.dtype).eps
         assert error <= bound * (max(exact) - min(exact)) + rounding

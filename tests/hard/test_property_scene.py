@@ -29,7 +29,19 @@ from fhash_formats.errors import FhashError, InputError, RegionError
 COLOURS = st.sampled_from(["#000000", "#ff8000", "white", "red", "transparent", "no colour"])
 TEXTS = {
     "colours": st.sampled_from(["viridis", "gray", "coolwarm", "no map"]),
-    "opacity": st.sampled_from(["auto", "feature", "linear", "linear_r", "geom", "sigmoid", "foreground", "opaque", "none such"]),
+    "opacity": st.sampled_from(
+        [
+            "auto",
+            "feature",
+            "linear",
+            "linear_r",
+            "geom",
+            "sigmoid",
+            "foreground",
+            "opaque",
+            "none such",
+        ]
+    ),
     "background": COLOURS,
     "colour": COLOURS,
 }
@@ -67,24 +79,40 @@ def values_of(hint: Any, each: dataclasses.Field[Any], *, quick: bool) -> st.Sea
     return st.sampled_from(choices) if choices else TEXTS.get(each.name, COLOURS)
 
 
-def floats(name: str, low: float | None, high: float | None, *, quick: bool) -> st.SearchStrategy[float]:
+def floats(
+    name: str, low: float | None, high: float | None, *, quick: bool
+) -> st.SearchStrategy[float]:
     """Numbers within limits, the limits themselves and near ones often."""
     if quick and name == "step" and low == 1e-6:  # of a march: a small one takes as many samples
         low = 0.02
     everything = st.floats(low, high, allow_nan=False, allow_infinity=False)
     if quick and name == "scale":  # of three from everywhere most are too different to be drawn
-        everything = st.one_of(everything, st.floats(1e-3, 1e3), st.sampled_from([1e-30, 1e-29, 1e29, 1e30]))
+        everything = st.one_of(
+            everything, st.floats(1e-3, 1e3), st.sampled_from([1e-30, 1e-29, 1e29, 1e30])
+        )
     near = [value for value in (low, high, 0.0, 0.5, 1.0, 2.0, -3.0, 1e30) if value is not None]
     return st.one_of(
-        everything, st.sampled_from([value for value in near if (low is None or value >= low) and (high is None or value <= high)])
+        everything,
+        st.sampled_from(
+            [
+                value
+                for value in near
+                if (low is None or value >= low) and (high is None or value <= high)
+            ]
+        ),
     )
 
 
 def records(kind: type[Record], *, quick: bool) -> st.SearchStrategy[Any]:
     """Records of any fields; those that contradict themselves are left out."""
     hints = typing.get_type_hints(kind)
-    fields = {each.name: values_of(hints[each.name], each, quick=quick) for each in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    required = {each.name for each in dataclasses.fields(kind) if each.default is dataclasses.MISSING}  # type: ignore[arg-type]
+    fields = {
+        each.name: values_of(hints[each.name], each, quick=quick)
+        for each in dataclasses.fields(kind)
+    }  # type: ignore[arg-type]
+    required = {
+        each.name for each in dataclasses.fields(kind) if each.default is dataclasses.MISSING
+    }  # type: ignore[arg-type]
     chosen = st.fixed_dictionaries(
         {name: strategy for name, strategy in fields.items() if name in required},
         optional={name: strategy for name, strategy in fields.items() if name not in required},
@@ -104,7 +132,11 @@ def toml(values: dict[str, Any]) -> str:
 
     def text(value: Any) -> str:
         if isinstance(value, dict):
-            return "{" + ", ".join(f"{json.dumps(key)} = {text(part)}" for key, part in value.items()) + "}"
+            return (
+                "{"
+                + ", ".join(f"{json.dumps(key)} = {text(part)}" for key, part in value.items())
+                + "}"
+            )
         if isinstance(value, list):
             return "[" + ", ".join(map(text, value)) + "]"
         return repr(value) if isinstance(value, float) else json.dumps(value)
@@ -140,7 +172,9 @@ def test_a_scene_comes_back_from_every_file(scene: Scene) -> None:
 
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    ),
     max_leaves=6,
 )
 PLACES = [(), ("camera",), ("transfer_function",), ("effects",), ("effects", "shading"), ("march",)]
@@ -149,13 +183,29 @@ PLACES = [(), ("camera",), ("transfer_function",), ("effects",), ("effects", "sh
 @looking(150)
 @given(
     place=st.sampled_from(PLACES),
-    name=st.sampled_from(["size", "camera", "step", "view", "position", "range", "opacity", "isosurfaces", "light", "lod", "nonsense"]),
+    name=st.sampled_from(
+        [
+            "size",
+            "camera",
+            "step",
+            "view",
+            "position",
+            "range",
+            "opacity",
+            "isosurfaces",
+            "light",
+            "lod",
+            "nonsense",
+        ]
+    ),
     value=ANYTHING,
 )
 @example(place=(), name="step", value=10**400)
 @example(place=("transfer_function",), name="range", value=[[1, 2], 3])
 @example(place=("effects",), name="isosurfaces", value=[True])
-def test_any_values_make_a_scene_or_are_refused_in_one_line(place: tuple[str, ...], name: str, value: object) -> None:
+def test_any_values_make_a_scene_or_are_refused_in_one_line(
+    place: tuple[str, ...], name: str, value: object
+) -> None:
     values: dict[str, Any] = {name: value}
     for part in reversed(place):
         values = {part: values}
@@ -177,7 +227,10 @@ def field(shape: tuple[int, ...], *, holes: bool = False) -> np.ndarray:
 
 VOLUMES: dict[str, tuple[tuple[int, ...], EncodeConfig]] = {
     "compact": ((3, 6, 7, 8), EncodeConfig(effort=1)),
-    "compact, a feature": ((3, 6, 7, 8), EncodeConfig(effort=1, features=("interval:0.2:2",), dilation=0)),
+    "compact, a feature": (
+        (3, 6, 7, 8),
+        EncodeConfig(effort=1, features=("interval:0.2:2",), dilation=0),
+    ),
     "paper": ((3, 6, 7, 8), EncodeConfig(profile="paper", epochs=1, width=4)),
     "a plane": ((2, 1, 7, 8), EncodeConfig(effort=1)),
     "one vertex": ((1, 1, 1, 1), EncodeConfig(effort=1)),
@@ -185,7 +238,9 @@ VOLUMES: dict[str, tuple[tuple[int, ...], EncodeConfig]] = {
 
 
 @pytest.fixture(scope="module", params=VOLUMES)
-def volume(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Volume]:
+def volume(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Volume]:
     shape, config = VOLUMES[request.param]
     path = tmp_path_factory.mktemp("scenes") / "a.fhz"
     with warnings.catch_warnings():
@@ -199,18 +254,33 @@ SMALL = {"size": [6, 5]}
 FOUND: dict[str, dict[str, Any]] = {
     "smallest scale": {"scale": [1e-30, 1e-30, 1e-30]},
     "largest scale": {"scale": [6e29, 6e29, 0.5]},
-    "light over a huge length": {"scale": [9.9e29, 6.3e29, 9.2e15], "effects": {"shading": {}, "shadows": {}}},
-    "occlusion over a huge length": {"scale": [1e10, 5.5e29, 8.6e29], "effects": {"ambient_occlusion": {}}},
+    "light over a huge length": {
+        "scale": [9.9e29, 6.3e29, 9.2e15],
+        "effects": {"shading": {}, "shadows": {}},
+    },
+    "occlusion over a huge length": {
+        "scale": [1e10, 5.5e29, 8.6e29],
+        "effects": {"ambient_occlusion": {}},
+    },
     "a surface beyond float32": {"effects": {"isosurfaces": [{"value": 6e44}, {"value": 0.0}]}},
     "shadows over tiny lengths": {"scale": [1.0, 1e-30, 1e-30], "effects": {"shadows": {}}},
     "the largest parallel picture": {"camera": {"projection": "parallel", "parallel_scale": 1e100}},
-    "a surface at the end of float32": {"effects": {"isosurfaces": [{"value": -3.402823364973241e38}]}},
+    "a surface at the end of float32": {
+        "effects": {"isosurfaces": [{"value": -3.402823364973241e38}]}
+    },
     "light from a huge direction": {"effects": {"shadows": {"light": [0.0, 1e200, 1.7e308]}}},
     "a camera turned by next to nothing": {"camera": {"view": "xy", "azimuth": 2.2e-311}},
     "a focal point far away": {"camera": {"focal_point": [0.0, 0.0, 1e100]}},
     "light hardly aslant": {"effects": {"shadows": {"light": [0.0, 2.2471164185778944e307, 0.5]}}},
-    "a tiny unit of distance": {"scale": [1.0, 1.0, 1.9e27], "transfer_function": {"unit_distance": 1e-100}},
-    "all the light there may be": {"effects": {"shading": {"ambient": 10.0, "diffuse": 10.0, "specular": 10.0, "specular_power": 1.0}}},
+    "a tiny unit of distance": {
+        "scale": [1.0, 1.0, 1.9e27],
+        "transfer_function": {"unit_distance": 1e-100},
+    },
+    "all the light there may be": {
+        "effects": {
+            "shading": {"ambient": 10.0, "diffuse": 10.0, "specular": 10.0, "specular_power": 1.0}
+        }
+    },
     "rays without an end": {"scale": [8e29, 2.4e29, 1e-30], "camera": {"view": "yz"}},
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
@@ -224,7 +294,9 @@ def test_scenes_that_were_found(volume: Volume, name: str) -> None:
 
 @looking(25, 1000)
 @given(scene=records(Scene, quick=True))
-def test_any_scene_is_drawn_in_finite_pixels_or_refused_in_one_line(volume: Volume, scene: Scene) -> None:
+def test_any_scene_is_drawn_in_finite_pixels_or_refused_in_one_line(
+    volume: Volume, scene: Scene
+) -> None:
     check_picture(volume, scene)
 
 
@@ -248,7 +320,9 @@ def check_picture(volume: Volume, scene: Scene) -> None:
     assert image.rgba[..., 3].max() <= 1 + 1e-5
     light = scene.effects.shading or Shading()  # surfaces are always lit
     brightest = max(1.0, light.ambient + light.diffuse + light.specular)
-    assert (image.rgba[..., :3].max(axis=-1) <= image.rgba[..., 3] * brightest * (1 + 1e-5) + 1e-5).all()
+    assert (
+        image.rgba[..., :3].max(axis=-1) <= image.rgba[..., 3] * brightest * (1 + 1e-5) + 1e-5
+    ).all()
     if image.depth is not None:
         assert not np.isnan(image.depth).any()
     if image.normal is not None:

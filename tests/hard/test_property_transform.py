@@ -18,11 +18,19 @@ from fhash_formats.transform import coder_portable
 from fhash_formats.transform.bands import band_table, single_band
 from fhash_formats.transform.basis import fit_basis
 from fhash_formats.transform.chunk import decode_chunk, encode_chunk
-from fhash_formats.transform.coder import MAX_INTEGER, decode_block, decode_integers, encode_block, encode_integers
+from fhash_formats.transform.coder import (
+    MAX_INTEGER,
+    decode_block,
+    decode_integers,
+    encode_block,
+    encode_integers,
+)
 from fhash_formats.transform.lifting import Transform
 from fhash_formats.transform.spec import KINDS, WAVELETS, AxisTransform, TransformSpec
 
-NATIVE = pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
+NATIVE = pytest.mark.skipif(
+    native.library() is None, reason="the native library was not built here"
+)
 
 
 @st.composite
@@ -32,10 +40,22 @@ def specs(draw: Draw, shape: tuple[int, ...]) -> TransformSpec:
     for length in shape:
         kind = draw(st.sampled_from(KINDS))
         if kind == "klt":
-            columns = np.cumsum(np.random.default_rng(draw(st.integers(0, 9))).standard_normal((length, 4 * length)), axis=0)
-            axes.append(AxisTransform(kind=kind, basis=fit_basis(columns @ columns.T, draw(st.sampled_from([1e-3, 1.0, 8.0])))))
+            columns = np.cumsum(
+                np.random.default_rng(draw(st.integers(0, 9))).standard_normal(
+                    (length, 4 * length)
+                ),
+                axis=0,
+            )
+            axes.append(
+                AxisTransform(
+                    kind=kind,
+                    basis=fit_basis(columns @ columns.T, draw(st.sampled_from([1e-3, 1.0, 8.0]))),
+                )
+            )
         else:
-            axes.append(AxisTransform(kind=kind, depth=draw(st.integers(1, 10)) if kind in WAVELETS else 0))
+            axes.append(
+                AxisTransform(kind=kind, depth=draw(st.integers(1, 10)) if kind in WAVELETS else 0)
+            )
     t, z, y, x = axes
     return TransformSpec(axes=(t, z, y, x))
 
@@ -51,9 +71,17 @@ TILES = hnp.array_shapes(min_dims=4, max_dims=4, min_side=1, max_side=9)
     kind=st.sampled_from(["noise", "constant", "step", "spike", "checkerboard", "ramp"]),
     data=st.data(),
 )
-def test_any_tile_of_any_size_of_values_comes_back(shape: tuple[int, ...], dtype: str, power: int, kind: str, data: Draw) -> None:
+def test_any_tile_of_any_size_of_values_comes_back(
+    shape: tuple[int, ...], dtype: str, power: int, kind: str, data: Draw
+) -> None:
     """Relative to the largest value: nothing is lost by how large the numbers are."""
-    spec = data.draw(specs(shape).filter(lambda spec: all(axis.basis is None or axis.basis.rank == axis.basis.n for axis in spec.axes)))
+    spec = data.draw(
+        specs(shape).filter(
+            lambda spec: all(
+                axis.basis is None or axis.basis.rank == axis.basis.n for axis in spec.axes
+            )
+        )
+    )
     t, z, y, x = np.meshgrid(*map(np.arange, shape), indexing="ij")
     values = {
         "noise": np.random.default_rng(0).standard_normal(shape),
@@ -78,7 +106,10 @@ def test_a_transform_is_what_its_json_says(shape: tuple[int, ...], data: Draw) -
     again = TransformSpec.from_dict(json.loads(json.dumps(spec.to_dict())))
     values = np.random.default_rng(0).standard_normal(shape)
     assert again.to_dict() == spec.to_dict()
-    assert same(Transform(again, shape, np.float64).forward(values), Transform(spec, shape, np.float64).forward(values))
+    assert same(
+        Transform(again, shape, np.float64).forward(values),
+        Transform(spec, shape, np.float64).forward(values),
+    )
 
 
 INTEGERS = hnp.arrays(
@@ -110,7 +141,9 @@ def test_both_engines_write_the_same_bytes(integers: np.ndarray, data: Draw) -> 
     fast = encode_integers(integers, table)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FHASH_NATIVE", "0")
-        patch.setattr(coder_portable, "_RUN", [None])  # plain Python: compiling takes longer than all examples
+        patch.setattr(
+            coder_portable, "_RUN", [None]
+        )  # plain Python: compiling takes longer than all examples
         slow = encode_integers(integers, table)
         assert slow.data == fast.data
         crossed = decode_integers(fast.data, integers.shape, table)
@@ -118,20 +151,35 @@ def test_both_engines_write_the_same_bytes(integers: np.ndarray, data: Draw) -> 
 
 
 @looking(60)
-@given(integers=hnp.arrays(np.int32, hnp.array_shapes(min_dims=4, max_dims=4, min_side=0, max_side=5), elements=st.integers(-999, 999)))
+@given(
+    integers=hnp.arrays(
+        np.int32,
+        hnp.array_shapes(min_dims=4, max_dims=4, min_side=0, max_side=5),
+        elements=st.integers(-999, 999),
+    )
+)
 def test_a_block_comes_back(integers: np.ndarray) -> None:
     assert (decode_block(encode_block(integers), integers.shape) == integers).all()
     if integers.size:
-        assert (decode_integers(encode_block(integers), integers.shape, single_band(integers.shape)) == integers).all()
+        assert (
+            decode_integers(encode_block(integers), integers.shape, single_band(integers.shape))
+            == integers
+        ).all()
 
 
 def gap(one: np.ndarray, other: np.ndarray) -> Fraction:
     """The largest difference of the finite values, exactly."""
-    return max((abs(Fraction(a) - Fraction(b)) for a, b in zip(one.tolist(), other.tolist(), strict=True)), default=Fraction(0))
+    return max(
+        (abs(Fraction(a) - Fraction(b)) for a, b in zip(one.tolist(), other.tolist(), strict=True)),
+        default=Fraction(0),
+    )
 
 
 @looking(150)
-@given(values=arrays(dims=(0, 6), side=5), bound=st.one_of(st.just(0.0), st.floats(0, 1e300), st.sampled_from([1e-9, 0.5, 3.0, 1e5])))
+@given(
+    values=arrays(dims=(0, 6), side=5),
+    bound=st.one_of(st.just(0.0), st.floats(0, 1e300), st.sampled_from([1e-9, 0.5, 3.0, 1e5])),
+)
 @example(values=np.array([1e8, 1e8 + 1e-3]), bound=1e-4)
 @example(values=np.array([-(2**63), 2**63 - 1], dtype=np.int64), bound=0.0)
 @example(values=np.array([5e-324, -5e-324, 0.0]), bound=0.0)

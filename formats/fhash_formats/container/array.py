@@ -17,14 +17,35 @@ from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 DTYPES = {
     name: np.dtype(name)
-    for name in ("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64")
+    for name in (
+        "int8",
+        "int16",
+        "int32",
+        "int64",
+        "uint8",
+        "uint16",
+        "uint32",
+        "uint64",
+        "float16",
+        "float32",
+        "float64",
+    )
 }
 MAX_CHUNK_BYTES = 1 << 30
 MAX_DIMENSIONS = 8
 MAX_AXIS = 1 << 62
 
 _INDEX = re.compile(r"0|[1-9][0-9]{0,18}")
-_KEYS = {"zarr_format", "node_type", "shape", "data_type", "chunk_grid", "chunk_key_encoding", "fill_value", "codecs"}
+_KEYS = {
+    "zarr_format",
+    "node_type",
+    "shape",
+    "data_type",
+    "chunk_grid",
+    "chunk_key_encoding",
+    "fill_value",
+    "codecs",
+}
 _OPTIONAL_KEYS = {"attributes", "dimension_names", "storage_transformers"}
 
 
@@ -47,11 +68,17 @@ class ArrayMetadata:
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.shape) <= MAX_DIMENSIONS or len(self.chunk_shape) != len(self.shape):
-            raise DamagedFileError(f"shape {self.shape} with chunks {self.chunk_shape}; 1 to {MAX_DIMENSIONS} axes are allowed")
+            raise DamagedFileError(
+                f"shape {self.shape} with chunks {self.chunk_shape}; 1 to {MAX_DIMENSIONS} axes are allowed"
+            )
         if self.dimension_names is not None and len(self.dimension_names) != len(self.shape):
-            raise DamagedFileError(f"{len(self.dimension_names)} dimension names for {len(self.shape)} axes")
+            raise DamagedFileError(
+                f"{len(self.dimension_names)} dimension names for {len(self.shape)} axes"
+            )
         if self.chunk_bytes > MAX_CHUNK_BYTES:
-            raise DamagedFileError(f"chunks of {self.chunk_bytes} bytes; the limit is {MAX_CHUNK_BYTES}")
+            raise DamagedFileError(
+                f"chunks of {self.chunk_bytes} bytes; the limit is {MAX_CHUNK_BYTES}"
+            )
         _ = self.coder
 
     @cached_property
@@ -92,7 +119,11 @@ class ArrayMetadata:
     def parse_key(self, key: str) -> tuple[int, ...]:
         """The index of a chunk from its name; raises DamagedFileError if it is none of this array's."""
         parts = key.split("/")
-        if parts[0] == "c" and len(parts) == len(self.shape) + 1 and all(_INDEX.fullmatch(part) for part in parts[1:]):
+        if (
+            parts[0] == "c"
+            and len(parts) == len(self.shape) + 1
+            and all(_INDEX.fullmatch(part) for part in parts[1:])
+        ):
             index = tuple(int(part) for part in parts[1:])
             if all(i < n for i, n in zip(index, self.grid, strict=True)):
                 return index
@@ -110,7 +141,10 @@ class ArrayMetadata:
             "node_type": "array",
             "shape": list(self.shape),
             "data_type": self.dtype.name,
-            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(self.chunk_shape)}},
+            "chunk_grid": {
+                "name": "regular",
+                "configuration": {"chunk_shape": list(self.chunk_shape)},
+            },
             "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
             "fill_value": 0.0 if self.dtype.kind == "f" else 0,
             "codecs": list(self.codecs),
@@ -129,15 +163,30 @@ class ArrayMetadata:
             raise DamagedFileError(f"key {missing[0]} is missing")
         check_keys(values, _KEYS | _OPTIONAL_KEYS)
         if values["data_type"] not in list(DTYPES):
-            raise UnsupportedFileError(f"data_type is {_shown(values['data_type'])}; allowed: {', '.join(DTYPES)}")
+            raise UnsupportedFileError(
+                f"data_type is {_shown(values['data_type'])}; allowed: {', '.join(DTYPES)}"
+            )
         shape = _lengths(values["shape"], "shape")
         grid, encoding = values["chunk_grid"], values["chunk_key_encoding"]
-        if not isinstance(grid, Mapping) or grid.get("name") != "regular" or not isinstance(grid.get("configuration"), Mapping):
-            raise UnsupportedFileError(f"chunk_grid is {_shown(grid)}; only regular grids are allowed")
-        if encoding not in ({"name": "default", "configuration": {"separator": "/"}}, {"name": "default"}):
-            raise UnsupportedFileError(f"chunk_key_encoding is {_shown(encoding)}; only the default with '/' is allowed")
+        if (
+            not isinstance(grid, Mapping)
+            or grid.get("name") != "regular"
+            or not isinstance(grid.get("configuration"), Mapping)
+        ):
+            raise UnsupportedFileError(
+                f"chunk_grid is {_shown(grid)}; only regular grids are allowed"
+            )
+        if encoding not in (
+            {"name": "default", "configuration": {"separator": "/"}},
+            {"name": "default"},
+        ):
+            raise UnsupportedFileError(
+                f"chunk_key_encoding is {_shown(encoding)}; only the default with '/' is allowed"
+            )
         if isinstance(values["fill_value"], bool) or values["fill_value"] != 0:
-            raise UnsupportedFileError(f"fill_value is {_shown(values['fill_value'])}; only 0 is allowed")
+            raise UnsupportedFileError(
+                f"fill_value is {_shown(values['fill_value'])}; only 0 is allowed"
+            )
         if values.get("storage_transformers", []) != []:
             raise UnsupportedFileError("storage_transformers are not allowed")
         if not isinstance(values["codecs"], list):
@@ -170,14 +219,18 @@ def attributes_of(values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _lengths(value: object, key: str) -> tuple[int, ...]:
     if not isinstance(value, list) or not all(type(n) is int and 1 <= n <= MAX_AXIS for n in value):
-        raise DamagedFileError(f"{key} is {_shown(value)}; a list of whole numbers from 1 to {MAX_AXIS} is needed")
+        raise DamagedFileError(
+            f"{key} is {_shown(value)}; a list of whole numbers from 1 to {MAX_AXIS} is needed"
+        )
     return tuple(value)
 
 
 def _dimension_names(value: object) -> tuple[str | None, ...] | None:
     if value is None:
         return None
-    if not isinstance(value, list) or not all(name is None or isinstance(name, str) for name in value):
+    if not isinstance(value, list) or not all(
+        name is None or isinstance(name, str) for name in value
+    ):
         raise DamagedFileError(f"dimension_names is {_shown(value)}; a list of names is needed")
     return tuple(value)
 

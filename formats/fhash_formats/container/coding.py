@@ -15,7 +15,12 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import DamagedFileError, InputError, MissingDependencyError, UnsupportedFileError
+from fhash_formats.errors import (
+    DamagedFileError,
+    InputError,
+    MissingDependencyError,
+    UnsupportedFileError,
+)
 
 Codec = Mapping[str, Any]
 """A codec as Zarr v3 names it: {"name": str, "configuration": {...}}."""
@@ -46,16 +51,26 @@ class ChunkCoder(Protocol):
 class PlainCoder:
     """`bytes` (little-endian, C order), then `zstd`."""
 
-    def __init__(self, codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    def __init__(
+        self, codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
+    ) -> None:
         """Raises UnsupportedFileError for codecs other than these two."""
-        level = codecs[1].get("configuration", {}).get("level") if len(codecs) == 2 and codecs[1]["name"] == "zstd" else None
+        level = (
+            codecs[1].get("configuration", {}).get("level")
+            if len(codecs) == 2 and codecs[1]["name"] == "zstd"
+            else None
+        )
         if isinstance(level, bool) or not isinstance(level, int):
-            raise UnsupportedFileError(f"codecs {_names(codecs)}; a container has bytes, zstd, crc32c")
+            raise UnsupportedFileError(
+                f"codecs {_names(codecs)}; a container has bytes, zstd, crc32c"
+            )
         expected = plain_codecs(dtype, level)[:-1]
         # Zarr lets one-byte types state an endianness, which then means nothing.
         allowed = [expected[0], _LITTLE] if dtype.itemsize == 1 else [expected[0]]
         if codecs[0] not in allowed or codecs[1] != expected[1]:
-            raise UnsupportedFileError(f"codecs {_names(codecs)} with settings that a container does not allow; {expected} is allowed")
+            raise UnsupportedFileError(
+                f"codecs {_names(codecs)} with settings that a container does not allow; {expected} is allowed"
+            )
         self._level, self._shape = level, shape
         self._stored, self._native = dtype.newbyteorder("<"), dtype.newbyteorder("=")
         self._size = prod(shape) * dtype.itemsize
@@ -75,13 +90,17 @@ class PlainCoder:
         if declared != self._size:
             raise DamagedFileError(f"zstd declares {declared} bytes; the chunk has {self._size}")
         if declared > ZSTD_MOST_RATIO * len(data):
-            raise DamagedFileError(f"zstd declares {declared} bytes, which {len(data)} bytes cannot hold")
+            raise DamagedFileError(
+                f"zstd declares {declared} bytes, which {len(data)} bytes cannot hold"
+            )
         # Into a buffer of exactly the chunk's size, which bounds what a hostile frame can write.
         values = np.empty(self._shape, dtype=self._stored)
         try:
             decompress(data, values)
         except (RuntimeError, ValueError) as error:
-            if "Allocation error" in str(error):  # zstd's own work space, which says nothing of the data
+            if "Allocation error" in str(
+                error
+            ):  # zstd's own work space, which says nothing of the data
                 raise MemoryError("no memory to decompress a chunk") from error
             raise DamagedFileError(f"zstd data are damaged: {error}") from error
         return values.astype(self._native, copy=False)
@@ -91,10 +110,14 @@ MOST_TILE_VERTICES = 1 << 27
 """Of a tile of the codec `fhash.transform`: decoding takes some 30 bytes for each, and a damaged file may claim any number."""
 
 
-def _transform_coder(codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]) -> ChunkCoder:
+def _transform_coder(
+    codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> ChunkCoder:
     """The coder of `fhash.transform`; raises DamagedFileError for tiles that are too large."""
     if prod(shape) > MOST_TILE_VERTICES:
-        raise DamagedFileError(f"tiles of {prod(shape):,} vertices; the limit is {MOST_TILE_VERTICES:,}")
+        raise DamagedFileError(
+            f"tiles of {prod(shape):,} vertices; the limit is {MOST_TILE_VERTICES:,}"
+        )
     # Containers without it are read without loading it.
     from fhash_formats.transform.stream import TransformCoder
 
@@ -155,14 +178,18 @@ class CheckedCoder:
         return coded
 
 
-def chunk_coder(codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]) -> CheckedCoder:
+def chunk_coder(
+    codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> CheckedCoder:
     """The coder for chunks of this dtype and full shape; raises UnsupportedFileError for codecs that are not known."""
     for codec in codecs:
         named = isinstance(codec, Mapping) and isinstance(codec.get("name"), str)
         if not named or not isinstance(codec.get("configuration", {}), Mapping):
             raise DamagedFileError("an array's codecs are not a list of {name, configuration}")
     if len(codecs) < 2 or codecs[-1] != CRC32C or codecs[0]["name"] not in ARRAY_CODECS:
-        raise UnsupportedFileError(f"codecs {_names(codecs)}; known are {', '.join(ARRAY_CODECS)} at the beginning and crc32c at the end")
+        raise UnsupportedFileError(
+            f"codecs {_names(codecs)}; known are {', '.join(ARRAY_CODECS)} at the beginning and crc32c at the end"
+        )
     return CheckedCoder(ARRAY_CODECS[codecs[0]["name"]](codecs[:-1], dtype, shape))
 
 
@@ -201,9 +228,13 @@ def crc32c(data: bytes | memoryview) -> int:
         # The implementation that zarr and numcodecs use. Checking cannot be left out where it is missing.
         import google_crc32c
     except ImportError as error:
-        raise MissingDependencyError("the CRC-32C of .fhz files needs google-crc32c: pip install google-crc32c") from error
+        raise MissingDependencyError(
+            "the CRC-32C of .fhz files needs google-crc32c: pip install google-crc32c"
+        ) from error
     # It takes bytes and arrays, but no memoryview.
-    value: int = google_crc32c.value(data if isinstance(data, bytes) else np.frombuffer(data, dtype=np.uint8))
+    value: int = google_crc32c.value(
+        data if isinstance(data, bytes) else np.frombuffer(data, dtype=np.uint8)
+    )
     return value
 
 

@@ -35,7 +35,9 @@ def describe_coordinates(coords: Mapping[str, Coordinate]) -> dict[str, Any]:
         description = describe_positions(coordinate.values)
         if description is not None:
             name = {} if coordinate.name == stored else {"name": coordinate.name}
-            attributes = {"attributes": dict(coordinate.attributes)} if coordinate.attributes else {}
+            attributes = (
+                {"attributes": dict(coordinate.attributes)} if coordinate.attributes else {}
+            )
             described[stored] = {**description, **name, **attributes}
     return described
 
@@ -43,7 +45,11 @@ def describe_coordinates(coords: Mapping[str, Coordinate]) -> dict[str, Any]:
 def described_coordinate(description: Mapping[str, Any], stored: str, length: int) -> Coordinate:
     """The coordinate of `length` positions that a checked description stands for; `stored`: its name in the container."""
     values = positions(description, length)
-    return Coordinate(name=description.get("name", stored), values=values, attributes=description.get("attributes", {}))
+    return Coordinate(
+        name=description.get("name", stored),
+        values=values,
+        attributes=description.get("attributes", {}),
+    )
 
 
 def describe_positions(values: Floats) -> dict[str, Any] | None:
@@ -59,8 +65,16 @@ def describe_positions(values: Floats) -> dict[str, Any] | None:
                 return rule
     if values.size > MAX_LISTED:
         return None
-    short = {"values": [_shortest(value, "float32") for value in values], "dtype": "float32"} if narrow else {}
-    return short if narrow and _same(positions(short, values.size), values) else {"values": values.tolist()}
+    short = (
+        {"values": [_shortest(value, "float32") for value in values], "dtype": "float32"}
+        if narrow
+        else {}
+    )
+    return (
+        short
+        if narrow and _same(positions(short, values.size), values)
+        else {"values": values.tolist()}
+    )
 
 
 def positions(description: Mapping[str, Any], length: int) -> Floats:
@@ -116,11 +130,22 @@ def _candidates(values: Floats, kind: str) -> Iterator[tuple[float, float]]:
         yield from ((start, 1.0) for start in starts)
         return
     first, last = _shortest(values[0], kind), _shortest(values[-1], kind)
-    with np.errstate(over="ignore", invalid="ignore"):  # at the ends of float64; what is no number is no guess
-        guesses = [float(values[1] - values[0]), float((values[-1] - values[0]) / (values.size - 1)), (last - first) / (values.size - 1)]
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # at the ends of float64; what is no number is no guess
+        guesses = [
+            float(values[1] - values[0]),
+            float((values[-1] - values[0]) / (values.size - 1)),
+            (last - first) / (values.size - 1),
+        ]
         # The middle of the steps that every position allows for, each within half of its spacing; the last may be no part of the rule.
-        numbers, spacing = np.arange(1, values.size), np.spacing(values[1:].astype(kind)).astype(np.float64)
-        low, high = ((values[1:] + sign * 0.5 * np.abs(spacing) - first) / numbers for sign in (-1, 1))
+        numbers, spacing = (
+            np.arange(1, values.size),
+            np.spacing(values[1:].astype(kind)).astype(np.float64),
+        )
+        low, high = (
+            (values[1:] + sign * 0.5 * np.abs(spacing) - first) / numbers for sign in (-1, 1)
+        )
         for end in {max(1, values.size - 2), values.size - 1}:
             guesses.append(float(low[:end].max() / 2 + high[:end].min() / 2))
     guesses = [guess for guess in guesses if np.isfinite(guess)]

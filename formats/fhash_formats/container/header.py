@@ -26,7 +26,15 @@ KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, "cross", "mask", "predictor"})
 PAPER, COMPACT = "paper", "compact"
 KNOWN_PROFILES = (PAPER, COMPACT)
 POSITIONS = ("time", "z", "y", "x")
-QUALITY = ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain", "rmse_domain", "max_abs_error_domain")
+QUALITY = (
+    "psnr",
+    "rmse",
+    "max_abs_error",
+    "ssim",
+    "psnr_domain",
+    "rmse_domain",
+    "max_abs_error_domain",
+)
 HISTORY = ("seconds", "epoch", "psnr")
 CODED = "transform"
 TABLE_TYPES = ("float32", "float16", "uint8", CODED)
@@ -54,8 +62,16 @@ def validate_header(header: Mapping[str, Any]) -> None:
     low, high = top.numbers("value_range", 2)
     most = _largest_decoded(dtype)
     top.need(low <= high, "value_range", "low <= high")
-    top.need(max(abs(low), abs(high)) <= most, "value_range", f"numbers up to {most:.6g}, as values of {dtype} decode to")
-    top.need(abs(top.number("background")) <= most, "background", f"a number up to {most:.6g}, as values of {dtype} decode to")
+    top.need(
+        max(abs(low), abs(high)) <= most,
+        "value_range",
+        f"numbers up to {most:.6g}, as values of {dtype} decode to",
+    )
+    top.need(
+        abs(top.number("background")) <= most,
+        "background",
+        f"a number up to {most:.6g}, as values of {dtype} decode to",
+    )
     box = _box(top, shape)
     top.texts("features")
     top.whole("dilation", 0, MAX_LENGTH)
@@ -77,14 +93,18 @@ def validate_header(header: Mapping[str, Any]) -> None:
     training.number_or_null("learning_rate")
     for key in QUALITY:
         quality.number_or_null(key)
-    for entry in top.records("history") if profile == PAPER or isinstance(top.get("history"), list) else ():
+    for entry in (
+        top.records("history") if profile == PAPER or isinstance(top.get("history"), list) else ()
+    ):
         for key in HISTORY:
             entry.number_or_null(key)
     if profile == COMPACT and not isinstance(top.get("history"), list):
         columns = top.record("history")
         for key in HISTORY:
             if columns.has(key):
-                columns.numbers(key, len(columns.get("epoch")) if isinstance(columns.get("epoch"), list) else 0)
+                columns.numbers(
+                    key, len(columns.get("epoch")) if isinstance(columns.get("epoch"), list) else 0
+                )
 
 
 def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]) -> None:
@@ -94,7 +114,11 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
             raise DamagedFileError(f"array {name} is missing")
         _check_array(name, arrays[name], shape, dtypes)
         attributes = Record(arrays[name].attributes, f"array {name} attribute ")
-        if name.startswith("tables/") and arrays[name].dtype == np.uint8 and header["model"]["profile"] == "paper":
+        if (
+            name.startswith("tables/")
+            and arrays[name].dtype == np.uint8
+            and header["model"]["profile"] == "paper"
+        ):
             attributes.number("offset")
             attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
         if name.startswith("tables/") and header["model"]["tables"] == CODED:
@@ -102,17 +126,23 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
     if TRANSFORM_FEATURE not in header["required_features"]:
         for name, array in arrays.items():
             if array.sharding is not None or array.codecs[0]["name"] == TRANSFORM:
-                raise DamagedFileError(f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, which the header does not require")
+                raise DamagedFileError(
+                    f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, which the header does not require"
+                )
     for name, array in arrays.items():
         for feature in array.coder.features:
             if feature not in header["required_features"]:
-                raise DamagedFileError(f"array {name} has the feature {feature}, which the header does not require")
+                raise DamagedFileError(
+                    f"array {name} has the feature {feature}, which the header does not require"
+                )
     for name, shape, dtypes in _optional(header):
         if name in arrays:
             _check_array(name, arrays[name], shape, dtypes)
     for axis in POSITIONS:
         if f"coords/{axis}" in arrays and "name" in arrays[f"coords/{axis}"].attributes:
-            Record(arrays[f"coords/{axis}"].attributes, f"array coords/{axis} attribute ").text("name")
+            Record(arrays[f"coords/{axis}"].attributes, f"array coords/{axis} attribute ").text(
+                "name"
+            )
 
 
 def check_key_frames(header: Mapping[str, Any], key_frames: npt.NDArray[np.int64]) -> None:
@@ -129,29 +159,47 @@ def occupancy_bytes(box: Sequence[Sequence[int]]) -> int:
 
 def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
     """(outputs, inputs) of each layer of the network."""
-    widths = [len(model["levels"]) * model["embedding_size"], *[model["width"]] * model["hidden_layers"], 1]
+    widths = [
+        len(model["levels"]) * model["embedding_size"],
+        *[model["width"]] * model["hidden_layers"],
+        1,
+    ]
     return [(outputs, inputs) for inputs, outputs in pairwise(widths)]
 
 
 def _check_format(top: Record) -> None:
     if top.get("format") != FORMAT:
-        raise DamagedFileError(f"header key format is {ascii(top.get('format'))[:40]}; '{FORMAT}' is needed")
+        raise DamagedFileError(
+            f"header key format is {ascii(top.get('format'))[:40]}; '{FORMAT}' is needed"
+        )
     major, minor = top.wholes("format_version", 2, 0, 10_000)
     if major > FORMAT_VERSION[0]:
-        raise UnsupportedFileError(f"written by a newer fhash format {major}.{minor}; this version reads {FORMAT_VERSION[0]}.x; upgrade")
+        raise UnsupportedFileError(
+            f"written by a newer fhash format {major}.{minor}; this version reads {FORMAT_VERSION[0]}.x; upgrade"
+        )
     top.need(major == FORMAT_VERSION[0], "format_version", f"[{FORMAT_VERSION[0]}, n]")
     unknown = [name for name in top.texts("required_features") if name not in KNOWN_FEATURES]
     if unknown:
-        raise UnsupportedFileError(f"the file needs the feature {unknown[0][:80]!a}, which this version does not know; upgrade")
+        raise UnsupportedFileError(
+            f"the file needs the feature {unknown[0][:80]!a}, which this version does not know; upgrade"
+        )
 
 
 def _box(top: Record, shape: Sequence[int]) -> list[int]:
     """Lengths (z, y, x) of the feature bounding box."""
     bounds = top.get("feature_bounding_box")
-    top.need(isinstance(bounds, list) and len(bounds) == 3, "feature_bounding_box", "[[z0, z1], [y0, y1], [x0, x1]]")
+    top.need(
+        isinstance(bounds, list) and len(bounds) == 3,
+        "feature_bounding_box",
+        "[[z0, z1], [y0, y1], [x0, x1]]",
+    )
     for bound, length in zip(bounds, shape[1:], strict=True):
         whole = isinstance(bound, list) and len(bound) == 2 and all(type(n) is int for n in bound)
-        top.need(whole and 0 <= bound[0] < bound[1] <= length, "feature_bounding_box", f"within the domain {list(shape)}")
+        top.need(
+            whole and 0 <= bound[0] < bound[1] <= length,
+            "feature_bounding_box",
+            f"within the domain {list(shape)}",
+        )
     return [high - low for low, high in bounds]
 
 
@@ -161,13 +209,17 @@ def _check_coordinates(top: Record, shape: Sequence[int]) -> None:
         coordinates = top.record("coordinates")
         for axis, length in zip(POSITIONS, shape, strict=True):
             if coordinates.has(axis):
-                coordinates.need(length <= MAX_RULED, axis, f"an array for more than {MAX_RULED} positions")
+                coordinates.need(
+                    length <= MAX_RULED, axis, f"an array for more than {MAX_RULED} positions"
+                )
                 check_positions(coordinates.record(axis), length)
 
 
 def _largest_decoded(source: np.dtype[Any]) -> float:
     """The largest value of the type that values of a source decode to: float32 where it is precise enough, else float64."""
-    return float(np.finfo(np.float32 if source.itemsize <= 2 or source == np.float32 else np.float64).max)
+    return float(
+        np.finfo(np.float32 if source.itemsize <= 2 or source == np.float32 else np.float64).max
+    )
 
 
 def _check_model(model: Record, steps: int, box: Sequence[int], source: np.dtype[Any]) -> str:
@@ -175,7 +227,9 @@ def _check_model(model: Record, steps: int, box: Sequence[int], source: np.dtype
     profile = model.text("profile")
     if profile not in KNOWN_PROFILES:
         known = ", ".join(KNOWN_PROFILES)
-        raise UnsupportedFileError(f"header key model.profile is {profile[:40]!a}; this version knows {known}; upgrade")
+        raise UnsupportedFileError(
+            f"header key model.profile is {profile[:40]!a}; this version knows {known}; upgrade"
+        )
     if profile == PAPER:
         model.whole("fold", 2, MAX_LENGTH)
         model.whole("embedding_size", 1, MAX_EMBEDDING)
@@ -189,19 +243,35 @@ def _check_model(model: Record, steps: int, box: Sequence[int], source: np.dtype
         model.whole("parameters", 0, 1 << 62)
         tables = DTYPES[model.choice("tables", tuple(DTYPES))]
         narrow = _largest_decoded(source) < np.finfo(np.float64).max
-        model.need(not (narrow and tables == np.float64), "tables", f"no float64 for a source of {source}")
-        model.need(model.get("head") is None or isinstance(model.get("head"), Mapping), "head", "an object or null")
+        model.need(
+            not (narrow and tables == np.float64), "tables", f"no float64 for a source of {source}"
+        )
+        model.need(
+            model.get("head") is None or isinstance(model.get("head"), Mapping),
+            "head",
+            "an object or null",
+        )
     levels = model.get("levels")
-    model.need(isinstance(levels, list) and 1 <= len(levels) <= MAX_LEVELS, "levels", f"1 to {MAX_LEVELS} of [t, z, y, x]")
+    model.need(
+        isinstance(levels, list) and 1 <= len(levels) <= MAX_LEVELS,
+        "levels",
+        f"1 to {MAX_LEVELS} of [t, z, y, x]",
+    )
     finer: Sequence[int] = [MAX_LENGTH] * 4
     for level in levels:
         whole = isinstance(level, list) and len(level) == 4 and all(type(n) is int for n in level)
         fits = whole and all(1 <= n <= limit for n, limit in zip(level, finer, strict=True))
-        model.need(fits, "levels", "[t, z, y, x] from finest to coarsest, none longer than the one before")
+        model.need(
+            fits, "levels", "[t, z, y, x] from finest to coarsest, none longer than the one before"
+        )
         finer = level
     model.need(levels[0][1:] == list(box), "levels", f"the box {list(box)} at the finest level")
-    model.need(levels[0][0] <= steps, "levels", f"at most the {steps} steps of the domain as key frames")
-    model.need(profile == PAPER or len(levels) == 1, "levels", f"one level in the profile {COMPACT}")
+    model.need(
+        levels[0][0] <= steps, "levels", f"at most the {steps} steps of the domain as key frames"
+    )
+    model.need(
+        profile == PAPER or len(levels) == 1, "levels", f"one level in the profile {COMPACT}"
+    )
     return profile
 
 
@@ -227,7 +297,11 @@ def _expected(header: Mapping[str, Any]) -> Iterator[Expected]:
     for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
         yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
         yield f"mlp/bias_{number}", (outputs,), ("float32",)
-    yield "occupancy/bits", (key_frames, occupancy_bytes(header["feature_bounding_box"])), ("uint8",)
+    yield (
+        "occupancy/bits",
+        (key_frames, occupancy_bytes(header["feature_bounding_box"])),
+        ("uint8",),
+    )
 
 
 def _optional(header: Mapping[str, Any]) -> Iterator[Expected]:
@@ -238,11 +312,19 @@ def _optional(header: Mapping[str, Any]) -> Iterator[Expected]:
     if model["profile"] == COMPACT:
         key_frames, *box = model["levels"][0]
         yield "key_frames", (key_frames,), ("int64",)
-        yield "occupancy/bits", (key_frames, occupancy_bytes(header["feature_bounding_box"])), ("uint8",)
+        yield (
+            "occupancy/bits",
+            (key_frames, occupancy_bytes(header["feature_bounding_box"])),
+            ("uint8",),
+        )
         yield "occupancy/mask", (key_frames, *box), ("uint8",)
     yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 
 
-def _check_array(name: str, array: ArrayMetadata, shape: tuple[int, ...], dtypes: tuple[str, ...]) -> None:
+def _check_array(
+    name: str, array: ArrayMetadata, shape: tuple[int, ...], dtypes: tuple[str, ...]
+) -> None:
     if array.shape != shape or array.dtype.name not in dtypes:
-        raise DamagedFileError(f"array {name} is {array.dtype.name} {array.shape}; the header asks for {' or '.join(dtypes)} {shape}")
+        raise DamagedFileError(
+            f"array {name} is {array.dtype.name} {array.shape}; the header asks for {' or '.join(dtypes)} {shape}"
+        )

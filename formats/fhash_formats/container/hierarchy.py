@@ -53,14 +53,18 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     for node in [*arrays, *groups]:
         if node and node.rpartition("/")[0] not in groups:
             raise DamagedFileError(f"member {node}/{DOCUMENT} lies in no group")
-    return Hierarchy(header=groups[""]["fhash"], arrays=arrays, chunks=_place_chunks(arrays, chunk_members))
+    return Hierarchy(
+        header=groups[""]["fhash"], arrays=arrays, chunks=_place_chunks(arrays, chunk_members)
+    )
 
 
 def _read_document(source: Source, member: Member) -> ArrayMetadata | Mapping[str, Any]:
     """The metadata of an array or the attributes of a group."""
     # Before reading; the data of a chunk may be that large, metadata may not.
     if max(member.sizes) > strict_json.MAX_BYTES:
-        raise DamagedFileError(f"member {member.name}: {max(member.sizes)} bytes of metadata; the limit is {strict_json.MAX_BYTES}")
+        raise DamagedFileError(
+            f"member {member.name}: {max(member.sizes)} bytes of metadata; the limit is {strict_json.MAX_BYTES}"
+        )
     data = read_member(source, member)
     try:
         values = strict_json.loads(data)
@@ -74,7 +78,9 @@ def _read_document(source: Source, member: Member) -> ArrayMetadata | Mapping[st
         raise type(error)(f"member {member.name}: {error}") from error
 
 
-def _place_chunks(arrays: Mapping[str, ArrayMetadata], members: list[tuple[str, str, Member]]) -> dict[str, dict[tuple[int, ...], Member]]:
+def _place_chunks(
+    arrays: Mapping[str, ArrayMetadata], members: list[tuple[str, str, Member]]
+) -> dict[str, dict[tuple[int, ...], Member]]:
     """Chunks by array and index; a chunk that is missing must never read as the fill value, one too many may hide anything."""
     chunks: dict[str, dict[tuple[int, ...], Member]] = {name: {} for name in arrays}
     for name, key, member in members:
@@ -87,5 +93,7 @@ def _place_chunks(arrays: Mapping[str, ArrayMetadata], members: list[tuple[str, 
     for name, metadata in arrays.items():
         # Names are unique and each is an index within the grid, so an equal number means that all are there.
         if len(chunks[name]) != prod(metadata.grid):
-            raise DamagedFileError(f"array {name} has {len(chunks[name])} chunks; {prod(metadata.grid)} are declared")
+            raise DamagedFileError(
+                f"array {name} has {len(chunks[name])} chunks; {prod(metadata.grid)} are declared"
+            )
     return chunks

@@ -78,7 +78,21 @@ class Member:
 def local_header(member: Member) -> bytes:
     """The bytes before a member's data."""
     name = member.name.encode("ascii")
-    return LOCAL.pack(LOCAL_MARK, VERSION, 0, member.method, TIME, DATE, member.crc, *member.sizes, len(name), 0) + name
+    return (
+        LOCAL.pack(
+            LOCAL_MARK,
+            VERSION,
+            0,
+            member.method,
+            TIME,
+            DATE,
+            member.crc,
+            *member.sizes,
+            len(name),
+            0,
+        )
+        + name
+    )
 
 
 def deflated(data: bytes) -> bytes:
@@ -92,7 +106,9 @@ def document_member(name: str, offset: int, data: bytes) -> tuple[Member, bytes]
     packed = deflated(data)
     if len(packed) >= len(data):
         return Member(name=name, offset=offset, size=len(data), crc=zlib.crc32(data)), data
-    return Member(name=name, offset=offset, size=len(packed), crc=zlib.crc32(data), full_size=len(data)), packed
+    return Member(
+        name=name, offset=offset, size=len(packed), crc=zlib.crc32(data), full_size=len(data)
+    ), packed
 
 
 def directory_entry(member: Member) -> bytes:
@@ -105,7 +121,23 @@ def directory_entry(member: Member) -> bytes:
     sizes = (member.crc, *member.sizes)
     lengths = (len(name), len(extra), 0, 0, 0)
     return (
-        ENTRY.pack(ENTRY_MARK, version, UNIX, version, 0, 0, member.method, TIME, DATE, *sizes, *lengths, FILE_MODE, offset) + name + extra
+        ENTRY.pack(
+            ENTRY_MARK,
+            version,
+            UNIX,
+            version,
+            0,
+            0,
+            member.method,
+            TIME,
+            DATE,
+            *sizes,
+            *lengths,
+            FILE_MODE,
+            offset,
+        )
+        + name
+        + extra
     )
 
 
@@ -116,7 +148,9 @@ def end_records(count: int, size: int, offset: int) -> bytes:
     end = END.pack(END_MARK, 0, 0, *short, comment_size)
     if count < MAX_16 and size < MAX_32 and offset < MAX_32:
         return end
-    end_64 = END_64.pack(END_64_MARK, END_64.size - 12, VERSION_64, VERSION_64, 0, 0, count, count, size, offset)
+    end_64 = END_64.pack(
+        END_64_MARK, END_64.size - 12, VERSION_64, VERSION_64, 0, 0, count, count, size, offset
+    )
     return end_64 + LOCATOR_64.pack(LOCATOR_64_MARK, 0, offset + size, 1) + end
 
 

@@ -57,7 +57,9 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
             pass
 
     helpers: list[Future[None]] = []
-    with suppress(RuntimeError):  # where no more threads can be started, there are fewer: the caller's own is enough
+    with suppress(
+        RuntimeError
+    ):  # where no more threads can be started, there are fewer: the caller's own is enough
         more = min(usable_threads(), len(work)) - 1
         for _ in range(more):
             helpers.append(_threads.pool(more).submit(every))

@@ -10,7 +10,12 @@ from typing import Any
 
 from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.coordinates import described_coordinate
-from fhash_formats.container.header import POSITIONS, check_arrays, check_key_frames, validate_header
+from fhash_formats.container.header import (
+    POSITIONS,
+    check_arrays,
+    check_key_frames,
+    validate_header,
+)
 from fhash_formats.container.hierarchy import read_hierarchy
 from fhash_formats.container.source import CountedSource, FileSource, Source
 from fhash_formats.container.stored import StoredArray, damage_named
@@ -63,13 +68,18 @@ class Container:
                 signature = find_signature(source)
                 assert signature is not None
                 self.digest = signature[1].rpartition(b"=")[2].decode("ascii")
-                self._documents = sum(member.name.endswith("zarr.json") for member in members.values())
+                self._documents = sum(
+                    member.name.endswith("zarr.json") for member in members.values()
+                )
                 found = read_hierarchy(source, members)
                 validate_header(found.header)
                 check_arrays(found.header, found.arrays)
             self.header = found.header
             self.arrays = MappingProxyType(
-                {name: StoredArray(path, name, array, found.chunks[name], source, self._cache) for name, array in found.arrays.items()}
+                {
+                    name: StoredArray(path, name, array, found.chunks[name], source, self._cache)
+                    for name, array in found.arrays.items()
+                }
             )
             if "key_frames" in self.arrays:
                 key_frames = self.arrays["key_frames"].read()
@@ -96,10 +106,14 @@ class Container:
         """Positions along the axis `stored` ("time", "z", "y" or "x"), from the header or from their array."""
         axis = POSITIONS.index(stored)
         if f"coords/{stored}" not in self.arrays:
-            return described_coordinate(self.header["coordinates"][stored], stored, self.header["domain"]["shape"][axis])
+            return described_coordinate(
+                self.header["coordinates"][stored], stored, self.header["domain"]["shape"][axis]
+            )
         array = self.arrays[f"coords/{stored}"]
         attributes = dict(array.attributes)
-        return Coordinate(name=attributes.pop("name", stored), values=array.read(), attributes=attributes)
+        return Coordinate(
+            name=attributes.pop("name", stored), values=array.read(), attributes=attributes
+        )
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
         """Read and decode every member (metadata were at opening); the number of arrays.
@@ -132,5 +146,10 @@ class Container:
     def __enter__(self) -> Container:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         self.close()

@@ -31,7 +31,9 @@ class Record:
     def need(self, condition: bool, key: str, allowed: str) -> None:
         """Refuse the value of `key` unless `condition` holds."""
         if not condition:
-            raise DamagedFileError(f"{self._prefix}{key} is {ascii(self.get(key))[:80]}; needed: {allowed}")
+            raise DamagedFileError(
+                f"{self._prefix}{key} is {ascii(self.get(key))[:80]}; needed: {allowed}"
+            )
 
     def record(self, key: str) -> Record:
         """An object."""
@@ -42,8 +44,14 @@ class Record:
     def records(self, key: str) -> list[Record]:
         """A list of objects."""
         values = self.get(key)
-        self.need(isinstance(values, list) and all(isinstance(value, Mapping) for value in values), key, "a list of objects")
-        return [Record(value, f"{self._prefix}{key}.{number}.") for number, value in enumerate(values)]
+        self.need(
+            isinstance(values, list) and all(isinstance(value, Mapping) for value in values),
+            key,
+            "a list of objects",
+        )
+        return [
+            Record(value, f"{self._prefix}{key}.{number}.") for number, value in enumerate(values)
+        ]
 
     def text(self, key: str) -> str:
         """A string."""
@@ -54,7 +62,11 @@ class Record:
     def texts(self, key: str) -> list[str]:
         """A list of strings."""
         values = self.get(key)
-        self.need(isinstance(values, list) and all(isinstance(value, str) for value in values), key, "a list of strings")
+        self.need(
+            isinstance(values, list) and all(isinstance(value, str) for value in values),
+            key,
+            "a list of strings",
+        )
         return list(values)
 
     def choice(self, key: str, allowed: tuple[str, ...]) -> str:
@@ -66,13 +78,19 @@ class Record:
     def whole(self, key: str, low: int, high: int) -> int:
         """A whole number from `low` to `high`."""
         value = self.get(key)
-        self.need(type(value) is int and low <= value <= high, key, f"a whole number from {low} to {high}")
+        self.need(
+            type(value) is int and low <= value <= high, key, f"a whole number from {low} to {high}"
+        )
         return int(value)
 
     def wholes(self, key: str, count: int, low: int, high: int) -> list[int]:
         """A list of `count` whole numbers from `low` to `high`."""
         values = self.get(key)
-        whole = isinstance(values, list) and len(values) == count and all(type(n) is int and low <= n <= high for n in values)
+        whole = (
+            isinstance(values, list)
+            and len(values) == count
+            and all(type(n) is int and low <= n <= high for n in values)
+        )
         self.need(whole, key, f"{count} whole numbers from {low} to {high}")
         return list(values)
 
@@ -89,7 +107,11 @@ class Record:
     def numbers(self, key: str, count: int) -> list[float]:
         """A list of `count` finite numbers."""
         values = self.get(key)
-        finite = isinstance(values, list) and len(values) == count and all(_is_finite(value) for value in values)
+        finite = (
+            isinstance(values, list)
+            and len(values) == count
+            and all(_is_finite(value) for value in values)
+        )
         self.need(finite, key, f"{count} finite numbers")
         return [float(value) for value in values]
 

@@ -47,7 +47,9 @@ class Sharding:
     @property
     def counts(self) -> tuple[int, ...]:
         """Inner chunks of a shard along each axis."""
-        return tuple(n // chunk for n, chunk in zip(self.shard_shape, self.chunk_shape, strict=True))
+        return tuple(
+            n // chunk for n, chunk in zip(self.shard_shape, self.chunk_shape, strict=True)
+        )
 
     @property
     def index_bytes(self) -> int:
@@ -78,16 +80,25 @@ class Sharding:
         return result
 
 
-def shard_order(shape: Sequence[int], chunk_shape: Sequence[int], shard_shape: Sequence[int]) -> Iterator[Index]:
+def shard_order(
+    shape: Sequence[int], chunk_shape: Sequence[int], shard_shape: Sequence[int]
+) -> Iterator[Index]:
     """Indices of all inner chunks of an array in the order of the file: shards in C order, in each its inner chunks in C order."""
     sharding = Sharding(shard_shape=tuple(shard_shape), chunk_shape=tuple(chunk_shape), codecs=())
-    for shard in product(*(range(-(-n // size)) for n, size in zip(shape, shard_shape, strict=True))):
+    for shard in product(
+        *(range(-(-n // size)) for n, size in zip(shape, shard_shape, strict=True))
+    ):
         yield from sharding.chunks_of(shard, shape)
 
 
 def sharding_codecs(chunk_shape: Sequence[int], codecs: Sequence[Codec]) -> list[Codec]:
     """The codecs of an array of shards whose inner chunks of `chunk_shape` have `codecs`."""
-    inner = {"chunk_shape": list(chunk_shape), "codecs": list(codecs), "index_codecs": INDEX_CODECS, "index_location": "end"}
+    inner = {
+        "chunk_shape": list(chunk_shape),
+        "codecs": list(codecs),
+        "index_codecs": INDEX_CODECS,
+        "index_location": "end",
+    }
     return [{"name": SHARDING, "configuration": inner}]
 
 
@@ -97,20 +108,38 @@ def parse_sharding(codecs: Sequence[Any], shard_shape: tuple[int, ...]) -> Shard
         return None
     settings = codecs[0].get("configuration")
     if len(codecs) != 1 or not isinstance(settings, Mapping):
-        raise UnsupportedFileError(f"codecs with {SHARDING} that is not the only one, or without configuration")
+        raise UnsupportedFileError(
+            f"codecs with {SHARDING} that is not the only one, or without configuration"
+        )
     unknown = settings.keys() - {"chunk_shape", "codecs", "index_codecs", "index_location"}
-    if unknown or settings.get("index_codecs") != INDEX_CODECS or settings.get("index_location", "end") != "end":
-        raise UnsupportedFileError(f"{SHARDING} with settings that are not allowed; the index is little-endian, crc32c, at the end")
+    if (
+        unknown
+        or settings.get("index_codecs") != INDEX_CODECS
+        or settings.get("index_location", "end") != "end"
+    ):
+        raise UnsupportedFileError(
+            f"{SHARDING} with settings that are not allowed; the index is little-endian, crc32c, at the end"
+        )
     shape, inner = settings.get("chunk_shape"), settings.get("codecs")
-    if not isinstance(shape, list) or len(shape) != len(shard_shape) or not all(type(n) is int and n >= 1 for n in shape):
-        raise DamagedFileError(f"{SHARDING}: chunk_shape is {ascii(shape)[:80]}; {len(shard_shape)} whole numbers from 1 are needed")
+    if (
+        not isinstance(shape, list)
+        or len(shape) != len(shard_shape)
+        or not all(type(n) is int and n >= 1 for n in shape)
+    ):
+        raise DamagedFileError(
+            f"{SHARDING}: chunk_shape is {ascii(shape)[:80]}; {len(shard_shape)} whole numbers from 1 are needed"
+        )
     if any(n % chunk for n, chunk in zip(shard_shape, shape, strict=True)):
-        raise DamagedFileError(f"{SHARDING}: shards of {shard_shape} are no multiple of inner chunks of {tuple(shape)}")
+        raise DamagedFileError(
+            f"{SHARDING}: shards of {shard_shape} are no multiple of inner chunks of {tuple(shape)}"
+        )
     if not isinstance(inner, list):
         raise DamagedFileError(f"{SHARDING}: codecs is not a list")
     sharding = Sharding(shard_shape=shard_shape, chunk_shape=tuple(shape), codecs=inner)
     if prod(sharding.counts) > MAX_SHARD_CHUNKS:
-        raise DamagedFileError(f"{SHARDING}: {prod(sharding.counts)} inner chunks in a shard; the limit is {MAX_SHARD_CHUNKS}")
+        raise DamagedFileError(
+            f"{SHARDING}: {prod(sharding.counts)} inner chunks in a shard; the limit is {MAX_SHARD_CHUNKS}"
+        )
     return sharding
 
 
@@ -132,11 +161,15 @@ def parse_entry(data: bytes, data_bytes: int) -> tuple[int, int]:
     if ABSENT in (offset, size):
         raise DamagedFileError("an inner chunk is missing from the shard's index")
     if size > data_bytes or offset > data_bytes - size:
-        raise DamagedFileError(f"an inner chunk reaches beyond the shard, which has {data_bytes} bytes of them")
+        raise DamagedFileError(
+            f"an inner chunk reaches beyond the shard, which has {data_bytes} bytes of them"
+        )
     return offset, size
 
 
-def parse_index(data: bytes, present: npt.NDArray[np.bool_], data_bytes: int) -> npt.NDArray[np.int64]:
+def parse_index(
+    data: bytes, present: npt.NDArray[np.bool_], data_bytes: int
+) -> npt.NDArray[np.int64]:
     """(offset, bytes) of each inner chunk of a shard, int64 (chunks, 2), (0, 0) where it is absent; `data_bytes`: before the index.
 
     Raises DamagedFileError unless the chunks that should be present, and no others, fill the bytes before the index in order.
@@ -152,10 +185,14 @@ def parse_index(data: bytes, present: npt.NDArray[np.bool_], data_bytes: int) ->
         raise DamagedFileError("the shard's index has an inner chunk beyond the end of the array")
     # Before the sum, which could overflow.
     if np.any(there[:, 1] > data_bytes):
-        raise DamagedFileError(f"an inner chunk is larger than the shard, which has {data_bytes} bytes of them")
+        raise DamagedFileError(
+            f"an inner chunk is larger than the shard, which has {data_bytes} bytes of them"
+        )
     ends = np.cumsum(there[:, 1], dtype=np.uint64)
     if int(ends[-1]) != data_bytes or np.any(there[:, 0] != ends - there[:, 1]):
-        raise DamagedFileError("the inner chunks of the shard overlap, leave gaps or are not in order")
+        raise DamagedFileError(
+            "the inner chunks of the shard overlap, leave gaps or are not in order"
+        )
     result = np.zeros(table.shape, dtype=np.int64)
     result[present] = there
     return result

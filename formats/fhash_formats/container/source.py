@@ -41,7 +41,9 @@ class FileSource:
     def read(self, offset: int, size: int) -> bytes:
         """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
         if offset < 0 or size < 0 or offset + size > self.size:
-            raise DamagedFileError(f"{size} bytes at offset {offset} are outside the file of {self.size} bytes")
+            raise DamagedFileError(
+                f"{size} bytes at offset {offset} are outside the file of {self.size} bytes"
+            )
         parts = []
         # A lock and not os.pread, which Windows lacks; decoding, the greater part of the time, is outside of it.
         with self._lock:
@@ -51,7 +53,9 @@ class FileSource:
             while size > 0:
                 part = self._file.read(size)
                 if not part:
-                    raise DamagedFileError(f"the file was cut short while it was read, {size} bytes from offset {offset} are missing")
+                    raise DamagedFileError(
+                        f"the file was cut short while it was read, {size} bytes from offset {offset} are missing"
+                    )
                 parts.append(part)
                 size -= len(part)
                 offset += len(part)
@@ -96,7 +100,9 @@ class PreviewSource:
     def read(self, offset: int, size: int) -> bytes:
         """Exactly `size` bytes from `offset`; raises DamagedFileError if they are not there."""
         if offset < 0 or size < 0 or offset + size > self.size:
-            raise DamagedFileError(f"{size} bytes at offset {offset} are outside the file of {self.size} bytes")
+            raise DamagedFileError(
+                f"{size} bytes at offset {offset} are outside the file of {self.size} bytes"
+            )
         from_file = max(0, min(offset + size, self._length) - offset)
         begin = self._begin.read(offset, from_file) if from_file else b""
         start = offset + from_file - self._length

@@ -62,7 +62,13 @@ class StoredArray:
     """
 
     def __init__(
-        self, path: object, name: str, metadata: ArrayMetadata, chunks: Mapping[tuple[int, ...], Member], source: Source, cache: ChunkCache
+        self,
+        path: object,
+        name: str,
+        metadata: ArrayMetadata,
+        chunks: Mapping[tuple[int, ...], Member],
+        source: Source,
+        cache: ChunkCache,
     ) -> None:
         self._path, self._source, self._cache = path, source, cache
         self._metadata = metadata
@@ -97,10 +103,21 @@ class StoredArray:
         True everywhere, without a look at the file, where the array is not `masked`. Raises what `read` raises.
         """
         if not self.masked:
-            return np.ones([stop - start for start, stop in map(self._bounds, range(len(self.shape)), self._full(region))], dtype=bool)
+            return np.ones(
+                [
+                    stop - start
+                    for start, stop in map(self._bounds, range(len(self.shape)), self._full(region))
+                ],
+                dtype=bool,
+            )
         return self._gathered(region, self._mask, np.dtype(bool))
 
-    def _gathered(self, region: tuple[slice, ...] | None, read: Callable[..., npt.NDArray[Any]], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    def _gathered(
+        self,
+        region: tuple[slice, ...] | None,
+        read: Callable[..., npt.NDArray[Any]],
+        dtype: np.dtype[Any],
+    ) -> npt.NDArray[Any]:
         """A region of what `read` gives of each chunk."""
         bounds = [self._bounds(axis, part) for axis, part in enumerate(self._full(region))]
         with damage_named(self._path):
@@ -117,7 +134,10 @@ class StoredArray:
                     origin.append(slice(low - i * size, high - i * size))
                 values[tuple(target)] = chunk[tuple(origin)]
 
-            spans = [range(start // chunk, -(-stop // chunk)) for (start, stop), chunk in zip(bounds, self.chunk_shape, strict=True)]
+            spans = [
+                range(start // chunk, -(-stop // chunk))
+                for (start, stop), chunk in zip(bounds, self.chunk_shape, strict=True)
+            ]
             # What finds hostile shards comes before the array that they ask for; the work itself is done as it is asked for.
             work = self._each(fill, spans)
             values = np.empty(lengths, dtype=dtype)
@@ -132,8 +152,12 @@ class StoredArray:
         Raises RegionError for an index outside `grid`, InputError for a level of detail that there is none of, DamagedFileError naming
         the member of the file.
         """
-        if len(index) != len(self.grid) or not all(0 <= i < n for i, n in zip(index, self.grid, strict=True)):
-            raise RegionError(f"{self._path}: {self.name}: chunk {index} is outside the grid {self.grid}")
+        if len(index) != len(self.grid) or not all(
+            0 <= i < n for i, n in zip(index, self.grid, strict=True)
+        ):
+            raise RegionError(
+                f"{self._path}: {self.name}: chunk {index} is outside the grid {self.grid}"
+            )
         with damage_named(self._path):
             return self._chunk(tuple(index), lod, keep=True)
 
@@ -148,15 +172,23 @@ class StoredArray:
     def _decode_and_drop(self, index: tuple[int, ...]) -> None:
         self._decode(index)
 
-    def _each(self, work: Callable[[tuple[int, ...]], None], spans: Sequence[range]) -> Iterator[None]:
+    def _each(
+        self, work: Callable[[tuple[int, ...]], None], spans: Sequence[range]
+    ) -> Iterator[None]:
         """Do the work for each chunk of `spans`, as the result is iterated; in threads if there are shards and several to decode."""
         sharding = self._metadata.sharding
         if sharding is None:
             return map(work, product(*spans))
         # Once for all chunks of a shard, before the threads that all need it.
-        shards = (range(span.start // count, (span.stop - 1) // count + 1) for span, count in zip(spans, sharding.counts, strict=True))
+        shards = (
+            range(span.start // count, (span.stop - 1) // count + 1)
+            for span, count in zip(spans, sharding.counts, strict=True)
+        )
         for shard in product(*shards):
-            ends = ((max(span.start, s * n), min(span.stop, (s + 1) * n)) for span, s, n in zip(spans, shard, sharding.counts, strict=True))
+            ends = (
+                (max(span.start, s * n), min(span.stop, (s + 1) * n))
+                for span, s, n in zip(spans, shard, sharding.counts, strict=True)
+            )
             inside = [range(*end) for end in ends]
             if FEW * prod(map(len, inside)) >= prod(sharding.counts):
                 self._shard_index(sharding, shard)
@@ -178,7 +210,9 @@ class StoredArray:
         assert mask is not None
         return mask
 
-    def _decoded(self, index: tuple[int, ...], lod: int, keep: bool) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
+    def _decoded(
+        self, index: tuple[int, ...], lod: int, keep: bool
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
         """A full chunk and its mask, of which the cache then has both."""
         values, mask = self._decode(index, lod)
         for name, part in ((self.name, values), (self.name + MASK, mask)):
@@ -188,7 +222,9 @@ class StoredArray:
                     self._cache.put((name, index, lod), part)
         return values, mask
 
-    def _decode(self, index: tuple[int, ...], lod: int = 0) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
+    def _decode(
+        self, index: tuple[int, ...], lod: int = 0
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
         """A full chunk, straight from the file, and where chunks have one its mask."""
         sharding = self._metadata.sharding
         if sharding is None:
@@ -201,7 +237,11 @@ class StoredArray:
             data = memoryview(self._source.read(member.data_offset + offset, size))
         try:
             coder = self._metadata.coder
-            return coder.decode_masked(data) if self.masked and not lod else (coder.decode(data, lod), None)
+            return (
+                coder.decode_masked(data)
+                if self.masked and not lod
+                else (coder.decode(data, lod), None)
+            )
         except DamagedFileError as error:
             raise type(error)(f"member {member.name}: {part}{error}") from error
 
@@ -214,7 +254,9 @@ class StoredArray:
             known = self._entries.get((shard, number))
             if known is None:
                 with self._index_of(sharding, shard) as (start, data_bytes):
-                    known = parse_entry(self._source.read(start + number * ENTRY_BYTES, ENTRY_BYTES), data_bytes)
+                    known = parse_entry(
+                        self._source.read(start + number * ENTRY_BYTES, ENTRY_BYTES), data_bytes
+                    )
                 self._entries[shard, number] = known
         return known
 
@@ -224,7 +266,11 @@ class StoredArray:
             found = self._indices.get(shard)
             if found is None:
                 with self._index_of(sharding, shard) as (start, data_bytes):
-                    found = parse_index(self._source.read(start, sharding.index_bytes), sharding.present(shard, self.shape), data_bytes)
+                    found = parse_index(
+                        self._source.read(start, sharding.index_bytes),
+                        sharding.present(shard, self.shape),
+                        data_bytes,
+                    )
                 self._indices[shard] = found
         return found
 
@@ -235,7 +281,9 @@ class StoredArray:
         data_bytes = member.size - sharding.index_bytes
         try:
             if data_bytes < 0:
-                raise DamagedFileError(f"{member.size} bytes are too few for the index of a shard, {sharding.index_bytes}")
+                raise DamagedFileError(
+                    f"{member.size} bytes are too few for the index of a shard, {sharding.index_bytes}"
+                )
             yield member.data_offset + data_bytes, data_bytes
         except DamagedFileError as error:
             raise type(error)(f"member {member.name}: {error}") from error
@@ -244,7 +292,9 @@ class StoredArray:
         if region is None:
             return tuple(slice(0, n) for n in self.shape)
         if len(region) != len(self.shape):
-            raise RegionError(f"{self._path}: {self.name}: a region of {len(region)} axes; the array has {len(self.shape)}")
+            raise RegionError(
+                f"{self._path}: {self.name}: a region of {len(region)} axes; the array has {len(self.shape)}"
+            )
         return region
 
     def _bounds(self, axis: int, part: slice) -> tuple[int, int]:
@@ -252,7 +302,9 @@ class StoredArray:
         start = 0 if part.start is None else int(part.start)
         stop = length if part.stop is None else int(part.stop)
         if part.step not in (None, 1) or not 0 <= start <= stop <= length:
-            raise RegionError(f"{self._path}: {self.name}: {part} on axis {axis}; slices without step within 0..{length} are allowed")
+            raise RegionError(
+                f"{self._path}: {self.name}: {part} on axis {axis}; slices without step within 0..{length} are allowed"
+            )
         return start, stop
 
     def __repr__(self) -> str:

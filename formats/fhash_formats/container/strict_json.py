@@ -24,7 +24,9 @@ def loads(data: bytes | memoryview) -> dict[str, Any]:
     try:
         text = bytes(data).decode("utf-8")
         _check_depth(text)
-        value = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant, parse_float=_finite)
+        value = json.loads(
+            text, object_pairs_hook=_unique, parse_constant=_refuse_constant, parse_float=_finite
+        )
         # A lone surrogate passes the parser and would fail later, where the text is shown.
         json.dumps(value, ensure_ascii=False).encode("utf-8")
     except DamagedFileError:
@@ -39,7 +41,9 @@ def loads(data: bytes | memoryview) -> dict[str, Any]:
 def dumps(value: Mapping[str, Any], what: str) -> bytes:
     """Compact JSON with sorted keys, UTF-8; raises InputError, naming `what`, for values that JSON cannot hold."""
     try:
-        data = json.dumps(value, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":")).encode("utf-8")
+        data = json.dumps(
+            value, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":")
+        ).encode("utf-8")
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{what} cannot be stored as JSON: {error}") from error
     if len(data) > MAX_BYTES:

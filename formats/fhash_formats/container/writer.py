@@ -58,7 +58,12 @@ class ContainerWriter:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         # After `commit` the stack is empty and this does nothing.
         failure = error if error is not None else _Abandoned()
         self._stack.__exit__(type(failure), failure, trace)
@@ -82,13 +87,20 @@ class ContainerWriter:
         """
         number_type = np.dtype(dtype).newbyteorder("=")
         coding = plain_codecs(number_type) if codecs is None else codecs
-        metadata = self._begin(name, shape, number_type, chunk_shape, coding, dimension_names, attributes)
+        metadata = self._begin(
+            name, shape, number_type, chunk_shape, coding, dimension_names, attributes
+        )
         given = iter(chunks)
         for index in product(*(range(n) for n in metadata.grid)):
             chunk = next(given, None)
             if chunk is None:
-                raise InputError(f"array {name}: chunk {index} was not given; the grid has {metadata.grid}")
-            self._add(f"{name}/{metadata.chunk_key(index)}", [metadata.coder.encode(full_chunk(name, metadata, index, chunk))])
+                raise InputError(
+                    f"array {name}: chunk {index} was not given; the grid has {metadata.grid}"
+                )
+            self._add(
+                f"{name}/{metadata.chunk_key(index)}",
+                [metadata.coder.encode(full_chunk(name, metadata, index, chunk))],
+            )
         expect_end(name, metadata, given)
 
     def add_sharded(
@@ -111,12 +123,19 @@ class ContainerWriter:
         first codec gave for the full chunk, without CRC-32C. Raises InputError for anything that does not fit together.
         """
         number_type = np.dtype(dtype).newbyteorder("=")
-        coding = sharding_codecs([int(n) for n in chunk_shape], plain_codecs(number_type) if codecs is None else codecs)
-        metadata = self._begin(name, shape, number_type, shard_shape, coding, dimension_names, attributes)
+        coding = sharding_codecs(
+            [int(n) for n in chunk_shape], plain_codecs(number_type) if codecs is None else codecs
+        )
+        metadata = self._begin(
+            name, shape, number_type, shard_shape, coding, dimension_names, attributes
+        )
         assert metadata.sharding is not None
         given = iter(chunks)
         for shard in product(*(range(n) for n in metadata.grid)):
-            self._add(f"{name}/{metadata.chunk_key(shard)}", shard_parts(name, metadata, metadata.sharding, shard, given))
+            self._add(
+                f"{name}/{metadata.chunk_key(shard)}",
+                shard_parts(name, metadata, metadata.sharding, shard, given),
+            )
         expect_end(name, metadata, given)
 
     def add_whole(
@@ -130,7 +149,11 @@ class ContainerWriter:
         codecs: Sequence[Codec] | None = None,
     ) -> None:
         """Write an array that is in memory; by default one chunk up to 2 MiB, slabs of the leading axes above. Raises as `add_array`."""
-        chosen = slab_shape(array.shape, array.dtype.itemsize, USUAL_CHUNK_BYTES) if chunk_shape is None else tuple(chunk_shape)
+        chosen = (
+            slab_shape(array.shape, array.dtype.itemsize, USUAL_CHUNK_BYTES)
+            if chunk_shape is None
+            else tuple(chunk_shape)
+        )
         self.add_array(
             name,
             shape=array.shape,
@@ -197,7 +220,9 @@ class ContainerWriter:
     def _open(self, tail: bytes) -> Container:
         self._file.flush()
         try:
-            return Container(self.path, PreviewSource(FileSource(self._temporary), self._position, tail))
+            return Container(
+                self.path, PreviewSource(FileSource(self._temporary), self._position, tail)
+            )
         except DamagedFileError as error:
             raise InputError(f"the container would not be readable: {error}") from error
 
@@ -205,10 +230,23 @@ class ContainerWriter:
         """Everything that comes after the arrays."""
         if self._file.closed:
             raise OutputError(f"{self.path}: the container is written already")
-        groups = {"/".join(parts[:n]) for parts in (name.split("/") for name in self._arrays) for n in range(1, len(parts))}
-        documents = {f"{group}/{DOCUMENT}": strict_json.dumps(GROUP, "a group") for group in sorted(groups)}
-        complete = {"required_features": [], **header, "format": FORMAT, "format_version": list(FORMAT_VERSION)}
-        documents[DOCUMENT] = strict_json.dumps({**GROUP, "attributes": {"fhash": complete}}, "the header")
+        groups = {
+            "/".join(parts[:n])
+            for parts in (name.split("/") for name in self._arrays)
+            for n in range(1, len(parts))
+        }
+        documents = {
+            f"{group}/{DOCUMENT}": strict_json.dumps(GROUP, "a group") for group in sorted(groups)
+        }
+        complete = {
+            "required_features": [],
+            **header,
+            "format": FORMAT,
+            "format_version": list(FORMAT_VERSION),
+        }
+        documents[DOCUMENT] = strict_json.dumps(
+            {**GROUP, "attributes": {"fhash": complete}}, "the header"
+        )
         members, parts, position = list(self._members), [], self._position
         for name, data in documents.items():
             member, packed = document_member(name, position, data)
@@ -218,8 +256,14 @@ class ContainerWriter:
         return b"".join([*parts, ending(members)])
 
     def _check_name(self, name: str) -> None:
-        if not NAME.fullmatch(name) or len(name) > MAX_NAME // 2 or name.rpartition("/")[2] == DOCUMENT:
-            raise InputError(f"array name {name[:80]!a} is not allowed; allowed: paths of A-Z a-z 0-9 . _ - up to {MAX_NAME // 2} letters")
+        if (
+            not NAME.fullmatch(name)
+            or len(name) > MAX_NAME // 2
+            or name.rpartition("/")[2] == DOCUMENT
+        ):
+            raise InputError(
+                f"array name {name[:80]!a} is not allowed; allowed: paths of A-Z a-z 0-9 . _ - up to {MAX_NAME // 2} letters"
+            )
         if name in self._arrays:
             raise InputError(f"array {name} is there already")
 
@@ -227,7 +271,9 @@ class ContainerWriter:
         """Write a chunk whose data are these parts, one after the other."""
         size, crc = sum(len(part) for part in parts), 0
         if size > MAX_MEMBER:
-            raise InputError(f"{name} takes {size} bytes; the limit is {MAX_MEMBER}, take smaller chunks or shards")
+            raise InputError(
+                f"{name} takes {size} bytes; the limit is {MAX_MEMBER}, take smaller chunks or shards"
+            )
         for part in parts:
             crc = zlib.crc32(part, crc)
         self._write(Member(name=name, offset=self._position, size=size, crc=crc), parts)

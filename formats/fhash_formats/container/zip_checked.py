@@ -61,15 +61,21 @@ def read_members(source: Source) -> dict[str, Member]:
     """Every member by name, in the order of the file; raises DamagedFileError or UnsupportedFileError."""
     signature = find_signature(source)
     if signature is None:
-        raise DamagedFileError("not an fhash container, or one that was cut short: no fhash signature at its end")
+        raise DamagedFileError(
+            "not an fhash container, or one that was cut short: no fhash signature at its end"
+        )
     version, signed = signature
     comment_at = source.size - len(signed)
     if version > LAYOUT_VERSION:
-        raise UnsupportedFileError(f"written by a newer fhash layout {version}; this version reads up to {LAYOUT_VERSION}; upgrade")
+        raise UnsupportedFileError(
+            f"written by a newer fhash layout {version}; this version reads up to {LAYOUT_VERSION}; upgrade"
+        )
     count, size, offset = _read_end(source, comment_at)
     directory = source.read(offset, comment_at - offset)
     if comment(directory, version) != signed:
-        raise DamagedFileError("the ZIP directory is damaged: its SHA-256 differs from the one in the comment")
+        raise DamagedFileError(
+            "the ZIP directory is damaged: its SHA-256 differs from the one in the comment"
+        )
     if directory[size:] != end_records(count, size, offset):
         raise DamagedFileError("the end record of the ZIP directory contradicts itself")
     return _parse(directory[:size], count, offset, version)
@@ -100,7 +106,9 @@ def check_member(source: Source, member: Member) -> None:
         raise DamagedFileError(f"member {member.name}: its header differs from the directory")
     crc = 0
     for start in range(0, member.size, _PIECE):
-        crc = zlib.crc32(source.read(member.data_offset + start, min(_PIECE, member.size - start)), crc)
+        crc = zlib.crc32(
+            source.read(member.data_offset + start, min(_PIECE, member.size - start)), crc
+        )
     if crc != member.crc:
         raise DamagedFileError(f"member {member.name}: its CRC-32 differs, the data are damaged")
 
@@ -111,9 +119,13 @@ def _inflated(member: Member, data: memoryview, size: int) -> bytes:
     try:
         full = inflate.decompress(data, size + 1)
     except zlib.error as error:
-        raise DamagedFileError(f"member {member.name}: its deflated data are damaged: {error}") from error
+        raise DamagedFileError(
+            f"member {member.name}: its deflated data are damaged: {error}"
+        ) from error
     if len(full) != size or not inflate.eof or inflate.unused_data:
-        raise DamagedFileError(f"member {member.name}: it does not inflate to the {size} bytes that are declared")
+        raise DamagedFileError(
+            f"member {member.name}: it does not inflate to the {size} bytes that are declared"
+        )
     return full
 
 
@@ -123,20 +135,30 @@ def _read_end(source: Source, comment_at: int) -> tuple[int, int, int]:
     if end_at < 0:
         raise DamagedFileError("the ZIP end record is missing")
     mark, _, _, _, count, size, offset, comment_size = END.unpack(source.read(end_at, END.size))
-    if mark != END_MARK or comment_size != source.size - comment_at or comment_size != len(comment(b"")):
+    if (
+        mark != END_MARK
+        or comment_size != source.size - comment_at
+        or comment_size != len(comment(b""))
+    ):
         raise DamagedFileError("the ZIP end record is damaged")
     records_at = end_at
     if count == MAX_16 or MAX_32 in (size, offset):
         records_at = end_at - LOCATOR_64.size - END_64.size
         if records_at < 0:
             raise DamagedFileError("the ZIP64 end record is missing")
-        mark, _, _, _, _, _, _, count, size, offset = END_64.unpack(source.read(records_at, END_64.size))
+        mark, _, _, _, _, _, _, count, size, offset = END_64.unpack(
+            source.read(records_at, END_64.size)
+        )
         if mark != END_64_MARK:
             raise DamagedFileError("the ZIP64 end record is damaged")
     if size > MAX_DIRECTORY:
-        raise DamagedFileError(f"the ZIP directory declares {size} bytes; the limit is {MAX_DIRECTORY}")
+        raise DamagedFileError(
+            f"the ZIP directory declares {size} bytes; the limit is {MAX_DIRECTORY}"
+        )
     if offset + size != records_at:
-        raise DamagedFileError(f"the ZIP directory is declared at {offset} with {size} bytes, but it ends at {records_at}")
+        raise DamagedFileError(
+            f"the ZIP directory is declared at {offset} with {size} bytes, but it ends at {records_at}"
+        )
     return count, size, offset
 
 
@@ -148,12 +170,16 @@ def _parse(directory: bytes, count: int, data_end: int, version: int) -> dict[st
         if member.name in members:
             raise DamagedFileError(f"member {member.name} is there twice")
         if member.offset != position or member.end > data_end:
-            raise DamagedFileError(f"member {member.name} at {member.offset} overlaps another or leaves a gap; {position} was expected")
+            raise DamagedFileError(
+                f"member {member.name} at {member.offset} overlaps another or leaves a gap; {position} was expected"
+            )
         members[member.name] = member
         position = member.end
         at += length
     if len(members) != count or position != data_end:
-        raise DamagedFileError(f"the ZIP directory has {len(members)} entries that end at {position}; {count} and {data_end} are declared")
+        raise DamagedFileError(
+            f"the ZIP directory has {len(members)} entries that end at {position}; {count} and {data_end} are declared"
+        )
     return members
 
 
@@ -162,30 +188,50 @@ def _parse_entry(directory: bytes, at: int, version: int) -> tuple[Member, int]:
     if at + ENTRY.size > len(directory):
         raise DamagedFileError("the ZIP directory ends within an entry")
     fields = ENTRY.unpack_from(directory, at)
-    mark, flags, method, crc, size, full_size, name_size, extra_size, offset = (fields[i] for i in (0, 5, 6, 9, 10, 11, 12, 13, 18))
+    mark, flags, method, crc, size, full_size, name_size, extra_size, offset = (
+        fields[i] for i in (0, 5, 6, 9, 10, 11, 12, 13, 18)
+    )
     if mark != ENTRY_MARK:
         raise DamagedFileError("the ZIP directory has an entry without its mark")
     name_at = at + ENTRY.size
     raw_name = directory[name_at : name_at + name_size]
     name = raw_name.decode("ascii", "replace")
     if name_size > MAX_NAME or not raw_name.isascii() or not NAME.fullmatch(name):
-        raise DamagedFileError(f"member name {name[:80]!a} is not allowed; names are relative paths of A-Z a-z 0-9 . _ -")
+        raise DamagedFileError(
+            f"member name {name[:80]!a} is not allowed; names are relative paths of A-Z a-z 0-9 . _ -"
+        )
     if flags & 1:
         raise DamagedFileError(f"member {name} is encrypted")
     document = version > 1 and name.rpartition("/")[2] == DOCUMENT
     if method != STORED and not (document and method == DEFLATED):
-        raise DamagedFileError(f"member {name} is compressed by ZIP method {method}; only metadata may be, by 8 from layout version 2 on")
+        raise DamagedFileError(
+            f"member {name} is compressed by ZIP method {method}; only metadata may be, by 8 from layout version 2 on"
+        )
     if method == DEFLATED:
         if not size < full_size <= MAX_DOCUMENT:
-            raise DamagedFileError(f"member {name} declares {size} deflated and {full_size} full bytes; the limit is {MAX_DOCUMENT}")
+            raise DamagedFileError(
+                f"member {name} declares {size} deflated and {full_size} full bytes; the limit is {MAX_DOCUMENT}"
+            )
     elif size != full_size or size > MAX_MEMBER:
         raise DamagedFileError(
             f"member {name} declares {size} stored and {full_size} full bytes; equal sizes up to {MAX_MEMBER} are allowed"
         )
-    if offset == MAX_32 and extra_size == OFFSET_64.size and name_at + name_size + extra_size <= len(directory):
+    if (
+        offset == MAX_32
+        and extra_size == OFFSET_64.size
+        and name_at + name_size + extra_size <= len(directory)
+    ):
         offset = OFFSET_64.unpack_from(directory, name_at + name_size)[2]
-    member = Member(name=name, offset=offset, size=size, crc=crc, full_size=full_size if method == DEFLATED else None)
+    member = Member(
+        name=name,
+        offset=offset,
+        size=size,
+        crc=crc,
+        full_size=full_size if method == DEFLATED else None,
+    )
     canonical = directory_entry(member)
     if directory[at : at + len(canonical)] != canonical:
-        raise DamagedFileError(f"member {name} has fields in its directory entry that the format does not allow")
+        raise DamagedFileError(
+            f"member {name} has fields in its directory entry that the format does not allow"
+        )
     return member, len(canonical)

@@ -41,7 +41,14 @@ def library() -> ctypes.CDLL | None:
 
 
 def _load(folder: Path) -> ctypes.CDLL | None:
-    path = next((folder / f"_core{suffix}" for suffix in EXTENSION_SUFFIXES if (folder / f"_core{suffix}").is_file()), None)
+    path = next(
+        (
+            folder / f"_core{suffix}"
+            for suffix in EXTENSION_SUFFIXES
+            if (folder / f"_core{suffix}").is_file()
+        ),
+        None,
+    )
     if path is None:
         return None
     advice = "install the package again (pip install .), or set FHASH_NATIVE=0 to do without"
@@ -49,7 +56,9 @@ def _load(folder: Path) -> ctypes.CDLL | None:
         loaded = ctypes.CDLL(str(path))
         version = loaded.fhash_abi_version
     except (OSError, AttributeError) as error:
-        raise MissingDependencyError(f"the native library {path} cannot be used ({error}): {advice}") from error
+        raise MissingDependencyError(
+            f"the native library {path} cannot be used ({error}): {advice}"
+        ) from error
     version.argtypes = []
     version.restype = ctypes.c_int64
     if version() != ABI_VERSION:

@@ -32,7 +32,9 @@ class Packing:
 
     def unpack(self, stored: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Physical values of stored ones; the same array where nothing is packed."""
-        numbers = stored.astype(stored.dtype.newbyteorder("="), copy=False).view(self.stored)  # the view is for _Unsigned
+        numbers = stored.astype(stored.dtype.newbyteorder("="), copy=False).view(
+            self.stored
+        )  # the view is for _Unsigned
         if self.dtype == self.stored:
             # floats without scaling; the array is fresh and may be changed in place
             for fill in self.fills:
@@ -48,7 +50,9 @@ class Packing:
         return values
 
 
-def packing(source: str, dtype: np.dtype[Any], attributes: Mapping[str, Any], fill_value: Any = None) -> Packing:
+def packing(
+    source: str, dtype: np.dtype[Any], attributes: Mapping[str, Any], fill_value: Any = None
+) -> Packing:
     """The packing that an array's attributes describe; `fill_value` is one more fill value, from zarr's own metadata.
 
     Raises InputError where an attribute is not a number.
@@ -61,12 +65,24 @@ def packing(source: str, dtype: np.dtype[Any], attributes: Mapping[str, Any], fi
         for each in value if isinstance(value, list) else [value]:
             if each is not None:
                 fills.append(_fill(source, each, stored))
-    scale, offset = (_number(source, name, attributes.get(name)) for name in ("scale_factor", "add_offset"))
+    scale, offset = (
+        _number(source, name, attributes.get(name)) for name in ("scale_factor", "add_offset")
+    )
     fills = [fill for fill in fills if fill is not None and fill == fill]  # NaN marks itself
     if scale is not None or offset is not None:
-        return Packing(stored=stored, dtype=np.dtype(np.float64), fills=tuple(fills), scale=scale, offset=offset)
+        return Packing(
+            stored=stored,
+            dtype=np.dtype(np.float64),
+            fills=tuple(fills),
+            scale=scale,
+            offset=offset,
+        )
     if fills and stored.kind in "iu":
-        return Packing(stored=stored, dtype=np.dtype(np.float32 if stored.itemsize <= 2 else np.float64), fills=tuple(fills))
+        return Packing(
+            stored=stored,
+            dtype=np.dtype(np.float32 if stored.itemsize <= 2 else np.float64),
+            fills=tuple(fills),
+        )
     return Packing(stored=stored, dtype=stored, fills=tuple(fills))
 
 
@@ -92,7 +108,9 @@ def _fill(source: str, value: Any, stored: np.dtype[Any]) -> Any:
     whole = int(value)
     limits = np.iinfo(stored)
     if whole < 0 and stored.kind == "u":
-        whole += 2 ** (8 * stored.itemsize)  # the fill value of an _Unsigned array is written signed
+        whole += 2 ** (
+            8 * stored.itemsize
+        )  # the fill value of an _Unsigned array is written signed
     return stored.type(whole) if limits.min <= whole <= limits.max else None
 
 

@@ -56,8 +56,14 @@ class Stamp:
         """Raise InputError if the file is no longer the one that was opened, so that frames of two states are never mixed."""
         now = Stamp.of(self.path)
         if now != self:
-            grown = f"{self.size} bytes before, {now.size} now" if now.size != self.size else "same size, written again"
-            raise InputError(f"{self.path} changed while it was being read ({grown}); wait until it is complete and start again")
+            grown = (
+                f"{self.size} bytes before, {now.size} now"
+                if now.size != self.size
+                else "same size, written again"
+            )
+            raise InputError(
+                f"{self.path} changed while it was being read ({grown}); wait until it is complete and start again"
+            )
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,11 @@ class FolderStamp:
                         continue
                     state = os.stat(entry.path)
                     files, size = files + 1, size + state.st_size
-                    digest.update(f"{entry.path}\0{state.st_size} {state.st_mtime_ns} {state.st_ino}\0".encode(errors="surrogateescape"))
+                    digest.update(
+                        f"{entry.path}\0{state.st_size} {state.st_mtime_ns} {state.st_ino}\0".encode(
+                            errors="surrogateescape"
+                        )
+                    )
         return cls(path, files, size, digest.digest())
 
     def check(self) -> None:
@@ -98,4 +108,6 @@ class FolderStamp:
             what = "something in it was written again"
             if (now.files, now.size) != (self.files, self.size):
                 what = f"{self.files} files and {self.size} bytes before, {now.files} and {now.size} now"
-            raise InputError(f"{self.path} changed while it was being read ({what}); wait until it is complete and start again")
+            raise InputError(
+                f"{self.path} changed while it was being read ({what}); wait until it is complete and start again"
+            )

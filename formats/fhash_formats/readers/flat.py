@@ -24,7 +24,9 @@ class FlatArray:
     Read with seek and read and not through a memory map, which would kill the process if the file were cut meanwhile.
     """
 
-    def __init__(self, path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], *, offset: int = 0) -> None:
+    def __init__(
+        self, path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], *, offset: int = 0
+    ) -> None:
         self.path, self.shape, self.dtype, self.offset = path, shape, dtype, offset
 
     @property
@@ -34,7 +36,11 @@ class FlatArray:
 
     def read(self, ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
         """The values in the ranges, of which at most one is not the whole dimension; raises InputError where the file ends too early."""
-        parts = [place for place, (part, length) in enumerate(zip(ranges, self.shape, strict=True)) if part != slice(0, length)]
+        parts = [
+            place
+            for place, (part, length) in enumerate(zip(ranges, self.shape, strict=True))
+            if part != slice(0, length)
+        ]
         place = parts[0] if parts else 0
         part = ranges[place]
         rows, inner = prod(self.shape[:place]), prod(self.shape[place + 1 :])
@@ -65,5 +71,7 @@ class FlatArray:
         while done < len(view):
             count = file.readinto(view[done:])  # type: ignore[attr-defined]
             if not count:
-                raise InputError(f"{self.path} ends after {file.tell()} bytes, {self.end} are needed")
+                raise InputError(
+                    f"{self.path} ends after {file.tell()} bytes, {self.end} are needed"
+                )
             done += count

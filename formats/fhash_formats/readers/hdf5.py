@@ -8,7 +8,16 @@ from typing import Any
 
 from fhash_formats.attributes import json_attributes, plain_text, text_of
 from fhash_formats.readers.failures import Stamp, refusing
-from fhash_formats.readers.hdf5_tree import column, columns, datasets, files_beside, own_name, require_filters, require_sources, variables
+from fhash_formats.readers.hdf5_tree import (
+    column,
+    columns,
+    datasets,
+    files_beside,
+    own_name,
+    require_filters,
+    require_sources,
+    variables,
+)
 from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.positions import beside, coordinate, usable
 from fhash_formats.readers.request import Request
@@ -24,7 +33,9 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 def is_hdf5(head: bytes) -> bool:
     """Whether a file that begins so is HDF5; a user block of 512, 1024 or 2048 bytes may come before the signature."""
-    return any(head[offset : offset + len(SIGNATURE)] == SIGNATURE for offset in (0, 512, 1024, 2048))
+    return any(
+        head[offset : offset + len(SIGNATURE)] == SIGNATURE for offset in (0, 512, 1024, 2048)
+    )
 
 
 def matches(head: bytes, path: Path) -> bool:
@@ -60,8 +71,13 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     require_sources(source, path, variable.name, dataset)
     _warn_of_packing(variable.name, dataset)
     scales = [_scale(dimension) for dimension in dataset.dims]
-    names = [dimension.label or (scale[0] if scale else None) for dimension, scale in zip(dataset.dims, scales, strict=True)]
-    hints = [_hint(dimension.label, scale) for dimension, scale in zip(dataset.dims, scales, strict=True)]
+    names = [
+        dimension.label or (scale[0] if scale else None)
+        for dimension, scale in zip(dataset.dims, scales, strict=True)
+    ]
+    hints = [
+        _hint(dimension.label, scale) for dimension, scale in zip(dataset.dims, scales, strict=True)
+    ]
     axes = assign_axes(source, dataset.shape, hints, names, request.axes)
     certain = request.axes is not None or all(hint is not None for hint in hints)
     group = variable.name.rpartition("/")[0]
@@ -88,10 +104,18 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
 def _warn_of_packing(name: str, dataset: Any) -> None:
     """Say that attributes which change the values of a NetCDF file change none here; without the path, so once for many files."""
     attributes = json_attributes(dataset.attrs)
-    found = [key for key, idle in PACKED.items() if key in attributes and attributes[key] not in (idle, [idle])]
+    found = [
+        key
+        for key, idle in PACKED.items()
+        if key in attributes and attributes[key] not in (idle, [idle])
+    ]
     if found:
         text = f"{plain_text(name)} has the attribute{'s' if len(found) > 1 else ''} {', '.join(found)}"
-        warnings.warn(f"{text}; its values are read as they stand in HDF5, a file named .nc is unpacked", UserWarning, stacklevel=2)
+        warnings.warn(
+            f"{text}; its values are read as they stand in HDF5, a file named .nc is unpacked",
+            UserWarning,
+            stacklevel=2,
+        )
 
 
 def _scale(dimension: Any) -> tuple[str, Any] | None:
@@ -116,7 +140,12 @@ def _scale_coordinates(
     found = {}
     for axis, length, scale in zip(axes, shape, scales, strict=True):
         # a NetCDF dimension without values is a scale too, and says so in its NAME
-        if scale is None or scale[1].shape != (length,) or not usable(scale[1].dtype) or _valueless(scale[1]):
+        if (
+            scale is None
+            or scale[1].shape != (length,)
+            or not usable(scale[1].dtype)
+            or _valueless(scale[1])
+        ):
             continue
         values = column(*scale)
         found[axis] = coordinate(source, values.name, values.read(), values.attributes)
@@ -124,4 +153,6 @@ def _scale_coordinates(
 
 
 def _valueless(scale: Any) -> bool:
-    return text_of(scale.attrs.get("NAME", "")).startswith("This is a netCDF dimension but not a netCDF variable")
+    return text_of(scale.attrs.get("NAME", "")).startswith(
+        "This is a netCDF dimension but not a netCDF variable"
+    )

@@ -53,7 +53,9 @@ def datasets(root: Any) -> Iterator[tuple[str, Any]]:
             for name in sorted(node, reverse=True):
                 child = _follow(node, name)
                 # what a link leads to comes last, so that an object goes by its own name and not by the link's
-                place = len(waiting) if isinstance(node.get(name, getlink=True), h5py.HardLink) else 0
+                place = (
+                    len(waiting) if isinstance(node.get(name, getlink=True), h5py.HardLink) else 0
+                )
                 if child is not None:
                     waiting.insert(place, (f"{path}/{name}".lstrip("/"), child))
 
@@ -70,7 +72,11 @@ def own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
     import h5py
 
     other = _follow(file, name)
-    return next((known for known, dataset in tree.items() if dataset == other), name) if isinstance(other, h5py.Dataset) else name
+    return (
+        next((known for known, dataset in tree.items() if dataset == other), name)
+        if isinstance(other, h5py.Dataset)
+        else name
+    )
 
 
 def variables(tree: Mapping[str, Any]) -> list[Variable]:
@@ -80,7 +86,13 @@ def variables(tree: Mapping[str, Any]) -> list[Variable]:
         if isinstance(dataset.attrs.get("bounds"), str | bytes):
             bounds.add(sibling(name, text_of(dataset.attrs["bounds"])))
     return [
-        Variable(name=name, shape=dataset.shape, dtype=dataset.dtype, auxiliary=dataset.is_scale or name in bounds, handle=dataset)
+        Variable(
+            name=name,
+            shape=dataset.shape,
+            dtype=dataset.dtype,
+            auxiliary=dataset.is_scale or name in bounds,
+            handle=dataset,
+        )
         for name, dataset in tree.items()
         if dataset.shape is not None
     ]
@@ -91,14 +103,21 @@ def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
     found = {}
     for path, dataset in tree.items():
         place, _, name = path.rpartition("/")
-        if place == group and dataset.shape is not None and len(dataset.shape) < 2 and usable(dataset.dtype):
+        if (
+            place == group
+            and dataset.shape is not None
+            and len(dataset.shape) < 2
+            and usable(dataset.dtype)
+        ):
             found[name.lower()] = column(path, dataset)
     return found
 
 
 def column(path: str, dataset: Any) -> Column:
     """A dataset of at most one dimension as a Column."""
-    return Column(name=path, length=dataset.size, read=lambda: dataset[()], attributes=dataset.attrs)
+    return Column(
+        name=path, length=dataset.size, read=lambda: dataset[()], attributes=dataset.attrs
+    )
 
 
 def sibling(path: str, name: str) -> str:
@@ -118,7 +137,9 @@ def require_filters(source: str, name: str, dataset: Any) -> None:
         code, _, _, stored = plist.get_filter(place)
         if h5py.h5z.filter_avail(code):
             continue
-        label = f"{FILTER_NAMES.get(code) or text_of(stored).split(' ')[0] or 'unknown'} (id {code})"
+        label = (
+            f"{FILTER_NAMES.get(code) or text_of(stored).split(' ')[0] or 'unknown'} (id {code})"
+        )
         try:
             importlib.import_module("hdf5plugin")
         except ImportError as error:
@@ -126,7 +147,9 @@ def require_filters(source: str, name: str, dataset: Any) -> None:
                 f"{source}: {name} is compressed with the HDF5 filter {label}, which needs hdf5plugin; pip install 'fhash[formats]'"
             ) from error
         if not h5py.h5z.filter_avail(code):
-            raise InputError(f"{source}: {name} is compressed with the HDF5 filter {label}, which neither h5py nor hdf5plugin has")
+            raise InputError(
+                f"{source}: {name} is compressed with the HDF5 filter {label}, which neither h5py nor hdf5plugin has"
+            )
 
 
 def require_sources(source: str, path: Path, name: str, dataset: Any) -> None:
@@ -135,8 +158,15 @@ def require_sources(source: str, path: Path, name: str, dataset: Any) -> None:
         return
     for mapped in dataset.virtual_sources():
         file = mapped.file_name
-        if file != "." and "%b" not in file and not (path.parent / file).exists() and not Path(file).exists():
-            raise InputError(f"{source}: {name} is a virtual dataset that draws on {file}, which is not there")
+        if (
+            file != "."
+            and "%b" not in file
+            and not (path.parent / file).exists()
+            and not Path(file).exists()
+        ):
+            raise InputError(
+                f"{source}: {name} is a virtual dataset that draws on {file}, which is not there"
+            )
 
 
 def files_beside(path: Path, dataset: Any) -> list[Path]:
@@ -144,6 +174,12 @@ def files_beside(path: Path, dataset: Any) -> list[Path]:
     names = [] if Path(dataset.file.filename) == path else [dataset.file.filename]
     names += [name for name, _, _ in dataset.external or ()]
     if dataset.is_virtual:
-        names += [mapped.file_name for mapped in dataset.virtual_sources() if mapped.file_name != "."]
+        names += [
+            mapped.file_name for mapped in dataset.virtual_sources() if mapped.file_name != "."
+        ]
     # HDF5 looks for a relative name beside the file, then in the current folder
-    return list(dict.fromkeys(found for name in names for found in (path.parent / name, Path(name)) if found.exists()))
+    return list(
+        dict.fromkeys(
+            found for name in names for found in (path.parent / name, Path(name)) if found.exists()
+        )
+    )

@@ -29,7 +29,10 @@ def is_pattern(text: str) -> bool:
 
 def natural_order(text: str) -> list[tuple[int, str]]:
     """A key that sorts frame_9 before frame_10: runs of digits count as numbers."""
-    return [(int(part), "") if part[:1].isdecimal() and part.isascii() else (-1, part) for part in re.split(r"([0-9]+)", text)]
+    return [
+        (int(part), "") if part[:1].isdecimal() and part.isascii() else (-1, part)
+        for part in re.split(r"([0-9]+)", text)
+    ]
 
 
 def files_of(pattern: str) -> list[Path]:
@@ -62,7 +65,9 @@ class JoinedSeries(Series):
     then increase from file to file; otherwise they are 0, 1, 2, ... Raises InputError that names the file which differs.
     """
 
-    def __init__(self, pattern: str, paths: Sequence[Path], open_part: Callable[[Path], FileSeries]) -> None:
+    def __init__(
+        self, pattern: str, paths: Sequence[Path], open_part: Callable[[Path], FileSeries]
+    ) -> None:
         self.source = pattern
         self._open_part = open_part
         self._current: tuple[int, FileSeries] | None = None
@@ -75,7 +80,9 @@ class JoinedSeries(Series):
                 first = first or part
                 _check_alike(part, path, first, paths[0])
                 time = part.coords["t"] if "t" in part.given else None
-                self._parts.append(_Part(path=path, stamps=part.stamps, steps=part.shape[0], time=time))
+                self._parts.append(
+                    _Part(path=path, stamps=part.stamps, steps=part.shape[0], time=time)
+                )
                 names.append(part.name)
                 files += part.files
         assert first is not None
@@ -120,13 +127,25 @@ class JoinedSeries(Series):
             return index_coordinate("t", self.shape[0])
         for part in self._parts:
             if part.time is None or dict(part.time.attributes) != dict(times[0].attributes):
-                raise InputError(f"{self.source}: the time in {part.path} has not the units of the time in {self._parts[0].path}")
+                raise InputError(
+                    f"{self.source}: the time in {part.path} has not the units of the time in {self._parts[0].path}"
+                )
         for before, after in zip(self._parts[:-1], self._parts[1:], strict=True):
             last, following = before.time, after.time
-            if last is not None and following is not None and not last.values[-1] < following.values[0]:
+            if (
+                last is not None
+                and following is not None
+                and not last.values[-1] < following.values[0]
+            ):
                 passed = f"{following.values[0]:g} in {after.path} after {last.values[-1]:g} in {before.path}"
-                raise InputError(f"{self.source}: times do not increase in the order of the file names: {passed}")
-        return Coordinate(name=times[0].name, values=np.concatenate([time.values for time in times]), attributes=times[0].attributes)
+                raise InputError(
+                    f"{self.source}: times do not increase in the order of the file names: {passed}"
+                )
+        return Coordinate(
+            name=times[0].name,
+            values=np.concatenate([time.values for time in times]),
+            attributes=times[0].attributes,
+        )
 
 
 def _common_name(names: Sequence[str]) -> str:
@@ -134,7 +153,10 @@ def _common_name(names: Sequence[str]) -> str:
     low, high = min(names), max(names)
     if low == high:
         return low
-    same = next((place for place, (one, other) in enumerate(zip(low, high, strict=False)) if one != other), len(low))
+    same = next(
+        (place for place, (one, other) in enumerate(zip(low, high, strict=False)) if one != other),
+        len(low),
+    )
     return low[:same].rstrip("0123456789_-. ") or names[0]
 
 
@@ -145,7 +167,11 @@ def _check_alike(part: Series, path: Path, first: Series, first_path: Path) -> N
         ("the unit", part.units, first.units),
     ):
         if here != there:
-            raise InputError(f"{path} has {what} {here}, {first_path} {there}; files of one series must be alike")
+            raise InputError(
+                f"{path} has {what} {here}, {first_path} {there}; files of one series must be alike"
+            )
     for axis in ("z", "y", "x"):
         if not np.array_equal(part.coords[axis].values, first.coords[axis].values):
-            raise InputError(f"{path} has other coordinates along {axis} than {first_path}; files of one series must be alike")
+            raise InputError(
+                f"{path} has other coordinates along {axis} than {first_path}; files of one series must be alike"
+            )

@@ -65,12 +65,19 @@ class FileSeries(Series):
         self.attributes = dict(attributes or {})
         self.units = str(self.attributes.get("units", ""))
         self.given = frozenset(coords or {})
-        self.coords = {axis: index_coordinate(axis, length) for axis, length in zip(AXES, self.shape, strict=True)} | dict(coords or {})
+        self.coords = {
+            axis: index_coordinate(axis, length)
+            for axis, length in zip(AXES, self.shape, strict=True)
+        } | dict(coords or {})
         self._axes, self._fetch, self._close = tuple(axes), fetch, close
         self._quick = (stamp, *map(Stamp.of, beside))
-        self.stamps: tuple[Stamp | FolderStamp, ...] = self._quick if folder is None else (*self._quick, folder)
+        self.stamps: tuple[Stamp | FolderStamp, ...] = (
+            self._quick if folder is None else (*self._quick, folder)
+        )
         frame_bytes = self.dtype.itemsize * prod(self.shape[1:])
-        self._together = max(1, min(_steps_of_a_chunk(self._axes, shape, chunks), SLAB_BYTES // frame_bytes))
+        self._together = max(
+            1, min(_steps_of_a_chunk(self._axes, shape, chunks), SLAB_BYTES // frame_bytes)
+        )
         self._slab: tuple[int, npt.NDArray[Any]] | None = None
 
     def read(self, step: int) -> npt.NDArray[Any]:
@@ -81,7 +88,10 @@ class FileSeries(Series):
         slab = self._slab
         if slab is None or slab[0] != start:
             self._slab = None  # before the fetch, so that two slabs are never held
-            slab = self._slab = (start, self._block(start, min(start + self._together, self.shape[0])))
+            slab = self._slab = (
+                start,
+                self._block(start, min(start + self._together, self.shape[0])),
+            )
         else:
             self._check_files()
         return np.array(slab[1][step - start], dtype=self.dtype, order="C")
@@ -103,18 +113,26 @@ class FileSeries(Series):
         steps = f"step {start}" if stop == start + 1 else f"steps {start} to {stop - 1}"
         self._check_files()
         with refusing(f"{self.source}: {steps} of {self.name} cannot be read"):
-            ranges = {axis: slice(0, length) for axis, length in zip(AXES, self.shape, strict=True)} | {"t": slice(start, stop)}
+            ranges = {
+                axis: slice(0, length) for axis, length in zip(AXES, self.shape, strict=True)
+            } | {"t": slice(start, stop)}
             values = self._fetch(tuple(ranges[axis] for axis in self._axes))
         self._check_files()
         expected = {**dict(zip(AXES, self.shape, strict=True)), "t": stop - start}
         if values.shape != tuple(expected[axis] for axis in self._axes):
-            raise InputError(f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed while it was being read")
+            raise InputError(
+                f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed while it was being read"
+            )
         present = [axis for axis in AXES if axis in self._axes]
         ordered = values.transpose([self._axes.index(axis) for axis in present])
-        return np.expand_dims(ordered, tuple(place for place, axis in enumerate(AXES) if axis not in present))
+        return np.expand_dims(
+            ordered, tuple(place for place, axis in enumerate(AXES) if axis not in present)
+        )
 
 
-def _steps_of_a_chunk(axes: Sequence[str], shape: Sequence[int], chunks: Sequence[int] | None) -> int:
+def _steps_of_a_chunk(
+    axes: Sequence[str], shape: Sequence[int], chunks: Sequence[int] | None
+) -> int:
     """Steps in one chunk; without chunks one, or all where time is not the slowest dimension."""
     if "t" not in axes:
         return 1

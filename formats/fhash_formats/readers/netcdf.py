@@ -47,7 +47,9 @@ CLASSIC_64 = b"CDF\x05"
 
 def matches(head: bytes, path: Path) -> bool:
     """Whether this is NetCDF: classic, or HDF5 that says so by its suffix, by `_NCProperties` or by CF `Conventions`."""
-    return head[:4] in (*CLASSIC, CLASSIC_64) or (is_hdf5(head) and (_says_netcdf(path) or path.suffix.lower() in SUFFIXES))
+    return head[:4] in (*CLASSIC, CLASSIC_64) or (
+        is_hdf5(head) and (_says_netcdf(path) or path.suffix.lower() in SUFFIXES)
+    )
 
 
 def _says_netcdf(path: Path) -> bool:
@@ -55,7 +57,9 @@ def _says_netcdf(path: Path) -> bool:
     import h5py
 
     with refusing(f"{path} cannot be read as HDF5"), h5py.File(path, "r") as file:
-        return "_NCProperties" in file.attrs or text_of(file.attrs.get("Conventions", "")).strip().upper().startswith("CF-")
+        return "_NCProperties" in file.attrs or text_of(
+            file.attrs.get("Conventions", "")
+        ).strip().upper().startswith("CF-")
 
 
 def open_netcdf(path: Path, request: Request) -> FileSeries:
@@ -83,12 +87,22 @@ def _quietly() -> Iterator[None]:
 def _open_groups(source: str, path: Path, head: bytes) -> Mapping[str, xr.Dataset]:
     """The datasets of all groups by path, "/" first."""
     if head == CLASSIC_64:
-        raise InputError(f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with: nccopy -k nc4 IN OUT")
+        raise InputError(
+            f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with: nccopy -k nc4 IN OUT"
+        )
     try:
         import xarray as xr
     except ImportError as error:
-        raise MissingDependencyError(f"{source}: NetCDF needs xarray and h5netcdf; pip install 'fhash[formats]'") from error
-    options: dict[str, Any] = {"decode_times": False, "decode_timedelta": False, "decode_coords": "all", "cache": False, "chunks": None}
+        raise MissingDependencyError(
+            f"{source}: NetCDF needs xarray and h5netcdf; pip install 'fhash[formats]'"
+        ) from error
+    options: dict[str, Any] = {
+        "decode_times": False,
+        "decode_timedelta": False,
+        "decode_coords": "all",
+        "cache": False,
+        "chunks": None,
+    }
     if head in CLASSIC:
         try:
             importlib.import_module("scipy")
@@ -99,7 +113,9 @@ def _open_groups(source: str, path: Path, head: bytes) -> Mapping[str, xr.Datase
     try:
         importlib.import_module("h5netcdf")
     except ImportError as error:
-        raise MissingDependencyError(f"{source}: NetCDF4 needs h5netcdf; pip install 'fhash[formats]'") from error
+        raise MissingDependencyError(
+            f"{source}: NetCDF4 needs h5netcdf; pip install 'fhash[formats]'"
+        ) from error
     # dimensions without a scale get a made-up name, so that HDF5 files named .nc open too
     return xr.open_groups(path, engine="h5netcdf", phony_dims="access", **options)
 
@@ -113,7 +129,9 @@ def _open_classic(source: str, path: Path, options: Mapping[str, Any]) -> xr.Dat
         message = condense(error)
     # the error is not chained: its traceback holds scipy's half-open file, which warns when it is dropped, and here nobody hears that
     gc.collect()
-    raise InputError(f"{source} cannot be read as classic NetCDF3: {message}; nccopy -k nc4 IN OUT may convert it")
+    raise InputError(
+        f"{source} cannot be read as classic NetCDF3: {message}; nccopy -k nc4 IN OUT may convert it"
+    )
 
 
 def _close(groups: Mapping[str, xr.Dataset]) -> None:
@@ -122,10 +140,16 @@ def _close(groups: Mapping[str, xr.Dataset]) -> None:
             dataset.close()
 
 
-def _series(source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Dataset], request: Request) -> FileSeries:
+def _series(
+    source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Dataset], request: Request
+) -> FileSeries:
     found = [
         Variable(
-            name=f"{group}/{name}".lstrip("/"), shape=array.shape, dtype=array.dtype, auxiliary=name in dataset.coords, handle=(group, name)
+            name=f"{group}/{name}".lstrip("/"),
+            shape=array.shape,
+            dtype=array.dtype,
+            auxiliary=name in dataset.coords,
+            handle=(group, name),
         )
         for group, dataset in groups.items()
         for name, array in ((str(name), array) for name, array in dataset.variables.items())
@@ -154,14 +178,24 @@ def _series(source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Datas
         axes=axes,
         fetch=fetch,
         stamp=stamp,
-        coords=_coordinates(source, axes, dimensions, array.shape, scope, groups[group][name], request.axes is not None),
+        coords=_coordinates(
+            source,
+            axes,
+            dimensions,
+            array.shape,
+            scope,
+            groups[group][name],
+            request.axes is not None,
+        ),
         attributes=json_attributes(array.attrs, without=PLUMBING | PACKING),
         chunks=array.encoding.get("chunksizes"),
         close=lambda: _close(groups),
     )
 
 
-def _exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, Any]) -> Exact | None:
+def _exactly_filled(
+    source: str, path: Path, name: str, encoding: Mapping[str, Any]
+) -> Exact | None:
     """What tells the neighbours of a fill value from it, where float64 does not: None where it does.
 
     xarray compares as float64, in which many 64-bit integers beyond 2^53 are the same.
@@ -171,7 +205,10 @@ def _exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, A
     stored = np.dtype(encoding.get("dtype", np.float32))
     if stored.kind not in "iu" or stored.itemsize < 8:
         return None
-    plain = {key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value for key, value in encoding.items()}
+    plain = {
+        key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        for key, value in encoding.items()
+    }
     packed = packing(source, stored, plain)
     if all(abs(int(fill)) < 1 << 53 for fill in packed.fills):
         return None
@@ -212,7 +249,13 @@ def _along(dimension: str, scope: Sequence[xr.Dataset]) -> Iterator[tuple[str, x
     for wanted in ("named", "coordinate", "other"):
         for dataset in scope:
             for key, array in dataset.variables.items():
-                kind = "named" if key == dimension else "coordinate" if key in dataset.coords else "other"
+                kind = (
+                    "named"
+                    if key == dimension
+                    else "coordinate"
+                    if key in dataset.coords
+                    else "other"
+                )
                 if kind == wanted and array.dims == (dimension,) and usable(array.dtype):
                     yield str(key), array
 
@@ -227,8 +270,17 @@ def _role(dimension: str, scope: Sequence[xr.Dataset]) -> str | None:
 
 def _columns(dataset: xr.Dataset) -> dict[str, Column]:
     """The variables of a dataset that may be coordinates, by lower-case name."""
-    arrays = [(str(key), array) for key, array in dataset.variables.items() if array.ndim < 2 and usable(array.dtype)]
-    return {key.lower(): Column(name=key, length=array.size, read=array.to_numpy, attributes=array.attrs) for key, array in arrays}
+    arrays = [
+        (str(key), array)
+        for key, array in dataset.variables.items()
+        if array.ndim < 2 and usable(array.dtype)
+    ]
+    return {
+        key.lower(): Column(
+            name=key, length=array.size, read=array.to_numpy, attributes=array.attrs
+        )
+        for key, array in arrays
+    }
 
 
 def _coordinates(
@@ -245,15 +297,25 @@ def _coordinates(
     Where the file names no dimension, by conventional names as in any HDF5 file.
     """
     if all(dimension.startswith(MADE_UP) for dimension in dimensions):
-        return beside(source, axes, shape, [_columns(dataset) for dataset in scope], certain=certain)
+        return beside(
+            source, axes, shape, [_columns(dataset) for dataset in scope], certain=certain
+        )
     found = {}
     for axis, dimension, length in zip(axes, dimensions, shape, strict=True):
         for name, array in _along(dimension, scope):
-            if array.shape == (length,) and (name == dimension or role_of_coordinate(name, array.attrs) == axis):
+            if array.shape == (length,) and (
+                name == dimension or role_of_coordinate(name, array.attrs) == axis
+            ):
                 found[axis] = coordinate(source, name, array.to_numpy(), array.attrs)
                 break
     for key, scalar in values.coords.items():
         role = role_of_coordinate(str(key), scalar.attrs)
-        if scalar.ndim == 0 and usable(scalar.dtype) and role in AXES and role not in axes and role not in found:
+        if (
+            scalar.ndim == 0
+            and usable(scalar.dtype)
+            and role in AXES
+            and role not in axes
+            and role not in found
+        ):
             found[role] = coordinate(source, str(key), scalar.to_numpy(), scalar.attrs)
     return found

@@ -26,7 +26,9 @@ def open_npy(path: Path, request: Request) -> FileSeries:
     """The series in a .npy file, in file order (t, z, y, x) or (z, y, x) unless the request's axes say otherwise."""
     source, stamp = str(path), Stamp.of(path)
     if path.suffix.lower() == ".npz":
-        raise InputError(f"{source} is a NumPy archive; save its array alone: numpy.save('array.npy', numpy.load('{path.name}')[NAME])")
+        raise InputError(
+            f"{source} is a NumPy archive; save its array alone: numpy.save('array.npy', numpy.load('{path.name}')[NAME])"
+        )
     request.refuse_var(source)
     with refusing(f"{source} cannot be read as .npy"):
         # opened as a map for its header only: type, shape, order and the offset of the values; Python objects are refused by it
@@ -34,14 +36,21 @@ def open_npy(path: Path, request: Request) -> FileSeries:
         shape, dtype, offset = header.shape, header.dtype, int(header.offset)
         fortran = header.flags.f_contiguous and not header.flags.c_contiguous
         del header
-    choose(source, [Variable(name=path.stem, shape=shape, dtype=dtype)], None, booleans=request.booleans)
+    choose(
+        source,
+        [Variable(name=path.stem, shape=shape, dtype=dtype)],
+        None,
+        booleans=request.booleans,
+    )
     axes = assign_axes(source, shape, [None] * len(shape), [None] * len(shape), request.axes)
     if fortran:
         # the last dimension is the slowest: the same bytes, read as C order with the dimensions reversed
         shape, axes = shape[::-1], axes[::-1]
     array = FlatArray(path, shape, dtype, offset=offset)
     if array.end != stamp.size:
-        raise InputError(f"{source} has {stamp.size} bytes, its header promises {array.end}; the file is cut or holds more than one array")
+        raise InputError(
+            f"{source} has {stamp.size} bytes, its header promises {array.end}; the file is cut or holds more than one array"
+        )
     return FileSeries(
         source=source,
         name=path.stem,

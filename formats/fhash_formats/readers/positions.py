@@ -14,7 +14,15 @@ from fhash_formats.errors import InputError
 from fhash_formats.readers.roles import NAMES
 from fhash_formats.series import AXES, Coordinate
 
-TIME_UNITS = {"D": "days", "h": "hours", "m": "minutes", "s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+TIME_UNITS = {
+    "D": "days",
+    "h": "hours",
+    "m": "minutes",
+    "s": "seconds",
+    "ms": "milliseconds",
+    "us": "microseconds",
+    "ns": "nanoseconds",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +36,9 @@ class Column:
     attributes: Mapping[str, Any]
 
 
-def coordinate(source: str, name: str, values: npt.NDArray[Any], attributes: Mapping[str, Any]) -> Coordinate:
+def coordinate(
+    source: str, name: str, values: npt.NDArray[Any], attributes: Mapping[str, Any]
+) -> Coordinate:
     """A Coordinate of stored values: numbers as they are, dates as numbers since the first of them with `units` and `calendar`.
 
     Raises InputError where float64 cannot tell two stored values apart, or where a date is missing.
@@ -38,14 +48,25 @@ def coordinate(source: str, name: str, values: npt.NDArray[Any], attributes: Map
     if stored.dtype.kind == "M":
         unit = np.datetime_data(stored.dtype)[0]
         if unit not in TIME_UNITS or np.isnat(stored).any():
-            raise InputError(f"{source}: coordinate {name} holds dates that cannot be counted ({stored.dtype}, or one is missing)")
+            raise InputError(
+                f"{source}: coordinate {name} holds dates that cannot be counted ({stored.dtype}, or one is missing)"
+            )
         # since the first date, and not since 1970: nanoseconds since then exceed what float64 can hold
-        extra = {"units": f"{TIME_UNITS[unit]} since {stored[0]}", "calendar": "proleptic_gregorian"}
+        extra = {
+            "units": f"{TIME_UNITS[unit]} since {stored[0]}",
+            "calendar": "proleptic_gregorian",
+        }
         stored = (stored - stored[0]).astype(np.int64)
     numbers = stored.astype(np.float64)
     if stored.dtype.kind in "iu" and np.unique(numbers).size != np.unique(stored).size:
-        raise InputError(f"{source}: coordinate {name} has values that 64-bit floats cannot tell apart, from {stored[0]} to {stored[-1]}")
-    return Coordinate(name=name.rsplit("/", 1)[-1], values=numbers, attributes={**json_attributes(attributes), **extra})
+        raise InputError(
+            f"{source}: coordinate {name} has values that 64-bit floats cannot tell apart, from {stored[0]} to {stored[-1]}"
+        )
+    return Coordinate(
+        name=name.rsplit("/", 1)[-1],
+        values=numbers,
+        attributes={**json_attributes(attributes), **extra},
+    )
 
 
 def usable(dtype: np.dtype[Any]) -> bool:
@@ -75,10 +96,16 @@ def beside(
         columns = [place[name] for place in places for name in NAMES[axis].split() if name in place]
         fitting = [column for column in columns if column.length == lengths.get(axis, 1)]
         if fitting:
-            found[axis] = coordinate(source, fitting[0].name, fitting[0].read(), fitting[0].attributes)
+            found[axis] = coordinate(
+                source, fitting[0].name, fitting[0].read(), fitting[0].attributes
+            )
         elif columns and not certain and columns[0].length in shape and columns[0].length > 1:
             column = columns[0]
-            assumed = f"axis {axis} of length {lengths[axis]}" if axis in lengths else f"no axis {axis}"
+            assumed = (
+                f"axis {axis} of length {lengths[axis]}" if axis in lengths else f"no axis {axis}"
+            )
             wrong = f"{column.name} has {column.length} values, but read as ({','.join(axes)}) the array {tuple(shape)} has {assumed}"
-            raise InputError(f"{source}: {wrong}; say what its dimensions are with --axes, such as t,z,y,x")
+            raise InputError(
+                f"{source}: {wrong}; say what its dimensions are with --axes, such as t,z,y,x"
+            )
     return found

@@ -13,7 +13,10 @@ from fhash_formats.readers.lattice import FileSeries
 from fhash_formats.readers.request import ENDIANS, RawLayout, Request, parse_dtype
 from fhash_formats.series import AXES
 
-NAME = re.compile(r"(?:^|_)(?P<shape>\d+x\d+x\d+(?:x\d+)?)_(?P<dtype>[a-z]+\d+)(?:_(?P<endian>be|le))?(?=_|$)", re.IGNORECASE)
+NAME = re.compile(
+    r"(?:^|_)(?P<shape>\d+x\d+x\d+(?:x\d+)?)_(?P<dtype>[a-z]+\d+)(?:_(?P<endian>be|le))?(?=_|$)",
+    re.IGNORECASE,
+)
 FORM = "name_XxYxZ[xT]_TYPE[_be].raw, such as density_64x64x32x10_float32.raw"
 
 
@@ -29,7 +32,9 @@ def layout_of_name(stem: str) -> tuple[str, RawLayout]:
         return stem, RawLayout()
     lengths = [int(length) for length in found["shape"].lower().split("x")]
     endian = {"be": "big", "le": "little"}.get((found["endian"] or "").lower())
-    return stem[: found.start()] or stem, RawLayout(dict(zip("xyzt", lengths, strict=False)), found["dtype"], endian)
+    return stem[: found.start()] or stem, RawLayout(
+        dict(zip("xyzt", lengths, strict=False)), found["dtype"], endian
+    )
 
 
 def open_raw(path: Path, request: Request) -> FileSeries:
@@ -41,16 +46,24 @@ def open_raw(path: Path, request: Request) -> FileSeries:
     request.refuse_var(source)
     name, named = layout_of_name(path.stem)
     given = request.raw or RawLayout()
-    lengths, dtype_name, endian = given.shape or named.shape, given.dtype or named.dtype, given.endian or named.endian or "little"
+    lengths, dtype_name, endian = (
+        given.shape or named.shape,
+        given.dtype or named.dtype,
+        given.endian or named.endian or "little",
+    )
     if lengths is None or dtype_name is None:
-        missing = " and ".join(word for word, value in (("shape", lengths), ("type", dtype_name)) if value is None)
+        missing = " and ".join(
+            word for word, value in (("shape", lengths), ("type", dtype_name)) if value is None
+        )
         raise InputError(
             f"{source}: the {missing} of the raw values is not known; name the file {FORM}, or give --shape x=..,y=..,z=.. and --dtype"
         )
     axes = tuple(axis for axis in AXES if axis in lengths)
     if request.axes is not None:
         if set(request.axes) != set(axes):
-            raise InputError(f"{source}: --axes {','.join(request.axes)} does not name the axes of the raw shape, {','.join(axes)}")
+            raise InputError(
+                f"{source}: --axes {','.join(request.axes)} does not name the axes of the raw shape, {','.join(axes)}"
+            )
         axes = request.axes
     dtype = parse_dtype(dtype_name)
     shape = tuple(lengths[axis] for axis in axes)
@@ -58,7 +71,9 @@ def open_raw(path: Path, request: Request) -> FileSeries:
     if array.end != stamp.size:
         layout = "x".join(str(length) for length in shape)
         needed = f"{layout} ({','.join(axes)}) of {dtype.name} need exactly {array.end}"
-        raise InputError(f"{source} has {stamp.size} bytes; {needed}{_advice(lengths, stamp.size, array.end)}")
+        raise InputError(
+            f"{source} has {stamp.size} bytes; {needed}{_advice(lengths, stamp.size, array.end)}"
+        )
     return FileSeries(
         source=source,
         name=name,

@@ -34,11 +34,20 @@ class Reader:
 
 
 RAW = Reader(name="raw", suffixes=(".raw", ".bin", ".dat"), matches=raw.matches, open=raw.open_raw)
-ZARR = Reader(name="Zarr", suffixes=(".zarr", ".zip"), matches=zarr_store.matches, open=zarr_store.open_zarr)
+ZARR = Reader(
+    name="Zarr", suffixes=(".zarr", ".zip"), matches=zarr_store.matches, open=zarr_store.open_zarr
+)
 REGISTRY = (
     RAW,
-    Reader(name="NetCDF", suffixes=netcdf.SUFFIXES, matches=netcdf.matches, open=netcdf.open_netcdf),
-    Reader(name="HDF5", suffixes=(".h5", ".hdf5", ".hdf", ".he5"), matches=hdf5.matches, open=hdf5.open_hdf5),
+    Reader(
+        name="NetCDF", suffixes=netcdf.SUFFIXES, matches=netcdf.matches, open=netcdf.open_netcdf
+    ),
+    Reader(
+        name="HDF5",
+        suffixes=(".h5", ".hdf5", ".hdf", ".he5"),
+        matches=hdf5.matches,
+        open=hdf5.open_hdf5,
+    ),
     Reader(name="NumPy", suffixes=(".npy",), matches=npy.matches, open=npy.open_npy),
     ZARR,
 )
@@ -46,7 +55,12 @@ REGISTRY = (
 
 
 def open_series(
-    path: str | Path, *, var: str | None = None, axes: str | None = None, steps: slice | None = None, raw: RawLayout | None = None
+    path: str | Path,
+    *,
+    var: str | None = None,
+    axes: str | None = None,
+    steps: slice | None = None,
+    raw: RawLayout | None = None,
 ) -> Series:
     """Open a time-varying volume in any supported format; it is read frame by frame, later.
 
@@ -55,13 +69,19 @@ def open_series(
     have length 1); `steps` is a slice of the steps; `raw` is the layout of headerless bytes.
     Raises MissingInputError, InputError for an unsuitable input, MissingDependencyError that names what to install.
     """
-    request = Request(var=var, axes=None if axes is None else parse_axes(axes), raw=None if raw == RawLayout() else raw)
+    request = Request(
+        var=var,
+        axes=None if axes is None else parse_axes(axes),
+        raw=None if raw == RawLayout() else raw,
+    )
     series = open_whole(path, request)
     if steps is None:
         return series
     try:
         if steps.step == 0:
-            raise InputError(f"{path}: the steps {steps.start}:{steps.stop}:0 have a stride of 0; it is at least 1, or negative")
+            raise InputError(
+                f"{path}: the steps {steps.start}:{steps.stop}:0 have a stride of 0; it is at least 1, or negative"
+            )
         return StepsSeries(series, range(*steps.indices(series.shape[0])))
     except BaseException:
         series.close()
@@ -91,18 +111,26 @@ def find_reader(path: Path, request: Request) -> Reader:
         raise MissingInputError(f"{path} does not exist")
     if path.is_dir():
         if not ZARR.matches(b"", path):
-            raise InputError(f"{path} is a folder without zarr metadata; give a file, a zarr folder, or a pattern such as '{path}/*.raw'")
+            raise InputError(
+                f"{path} is a folder without zarr metadata; give a file, a zarr folder, or a pattern such as '{path}/*.raw'"
+            )
         if request.raw is not None:
-            raise InputError(f"{path} is a zarr folder; shape, type and byte order are given for raw files only")
+            raise InputError(
+                f"{path} is a zarr folder; shape, type and byte order are given for raw files only"
+            )
         return ZARR
     if not path.is_file():
         raise InputError(f"{path} is not a regular file; write its data to a file first")
     head = _head(path)
     suffix = path.suffix.lower()
     if request.raw is not None:
-        other = next((reader for reader in REGISTRY if reader is not RAW and suffix in reader.suffixes), None)
+        other = next(
+            (reader for reader in REGISTRY if reader is not RAW and suffix in reader.suffixes), None
+        )
         if other is not None:
-            raise InputError(f"{path} is a {other.name} file by its name; --shape, --dtype and --endian are for raw files only")
+            raise InputError(
+                f"{path} is a {other.name} file by its name; --shape, --dtype and --endian are for raw files only"
+            )
         if suffix != CONTAINER_SUFFIX:
             return RAW
     if suffix == CONTAINER_SUFFIX or _is_container(path, head):
@@ -113,7 +141,9 @@ def find_reader(path: Path, request: Request) -> Reader:
     for reader in REGISTRY:
         if suffix in reader.suffixes:
             return reader
-    raise InputError(f"{path} is of no format that can be read: {', '.join(str(reader) for reader in REGISTRY)}")
+    raise InputError(
+        f"{path} is of no format that can be read: {', '.join(str(reader) for reader in REGISTRY)}"
+    )
 
 
 def _head(path: Path) -> bytes:

@@ -11,7 +11,11 @@ import numpy as np
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES
 
-DTYPES = {f"{kind}{8 * size}": f"{letter}{size}" for kind, letter in (("uint", "u"), ("int", "i")) for size in (1, 2, 4, 8)}
+DTYPES = {
+    f"{kind}{8 * size}": f"{letter}{size}"
+    for kind, letter in (("uint", "u"), ("int", "i"))
+    for size in (1, 2, 4, 8)
+}
 DTYPES |= {f"float{8 * size}": f"f{size}" for size in (2, 4, 8)}
 """Number types of raw files by long name; the short names are the values."""
 
@@ -22,7 +26,9 @@ def parse_dtype(text: str) -> np.dtype[Any]:
     """The number type of a long or short name ("float32", "f4"), in native byte order; raises InputError for any other."""
     short = DTYPES.get(text.lower(), text.lower())
     if short not in DTYPES.values():
-        raise InputError(f"'{text}' is not a number type; allowed: {', '.join(DTYPES)} or short, such as f4 and u1")
+        raise InputError(
+            f"'{text}' is not a number type; allowed: {', '.join(DTYPES)} or short, such as f4 and u1"
+        )
     return np.dtype(short)
 
 
@@ -31,8 +37,16 @@ def parse_shape(text: str) -> dict[str, int]:
     shape: dict[str, int] = {}
     for part in text.split(","):
         axis, equals, length = (word.strip() for word in part.partition("="))
-        if axis not in AXES or not equals or not length.isascii() or not length.isdigit() or axis in shape:
-            raise InputError(f"shape '{text}': cannot use '{part.strip()}'; write each axis once, such as x=64,y=64,z=32,t=10")
+        if (
+            axis not in AXES
+            or not equals
+            or not length.isascii()
+            or not length.isdigit()
+            or axis in shape
+        ):
+            raise InputError(
+                f"shape '{text}': cannot use '{part.strip()}'; write each axis once, such as x=64,y=64,z=32,t=10"
+            )
         shape[axis] = int(length)
     return shape
 
@@ -41,7 +55,9 @@ def parse_axes(text: str) -> tuple[str, ...]:
     """The axis of each dimension of the file from text such as "t,z,y,x", in any case; raises InputError where it is not of that form."""
     letters = tuple(word.strip().lower() for word in text.split(","))
     if not set(letters) <= set(AXES) or len(set(letters)) != len(letters):
-        raise InputError(f"axes '{text}': name the file's dimensions in their order, each once, by t, z, y and x, such as t,z,y,x")
+        raise InputError(
+            f"axes '{text}': name the file's dimensions in their order, each once, by t, z, y and x, such as t,z,y,x"
+        )
     return letters
 
 
@@ -91,4 +107,6 @@ class Request:
     def refuse_var(self, source: str) -> None:
         """Raise InputError if a variable was asked of a format that has none."""
         if self.var is not None:
-            raise InputError(f"{source}: --var {self.var} cannot be used, this format holds one array without a name")
+            raise InputError(
+                f"{source}: --var {self.var} cannot be used, this format holds one array without a name"
+            )

@@ -21,13 +21,33 @@ ROLE_OF_NAME = {name: axis for axis, names in NAMES.items() for name in names.sp
 
 STANDARD_NAMES = (
     ("t", re.compile(r"time|forecast_reference_time")),
-    ("z", re.compile(r"(atmosphere|ocean)_.*_coordinate|height.*|altitude|depth.*|air_pressure|model_level_number|.*_sigma_.*")),
-    ("y", re.compile(r"latitude|grid_latitude|projection_y_coordinate|projection_y_angular_coordinate")),
-    ("x", re.compile(r"longitude|grid_longitude|projection_x_coordinate|projection_x_angular_coordinate")),
+    (
+        "z",
+        re.compile(
+            r"(atmosphere|ocean)_.*_coordinate|height.*|altitude|depth.*|air_pressure|model_level_number|.*_sigma_.*"
+        ),
+    ),
+    (
+        "y",
+        re.compile(
+            r"latitude|grid_latitude|projection_y_coordinate|projection_y_angular_coordinate"
+        ),
+    ),
+    (
+        "x",
+        re.compile(
+            r"longitude|grid_longitude|projection_x_coordinate|projection_x_angular_coordinate"
+        ),
+    ),
 )
 UNITS = (
     ("t", re.compile(r"\S+ since \S.*")),
-    ("z", re.compile(r"(pascal|pa|hpa|kpa|bar|millibar|mbar|mb|dbar|decibar|atm|layer|level|sigma_level)s?")),
+    (
+        "z",
+        re.compile(
+            r"(pascal|pa|hpa|kpa|bar|millibar|mbar|mb|dbar|decibar|atm|layer|level|sigma_level)s?"
+        ),
+    ),
     ("y", re.compile(r"degrees?_?n(orth)?")),
     ("x", re.compile(r"degrees?_?e(ast)?")),
 )
@@ -55,7 +75,11 @@ def role_of_coordinate(name: str, attributes: Mapping[str, Any]) -> str | None:
 
 
 def assign_axes(
-    what: str, shape: Sequence[int], hints: Sequence[str | None], names: Sequence[str | None], axes: tuple[str, ...] | None
+    what: str,
+    shape: Sequence[int],
+    hints: Sequence[str | None],
+    names: Sequence[str | None],
+    axes: tuple[str, ...] | None,
 ) -> tuple[str, ...]:
     """The axis of each of 3 or 4 dimensions.
 
@@ -72,10 +96,14 @@ def assign_axes(
     said = [hint for hint in hints if hint is not None]
     shown = ", ".join(f"{name or '?'}={length}" for name, length in zip(names, shape, strict=True))
     if len(set(said)) != len(said):
-        raise InputError(f"{what}: two dimensions of ({shown}) mean the same axis; say what they are with --axes, such as t,z,y,x")
+        raise InputError(
+            f"{what}: two dimensions of ({shown}) mean the same axis; say what they are with --axes, such as t,z,y,x"
+        )
     open_places = len(shape) - len(said)
     if open_places > 1 and said != sorted(said, key=AXES.index):
-        raise InputError(f"{what}: the order of the dimensions ({shown}) is not clear; say what they are with --axes, such as x,y,z,t")
+        raise InputError(
+            f"{what}: the order of the dimensions ({shown}) is not clear; say what they are with --axes, such as x,y,z,t"
+        )
     left = [axis for axis in (AXES if len(shape) == len(AXES) else AXES[1:]) if axis not in said]
     fill = iter(left[len(left) - open_places :])
     return tuple(hint if hint is not None else next(fill) for hint in hints)

@@ -14,7 +14,15 @@ from fhash_formats.errors import InputError
 MOST_LISTED = 12
 """Names in one message; a file with hundreds of arrays would fill the screen."""
 
-KINDS = {"b": "boolean", "S": "text", "U": "text", "T": "text", "O": "objects", "M": "dates", "m": "time spans"}
+KINDS = {
+    "b": "boolean",
+    "S": "text",
+    "U": "text",
+    "T": "text",
+    "O": "objects",
+    "M": "dates",
+    "m": "time spans",
+}
 
 
 def kind_of(dtype: np.dtype[Any]) -> str:
@@ -62,7 +70,9 @@ class Variable:
         return ""
 
 
-def choose(source: str, variables: Sequence[Variable], var: str | None, *, booleans: bool = False) -> Variable:
+def choose(
+    source: str, variables: Sequence[Variable], var: str | None, *, booleans: bool = False
+) -> Variable:
     """The variable named `var` (full name, or its last part where only one has it), or the only suitable one.
 
     Raises InputError: no such name, an unsuitable one, several to choose from, or none.
@@ -74,31 +84,52 @@ def choose(source: str, variables: Sequence[Variable], var: str | None, *, boole
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
-        raise InputError(f"{source} holds {len(candidates)} variables: {_listed(candidates)}; choose one with --var")
+        raise InputError(
+            f"{source} holds {len(candidates)} variables: {_listed(candidates)}; choose one with --var"
+        )
     if not variables:
         raise InputError(f"{source} holds no array at all")
-    found = "; ".join(f"{each.name}: {each.problem(booleans) or 'a coordinate or its bounds'}" for each in variables[:MOST_LISTED])
+    found = "; ".join(
+        f"{each.name}: {each.problem(booleans) or 'a coordinate or its bounds'}"
+        for each in variables[:MOST_LISTED]
+    )
     rest = f"; and {len(variables) - MOST_LISTED} more" if len(variables) > MOST_LISTED else ""
-    raise InputError(f"{source} holds no variable of 3 or 4 dimensions with integer or float values; found {found}{rest}")
+    raise InputError(
+        f"{source} holds no variable of 3 or 4 dimensions with integer or float values; found {found}{rest}"
+    )
 
 
-def _named(source: str, variables: Sequence[Variable], candidates: Sequence[Variable], var: str, booleans: bool) -> Variable:
+def _named(
+    source: str,
+    variables: Sequence[Variable],
+    candidates: Sequence[Variable],
+    var: str,
+    booleans: bool,
+) -> Variable:
     wanted = var.strip("/")
     found = [each for each in variables if each.name == wanted]
     found = found or [each for each in variables if each.name.rsplit("/", 1)[-1] == wanted]
     if len(found) > 1:
-        raise InputError(f"{source}: --var {var} means {len(found)} variables: {_listed(found)}; give the whole name")
+        raise InputError(
+            f"{source}: --var {var} means {len(found)} variables: {_listed(found)}; give the whole name"
+        )
     if found:
         problem = found[0].problem(booleans)
         if problem:
             raise InputError(f"{source}: variable {found[0].name} has {problem}")
         return found[0]
-    nearest = sorted(candidates, key=lambda each: -difflib.SequenceMatcher(None, wanted.lower(), each.name.lower()).ratio())
+    nearest = sorted(
+        candidates,
+        key=lambda each: -difflib.SequenceMatcher(None, wanted.lower(), each.name.lower()).ratio(),
+    )
     raise InputError(
-        f"{source} has no variable '{var}'; " + (f"it holds {_listed(nearest)}" if nearest else "nor any other that can be read")
+        f"{source} has no variable '{var}'; "
+        + (f"it holds {_listed(nearest)}" if nearest else "nor any other that can be read")
     )
 
 
 def _listed(variables: Sequence[Variable]) -> str:
     text = ", ".join(str(each) for each in variables[:MOST_LISTED])
-    return text if len(variables) <= MOST_LISTED else f"{text} and {len(variables) - MOST_LISTED} more"
+    return (
+        text if len(variables) <= MOST_LISTED else f"{text} and {len(variables) - MOST_LISTED} more"
+    )

@@ -59,12 +59,21 @@ def open_zarr(path: Path, request: Request) -> FileSeries:
         store = ZipStore(path, mode="r")
     try:
         with warnings.catch_warnings(), refusing(f"{source} cannot be read as zarr"):
-            warnings.simplefilter("ignore")  # zarr warns of codecs and types that are not in the specification
+            warnings.simplefilter(
+                "ignore"
+            )  # zarr warns of codecs and types that are not in the specification
             arrays, failed = _open_arrays(store, inside, nodes)
             if "" in failed:
                 raise InputError(f"{source} cannot be read as zarr: {failed['']}")
-            place = path if path.name.strip(".") else path.resolve()  # "." and ".." have a name and a folder around them too
-            if "" in arrays and path.is_dir() and request.var is None and _metadata(place.parent) is not None:
+            place = (
+                path if path.name.strip(".") else path.resolve()
+            )  # "." and ".." have a name and a folder around them too
+            if (
+                "" in arrays
+                and path.is_dir()
+                and request.var is None
+                and _metadata(place.parent) is not None
+            ):
                 # an array of a group, named by its folder: its coordinates are beside it
                 store.close()
                 return open_zarr(place.parent, replace(request, var=place.name))
@@ -87,15 +96,21 @@ def _nodes_in_zip(source: str, path: Path) -> tuple[str, list[str]]:
     """Where in a ZIP the hierarchy begins (at the top, or in the one folder that was zipped), and its groups and arrays from there."""
     with refusing(f"{source} cannot be read as a ZIP"), zipfile.ZipFile(path) as file:
         names = file.namelist()
-    nodes = sorted({name.rpartition("/")[0] for name in names if name.rpartition("/")[2] in METADATA})
+    nodes = sorted(
+        {name.rpartition("/")[0] for name in names if name.rpartition("/")[2] in METADATA}
+    )
     tops = {name.split("/", 1)[0] for name in names}
     inside = "" if "" in nodes else next(iter(tops)) if len(tops) == 1 else None
     if inside is None or inside not in nodes:
-        raise InputError(f"{source} is a ZIP that holds no zarr hierarchy ({', '.join(METADATA)} at its top)")
+        raise InputError(
+            f"{source} is a ZIP that holds no zarr hierarchy ({', '.join(METADATA)} at its top)"
+        )
     return inside, [node.removeprefix(inside).lstrip("/") for node in nodes]
 
 
-def _open_arrays(store: Any, inside: str, nodes: Iterable[str]) -> tuple[dict[str, zarr.Array[Any]], dict[str, str]]:
+def _open_arrays(
+    store: Any, inside: str, nodes: Iterable[str]
+) -> tuple[dict[str, zarr.Array[Any]], dict[str, str]]:
     """The arrays by path, and what was wrong with those that cannot be opened; one with an unknown codec does not bar the others."""
     import zarr
 
@@ -112,29 +127,57 @@ def _open_arrays(store: Any, inside: str, nodes: Iterable[str]) -> tuple[dict[st
     return arrays, failed
 
 
-def _series(root: Path, store: Any, arrays: Mapping[str, zarr.Array[Any]], failed: Mapping[str, str], request: Request) -> FileSeries:
+def _series(
+    root: Path,
+    store: Any,
+    arrays: Mapping[str, zarr.Array[Any]],
+    failed: Mapping[str, str],
+    request: Request,
+) -> FileSeries:
     source = str(root)
-    bounds = {sibling(name, str(array.attrs["bounds"])) for name, array in arrays.items() if "bounds" in array.attrs}
+    bounds = {
+        sibling(name, str(array.attrs["bounds"]))
+        for name, array in arrays.items()
+        if "bounds" in array.attrs
+    }
     found = [
-        Variable(name=name or root.stem, shape=array.shape, dtype=array.dtype, auxiliary=name in bounds, handle=(name, array))
+        Variable(
+            name=name or root.stem,
+            shape=array.shape,
+            dtype=array.dtype,
+            auxiliary=name in bounds,
+            handle=(name, array),
+        )
         for name, array in arrays.items()
     ]
-    found += [Variable(name=name or root.stem, shape=(), dtype=np.dtype(object), error=error) for name, error in failed.items()]
+    found += [
+        Variable(name=name or root.stem, shape=(), dtype=np.dtype(object), error=error)
+        for name, error in failed.items()
+    ]
     variable = choose(source, found, request.var, booleans=request.booleans)
     path, array = variable.handle
     names = dimension_names(array)
     group = path.rpartition("/")[0]
     columns = [_columns(source, arrays, place) for place in dict.fromkeys([group, ""])]
-    own = [next((place[name] for place in columns if name in place), None) if name else None for name in names]
+    own = [
+        next((place[name] for place in columns if name in place), None) if name else None
+        for name in names
+    ]
     hints = [
-        role_of_coordinate(name, column.attributes) if name and column else role_of_name(name) if name else None
+        role_of_coordinate(name, column.attributes)
+        if name and column
+        else role_of_name(name)
+        if name
+        else None
         for name, column in zip(names, own, strict=True)
     ]
     axes = assign_axes(source, array.shape, hints, names, request.axes)
     lower = [{name.lower(): column for name, column in place.items()} for place in columns]
     certain = request.axes is not None or all(hint is not None for hint in hints)
     tied = [axis for axis, name in zip(axes, names, strict=True) if name is not None]
-    coords: dict[str, Coordinate] = beside(source, axes, array.shape, lower, certain=certain, tied=tied)
+    coords: dict[str, Coordinate] = beside(
+        source, axes, array.shape, lower, certain=certain, tied=tied
+    )
     for axis, length, name, column in zip(axes, array.shape, names, own, strict=True):
         chosen = column or _along(columns, axis, name)
         if chosen is not None and chosen.length == length:
@@ -159,16 +202,32 @@ def _series(root: Path, store: Any, arrays: Mapping[str, zarr.Array[Any]], faile
 
 def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
     """The name of each dimension, None where there is none: format 3 has a field for them, xarray an attribute in format 2."""
-    names: Any = array.attrs.get("_ARRAY_DIMENSIONS") or getattr(array.metadata, "dimension_names", None)
+    names: Any = array.attrs.get("_ARRAY_DIMENSIONS") or getattr(
+        array.metadata, "dimension_names", None
+    )
     if not isinstance(names, list | tuple) or len(names) != array.ndim:
         return [None] * array.ndim
     return [str(name) if name is not None else None for name in names]
 
 
-def _along(columns: Sequence[Mapping[str, Column]], axis: str, dimension: str | None) -> Column | None:
+def _along(
+    columns: Sequence[Mapping[str, Column]], axis: str, dimension: str | None
+) -> Column | None:
     """An array along one named dimension that is no namesake of it, but is by its own name or attributes a coordinate of the axis."""
-    along = [column for place in columns for column in place.values() if dimension is not None and column.along == dimension]
-    return next((column for column in along if role_of_coordinate(column.name.rpartition("/")[2], column.attributes) == axis), None)
+    along = [
+        column
+        for place in columns
+        for column in place.values()
+        if dimension is not None and column.along == dimension
+    ]
+    return next(
+        (
+            column
+            for column in along
+            if role_of_coordinate(column.name.rpartition("/")[2], column.attributes) == axis
+        ),
+        None,
+    )
 
 
 def _columns(source: str, arrays: Mapping[str, zarr.Array[Any]], group: str) -> dict[str, Column]:
@@ -179,7 +238,13 @@ def _columns(source: str, arrays: Mapping[str, zarr.Array[Any]], group: str) -> 
         if path and place == group and array.ndim < 2 and usable(array.dtype):
             along = dimension_names(array)[0] if array.ndim else None
             attributes = json_attributes(dict(array.attrs), without=PLUMBING | PACKING)
-            found[name] = Column(name=path, length=array.size, along=along, read=_Values(source, array).whole, attributes=attributes)
+            found[name] = Column(
+                name=path,
+                length=array.size,
+                along=along,
+                read=_Values(source, array).whole,
+                attributes=attributes,
+            )
     return found
 
 
@@ -189,8 +254,16 @@ class _Values:
     def __init__(self, source: str, array: zarr.Array[Any]) -> None:
         self.array = array
         # xarray keeps `_FillValue` as the fill value of zarr's own in format 2, where other writers use that for chunks never written
-        cf_fill = array.fill_value if array.metadata.zarr_format == 2 and "_ARRAY_DIMENSIONS" in array.attrs else None
-        self.packing = packing(source, array.dtype, dict(array.attrs), cf_fill) if array.dtype.kind in "iuf" else None
+        cf_fill = (
+            array.fill_value
+            if array.metadata.zarr_format == 2 and "_ARRAY_DIMENSIONS" in array.attrs
+            else None
+        )
+        self.packing = (
+            packing(source, array.dtype, dict(array.attrs), cf_fill)
+            if array.dtype.kind in "iuf"
+            else None
+        )
         self.dtype = self.packing.dtype if self.packing else array.dtype
 
     def read(self, ranges: tuple[slice, ...]) -> npt.NDArray[Any]:

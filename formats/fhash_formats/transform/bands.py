@@ -36,9 +36,16 @@ def band_table(spec: TransformSpec, shape: Sequence[int]) -> Table:
     t, z, y, x = spec.axes
     for name, axis, length in zip(AXES, spec.axes, shape, strict=True):
         if axis.basis is not None and axis.basis.n != length:
-            raise InputError(f"the basis along {name} is for {axis.basis.n} vertices, the tile has {length}")
+            raise InputError(
+                f"the basis along {name} is for {axis.basis.n} vertices, the tile has {length}"
+            )
     return _table(
-        _spans(t, shape[0]), _spans(z, shape[1]), _spans(y, shape[2]), _spans(x, shape[3]), spec.coupled, y.kind == "klt" or x.kind == "klt"
+        _spans(t, shape[0]),
+        _spans(z, shape[1]),
+        _spans(y, shape[2]),
+        _spans(x, shape[3]),
+        spec.coupled,
+        y.kind == "klt" or x.kind == "klt",
     )
 
 
@@ -60,7 +67,14 @@ def _spans(axis: AxisTransform, length: int) -> tuple[Span, ...]:
 
 
 @lru_cache(maxsize=256)
-def _table(t: tuple[Span, ...], z: tuple[Span, ...], y: tuple[Span, ...], x: tuple[Span, ...], coupled: bool, klt: bool) -> Table:
+def _table(
+    t: tuple[Span, ...],
+    z: tuple[Span, ...],
+    y: tuple[Span, ...],
+    x: tuple[Span, ...],
+    coupled: bool,
+    klt: bool,
+) -> Table:
     known: dict[tuple[int, int, int, int], int] = {}
     rows: list[list[int]] = []
     for plane in _coupled_planes(y, x) if coupled else [list(product(y, x))]:
@@ -87,7 +101,13 @@ def _coupled_planes(y: tuple[Span, ...], x: tuple[Span, ...]) -> list[list[tuple
     for level in range(max([*by_y, *by_x]), 0, -1):
         # At this level the low quadrant ends where the level's high band begins, or with the axis where it has none.
         low_y, low_x = (
-            (level, 0, spans[level][1] if level in spans else max(span[2] for span in spans.values() if span[0] >= level or span[0] == 0))
+            (
+                level,
+                0,
+                spans[level][1]
+                if level in spans
+                else max(span[2] for span in spans.values() if span[0] >= level or span[0] == 0),
+            )
             for spans in (by_y, by_x)
         )
         plane = []
@@ -106,32 +126,52 @@ def _plane_kind(y: int, x: int, klt: bool) -> int:
     if klt:
         return _KLT_PLANE
     level = max(y, x)
-    return 0 if level <= 0 else 1 + 3 * min(level - 1, 3) + (2 if y > 0 and x > 0 else 1 if y > 0 else 0)
+    return (
+        0
+        if level <= 0
+        else 1 + 3 * min(level - 1, 3) + (2 if y > 0 and x > 0 else 1 if y > 0 else 0)
+    )
 
 
-def _reference(known: dict[tuple[int, int, int, int], int], key: tuple[int, int, int, int], shift: tuple[int, ...]) -> list[int]:
+def _reference(
+    known: dict[tuple[int, int, int, int], int],
+    key: tuple[int, int, int, int],
+    shift: tuple[int, ...],
+) -> list[int]:
     return [known[key], *shift] if key in known else _NONE
 
 
 def _parent(
-    known: dict[tuple[int, int, int, int], int], key: tuple[int, int, int, int], y: tuple[Span, ...], x: tuple[Span, ...], coupled: bool
+    known: dict[tuple[int, int, int, int], int],
+    key: tuple[int, int, int, int],
+    y: tuple[Span, ...],
+    x: tuple[Span, ...],
+    coupled: bool,
 ) -> list[int]:
     ti, zi, ly, lx = key
     if coupled:
         level = max(ly, lx)
         if level <= 0:
             return _NONE
-        coarser = [(ti, zi, (level + 1) * (1 if ly > 0 else -1), (level + 1) * (1 if lx > 0 else -1))]
+        coarser = [
+            (ti, zi, (level + 1) * (1 if ly > 0 else -1), (level + 1) * (1 if lx > 0 else -1))
+        ]
         found = _reference(known, coarser[0], (0, 0, 1, 1))
         return found if found[0] >= 0 else _reference(known, (ti, zi, 0, 0), (0, 0, 0, 0))
     levels_y, levels_x = [span[0] for span in y], [span[0] for span in x]
     at_y, at_x = levels_y.index(ly), levels_x.index(lx)
     if at_y:
         return _reference(known, (ti, zi, levels_y[at_y - 1], lx), (0, 0, int(at_y > 1), 0))
-    return _reference(known, (ti, zi, ly, levels_x[at_x - 1]), (0, 0, 0, int(at_x > 1))) if at_x else _NONE
+    return (
+        _reference(known, (ti, zi, ly, levels_x[at_x - 1]), (0, 0, 0, int(at_x > 1)))
+        if at_x
+        else _NONE
+    )
 
 
-def _sibling(known: dict[tuple[int, int, int, int], int], key: tuple[int, int, int, int], coupled: bool) -> list[int]:
+def _sibling(
+    known: dict[tuple[int, int, int, int], int], key: tuple[int, int, int, int], coupled: bool
+) -> list[int]:
     ti, zi, ly, lx = key
     if not coupled or max(ly, lx) <= 0 or ly < 0:
         return _NONE

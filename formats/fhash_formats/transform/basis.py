@@ -54,9 +54,16 @@ class Basis:
             )
         falling = [MAX_EXPONENT, *self.exponents, 0]
         if any(before < after for before, after in pairwise(falling)):
-            raise InputError(f"the exponents of a basis fall from at most {MAX_EXPONENT} to at least 0")
-        largest = np.abs(self.integers.astype(np.int64)).max(axis=1) if rank else np.zeros(0, np.int64)
-        if any(not 0 < size <= (1 << exponent // 2) * 1.5 + 1 for size, exponent in zip(largest.tolist(), self.exponents, strict=True)):
+            raise InputError(
+                f"the exponents of a basis fall from at most {MAX_EXPONENT} to at least 0"
+            )
+        largest = (
+            np.abs(self.integers.astype(np.int64)).max(axis=1) if rank else np.zeros(0, np.int64)
+        )
+        if any(
+            not 0 < size <= (1 << exponent // 2) * 1.5 + 1
+            for size, exponent in zip(largest.tolist(), self.exponents, strict=True)
+        ):
             raise InputError("a vector of the basis is zero or longer than 1")
         self.integers.setflags(write=False)
 
@@ -95,7 +102,9 @@ class Basis:
 
     def to_bytes(self) -> bytes:
         """The packed basis; see the module."""
-        from fhash_formats.transform.coder import encode_block  # here, because the coder's bands are made from a spec, and a spec from this
+        from fhash_formats.transform.coder import (
+            encode_block,
+        )  # here, because the coder's bands are made from a spec, and a spec from this
 
         bits: list[int] = []
         level = MAX_EXPONENT
@@ -103,7 +112,11 @@ class Basis:
             bits += [0] * (level - exponent) + [1]
             level = exponent
         block = encode_block(self.integers.reshape(1, 1, self.rank, self.n)) if self.rank else b""
-        return struct.pack("<HH", self.n, self.rank) + np.packbits(np.array(bits, np.uint8)).tobytes() + block
+        return (
+            struct.pack("<HH", self.n, self.rank)
+            + np.packbits(np.array(bits, np.uint8)).tobytes()
+            + block
+        )
 
     @classmethod
     def from_bytes(cls, data: bytes, n: int | None = None) -> Basis:
@@ -114,19 +127,29 @@ class Basis:
             raise DamagedFileError(f"a packed basis has at least 4 bytes, not {len(data)}")
         length, rank = struct.unpack("<HH", data[:4])
         if not 1 <= length <= MAX_LENGTH or rank > length or n not in (None, length):
-            raise DamagedFileError(f"a packed basis of {rank} vectors of length {length} where {n or f'at most {MAX_LENGTH}'} is wanted")
+            raise DamagedFileError(
+                f"a packed basis of {rank} vectors of length {length} where {n or f'at most {MAX_LENGTH}'} is wanted"
+            )
         exponents, used = _read_exponents(data[4:], rank)
         rest = data[4 + used :]
         if not rank and rest:
             raise DamagedFileError("a packed basis has bytes after its end")
-        integers = decode_block(rest, (1, 1, rank, length)).reshape(rank, length) if rank else np.zeros((0, length), np.int32)
+        integers = (
+            decode_block(rest, (1, 1, rank, length)).reshape(rank, length)
+            if rank
+            else np.zeros((0, length), np.int32)
+        )
         try:
             return cls(integers=integers, exponents=exponents)
         except InputError as error:
             raise DamagedFileError(f"a packed basis: {error}") from error
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Basis) and self.exponents == other.exponents and np.array_equal(self.integers, other.integers)
+        return (
+            isinstance(other, Basis)
+            and self.exponents == other.exponents
+            and np.array_equal(self.integers, other.integers)
+        )
 
     def __hash__(self) -> int:
         return hash((self.exponents, self.integers.tobytes()))
@@ -141,7 +164,9 @@ def fit_basis(gram: NDArray[np.float64], step: float) -> Basis:
     InputError.
     """
     if gram.ndim != 2 or gram.shape[0] != gram.shape[1] or not 1 <= len(gram) <= MAX_LENGTH:
-        raise InputError(f"a Gram matrix is square with at most {MAX_LENGTH} rows, not {gram.shape}")
+        raise InputError(
+            f"a Gram matrix is square with at most {MAX_LENGTH} rows, not {gram.shape}"
+        )
     if not np.isfinite(gram).all() or not (math.isfinite(step) and step > 0):
         raise InputError(f"a basis needs finite data and a positive step, not {step!r}")
     values, vectors = np.linalg.eigh(gram)
@@ -166,7 +191,9 @@ def fit_basis(gram: NDArray[np.float64], step: float) -> Basis:
         found = np.vstack([found, new / left])
         rows.append(row)
         exponents.append(exponent)
-    return Basis(integers=np.array(rows, np.int32).reshape(len(rows), len(gram)), exponents=tuple(exponents))
+    return Basis(
+        integers=np.array(rows, np.int32).reshape(len(rows), len(gram)), exponents=tuple(exponents)
+    )
 
 
 def _shrink(exponent: int) -> float:
@@ -222,7 +249,9 @@ def _solve(gram: NDArray[np.float64], right: NDArray[Any]) -> NDArray[np.float64
     left, result = gram.copy(), right.astype(np.float64)
     for k in range(len(left)):
         if not left[k, k] > 1e-9 * gram[k, k]:
-            raise InputError("the vectors of a basis depend on each other, so nothing can be encoded with it")
+            raise InputError(
+                "the vectors of a basis depend on each other, so nothing can be encoded with it"
+            )
         ratios = left[k + 1 :, k] / left[k, k]
         left[k + 1 :] -= ratios[:, None] * left[k]
         result[k + 1 :] -= ratios[:, None] * result[k]

@@ -17,7 +17,15 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError
 from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.tile import CodedTile, Shape, decode_tile, encode_tile, exact_tile, transform_for, within
+from fhash_formats.transform.tile import (
+    CodedTile,
+    Shape,
+    decode_tile,
+    encode_tile,
+    exact_tile,
+    transform_for,
+    within,
+)
 
 __all__ = ["Quality", "decode_chunk", "encode_chunk", "supported", "tile_shape"]
 
@@ -52,16 +60,26 @@ class Quality:
         given = self.to_dict()
         if len(given) != 1:
             named = " and ".join(given) if given else "none"
-            raise InputError(f"fhash.transform needs one of max_error, max_error_rel and step; given: {named}")
+            raise InputError(
+                f"fhash.transform needs one of max_error, max_error_rel and step; given: {named}"
+            )
         for name, value in given.items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, int | float)
+                or not 0 <= value < math.inf
+            ):
                 raise InputError(f"{name} is {value!r:.40}; a finite number, 0 or more, is needed")
         if self.step == 0:
             raise InputError("step is 0; a number above 0 is needed (max_error 0 is lossless)")
 
     def to_dict(self) -> dict[str, float]:
         """The one that is given."""
-        every = {"max_error": self.max_error, "max_error_rel": self.max_error_rel, "step": self.step}
+        every = {
+            "max_error": self.max_error,
+            "max_error_rel": self.max_error_rel,
+            "step": self.step,
+        }
         return {name: value for name, value in every.items() if value is not None}
 
 
@@ -69,13 +87,19 @@ def supported(dtype: npt.DTypeLike) -> np.dtype[Any]:
     """The type in this machine's byte order. Raises InputError unless it is float16 to float64 or an integer."""
     kind = np.dtype(dtype)
     if kind.kind not in "fiu" or kind.itemsize > 8:
-        raise InputError(f"fhash.transform codes float16, float32, float64 and integers, not {kind.name}")
+        raise InputError(
+            f"fhash.transform codes float16, float32, float64 and integers, not {kind.name}"
+        )
     return kind.newbyteorder("=")
 
 
 def tile_shape(shape: tuple[int, ...]) -> Shape:
     """Four axes (t, z, y, x): ones in front of fewer, and of more axes the leading ones as one."""
-    t, z, y, x = (*(1,) * (4 - len(shape)), *shape) if len(shape) <= 4 else (math.prod(shape[:-3]), *shape[-3:])
+    t, z, y, x = (
+        (*(1,) * (4 - len(shape)), *shape)
+        if len(shape) <= 4
+        else (math.prod(shape[:-3]), *shape[-3:])
+    )
     return t, z, y, x
 
 
@@ -94,7 +118,9 @@ def encode_chunk(
     """
     quality = Quality(max_error=max_error, max_error_rel=max_error_rel, step=step)
     values = np.asarray(values)
-    tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(tile_shape(values.shape))
+    tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(
+        tile_shape(values.shape)
+    )
     specs = _candidates(tile.shape) if transform is None else (_spec(transform),)
     return _encode(tile, quality, specs).data if tile.size else b""
 
@@ -103,14 +129,20 @@ def decode_chunk(data: bytes | memoryview, shape: tuple[int, ...], dtype: npt.DT
     """The values of a stream, of the shape and type that was coded. Raises DamagedFileError for bytes that no encoder writes."""
     if not math.prod(shape):
         return np.empty(shape, dtype)
-    return decode_tile(data, tile_shape(shape), supported(dtype)).reshape(shape).astype(dtype, copy=False)
+    return (
+        decode_tile(data, tile_shape(shape), supported(dtype))
+        .reshape(shape)
+        .astype(dtype, copy=False)
+    )
 
 
 def _encode(tile: Values, quality: Quality, specs: tuple[TransformSpec, ...]) -> CodedTile:
     finite = np.isfinite(tile)
     every = bool(finite.all())
     counted = tile if every else tile[finite]
-    plain = Settings(transform=_candidates((1, 1, 1, 1))[0], step=1.0, center=0.0, low=0.0, high=0.0, double=True)
+    plain = Settings(
+        transform=_candidates((1, 1, 1, 1))[0], step=1.0, center=0.0, low=0.0, high=0.0, double=True
+    )
     nothing = np.zeros(tile.shape, bool)
     if not counted.size:
         return encode_tile(tile, plain, care=nothing, own=True)
@@ -120,7 +152,9 @@ def _encode(tile: Values, quality: Quality, specs: tuple[TransformSpec, ...]) ->
     error, reach = _bound(quality, low, high, tile.dtype)
     center = float(low) + (float(high) / 2 - float(low) / 2)
     if high == low or (with_bound and float(high) / 2 - float(low) / 2 <= reach):
-        constant = encode_tile(tile, replace(plain, center=center, low=center, high=center), care=nothing, own=True)
+        constant = encode_tile(
+            tile, replace(plain, center=center, low=center, high=center), care=nothing, own=True
+        )
         # Without loss zeros keep their signs, which the constant has not.
         signed = with_bound and error == 0 and low == 0 and bool(np.signbit(counted).any())
         if within(tile, constant.decoded, error, None if every else finite) and not signed:
@@ -169,10 +203,18 @@ def _double(dtype: np.dtype[Any], largest: float, span: float, step: float) -> b
     """Whether float32 would lose what the step keeps."""
     if max(largest, step) > _LARGEST_SINGLE or step < _SMALLEST_SINGLE:
         return True
-    return dtype.itemsize >= 4 and (span / step > 1 << 18 or (dtype != np.float32 and largest / step > 1 << 20))
+    return dtype.itemsize >= 4 and (
+        span / step > 1 << 18 or (dtype != np.float32 and largest / step > 1 << 20)
+    )
 
 
-def _chosen(tile: Values, settings: Settings, specs: tuple[TransformSpec, ...], bound: float | None, reach: float) -> Settings:
+def _chosen(
+    tile: Values,
+    settings: Settings,
+    specs: tuple[TransformSpec, ...],
+    bound: float | None,
+    reach: float,
+) -> Settings:
     """The settings with the transform, then the step, by which a window takes the fewest bytes; the first of equals."""
     trials = [replace(settings, transform=spec) for spec in specs]
     ratios = _RATIOS[1:] if bound is not None else ()
@@ -200,7 +242,14 @@ def _window(tile: Values) -> Values:
     while math.prod(lengths) > _WINDOW:
         longest = lengths.index(max(lengths))
         lengths[longest] = (lengths[longest] + 1) // 2
-    return np.ascontiguousarray(tile[tuple(slice((n - k) // 2, (n - k) // 2 + k) for n, k in zip(tile.shape, lengths, strict=True))])
+    return np.ascontiguousarray(
+        tile[
+            tuple(
+                slice((n - k) // 2, (n - k) // 2 + k)
+                for n, k in zip(tile.shape, lengths, strict=True)
+            )
+        ]
+    )
 
 
 def _candidates(shape: tuple[int, ...]) -> tuple[TransformSpec, ...]:
@@ -208,12 +257,18 @@ def _candidates(shape: tuple[int, ...]) -> tuple[TransformSpec, ...]:
     lead = next((axis for axis, n in enumerate(shape) if n > 1), None)
     if lead is None:
         return (TransformSpec(axes=(AxisTransform(kind="none"),) * 4),)
-    depths = [0 if n < 2 else max(1, min(most, n.bit_length() - 3)) for n, most in zip(shape, (1, 1, 5, 5), strict=True)]
+    depths = [
+        0 if n < 2 else max(1, min(most, n.bit_length() - 3))
+        for n, most in zip(shape, (1, 1, 5, 5), strict=True)
+    ]
     if min(shape[2:]) >= 16:
         depths[2:] = [min(depths[2:])] * 2
     # Along time, which few chunks are long in, two levels of haar are worth it.
     times = min(2, shape[lead].bit_length() - 1) if lead < 2 else depths[lead]
-    found = [_along("9/7", depths, lead, kind, depth) for kind, depth in (("9/7", depths[lead]), ("haar", times), ("none", 0))]
+    found = [
+        _along("9/7", depths, lead, kind, depth)
+        for kind, depth in (("9/7", depths[lead]), ("haar", times), ("none", 0))
+    ]
     return tuple(dict.fromkeys([*found, _along("haar", depths, lead, "haar", times)]))
 
 

@@ -46,7 +46,12 @@ class Encoded:
 
 
 def encode_integers(
-    integers: Integers, table: Table, *, scaled: npt.NDArray[np.float32] | None = None, weight: float = 0.0, state: State | None = None
+    integers: Integers,
+    table: Table,
+    *,
+    scaled: npt.NDArray[np.float32] | None = None,
+    weight: float = 0.0,
+    state: State | None = None,
 ) -> Encoded:
     """Code int32 integers (t, z, y, x) in the bands of a table; all outside the bands count as 0.
 
@@ -61,7 +66,9 @@ def encode_integers(
         from fhash_formats.transform import coder_portable
 
         integers = given.copy()
-        data = coder_portable.encode(integers, table, scaled, weight, state.copy() if not kept else state)
+        data = coder_portable.encode(
+            integers, table, scaled, weight, state.copy() if not kept else state
+        )
         return Encoded(data=data, integers=integers)
     library.fhash_encode.restype = ctypes.c_int64
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
@@ -121,7 +128,9 @@ def decode_block(data: bytes | memoryview, shape: tuple[int, ...]) -> Integers:
         return np.zeros(shape, dtype=np.int32)
     integers = decode_integers(data, shape, single_band(shape))
     # Small blocks carry no digest: they must be what the encoder would write.
-    if np.abs(integers.astype(np.int64)).max(initial=0) > MAX_INTEGER or encode_block(integers) != bytes(data):
+    if np.abs(integers.astype(np.int64)).max(initial=0) > MAX_INTEGER or encode_block(
+        integers
+    ) != bytes(data):
         raise DamagedFileError("the coded integers are damaged")
     return integers
 
@@ -145,4 +154,8 @@ def array_arguments(array: npt.NDArray[Any], count: int) -> tuple[ctypes.c_void_
 
 def state_arguments(state: State) -> list[Any]:
     """The arrays of a state as the native functions take them."""
-    return [part for array in (state.slots, state.weights, state.simples) for part in array_arguments(array, array.shape[0])]
+    return [
+        part
+        for array in (state.slots, state.weights, state.simples)
+        for part in array_arguments(array, array.shape[0])
+    ]

@@ -24,7 +24,17 @@ CONTEXTS, SIGN_CONTEXTS, UNARY = 6, 3, 14
 SLOW_LIMIT, SIGN_LIMIT, FAST_LIMIT, SIMPLE_LIMIT, LEARNING_RATE = 400, 255, 20, 60, 6
 MAX_MAGNITUDE = 4095
 PADDING = 2
-LEFT, LEFT2, ABOVE, DIAGONAL, ABOVE2, BEFORE, AROUND, BEFORE2, REFERENCE = 184, 20, 184, 61, 41, 102, 20, 31, 62
+LEFT, LEFT2, ABOVE, DIAGONAL, ABOVE2, BEFORE, AROUND, BEFORE2, REFERENCE = (
+    184,
+    20,
+    184,
+    61,
+    41,
+    102,
+    20,
+    31,
+    62,
+)
 STARTS = tuple(sum(SIZES[:i]) * DECISIONS for i in range(CONTEXTS))
 SIGN_STARTS = tuple(sum(SIZES) * DECISIONS + sum(SIGN_SIZES[:i]) for i in range(SIGN_CONTEXTS))
 SECOND = KINDS * DECISIONS * LANES
@@ -82,7 +92,11 @@ class Work(NamedTuple):
 
 
 def encode(
-    integers: npt.NDArray[np.int32], table: npt.NDArray[np.int32], scaled: npt.NDArray[np.float32] | None, weight: float, state: State
+    integers: npt.NDArray[np.int32],
+    table: npt.NDArray[np.int32],
+    scaled: npt.NDArray[np.float32] | None,
+    weight: float,
+    state: State,
 ) -> bytes:
     """Code integers (t, z, y, x), in C order; with `scaled` they are chosen anew in place. The state is left as it has become."""
     compiled = _compiled()
@@ -90,7 +104,17 @@ def encode(
     q: Sequence = integers.reshape(-1) if compiled else integers.ravel().tolist()
     memory = _memory(state, compiled is not None)
     mode = ENCODE if scaled is None else CHOOSE
-    out = _start(compiled, mode, q, real if compiled else real.tolist(), weight / 2048, integers.shape, table, memory, b"")[1]
+    out = _start(
+        compiled,
+        mode,
+        q,
+        real if compiled else real.tolist(),
+        weight / 2048,
+        integers.shape,
+        table,
+        memory,
+        b"",
+    )[1]
     if not compiled and mode == CHOOSE:
         integers[:] = np.array(q, dtype=np.int32).reshape(integers.shape)
     state.slots[:, 0], state.slots[:, 1], state.slots[:, 2] = memory.slow, memory.fast, memory.count
@@ -99,12 +123,24 @@ def encode(
     return bytes(out)
 
 
-def decode(integers: npt.NDArray[np.int32], table: npt.NDArray[np.int32], data: bytes, state: State) -> None:
+def decode(
+    integers: npt.NDArray[np.int32], table: npt.NDArray[np.int32], data: bytes, state: State
+) -> None:
     """Decode into integers (t, z, y, x), which are zeros in C order. Raises DamagedFileError for bytes that no encoder writes."""
     compiled = _compiled()
     q: Sequence = integers.reshape(-1) if compiled else [0] * integers.size
     real: Sequence = np.zeros(0) if compiled else []
-    code = _start(compiled, DECODE, q, real, 0.0, integers.shape, table, _memory(state, compiled is not None), data)[0]
+    code = _start(
+        compiled,
+        DECODE,
+        q,
+        real,
+        0.0,
+        integers.shape,
+        table,
+        _memory(state, compiled is not None),
+        data,
+    )[0]
     if code < 0:
         raise DamagedFileError("the coded integers are damaged")
     if not compiled:
@@ -113,14 +149,20 @@ def decode(integers: npt.NDArray[np.int32], table: npt.NDArray[np.int32], data: 
 
 def _tables() -> dict[str, npt.NDArray[np.int64]]:
     """The values before they are rounded down are nowhere near a whole number (a test sees to it), so every machine has the same."""
-    p, logits, small = (np.arange(65536) + 0.5) / 65536, np.arange(-STRETCH_MAX, STRETCH_MAX + 1), [3, 5, 7, 10, 15, 23, 37]
+    p, logits, small = (
+        (np.arange(65536) + 0.5) / 65536,
+        np.arange(-STRETCH_MAX, STRETCH_MAX + 1),
+        [3, 5, 7, 10, 15, 23, 37],
+    )
     tables = {
         "stretch": np.clip(np.floor(np.log(p / (1 - p)) * 256 + 0.5), -STRETCH_MAX, STRETCH_MAX),
         "squash": np.clip(np.floor(65536 / (1 + np.exp(-logits / 256)) + 0.5), 1, 65535),
         "cost": np.floor(-np.log2(np.maximum(np.arange(65537), 1) / 65536) * 2048 + 0.5),
         "log": np.floor(np.log2(np.maximum(np.arange(4096), 1)) * 16 + 0.5),
         "rate": 655360 // (10 * np.arange(SLOW_LIMIT + 1) + 16),
-        "small": np.array([v if v < 3 else 2 + sum(v >= bound for bound in small) for v in range(38)]),
+        "small": np.array(
+            [v if v < 3 else 2 + sum(v >= bound for bound in small) for v in range(38)]
+        ),
     }
     return {name: values.astype(np.int64) for name, values in tables.items()}
 
@@ -143,7 +185,17 @@ def _compiled() -> Callable[..., Any] | None:
 
 
 def _compile(numba: Any, extending: Any) -> Callable[..., Any]:
-    parts: tuple[Callable[..., Any], ...] = (_code, _chance, _finish, _log16, _small, _mix, _learn, _context_mix, _choose)
+    parts: tuple[Callable[..., Any], ...] = (
+        _code,
+        _chance,
+        _finish,
+        _log16,
+        _small,
+        _mix,
+        _learn,
+        _context_mix,
+        _choose,
+    )
     for part in (*parts, _add_centre, _add_neighbour, _prepare, _sign):
         extending.register_jitable(part)
     try:
@@ -154,7 +206,12 @@ def _compile(numba: Any, extending: Any) -> Callable[..., Any]:
 
 
 def _memory(state: State, arrays: bool) -> Memory:
-    columns: list[npt.NDArray[Any]] = [state.slots[:, 0], state.slots[:, 1], state.slots[:, 2], state.weights]
+    columns: list[npt.NDArray[Any]] = [
+        state.slots[:, 0],
+        state.slots[:, 1],
+        state.slots[:, 2],
+        state.weights,
+    ]
     columns += [state.simples[:, 0], state.simples[:, 1]]
     return Memory(*(column.astype(np.int64) if arrays else column.tolist() for column in columns))
 
@@ -178,7 +235,22 @@ def _start(
     # After the columns of the table: where the band's magnitudes and its rows begin.
     first = np.cumsum([width, *(rows * (sizes[:, 3] + 2 * PADDING))])
     bands = np.column_stack([bands, first[:-1], np.cumsum([0, *rows])[:-1]])
-    lengths = [4, int(first[-1]), int(rows.sum()), len(bands), width, width, width, width, 4 * width, 4, 4, CONTEXTS, CONTEXTS, LANES]
+    lengths = [
+        4,
+        int(first[-1]),
+        int(rows.sum()),
+        len(bands),
+        width,
+        width,
+        width,
+        width,
+        4 * width,
+        4,
+        4,
+        CONTEXTS,
+        CONTEXTS,
+        LANES,
+    ]
     lengths += [CONTEXTS, LANES]
     if compiled is None:
         work = Work(*([0] * length for length in lengths))
@@ -211,7 +283,16 @@ def _code(bit: int, p: int, decoding: bool, span: Sequence, data: Sequence, out:
     return bit
 
 
-def _chance(bit: int, at: int, decoding: bool, memory: Memory, rate: Sequence, span: Sequence, data: Sequence, out: Sequence) -> int:
+def _chance(
+    bit: int,
+    at: int,
+    decoding: bool,
+    memory: Memory,
+    rate: Sequence,
+    span: Sequence,
+    data: Sequence,
+    out: Sequence,
+) -> int:
     p, seen = memory.chance[at], memory.seen[at]
     bit = _code(bit, min(max(p, 32), 65504), decoding, span, data, out)
     memory.chance[at] = p + ((((65535 if bit else 0) - p) * rate[seen]) >> 16)
@@ -233,12 +314,24 @@ def _small(v: int, small: Sequence) -> int:
     return 9 if v <= 64 else 10 if v <= 140 else 11
 
 
-def _mix(n: int, where: Sequence, inputs: Sequence, first: int, second: int, memory: Memory, tables: Tables) -> int:
+def _mix(
+    n: int,
+    where: Sequence,
+    inputs: Sequence,
+    first: int,
+    second: int,
+    memory: Memory,
+    tables: Tables,
+) -> int:
     """The probability of a 1; `second` is negative where there is one set of weights."""
     weights, dot = memory.weights, 0
     for i in range(n):
         at = where[i]
-        slow, fast, seen = tables.stretch[memory.slow[at]], tables.stretch[memory.fast[at]], memory.count[at] + 1
+        slow, fast, seen = (
+            tables.stretch[memory.slow[at]],
+            tables.stretch[memory.fast[at]],
+            memory.count[at] + 1,
+        )
         if seen <= 12:
             # Rounded towards 0.
             slow = slow * seen // 13 if slow >= 0 else -(-slow * seen // 13)
@@ -252,7 +345,16 @@ def _mix(n: int, where: Sequence, inputs: Sequence, first: int, second: int, mem
 
 
 def _learn(
-    n: int, where: Sequence, inputs: Sequence, first: int, second: int, p: int, bit: int, limit: int, memory: Memory, rate: Sequence
+    n: int,
+    where: Sequence,
+    inputs: Sequence,
+    first: int,
+    second: int,
+    p: int,
+    bit: int,
+    limit: int,
+    memory: Memory,
+    rate: Sequence,
 ) -> None:
     weights = memory.weights
     target = 65535 if bit else 0
@@ -272,14 +374,30 @@ def _learn(
 
 
 def _context_mix(
-    k: int, where: Sequence, inputs: Sequence, context: Sequence, first: int, second: int, memory: Memory, tables: Tables
+    k: int,
+    where: Sequence,
+    inputs: Sequence,
+    context: Sequence,
+    first: int,
+    second: int,
+    memory: Memory,
+    tables: Tables,
 ) -> int:
     for i in range(CONTEXTS):
         where[i] = STARTS[i] + context[i] * DECISIONS + k
     return _mix(CONTEXTS, where, inputs, first, second, memory, tables)
 
 
-def _choose(s: float, p: int, price: float, first: int, second: int, memory: Memory, tables: Tables, work: Work) -> int:
+def _choose(
+    s: float,
+    p: int,
+    price: float,
+    first: int,
+    second: int,
+    memory: Memory,
+    tables: Tables,
+    work: Work,
+) -> int:
     s = s if s < 1e9 else 1e9
     nearest = int(s + 0.5)
     if nearest == 0 or nearest >= UNARY:
@@ -288,11 +406,22 @@ def _choose(s: float, p: int, price: float, first: int, second: int, memory: Mem
     by_kind, by_level = KINDS * LANES, 64 * LANES  # weights of a decision
     zero = s * s + price * cost[p]
     other_than_zero = price * (cost[65536 - p] + 2048)
-    stop = _context_mix(nearest, where, inputs, context, first + nearest * by_kind, second + nearest * by_level, memory, tables)
+    stop = _context_mix(
+        nearest,
+        where,
+        inputs,
+        context,
+        first + nearest * by_kind,
+        second + nearest * by_level,
+        memory,
+        tables,
+    )
     if nearest == 1:
         return 0 if zero <= (s - 1) * (s - 1) + price * cost[65536 - stop] + other_than_zero else 1
     k = nearest - 1
-    before = _context_mix(k, where, inputs, context, first + k * by_kind, second + k * by_level, memory, tables)
+    before = _context_mix(
+        k, where, inputs, context, first + k * by_kind, second + k * by_level, memory, tables
+    )
     same = (s - nearest) * (s - nearest) + price * (cost[before] + cost[65536 - stop])
     less = (s - nearest + 1) * (s - nearest + 1) + price * cost[65536 - before]
     if nearest == 2 and zero < min(same, less) + other_than_zero:
@@ -315,10 +444,19 @@ def _add_neighbour(sums: Sequence, row: int, n: int, work: Work) -> None:
         sums[x] += m[row + x]
 
 
-def _prepare(t: int, z: int, y: int, r: int, band: Sequence, table: Sequence, work: Work, width: int) -> int:
+def _prepare(
+    t: int, z: int, y: int, r: int, band: Sequence, table: Sequence, work: Work, width: int
+) -> int:
     """What is known of a row beforehand, into the sums of `work`; the weight of the neighbours that exist."""
     n1, n2, n = band[5] - band[1], band[6] - band[2], band[7] - band[3]
-    m, filled, expected, plane, before, below = work.magnitudes, work.filled, work.expected, work.plane, work.before, work.below
+    m, filled, expected, plane, before, below = (
+        work.magnitudes,
+        work.filled,
+        work.expected,
+        work.plane,
+        work.before,
+        work.below,
+    )
     m2 = n + 2 * PADDING
     m1, m0, r1, r0 = m2 * n2, m2 * n2 * n1, n2, n1 * n2
     f, row = band[30] + r, band[29] + r * m2 + PADDING
@@ -405,7 +543,14 @@ def _run(
     decoding = mode == DECODE
     out = [0 for _ in range(0)]
     log, rate, small = tables.log, tables.rate, tables.small
-    span, m, where, inputs, context, width = work.span, work.magnitudes, work.where, work.inputs, work.context, len(work.expected)
+    span, m, where, inputs, context, width = (
+        work.span,
+        work.magnitudes,
+        work.where,
+        work.inputs,
+        work.context,
+        len(work.expected),
+    )
     span[1] = 0xFFFFFFFF
     if decoding:
         for i in range(4):
@@ -417,7 +562,13 @@ def _run(
 
     for number in range(len(table)):
         band = table[number]
-        n0, n1, n2, n3, kind = band[4] - band[0], band[5] - band[1], band[6] - band[2], band[7] - band[3], band[8]
+        n0, n1, n2, n3, kind = (
+            band[4] - band[0],
+            band[5] - band[1],
+            band[6] - band[2],
+            band[7] - band[3],
+            band[8],
+        )
         origin = band[0] * s0 + band[1] * s1 + band[2] * s2 + band[3]
         some = 0
         if not decoding:
@@ -449,14 +600,21 @@ def _run(
                 if to < 0 or not work.any[to]:
                     continue
                 other = table[to]
-                rt, rz = min(t >> band[10 + 5 * k], other[4] - other[0] - 1), min(z >> band[11 + 5 * k], other[5] - other[1] - 1)
+                rt, rz = (
+                    min(t >> band[10 + 5 * k], other[4] - other[0] - 1),
+                    min(z >> band[11 + 5 * k], other[5] - other[1] - 1),
+                )
                 ry = min(y >> band[12 + 5 * k], other[6] - other[2] - 1)
                 to_row = (rt * (other[5] - other[1]) + rz) * (other[6] - other[2]) + ry
                 work.row_y[k] = ry
                 work.rows[k] = other[29] + to_row * (other[7] - other[3] + 2 * PADDING) + PADDING
                 if k == 0:
                     parent_filled = work.filled[other[30] + to_row]
-            known = (y > 0 and work.filled[f - 1]) or (z > 0 and work.filled[f - r1]) or (t > 0 and work.filled[f - r0])
+            known = (
+                (y > 0 and work.filled[f - 1])
+                or (z > 0 and work.filled[f - r1])
+                or (t > 0 and work.filled[f - r0])
+            )
             if not (known or parent_filled):
                 some = 0
                 if not decoding:
@@ -464,7 +622,12 @@ def _run(
                         if q[at] != 0:
                             some = 1
                             break
-                at = ROWS + (2 if n3 > 24 else 0) + (1 if y > 1 and work.filled[f - 2] else 0) + (4 if r == 0 else 0)
+                at = (
+                    ROWS
+                    + (2 if n3 > 24 else 0)
+                    + (1 if y > 1 and work.filled[f - 2] else 0)
+                    + (4 if r == 0 else 0)
+                )
                 if not _chance(some, at, decoding, memory, rate, span, data, out):
                     continue
 
@@ -478,17 +641,27 @@ def _run(
                 mu = work.expected[x] + LEFT * left + LEFT2 * left2
                 level = min(max((_log16(mu, log) + offset) // 4 + 1, 0), LEVELS - 1) if mu else 0
                 coarse = min(level // 2, 63)
-                near, before, below = work.plane[x] + 2 * left + left2, work.before[x], work.below[x]
+                near, before, below = (
+                    work.plane[x] + 2 * left + left2,
+                    work.before[x],
+                    work.below[x],
+                )
                 parent = _small(work.around[x], small)
-                beside = ((min(left, 2) * 3 + min(m[above + x], 2)) * 3 + min(m[above + x - 1], 2)) * 3 + min(m[above + x + 1], 2)
+                beside = (
+                    (min(left, 2) * 3 + min(m[above + x], 2)) * 3 + min(m[above + x - 1], 2)
+                ) * 3 + min(m[above + x + 1], 2)
                 others = (min(parent, 6) * 7 + min(_small(work.around[width + x], small), 6)) * 7
                 others = (others + min(_small(work.around[2 * width + x], small), 6)) * 7
                 context[0] = level
                 context[1] = kind * 64 + coarse
                 context[2] = (beside * 3 + min(m[back + x], 2)) * 3 + min(m[under + x], 2)
-                context[3] = (_small(near, small) * 12 + _small(before, small)) * 12 + _small(below, small)
+                context[3] = (_small(near, small) * 12 + _small(before, small)) * 12 + _small(
+                    below, small
+                )
                 context[4] = others + min(_small(work.around[3 * width + x], small), 6)
-                context[5] = (_small((near + before + below) // 2, small) * 12 + parent) * KINDS + kind
+                context[5] = (
+                    _small((near + before + below) // 2, small) * 12 + parent
+                ) * KINDS + kind
 
                 first, second = kind * LANES, SECOND + coarse * LANES
                 p = _context_mix(0, where, inputs, context, first, second, memory, tables)
@@ -512,12 +685,19 @@ def _run(
                 z_sign = _sign(q[at - s1]) if z > 0 else 1
                 t_sign = _sign(q[at - s0]) if t > 0 else 1
                 where[0] = SIGN_STARTS[0] + kind * 27 + (left_sign * 3 + y_sign) * 3 + t_sign
-                where[1] = SIGN_STARTS[1] + kind * 81 + ((left_sign * 3 + left2_sign) * 3 + y_sign) * 3 + y2_sign
+                where[1] = (
+                    SIGN_STARTS[1]
+                    + kind * 81
+                    + ((left_sign * 3 + left2_sign) * 3 + y_sign) * 3
+                    + y2_sign
+                )
                 where[2] = SIGN_STARTS[2] + kind * 27 + (t_sign * 3 + z_sign) * 3 + left_sign
                 weights = SIGNS + kind * LANES
                 p = _mix(SIGN_CONTEXTS, where, inputs, weights, -1, memory, tables)
                 negative = _code(1 if value < 0 else 0, p, decoding, span, data, out)
-                _learn(SIGN_CONTEXTS, where, inputs, weights, -1, p, negative, SIGN_LIMIT, memory, rate)
+                _learn(
+                    SIGN_CONTEXTS, where, inputs, weights, -1, p, negative, SIGN_LIMIT, memory, rate
+                )
 
                 k = 1
                 while k < UNARY:
@@ -525,7 +705,9 @@ def _run(
                     second += 64 * LANES
                     p = _context_mix(k, where, inputs, context, first, second, memory, tables)
                     more = _code(1 if magnitude > k else 0, p, decoding, span, data, out)
-                    _learn(CONTEXTS, where, inputs, first, second, p, more, SLOW_LIMIT, memory, rate)
+                    _learn(
+                        CONTEXTS, where, inputs, first, second, p, more, SLOW_LIMIT, memory, rate
+                    )
                     if not more:
                         break
                     k += 1
@@ -535,14 +717,25 @@ def _run(
                         rest = magnitude - UNARY + 1
                         while (rest >> bits) > 1:
                             bits += 1
-                    while _chance(1 if j < bits else 0, escape + min(j, 20), decoding, memory, rate, span, data, out):
+                    while _chance(
+                        1 if j < bits else 0,
+                        escape + min(j, 20),
+                        decoding,
+                        memory,
+                        rate,
+                        span,
+                        data,
+                        out,
+                    ):
                         j += 1
                         if j > 30:
                             return -1, out
                     v = 1
                     for i in range(j - 1, -1, -1):
                         place = escape + 21 + min(j, 19) * 2 + (1 if i != j - 1 else 0)
-                        v = (v << 1) | _chance((rest >> i) & 1, place, decoding, memory, rate, span, data, out)
+                        v = (v << 1) | _chance(
+                            (rest >> i) & 1, place, decoding, memory, rate, span, data, out
+                        )
                     k = min(v + UNARY - 1, 0x7FFFFFFF)
                 if decoding:
                     magnitude = k

@@ -34,7 +34,14 @@ from fhash_formats.transform.sections import (
 from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.spec import TransformSpec
 
-__all__ = ["decode_tile", "decode_tile_mask", "linear_values", "outside", "predicted_values", "transform_for"]
+__all__ = [
+    "decode_tile",
+    "decode_tile_mask",
+    "linear_values",
+    "outside",
+    "predicted_values",
+    "transform_for",
+]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -50,7 +57,13 @@ def _transform(spec: TransformSpec, shape: Shape, dtype: str) -> Transform:
     return Transform(spec, shape, np.dtype(dtype))
 
 
-def decode_tile(data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: Settings | None = None, lod: int = 0) -> Values:
+def decode_tile(
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: Settings | None = None,
+    lod: int = 0,
+) -> Values:
     """The values (t, z, y, x) of a stream, in the type of the source.
 
     settings: those shared by all tiles, unless the stream has its own. lod: every 2^lod-th vertex along z, y, x, low-passed, without head,
@@ -59,14 +72,20 @@ def decode_tile(data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, se
     return _decode(data, shape, dtype, settings, lod)[0]
 
 
-def decode_tile_mask(data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: Settings | None = None) -> tuple[Values, Mask]:
+def decode_tile_mask(
+    data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: Settings | None = None
+) -> tuple[Values, Mask]:
     """The values of a stream as `decode_tile` gives them, and which are occupied: all, where the stream has no mask."""
     values, mask = _decode(data, shape, dtype, settings, 0)
     return values, np.ones(shape, bool) if mask is None else mask
 
 
 def _decode(
-    data: bytes | memoryview, shape: Shape, dtype: npt.DTypeLike, settings: Settings | None, lod: int
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: Settings | None,
+    lod: int,
 ) -> tuple[Values, Mask | None]:
     kind = np.dtype(dtype)
     parts = parts_of(data)
@@ -94,7 +113,9 @@ def _decode(
         try:
             transform = transform_for(settings, shape)
         except InputError as error:
-            raise DamagedFileError(f"the settings of a coded tile do not fit its shape: {error}") from error
+            raise DamagedFileError(
+                f"the settings of a coded tile do not fit its shape: {error}"
+            ) from error
         integers = decode_integers(parts.body, shape, band_table(settings.transform, shape))
     elif predictor is not None:
         integers = decode_predicted(parts.body, shape, predictor)
@@ -115,7 +136,9 @@ def _decode(
         mask = None if parts.mask is None else _mask_of(parts.mask, found, settings)
         return restored(outside(cast(found, kind), mask, settings), missing), mask
     if lod:
-        coarse = transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype), lod=lod)
+        coarse = transform.inverse(
+            dequantise(integers, settings.step, settings.offsets, settings.dtype), lod=lod
+        )
         return cast(_shifted(coarse, settings), kind), None
     linear = linear_values(integers, transform, settings)
     mask = None if parts.mask is None else _mask_of(parts.mask, linear, settings)
@@ -131,17 +154,27 @@ def _check_numbers(settings: Settings, kind: np.dtype[Any]) -> float:
     """Refuse settings that make infinities of finite values in the type of the source or in the working type; the largest such number."""
     types = [settings.dtype] if kind.kind != "f" else [settings.dtype, kind]
     largest = min(float(np.finfo(name).max) for name in types)
-    if kind.kind == "f" and max(abs(settings.low), abs(settings.high), abs(settings.center)) > largest:
+    if (
+        kind.kind == "f"
+        and max(abs(settings.low), abs(settings.high), abs(settings.center)) > largest
+    ):
         raise DamagedFileError(f"the range of a coded tile or its centre is beyond {largest:.6g}")
     return largest
 
 
-def linear_values(integers: npt.NDArray[np.int32], transform: Transform, settings: Settings) -> Values:
+def linear_values(
+    integers: npt.NDArray[np.int32], transform: Transform, settings: Settings
+) -> Values:
     """Decoded values in the working type, before head and residual."""
-    return _shifted(transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype)), settings)
+    return _shifted(
+        transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype)),
+        settings,
+    )
 
 
-def predicted_values(integers: npt.NDArray[np.int32], predictor: Predictor, settings: Settings) -> npt.NDArray[np.float64]:
+def predicted_values(
+    integers: npt.NDArray[np.int32], predictor: Predictor, settings: Settings
+) -> npt.NDArray[np.float64]:
     """Values by prediction, within the range."""
     values = values_of(integers, predictor)
     return np.clip(values, settings.low, settings.high, out=values)

@@ -15,7 +15,16 @@ import numpy.typing as npt
 
 from fhash_formats import native
 
-__all__ = ["all_finite", "cast", "clip_shifted", "corrected", "free_values", "pieces", "residual_of", "within"]
+__all__ = [
+    "all_finite",
+    "cast",
+    "clip_shifted",
+    "corrected",
+    "free_values",
+    "pieces",
+    "residual_of",
+    "within",
+]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -37,8 +46,18 @@ def within(values: Values, decoded: Values, error: float, counts: Mask | None = 
     """Whether |decoded - value| <= error wherever it counts, without rounding in favour of the answer."""
     function = _native("within", values.dtype) if values.dtype == decoded.dtype else None
     if function is not None:
-        return bool(function(*_pointers(values, decoded, counts), ctypes.c_int64(values.size), ctypes.c_double(error)))
-    one, other, marks = values.reshape(-1), decoded.reshape(-1), None if counts is None else counts.reshape(-1)
+        return bool(
+            function(
+                *_pointers(values, decoded, counts),
+                ctypes.c_int64(values.size),
+                ctypes.c_double(error),
+            )
+        )
+    one, other, marks = (
+        values.reshape(-1),
+        decoded.reshape(-1),
+        None if counts is None else counts.reshape(-1),
+    )
     near = _near_whole if values.dtype.kind in "iu" and values.dtype.itemsize == 8 else _near
     for piece in pieces(one.size):
         found = near(one[piece], other[piece], error)
@@ -51,18 +70,26 @@ def _near(one: Values, other: Values, error: float) -> Mask:
     with np.errstate(all="ignore"):
         difference = np.abs(one.astype(np.float64) - other.astype(np.float64))
         # A difference of float64 numbers is rounded: the next one up is surely not too small.
-        found: Mask = (one == other) | (np.nextafter(difference, np.inf) <= error) | ((one.dtype.itemsize < 8) & (difference <= error))
+        found: Mask = (
+            (one == other)
+            | (np.nextafter(difference, np.inf) <= error)
+            | ((one.dtype.itemsize < 8) & (difference <= error))
+        )
     return found
 
 
 def _near_whole(one: Values, other: Values, error: float) -> Mask:
     most = 0 if error < 0 else np.iinfo(np.uint64).max if error >= 2.0**64 else int(error)
     # A signed difference may go round, and as an unsigned number it is right again.
-    found: Mask = np.where(one > other, one - other, other - one).astype(np.uint64) <= np.uint64(most)
+    found: Mask = np.where(one > other, one - other, other - one).astype(np.uint64) <= np.uint64(
+        most
+    )
     return found
 
 
-def residual_of(values: Values, base: Values, counts: Mask | None, quantum: float, largest: int) -> tuple[Integers, int] | None:
+def residual_of(
+    values: Values, base: Values, counts: Mask | None, quantum: float, largest: int
+) -> tuple[Integers, int] | None:
     """Whole quanta to add to `base` where the error is too large, and how many are not 0; None where one would be above `largest`.
 
     values: of any real type. base: float32 or float64. counts: where the error matters; None for everywhere.
@@ -71,9 +98,21 @@ def residual_of(values: Values, base: Values, counts: Mask | None, quantum: floa
     function = _native("residual", values.dtype, base.dtype)
     if function is not None:
         numbers = (ctypes.c_double(quantum), ctypes.c_double(largest))
-        found = int(function(*_pointers(values, base, counts), ctypes.c_int64(values.size), *numbers, *_pointers(result)))
+        found = int(
+            function(
+                *_pointers(values, base, counts),
+                ctypes.c_int64(values.size),
+                *numbers,
+                *_pointers(result),
+            )
+        )
         return None if found < 0 else (result, found)
-    one, other, marks, out = values.reshape(-1), base.reshape(-1), None if counts is None else counts.reshape(-1), result.reshape(-1)
+    one, other, marks, out = (
+        values.reshape(-1),
+        base.reshape(-1),
+        None if counts is None else counts.reshape(-1),
+        result.reshape(-1),
+    )
     found = 0
     for piece in pieces(one.size):
         with np.errstate(all="ignore"):
@@ -87,19 +126,28 @@ def residual_of(values: Values, base: Values, counts: Mask | None, quantum: floa
     return result, found
 
 
-def corrected(base: Values, residual: Integers | None, quantum: float, dtype: np.dtype[Any]) -> Values:
+def corrected(
+    base: Values, residual: Integers | None, quantum: float, dtype: np.dtype[Any]
+) -> Values:
     """`base` plus so many quanta, in float64, and from there to a type; may be `base` itself where nothing is to be done."""
     if residual is None:
         return base if base.dtype == dtype else cast(base, dtype)
     function = _native("correct", base.dtype, dtype)
     result = np.empty(base.shape, dtype)
     if function is not None:
-        function(*_pointers(base, residual), ctypes.c_int64(base.size), ctypes.c_double(quantum), *_pointers(result))
+        function(
+            *_pointers(base, residual),
+            ctypes.c_int64(base.size),
+            ctypes.c_double(quantum),
+            *_pointers(result),
+        )
         return result
     flat, whole, out = base.reshape(-1), residual.reshape(-1), result.reshape(-1)
     for piece in pieces(flat.size):
         with np.errstate(all="ignore"):
-            out[piece] = _cast(flat[piece].astype(np.float64) + whole[piece] * np.float64(quantum), dtype)
+            out[piece] = _cast(
+                flat[piece].astype(np.float64) + whole[piece] * np.float64(quantum), dtype
+            )
     return result
 
 
@@ -130,7 +178,11 @@ def clip_shifted(values: Values, center: float, low: float, high: float) -> Valu
     """values + center within [low, high], each first rounded to the type of the values, in place; NaN stays."""
     function = _native("clip", values.dtype)
     if function is not None and values.flags.c_contiguous:
-        function(*_pointers(values), ctypes.c_int64(values.size), *(ctypes.c_double(number) for number in (center, low, high)))
+        function(
+            *_pointers(values),
+            ctypes.c_int64(values.size),
+            *(ctypes.c_double(number) for number in (center, low, high)),
+        )
         return values
     kind = values.dtype.type
     with np.errstate(all="ignore"):
@@ -138,7 +190,9 @@ def clip_shifted(values: Values, center: float, low: float, high: float) -> Valu
         return np.clip(values, kind(low), kind(high), out=values)
 
 
-def free_values(target: Values, rebuilt: Values, counts: Mask | None, low: float, high: float) -> int:
+def free_values(
+    target: Values, rebuilt: Values, counts: Mask | None, low: float, high: float
+) -> int:
     """Put `rebuilt` into `target` wherever it may be anything, and count where that is.
 
     That is what does not count, and what lies at or beyond `low` or `high` and was rebuilt still farther out.
@@ -176,4 +230,9 @@ def _native(name: str, *types: np.dtype[Any]) -> Any:
 
 def _pointers(*arrays: Values | None) -> list[ctypes.c_void_p]:
     """Each holds its array, or a copy of it in C order."""
-    return [ctypes.c_void_p(None) if array is None else np.ascontiguousarray(array).ctypes.data_as(ctypes.c_void_p) for array in arrays]
+    return [
+        ctypes.c_void_p(None)
+        if array is None
+        else np.ascontiguousarray(array).ctypes.data_as(ctypes.c_void_p)
+        for array in arrays
+    ]

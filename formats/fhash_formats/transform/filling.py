@@ -33,7 +33,14 @@ FEW_BITS = 64
 """Of the magnitudes of a tile, of which more thresholds could not save many."""
 
 
-def filled(target: Values, counts: Mask, finite: Mask, transform: Transform, settings: Settings, density: int = 1) -> Values:
+def filled(
+    target: Values,
+    counts: Mask,
+    finite: Mask,
+    transform: Transform,
+    settings: Settings,
+    density: int = 1,
+) -> Values:
     """`target` (t, z, y, x) with other values where it does not count.
 
     finite: where it has values. density: 1, 2, 4 or 8 thresholds to each factor of two; 0 goes on from a filling that was made for other
@@ -42,7 +49,9 @@ def filled(target: Values, counts: Mask, finite: Mask, transform: Transform, set
     take fewer bytes, they stay.
     """
     # A running sum has one order on every machine, a mean has not.
-    mean = settings.dtype.type(np.cumsum(target[counts], dtype=np.float64)[-1] / np.count_nonzero(counts))
+    mean = settings.dtype.type(
+        np.cumsum(target[counts], dtype=np.float64)[-1] / np.count_nonzero(counts)
+    )
     t, z, y, x = target.shape
     if density == 0:
         return _settled(np.where(finite, target, mean), counts, transform, settings, 1, NEARBY)
@@ -52,10 +61,17 @@ def filled(target: Values, counts: Mask, finite: Mask, transform: Transform, set
     bits = [_bits(values, transform, settings) for values in settled]
     better = bits.index(min(bits))
     enough = density == 1 or bits[better] < FEW_BITS
-    found = settled[better] if enough else _settled(starts[better], counts, transform, settings, density)
+    found = (
+        settled[better]
+        if enough
+        else _settled(starts[better], counts, transform, settings, density)
+    )
     # Bits are a rough measure: smooth values of many bits may be coded in few.
     table = band_table(settings.transform, (t, z, y, x))
-    sizes = [len(encode_integers(quantise(transform.forward(values), settings.step)[0], table).data) for values in (own, found)]
+    sizes = [
+        len(encode_integers(quantise(transform.forward(values), settings.step)[0], table).data)
+        for values in (own, found)
+    ]
     return own if sizes[0] <= sizes[1] else found
 
 
@@ -65,7 +81,14 @@ def _bits(values: Values, transform: Transform, settings: Settings) -> int:
     return int(np.frexp(integers.astype(np.float32))[1].sum(dtype=np.int64))
 
 
-def _settled(start: Values, counts: Mask, transform: Transform, settings: Settings, density: int, threshold: float = HIGHEST) -> Values:
+def _settled(
+    start: Values,
+    counts: Mask,
+    transform: Transform,
+    settings: Settings,
+    density: int,
+    threshold: float = HIGHEST,
+) -> Values:
     kind = settings.dtype.type
     now, guess = start, start
     while threshold > LOWEST:

@@ -26,9 +26,23 @@ import numpy.typing as npt
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.head_portable import CROSS, FEATURES, apply_cross, apply_network
-from fhash_formats.transform.head_weights import MAX_WEIGHT, best_spread, decode_weights, encode_weights
+from fhash_formats.transform.head_weights import (
+    MAX_WEIGHT,
+    best_spread,
+    decode_weights,
+    encode_weights,
+)
 
-__all__ = ["MAX_BIAS", "MAX_CROSS_WIDTH", "MAX_HIDDEN", "MAX_WEIGHT", "MAX_WIDTH", "Head", "Layer", "layer_inputs"]
+__all__ = [
+    "MAX_BIAS",
+    "MAX_CROSS_WIDTH",
+    "MAX_HIDDEN",
+    "MAX_WEIGHT",
+    "MAX_WIDTH",
+    "Head",
+    "Layer",
+    "layer_inputs",
+]
 
 MAX_HIDDEN = 3
 """Most hidden layers."""
@@ -50,7 +64,13 @@ Floats = npt.NDArray[np.float32]
 
 def layer_inputs(hidden: Sequence[int], cross: bool) -> list[int]:
     """How many inputs each layer has, the last one included."""
-    return [FEATURES, *(width * len(CROSS) if cross and number == 0 else width for number, width in enumerate(hidden))]
+    return [
+        FEATURES,
+        *(
+            width * len(CROSS) if cross and number == 0 else width
+            for number, width in enumerate(hidden)
+        ),
+    ]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,26 +114,54 @@ class Head:
 
     def __post_init__(self) -> None:
         if not 2 <= len(self.layers) <= MAX_HIDDEN + 1:
-            raise InputError(f"a head has 1 to {MAX_HIDDEN} hidden layers, not {len(self.layers) - 1}")
+            raise InputError(
+                f"a head has 1 to {MAX_HIDDEN} hidden layers, not {len(self.layers) - 1}"
+            )
         if self.cross and len(self.layers) != 3:
             raise InputError(f"a head with a cross has 2 hidden layers, not {len(self.layers) - 1}")
-        for number, (layer, inputs) in enumerate(zip(self.layers, layer_inputs(self.hidden, self.cross), strict=True)):
+        for number, (layer, inputs) in enumerate(
+            zip(self.layers, layer_inputs(self.hidden, self.cross), strict=True)
+        ):
             width = len(layer.biases)
-            allowed = 1 if number == len(self.layers) - 1 else MAX_CROSS_WIDTH if self.cross and number == 0 else MAX_WIDTH
+            allowed = (
+                1
+                if number == len(self.layers) - 1
+                else MAX_CROSS_WIDTH
+                if self.cross and number == 0
+                else MAX_WIDTH
+            )
             if not 1 <= width <= allowed:
-                raise InputError(f"layer {number} of a head has {width} outputs, 1 to {allowed} are allowed")
+                raise InputError(
+                    f"layer {number} of a head has {width} outputs, 1 to {allowed} are allowed"
+                )
             if layer.weights.shape != (width, inputs) or layer.biases.shape != (width,):
-                raise InputError(f"layer {number} of a head has weights {layer.weights.shape} where {(width, inputs)} is needed")
-            for name, values, most in (("weights", layer.weights, MAX_WEIGHT), ("biases", layer.biases, MAX_BIAS)):
+                raise InputError(
+                    f"layer {number} of a head has weights {layer.weights.shape} where {(width, inputs)} is needed"
+                )
+            for name, values, most in (
+                ("weights", layer.weights, MAX_WEIGHT),
+                ("biases", layer.biases, MAX_BIAS),
+            ):
                 if values.dtype != np.int8 or int(np.abs(values.astype(np.int16)).max()) > most:
-                    raise InputError(f"the {name} of layer {number} of a head must be int8 of at most {most} either way")
+                    raise InputError(
+                        f"the {name} of layer {number} of a head must be int8 of at most {most} either way"
+                    )
             for scale in (layer.weight_scale, layer.bias_scale):
                 if not (np.isfinite(scale) and scale > 0 and float(np.float16(scale)) == scale):
-                    raise InputError(f"layer {number} of a head has scale {scale}: a positive float16 value is needed")
-        if any(not np.isfinite(value) or float(np.float32(value)) != value for value in (self.sigma, self.low, self.high)):
-            raise InputError(f"a head's sigma, low and high must be finite float32 values, not {self.sigma}, {self.low}, {self.high}")
+                    raise InputError(
+                        f"layer {number} of a head has scale {scale}: a positive float16 value is needed"
+                    )
+        if any(
+            not np.isfinite(value) or float(np.float32(value)) != value
+            for value in (self.sigma, self.low, self.high)
+        ):
+            raise InputError(
+                f"a head's sigma, low and high must be finite float32 values, not {self.sigma}, {self.low}, {self.high}"
+            )
         if not _SIGMA_RANGE[0] <= self.sigma <= _SIGMA_RANGE[1] or self.low > self.high:
-            raise InputError(f"a head needs sigma in {_SIGMA_RANGE} and low <= high, not {self.sigma}, {self.low}, {self.high}")
+            raise InputError(
+                f"a head needs sigma in {_SIGMA_RANGE} and low <= high, not {self.sigma}, {self.low}, {self.high}"
+            )
 
     @property
     def hidden(self) -> tuple[int, ...]:
@@ -127,7 +175,10 @@ class Head:
         for number, layer in enumerate(self.layers):
             # Exact products of few bits, but for the one with sigma.
             unit_in = _FEATURE_UNIT if number == 0 else _ACTIVATION_UNIT
-            scale, bias = np.float32(layer.weight_scale / unit_in), np.float32(layer.bias_scale) * layer.biases.astype(np.float32)
+            scale, bias = (
+                np.float32(layer.weight_scale / unit_in),
+                np.float32(layer.bias_scale) * layer.biases.astype(np.float32),
+            )
             unit_out = sigma if number == len(self.layers) - 1 else np.float32(_ACTIVATION_UNIT)
             with np.errstate(over="ignore"):
                 weights.append(np.ascontiguousarray(layer.weights, dtype=np.float32))
@@ -146,7 +197,9 @@ class Head:
         NaN counts as low. Raises InputError for another dtype or rank.
         """
         if decoded.dtype != np.float32 or decoded.ndim != 4:
-            raise InputError(f"a head takes a float32 tile (t, z, y, x), not {decoded.dtype} of shape {decoded.shape}")
+            raise InputError(
+                f"a head takes a float32 tile (t, z, y, x), not {decoded.dtype} of shape {decoded.shape}"
+            )
         if decoded.size == 0:
             return decoded.copy()
         library = native.library()
@@ -160,13 +213,23 @@ class Head:
         scales = np.array(constants.scales, dtype=np.float32)
         widths = np.array([FEATURES, *self.hidden, 1], dtype=np.int64)
         sizes = (ctypes.c_int64(size) for size in (*source.shape, len(self.layers)))
-        pointers = (ctypes.c_void_p(array.ctypes.data) for array in (widths, weights, biases, scales))
+        pointers = (
+            ctypes.c_void_p(array.ctypes.data) for array in (widths, weights, biases, scales)
+        )
         numbers = (ctypes.c_float(float(value)) for value in constants[3:])
         function = library.fhash_head_apply_cross if self.cross else library.fhash_head_apply
         function.restype = ctypes.c_int64
-        code = function(ctypes.c_void_p(source.ctypes.data), *sizes, *pointers, *numbers, ctypes.c_void_p(out.ctypes.data))
+        code = function(
+            ctypes.c_void_p(source.ctypes.data),
+            *sizes,
+            *pointers,
+            *numbers,
+            ctypes.c_void_p(out.ctypes.data),
+        )
         if code != 0:
-            raise MemoryError(f"no memory to apply a head to a tile of shape {source.shape} (code {code})")
+            raise MemoryError(
+                f"no memory to apply a head to a tile of shape {source.shape} (code {code})"
+            )
         return out
 
     def to_bytes(self) -> bytes:
@@ -177,7 +240,10 @@ class Head:
         one number (head_weights.py).
         """
         spreads = [best_spread(layer.weights.ravel().tolist()) for layer in self.layers]
-        parts = [bytes([_CROSSED if self.cross else len(self.hidden), *self.hidden]), struct.pack("<3f", self.sigma, self.low, self.high)]
+        parts = [
+            bytes([_CROSSED if self.cross else len(self.hidden), *self.hidden]),
+            struct.pack("<3f", self.sigma, self.low, self.high),
+        ]
         for layer, spread in zip(self.layers, spreads, strict=True):
             parts.append(struct.pack("<eeB", layer.weight_scale, layer.bias_scale, spread))
         parts += [layer.biases.tobytes() for layer in self.layers]
@@ -195,7 +261,9 @@ class Head:
         except (struct.error, ValueError, IndexError) as error:
             raise DamagedFileError(f"a damaged neighbourhood head: {error}") from error
         if head.to_bytes() != data:
-            raise DamagedFileError("a damaged neighbourhood head: its bytes are not those of the head that they describe")
+            raise DamagedFileError(
+                "a damaged neighbourhood head: its bytes are not those of the head that they describe"
+            )
         return head
 
     @classmethod
@@ -205,7 +273,11 @@ class Head:
         if not 1 <= count <= MAX_HIDDEN:
             raise ValueError(f"{count} hidden layers")
         widths = [*data[1 : 1 + count], 1]
-        if len(widths) != count + 1 or not all(1 <= width <= MAX_WIDTH for width in widths) or (cross and widths[0] > MAX_CROSS_WIDTH):
+        if (
+            len(widths) != count + 1
+            or not all(1 <= width <= MAX_WIDTH for width in widths)
+            or (cross and widths[0] > MAX_CROSS_WIDTH)
+        ):
             raise ValueError(f"layers of widths {widths}")
         inputs = layer_inputs(widths[:-1], cross)
         sigma, low, high = struct.unpack_from("<3f", data, 1 + count)
@@ -217,14 +289,20 @@ class Head:
             biases.append(np.frombuffer(data, dtype=np.int8, count=width, offset=at))
             at += width
         size = sum(first * second for first, second in zip(inputs, widths, strict=True))
-        if len(data) - at > 3 * size + 1:  # no weight takes more than 22 bits: bounds the work on hostile bytes
+        if (
+            len(data) - at > 3 * size + 1
+        ):  # no weight takes more than 22 bits: bounds the work on hostile bytes
             raise ValueError(f"{len(data)} bytes are too many")
         state = int.from_bytes(data[at:], "little")
         layers = []
-        for (weight_scale, bias_scale, spread), columns, bias in zip(scales, inputs, biases, strict=True):
+        for (weight_scale, bias_scale, spread), columns, bias in zip(
+            scales, inputs, biases, strict=True
+        ):
             state, weights = decode_weights(state, len(bias) * columns, spread)
             matrix = np.array(weights, dtype=np.int8).reshape(len(bias), columns)
-            layers.append(Layer(weights=matrix, biases=bias, weight_scale=weight_scale, bias_scale=bias_scale))
+            layers.append(
+                Layer(weights=matrix, biases=bias, weight_scale=weight_scale, bias_scale=bias_scale)
+            )
         if state != 1:
             raise ValueError("its weights do not end where their code ends")
         return cls(layers=tuple(layers), sigma=sigma, low=low, high=high, cross=cross)

@@ -11,7 +11,18 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["CROSS", "FEATURES", "LIMIT", "STEPS", "apply_cross", "apply_network", "centre_features", "clip", "compress", "locate"]
+__all__ = [
+    "CROSS",
+    "FEATURES",
+    "LIMIT",
+    "STEPS",
+    "apply_cross",
+    "apply_network",
+    "centre_features",
+    "clip",
+    "compress",
+    "locate",
+]
 
 Floats = npt.NDArray[np.float32]
 
@@ -61,7 +72,9 @@ def compress(scaled: Floats) -> Floats:
 def locate(values: Floats, low: np.float32, unit: np.float32) -> Floats:
     """The place of values >= low in the clip range as integers in [-512, 512]; unit is 1024 over the range's length."""
     place = (values - low) * unit + np.float32(0.5)
-    return (np.where(place < 1024, place, np.float32(1024)).astype(np.int32) - 512).astype(np.float32)
+    return (np.where(place < 1024, place, np.float32(1024)).astype(np.int32) - 512).astype(
+        np.float32
+    )
 
 
 def apply_network(
@@ -74,12 +87,16 @@ def apply_network(
     """
     values = clip(decoded, low, high)
     out = np.empty_like(values)
-    with np.errstate(over="ignore", invalid="ignore"):  # extreme constants may overflow on the way: the clip has the last word
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # extreme constants may overflow on the way: the clip has the last word
         for step in range(len(values)):
             for start, features in _features(values, step, low, inverse, unit):
                 centre = values[step, start : start + features.shape[1]]
                 correction = _network(features.reshape(FEATURES, -1), weights, scales, biases)
-                out[step, start : start + len(centre)] = clip(centre + correction.reshape(centre.shape), low, high)
+                out[step, start : start + len(centre)] = clip(
+                    centre + correction.reshape(centre.shape), low, high
+                )
     return out
 
 
@@ -93,7 +110,9 @@ def apply_cross(
     width = len(weights[0])
     out = np.empty_like(values)
     planes = max(1, _SLAB // (y * x))
-    frames: dict[int, Floats] = {}  # first-layer outputs of a frame, its edges repeated once along z, y, x
+    frames: dict[
+        int, Floats
+    ] = {}  # first-layer outputs of a frame, its edges repeated once along z, y, x
     with np.errstate(over="ignore", invalid="ignore"):
         for step in range(steps):
             for ahead in range(step, min(step + 2, steps)):
@@ -101,26 +120,40 @@ def apply_cross(
                     first = np.empty((width, z, y, x), dtype=np.float32)
                     for start, features in _features(values, ahead, low, inverse, unit):
                         part = first[:, start : start + features.shape[1]]
-                        part[...] = _hidden(features.reshape(FEATURES, -1), weights[0], scales[0], biases[0]).reshape(part.shape)
+                        part[...] = _hidden(
+                            features.reshape(FEATURES, -1), weights[0], scales[0], biases[0]
+                        ).reshape(part.shape)
                     frames[ahead] = np.pad(first, ((0, 0), (1, 1), (1, 1), (1, 1)), mode="edge")
             frames.pop(step - 2, None)
             for start in range(0, z, planes):
                 stop = min(start + planes, z)
                 taken = [
-                    frames[min(max(step + dt, 0), steps - 1)][:, 1 + start + dz : 1 + stop + dz, 1 + dy : 1 + dy + y, 1 + dx : 1 + dx + x]
+                    frames[min(max(step + dt, 0), steps - 1)][
+                        :, 1 + start + dz : 1 + stop + dz, 1 + dy : 1 + dy + y, 1 + dx : 1 + dx + x
+                    ]
                     for dt, dz, dy, dx in CROSS
                 ]
-                correction = _network(np.stack(taken, axis=1).reshape(len(CROSS) * width, -1), weights[1:], scales[1:], biases[1:])
+                correction = _network(
+                    np.stack(taken, axis=1).reshape(len(CROSS) * width, -1),
+                    weights[1:],
+                    scales[1:],
+                    biases[1:],
+                )
                 centre = values[step, start:stop]
                 out[step, start:stop] = clip(centre + correction.reshape(centre.shape), low, high)
     return out
 
 
-def _features(values: Floats, step: int, low: np.float32, inverse: np.float32, unit: np.float32) -> Iterator[tuple[int, Floats]]:
+def _features(
+    values: Floats, step: int, low: np.float32, inverse: np.float32, unit: np.float32
+) -> Iterator[tuple[int, Floats]]:
     """Of one frame of the clipped values, some planes at a time: the first plane, and the features (FEATURES, planes, y, x)."""
     steps, z, y, x = values.shape
     planes = max(1, _SLAB // (y * x))
-    frames = {at: np.pad(values[min(max(step + at, 0), steps - 1)], _HALO, mode="edge") for at in (-1, 0, 1)}
+    frames = {
+        at: np.pad(values[min(max(step + at, 0), steps - 1)], _HALO, mode="edge")
+        for at in (-1, 0, 1)
+    }
     for start in range(0, z, planes):
         stop = min(start + planes, z)
         centre = values[step, start:stop]
@@ -133,12 +166,16 @@ def _features(values: Floats, step: int, low: np.float32, inverse: np.float32, u
         yield start, features
 
 
-def centre_features(centre: Floats, low: np.float32, inverse: np.float32, unit: np.float32) -> Floats:
+def centre_features(
+    centre: Floats, low: np.float32, inverse: np.float32, unit: np.float32
+) -> Floats:
     """The two features of clipped values themselves, (2, ...)."""
     return np.stack([locate(centre, low, unit), compress((centre - low) * inverse)])
 
 
-def _network(inputs: Floats, weights: list[Floats], scales: list[np.float32], biases: list[Floats]) -> Floats:
+def _network(
+    inputs: Floats, weights: list[Floats], scales: list[np.float32], biases: list[Floats]
+) -> Floats:
     for weight, scale, bias in zip(weights[:-1], scales[:-1], biases[:-1], strict=True):
         inputs = _hidden(inputs, weight, scale, bias)
     return _layer(inputs, weights[-1], scales[-1], biases[-1])

@@ -22,7 +22,10 @@ MAX_WEIGHT = 31
 def _model(spread: int) -> tuple[list[int], list[int]]:
     """The frequencies of the weights -MAX_WEIGHT to MAX_WEIGHT, and their running sums from 0 to the total."""
     square = spread * spread
-    frequencies = [1 + (square * square << 16) // (square + weight * weight) ** 2 for weight in range(-MAX_WEIGHT, MAX_WEIGHT + 1)]
+    frequencies = [
+        1 + (square * square << 16) // (square + weight * weight) ** 2
+        for weight in range(-MAX_WEIGHT, MAX_WEIGHT + 1)
+    ]
     return frequencies, [0, *accumulate(frequencies)]
 
 
@@ -32,7 +35,10 @@ def best_spread(weights: Sequence[int]) -> int:
 
     def bits(spread: int) -> float:
         frequencies, starts = _model(spread)
-        return sum(number * log2(starts[-1] / frequencies[weight + MAX_WEIGHT]) for weight, number in numbers)
+        return sum(
+            number * log2(starts[-1] / frequencies[weight + MAX_WEIGHT])
+            for weight, number in numbers
+        )
 
     return min(range(1, 256), key=bits)
 

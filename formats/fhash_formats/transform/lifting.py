@@ -17,7 +17,12 @@ from numpy.typing import DTypeLike, NDArray
 
 from fhash_formats import native
 from fhash_formats.errors import InputError
-from fhash_formats.transform.lifting_portable import KIND_NUMBERS, forward_axis, forward_tile, inverse_tile
+from fhash_formats.transform.lifting_portable import (
+    KIND_NUMBERS,
+    forward_axis,
+    forward_tile,
+    inverse_tile,
+)
 from fhash_formats.transform.spec import AXES, TransformSpec
 from fhash_formats.transform.weights import axis_norms, band_lengths, plane_norms
 
@@ -53,12 +58,26 @@ class _Plan:
         rank = 1 if inverse else 0
         ranks = [0 if matrix is None else matrix.shape[rank] for matrix in self.matrices]
         # Along x the library takes the transpose, whose rows lie along the results.
-        held = [None if m is None else np.ascontiguousarray(m.T if axis == 3 else m) for axis, m in enumerate(self.matrices)]
+        held = [
+            None if m is None else np.ascontiguousarray(m.T if axis == 3 else m)
+            for axis, m in enumerate(self.matrices)
+        ]
         pointers = (ctypes.c_void_p * 4)(*(None if m is None else m.ctypes.data for m in held))
-        shape, kinds = (ctypes.c_int64 * 4)(*values.shape), (ctypes.c_int64 * 4)(*(KIND_NUMBERS[kind] for kind in self.kinds))
+        shape, kinds = (
+            (ctypes.c_int64 * 4)(*values.shape),
+            (ctypes.c_int64 * 4)(*(KIND_NUMBERS[kind] for kind in self.kinds)),
+        )
         scales = (ctypes.c_void_p(array.ctypes.data) for array in (self.scale_tz, self.scale_yx))
         ends = (ctypes.c_void_p(array.ctypes.data) for array in (values, result))
-        code = function(*ends, shape, kinds, (ctypes.c_int64 * 4)(*self.depths), (ctypes.c_int64 * 4)(*ranks), pointers, *scales)
+        code = function(
+            *ends,
+            shape,
+            kinds,
+            (ctypes.c_int64 * 4)(*self.depths),
+            (ctypes.c_int64 * 4)(*ranks),
+            pointers,
+            *scales,
+        )
         if code == -2:
             raise MemoryError("no memory for the transform of a tile")
         assert code == 0, f"the native transform refused its arguments ({code})"
@@ -72,7 +91,9 @@ class Transform:
     float64, the type of values, coefficients and arithmetic. Raises InputError.
     """
 
-    def __init__(self, spec: TransformSpec, shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> None:
+    def __init__(
+        self, spec: TransformSpec, shape: tuple[int, ...], dtype: DTypeLike = np.float32
+    ) -> None:
         self.spec = spec
         self.shape = tuple(int(n) for n in shape)
         self.dtype: np.dtype[Any] = np.dtype(dtype)
@@ -82,14 +103,18 @@ class Transform:
             raise InputError(f"a transform works in float32 or float64, not {self.dtype}")
         for name, axis, n in zip(AXES, spec.axes, self.shape, strict=True):
             if axis.basis is not None and axis.basis.n != n:
-                raise InputError(f"the basis along {name} is for {axis.basis.n} vertices, the tile has {n}")
+                raise InputError(
+                    f"the basis along {name} is for {axis.basis.n} vertices, the tile has {n}"
+                )
         self._plans: dict[int, _Plan] = {}
 
     @cached_property
     def norms(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Norms of the synthesis vectors, float64, as two factors: (t, z) and (y, x)."""
         t, z, y, x = self.spec.axes
-        return axis_norms(t, self.shape[0])[:, None] * axis_norms(z, self.shape[1]), plane_norms(y, x, *self.shape[2:])
+        return axis_norms(t, self.shape[0])[:, None] * axis_norms(z, self.shape[1]), plane_norms(
+            y, x, *self.shape[2:]
+        )
 
     @property
     def weights(self) -> NDArray[np.float64]:
@@ -135,7 +160,9 @@ class Transform:
         return _Plan(
             kinds=tuple(axis.kind for axis in self.spec.axes),
             depths=tuple(axis.depth for axis in self.spec.axes),
-            matrices=tuple(None if basis is None else basis.analysis.astype(self.dtype) for basis in bases),
+            matrices=tuple(
+                None if basis is None else basis.analysis.astype(self.dtype) for basis in bases
+            ),
             scale_tz=self.norms[0].astype(self.dtype),
             scale_yx=self.norms[1].astype(self.dtype),
         )
@@ -143,15 +170,25 @@ class Transform:
     def _inverse_plan(self, lod: int) -> _Plan:
         """The inverse of the first bands of z, y, x: what is left of each wavelet after `lod` levels, its gain on a constant taken out."""
         stopped = (0, *(min(lod, axis.depth) for axis in self.spec.axes[1:]))
-        depths = tuple(axis.depth - levels for axis, levels in zip(self.spec.axes, stopped, strict=True))
-        kinds = tuple("none" if axis.wavelet and depth == 0 else axis.kind for axis, depth in zip(self.spec.axes, depths, strict=True))
+        depths = tuple(
+            axis.depth - levels for axis, levels in zip(self.spec.axes, stopped, strict=True)
+        )
+        kinds = tuple(
+            "none" if axis.wavelet and depth == 0 else axis.kind
+            for axis, depth in zip(self.spec.axes, depths, strict=True)
+        )
         t, z, y, x = self._bands(lod)
-        gains = [_gain(axis.kind, n, levels) for axis, n, levels in zip(self.spec.axes, self.shape, stopped, strict=True)]
+        gains = [
+            _gain(axis.kind, n, levels)
+            for axis, n, levels in zip(self.spec.axes, self.shape, stopped, strict=True)
+        ]
         bases = [axis.basis for axis in self.spec.axes]
         return _Plan(
             kinds=kinds,
             depths=depths,
-            matrices=tuple(None if basis is None else basis.synthesis.astype(self.dtype) for basis in bases),
+            matrices=tuple(
+                None if basis is None else basis.synthesis.astype(self.dtype) for basis in bases
+            ),
             scale_tz=(1.0 / (self.norms[0][:t, :z] * gains[1])).astype(self.dtype),
             scale_yx=(1.0 / (self.norms[1][:y, :x] * (gains[2] * gains[3]))).astype(self.dtype),
         )
@@ -160,12 +197,17 @@ class Transform:
         """Shape of the coefficients that `lod` needs."""
         return (
             self.shape[0],
-            *(band_lengths(n, min(lod, axis.depth))[-1] for axis, n in zip(self.spec.axes[1:], self.shape[1:], strict=True)),
+            *(
+                band_lengths(n, min(lod, axis.depth))[-1]
+                for axis, n in zip(self.spec.axes[1:], self.shape[1:], strict=True)
+            ),
         )
 
     def _checked(self, values: Values) -> Values:
         if values.shape != self.shape or values.dtype != self.dtype:
-            raise InputError(f"this transform takes {self.dtype} of shape {self.shape}, not {values.dtype} of {values.shape}")
+            raise InputError(
+                f"this transform takes {self.dtype} of shape {self.shape}, not {values.dtype} of {values.shape}"
+            )
         return np.ascontiguousarray(values)
 
 
@@ -185,7 +227,12 @@ def _gain(kind: str, n: int, levels: int) -> float:
 def _halved(values: Values, axis: int) -> Values:
     """Every second entry along an axis after the filter (1/4, 1/2, 1/4), clamped at the ends."""
     moved = np.moveaxis(values, axis, 0)
-    before, after = np.concatenate([moved[:1], moved])[:-1][0::2], np.concatenate([moved[1:], moved[-1:]])[0::2]
+    before, after = (
+        np.concatenate([moved[:1], moved])[:-1][0::2],
+        np.concatenate([moved[1:], moved[-1:]])[0::2],
+    )
     kind = values.dtype.type
     with np.errstate(all="ignore"):
-        return np.ascontiguousarray(np.moveaxis((before + after) * kind(0.25) + moved[0::2] * kind(0.5), 0, axis))
+        return np.ascontiguousarray(
+            np.moveaxis((before + after) * kind(0.25) + moved[0::2] * kind(0.5), 0, axis)
+        )

@@ -22,13 +22,23 @@ _BLOCK = 1 << 15  # numbers of a matrix product that are worked on at once, to s
 
 _STEPS: dict[str, tuple[tuple[bool, float], ...]] = {
     "5/3": ((True, -0.5), (False, 0.25)),
-    "9/7": ((True, -1.586134342059924), (False, -0.052980118572961), (True, 0.882911075530934), (False, 0.443506852043971)),
+    "9/7": (
+        (True, -1.586134342059924),
+        (False, -0.052980118572961),
+        (True, 0.882911075530934),
+        (False, 0.443506852043971),
+    ),
 }
 """(whether the odd half changes, factor) of each lifting step. 9/7: Daubechies and Sweldens 1998, without the last scaling by K."""
 
 
 def forward_tile(
-    values: Values, kinds: Sequence[str], depths: Sequence[int], matrices: Sequence[Values | None], scale_tz: Values, scale_yx: Values
+    values: Values,
+    kinds: Sequence[str],
+    depths: Sequence[int],
+    matrices: Sequence[Values | None],
+    scale_tz: Values,
+    scale_yx: Values,
 ) -> Values:
     """Coefficients of a tile (t, z, y, x): along t, then z, then y and x, then times scale_tz (t, z), then times scale_yx (y, x)."""
     result = values.copy()
@@ -47,7 +57,12 @@ def forward_tile(
 
 
 def inverse_tile(
-    coefficients: Values, kinds: Sequence[str], depths: Sequence[int], matrices: Sequence[Values | None], scale_tz: Values, scale_yx: Values
+    coefficients: Values,
+    kinds: Sequence[str],
+    depths: Sequence[int],
+    matrices: Sequence[Values | None],
+    scale_tz: Values,
+    scale_yx: Values,
 ) -> Values:
     """Values of a tile: the steps of `forward_tile` undone in the opposite order; the scales are the reciprocals."""
     result = (coefficients * scale_tz[:, :, None, None]) * scale_yx
@@ -102,16 +117,23 @@ def inverse_axis(bands: Values, axis: int, kind: str) -> Values:
 def _lift(even: Values, odd: Values, changes_odd: bool, factor: float) -> None:
     """One lifting step in place; beyond its ends the whole row is mirrored about its first and last number."""
     if changes_odd:
-        odd += odd.dtype.type(factor) * (even[: len(odd)] + np.concatenate([even[1:], even[-1:]])[: len(odd)])
+        odd += odd.dtype.type(factor) * (
+            even[: len(odd)] + np.concatenate([even[1:], even[-1:]])[: len(odd)]
+        )
     else:
-        even += even.dtype.type(factor) * (np.concatenate([odd[:1], odd])[: len(even)] + np.concatenate([odd, odd[-1:]])[: len(even)])
+        even += even.dtype.type(factor) * (
+            np.concatenate([odd[:1], odd])[: len(even)]
+            + np.concatenate([odd, odd[-1:]])[: len(even)]
+        )
 
 
 def _coupled(kinds: Sequence[str], depths: Sequence[int]) -> bool:
     return kinds[2] == kinds[3] and kinds[2] in ("haar", "5/3", "9/7") and depths[2] == depths[3]
 
 
-def _forward_packet(values: Values, axis: int, kind: str, depth: int, matrix: Values | None) -> Values:
+def _forward_packet(
+    values: Values, axis: int, kind: str, depth: int, matrix: Values | None
+) -> Values:
     if matrix is not None:
         return _product(matrix, values, axis)
     moved = np.moveaxis(values, axis, 0)
@@ -122,7 +144,9 @@ def _forward_packet(values: Values, axis: int, kind: str, depth: int, matrix: Va
     return values
 
 
-def _inverse_packet(values: Values, axis: int, kind: str, depth: int, matrix: Values | None) -> Values:
+def _inverse_packet(
+    values: Values, axis: int, kind: str, depth: int, matrix: Values | None
+) -> Values:
     if matrix is not None:
         return _product(matrix, values, axis)
     moved = np.moveaxis(values, axis, 0)

@@ -36,7 +36,9 @@ _FILE = Path(__file__).with_name("mask_prior.bin")
 
 def blank_mask_state() -> State:
     """Nothing known: even odds, and weights that take the estimates at their word."""
-    return State.even(slots=sum(SIZES), weights=[(LEVELS * LANES, 3277), (NEAR * LANES, 0)], simples=SIMPLES)
+    return State.even(
+        slots=sum(SIZES), weights=[(LEVELS * LANES, 3277), (NEAR * LANES, 0)], simples=SIMPLES
+    )
 
 
 @cache

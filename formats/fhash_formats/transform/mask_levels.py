@@ -51,13 +51,25 @@ class MaskLevels:
 
     def __post_init__(self) -> None:
         numbers = all(type(edge) in (int, float) and abs(edge) <= LARGEST for edge in self.edges)
-        if len(self.edges) > MAX_EDGES or not numbers or any(low >= high for low, high in pairwise(self.edges)):
-            raise InputError(f"edges of a mask are {self.edges!r:.80}; at most {MAX_EDGES} ascending numbers are needed")
+        if (
+            len(self.edges) > MAX_EDGES
+            or not numbers
+            or any(low >= high for low, high in pairwise(self.edges))
+        ):
+            raise InputError(
+                f"edges of a mask are {self.edges!r:.80}; at most {MAX_EDGES} ascending numbers are needed"
+            )
         for scores in (self.scores, *([self.others] if self.others else [])):
-            if len(scores) != len(self.edges) + 1 or not all(type(n) is int and 0 <= n <= MAX_SCORE for n in scores):
-                raise InputError(f"scores of a mask are {scores!r:.80}; {len(self.edges) + 1} whole numbers to {MAX_SCORE} are needed")
+            if len(scores) != len(self.edges) + 1 or not all(
+                type(n) is int and 0 <= n <= MAX_SCORE for n in scores
+            ):
+                raise InputError(
+                    f"scores of a mask are {scores!r:.80}; {len(self.edges) + 1} whole numbers to {MAX_SCORE} are needed"
+                )
         if type(self.reach) is not int or not 0 <= self.reach <= MAX_REACH:
-            raise InputError(f"reach of a mask is {self.reach!r:.40}; a whole number to {MAX_REACH} is needed")
+            raise InputError(
+                f"reach of a mask is {self.reach!r:.40}; a whole number to {MAX_REACH} is needed"
+            )
 
     def levels(self, values: npt.NDArray[Any]) -> tuple[Levels, Levels]:
         """The level 0 to 31 of each vertex (t, z, y, x), and the second level 0 to 15; values are finite, of the working type."""
@@ -76,18 +88,36 @@ class MaskLevels:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values, without those that are the default."""
-        named = {"edges": list(self.edges), "scores": list(self.scores), "others": list(self.others), "reach": self.reach}
+        named = {
+            "edges": list(self.edges),
+            "scores": list(self.scores),
+            "others": list(self.others),
+            "reach": self.reach,
+        }
         return {name: value for name, value in named.items() if value and value != [0]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> MaskLevels:
         """From `to_dict`'s values; raises InputError for anything else."""
-        if not isinstance(values, Mapping) or not set(values) <= {"edges", "scores", "others", "reach"}:
-            raise InputError(f"mask is {values!r:.80}; an object of edges, scores, others and reach is needed")
-        lists = {name: values.get(name, default) for name, default in (("edges", []), ("scores", [0]), ("others", []))}
+        if not isinstance(values, Mapping) or not set(values) <= {
+            "edges",
+            "scores",
+            "others",
+            "reach",
+        }:
+            raise InputError(
+                f"mask is {values!r:.80}; an object of edges, scores, others and reach is needed"
+            )
+        lists = {
+            name: values.get(name, default)
+            for name, default in (("edges", []), ("scores", [0]), ("others", []))
+        }
         if not all(isinstance(numbers, list | tuple) for numbers in lists.values()):
             raise InputError("edges, scores and others of a mask are lists")
-        return cls(**{name: tuple(numbers) for name, numbers in lists.items()}, reach=values.get("reach", 0))
+        return cls(
+            **{name: tuple(numbers) for name, numbers in lists.items()},
+            reach=values.get("reach", 0),
+        )
 
 
 def _summed(scores: npt.NDArray[np.int32], reach: int) -> npt.NDArray[np.int32]:

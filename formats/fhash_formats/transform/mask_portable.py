@@ -14,7 +14,18 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.transform import coder_portable
-from fhash_formats.transform.coder_portable import _ARRAYS, _LISTS, Memory, Sequence, Tables, _chance, _code, _finish, _memory, _mix
+from fhash_formats.transform.coder_portable import (
+    _ARRAYS,
+    _LISTS,
+    Memory,
+    Sequence,
+    Tables,
+    _chance,
+    _code,
+    _finish,
+    _memory,
+    _mix,
+)
 from fhash_formats.transform.prior import State
 
 __all__ = ["decode", "encode"]
@@ -22,7 +33,19 @@ __all__ = ["decode", "encode"]
 Mask = npt.NDArray[np.bool_]
 Levels = npt.NDArray[np.uint8]
 
-CONTEXTS, LEVELS, EVEN, SEGMENT, NEAR, PADDING, NOTHING, QUIET, LIMIT, RATE, FAST = 10, 32, 16, 16, 16, 2, 3, 12, 400, 2, 20
+CONTEXTS, LEVELS, EVEN, SEGMENT, NEAR, PADDING, NOTHING, QUIET, LIMIT, RATE, FAST = (
+    10,
+    32,
+    16,
+    16,
+    16,
+    2,
+    3,
+    12,
+    400,
+    2,
+    20,
+)
 SIZES = (512, 1024, 4096, 2048, 2048, 1920, 2592, 4096, 4096, 2048)
 STARTS = tuple(sum(SIZES[:i]) for i in range(CONTEXTS))
 LANES = 2 * CONTEXTS
@@ -42,7 +65,14 @@ def encode(mask: Mask, levels: tuple[Levels, Levels], state: State) -> bytes:
 def decode(data: bytes, levels: tuple[Levels, Levels], state: State) -> Mask:
     """The mask that was coded; any other bytes give some mask."""
     compiled = _compiled()
-    bits = _start(compiled, True, np.zeros(levels[0].size, np.int64), levels, _memory(state, compiled is not None), data)[0]
+    bits = _start(
+        compiled,
+        True,
+        np.zeros(levels[0].size, np.int64),
+        levels,
+        _memory(state, compiled is not None),
+        data,
+    )[0]
     return np.array(bits, dtype=np.uint8).reshape(levels[0].shape).view(np.bool_)
 
 
@@ -78,10 +108,17 @@ def _start(
     n0, n1, n2, n3 = shape = levels[0].shape
     rows, segments = n0 * n1 * n2, -(-n3 // SEGMENT)
     # The first row stands for those that do not exist.
-    known, states = np.zeros((rows + 1) * (n3 + 2 * PADDING), np.int64), np.full(rows * (segments + 1), NOTHING, np.int64)
+    known, states = (
+        np.zeros((rows + 1) * (n3 + 2 * PADDING), np.int64),
+        np.full(rows * (segments + 1), NOTHING, np.int64),
+    )
     first, second = (level.astype(np.int64).ravel() for level in levels)
     source = np.frombuffer(data, dtype=np.uint8).astype(np.int64)
-    span, where, inputs = np.zeros(4, np.int64), np.zeros(CONTEXTS, np.int64), np.zeros(LANES, np.int64)
+    span, where, inputs = (
+        np.zeros(4, np.int64),
+        np.zeros(CONTEXTS, np.int64),
+        np.zeros(LANES, np.int64),
+    )
     work: list[Sequence] = [bits, first, second, known, states, source, span, where, inputs]
     if compiled is None:
         work = [part.tolist() for part in work]
@@ -89,7 +126,16 @@ def _start(
     return work[0], out
 
 
-def _learn(where: Sequence, inputs: Sequence, first: int, second: int, p: int, bit: int, memory: Memory, rate: Sequence) -> None:
+def _learn(
+    where: Sequence,
+    inputs: Sequence,
+    first: int,
+    second: int,
+    p: int,
+    bit: int,
+    memory: Memory,
+    rate: Sequence,
+) -> None:
     weights = memory.weights
     target = 65535 if bit else 0
     error = ((target - p) * RATE) >> 4
@@ -192,7 +238,16 @@ def _run(
                             if bits[at + x] != same:
                                 uniform = 0
                                 break
-                    if _chance(uniform, (same * 3 + away // 4) * 5 + around, decoding, memory, rate, span, data, out):
+                    if _chance(
+                        uniform,
+                        (same * 3 + away // 4) * 5 + around,
+                        decoding,
+                        memory,
+                        rate,
+                        span,
+                        data,
+                        out,
+                    ):
                         for x in range(x0, x1):
                             bits[at + x] = same
                             if level[at + x] < EVEN:
@@ -206,25 +261,82 @@ def _run(
                 a = level[at + x]
                 ahead = level[at + x + 1] if x + 1 < n3 else a
                 half = a >> 1
-                w, n, p, b = known[row + x - 1] & 1, known[north + x] & 1, known[below + x] & 1, known[back + x] & 1
+                w, n, p, b = (
+                    known[row + x - 1] & 1,
+                    known[north + x] & 1,
+                    known[below + x] & 1,
+                    known[back + x] & 1,
+                )
                 nw, ne = known[north + x - 1] & 1, known[north + x + 1] & 1
-                pw, pe, ps, pn = known[below + x - 1] & 1, known[below + x + 1] & 1, known[below_s + x] & 1, known[below_n + x] & 1
-                bw, be, bs, bn = known[back + x - 1] & 1, known[back + x + 1] & 1, known[back_s + x] & 1, known[back_n + x] & 1
+                pw, pe, ps, pn = (
+                    known[below + x - 1] & 1,
+                    known[below + x + 1] & 1,
+                    known[below_s + x] & 1,
+                    known[below_n + x] & 1,
+                )
+                bw, be, bs, bn = (
+                    known[back + x - 1] & 1,
+                    known[back + x + 1] & 1,
+                    known[back_s + x] & 1,
+                    known[back_n + x] & 1,
+                )
                 bf, bp = known[back_f + x] & 1, known[back_b + x] & 1
-                w2, above2, p2, b2 = known[row + x - 2] & 1, known[north2 + x] & 1, known[below2 + x] & 1, known[back2 + x] & 1
+                w2, above2, p2, b2 = (
+                    known[row + x - 2] & 1,
+                    known[north2 + x] & 1,
+                    known[below2 + x] & 1,
+                    known[back2 + x] & 1,
+                )
                 nearest = w | n << 1 | p << 2 | b << 3
                 before = b | be << 1 | bw << 2 | bs << 3 | bn << 4 | bf << 5 | bp << 6
-                sums = ((w + n + nw + ne) * 6 + p + pw + pe + ps + pn) * 8 + b + bw + be + bs + bn + bf + bp
+                sums = (
+                    ((w + n + nw + ne) * 6 + p + pw + pe + ps + pn) * 8
+                    + b
+                    + bw
+                    + be
+                    + bs
+                    + bn
+                    + bf
+                    + bp
+                )
                 against = (a * 3 + (known[row + x - 1] >> 1)) * 3 + (known[north + x] >> 1)
                 where[0] = a * NEAR + nearest
                 where[1] = STARTS[1] + (a * 16 + other[at + x]) * 2 + w
-                where[2] = STARTS[2] + (nearest | w2 << 4 | nw << 5 | ne << 6 | above2 << 7 | pe << 8 | ps << 9 | be << 10 | bs << 11)
-                where[3] = STARTS[3] + ((half * 8 + (ahead >> 2)) * 8 + (level[south + x] >> 2)) * 2 + w
-                where[4] = STARTS[4] + ((half * 8 + (level[front + x] >> 2)) * 8 + (level[later + x] >> 2)) * 2 + p
+                where[2] = STARTS[2] + (
+                    nearest
+                    | w2 << 4
+                    | nw << 5
+                    | ne << 6
+                    | above2 << 7
+                    | pe << 8
+                    | ps << 9
+                    | be << 10
+                    | bs << 11
+                )
+                where[3] = (
+                    STARTS[3] + ((half * 8 + (ahead >> 2)) * 8 + (level[south + x] >> 2)) * 2 + w
+                )
+                where[4] = (
+                    STARTS[4]
+                    + ((half * 8 + (level[front + x] >> 2)) * 8 + (level[later + x] >> 2)) * 2
+                    + p
+                )
                 where[5] = STARTS[5] + sums * 8 + (a >> 2)
-                where[6] = STARTS[6] + (against * 3 + (known[below + x] >> 1)) * 3 + (known[back + x] >> 1)
+                where[6] = (
+                    STARTS[6] + (against * 3 + (known[below + x] >> 1)) * 3 + (known[back + x] >> 1)
+                )
                 where[7] = STARTS[7] + ((a >> 3) << 10 | before | w << 7 | n << 8 | p << 9)
-                where[8] = STARTS[8] + (nearest | w2 << 4 | above2 << 5 | p2 << 6 | b2 << 7 | be << 8 | bs << 9 | bf << 10 | pe << 11)
+                where[8] = STARTS[8] + (
+                    nearest
+                    | w2 << 4
+                    | above2 << 5
+                    | p2 << 6
+                    | b2 << 7
+                    | be << 8
+                    | bs << 9
+                    | bf << 10
+                    | pe << 11
+                )
                 where[9] = STARTS[9] + (half << 7 | before)
                 first, second = a * LANES, (LEVELS + nearest) * LANES
                 probability = _mix(CONTEXTS, where, inputs, first, second, memory, tables)

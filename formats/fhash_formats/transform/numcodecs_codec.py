@@ -45,12 +45,16 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
         transform: TransformSpec | Mapping[str, Any] | None = None,
     ) -> None:
         self.quality = Quality(max_error=max_error, max_error_rel=max_error_rel, step=step)
-        self.transform = TransformSpec.from_dict(transform) if isinstance(transform, Mapping) else transform
+        self.transform = (
+            TransformSpec.from_dict(transform) if isinstance(transform, Mapping) else transform
+        )
 
     def get_config(self) -> dict[str, Any]:
         """JSON values from which `from_config` makes the codec again."""
         config: dict[str, Any] = {"id": self.codec_id, **self.quality.to_dict()}
-        return config if self.transform is None else {**config, "transform": self.transform.to_dict()}
+        return (
+            config if self.transform is None else {**config, "transform": self.transform.to_dict()}
+        )
 
     def encode(self, buf: Any) -> bytes:
         """The bytes of an array; raises InputError for what has no type of its own, such as bytes."""
@@ -58,7 +62,11 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
             raise InputError("fhash.transform codes numbers: give an array, not bytes")
         values = np.asarray(buf)
         dtype = supported(values.dtype)
-        head = _MAGIC + dtype.str[1:].encode("ascii") + struct.pack(f"<B{values.ndim}Q", values.ndim, *values.shape)
+        head = (
+            _MAGIC
+            + dtype.str[1:].encode("ascii")
+            + struct.pack(f"<B{values.ndim}Q", values.ndim, *values.shape)
+        )
         data = encode_chunk(values, **self.quality.to_dict(), transform=self.transform)
         return head + zlib.crc32(head).to_bytes(4, "little") + data
 

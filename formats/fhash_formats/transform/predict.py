@@ -51,7 +51,11 @@ def _blank() -> State:
 def integers_of(values: Values, counts: Mask | None, predictor: Predictor) -> Integers | None:
     """The integers nearest to values of any real type, 0 where they do not count; None where one would be too large."""
     result = np.empty(values.shape, np.int32)
-    flat, marks, out = values.reshape(-1), None if counts is None else counts.reshape(-1), result.reshape(-1)
+    flat, marks, out = (
+        values.reshape(-1),
+        None if counts is None else counts.reshape(-1),
+        result.reshape(-1),
+    )
     for piece in pieces(flat.size):
         with np.errstate(all="ignore"):
             # Whole numbers of 64 bits are subtracted as float64: near the ends a bound may be missed, which the encoder sees.
@@ -72,7 +76,9 @@ def values_of(integers: Integers, predictor: Predictor) -> npt.NDArray[np.float6
     return values
 
 
-def encode_predicted(integers: Integers, care: Mask | None, predictor: Predictor) -> tuple[bytes, Integers]:
+def encode_predicted(
+    integers: Integers, care: Mask | None, predictor: Predictor
+) -> tuple[bytes, Integers]:
     """Code integers (t, z, y, x), each within +-LARGEST: the bytes, and the integers that they decode to.
 
     care: what must come back as it is (bool, same shape; None is all); the rest becomes what is predicted for it.
@@ -100,7 +106,9 @@ def encode_predicted(integers: Integers, care: Mask | None, predictor: Predictor
         capacity = size
 
 
-def decode_predicted(data: bytes | memoryview, shape: tuple[int, ...], predictor: Predictor) -> Integers:
+def decode_predicted(
+    data: bytes | memoryview, shape: tuple[int, ...], predictor: Predictor
+) -> Integers:
     """The integers (t, z, y, x) of a shape; raises DamagedFileError for bytes that no encoder writes, as far as that shows."""
     library = native.library()
     if library is None:

@@ -9,7 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
-from fhash_formats.transform.coder_portable import _LISTS, _chance, _code, _finish, _learn, _log16, _memory, _mix
+from fhash_formats.transform.coder_portable import (
+    _LISTS,
+    _chance,
+    _code,
+    _finish,
+    _learn,
+    _log16,
+    _memory,
+    _mix,
+)
 from fhash_formats.transform.predictor import CLASSES, Pass, Predictor
 from fhash_formats.transform.prior import State
 
@@ -19,15 +28,34 @@ Integers = npt.NDArray[np.int32]
 Lattice = npt.NDArray[np.int64]
 Care = npt.NDArray[np.bool_] | None
 
-CONTEXTS, LANES, DECISIONS, UNARY, LEVELS, HALF_LEVELS, ACTIVITIES, SLOPES = 7, 14, 16, 14, 48, 24, 32, 27
-SIZES = (LEVELS * 5, ACTIVITIES * SLOPES, CLASSES * HALF_LEVELS * 5, 3125, 81 * 5 * 8, 81 * HALF_LEVELS, ACTIVITIES * HALF_LEVELS * 5)
+CONTEXTS, LANES, DECISIONS, UNARY, LEVELS, HALF_LEVELS, ACTIVITIES, SLOPES = (
+    7,
+    14,
+    16,
+    14,
+    48,
+    24,
+    32,
+    27,
+)
+SIZES = (
+    LEVELS * 5,
+    ACTIVITIES * SLOPES,
+    CLASSES * HALF_LEVELS * 5,
+    3125,
+    81 * 5 * 8,
+    81 * HALF_LEVELS,
+    ACTIVITIES * HALF_LEVELS * 5,
+)
 STARTS = tuple(sum(SIZES[:i]) for i in range(CONTEXTS))
 ESCAPES, ROWS = 160, 192
 SIDE, BEFORE, DIAGONAL, COARSE = 20, 15, 7, 4
 MOST, CLIP, ACTIVE, SLOW_LIMIT = 1 << 27, 4095, 14, 400
 
 
-def encode(integers: Integers, care: Care, predictor: Predictor, state: State) -> tuple[bytes, Integers]:
+def encode(
+    integers: Integers, care: Care, predictor: Predictor, state: State
+) -> tuple[bytes, Integers]:
     """The bytes, and the integers that they decode to."""
     q = integers.astype(np.int64)
     coder = _Coder(state, None)
@@ -69,8 +97,13 @@ class _Coder:
             view = q[tuple(where)]
             if not view.size:
                 continue
-            found: tuple[Lattice, Lattice] = np.zeros(view.shape, np.int64), np.zeros(view.shape, np.int64)
-            _Run(self, part, weights, (coarse, errors), found).run(view, None if care is None else care[tuple(where)])
+            found: tuple[Lattice, Lattice] = (
+                np.zeros(view.shape, np.int64),
+                np.zeros(view.shape, np.int64),
+            )
+            _Run(self, part, weights, (coarse, errors), found).run(
+                view, None if care is None else care[tuple(where)]
+            )
             if part.axis < 0:
                 coarse, errors = found
                 continue
@@ -81,7 +114,9 @@ class _Coder:
             coarse, errors = both
 
     def simple(self, bit: int, number: int) -> int:
-        return _chance(bit, number, self.decodes, self.memory, _LISTS.rate, self.span, self.data, self.out)
+        return _chance(
+            bit, number, self.decodes, self.memory, _LISTS.rate, self.span, self.data, self.out
+        )
 
     def plain(self, bit: int) -> int:
         return _code(bit, 32768, self.decodes, self.span, self.data, self.out)
@@ -100,7 +135,12 @@ class _Run:
     """One pass: the known lattice and that of the pass, each as values and differences."""
 
     def __init__(
-        self, coder: _Coder, part: Pass, weights: tuple[int, ...], coarse: tuple[Lattice, Lattice], found: tuple[Lattice, Lattice]
+        self,
+        coder: _Coder,
+        part: Pass,
+        weights: tuple[int, ...],
+        coarse: tuple[Lattice, Lattice],
+        found: tuple[Lattice, Lattice],
     ) -> None:
         self.coder, self.part, self.weights = coder, part, weights
         self.coarse, self.coarse_errors = coarse
@@ -127,16 +167,22 @@ class _Run:
                     if wrong:
                         break
             moved = axis >= 0 and any(self._lively((*row, x)) for x in range(n))
-            wrong = coder.simple(wrong, ROWS + moved + (2 if t + z + y else 0) + (4 if n > 16 else 0))
+            wrong = coder.simple(
+                wrong, ROWS + moved + (2 if t + z + y else 0) + (4 if n > 16 else 0)
+            )
             if not wrong:
                 for x in range(n):
-                    q[(*row, x)] = self.values[(*row, x)] = self._rounded(self._predict((*row, x))[0])
+                    q[(*row, x)] = self.values[(*row, x)] = self._rounded(
+                        self._predict((*row, x))[0]
+                    )
                 return
         logs = _log16(max(weight, 1), _LISTS.log), _log16(weight + SIDE, _LISTS.log)
         for x in range(n):
             self._vertex((*row, x), q, care, known[x], logs[x > 0])
 
-    def _vertex(self, at: tuple[int, ...], q: Lattice, care: Care, known: int, log_weight: int) -> None:
+    def _vertex(
+        self, at: tuple[int, ...], q: Lattice, care: Care, known: int, log_weight: int
+    ) -> None:
         coder, axis, kind = self.coder, self.part.axis, self.part.kind
         t, z, y, x = at
         p, base, activity, slope, step = self._predict(at)
@@ -158,7 +204,9 @@ class _Run:
         other = _side((base * 4096 - p) * sign)
         before = _side(0 if step is None else ((base + step) * 4096 - p) * sign)
         few = [_few(_clipped(e)) for e in (left, above, under, ago, beside)]
-        turned = [2 if e * sign > 0 else 0 if e * sign < 0 else 1 for e in (left, above, under, ago)]
+        turned = [
+            2 if e * sign > 0 else 0 if e * sign < 0 else 1 for e in (left, above, under, ago)
+        ]
         context = [
             level * 5 + part,
             lively * SLOPES + steep,
@@ -206,7 +254,9 @@ class _Run:
         about = (min(low, 19) * 4 + min(magnitude, 3)) * 2
         for b in range(low - 1, -1, -1):
             bit = (size >> b) & 1
-            magnitude = (magnitude << 1) | (coder.simple(bit, about + (b != low - 1)) if b > low - 3 else coder.plain(bit))
+            magnitude = (magnitude << 1) | (
+                coder.simple(bit, about + (b != low - 1)) if b > low - 3 else coder.plain(bit)
+            )
         if zero and magnitude:
             positive = coder.decide(positive, 1, context, kind, level)
         return magnitude * (sign if positive else -sign)
@@ -231,11 +281,15 @@ class _Run:
         """The weighted sum, and the activity; own: also of taps in the row itself."""
         base = self._base(at)[0]
         total = activity = 0
-        for k, ((inside, *offset), weight) in enumerate(zip(self.part.taps, self.weights, strict=True)):
+        for k, ((inside, *offset), weight) in enumerate(
+            zip(self.part.taps, self.weights, strict=True)
+        ):
             lattice = self.values if inside else self.coarse
             place = tuple(a + o for a, o in zip(at, offset, strict=True))
             in_row = bool(inside) and not any(offset[:3])
-            if (in_row and not own) or not all(0 <= a < n for a, n in zip(place, lattice.shape, strict=True)):
+            if (in_row and not own) or not all(
+                0 <= a < n for a, n in zip(place, lattice.shape, strict=True)
+            ):
                 continue
             d = 2 * int(lattice[place]) - base
             total += weight * d
@@ -273,11 +327,17 @@ class _Run:
             if axis == 3 or beyond[axis] < self.coarse.shape[axis]:
                 rows.append((self.coarse_errors, beyond, int(axis == 3), COARSE))
         if y:
-            rows += [(self.errors, (t, z, y - 1), offset, DIAGONAL if offset else SIDE) for offset in (0, -1, 1)]
+            rows += [
+                (self.errors, (t, z, y - 1), offset, DIAGONAL if offset else SIDE)
+                for offset in (0, -1, 1)
+            ]
         if z:
             rows.append((self.errors, (t, z - 1, y), 0, BEFORE))
         if t:
-            rows += [(self.errors, (t - 1, z, y), 0, BEFORE), (self.errors, (t - 1, z, y), 1, DIAGONAL)]
+            rows += [
+                (self.errors, (t - 1, z, y), 0, BEFORE),
+                (self.errors, (t - 1, z, y), 1, DIAGONAL),
+            ]
             if y + 1 < self.values.shape[2]:
                 rows.append((self.errors, (t - 1, z, y + 1), 0, DIAGONAL))
         for errors, place, offset, factor in rows:

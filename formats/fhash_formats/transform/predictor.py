@@ -22,7 +22,15 @@ import numpy.typing as npt
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.coder import decode_block, encode_block
 
-__all__ = ["CLASSES", "LARGEST_WEIGHT", "WEIGHT_UNIT", "Pass", "Predictor", "pass_arrays", "passes_of"]
+__all__ = [
+    "CLASSES",
+    "LARGEST_WEIGHT",
+    "WEIGHT_UNIT",
+    "Pass",
+    "Predictor",
+    "pass_arrays",
+    "passes_of",
+]
 
 CLASSES = 16
 """Kinds of passes that statistics tell apart: 0 the last one, then backwards; all of the first belong to the last kind."""
@@ -64,16 +72,26 @@ class Predictor:
     def __post_init__(self) -> None:
         for name in ("step", "origin"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, int | float)
+                or not math.isfinite(value)
+            ):
                 raise InputError(f"predictor: {name} is {value!r:.40}; a finite number is needed")
         if self.step <= 0:
             raise InputError(f"predictor: step is {self.step}; it must be above 0")
         if not _whole(self.levels, 4, 0, MOST_LEVELS):
-            raise InputError(f"predictor: levels are {self.levels!r:.60}; four whole numbers from 0 to {MOST_LEVELS} are needed")
+            raise InputError(
+                f"predictor: levels are {self.levels!r:.60}; four whole numbers from 0 to {MOST_LEVELS} are needed"
+            )
         if not _whole(self.order, 4, 0, 3) or sorted(self.order) != [0, 1, 2, 3]:
-            raise InputError(f"predictor: order is {self.order!r:.60}; 0, 1, 2, 3 in some order are needed")
+            raise InputError(
+                f"predictor: order is {self.order!r:.60}; 0, 1, 2, 3 in some order are needed"
+            )
         if type(self.reach) is not int or not 0 <= self.reach <= MOST_REACH:
-            raise InputError(f"predictor: reach is {self.reach!r:.40}; 0 to {MOST_REACH} is possible")
+            raise InputError(
+                f"predictor: reach is {self.reach!r:.40}; 0 to {MOST_REACH} is possible"
+            )
         count = sum(len(part.taps) for part in self.passes)
         if not _whole(self.weights, count, -LARGEST_WEIGHT, LARGEST_WEIGHT):
             raise InputError(f"predictor: {count} weights within +-{LARGEST_WEIGHT} are needed")
@@ -100,20 +118,35 @@ class Predictor:
         """The inverse of `to_dict`. Raises InputError, naming the key, or DamagedFileError for anything else."""
         keys = ("step", "origin", "levels", "order", "reach", "weights")
         if not isinstance(values, Mapping):
-            raise InputError(f"a predictor is a mapping with the keys {', '.join(keys)}, not {values!r:.60}")
+            raise InputError(
+                f"a predictor is a mapping with the keys {', '.join(keys)}, not {values!r:.60}"
+            )
         for key in (*values, *keys):
             if key not in keys or key not in values:
                 raise InputError(
                     f"predictor: {'unknown' if key not in keys else 'missing'} key {key!r:.40}; the keys are {', '.join(keys)}"
                 )
-        levels, order = (tuple(values[key]) if isinstance(values[key], list | tuple) else () for key in ("levels", "order"))
-        if not _whole(levels, 4, 0, MOST_LEVELS) or not _whole(order, 4, 0, 3) or sorted(order) != [0, 1, 2, 3]:
-            raise InputError(f"predictor: levels {levels!r:.60} and order {order!r:.60} are no such lists")
+        levels, order = (
+            tuple(values[key]) if isinstance(values[key], list | tuple) else ()
+            for key in ("levels", "order")
+        )
+        if (
+            not _whole(levels, 4, 0, MOST_LEVELS)
+            or not _whole(order, 4, 0, 3)
+            or sorted(order) != [0, 1, 2, 3]
+        ):
+            raise InputError(
+                f"predictor: levels {levels!r:.60} and order {order!r:.60} are no such lists"
+            )
         if type(values["reach"]) is not int or not 0 <= values["reach"] <= MOST_REACH:
-            raise InputError(f"predictor: reach is {values['reach']!r:.40}; 0 to {MOST_REACH} is possible")
+            raise InputError(
+                f"predictor: reach is {values['reach']!r:.40}; 0 to {MOST_REACH} is possible"
+            )
         count = sum(len(part.taps) for part in passes_of(levels, order, values["reach"]))
         try:
-            block = decode_block(base64.b64decode(values["weights"], validate=True), (1, 1, 1, count))
+            block = decode_block(
+                base64.b64decode(values["weights"], validate=True), (1, 1, 1, count)
+            )
         except (binascii.Error, TypeError, ValueError) as error:
             if isinstance(error, DamagedFileError):
                 raise
@@ -129,22 +162,33 @@ class Predictor:
 
 
 @lru_cache(maxsize=64)
-def passes_of(levels: tuple[int, int, int, int], order: tuple[int, int, int, int], reach: int) -> tuple[Pass, ...]:
+def passes_of(
+    levels: tuple[int, int, int, int], order: tuple[int, int, int, int], reach: int
+) -> tuple[Pass, ...]:
     """The passes of a predictor: the coarsest lattice, then level by level along the axes in this order."""
     axes = [axis for level in range(max(levels), 0, -1) for axis in order if levels[axis] >= level]
     parts = [Pass(axis=-1, kind=CLASSES - 1, taps=_first_taps())]
-    parts += [Pass(axis=axis, kind=min(len(axes) - 1 - i, CLASSES - 2), taps=_taps(axis, reach)) for i, axis in enumerate(axes)]
+    parts += [
+        Pass(axis=axis, kind=min(len(axes) - 1 - i, CLASSES - 2), taps=_taps(axis, reach))
+        for i, axis in enumerate(axes)
+    ]
     return tuple(parts)
 
 
-def pass_arrays(predictor: Predictor) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], npt.NDArray[np.int16]]:
+def pass_arrays(
+    predictor: Predictor,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], npt.NDArray[np.int16]]:
     """Passes (n, 4) of (axis, kind, first tap, taps), all taps (m, 5) and their weights (m,)."""
     rows: list[tuple[int, ...]] = []
     taps: list[Tap] = []
     for part in predictor.passes:
         rows.append((part.axis, part.kind, len(taps), len(part.taps)))
         taps += part.taps
-    return np.array(rows, dtype=np.int32), np.array(taps, dtype=np.int32), np.array(predictor.weights, dtype=np.int16)
+    return (
+        np.array(rows, dtype=np.int32),
+        np.array(taps, dtype=np.int32),
+        np.array(predictor.weights, dtype=np.int16),
+    )
 
 
 def _tap(own: int, **offsets: int) -> Tap:
@@ -169,17 +213,33 @@ def _taps(axis: int, reach: int) -> tuple[Tap, ...]:
     """Of a pass along an axis: known vertices at 0 and 1 are beside the vertex; those of the pass are known in C order."""
     others = [other for other in range(4) if other != axis]
     taps = [_at(0, (axis, 1)), _at(0, (axis, -1)), _at(0, (axis, 2))]
-    taps += [_at(0, (axis, near), (other, side)) for other in others for near in (0, 1) for side in (-1, 1)]
+    taps += [
+        _at(0, (axis, near), (other, side))
+        for other in others
+        for near in (0, 1)
+        for side in (-1, 1)
+    ]
     taps += [_at(1, (axis, -1)), *(_at(1, (other, -1)) for other in others)]
     if reach > 0:
         taps += [_at(1, (other, -2)) for other in others]
-        pairs = [*combinations(others, 2), *((min(axis, other), max(axis, other)) for other in others)]
+        pairs = [
+            *combinations(others, 2),
+            *((min(axis, other), max(axis, other)) for other in others),
+        ]
         taps += [_at(1, (one, -1), (two, side)) for one, two in pairs for side in (-1, 1)]
     if reach > 1:
         sides = [(near, a, b) for near in (0, 1) for a in (-1, 1) for b in (-1, 1)]
-        taps += [_at(0, (axis, near), (one, a), (two, b)) for one, two in combinations(others, 2) for near, a, b in sides]
+        taps += [
+            _at(0, (axis, near), (one, a), (two, b))
+            for one, two in combinations(others, 2)
+            for near, a, b in sides
+        ]
     return tuple(taps)
 
 
 def _whole(values: Any, count: int, low: int, high: int) -> bool:
-    return isinstance(values, tuple) and len(values) == count and all(type(value) is int and low <= value <= high for value in values)
+    return (
+        isinstance(values, tuple)
+        and len(values) == count
+        and all(type(value) is int and low <= value <= high for value in values)
+    )

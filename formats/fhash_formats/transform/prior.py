@@ -53,7 +53,9 @@ class State:
 
     def copy(self) -> State:
         """Arrays of its own."""
-        return State(slots=self.slots.copy(), weights=self.weights.copy(), simples=self.simples.copy())
+        return State(
+            slots=self.slots.copy(), weights=self.weights.copy(), simples=self.simples.copy()
+        )
 
     def frozen(self) -> State:
         """This state, its arrays read-only from now on."""
@@ -64,7 +66,11 @@ class State:
 
 def blank_state() -> State:
     """Nothing known: even odds, and weights that take the estimates at their word."""
-    weights = [(KINDS * DECISIONS * LANES, 4423), (64 * DECISIONS * LANES, 0), (KINDS * LANES, 4096)]
+    weights = [
+        (KINDS * DECISIONS * LANES, 4423),
+        (64 * DECISIONS * LANES, 0),
+        (KINDS * LANES, 4096),
+    ]
     return State.even(slots=SLOTS, weights=weights, simples=SIMPLES)
 
 
@@ -79,7 +85,10 @@ def prior_state() -> State:
 def unpack_state(data: bytes, state: State) -> State:
     """`state`, its arrays filled with what `pack_state` made of one of the same sizes."""
     slots, weights, simples = len(state.slots), len(state.weights), len(state.simples)
-    parts = np.split(np.frombuffer(data, dtype=np.uint8), np.cumsum([slots, slots, 2 * weights, 2 * simples, simples]))
+    parts = np.split(
+        np.frombuffer(data, dtype=np.uint8),
+        np.cumsum([slots, slots, 2 * weights, 2 * simples, simples]),
+    )
     # Whole numbers only, so that every machine has the same: 128 is even odds.
     state.slots[:, 0] = state.slots[:, 1] = _PROBABILITIES[parts[0]]
     state.slots[:, 2] = parts[1]
@@ -91,7 +100,9 @@ def unpack_state(data: bytes, state: State) -> State:
 
 def _probabilities() -> npt.NDArray[np.uint16]:
     """Probability in 1/65536 of each logit (i - 128) / 12, rounded."""
-    return np.clip(np.floor(65536 / (1 + np.exp(-(np.arange(256) - 128) / 12)) + 0.5), 1, 65535).astype(np.uint16)
+    return np.clip(
+        np.floor(65536 / (1 + np.exp(-(np.arange(256) - 128) / 12)) + 0.5), 1, 65535
+    ).astype(np.uint16)
 
 
 _PROBABILITIES = _probabilities()
@@ -99,7 +110,9 @@ _PROBABILITIES = _probabilities()
 
 def pack_prior(state: State) -> bytes:
     """A learned state as the bytes of `prior.bin`."""
-    turned = State(slots=_turned(state.slots, back=True), weights=state.weights, simples=state.simples)
+    turned = State(
+        slots=_turned(state.slots, back=True), weights=state.weights, simples=state.simples
+    )
     return zlib.compress(pack_state(turned), 9)
 
 
@@ -117,8 +130,13 @@ def _turned(slots: npt.NDArray[np.uint16], *, back: bool) -> npt.NDArray[np.uint
 def pack_state(state: State) -> bytes:
     """A learned state as bytes, not deflated: rounded, and with little trust."""
     order = np.searchsorted(_PROBABILITIES, state.slots[:, 0]).clip(1, 255)
-    below, above = _PROBABILITIES[order - 1].astype(np.int32), _PROBABILITIES[order].astype(np.int32)
-    steps = np.where(state.slots[:, 0] - below < above - state.slots[:, 0], order - 1, order).astype(np.uint8)
+    below, above = (
+        _PROBABILITIES[order - 1].astype(np.int32),
+        _PROBABILITIES[order].astype(np.int32),
+    )
+    steps = np.where(
+        state.slots[:, 0] - below < above - state.slots[:, 0], order - 1, order
+    ).astype(np.uint8)
     counts = np.minimum(state.slots[:, 2], TRUST).astype(np.uint8)
     steps[counts == 0] = 128
     parts = [

@@ -21,7 +21,9 @@ LARGEST = 1_000_000_000.0
 Values = npt.NDArray[Any]
 
 
-def quantise(coefficients: Values, step: float, rounding: float = ROUNDING) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+def quantise(
+    coefficients: Values, step: float, rounding: float = ROUNDING
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
     """Integers int32, sign(c) floor(|c| / step + rounding), and c / step as float32; magnitudes stop at 1e9."""
     width, scale = coefficients.dtype.itemsize * 8, 1.0 / step
     library = native.library()
@@ -29,9 +31,14 @@ def quantise(coefficients: Values, step: float, rounding: float = ROUNDING) -> t
         kind = coefficients.dtype.type
         exact = coefficients * kind(scale)
         magnitude = np.abs(exact)
-        magnitude = np.where(magnitude < kind(LARGEST), magnitude + kind(rounding), kind(LARGEST)).astype(np.int32)
+        magnitude = np.where(
+            magnitude < kind(LARGEST), magnitude + kind(rounding), kind(LARGEST)
+        ).astype(np.int32)
         return np.where(exact < 0, -magnitude, magnitude), exact.astype(np.float32)
-    integers, scaled = np.empty(coefficients.shape, np.int32), np.empty(coefficients.shape, np.float32)
+    integers, scaled = (
+        np.empty(coefficients.shape, np.int32),
+        np.empty(coefficients.shape, np.float32),
+    )
     source = np.ascontiguousarray(coefficients)
     getattr(library, f"fhash_quantise_f{width}")(
         ctypes.c_void_p(source.ctypes.data),
@@ -43,7 +50,12 @@ def quantise(coefficients: Values, step: float, rounding: float = ROUNDING) -> t
     return integers, scaled
 
 
-def dequantise(integers: npt.NDArray[np.int32], step: float, offsets: tuple[int, int, int], dtype: npt.DTypeLike) -> Values:
+def dequantise(
+    integers: npt.NDArray[np.int32],
+    step: float,
+    offsets: tuple[int, int, int],
+    dtype: npt.DTypeLike,
+) -> Values:
     """sign(q) (|q| + offset / OFFSET_UNIT) step in a floating type; offsets for |q| of 1, 2 and more; 0 for 0."""
     kind: np.dtype[Any] = np.dtype(dtype)
     one, two, more = (offset / OFFSET_UNIT for offset in offsets)

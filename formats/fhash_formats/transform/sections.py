@@ -88,7 +88,11 @@ class Parts:
 
     def sections(self) -> list[bytes]:
         """Those that there are, in their order."""
-        return [bytes(part) for part in (self.settings, self.missing, self.body, self.residual, self.mask) if part is not None]
+        return [
+            bytes(part)
+            for part in (self.settings, self.missing, self.body, self.residual, self.mask)
+            if part is not None
+        ]
 
 
 def assembled(
@@ -141,8 +145,14 @@ def parts_of(data: bytes | memoryview) -> Parts:
     flags = data[0]
     number = flags & 0xE0
     if number not in (FORMAT, MASKED, PREDICTED, PREDICTED_MASKED):
-        raise DamagedFileError(f"a coded tile begins with {flags:#04x}, which is no known stream format")
-    masked, predicted, coded = number in (MASKED, PREDICTED_MASKED), number in (PREDICTED, PREDICTED_MASKED), not flags & (EXACT | EMPTY)
+        raise DamagedFileError(
+            f"a coded tile begins with {flags:#04x}, which is no known stream format"
+        )
+    masked, predicted, coded = (
+        number in (MASKED, PREDICTED_MASKED),
+        number in (PREDICTED, PREDICTED_MASKED),
+        not flags & (EXACT | EMPTY),
+    )
     if predicted and flags & (EXACT | EMPTY | RESIDUAL):
         raise DamagedFileError("a coded tile is by prediction and something else as well")
     if coded and len(data) < 5:
@@ -158,12 +168,16 @@ def parts_of(data: bytes | memoryview) -> Parts:
     names = [name for name, there in expected.items() if there]
     sections = list(_sections(data[5:] if coded else data[1:]))
     if len(sections) != len(names):
-        raise DamagedFileError(f"a coded tile has {len(sections)} sections; its flags say {len(names)}")
+        raise DamagedFileError(
+            f"a coded tile has {len(sections)} sections; its flags say {len(names)}"
+        )
     found = dict(zip(names, sections, strict=True))
     if flags & MISSING and not len(found["missing"]):
         raise DamagedFileError("a coded tile has lost its missing values")
     digest = int.from_bytes(data[1:5], "little") if coded else 0
-    return Parts(flags=flags, masked=masked, predicted=predicted, coded=coded, digest=digest, **found)
+    return Parts(
+        flags=flags, masked=masked, predicted=predicted, coded=coded, digest=digest, **found
+    )
 
 
 def _sections(data: memoryview) -> Iterator[memoryview]:
@@ -214,7 +228,11 @@ def exact_bytes(values: Values, settings: Settings | None, occupied: Mask | None
     plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
     planes = plain.view(np.uint8).reshape(-1, plain.dtype.itemsize).T
     body = zlib.compress(planes.tobytes(), 6)
-    sections = [*_own(settings), body, *([] if occupied is None else [pack_mask(occupied, no_levels(values.shape))])]
+    sections = [
+        *_own(settings),
+        body,
+        *([] if occupied is None else [pack_mask(occupied, no_levels(values.shape))]),
+    ]
     return bytes([flags]) + b"".join(map(section, sections))
 
 
@@ -231,7 +249,12 @@ def exact_values(data: bytes | memoryview, shape: Shape, dtype: np.dtype[Any]) -
     if len(plain) != count or not inflate.eof or inflate.unused_data:
         raise DamagedFileError("a coded tile is damaged: it holds another number of values")
     planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
-    return np.array(planes.T, order="C").view(dtype.newbyteorder("<")).reshape(shape).astype(dtype, copy=False)
+    return (
+        np.array(planes.T, order="C")
+        .view(dtype.newbyteorder("<"))
+        .reshape(shape)
+        .astype(dtype, copy=False)
+    )
 
 
 _MISSING_VALUES = (np.nan, np.inf, -np.inf)
@@ -239,8 +262,13 @@ _MISSING_VALUES = (np.nan, np.inf, -np.inf)
 
 def pack_missing(values: Values, finite: Mask) -> bytes:
     """The section of values that are not finite."""
-    marks = np.where(finite, 0, np.where(np.isnan(values), 1, np.where(values > 0, 2, 3))).astype(np.int32)
-    return zlib.crc32(little(marks)).to_bytes(4, "little") + encode_integers(marks, single_band(values.shape)).data
+    marks = np.where(finite, 0, np.where(np.isnan(values), 1, np.where(values > 0, 2, 3))).astype(
+        np.int32
+    )
+    return (
+        zlib.crc32(little(marks)).to_bytes(4, "little")
+        + encode_integers(marks, single_band(values.shape)).data
+    )
 
 
 def restored(decoded: Values, missing: bytes) -> Values:
@@ -249,7 +277,11 @@ def restored(decoded: Values, missing: bytes) -> Values:
         if decoded.dtype.kind != "f":
             raise DamagedFileError("a coded tile of integers has missing values")
         marks = decode_integers(missing[4:], decoded.shape, single_band(decoded.shape))
-        if zlib.crc32(little(marks)).to_bytes(4, "little") != missing[:4] or marks.min() < 0 or marks.max() > 3:
+        if (
+            zlib.crc32(little(marks)).to_bytes(4, "little") != missing[:4]
+            or marks.min() < 0
+            or marks.max() > 3
+        ):
             raise DamagedFileError("the missing values of a coded tile are damaged")
         for mark, value in enumerate(_MISSING_VALUES, start=1):
             decoded[marks == mark] = value

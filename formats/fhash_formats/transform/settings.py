@@ -52,14 +52,27 @@ class Settings:
     def __post_init__(self) -> None:
         for name in ("step", "center", "low", "high", "quantum"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, int | float)
+                or not math.isfinite(value)
+            ):
                 raise InputError(f"{name} is {value!r:.40}; a finite number is needed")
         if not (self.step > 0 and self.quantum >= 0 and self.low <= self.high):
-            raise InputError(f"step {self.step}, quantum {self.quantum}, range {self.low} to {self.high} do not fit together")
-        if not (self.double or float(np.finfo(np.float32).tiny) < self.step < float(np.finfo(np.float32).max)):
+            raise InputError(
+                f"step {self.step}, quantum {self.quantum}, range {self.low} to {self.high} do not fit together"
+            )
+        if not (
+            self.double
+            or float(np.finfo(np.float32).tiny) < self.step < float(np.finfo(np.float32).max)
+        ):
             raise InputError(f"step {self.step} is not for float32")
-        if len(self.offsets) != 3 or not all(type(o) is int and abs(o) <= OFFSET_UNIT for o in self.offsets):
-            raise InputError(f"offsets are {self.offsets!r:.60}; three whole numbers within +-{OFFSET_UNIT} are needed")
+        if len(self.offsets) != 3 or not all(
+            type(o) is int and abs(o) <= OFFSET_UNIT for o in self.offsets
+        ):
+            raise InputError(
+                f"offsets are {self.offsets!r:.60}; three whole numbers within +-{OFFSET_UNIT} are needed"
+            )
         if self.head is not None and self.double:
             raise InputError("a head works in float32 only")
 
@@ -72,7 +85,11 @@ class Settings:
     def features(self) -> tuple[str, ...]:
         """What a reader must know beside the codec itself, by the names that containers require features by."""
         cross = self.head is not None and self.head.cross
-        used = {"cross": cross, "mask": self.mask is not None, "predictor": self.predictor is not None}
+        used = {
+            "cross": cross,
+            "mask": self.mask is not None,
+            "predictor": self.predictor is not None,
+        }
         return tuple(name for name, wanted in used.items() if wanted)
 
     def to_dict(self) -> dict[str, Any]:
@@ -100,7 +117,18 @@ class Settings:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Settings:
         """From `to_dict`'s values; raises InputError or DamagedFileError for anything else."""
-        known = {"transform", "step", "center", "range", "offsets", "double", "quantum", "head", "mask", "predictor"}
+        known = {
+            "transform",
+            "step",
+            "center",
+            "range",
+            "offsets",
+            "double",
+            "quantum",
+            "head",
+            "mask",
+            "predictor",
+        }
         unknown = sorted(str(key)[:40] for key in set(values) - known)
         if unknown:
             raise InputError(f"unknown setting {unknown[0]!a}; known: {', '.join(sorted(known))}")
@@ -108,7 +136,11 @@ class Settings:
         if missing:
             raise InputError(f"setting {missing[0]} is missing")
         span, offsets = values["range"], values.get("offsets", [0, 0, 0])
-        if not isinstance(span, list | tuple) or len(span) != 2 or not isinstance(offsets, list | tuple):
+        if (
+            not isinstance(span, list | tuple)
+            or len(span) != 2
+            or not isinstance(offsets, list | tuple)
+        ):
             raise InputError("range is [low, high] and offsets are three whole numbers")
         if not isinstance(values.get("double", False), bool):
             raise InputError("double is true or false")
@@ -128,5 +160,7 @@ class Settings:
             quantum=values.get("quantum", 0.0),
             head=None if packed is None else Head.from_bytes(packed),
             mask=None if values.get("mask") is None else MaskLevels.from_dict(values["mask"]),
-            predictor=None if values.get("predictor") is None else Predictor.from_dict(values["predictor"]),
+            predictor=None
+            if values.get("predictor") is None
+            else Predictor.from_dict(values["predictor"]),
         )

@@ -48,7 +48,9 @@ class AxisTransform:
             raise InputError(f"the depth of a transform is a whole number, not {self.depth!r:.40}")
         least, most = (1, MAX_DEPTH) if self.wavelet else (0, 0)
         if not least <= self.depth <= most:
-            raise InputError(f"the depth of {self.kind!r} is {least} to {most}, not {self.depth!r:.40}")
+            raise InputError(
+                f"the depth of {self.kind!r} is {least} to {most}, not {self.depth!r:.40}"
+            )
         if (self.kind == "klt") != isinstance(self.basis, Basis):
             raise InputError("'klt' needs a basis, and nothing else takes one")
 
@@ -72,7 +74,9 @@ class AxisTransform:
             return cls(kind=value[0], depth=value[1])
         if isinstance(value, Mapping) and set(value) == {"klt"} and isinstance(value["klt"], str):
             return cls(kind="klt", basis=_basis_from_text(value["klt"]))
-        raise InputError(f'a transform is "none", [kind, depth] or {{"klt": base64}}, not {value!r:.60}')
+        raise InputError(
+            f'a transform is "none", [kind, depth] or {{"klt": base64}}, not {value!r:.60}'
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +86,11 @@ class TransformSpec:
     axes: tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
 
     def __post_init__(self) -> None:
-        if not isinstance(self.axes, tuple) or len(self.axes) != 4 or not all(isinstance(axis, AxisTransform) for axis in self.axes):
+        if (
+            not isinstance(self.axes, tuple)
+            or len(self.axes) != 4
+            or not all(isinstance(axis, AxisTransform) for axis in self.axes)
+        ):
             raise InputError("a transform has four axes (t, z, y, x), each an AxisTransform")
 
     @property
@@ -99,7 +107,9 @@ class TransformSpec:
     def from_dict(cls, values: Mapping[str, Any]) -> TransformSpec:
         """The inverse of `to_dict`. Raises InputError, naming the key, for a missing, unknown or bad one."""
         if not isinstance(values, Mapping):
-            raise InputError(f"a transform is a mapping with the keys {', '.join(AXES)}, not {values!r:.60}")
+            raise InputError(
+                f"a transform is a mapping with the keys {', '.join(AXES)}, not {values!r:.60}"
+            )
         unknown = [key for key in values if key not in AXES]
         missing = [key for key in AXES if key not in values]
         if unknown or missing:

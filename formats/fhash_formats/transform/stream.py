@@ -22,15 +22,23 @@ class TransformCoder:
     masked: whether the chunks say which of their values are occupied.
     """
 
-    def __init__(self, codecs: Sequence[Mapping[str, Any]], dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    def __init__(
+        self, codecs: Sequence[Mapping[str, Any]], dtype: np.dtype[Any], shape: tuple[int, ...]
+    ) -> None:
         """Raises DamagedFileError for a configuration that is not allowed, UnsupportedFileError for a second codec."""
         if len(codecs) != 1:
-            raise UnsupportedFileError("nothing may stand between the codecs fhash.transform and crc32c")
+            raise UnsupportedFileError(
+                "nothing may stand between the codecs fhash.transform and crc32c"
+            )
         if len(shape) > 4:
-            raise DamagedFileError(f"fhash.transform codes arrays of at most 4 axes, not {len(shape)}")
+            raise DamagedFileError(
+                f"fhash.transform codes arrays of at most 4 axes, not {len(shape)}"
+            )
         configuration = codecs[0].get("configuration", {})
         try:
-            self.settings = Settings.from_dict(configuration) if "transform" in configuration else None
+            self.settings = (
+                Settings.from_dict(configuration) if "transform" in configuration else None
+            )
         except InputError as error:
             raise DamagedFileError(f"codec fhash.transform: {error}") from error
         self.features = () if self.settings is None else self.settings.features
@@ -41,7 +49,9 @@ class TransformCoder:
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The stream of a full chunk."""
         if self.settings is None:
-            raise InputError("fhash.transform without settings only decodes here; fhash_formats.transform.zarr_codec chooses them")
+            raise InputError(
+                "fhash.transform without settings only decodes here; fhash_formats.transform.zarr_codec chooses them"
+            )
         return encode_tile(chunk.reshape(self._four), self.settings).data
 
     def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:

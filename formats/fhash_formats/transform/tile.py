@@ -13,16 +13,46 @@ import numpy.typing as npt
 
 from fhash_formats.transform.bands import band_table
 from fhash_formats.transform.coder import MAX_INTEGER, encode_integers
-from fhash_formats.transform.decoding import decode_tile, decode_tile_mask, linear_values, outside, predicted_values, transform_for
-from fhash_formats.transform.elementwise import all_finite, cast, corrected, free_values, residual_of, within
+from fhash_formats.transform.decoding import (
+    decode_tile,
+    decode_tile_mask,
+    linear_values,
+    outside,
+    predicted_values,
+    transform_for,
+)
+from fhash_formats.transform.elementwise import (
+    all_finite,
+    cast,
+    corrected,
+    free_values,
+    residual_of,
+    within,
+)
 from fhash_formats.transform.filling import filled as filled_in
 from fhash_formats.transform.predict import encode_predicted, integers_of
 from fhash_formats.transform.predictor import Predictor
 from fhash_formats.transform.quantise import dequantise, quantise
-from fhash_formats.transform.sections import Shape, assembled, exact_bytes, pack_mask, pack_missing, restored
+from fhash_formats.transform.sections import (
+    Shape,
+    assembled,
+    exact_bytes,
+    pack_mask,
+    pack_missing,
+    restored,
+)
 from fhash_formats.transform.settings import Settings
 
-__all__ = ["CodedTile", "Shape", "decode_tile", "decode_tile_mask", "encode_tile", "exact_tile", "transform_for", "within"]
+__all__ = [
+    "CodedTile",
+    "Shape",
+    "decode_tile",
+    "decode_tile_mask",
+    "encode_tile",
+    "exact_tile",
+    "transform_for",
+    "within",
+]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -66,28 +96,51 @@ def encode_tile(
     if counts is not None and counts.all():
         counts = None  # all does
     missing = b"" if finite is None or not keep_missing else pack_missing(values, finite)
-    occupied = None if settings.mask is None else np.ones(values.shape, bool) if counts is None else counts
+    occupied = (
+        None if settings.mask is None else np.ones(values.shape, bool) if counts is None else counts
+    )
     if not values.size or (counts is not None and not counts.any()):
-        decoded = outside(cast(np.full(values.shape, settings.center), values.dtype), occupied, settings)
-        data = assembled(settings if own else None, missing, b"", None, None, None if occupied is None else b"")
+        decoded = outside(
+            cast(np.full(values.shape, settings.center), values.dtype), occupied, settings
+        )
+        data = assembled(
+            settings if own else None, missing, b"", None, None, None if occupied is None else b""
+        )
         return CodedTile(data=data, decoded=restored(decoded, missing), nonzero=0)
     if settings.predictor is not None and error is not None:
         return _predicted_tile(values, settings, settings.predictor, counts, error, missing, own)
     transform = transform_for(settings, values.shape)
     table = band_table(settings.transform, values.shape)
-    target = (values if finite is None else np.where(finite, values, values.dtype.type(0))).astype(settings.dtype)
+    target = (values if finite is None else np.where(finite, values, values.dtype.type(0))).astype(
+        settings.dtype
+    )
     target -= settings.dtype.type(settings.center)
     if counts is not None and not (filled and finite is None):
-        target = filled_in(target, counts, np.ones(values.shape, bool) if finite is None else finite, transform, settings, density)
+        target = filled_in(
+            target,
+            counts,
+            np.ones(values.shape, bool) if finite is None else finite,
+            transform,
+            settings,
+            density,
+        )
     coefficients = transform.forward(target)
     for _ in range(rounds):
         integers, scaled = quantise(coefficients, settings.step)
         if weight > 0:
             integers = encode_integers(integers, table, scaled=scaled, weight=weight).integers
-        rebuilt = transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype))
+        rebuilt = transform.inverse(
+            dequantise(integers, settings.step, settings.offsets, settings.dtype)
+        )
         # What lies at an end of the range may decode to anything beyond it.
         margin = (settings.high - settings.low) * 1e-4
-        if not free_values(target, rebuilt, counts, settings.low - settings.center + margin, settings.high - settings.center - margin):
+        if not free_values(
+            target,
+            rebuilt,
+            counts,
+            settings.low - settings.center + margin,
+            settings.high - settings.center - margin,
+        ):
             break
         coefficients = transform.forward(target)
     integers, scaled = quantise(coefficients, settings.step)
@@ -95,7 +148,11 @@ def encode_tile(
     if passes > 1 and weight > 0:
         coded = encode_integers(coded.integers, table)
     linear = linear_values(coded.integers, transform, settings)
-    mask = None if occupied is None or settings.mask is None else pack_mask(occupied, settings.mask.levels(linear))
+    mask = (
+        None
+        if occupied is None or settings.mask is None
+        else pack_mask(occupied, settings.mask.levels(linear))
+    )
     base = linear if settings.head is None else settings.head.apply(linear)
     residual = None
     if error is not None:
@@ -112,10 +169,18 @@ def encode_tile(
 
 
 def _predicted_tile(
-    values: Values, settings: Settings, predictor: Predictor, counts: Mask | None, error: float, missing: bytes, own: bool
+    values: Values,
+    settings: Settings,
+    predictor: Predictor,
+    counts: Mask | None,
+    error: float,
+    missing: bytes,
+    own: bool,
 ) -> CodedTile:
     """Code by prediction; exactly where that cannot keep the bound."""
-    occupied = None if settings.mask is None else np.ones(values.shape, bool) if counts is None else counts
+    occupied = (
+        None if settings.mask is None else np.ones(values.shape, bool) if counts is None else counts
+    )
     integers = integers_of(values, counts, predictor)
     if integers is None:
         return exact_tile(values, settings if own else None, occupied)
@@ -124,16 +189,30 @@ def _predicted_tile(
     decoded = cast(linear, values.dtype)
     if not within(values, decoded, error, counts):
         return exact_tile(values, settings if own else None, occupied)
-    mask = None if occupied is None or settings.mask is None else pack_mask(occupied, settings.mask.levels(linear.astype(settings.dtype)))
-    data = assembled(settings if own else None, missing, coded, integers, None, mask, predicted=True)
-    return CodedTile(data=data, decoded=restored(outside(decoded, occupied, settings), missing), nonzero=int(np.count_nonzero(integers)))
+    mask = (
+        None
+        if occupied is None or settings.mask is None
+        else pack_mask(occupied, settings.mask.levels(linear.astype(settings.dtype)))
+    )
+    data = assembled(
+        settings if own else None, missing, coded, integers, None, mask, predicted=True
+    )
+    return CodedTile(
+        data=data,
+        decoded=restored(outside(decoded, occupied, settings), missing),
+        nonzero=int(np.count_nonzero(integers)),
+    )
 
 
-def exact_tile(values: Values, settings: Settings | None = None, occupied: Mask | None = None) -> CodedTile:
+def exact_tile(
+    values: Values, settings: Settings | None = None, occupied: Mask | None = None
+) -> CodedTile:
     """A tile stored without loss: its bytes, those of equal weight together, deflated.
 
     occupied: the mask, for a stream with one; outside of it stands NaN, or 0 for whole numbers.
     """
     if occupied is not None:
-        values = np.where(occupied, values, values.dtype.type(np.nan if values.dtype.kind == "f" else 0))
+        values = np.where(
+            occupied, values, values.dtype.type(np.nan if values.dtype.kind == "f" else 0)
+        )
     return CodedTile(data=exact_bytes(values, settings, occupied), decoded=values.copy(), nonzero=0)

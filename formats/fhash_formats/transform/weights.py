@@ -51,12 +51,17 @@ def plane_norms(y: AxisTransform, x: AxisTransform, rows: int, columns: int) -> 
     if not y.wavelet or (y.kind, y.depth) != (x.kind, x.depth):
         return axis_norms(y, rows)[:, None] * axis_norms(x, columns)
     ys, xs = band_lengths(rows, y.depth), band_lengths(columns, x.depth)
-    (low_y, high_y), (low_x, high_x) = _level_norms(y.kind, y.depth, rows), _level_norms(x.kind, x.depth, columns)
+    (low_y, high_y), (low_x, high_x) = (
+        _level_norms(y.kind, y.depth, rows),
+        _level_norms(x.kind, x.depth, columns),
+    )
     norms = np.ones((rows, columns))
     for level in range(1, y.depth + 1):
         norms[: ys[level], xs[level] : xs[level - 1]] = low_y[level][:, None] * high_x[level]
         norms[ys[level] : ys[level - 1], : xs[level]] = high_y[level][:, None] * low_x[level]
-        norms[ys[level] : ys[level - 1], xs[level] : xs[level - 1]] = high_y[level][:, None] * high_x[level]
+        norms[ys[level] : ys[level - 1], xs[level] : xs[level - 1]] = (
+            high_y[level][:, None] * high_x[level]
+        )
     norms[: ys[-1], : xs[-1]] = low_y[-1][:, None] * low_x[-1]
     return norms
 

@@ -58,15 +58,21 @@ class TransformCodec(ArrayBytesCodec):
             Quality(max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step)
             if isinstance(self.transform, Mapping):
                 object.__setattr__(self, "transform", TransformSpec.from_dict(self.transform))
-        elif (self.max_error, self.max_error_rel, self.step, self.transform) != (None,) * 4 or (self.reading and self.settings):
-            raise InputError("settings that all chunks share, and reading, leave nothing else to be given")
+        elif (self.max_error, self.max_error_rel, self.step, self.transform) != (None,) * 4 or (
+            self.reading and self.settings
+        ):
+            raise InputError(
+                "settings that all chunks share, and reading, leave nothing else to be given"
+            )
 
     @classmethod
     def from_dict(cls, data: dict[str, JSON]) -> Self:
         """From the metadata's `{"name": ..., "configuration": ...}`."""
         configuration = data.get("configuration", {})
         if data.get("name") != NAME or not isinstance(configuration, Mapping):
-            raise InputError(f"codec {data.get('name')!r:.40} with {configuration!r:.60} is no {NAME}")
+            raise InputError(
+                f"codec {data.get('name')!r:.40} with {configuration!r:.60} is no {NAME}"
+            )
         if "center" in configuration:
             return cls(settings=Settings.from_dict(configuration))
         if not configuration:
@@ -86,13 +92,21 @@ class TransformCodec(ArrayBytesCodec):
         elif self.reading:
             configuration = {}
         else:
-            quality = Quality(max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step)
+            quality = Quality(
+                max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step
+            )
             configuration = {**quality.to_dict()}
             if isinstance(self.transform, TransformSpec):
                 configuration["transform"] = self.transform.to_dict()
         return {"name": NAME, "configuration": configuration}
 
-    def validate(self, *, shape: tuple[int, ...], dtype: ZDType[TBaseDType, TBaseScalar], chunk_grid: ChunkGrid) -> None:
+    def validate(
+        self,
+        *,
+        shape: tuple[int, ...],
+        dtype: ZDType[TBaseDType, TBaseScalar],
+        chunk_grid: ChunkGrid,
+    ) -> None:
         """Raises InputError for a type that is not coded."""
         supported(dtype.to_native_dtype())
 
@@ -107,23 +121,39 @@ class TransformCodec(ArrayBytesCodec):
 
     def _encode_sync(self, chunk_array: NDBuffer, chunk_spec: ArraySpec) -> Buffer | None:
         if self.reading:
-            raise InputError(f"{NAME} without a configuration only decodes: give max_error, max_error_rel or step to write")
+            raise InputError(
+                f"{NAME} without a configuration only decodes: give max_error, max_error_rel or step to write"
+            )
         values = np.asarray(chunk_array.as_ndarray_like())
         if self.settings is None:
             data = encode_chunk(
-                values, max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step, transform=self.transform
+                values,
+                max_error=self.max_error,
+                max_error_rel=self.max_error_rel,
+                step=self.step,
+                transform=self.transform,
             )
         else:
-            tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(tile_shape(values.shape))
+            tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(
+                tile_shape(values.shape)
+            )
             data = encode_tile(tile, self.settings).data
         return chunk_spec.prototype.buffer.from_bytes(data)
 
     def _decode_sync(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
-        data, shape, dtype = chunk_data.to_bytes(), chunk_spec.shape, chunk_spec.dtype.to_native_dtype()
+        data, shape, dtype = (
+            chunk_data.to_bytes(),
+            chunk_spec.shape,
+            chunk_spec.dtype.to_native_dtype(),
+        )
         if self.settings is None:
             values = decode_chunk(data, shape, dtype)
         else:
-            values = decode_tile(data, tile_shape(shape), supported(dtype), self.settings).reshape(shape).astype(dtype, copy=False)
+            values = (
+                decode_tile(data, tile_shape(shape), supported(dtype), self.settings)
+                .reshape(shape)
+                .astype(dtype, copy=False)
+            )
         return chunk_spec.prototype.nd_buffer.from_numpy_array(values)
 
     async def _encode_single(self, chunk_data: NDBuffer, chunk_spec: ArraySpec) -> Buffer | None:

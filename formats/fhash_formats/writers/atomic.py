@@ -22,7 +22,9 @@ from fhash_formats.writers.signals import signals_held
 ZARR_METADATA = ("zarr.json", ".zgroup", ".zarray")
 
 
-def check_output(path: Path, force: bool, *, directory: bool = False, sources: Sequence[str | Path] = ()) -> None:
+def check_output(
+    path: Path, force: bool, *, directory: bool = False, sources: Sequence[str | Path] = ()
+) -> None:
     """The checks of an output that can be made before any work.
 
     Args:
@@ -59,11 +61,17 @@ def check_output(path: Path, force: bool, *, directory: bool = False, sources: S
     if stat.S_ISDIR(mode) and not directory:
         raise OutputError(f"{path} is a directory; give the name of a file")
     if not force:
-        raise OutputExistsError(f"{path} exists; use --force (force=True) to replace it, or another name")
+        raise OutputExistsError(
+            f"{path} exists; use --force (force=True) to replace it, or another name"
+        )
     if stat.S_ISDIR(mode) and not any(os.path.isfile(target / name) for name in ZARR_METADATA):
-        raise OutputError(f"{path} is a directory but no Zarr store: --force does not replace it; give another name")
+        raise OutputError(
+            f"{path} is a directory but no Zarr store: --force does not replace it; give another name"
+        )
     if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
-        raise OutputError(f"{path} is not an ordinary file and cannot be replaced; give another name")
+        raise OutputError(
+            f"{path} is not an ordinary file and cannot be replaced; give another name"
+        )
 
 
 def _check_source(path: Path, target: Path, source: str | Path) -> None:
@@ -96,7 +104,9 @@ def replacing(path: Path, *, force: bool, directory: bool = False) -> Iterator[P
 
 
 @contextmanager
-def replacing_all(paths: Sequence[Path], *, force: bool, directory: bool = False) -> Iterator[list[Path]]:
+def replacing_all(
+    paths: Sequence[Path], *, force: bool, directory: bool = False
+) -> Iterator[list[Path]]:
     """Temporary paths that become `paths`, in that order, when the block ends; if one cannot, none does.
 
     Raises and guarantees what `replacing` does. Only a process that is killed between two renames can leave some of
@@ -132,7 +142,9 @@ def explained(path: Path, error: OSError) -> OutputError:
     folder = path.parent
     code = error.errno
     if code in (errno.ENOSPC, errno.EDQUOT):
-        return OutputError(f"{path}: no space left on the disk of {folder}; nothing was written: make room or choose another folder")
+        return OutputError(
+            f"{path}: no space left on the disk of {folder}; nothing was written: make room or choose another folder"
+        )
     if code == errno.ENOENT and not folder.exists():
         return OutputError(f"{path}: the folder {folder} does not exist; create it first")
     if code == errno.ENOTDIR:
@@ -167,8 +179,13 @@ class _Output:
             try:
                 os.replace(self.temporary, self.target)
             except OSError as error:
-                if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # a folder takes no name that another took since
-                    raise OutputError(f"{self.path}: another process wrote it meanwhile, and that is kept") from error
+                if error.errno in (
+                    errno.ENOTEMPTY,
+                    errno.EEXIST,
+                ):  # a folder takes no name that another took since
+                    raise OutputError(
+                        f"{self.path}: another process wrote it meanwhile, and that is kept"
+                    ) from error
                 raise
         else:
             self._create()
@@ -209,7 +226,9 @@ class _Output:
             raise
 
     def _appeared(self) -> OutputExistsError:
-        return OutputExistsError(f"{self.path} exists: it appeared meanwhile; use --force (force=True) to replace it, or another name")
+        return OutputExistsError(
+            f"{self.path} exists: it appeared meanwhile; use --force (force=True) to replace it, or another name"
+        )
 
     def undo(self) -> None:
         """Everything as it was before."""
@@ -218,7 +237,9 @@ class _Output:
                 remove(self.target)
             if not os.path.lexists(self.target):
                 os.rename(self.old, self.target)
-            elif not self.placed:  # what is there is the older output itself, or what another process put in its place
+            elif (
+                not self.placed
+            ):  # what is there is the older output itself, or what another process put in its place
                 remove(self.old)
         remove(self.temporary)
 
@@ -226,7 +247,9 @@ class _Output:
         """Delete the older output that was replaced."""
         remove(self.old)
         if os.path.lexists(self.old):
-            raise OutputError(f"{self.path} is written, but the older one could not be deleted; delete {self.old}")
+            raise OutputError(
+                f"{self.path} is written, but the older one could not be deleted; delete {self.old}"
+            )
 
 
 def _sync(path: Path) -> None:

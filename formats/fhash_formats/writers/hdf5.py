@@ -14,7 +14,12 @@ from typing import Any
 
 from fhash_formats.series import AXES
 from fhash_formats.writers.held_file import held_hdf5
-from fhash_formats.writers.labels import coordinate_attributes, hdf5_value, safe_names, variable_attributes
+from fhash_formats.writers.labels import (
+    coordinate_attributes,
+    hdf5_value,
+    safe_names,
+    variable_attributes,
+)
 from fhash_formats.writers.region import Region
 from fhash_formats.writers.writer import Frame, Put, Writer, chunk_shape, little_endian, one_output
 
@@ -40,7 +45,9 @@ def _create(root: Any, region: Region) -> Any:
     """The empty dataset in `root`, with its attributes and scales."""
     variable, names = safe_names(region)
     dtype = little_endian(region.dtype, half=True)
-    values = root.create_dataset(variable, shape=region.shape, dtype=dtype, chunks=chunk_shape(region), **COMPRESSION)
+    values = root.create_dataset(
+        variable, shape=region.shape, dtype=dtype, chunks=chunk_shape(region), **COMPRESSION
+    )
     for key, value in variable_attributes(region).items():
         values.attrs[key] = hdf5_value(value)
     for dimension, axis in enumerate(AXES):

@@ -20,7 +20,10 @@ from pathlib import Path
 PARTIAL, OLD = ".partial", ".old"
 LONGEST = 40
 """Characters of an output's name in that of its temporary, which so stays below the 255 bytes of most file systems."""
-_NAME = re.compile(r"\.(?P<output>.+)\.(?P<machine>[0-9a-f]{8})-(?P<process>[0-9]{1,10})-[0-9a-f]{8}(?P<kind>\.partial|\.old)", re.DOTALL)
+_NAME = re.compile(
+    r"\.(?P<output>.+)\.(?P<machine>[0-9a-f]{8})-(?P<process>[0-9]{1,10})-[0-9a-f]{8}(?P<kind>\.partial|\.old)",
+    re.DOTALL,
+)
 
 
 def new_stem(name: str) -> str:
@@ -34,11 +37,19 @@ def clear(targets: Iterable[Path]) -> None:
     for target in targets:
         folders.setdefault(target.parent, {})[_short(target.name)] = target
     for folder, outputs in folders.items():
-        with suppress(OSError):  # no such folder, or not ours to read: the checks of the output say it better
+        with suppress(
+            OSError
+        ):  # no such folder, or not ours to read: the checks of the output say it better
             for name in sorted(os.listdir(folder)):
                 found = _NAME.fullmatch(name) if name.endswith((PARTIAL, OLD)) else None
-                if found and found["output"] in outputs and not _may_live(found["machine"], int(found["process"])):
-                    _clear(folder / name, outputs[found["output"]], moved_aside=found["kind"] == OLD)
+                if (
+                    found
+                    and found["output"] in outputs
+                    and not _may_live(found["machine"], int(found["process"]))
+                ):
+                    _clear(
+                        folder / name, outputs[found["output"]], moved_aside=found["kind"] == OLD
+                    )
 
 
 def remove(path: Path) -> None:
@@ -88,5 +99,7 @@ def _may_live(machine: str, process: int) -> bool:
     except (OSError, OverflowError):  # another user's
         return True
     with suppress(OSError):  # killed, and its parent has not asked for it yet
-        return Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2].split()[:1] != ["Z"]
+        return Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2].split()[
+            :1
+        ] != ["Z"]
     return True

@@ -38,15 +38,21 @@ class Mesh:
     time: float = 0.0
 
 
-def check_mesh_output(path: str | Path, force: bool = False, sources: Sequence[str | Path] = ()) -> None:
+def check_mesh_output(
+    path: str | Path, force: bool = False, sources: Sequence[str | Path] = ()
+) -> None:
     """The checks of `save_mesh` that can be made before any work; raises InputError, OutputExistsError or OutputError."""
     target = Path(path)
     if target.suffix.lower() not in MESH_SUFFIXES:
-        raise InputError(f"{path}: cannot write a surface with the suffix {target.suffix!r}; use one of {', '.join(MESH_SUFFIXES)}")
+        raise InputError(
+            f"{path}: cannot write a surface with the suffix {target.suffix!r}; use one of {', '.join(MESH_SUFFIXES)}"
+        )
     check_output(target, force, sources=sources)
 
 
-def save_mesh(path: str | Path, mesh: Mesh, *, force: bool = False, sources: Sequence[str | Path] = ()) -> Path:
+def save_mesh(
+    path: str | Path, mesh: Mesh, *, force: bool = False, sources: Sequence[str | Path] = ()
+) -> Path:
     """Write a surface in the format that the suffix names, complete or not at all; raises what `check_mesh_output` raises."""
     target = Path(path)
     check_mesh_output(target, force, sources)
@@ -105,4 +111,7 @@ _"""
     handle.write(b"\n</AppendedData>\n</VTKFile>\n")
 
 
-MESH_SUFFIXES: dict[str, Callable[[BinaryIO, Mesh], None]] = {".vtp": _write_vtp, ".ply": _write_ply}
+MESH_SUFFIXES: dict[str, Callable[[BinaryIO, Mesh], None]] = {
+    ".vtp": _write_vtp,
+    ".ply": _write_ply,
+}

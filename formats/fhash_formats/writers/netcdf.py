@@ -16,7 +16,12 @@ import numpy as np
 from fhash_formats.series import AXES
 from fhash_formats.writers.hdf5 import COMPRESSION
 from fhash_formats.writers.held_file import held_hdf5
-from fhash_formats.writers.labels import coordinate_attributes, hdf5_value, safe_names, variable_attributes
+from fhash_formats.writers.labels import (
+    coordinate_attributes,
+    hdf5_value,
+    safe_names,
+    variable_attributes,
+)
 from fhash_formats.writers.region import Region
 from fhash_formats.writers.writer import Frame, Put, Writer, chunk_shape, little_endian, one_output
 
@@ -44,15 +49,21 @@ def _create(root: Any, region: Region, dtype: np.dtype[Any]) -> Any:
     root.dimensions = {names[axis]: length for axis, length in zip(AXES, region.shape, strict=True)}
     for axis in AXES:
         coordinate = region.coords[axis]
-        scale = root.create_variable(names[axis], (names[axis],), data=coordinate.values.astype("<f8"))
+        scale = root.create_variable(
+            names[axis], (names[axis],), data=coordinate.values.astype("<f8")
+        )
         for key, value in coordinate_attributes(axis, coordinate).items():
             scale.attrs[key] = hdf5_value(value)
     fill = np.nan if dtype.kind == "f" else None
     dimensions = tuple(names[axis] for axis in AXES)
-    values = root.create_variable(variable, dimensions, dtype, chunks=chunk_shape(region), fillvalue=fill, **COMPRESSION)
+    values = root.create_variable(
+        variable, dimensions, dtype, chunks=chunk_shape(region), fillvalue=fill, **COMPRESSION
+    )
     for key, value in variable_attributes(region).items():
         values.attrs[key] = hdf5_value(value)
     return values
 
 
-NETCDF = Writer(name="NetCDF", suffixes=(".nc", ".nc4"), outputs=one_output, open=_open, module="h5netcdf")
+NETCDF = Writer(
+    name="NetCDF", suffixes=(".nc", ".nc4"), outputs=one_output, open=_open, module="h5netcdf"
+)

@@ -15,7 +15,11 @@ from fhash_formats.writers.writer import Frame, Put, Writer, little_endian, one_
 @contextmanager
 def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
     dtype = little_endian(region.dtype, half=True)
-    header = {"descr": npy_format.dtype_to_descr(dtype), "fortran_order": False, "shape": region.shape}
+    header = {
+        "descr": npy_format.dtype_to_descr(dtype),
+        "fortran_order": False,
+        "shape": region.shape,
+    }
     with temporaries[0].open("xb") as handle:
         npy_format.write_array_header_1_0(handle, header)
 

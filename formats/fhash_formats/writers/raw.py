@@ -33,19 +33,30 @@ def _outputs(path: Path, region: Region) -> list[Path]:
     _, layout = layout_of_name(path.stem)
     if layout.shape is None or layout.dtype is None:
         if not path.name.isprintable():
-            raise InputError(f"{path}: the file name holds control characters, which a .nhdr header cannot name; use another name")
+            raise InputError(
+                f"{path}: the file name holds control characters, which a .nhdr header cannot name; use another name"
+            )
         return [path, path.with_suffix(".nhdr")]
-    if tuple(layout.shape.get(axis, 1) for axis in AXES) != region.shape or parse_dtype(layout.dtype) != region.dtype:
+    if (
+        tuple(layout.shape.get(axis, 1) for axis in AXES) != region.shape
+        or parse_dtype(layout.dtype) != region.dtype
+    ):
         t, z, y, x = region.shape
         true = f"*_{x}x{y}x{z}x{t}_{region.dtype.name}.raw"
-        raise InputError(f"{path}: the name says another layout than the values have; use {true} or a name that says none")
+        raise InputError(
+            f"{path}: the name says another layout than the values have; use {true} or a name that says none"
+        )
     return [path]
 
 
 @contextmanager
 def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
     _, layout = layout_of_name(outputs[0].stem)
-    dtype = little_endian(region.dtype) if layout.dtype is None else region.dtype.newbyteorder(ENDIANS[layout.endian or "little"])
+    dtype = (
+        little_endian(region.dtype)
+        if layout.dtype is None
+        else region.dtype.newbyteorder(ENDIANS[layout.endian or "little"])
+    )
     with temporaries[0].open("xb") as handle:
 
         def put(step: int, frame: Frame) -> None:
@@ -90,7 +101,10 @@ def _space(region: Region, axes: str) -> list[str]:
     steps = [even_spacing(region.coords[axis].values) for axis in "xyz"]
     if None in steps:
         return []
-    directions = [f"({','.join(repr(step) if i == j else '0' for j in range(3))})" for i, step in enumerate(steps)]
+    directions = [
+        f"({','.join(repr(step) if i == j else '0' for j in range(3))})"
+        for i, step in enumerate(steps)
+    ]
     origin = ",".join(repr(float(region.coords[axis].values[0])) for axis in "xyz")
     return [
         "space dimension: 3",

@@ -24,7 +24,12 @@ from fhash_formats.writers.zarr_ import ZARR
 WRITERS = (NPY, HDF5, NETCDF, ZARR, RAW, VTK, VTKHDF)
 
 
-def save_check(path: str | Path, force: bool = False, region: Region | None = None, sources: Sequence[str | Path] = ()) -> None:
+def save_check(
+    path: str | Path,
+    force: bool = False,
+    region: Region | None = None,
+    sources: Sequence[str | Path] = (),
+) -> None:
     """The checks of `save_region` that can be made before any work; all of them where the region is known.
 
     Raises:
@@ -69,12 +74,19 @@ def save_region(
     save_check(target, force, region, sources)
     writer = _writer(target)
     outputs = writer.outputs(target, region)
-    with replacing_all(outputs, force=force, directory=writer.directory) as temporaries, writer.open(region, outputs, temporaries) as put:
+    with (
+        replacing_all(outputs, force=force, directory=writer.directory) as temporaries,
+        writer.open(region, outputs, temporaries) as put,
+    ):
         source = iter(frames)
         for step in range(region.shape[0]):
-            put(step, _frame(region, source, step))  # no variable: the frame must be gone before the next one is made
+            put(
+                step, _frame(region, source, step)
+            )  # no variable: the frame must be gone before the next one is made
         if _next(region, source) is not None:
-            raise InputError(f"region {region.name!r}: more frames than its {region.shape[0]} steps")
+            raise InputError(
+                f"region {region.name!r}: more frames than its {region.shape[0]} steps"
+            )
     return outputs
 
 
@@ -83,16 +95,22 @@ def _writer(path: Path) -> Writer:
     for writer in WRITERS:
         if suffix in writer.suffixes:
             if writer.module and importlib.util.find_spec(writer.module) is None:
-                raise MissingDependencyError(f"{path}: writing {writer.name} needs {writer.module}: pip install 'fhash[formats]'")
+                raise MissingDependencyError(
+                    f"{path}: writing {writer.name} needs {writer.module}: pip install 'fhash[formats]'"
+                )
             return writer
     known = ", ".join(suffix for writer in WRITERS for suffix in writer.suffixes)
-    raise InputError(f"{path}: cannot write {f'the suffix {path.suffix!r}' if suffix else 'a name without a suffix'}; use one of {known}")
+    raise InputError(
+        f"{path}: cannot write {f'the suffix {path.suffix!r}' if suffix else 'a name without a suffix'}; use one of {known}"
+    )
 
 
 def _frame(region: Region, source: Iterator[npt.NDArray[np.generic]], step: int) -> Frame:
     frame = _next(region, source)
     if frame is None:
-        raise InputError(f"region {region.name!r}: only {step} frames came for its {region.shape[0]} steps")
+        raise InputError(
+            f"region {region.name!r}: only {step} frames came for its {region.shape[0]} steps"
+        )
     if frame.shape != region.shape[1:] or frame.dtype.newbyteorder("=") != region.dtype:
         raise InputError(
             f"region {region.name!r}: frame {step} is {frame.dtype} {frame.shape}; {region.dtype} {region.shape[1:]} (z, y, x) is needed"
@@ -107,4 +125,6 @@ def _next(region: Region, source: Iterator[npt.NDArray[np.generic]]) -> Frame | 
         if isinstance(error, FhashError):
             raise
         # Not the output's failure, and an OSError would be reported as one.
-        raise InputError(f"region {region.name!r}: the values could not be read: {error}") from error
+        raise InputError(
+            f"region {region.name!r}: the values could not be read: {error}"
+        ) from error

@@ -35,9 +35,13 @@ def _outputs(path: Path, region: Region) -> list[Path]:
     elif region.shape[0] == 1:
         return [path]
     if not path.name.isprintable():
-        raise InputError(f"{path}: the file name holds control characters, which a .pvd cannot list; use another name")
+        raise InputError(
+            f"{path}: the file name holds control characters, which a .pvd cannot list; use another name"
+        )
     digits = max(4, len(str(region.shape[0] - 1)))
-    steps = [path.with_name(f"{path.stem}_{step:0{digits}d}{suffix}") for step in range(region.shape[0])]
+    steps = [
+        path.with_name(f"{path.stem}_{step:0{digits}d}{suffix}") for step in range(region.shape[0])
+    ]
     return [*steps, path.with_suffix(".pvd")]
 
 
@@ -48,11 +52,15 @@ def _is_even(region: Region) -> bool:
 def _check_grid(path: Path, region: Region, suffix: str) -> None:
     """InputError where the coordinates do not fit the format."""
     if not np.all(np.isfinite(region.coords["t"].values)):
-        raise InputError(f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy")
+        raise InputError(
+            f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy"
+        )
     for axis in SPACE:
         values = region.coords[axis].values
         if suffix == ".vti" and even_spacing(values) is None:
-            raise InputError(f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly spaced, as .vti needs; use .vtr")
+            raise InputError(
+                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly spaced, as .vti needs; use .vtr"
+            )
         steps = np.diff(values)
         if not np.all(np.isfinite(values)) or not (np.all(steps > 0) or np.all(steps < 0)):
             raise InputError(
@@ -62,12 +70,23 @@ def _check_grid(path: Path, region: Region, suffix: str) -> None:
 
 @contextmanager
 def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
-    ascending = {axis: values[:: direction(values)] for axis in SPACE for values in [region.coords[axis].values]}
+    ascending = {
+        axis: values[:: direction(values)]
+        for axis in SPACE
+        for values in [region.coords[axis].values]
+    }
     turn = tuple(slice(None, None, direction(region.coords[axis].values)) for axis in SPACE)
     image = outputs[0].suffix.lower() == ".vti"
 
     def put(step: int, frame: Frame) -> None:
-        _write_grid(temporaries[step], region, float(region.coords["t"].values[step]), ascending, frame[turn], image=image)
+        _write_grid(
+            temporaries[step],
+            region,
+            float(region.coords["t"].values[step]),
+            ascending,
+            frame[turn],
+            image=image,
+        )
 
     yield put
     if len(outputs) > region.shape[0]:
@@ -79,7 +98,15 @@ def direction(values: npt.NDArray[np.float64]) -> int:
     return -1 if values[-1] < values[0] else 1
 
 
-def _write_grid(path: Path, region: Region, time: float, coords: dict[str, npt.NDArray[np.float64]], frame: Frame, *, image: bool) -> None:
+def _write_grid(
+    path: Path,
+    region: Region,
+    time: float,
+    coords: dict[str, npt.NDArray[np.float64]],
+    frame: Frame,
+    *,
+    image: bool,
+) -> None:
     """One step: `frame` (z, y, x) on ascending `coords`, as ImageData or RectilinearGrid."""
     dtype = little_endian(region.dtype)
     extent = " ".join(f"0 {length - 1}" for length in reversed(frame.shape))
@@ -91,8 +118,14 @@ def _write_grid(path: Path, region: Region, time: float, coords: dict[str, npt.N
     name = quoteattr(printable(region.name))
     key = '<InformationKey name="UNITS_LABEL" location="vtkDataArray">'
     units = f"{key}{escape(printable(region.units))}</InformationKey>" if region.units else ""
-    sizes = [frame.size * dtype.itemsize] if image else [frame.size * dtype.itemsize, *(coords[axis].nbytes for axis in "xyz")]
-    offsets = [sum(sizes[:i]) + 8 * i for i in range(len(sizes))]  # each array follows its 64-bit size
+    sizes = (
+        [frame.size * dtype.itemsize]
+        if image
+        else [frame.size * dtype.itemsize, *(coords[axis].nbytes for axis in "xyz")]
+    )
+    offsets = [
+        sum(sizes[:i]) + 8 * i for i in range(len(sizes))
+    ]  # each array follows its 64-bit size
     grid = (
         ""
         if image
@@ -134,7 +167,8 @@ def _vtk_type(dtype: np.dtype[Any]) -> str:
 def _collection(region: Region, files: Sequence[Path]) -> str:
     times = region.coords["t"].values.tolist()
     rows = [
-        f'<DataSet timestep="{time!r}" group="" part="0" file={quoteattr(file.name)}/>\n' for time, file in zip(times, files, strict=True)
+        f'<DataSet timestep="{time!r}" group="" part="0" file={quoteattr(file.name)}/>\n'
+        for time, file in zip(times, files, strict=True)
     ]
     head = '<?xml version="1.0" encoding="UTF-8"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n<Collection>\n'
     return head + "".join(rows) + "</Collection>\n</VTKFile>\n"

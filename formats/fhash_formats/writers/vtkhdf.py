@@ -27,7 +27,9 @@ VERSION = (2, 0)
 
 def _outputs(path: Path, region: Region) -> list[Path]:
     if not np.all(np.isfinite(region.coords["t"].values)):
-        raise InputError(f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy")
+        raise InputError(
+            f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy"
+        )
     for axis in SPACE:
         if not even_spacing(region.coords[axis].values):
             raise InputError(
@@ -42,7 +44,10 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
 
     turn = tuple(slice(None, None, direction(region.coords[axis].values)) for axis in SPACE)
     # Links in the order of their creation, as the reader of VTK demands for composite files and takes for all.
-    with held_hdf5(temporaries[0], lambda file: h5py.File(file, "w", track_order=True)) as (file, root):
+    with held_hdf5(temporaries[0], lambda file: h5py.File(file, "w", track_order=True)) as (
+        file,
+        root,
+    ):
         with file.calling():
             values = _create(root, region)
 
@@ -55,19 +60,33 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
 
 def _create(root: Any, region: Region) -> Any:
     """The empty dataset in `root`, with all that describes it."""
-    ascending = {axis: values[:: direction(values)] for axis in SPACE for values in [region.coords[axis].values]}
+    ascending = {
+        axis: values[:: direction(values)]
+        for axis in SPACE
+        for values in [region.coords[axis].values]
+    }
     steps, *size = region.shape
     group = root.create_group("VTKHDF", track_order=True)
     group.attrs["Version"] = np.array(VERSION, dtype="<i8")
     group.attrs["Type"] = np.bytes_("ImageData")
-    group.attrs["WholeExtent"] = np.array([bound for length in reversed(size) for bound in (0, length - 1)], dtype="<i8")
+    group.attrs["WholeExtent"] = np.array(
+        [bound for length in reversed(size) for bound in (0, length - 1)], dtype="<i8"
+    )
     group.attrs["Origin"] = np.array([ascending[axis][0] for axis in "xyz"], dtype="<f8")
-    group.attrs["Spacing"] = np.array([even_spacing(ascending[axis]) for axis in "xyz"], dtype="<f8")
+    group.attrs["Spacing"] = np.array(
+        [even_spacing(ascending[axis]) for axis in "xyz"], dtype="<f8"
+    )
     group.attrs["Direction"] = np.eye(3, dtype="<f8").ravel()
     name = safe_name(region.name)
     points = group.create_group("PointData", track_order=True)
     points.attrs["Scalars"] = np.bytes_(name.encode())
-    values = points.create_dataset(name, shape=region.shape, dtype=little_endian(region.dtype), chunks=chunk_shape(region), **COMPRESSION)
+    values = points.create_dataset(
+        name,
+        shape=region.shape,
+        dtype=little_endian(region.dtype),
+        chunks=chunk_shape(region),
+        **COMPRESSION,
+    )
     if region.units:
         values.attrs["units"] = region.units.replace("\0", "")
     times = group.create_group("Steps", track_order=True)

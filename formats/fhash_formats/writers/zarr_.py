@@ -44,7 +44,12 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
     for axis in AXES:
         coordinate = region.coords[axis]
         attributes = coordinate_attributes(axis, coordinate)
-        root.create_array(names[axis], data=coordinate.values, dimension_names=[names[axis]], attributes=attributes)
+        root.create_array(
+            names[axis],
+            data=coordinate.values,
+            dimension_names=[names[axis]],
+            attributes=attributes,
+        )
     values = root.create_array(
         variable,
         shape=region.shape,
@@ -53,7 +58,9 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
         fill_value=np.nan if region.dtype.kind == "f" else 0,
         dimension_names=[names[axis] for axis in AXES],
         attributes=variable_attributes(region),
-        config={"write_empty_chunks": True},  # a chunk that is missing is then always a fault, not a frame of fill values
+        config={
+            "write_empty_chunks": True
+        },  # a chunk that is missing is then always a fault, not a frame of fill values
     )
     with warnings.catch_warnings():  # that this is not yet in Zarr's specification; xarray looks for it and warns where it is not
         warnings.filterwarnings("ignore", message="Consolidated metadata")

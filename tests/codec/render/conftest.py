@@ -44,7 +44,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "paper": EncodeConfig(profile="paper", features=("interval:3:99",), epochs=15, width=16),
     }
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FhashWarning)  # coding without the native core is slow, and here so little that it is not
+        warnings.simplefilter(
+            "ignore", FhashWarning
+        )  # coding without the native core is slow, and here so little that it is not
         for name, config in configs.items():
             fhash_codec.encode(blobs(), folder / f"{name}.fhz", config)
     return {name: folder / f"{name}.fhz" for name in configs}

@@ -16,9 +16,20 @@ def bricks_of(values):
 
 
 def task_of(shape, extinctions, surfaces=()):
-    table = Table(low=0.0, high=1.0, colours=np.ones((len(extinctions), 3), dtype=np.float32), extinctions=np.array(extinctions))
+    table = Table(
+        low=0.0,
+        high=1.0,
+        colours=np.ones((len(extinctions), 3), dtype=np.float32),
+        extinctions=np.array(extinctions),
+    )
     grid = Grid(counts=shape[::-1], origin=np.zeros(3), spacing=np.ones(3))
-    return Task(rays=Rays.of(Camera(), grid, (4, 4)), step=0.5, threshold=0.0, table=table, surfaces=surfaces)
+    return Task(
+        rays=Rays.of(Camera(), grid, (4, 4)),
+        step=0.5,
+        threshold=0.0,
+        table=table,
+        surfaces=surfaces,
+    )
 
 
 @pytest.mark.parametrize("shape", [(20, 17, 33), (9, 8, 10), (1, 30, 2), (1, 1, 1), (70, 70, 70)])
@@ -31,7 +42,10 @@ def test_a_brick_has_the_extremes_of_its_vertices(way, shape):
         known = part[~np.isnan(part)]
         assert bricks.low[at] == (known.min() if known.size else np.inf)
         assert bricks.high[at] == (known.max() if known.size else -np.inf)
-    assert all(count == max(-(-(size - 1) // SIDE), 1) for count, size in zip(bricks.low.shape, shape, strict=True))
+    assert all(
+        count == max(-(-(size - 1) // SIDE), 1)
+        for count, size in zip(bricks.low.shape, shape, strict=True)
+    )
 
 
 def test_what_is_infinite_has_no_value(way):

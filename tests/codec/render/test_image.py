@@ -17,7 +17,9 @@ from fhash_codec.render.image import LARGEST_TEXT, SCENE_KEY, Image, scene_in_pn
 from fhash_codec.render.scene import Camera, Scene
 from fhash_formats.errors import InputError, OutputExistsError
 
-SCENE = Scene(size=(3, 2), camera=Camera(view="xz", position=(1.5, 2.0, 3.25)), background="#204060", step=3.5)
+SCENE = Scene(
+    size=(3, 2), camera=Camera(view="xz", position=(1.5, 2.0, 3.25)), background="#204060", step=3.5
+)
 
 
 def image(**arguments: Any) -> Image:
@@ -71,7 +73,10 @@ def test_buffers_lie_beside_the_picture(tmp_path: Path) -> None:
     assert [path.name for path in paths] == ["view.depth.npy", "view.normal.npy", "view.png"]
     np.testing.assert_array_equal(np.load(paths[0]), depth)
     np.testing.assert_array_equal(np.load(paths[1]), normal)
-    assert [path.name for path in image(normal=normal).outputs(Path("a.png"))] == ["a.normal.npy", "a.png"]
+    assert [path.name for path in image(normal=normal).outputs(Path("a.png"))] == [
+        "a.normal.npy",
+        "a.png",
+    ]
 
 
 @pytest.mark.parametrize("existing", ["view.png", "view.depth.npy"])
@@ -94,11 +99,18 @@ def test_a_notebook_shows_the_picture() -> None:
 
 
 def chunk(kind: bytes, data: bytes, wrong: int = 0) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data) ^ wrong)
+    return (
+        struct.pack(">I", len(data))
+        + kind
+        + data
+        + struct.pack(">I", zlib.crc32(kind + data) ^ wrong)
+    )
 
 
 def png(*chunks: bytes) -> bytes:
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", b"\0" * 13) + b"".join(chunks) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", b"\0" * 13) + b"".join(chunks) + chunk(b"IEND", b"")
+    )
 
 
 def text(content: bytes, packed: bytes = b"\0\0") -> bytes:

@@ -22,7 +22,12 @@ def grid_of(shape, spacing=(1.0, 1.0, 1.0)):
 
 
 def table_of(extinctions):
-    return Table(low=0.0, high=1.0, colours=np.ones((len(extinctions), 3), dtype=np.float32), extinctions=np.array(extinctions))
+    return Table(
+        low=0.0,
+        high=1.0,
+        colours=np.ones((len(extinctions), 3), dtype=np.float32),
+        extinctions=np.array(extinctions),
+    )
 
 
 @pytest.mark.parametrize("resolution", [1.0, 2.0])
@@ -31,7 +36,13 @@ def test_the_shadow_within_a_slab_is_its_closed_form(way, resolution, spacing):
     shape = (41, 9, 9)
     settings = Shadows(strength=0.75, resolution=resolution)
     lamp = UP * np.sign(spacing)
-    light = light_grid(frame_of(np.ones(shape)), grid_of(shape, (1, 1, spacing)), table_of([0.05, 0.05]), shadows=settings, lamp=lamp)
+    light = light_grid(
+        frame_of(np.ones(shape)),
+        grid_of(shape, (1, 1, spacing)),
+        table_of([0.05, 0.05]),
+        shadows=settings,
+        lamp=lamp,
+    )
     depth = (40 - np.arange(light.shares.shape[0]) * light.cell) * abs(spacing)
     exact = 1 - 0.75 * (1 - np.exp(-0.05 * depth))
     middle = light.shares[:, light.shares.shape[1] // 2, light.shares.shape[2] // 2]
@@ -46,7 +57,11 @@ def test_a_block_throws_its_shadow_away_from_the_lamp(way):
     values[18:22, 18:22, 18:22] = 1.0
     lamp = np.array([1.0, 0.0, 1.0]) / np.sqrt(2)
     light = light_grid(
-        frame_of(values), grid_of(values.shape), table_of([0.0, 5.0]), shadows=Shadows(strength=1.0, resolution=1.0), lamp=lamp
+        frame_of(values),
+        grid_of(values.shape),
+        table_of([0.0, 5.0]),
+        shadows=Shadows(strength=1.0, resolution=1.0),
+        lamp=lamp,
     )
     lamp_share = light.shares[..., 0]
     assert lamp_share[10, 20, 10] < 0.01
@@ -59,7 +74,9 @@ def test_surroundings_take_light_only_where_there_are_any(way):
     values = np.zeros((40, 40, 40))
     values[:20] = 1.0
     settings = AmbientOcclusion(strength=0.5, radius=6.0)
-    light = light_grid(frame_of(values), grid_of(values.shape), table_of([0.0, 50.0]), ambient_occlusion=settings)
+    light = light_grid(
+        frame_of(values), grid_of(values.shape), table_of([0.0, 50.0]), ambient_occlusion=settings
+    )
     around = light.shares[:, 10, 10, 1]
     assert np.all(light.shares[..., 0] == 1)
     assert around[5] == pytest.approx(0.5, abs=0.01)
@@ -97,11 +114,18 @@ def test_native_and_numpy_agree(monkeypatch):
 
 def test_nothing_that_takes_light_leaves_all_of_it(way):
     for table in (None, table_of([0.0, 0.0])):
-        light = light_grid(frame_of(np.ones((5, 5, 5))), grid_of((5, 5, 5)), table, shadows=Shadows(), lamp=UP)
+        light = light_grid(
+            frame_of(np.ones((5, 5, 5))), grid_of((5, 5, 5)), table, shadows=Shadows(), lamp=UP
+        )
         assert np.all(light.shares == 1)
         assert light.secondary_rays == 0
 
 
 def test_shadows_need_a_lamp():
     with pytest.raises(InputError, match="lamp"):
-        light_grid(frame_of(np.ones((5, 5, 5))), grid_of((5, 5, 5)), table_of([1.0, 1.0]), shadows=Shadows())
+        light_grid(
+            frame_of(np.ones((5, 5, 5))),
+            grid_of((5, 5, 5)),
+            table_of([1.0, 1.0]),
+            shadows=Shadows(),
+        )

@@ -28,17 +28,34 @@ def grid_of(shape, spacing=(1.0, 1.0, 1.0)):
 
 def table_of(extinctions, low=0.0, high=1.0, colour=(1.0, 1.0, 1.0)):
     extinctions = np.asarray(extinctions, dtype=np.float64)
-    return Table(low=low, high=high, colours=np.tile(np.float32(colour), (len(extinctions), 1)), extinctions=extinctions)
+    return Table(
+        low=low,
+        high=high,
+        colours=np.tile(np.float32(colour), (len(extinctions), 1)),
+        extinctions=extinctions,
+    )
 
 
-def task_of(shape, table, *, camera=FRONT, size=(8, 8), step=0.5, spacing=(1.0, 1.0, 1.0), threshold=0.0, **more):
+def task_of(
+    shape,
+    table,
+    *,
+    camera=FRONT,
+    size=(8, 8),
+    step=0.5,
+    spacing=(1.0, 1.0, 1.0),
+    threshold=0.0,
+    **more,
+):
     rays = Rays.of(camera, grid_of(shape, spacing), size)
     return Task(rays=rays, step=step, threshold=threshold, table=table, lighting=LIGHTING, **more)
 
 
 def waves(shape=(20, 17, 30)):
     z, y, x = np.meshgrid(*(np.linspace(0, 1, size) for size in shape), indexing="ij")
-    return (0.5 + 0.25 * np.sin(7 * x + 3 * y) + 0.25 * np.cos(5 * y - 6 * z + 2 * x)).astype(np.float32)
+    return (0.5 + 0.25 * np.sin(7 * x + 3 * y) + 0.25 * np.cos(5 * y - 6 * z + 2 * x)).astype(
+        np.float32
+    )
 
 
 def sphere(count=33):
@@ -52,9 +69,13 @@ def sphere(count=33):
 def test_a_constant_slab_has_its_closed_form_at_every_step(way, extinction, step):
     table = table_of([extinction, extinction], colour=(0.8, 0.4, 0.2))
     shape = (21, 8, 8)
-    rgba = march(frame_of(np.full(shape, 0.3)), task_of(shape, table, step=step, size=(4, 4))).rgba[2, 2]
+    rgba = march(frame_of(np.full(shape, 0.3)), task_of(shape, table, step=step, size=(4, 4))).rgba[
+        2, 2
+    ]
     exact = -np.expm1(-extinction * 20)
-    np.testing.assert_allclose(rgba, exact * np.array([0.8, 0.4, 0.2, 1.0]), rtol=1e-3 if exact < 1e-6 else 1e-5)
+    np.testing.assert_allclose(
+        rgba, exact * np.array([0.8, 0.4, 0.2, 1.0]), rtol=1e-3 if exact < 1e-6 else 1e-5
+    )
 
 
 def test_thin_fog_holds_down_to_tiny_steps(way):
@@ -68,8 +89,15 @@ def test_thin_fog_holds_down_to_tiny_steps(way):
 def test_a_linear_ramp_in_front_of_colours_has_its_integral(way):
     ramp = np.broadcast_to(np.linspace(1, 0, 65, dtype=np.float32)[:, None, None], (65, 6, 6))
     n = 257
-    table = Table(low=0.0, high=1.0, colours=np.linspace([0, 0, 0], [1, 0, 0], n, dtype=np.float32), extinctions=np.linspace(0, 0.1, n))
-    red, _, _, opacity = march(frame_of(ramp), task_of(ramp.shape, table, step=0.05, size=(1, 1))).rgba[0, 0]
+    table = Table(
+        low=0.0,
+        high=1.0,
+        colours=np.linspace([0, 0, 0], [1, 0, 0], n, dtype=np.float32),
+        extinctions=np.linspace(0, 0.1, n),
+    )
+    red, _, _, opacity = march(
+        frame_of(ramp), task_of(ramp.shape, table, step=0.05, size=(1, 1))
+    ).rgba[0, 0]
     s = (np.arange(200_000) + 0.5) / 200_000
     left = np.exp(-6.4 * s**2 / 2)  # the ray begins at the last layer, of value 0
     assert opacity == pytest.approx(1 - np.exp(-3.2), rel=1e-4)
@@ -81,7 +109,15 @@ def test_the_surface_of_a_sphere_lies_where_it_is(way, position):
     values = sphere()
     surface = Surface(value=0.5, colour=np.array([1.0, 0.5, 0.25]), opacity=1.0)
     camera = Camera(position=position, view_up=(0, 1, 0))
-    task = task_of(values.shape, None, camera=camera, size=(33, 33), surfaces=(surface,), depth=True, normal=True)
+    task = task_of(
+        values.shape,
+        None,
+        camera=camera,
+        size=(33, 33),
+        surfaces=(surface,),
+        depth=True,
+        normal=True,
+    )
     marched = march(frame_of(values), task)
     assert marched.depth is not None
     assert marched.normal is not None
@@ -104,7 +140,9 @@ def test_the_surface_of_a_sphere_lies_where_it_is(way, position):
 
 def test_roots_of_a_plane_are_exact(way):
     x = np.broadcast_to(np.linspace(0, 1, 11, dtype=np.float32)[:, None, None] ** 2, (11, 5, 5))
-    surfaces = tuple(Surface(value=value, colour=WHITE, opacity=0.6) for value in (0.005, 0.333, 0.995))
+    surfaces = tuple(
+        Surface(value=value, colour=WHITE, opacity=0.6) for value in (0.005, 0.333, 0.995)
+    )
     task = task_of(x.shape, None, surfaces=surfaces, depth=True, size=(4, 4), step=0.7)
     marched = march(frame_of(x), task)
     assert marched.depth is not None
@@ -123,15 +161,24 @@ def test_a_surface_of_the_value_of_a_face_is_that_face(way, spacing):
         ramp = np.broadcast_to(np.linspace(low, high, 9, dtype=np.float32)[:, None, None], shape)
         camera = Camera(azimuth=7, elevation=50)
         task = task_of(
-            shape, None, camera=camera, size=(64, 64), spacing=spacing, surfaces=(Surface(value=6.0, colour=WHITE, opacity=1.0),)
+            shape,
+            None,
+            camera=camera,
+            size=(64, 64),
+            spacing=spacing,
+            surfaces=(Surface(value=6.0, colour=WHITE, opacity=1.0),),
         )
         seen = march(frame_of(ramp), replace(task, depth=True))
         origin, direction = (part.reshape(-1, 3) for part in task.rays.pixels())
         face = 8.0 if high == 6.0 else 0.0
         with np.errstate(divide="ignore"):
             place = origin + ((face - origin[:, 2]) / direction[:, 2])[:, None] * direction
-        inside = np.all((place[:, :2] > 0.01) & (place[:, :2] < np.array([5.99, 6.99])), axis=1).reshape(64, 64)
-        outside = np.any((place[:, :2] < -0.01) | (place[:, :2] > np.array([6.01, 7.01])), axis=1).reshape(64, 64)
+        inside = np.all(
+            (place[:, :2] > 0.01) & (place[:, :2] < np.array([5.99, 6.99])), axis=1
+        ).reshape(64, 64)
+        outside = np.any(
+            (place[:, :2] < -0.01) | (place[:, :2] > np.array([6.01, 7.01])), axis=1
+        ).reshape(64, 64)
         assert inside.sum() > 200
         assert seen.rgba[inside, 3].min() == 1
         assert seen.rgba[outside, 3].max() == 0
@@ -139,10 +186,15 @@ def test_a_surface_of_the_value_of_a_face_is_that_face(way, spacing):
 
 def test_surfaces_are_drawn_in_the_order_in_which_a_ray_meets_them(way):
     ramp = np.broadcast_to(np.linspace(0, 1, 11, dtype=np.float32)[:, None, None], (11, 5, 5))
-    red, blue = (Surface(value=v, colour=np.array(c), opacity=0.5) for v, c in ((0.81, (1.0, 0, 0)), (0.83, (0, 0, 1.0))))
+    red, blue = (
+        Surface(value=v, colour=np.array(c), opacity=0.5)
+        for v, c in ((0.81, (1.0, 0, 0)), (0.83, (0, 0, 1.0)))
+    )
     lighting = Lighting(ambient=1.0, diffuse=0.0, specular=0.0, specular_power=1.0, lamp=None)
     task = replace(task_of(ramp.shape, None, surfaces=(red, blue), size=(4, 4)), lighting=lighting)
-    np.testing.assert_allclose(march(frame_of(ramp), task).rgba[2, 2], [0.25, 0, 0.5, 0.75], atol=1e-5)
+    np.testing.assert_allclose(
+        march(frame_of(ramp), task).rgba[2, 2], [0.25, 0, 0.5, 0.75], atol=1e-5
+    )
 
 
 def test_an_empty_scene_is_empty_and_an_opaque_one_is_opaque(way):
@@ -157,10 +209,15 @@ def test_a_camera_may_be_inside_and_rays_may_run_along_faces(way):
     values = np.full((9, 9, 9), 0.5)
     table = table_of([0.1, 0.1])
     camera = Camera(position=(4.0, 4.0, 4.0), focal_point=(4.0, 4.0, -10.0), view_up=(0, 1, 0))
-    middle = march(frame_of(values), task_of(values.shape, table, camera=camera, size=(1, 1))).rgba[0, 0, 3]
+    middle = march(frame_of(values), task_of(values.shape, table, camera=camera, size=(1, 1))).rgba[
+        0, 0, 3
+    ]
     assert middle == pytest.approx(-np.expm1(-0.4), rel=1e-5)
     task = task_of(values.shape, table, size=(2, 1))
-    along = replace(task, rays=replace(task.rays, eye=np.array([8.0, 0.0, 20.0]), right=np.zeros(3), up=np.zeros(3)))
+    along = replace(
+        task,
+        rays=replace(task.rays, eye=np.array([8.0, 0.0, 20.0]), right=np.zeros(3), up=np.zeros(3)),
+    )
     assert march(frame_of(values), along).rgba[0, 0, 3] == pytest.approx(-np.expm1(-0.8), rel=1e-5)
     beside = replace(along, rays=replace(along.rays, eye=np.array([8.0 + 1e-9, 0.0, 20.0])))
     assert march(frame_of(values), beside).rgba[0, 0, 3] == 0
@@ -168,7 +225,9 @@ def test_a_camera_may_be_inside_and_rays_may_run_along_faces(way):
 
 @pytest.mark.parametrize("shape", [(1, 6, 6), (6, 1, 6), (1, 1, 1), (2, 2, 2)])
 def test_volumes_of_one_vertex_are_drawn(way, shape):
-    rgba = march(frame_of(np.full(shape, 0.5)), task_of(shape, table_of([0.5, 0.5]), shaded=True)).rgba
+    rgba = march(
+        frame_of(np.full(shape, 0.5)), task_of(shape, table_of([0.5, 0.5]), shaded=True)
+    ).rgba
     thickness = 1 if shape[0] == 1 else shape[0] - 1
     assert rgba[4, 4, 3] == pytest.approx(-np.expm1(-0.5 * thickness), rel=1e-5)
     assert np.all(np.isfinite(rgba))
@@ -181,7 +240,16 @@ def test_what_has_no_value_never_reaches_a_pixel(way):
     table = table_of([0.05, 0.2])
     surface = Surface(value=0.6, colour=WHITE, opacity=0.5)
     for camera in (FRONT, Camera()):
-        task = task_of(values.shape, table, camera=camera, size=(40, 40), shaded=True, surfaces=(surface,), depth=True, normal=True)
+        task = task_of(
+            values.shape,
+            table,
+            camera=camera,
+            size=(40, 40),
+            shaded=True,
+            surfaces=(surface,),
+            depth=True,
+            normal=True,
+        )
         marched = march(frame_of(values), task)
         assert np.all(np.isfinite(marched.rgba))
         assert marched.normal is not None
@@ -194,14 +262,22 @@ def test_a_face_of_vertices_with_values_is_seen_though_what_lies_behind_has_none
     values[0] = np.nan
     camera = Camera(view="xz", projection="parallel")
     task = task_of(values.shape, table_of([0.1, 0.1]), camera=camera, size=(1, 1))
-    task = replace(task, rays=replace(task.rays, eye=np.array([2.0, -9.0, 1.0]), right=np.zeros(3), up=np.zeros(3)))
+    task = replace(
+        task,
+        rays=replace(task.rays, eye=np.array([2.0, -9.0, 1.0]), right=np.zeros(3), up=np.zeros(3)),
+    )
     assert march(frame_of(values), task).rgba[0, 0, 3] == pytest.approx(-np.expm1(-0.4), rel=1e-5)
 
 
 def test_the_maximum_is_that_of_the_samples(way):
     values = waves()
     n = 1000
-    table = Table(low=0.0, high=1.0, colours=np.linspace([0, 0, 0], [1, 1, 1], n, dtype=np.float32), extinctions=np.ones(n))
+    table = Table(
+        low=0.0,
+        high=1.0,
+        colours=np.linspace([0, 0, 0], [1, 1, 1], n, dtype=np.float32),
+        extinctions=np.ones(n),
+    )
     task = task_of(values.shape, table, size=(17, 17), maximum=True, step=0.25, depth=True)
     marched = march(frame_of(values), task)
     everything = march(frame_of(values), replace(task, skipping=False))
@@ -221,11 +297,17 @@ CASES = {
     "antialiased": {"antialiasing": 2, "jitter": True},
     "jitter": {"jitter": True, "step": 1.7},
     "surfaces": {
-        "surfaces": (Surface(value=0.62, colour=np.array([1, 0, 0.0]), opacity=0.4), Surface(value=0.3, colour=WHITE, opacity=0.7)),
+        "surfaces": (
+            Surface(value=0.62, colour=np.array([1, 0, 0.0]), opacity=0.4),
+            Surface(value=0.3, colour=WHITE, opacity=0.7),
+        ),
         "shaded": True,
     },
     "maximum": {"maximum": True},
-    "maximum and surface": {"maximum": True, "surfaces": (Surface(value=0.8, colour=WHITE, opacity=0.5),)},
+    "maximum and surface": {
+        "maximum": True,
+        "surfaces": (Surface(value=0.8, colour=WHITE, opacity=0.5),),
+    },
     "all": {"skipping": False, "shaded": True},
 }
 
@@ -237,10 +319,14 @@ def test_native_and_numpy_make_one_picture(case, spacing):
         pytest.skip("no native library")
     values = waves()
     unit = float(np.exp(np.mean(np.log(np.abs(spacing)))))
-    table = table_of(np.concatenate([np.zeros(30), np.linspace(0, 0.4, 71)]) / unit, colour=(0.9, 0.5, 0.3))
+    table = table_of(
+        np.concatenate([np.zeros(30), np.linspace(0, 0.4, 71)]) / unit, colour=(0.9, 0.5, 0.3)
+    )
     more = {"step": 0.5, **CASES[case]}
     more["step"] *= unit
-    task = task_of(values.shape, table, camera=Camera(azimuth=20.0), size=(45, 35), spacing=spacing, **more)
+    task = task_of(
+        values.shape, table, camera=Camera(azimuth=20.0), size=(45, 35), spacing=spacing, **more
+    )
     one, other = march(frame_of(values), task), march_numpy(values, task)
     assert one.rgba[..., 3].max() > 0.2
     np.testing.assert_allclose(one.rgba, other.rgba, atol=2e-4)
@@ -259,12 +345,20 @@ def march_numpy(values, task):
 def test_values_of_any_magnitude_make_the_same_picture(way):
     values = waves()
     table = table_of(np.linspace(0, 0.3, 100))
-    task = task_of(values.shape, table, size=(20, 20), shaded=True, surfaces=(Surface(value=0.5, colour=WHITE, opacity=0.5),))
+    task = task_of(
+        values.shape,
+        table,
+        size=(20, 20),
+        shaded=True,
+        surfaces=(Surface(value=0.5, colour=WHITE, opacity=0.5),),
+    )
     plain = march(frame_of(values), task).rgba
     for unit in (1e-33, 1e12, 2e38):
         scaled = replace(table, high=unit)
         surface = Surface(value=0.5 * unit, colour=WHITE, opacity=0.5)
-        found = march(frame_of(values * np.float32(unit)), replace(task, table=scaled, surfaces=(surface,))).rgba
+        found = march(
+            frame_of(values * np.float32(unit)), replace(task, table=scaled, surfaces=(surface,))
+        ).rgba
         np.testing.assert_allclose(found, plain, atol=5e-3)
 
 
@@ -274,7 +368,10 @@ def test_skipping_and_the_end_of_rays_change_no_picture(way):
     surface = Surface(value=0.9, colour=WHITE, opacity=0.5)
     for surfaces in ((), (surface,)):
         task = task_of(values.shape, table, camera=Camera(), size=(40, 40), surfaces=surfaces)
-        with_, without = march(frame_of(values), task), march(frame_of(values), replace(task, skipping=False))
+        with_, without = (
+            march(frame_of(values), task),
+            march(frame_of(values), replace(task, skipping=False)),
+        )
         np.testing.assert_allclose(with_.rgba, without.rgba, atol=1e-5)
         ended = march(frame_of(values), replace(task, threshold=1 / 1024))
         np.testing.assert_allclose(ended.rgba, without.rgba, atol=2 / 1024)
@@ -302,7 +399,15 @@ def test_surfaces_of_a_part_are_seen_up_to_its_faces(stride):
     frame = Frame(values=values, first=(stride, 0, 2 * stride), stride=stride)
     surfaces = (Surface(value=0.6, colour=WHITE, opacity=0.5),)
     table, camera = table_of(np.linspace(0, 0.3, 100)), Camera(azimuth=10)
-    task = task_of((43, 43, 43), table, size=(50, 50), camera=camera, shaded=True, surfaces=surfaces, depth=True)
+    task = task_of(
+        (43, 43, 43),
+        table,
+        size=(50, 50),
+        camera=camera,
+        shaded=True,
+        surfaces=surfaces,
+        depth=True,
+    )
     one = march(frame, task)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FHASH_NATIVE", "0")
@@ -315,7 +420,9 @@ def test_a_coarse_frame_covers_the_same_box(way):
     z, y, x = np.meshgrid(*(np.arange(22.0),) * 3, indexing="ij")
     values = ((x + y + z) / 66).astype(np.float32)
     table = table_of(np.linspace(0, 0.2, 100))
-    fine = march(frame_of(values), task_of(values.shape, table, size=(24, 24), camera=Camera(), shaded=True))
+    fine = march(
+        frame_of(values), task_of(values.shape, table, size=(24, 24), camera=Camera(), shaded=True)
+    )
     coarse = Frame(values=values[::2, ::2, ::2], first=(0, 0, 0), stride=2)
     found = march(coarse, task_of(values.shape, table, size=(24, 24), camera=Camera(), shaded=True))
     assert np.array_equal(fine.rgba[..., 3] > 0, found.rgba[..., 3] > 0)
@@ -335,8 +442,17 @@ def test_light_has_a_direction_where_one_axis_is_much_shorter_than_the_others(wa
     """Its derivative is as much larger, of a narrow range even more so, and no square of it may leave float32."""
     values = np.broadcast_to(np.linspace(0, 1, 12)[:, None, None], (12, 12, 12))
     table = table_of([50 / unit, 50 / unit], low=0.5, high=0.5 + 1e-14)
-    task = task_of(values.shape, table, size=(8, 8), step=0.5 * unit, spacing=(1 / unit, 1 / unit, unit), shaded=True)
-    np.testing.assert_allclose(march(frame_of(values), task).rgba[4, 4], [1.3, 1.3, 1.3, 1.0], rtol=1e-3)
+    task = task_of(
+        values.shape,
+        table,
+        size=(8, 8),
+        step=0.5 * unit,
+        spacing=(1 / unit, 1 / unit, unit),
+        shaded=True,
+    )
+    np.testing.assert_allclose(
+        march(frame_of(values), task).rgba[4, 4], [1.3, 1.3, 1.3, 1.0], rtol=1e-3
+    )
 
 
 def test_counters_show_that_nothing_is_done_unasked(way):
@@ -352,14 +468,23 @@ def test_a_light_grid_darkens(way):
     values = waves()
     grid, frame = grid_of(values.shape), frame_of(values)
     table = table_of([0.1, 0.5])
-    light = light_grid(frame, grid, table, shadows=Shadows(), lamp=np.array([0, 0, 1.0]), ambient_occlusion=AmbientOcclusion())
+    light = light_grid(
+        frame,
+        grid,
+        table,
+        shadows=Shadows(),
+        lamp=np.array([0, 0, 1.0]),
+        ambient_occlusion=AmbientOcclusion(),
+    )
     for shading in (False, True):
         task = task_of(values.shape, table, size=(20, 20), shaded=shading)
         plain, lit = march(frame, task).rgba, march(frame, replace(task, light=light)).rgba
         np.testing.assert_allclose(lit[..., 3], plain[..., 3], atol=1e-6)
         assert np.all(lit[..., :3] <= plain[..., :3] + 1e-6)
         assert lit[..., 0].sum() < 0.9 * plain[..., 0].sum()
-        np.testing.assert_allclose(march_numpy(values, replace(task, light=light)).rgba, lit, atol=2e-4)
+        np.testing.assert_allclose(
+            march_numpy(values, replace(task, light=light)).rgba, lit, atol=2e-4
+        )
 
 
 def test_threads_make_the_same_picture():

@@ -13,7 +13,9 @@ from fhash_codec.render.scene import Camera, Shadows
 from fhash_codec.render.task import Frame, Lighting, Surface, Table, Task
 from fhash_formats import native
 
-CENTRAL = Lighting(ambient=0.2, diffuse=0.8, specular=0.3, specular_power=8.0, lamp=None, central=True)
+CENTRAL = Lighting(
+    ambient=0.2, diffuse=0.8, specular=0.3, specular_power=8.0, lamp=None, central=True
+)
 CELL = replace(CENTRAL, central=False)
 WHITE = np.ones(3)
 PATHS = {"quickest": 0, "AVX2": 1, "plain": 2}
@@ -31,18 +33,39 @@ def marched(values, task, path=0, first=(0, 0, 0)):
     return march_native(native.library(), frame, task, Bricks.of(frame), path=path)
 
 
-def task_of(shape, extinctions, *, camera=None, size=(20, 18), step=0.5, threshold=0.0, lighting=CENTRAL, **more):
+def task_of(
+    shape,
+    extinctions,
+    *,
+    camera=None,
+    size=(20, 18),
+    step=0.5,
+    threshold=0.0,
+    lighting=CENTRAL,
+    **more,
+):
     table = None
     if extinctions is not None:
         colours = np.tile(np.float32([0.9, 0.6, 0.3]), (len(extinctions), 1))
-        table = Table(low=0.0, high=1.0, colours=colours, extinctions=np.asarray(extinctions, dtype=np.float64))
-    rays = Rays.of(camera or Camera(azimuth=20.0), Grid(counts=shape[::-1], origin=np.zeros(3), spacing=np.ones(3)), size)
+        table = Table(
+            low=0.0,
+            high=1.0,
+            colours=colours,
+            extinctions=np.asarray(extinctions, dtype=np.float64),
+        )
+    rays = Rays.of(
+        camera or Camera(azimuth=20.0),
+        Grid(counts=shape[::-1], origin=np.zeros(3), spacing=np.ones(3)),
+        size,
+    )
     return Task(rays=rays, step=step, threshold=threshold, table=table, lighting=lighting, **more)
 
 
 def waves(shape=(14, 17, 22), pace=1.0):
     z, y, x = np.meshgrid(*(np.linspace(0, pace, size) for size in shape), indexing="ij")
-    return (0.5 + 0.25 * np.sin(7 * x + 3 * y) + 0.25 * np.cos(5 * y - 6 * z + 2 * x)).astype(np.float32)
+    return (0.5 + 0.25 * np.sin(7 * x + 3 * y) + 0.25 * np.cos(5 * y - 6 * z + 2 * x)).astype(
+        np.float32
+    )
 
 
 def trilinear(values, places):
@@ -59,14 +82,22 @@ def trilinear(values, places):
         weight = weights.prod(axis=1)
         value += np.where(weight > 0, weight * found, 0)
         for axis in range(3):
-            slope[:, axis] += (2 * corner[axis] - 1) * np.delete(weights, axis, axis=1).prod(axis=1) * found
+            slope[:, axis] += (
+                (2 * corner[axis] - 1) * np.delete(weights, axis, axis=1).prod(axis=1) * found
+            )
     return value, slope
 
 
 def slopes(values, places):
     """Central differences, where one is missing that of the cell, where that is missing none."""
     places = np.clip(places, 0, np.array(values.shape[::-1]) - 1)
-    central = np.stack([(trilinear(values, places + one)[0] - trilinear(values, places - one)[0]) / 2 for one in np.eye(3)], axis=-1)
+    central = np.stack(
+        [
+            (trilinear(values, places + one)[0] - trilinear(values, places - one)[0]) / 2
+            for one in np.eye(3)
+        ],
+        axis=-1,
+    )
     return np.nan_to_num(np.where(np.isnan(central), trilinear(values, places)[1], central))
 
 
@@ -79,10 +110,15 @@ def lit(colour, slope, along, lighting):
 
 def places_of(task, shape):
     """Of each sample of each ray: pixel, number, place and length; directions of the rays."""
-    origin, along = (np.array(np.broadcast_to(part.reshape(-1, 3), (np.prod(task.rays.size), 3))) for part in task.rays.pixels())
+    origin, along = (
+        np.array(np.broadcast_to(part.reshape(-1, 3), (np.prod(task.rays.size), 3)))
+        for part in task.rays.pixels()
+    )
     along = along / np.linalg.norm(along, axis=1, keepdims=True)
     with np.errstate(divide="ignore"):
-        ends = (np.stack([np.zeros(3), np.array(shape[::-1]) - 1.0]) - origin[:, None]) / along[:, None]
+        ends = (np.stack([np.zeros(3), np.array(shape[::-1]) - 1.0]) - origin[:, None]) / along[
+            :, None
+        ]
     enter, leave = np.maximum(ends.min(axis=1).max(axis=1), 0), ends.max(axis=1).min(axis=1)
     for number in range(int(np.ceil((leave - enter).max() / task.step))):
         pixels = np.flatnonzero(enter + number * task.step < leave)
@@ -100,12 +136,18 @@ def pictured(values, task):
     rgb, clear = np.zeros((np.prod(task.rays.size), 3)), np.ones(np.prod(task.rays.size))
     for pixels, places, length, along in places_of(task, values.shape):
         value = trilinear(values, places)[0]
-        extinction = np.interp(value, np.linspace(0, 1, len(task.table.extinctions)), task.table.extinctions)
+        extinction = np.interp(
+            value, np.linspace(0, 1, len(task.table.extinctions)), task.table.extinctions
+        )
         opacity = np.where(np.isnan(value), 0, -np.expm1(-extinction * length))
-        colour = lit(task.table.colours[0].astype(np.float64), slopes(values, places), along, task.lighting)
+        colour = lit(
+            task.table.colours[0].astype(np.float64), slopes(values, places), along, task.lighting
+        )
         rgb[pixels] += (clear[pixels] * opacity)[:, None] * colour
         clear[pixels] *= 1 - opacity
-    return np.concatenate([rgb, 1 - clear[:, None]], axis=1).reshape(task.rays.size[1], task.rays.size[0], 4)
+    return np.concatenate([rgb, 1 - clear[:, None]], axis=1).reshape(
+        task.rays.size[1], task.rays.size[0], 4
+    )
 
 
 @pytest.mark.parametrize("missing", [False, True])
@@ -155,7 +197,11 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_all_paths_make_one_picture(path, case, shape):
     values = waves(shape)
-    more = {"extinctions": np.concatenate([np.zeros(40), np.linspace(0, 0.4, 60)]), "size": (37, 29), **CASES[case]}
+    more = {
+        "extinctions": np.concatenate([np.zeros(40), np.linspace(0, 0.4, 60)]),
+        "size": (37, 29),
+        **CASES[case],
+    }
     for first, counts in (((0, 0, 0), shape), ((0, 2, 0), (shape[0], shape[1] + 5, shape[2]))):
         task = task_of(counts, **more)
         quickest, found = marched(values, task, 0, first), marched(values, task, path, first)
@@ -172,16 +218,23 @@ def test_all_paths_make_one_picture_in_a_grid_of_light(path):
     for shaded in (False, True):
         task = task_of(values.shape, np.linspace(0, 0.4, 100), shaded=shaded)
         frame = Frame(values=values, first=(0, 0, 0))
-        light = light_grid(frame, task.rays.grid, task.table, shadows=Shadows(), lamp=np.array([0, 0, 1.0]))
+        light = light_grid(
+            frame, task.rays.grid, task.table, shadows=Shadows(), lamp=np.array([0, 0, 1.0])
+        )
         task = replace(task, light=light)
-        np.testing.assert_allclose(marched(values, task, path).rgba, marched(values, task).rgba, atol=2e-5)
+        np.testing.assert_allclose(
+            marched(values, task, path).rgba, marched(values, task).rgba, atol=2e-5
+        )
 
 
 @pytest.mark.parametrize("step", [0.3, 0.5, 1.9])
 def test_samples_of_a_narrow_interval_lie_in_cells_where_it_is(path, step):
     values = waves((40, 41, 43))
     task = task_of(values.shape, [0.0] * 50 + [0.5] * 2 + [0.0] * 50, size=(50, 40), step=step)
-    found, everything = marched(values, task, path), marched(values, replace(task, skipping=False), path)
+    found, everything = (
+        marched(values, task, path),
+        marched(values, replace(task, skipping=False), path),
+    )
     np.testing.assert_allclose(found.rgba, everything.rgba, atol=1e-6)
     corners = np.lib.stride_tricks.sliding_window_view(values, (2, 2, 2)).reshape(39, 40, 42, 8)
     low, high = (end / 101 for end in (49, 52))
@@ -202,8 +255,19 @@ def test_no_surface_is_lost_by_skipping(path, step, jitter):
     for camera in (Camera(azimuth=20.0, elevation=10.0), Camera(view="xy", projection="parallel")):
         for level in (0.52, 0.9):
             surface = Surface(value=level, colour=WHITE, opacity=0.5)
-            task = task_of(values.shape, None, camera=camera, size=(80, 70), step=step, jitter=jitter, surfaces=(surface,))
-            found, everything = marched(values, task, path), marched(values, replace(task, skipping=False), path)
+            task = task_of(
+                values.shape,
+                None,
+                camera=camera,
+                size=(80, 70),
+                step=step,
+                jitter=jitter,
+                surfaces=(surface,),
+            )
+            found, everything = (
+                marched(values, task, path),
+                marched(values, replace(task, skipping=False), path),
+            )
             np.testing.assert_allclose(found.rgba, everything.rgba, atol=1e-5)
             samples.append(found.counters["samples"] / everything.counters["samples"])
     if step < 1:

@@ -24,30 +24,56 @@ SIZES = [(256, 256), (300, 700), (1024, 512)]
 NAMES = ("box", "axes", "colour_bar", "time_label")
 
 
-def drawn(effects: Effects, size: tuple[int, int] = (256, 256), background: str = "#ffffff", fill: float = 0.0, **camera: Any) -> Image:
+def drawn(
+    effects: Effects,
+    size: tuple[int, int] = (256, 256),
+    background: str = "#ffffff",
+    fill: float = 0.0,
+    **camera: Any,
+) -> Image:
     rgba = np.zeros((size[1], size[0], 4), dtype=np.float32)
     rgba[..., 3] = fill
     image = Image(rgba=rgba, scene=Scene(background=background).to_dict())
     rays = Rays.of(Camera(**camera), GRID, size)
     return overlay(
-        image, effects, rays, colours=named_map("plasma").rescaled(-3, 5), quantity="speed [m/s]", coords=COORDS, label="step 3   t = 1 s"
+        image,
+        effects,
+        rays,
+        colours=named_map("plasma").rescaled(-3, 5),
+        quantity="speed [m/s]",
+        coords=COORDS,
+        label="step 3   t = 1 s",
     )
 
 
 def test_nothing_is_drawn_unless_asked_for() -> None:
     image = Image(rgba=np.zeros((4, 4, 4), dtype=np.float32))
-    assert overlay(image, Effects(), Rays.of(Camera(), GRID, (4, 4)), colours=named_map("grey"), quantity="", coords=COORDS) is image
+    assert (
+        overlay(
+            image,
+            Effects(),
+            Rays.of(Camera(), GRID, (4, 4)),
+            colours=named_map("grey"),
+            quantity="",
+            coords=COORDS,
+        )
+        is image
+    )
 
 
 @pytest.mark.parametrize("background", ["#ffffff", "#10121c", "transparent"])
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", NAMES)
-def test_each_part_is_seen_on_any_background(name: str, size: tuple[int, int], background: str) -> None:
+def test_each_part_is_seen_on_any_background(
+    name: str, size: tuple[int, int], background: str
+) -> None:
     image = drawn(Effects(**{name: True}), size, background)
     assert image.rgba.shape == (size[1], size[0], 4)
     assert np.all((image.rgba >= 0) & (image.rgba <= 1 + 1e-6))
     assert np.all(image.rgba[..., :3] <= image.rgba[..., 3:] + 1e-6)
-    paper = np.array([0, 0, 0] if background == "transparent" else list(bytes.fromhex(background[1:])))
+    paper = np.array(
+        [0, 0, 0] if background == "transparent" else list(bytes.fromhex(background[1:]))
+    )
     marked = np.abs(image.to_uint8()[..., :3].astype(int) - paper).max(axis=-1) > 100
     if background == "transparent":
         marked = image.to_uint8()[..., 3] > 100
@@ -85,14 +111,20 @@ def test_every_edge_has_its_side(view: str, projection: str) -> None:
 
 
 def test_from_inside_all_edges_are_behind_the_volume() -> None:
-    rays = Rays.of(Camera(position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60), GRID, (64, 64))
+    rays = Rays.of(
+        Camera(position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60),
+        GRID,
+        (64, 64),
+    )
     found = edges(rays)
     assert 3 <= len(found) < 12
     assert all(edge.fronts == 0 for edge in found)
     assert all(np.all(np.isfinite(edge.ends)) for edge in found)
     assert outer_edges(rays) == []
     everything = Effects(box=True, axes=True, colour_bar=True, time_label=True)
-    inside = drawn(everything, position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60)
+    inside = drawn(
+        everything, position=(2, 1, 1), focal_point=(4, 3, 1.1), view_up=(0, 0, 1), view_angle=60
+    )
     assert np.all(np.isfinite(inside.rgba))
 
 
@@ -131,8 +163,13 @@ def test_ticks_lie_within_the_ends_at_any_scale(scale: float, count: int) -> Non
         values, texts = [value for value, _ in found], [text for _, text in found]
         assert 1 <= len(found) <= 2.6 * count + 2
         assert len(set(texts)) == len(texts)
-        assert all(low * scale - 1e-9 * abs(scale) <= value <= high * scale + 1e-9 * scale for value in values)
-        np.testing.assert_allclose([float(text) for text in texts], values, rtol=1e-6, atol=1e-9 * scale)
+        assert all(
+            low * scale - 1e-9 * abs(scale) <= value <= high * scale + 1e-9 * scale
+            for value in values
+        )
+        np.testing.assert_allclose(
+            [float(text) for text in texts], values, rtol=1e-6, atol=1e-9 * scale
+        )
 
 
 def test_the_text_of_a_time() -> None:

@@ -27,10 +27,16 @@ def written(folder: Path, content: Any) -> Path:
     return path
 
 
-@pytest.mark.parametrize("content", [PRESET, [PRESET], [{"Name": "no colours"}, PRESET, {"RGBPoints": []}]])
+@pytest.mark.parametrize(
+    "content", [PRESET, [PRESET], [{"Name": "no colours"}, PRESET, {"RGBPoints": []}]]
+)
 def test_one_or_a_list(tmp_path: Path, content: Any) -> None:
     preset = read_preset(written(tmp_path, content))
-    assert (preset.name, preset.colours.space, preset.colours.nan) == ("of mine", "Lab", (0.25, 0.0, 0.0))
+    assert (preset.name, preset.colours.space, preset.colours.nan) == (
+        "of mine",
+        "Lab",
+        (0.25, 0.0, 0.0),
+    )
     np.testing.assert_array_equal(preset.colours.positions, [0, 5, 10])
     np.testing.assert_allclose(preset.colours(5.0), [0, 1, 0], rtol=0, atol=1e-3)
     np.testing.assert_array_equal(preset.opacity, [[0, 0], [4, 1], [10, 0.5]])
@@ -45,14 +51,29 @@ def test_colours_and_opacities_move_together(tmp_path: Path) -> None:
 
 def test_what_a_preset_may_leave_out(tmp_path: Path) -> None:
     preset = read_preset(written(tmp_path, {"RGBPoints": [-1, 0, 0, 0, 1, 1, 1, 1]}))
-    assert (preset.name, preset.colours.space, preset.opacity, preset.is_relative) == ("preset", "RGB", None, True)
+    assert (preset.name, preset.colours.space, preset.opacity, preset.is_relative) == (
+        "preset",
+        "RGB",
+        None,
+        True,
+    )
 
 
 # Of vtkPiecewiseFunction 9.7, from 0 to 1, at these places.
 PLACES = [0.1, 0.25, 0.4, 0.45, 0.49, 0.5, 0.51, 0.6, 0.9]
 CURVES = {
     (0.7, 0.0): [0.07143, 0.17857, 0.28571, 0.32143, 0.35, 0.35714, 0.36429, 0.42857, 0.83333],
-    (0.5, 0.5): [2.0e-05, 4.0e-03, 8.905e-02, 2.2001e-01, 4.2884e-01, 0.5, 5.7116e-01, 9.1095e-01, 9.9998e-01],
+    (0.5, 0.5): [
+        2.0e-05,
+        4.0e-03,
+        8.905e-02,
+        2.2001e-01,
+        4.2884e-01,
+        0.5,
+        5.7116e-01,
+        9.1095e-01,
+        9.9998e-01,
+    ],
     (0.5, 1.0): [0.0, 0.0, 0.00538, 0.06613, 0.35253, 0.5, 0.64747, 0.99462, 1.0],
     (0.3, 0.2): [0.01502, 0.27203, 0.70111, 0.77639, 0.82576, 0.83673, 0.84717, 0.92047, 0.99883],
 }
@@ -64,7 +85,9 @@ def test_curves_become_straight_pieces(tmp_path: Path, curve: tuple[float, float
     assert preset.opacity is not None
     assert len(preset.opacity) == PIECES + 1
     assert np.all(np.diff(preset.opacity[:, 0]) > 0)
-    np.testing.assert_allclose(np.interp(PLACES, *preset.opacity.T), CURVES[curve], rtol=0, atol=6e-3)
+    np.testing.assert_allclose(
+        np.interp(PLACES, *preset.opacity.T), CURVES[curve], rtol=0, atol=6e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -75,7 +98,10 @@ def test_curves_become_straight_pieces(tmp_path: Path, curve: tuple[float, float
         ([], "holds no preset with RGBPoints"),
         ({"Name": "x", "IndexedColors": [1, 0, 0]}, "IndexedColors are for categories"),
         ("7", "holds no preset"),
-        ({**PRESET, "RGBPoints": []}, "RGBPoints is not a list of finite numbers, 4 for each point"),
+        (
+            {**PRESET, "RGBPoints": []},
+            "RGBPoints is not a list of finite numbers, 4 for each point",
+        ),
         ({**PRESET, "RGBPoints": [0, 1, 0]}, "RGBPoints is not a list"),
         ({**PRESET, "RGBPoints": [0, 1, 0, "0"]}, "RGBPoints is not a list"),
         ({**PRESET, "RGBPoints": [0, 1, 0, float("nan")]}, "RGBPoints is not a list"),

@@ -49,7 +49,12 @@ def test_the_package_is_the_function(volume: Volume) -> None:
 )
 def test_the_package_is_the_function_whatever_was_imported_before(statement: str) -> None:
     subprocess.run(
-        [sys.executable, "-c", f"{statement}; assert callable(f); import fhash_codec; assert fhash_codec.render is f"], check=True
+        [
+            sys.executable,
+            "-c",
+            f"{statement}; assert callable(f); import fhash_codec; assert fhash_codec.render is f",
+        ],
+        check=True,
     )
 
 
@@ -91,7 +96,9 @@ def test_what_comes_next_is_decoded_beside(volume: Volume, monkeypatch: pytest.M
     renderer, alone = Renderer(volume), Renderer(volume)
     shown = [scene(step=step) for step in (0, 1, 2)]
     for each, following in zip(shown, [*shown[1:], None], strict=True):
-        np.testing.assert_array_equal(renderer.render(each, upcoming=following).rgba, alone.render(each).rgba)
+        np.testing.assert_array_equal(
+            renderer.render(each, upcoming=following).rgba, alone.render(each).rgba
+        )
     assert [entry for entry in decoded if not entry[1]] == [(1, False), (2, False)]
     assert sorted(entry[0] for entry in decoded) == [0, 0, 1, 1, 2, 2]
     # What nobody came for, what cannot be planned and what is not decoded at all do no harm.
@@ -103,7 +110,9 @@ def test_what_comes_next_is_decoded_beside(volume: Volume, monkeypatch: pytest.M
         renderer.render(scene(step=99))
 
 
-def test_a_failure_beside_is_that_of_its_own_picture(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_beside_is_that_of_its_own_picture(
+    volume: Volume, monkeypatch: pytest.MonkeyPatch
+) -> None:
     original = module.decoded_frame
 
     def failing(volume: Volume, step: float, *others: Any) -> Any:
@@ -146,7 +155,9 @@ def test_a_part_of_the_volume_makes_the_picture_of_all(volume: Volume) -> None:
 def test_nothing_in_the_picture_is_an_empty_picture(volume: Volume) -> None:
     away = scene(camera={"position": [100, 100, 100], "focal_point": [200, 200, 200]})
     for mode in ("cache", "arm"):
-        image = fhash_codec.render(volume, scene(camera=away.camera.to_dict(), march={"mode": mode}))
+        image = fhash_codec.render(
+            volume, scene(camera=away.camera.to_dict(), march={"mode": mode})
+        )
         assert not image.rgba.any()
         assert image.counters["samples"] == 0
 
@@ -155,7 +166,9 @@ def test_a_step_between_is_the_mean_of_values(volume: Volume) -> None:
     frame = module.decoded_frame(volume, 0.5, 0, ((0, 20), (0, 24), (0, 28)), Units())
     np.testing.assert_allclose(frame.values, (volume.read(0) + volume.read(1)) / 2, atol=1e-5)
     coarse = module.decoded_frame(volume, 0.5, 1, ((0, 20), (0, 24), (0, 28)), Units())
-    np.testing.assert_allclose(coarse.values, (volume.read_lod(0, 1) + volume.read_lod(1, 1)) / 2, atol=1e-5)
+    np.testing.assert_allclose(
+        coarse.values, (volume.read_lod(0, 1) + volume.read_lod(1, 1)) / 2, atol=1e-5
+    )
     assert coarse.stride == 2
 
 
@@ -188,14 +201,20 @@ def test_light_costs_secondary_rays_and_nothing_else(renderer: Renderer) -> None
         np.testing.assert_allclose(dark.rgba[..., 3], plain.rgba[..., 3], atol=1e-6)
         assert dark.rgba[..., :3].sum() < plain.rgba[..., :3].sum()
         both = renderer.render(scene(effects={name: True, "shading": True}))
-        assert both.counters == {**shaded.counters, "secondary_rays": dark.counters["secondary_rays"]}
+        assert both.counters == {
+            **shaded.counters,
+            "secondary_rays": dark.counters["secondary_rays"],
+        }
         assert renderer.render(scene(effects={name: {"strength": 0}})).counters == plain.counters
 
 
 def test_where_there_is_no_volume_there_is_no_light_to_take_away(renderer: Renderer) -> None:
     surface = {"isosurfaces": [{"value": 5}]}
     alone = {"transfer_function": {"nothing": True}}
-    lit, dark = (renderer.render(scene(effects={**surface, **more}, **alone)) for more in ({}, {"shadows": True}))
+    lit, dark = (
+        renderer.render(scene(effects={**surface, **more}, **alone))
+        for more in ({}, {"shadows": True})
+    )
     assert lit.counters["secondary_rays"] == dark.counters["secondary_rays"] == 0
 
 
@@ -220,7 +239,11 @@ def test_values_at_the_ends_of_float64_have_a_picture(tmp_path: Path, factor: fl
 
 
 def test_counters_are_complete_and_known() -> None:
-    assert complete({"rays": 2}, {"rays": 3, "samples": 1}) == {**dict.fromkeys(COUNTERS, 0), "rays": 5, "samples": 1}
+    assert complete({"rays": 2}, {"rays": 3, "samples": 1}) == {
+        **dict.fromkeys(COUNTERS, 0),
+        "rays": 5,
+        "samples": 1,
+    }
     with pytest.raises(KeyError):
         complete({"raise": 1})
     assert rows({"samples": 12345})[2][1] == "12,345"
@@ -228,7 +251,10 @@ def test_counters_are_complete_and_known() -> None:
 
 def test_progress_is_reported(volume: Volume) -> None:
     said: list[tuple[str, int, int]] = []
-    Renderer(volume).render(scene(march={"mode": "arm"}), progress=lambda stage, done, total, note: said.append((stage, done, total)))
+    Renderer(volume).render(
+        scene(march={"mode": "arm"}),
+        progress=lambda stage, done, total, note: said.append((stage, done, total)),
+    )
     assert said[0][0] == "decoding"
     assert said[-1][0] == "marching"
     assert all(0 <= done <= total for _, done, total in said)

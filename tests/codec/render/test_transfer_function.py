@@ -18,7 +18,10 @@ VALUES = np.linspace(-2, 12, 1401)
 
 
 def made(spec: dict[str, Any] | None = None, **arguments: Any) -> TransferFunction:
-    return TransferFunction.of(TransferFunctionSpec.from_dict(spec or {}), **{"value_range": (0.0, 10.0), "spacing": 1.0, **arguments})
+    return TransferFunction.of(
+        TransferFunctionSpec.from_dict(spec or {}),
+        **{"value_range": (0.0, 10.0), "spacing": 1.0, **arguments},
+    )
 
 
 def test_alpha_does_not_depend_on_the_steps() -> None:
@@ -39,7 +42,9 @@ def test_opacity_of_one_is_capped_and_finite() -> None:
 def test_points_are_in_data_units_and_hold_beyond_the_ends() -> None:
     found = made({"opacity": [[2, 0.5], [4, 0]], "unit_distance": 3.0, "density": 2.0})
     np.testing.assert_allclose(found.opacity([-9, 2, 3, 4, 99]), [0.5, 0.5, 0.25, 0, 0])
-    np.testing.assert_allclose(found.extinction([2, 3, 9]), [2 * np.log(2) / 3, -2 * np.log(0.75) / 3, 0])
+    np.testing.assert_allclose(
+        found.extinction([2, 3, 9]), [2 * np.log(2) / 3, -2 * np.log(0.75) / 3, 0]
+    )
     assert found.extinction(np.nan) == 0
     assert np.all(np.isfinite(found.colour([np.nan, np.inf, -np.inf])))
 
@@ -51,7 +56,9 @@ def test_the_unit_distance_is_a_vertex_spacing_unless_said() -> None:
 
 def test_colours_by_name_points_and_range() -> None:
     np.testing.assert_allclose(made({"colours": "grey"}).colour([0, 5, 10])[:, 0], [0, 0.5, 1])
-    np.testing.assert_allclose(made({"colours": "grey", "range": [4, 6]}).colour([0, 5, 10])[:, 0], [0, 0.5, 1])
+    np.testing.assert_allclose(
+        made({"colours": "grey", "range": [4, 6]}).colour([0, 5, 10])[:, 0], [0, 0.5, 1]
+    )
     points = made({"colours": [[2, "#000000"], [4, "white"]]})
     np.testing.assert_allclose(points.colour([0, 3, 9])[:, 0], [0, 0.5, 1])
 
@@ -65,10 +72,19 @@ def test_colours_by_name_points_and_range() -> None:
         ((3.0, 7.0), {"range": [0, 1]}, (0, 1)),
     ],
 )
-def test_presets_of_paraview(tmp_path: Path, positions: tuple[float, float], spec: dict[str, Any], ends: tuple[float, float]) -> None:
+def test_presets_of_paraview(
+    tmp_path: Path, positions: tuple[float, float], spec: dict[str, Any], ends: tuple[float, float]
+) -> None:
     low, high = positions
     path = tmp_path / "p.json"
-    path.write_text(json.dumps({"RGBPoints": [low, 0, 0, 0, high, 1, 1, 1], "Points": [low, 0, 0.5, 0, high, 0.5, 0.5, 0]}))
+    path.write_text(
+        json.dumps(
+            {
+                "RGBPoints": [low, 0, 0, 0, high, 1, 1, 1],
+                "Points": [low, 0, 0.5, 0, high, 0.5, 0.5, 0],
+            }
+        )
+    )
     found = made({"colours": str(path), **spec})
     assert tuple(found.colours.positions) == ends
     np.testing.assert_allclose(found.points, [[ends[0], 0], [ends[1], 0.5]])
@@ -76,19 +92,32 @@ def test_presets_of_paraview(tmp_path: Path, positions: tuple[float, float], spe
 
 
 @pytest.mark.parametrize("density", [0.01, 1.0])
-@pytest.mark.parametrize("opacity", [*PRESETS[2:], "auto", [[1, 0], [2, 0.9], [2.5, 0], [6, 0], [7, 1.0]]])
-def test_a_table_is_the_function_and_the_marker_of_visible_values(opacity: Any, density: float) -> None:
+@pytest.mark.parametrize(
+    "opacity", [*PRESETS[2:], "auto", [[1, 0], [2, 0.9], [2.5, 0], [6, 0], [7, 1.0]]]
+)
+def test_a_table_is_the_function_and_the_marker_of_visible_values(
+    opacity: Any, density: float
+) -> None:
     found = made({"opacity": opacity, "density": density})
     low, high, colours, extinctions = found.table()
-    assert (colours.shape, colours.dtype, extinctions.shape, extinctions.dtype) == ((4096, 3), np.float32, (4096,), np.float64)
+    assert (colours.shape, colours.dtype, extinctions.shape, extinctions.dtype) == (
+        (4096, 3),
+        np.float32,
+        (4096,),
+        np.float64,
+    )
     inside = VALUES[(VALUES >= 0) & (VALUES <= 10)]
     place = (inside - low) / (high - low) * 4095
     tabled = np.interp(place, np.arange(4096), 1 - np.exp(-extinctions))
     # Towards opacity 1 the extinction of the last entry rises without bound, so the entries beside a point may differ.
     away = np.min(np.abs(inside[:, None] - found.points[:, 0]), axis=1) > (high - low) / 4095
-    np.testing.assert_allclose(tabled[away], (1 - np.exp(-found.extinction(inside)))[away], rtol=0, atol=0.02)
+    np.testing.assert_allclose(
+        tabled[away], (1 - np.exp(-found.extinction(inside)))[away], rtol=0, atol=0.02
+    )
     shown = found.extinction(inside) > 0
-    mixed = np.stack([np.interp(place, np.arange(4096), colours[:, channel]) for channel in range(3)], axis=-1)
+    mixed = np.stack(
+        [np.interp(place, np.arange(4096), colours[:, channel]) for channel in range(3)], axis=-1
+    )
     np.testing.assert_allclose(mixed[shown], found.colour(inside)[shown], rtol=0, atol=2e-3)
     assert np.all(found.visible(inside, inside)[tabled > 0])
 
@@ -100,9 +129,14 @@ def test_visible_is_a_query_by_range() -> None:
     low, high = ends.T.copy()
     high[:1000] = low[:1000]
     entry = (found.span[1] - found.span[0]) / 4095
-    truth = np.array([np.any(((a < 3) & (b > 1)) | ((a < 8) & (b > 6))) for a, b in zip(low, high, strict=True)])
+    truth = np.array(
+        [np.any(((a < 3) & (b > 1)) | ((a < 8) & (b > 6))) for a, b in zip(low, high, strict=True)]
+    )
     wider = np.array(
-        [np.any(((a - entry < 3) & (b + entry > 1)) | ((a - entry < 8) & (b + entry > 6))) for a, b in zip(low, high, strict=True)]
+        [
+            np.any(((a - entry < 3) & (b + entry > 1)) | ((a - entry < 8) & (b + entry > 6)))
+            for a, b in zip(low, high, strict=True)
+        ]
     )
     np.testing.assert_array_equal(found.visible(low, high), wider)
     assert 100 < truth.sum() < 2900
@@ -124,7 +158,20 @@ def test_a_narrow_range_gets_the_whole_table() -> None:
 
 
 def test_a_peak_that_a_table_misses_is_told() -> None:
-    found = made({"opacity": [[1, 0], [2, 0.5], [3, 0], [6.00031, 0], [6.00032, 1], [6.00033, 0], [8, 0], [9, 0.2]]})
+    found = made(
+        {
+            "opacity": [
+                [1, 0],
+                [2, 0.5],
+                [3, 0],
+                [6.00031, 0],
+                [6.00032, 1],
+                [6.00033, 0],
+                [8, 0],
+                [9, 0.2],
+            ]
+        }
+    )
     with pytest.warns(FhashWarning, match="peak of the opacity is narrower"):
         found.table(64)
 
@@ -179,7 +226,11 @@ LARGEST = float(np.finfo(np.float64).max)
 @pytest.mark.parametrize("opacity", ["auto", "linear", "opaque"])
 def test_a_constant_at_the_end_of_float64_has_a_table(value: float, opacity: str) -> None:
     with np.errstate(all="raise", under="ignore"):
-        found = made({"opacity": opacity}, value_range=(value, value), features=("isosurface:" + repr(value),))
+        found = made(
+            {"opacity": opacity},
+            value_range=(value, value),
+            features=("isosurface:" + repr(value),),
+        )
         low, high, colours, extinctions = found.table()
     assert -LARGEST <= low < high <= LARGEST
     assert np.isfinite(colours).all()
@@ -194,6 +245,8 @@ def test_a_range_whose_width_overflows_is_drawn_like_any_other(reach: float) -> 
         found = made({}, value_range=(-reach, reach), features=features)
         opacities = found.opacity(reach * np.array([-1, -0.5, 0.4, 0.425, 0.5, 1]))
         found.table()
-        linear = made({"opacity": "linear"}, value_range=(-reach, reach)).opacity(reach * np.array([-1, -0.5, 0, 1]))
+        linear = made({"opacity": "linear"}, value_range=(-reach, reach)).opacity(
+            reach * np.array([-1, -0.5, 0, 1])
+        )
     np.testing.assert_allclose(opacities / INTERVAL, [1, 1, 2 / 3, 0.5, 0, 0], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(linear, [0, 0.25, 0.5, 1])

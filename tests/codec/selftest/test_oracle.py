@@ -23,12 +23,24 @@ def small_network() -> Network:
     table = ArrayTable((t + 10 * z + 100 * y + 1000 * x)[..., None])
     first = (np.ones((1, 1), np.float32), np.array([-500.0], np.float32))
     last = (np.full((1, 1), 2.0, np.float32), np.array([0.25], np.float32))
-    return Network(levels=((2, 2, 2, 3),), embedding_size=1, tables=[table], layers=(first, last), box_size=(3, 3, 3), key_frames=5)
+    return Network(
+        levels=((2, 2, 2, 3),),
+        embedding_size=1,
+        tables=[table],
+        layers=(first, last),
+        box_size=(3, 3, 3),
+        key_frames=5,
+    )
 
 
 @pytest.mark.parametrize(
     ("point", "table_value"),
-    [((0, 0, 0, 0), 0.0), ((4, 2, 2, 2), 2111.0), ((2, 0, 0, 1), 1000.5), ((1, 1, 0.5, 1.75), 0.25 + 5 + 25 + 1750)],
+    [
+        ((0, 0, 0, 0), 0.0),
+        ((4, 2, 2, 2), 2111.0),
+        ((2, 0, 0, 1), 1000.5),
+        ((1, 1, 0.5, 1.75), 0.25 + 5 + 25 + 1750),
+    ],
 )
 def test_the_oracle_is_the_definition(point, table_value):
     answer = Oracle(small_network()).at(point)
@@ -41,9 +53,14 @@ def test_the_oracle_is_the_definition(point, table_value):
 
 def test_the_bound_of_rounding_is_seen_to_be_broken(monkeypatch):
     true = sample_points
-    monkeypatch.setattr(oracle, "sample_points", lambda *given, **more: true(*given, **more) + np.float32(1e-3))
+    monkeypatch.setattr(
+        oracle, "sample_points", lambda *given, **more: true(*given, **more) + np.float32(1e-3)
+    )
     result = run_case(LAYERS, checks=())
-    assert {finding.name for finding in result.findings if not finding.holds} >= {"float64 oracle", "float64 oracle, error"}
+    assert {finding.name for finding in result.findings if not finding.holds} >= {
+        "float64 oracle",
+        "float64 oracle, error",
+    }
 
 
 def test_false_gradients_are_seen(monkeypatch):
@@ -54,9 +71,15 @@ def test_false_gradients_are_seen(monkeypatch):
     result = run_case(LAYERS, checks=())
     assert result.holds, result.failures
     monkeypatch.setattr(
-        oracle, "sample_points", lambda *given, gradient=False: turned(*given, gradient=True) if gradient else sample_points(*given)
+        oracle,
+        "sample_points",
+        lambda *given, gradient=False: (
+            turned(*given, gradient=True) if gradient else sample_points(*given)
+        ),
     )
-    assert "gradient = differences" in {finding.name for finding in run_case(LAYERS, checks=()).findings if not finding.holds}
+    assert "gradient = differences" in {
+        finding.name for finding in run_case(LAYERS, checks=()).findings if not finding.holds
+    }
 
 
 def task_of(shape, **more) -> Task:
@@ -68,26 +91,42 @@ def task_of(shape, **more) -> Task:
 
 @pytest.mark.parametrize("extinction", [1e-6, 0.3, 50.0])
 def test_a_constant_slab_has_its_closed_form(extinction):
-    table = Table(low=0.0, high=1.0, colours=np.tile(np.float32([1.0, 0.5, 0.0]), (3, 1)), extinctions=np.full(3, extinction))
+    table = Table(
+        low=0.0,
+        high=1.0,
+        colours=np.tile(np.float32([1.0, 0.5, 0.0]), (3, 1)),
+        extinctions=np.full(3, extinction),
+    )
     frame = Frame(values=np.full((5, 4, 4), 0.5, np.float32), first=(0, 0, 0))
     exact = -np.expm1(-4 * extinction)
     np.testing.assert_allclose(
-        drawn(frame, task_of((5, 4, 4), table=table)), np.broadcast_to(exact * np.array([1, 0.5, 0, 1]), (2, 2, 4)), rtol=1e-9
+        drawn(frame, task_of((5, 4, 4), table=table)),
+        np.broadcast_to(exact * np.array([1, 0.5, 0, 1]), (2, 2, 4)),
+        rtol=1e-9,
     )
 
 
 def test_surfaces_and_what_is_behind_them():
     ramp = np.broadcast_to(np.arange(5, dtype=np.float32)[:, None, None], (5, 4, 4))
-    surfaces = tuple(Surface(value=value, colour=np.array(colour), opacity=0.5) for value, colour in ((1.0, (0, 1, 0)), (4.0, (1, 0, 0))))
-    picture = drawn(Frame(values=ramp, first=(0, 0, 0)), task_of((5, 4, 4), table=None, surfaces=surfaces))
+    surfaces = tuple(
+        Surface(value=value, colour=np.array(colour), opacity=0.5)
+        for value, colour in ((1.0, (0, 1, 0)), (4.0, (1, 0, 0)))
+    )
+    picture = drawn(
+        Frame(values=ramp, first=(0, 0, 0)), task_of((5, 4, 4), table=None, surfaces=surfaces)
+    )
     # Seen from above: the one at 4 lies on the face where the rays enter, the one at 1 exactly on vertices behind it.
-    np.testing.assert_allclose(picture, np.broadcast_to([0.5, 0.25, 0.0, 0.75], (2, 2, 4)), rtol=1e-12)
+    np.testing.assert_allclose(
+        picture, np.broadcast_to([0.5, 0.25, 0.0, 0.75], (2, 2, 4)), rtol=1e-12
+    )
 
 
 def test_nothing_is_seen_where_a_vertex_of_weight_has_no_value():
     values = np.full((5, 4, 4), 0.5, np.float32)
     values[2] = np.nan
-    table = Table(low=0.0, high=1.0, colours=np.ones((2, 3), np.float32), extinctions=np.full(2, 0.1))
+    table = Table(
+        low=0.0, high=1.0, colours=np.ones((2, 3), np.float32), extinctions=np.full(2, 0.1)
+    )
     picture = drawn(Frame(values=values, first=(0, 0, 0)), task_of((5, 4, 4), table=table))
     # Samples at 0.15, 0.45, ..., 3.75 and one of a length of 0.1 at 3.95: those from 1 to 3 lie beside the layer without values.
     lengths = 0.3 * np.count_nonzero(np.abs(np.arange(0.15, 3.9, 0.3) - 2) >= 1) + 0.1

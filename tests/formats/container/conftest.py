@@ -23,7 +23,12 @@ def make_header() -> dict[str, Any]:
     """A header whose arrays are small and of several chunks."""
     return {
         "encoder": {"version": "0.1.0", "seed": 7},
-        "variable": {"name": "density", "units": "kg m-3", "dtype": "float32", "attributes": {"long_name": "Dichte \u00fc"}},
+        "variable": {
+            "name": "density",
+            "units": "kg m-3",
+            "dtype": "float32",
+            "attributes": {"long_name": "Dichte \u00fc"},
+        },
         "domain": {"shape": [4, 3, 5, 6]},
         "value_range": [-1.5, 2.5],
         "background": 0.125,
@@ -52,15 +57,22 @@ def make_arrays(header: dict[str, Any]) -> dict[str, np.ndarray]:
     """Random values for every array that a header asks for."""
     rng = np.random.default_rng(0)
     model, shape = header["model"], header["domain"]["shape"]
-    arrays: dict[str, np.ndarray] = {f"coords/{a}": np.arange(n) * 0.5 for a, n in zip(("time", "z", "y", "x"), shape, strict=True)}
+    arrays: dict[str, np.ndarray] = {
+        f"coords/{a}": np.arange(n) * 0.5
+        for a, n in zip(("time", "z", "y", "x"), shape, strict=True)
+    }
     key_frames = model["levels"][0][0]
     arrays["key_frames"] = np.linspace(0, shape[0] - 1, key_frames).astype(np.int64)
     for number, level in enumerate(model["levels"], start=1):
-        arrays[f"tables/level_{number}"] = rng.standard_normal((*level, model["embedding_size"])).astype(model["tables"])
+        arrays[f"tables/level_{number}"] = rng.standard_normal(
+            (*level, model["embedding_size"])
+        ).astype(model["tables"])
     for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
         arrays[f"mlp/weight_{number}"] = rng.standard_normal((outputs, inputs)).astype(np.float32)
         arrays[f"mlp/bias_{number}"] = rng.standard_normal(outputs).astype(np.float32)
-    arrays["occupancy/bits"] = rng.integers(0, 256, (key_frames, occupancy_bytes(header["feature_bounding_box"])), dtype=np.uint8)
+    arrays["occupancy/bits"] = rng.integers(
+        0, 256, (key_frames, occupancy_bytes(header["feature_bounding_box"])), dtype=np.uint8
+    )
     return arrays
 
 
@@ -89,8 +101,16 @@ def write(path: Path, header: dict[str, Any], arrays: dict[str, np.ndarray], **o
     """A container of whole arrays; the finest table in 2 x 2 x 2 chunks, some of them at an end."""
     with ContainerWriter(path, **options) as writer:
         for name, array in arrays.items():
-            chunk = (1, 2, 3, 6, 2) if name == "tables/level_1" and array.shape[1:] == (3, 4, 6, 2) else None
-            attributes = {"offset": 0.5, "scale": 0.25} if name.startswith("tables/") and array.dtype == np.uint8 else None
+            chunk = (
+                (1, 2, 3, 6, 2)
+                if name == "tables/level_1" and array.shape[1:] == (3, 4, 6, 2)
+                else None
+            )
+            attributes = (
+                {"offset": 0.5, "scale": 0.25}
+                if name.startswith("tables/") and array.dtype == np.uint8
+                else None
+            )
             writer.add_whole(name, array, chunk_shape=chunk, attributes=attributes)
         return writer.commit(header)
 
@@ -100,10 +120,18 @@ def unpack(data: bytes) -> Parts:
     count, _, offset = _end(data)
     parts, at = [], offset
     for _ in range(count):
-        size, name_size = struct.unpack_from("<I", data, at + 20)[0], struct.unpack_from("<H", data, at + 28)[0]
+        size, name_size = (
+            struct.unpack_from("<I", data, at + 20)[0],
+            struct.unpack_from("<H", data, at + 28)[0],
+        )
         begin = struct.unpack_from("<I", data, at + 42)[0] + 30 + name_size
         stored, method = data[begin : begin + size], struct.unpack_from("<H", data, at + 10)[0]
-        parts.append((data[at + 46 : at + 46 + name_size].decode(), zlib.decompress(stored, -15) if method == 8 else stored))
+        parts.append(
+            (
+                data[at + 46 : at + 46 + name_size].decode(),
+                zlib.decompress(stored, -15) if method == 8 else stored,
+            )
+        )
         at += 46 + name_size
     return parts
 
@@ -128,7 +156,9 @@ def reseal(data: bytes) -> bytes:
 
 def _end(data: bytes) -> tuple[int, int, int]:
     """Entries, bytes and offset of the directory."""
-    _, _, _, _, count, size, offset, _ = END.unpack_from(data, len(data) - len(comment(b"")) - END.size)
+    _, _, _, _, count, size, offset, _ = END.unpack_from(
+        data, len(data) - len(comment(b"")) - END.size
+    )
     return count, size, offset
 
 

@@ -83,11 +83,15 @@ def test_another_codec_is_added_in_one_place(tmp_path, samples, monkeypatch):
         np.testing.assert_array_equal(container.arrays["extra/values"].read(), values)
         container.verify()
     monkeypatch.delitem(coding.ARRAY_CODECS, "test.negative")
-    with pytest.raises(DamagedFileError, match=r"extra/values/zarr[.]json: codecs 'test[.]negative, crc32c'"):
+    with pytest.raises(
+        DamagedFileError, match=r"extra/values/zarr[.]json: codecs 'test[.]negative, crc32c'"
+    ):
         Container.open(path)
 
 
 def test_a_tile_that_would_take_gigabytes_is_refused() -> None:
     codecs = [{"name": "fhash.transform", "configuration": {}}, {"name": "crc32c"}]
-    with pytest.raises(DamagedFileError, match=r"tiles of 134,217,729 vertices; the limit is 134,217,728"):
+    with pytest.raises(
+        DamagedFileError, match=r"tiles of 134,217,729 vertices; the limit is 134,217,728"
+    ):
         chunk_coder(codecs, np.dtype(np.uint8), (1, 1, 1, (1 << 27) + 1))

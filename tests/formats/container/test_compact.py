@@ -123,21 +123,58 @@ def test_what_is_not_data_takes_few_bytes(tmp_path, samples):
     header["feature_bounding_box"] = [[0, 64], [0, 64], [0, 128]]
     header["model"]["levels"] = [[steps, 64, 64, 128]]
     header["coordinates"] = {
-        "time": {"values": np.cumsum(rng.random(steps)).tolist(), "attributes": {"units": "hours since 2000-01-01"}},
-        **{axis: {"start": 0.1, "step": 0.0771653543, "dtype": "float32", "attributes": {"units": "km"}} for axis in "zyx"},
+        "time": {
+            "values": np.cumsum(rng.random(steps)).tolist(),
+            "attributes": {"units": "hours since 2000-01-01"},
+        },
+        **{
+            axis: {
+                "start": 0.1,
+                "step": 0.0771653543,
+                "dtype": "float32",
+                "attributes": {"units": "km"},
+            }
+            for axis in "zyx"
+        },
     }
     figures = [float(f"{v:.4e}") for v in rng.random(steps)]
     header["quality"] = {
-        **dict.fromkeys(("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain", "rmse_domain", "max_abs_error_domain"), 0.123456),
-        "ssim_window": {"sigma": 1.5, "window": 11, "data_range": 4.0123456789, "steps": list(range(steps))},
+        **dict.fromkeys(
+            (
+                "psnr",
+                "rmse",
+                "max_abs_error",
+                "ssim",
+                "psnr_domain",
+                "rmse_domain",
+                "max_abs_error_domain",
+            ),
+            0.123456,
+        ),
+        "ssim_window": {
+            "sigma": 1.5,
+            "window": 11,
+            "data_range": 4.0123456789,
+            "steps": list(range(steps)),
+        },
         "per_step": dict.fromkeys(("psnr", "rmse", "max_abs_error"), figures),
     }
     header["history"] = {"seconds": [1.234] * 24, "epoch": list(range(24)), "psnr": [45.12] * 24}
     header["config"] = {f"setting_{n}": 1.5 for n in range(16)}
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         tile = np.zeros((21, 32, 32, 64), dtype=np.float32)
-        settings = {"shape": (steps, 64, 64, 128), "chunk_shape": tile.shape, "shard_shape": (steps, 64, 64, 128)}
-        writer.add_sharded("tables/level_1", dtype=tile.dtype, chunks=[tile] * 8, dimension_names=["t", "z", "y", "x"], **settings)
+        settings = {
+            "shape": (steps, 64, 64, 128),
+            "chunk_shape": tile.shape,
+            "shard_shape": (steps, 64, 64, 128),
+        }
+        writer.add_sharded(
+            "tables/level_1",
+            dtype=tile.dtype,
+            chunks=[tile] * 8,
+            dimension_names=["t", "z", "y", "x"],
+            **settings,
+        )
         size = writer.commit(header)
     with Container.open(tmp_path / "a.fhz") as container:
         table = container.arrays["tables/level_1"].nbytes_stored

@@ -24,7 +24,10 @@ RULED = {
     "large": (1e300 + np.arange(5) * 1e299, {"start": 1e300, "step": 1e299}),
     "to the end of float64 and back": (np.array([0.0, LARGEST, 0.0]), {"step": LARGEST, "last": 0}),
     "two far apart": (np.array([0.0, 3e-320]), {"step": 3e-320}),
-    "float32": (np.linspace(0.1, 9.9, 128, dtype=np.float32).astype(float), {"start": 0.1, "dtype": "float32"}),
+    "float32": (
+        np.linspace(0.1, 9.9, 128, dtype=np.float32).astype(float),
+        {"start": 0.1, "dtype": "float32"},
+    ),
     "last": (np.linspace(-3.3, 7.1, 128), {"start": -3.3, "last": 7.1}),
 }
 LISTED = {
@@ -75,7 +78,10 @@ def test_random_positions_come_back():
     for _ in range(300):
         size = int(rng.integers(1, 100))
         # As people write them: a start of few digits, steps of more.
-        start, step = (float(f"{rng.normal() * 10.0 ** rng.integers(-4, 5):.{rng.integers(1, most)}g}") for most in (6, 12))
+        start, step = (
+            float(f"{rng.normal() * 10.0 ** rng.integers(-4, 5):.{rng.integers(1, most)}g}")
+            for most in (6, 12)
+        )
         values = start + step * np.arange(size)
         if rng.random() < 0.5:
             values = values.astype(np.float32).astype(np.float64)
@@ -88,9 +94,13 @@ def test_a_rule_that_leaves_float64_gives_infinities():
 
 def coords():
     return {
-        "t": Coordinate(name="time", values=np.array([0, 0.5, 2.0, 2.25]), attributes={"units": "h"}),
+        "t": Coordinate(
+            name="time", values=np.array([0, 0.5, 2.0, 2.25]), attributes={"units": "h"}
+        ),
         "z": index_coordinate("z", 3),
-        "y": Coordinate(name="lat", values=np.array([1.0, np.nan, 3, 4, 5]), attributes={"units": "deg"}),
+        "y": Coordinate(
+            name="lat", values=np.array([1.0, np.nan, 3, 4, 5]), attributes={"units": "deg"}
+        ),
         "x": Coordinate(name="lon", values=np.arange(6) * 0.25),
     }
 
@@ -108,11 +118,18 @@ def test_coordinates_of_a_series_come_back(tmp_path, samples):
     header = {**samples.compact_header(), "coordinates": describe_coordinates(given)}
     assert sorted(header["coordinates"]) == ["time", "x", "z"]
     assert header["coordinates"]["z"] == {}
-    write(tmp_path / "a.fhz", header, [("coords/y", given["y"].values, {**given["y"].attributes, "name": "lat"})])
+    write(
+        tmp_path / "a.fhz",
+        header,
+        [("coords/y", given["y"].values, {**given["y"].attributes, "name": "lat"})],
+    )
     with Container.open(tmp_path / "a.fhz") as container:
         for axis, stored in (("t", "time"), ("z", "z"), ("y", "y"), ("x", "x")):
             found = container.coordinate(stored)
-            assert (found.name, dict(found.attributes)) == (given[axis].name, dict(given[axis].attributes))
+            assert (found.name, dict(found.attributes)) == (
+                given[axis].name,
+                dict(given[axis].attributes),
+            )
             np.testing.assert_array_equal(found.values, given[axis].values)
 
 
@@ -140,7 +157,9 @@ def test_an_array_beside_a_description_is_checked_as_well(tmp_path, samples, cas
 def test_the_paper_profile_has_arrays(sample, samples):
     header = samples.header()
     with Container.open(sample) as container:
-        np.testing.assert_array_equal(container.coordinate("x").values, samples.arrays(header)["coords/x"])
+        np.testing.assert_array_equal(
+            container.coordinate("x").values, samples.arrays(header)["coords/x"]
+        )
     header["coordinates"] = samples.compact_header()["coordinates"]
     arrays = samples.arrays(header)
     del arrays["coords/x"]
@@ -170,7 +189,9 @@ def test_wrong_description_is_named(samples, description, key):
     header = {**samples.compact_header(), "format": "fhash", "format_version": [1, 1]}
     validate_header(header)
     header["coordinates"] = {"x": description}
-    with pytest.raises(DamagedFileError, match=rf"header key coordinates[.]{key.replace('.', '[.]')}\b"):
+    with pytest.raises(
+        DamagedFileError, match=rf"header key coordinates[.]{key.replace('.', '[.]')}\b"
+    ):
         validate_header(header)
 
 

@@ -117,7 +117,9 @@ def test_what_does_not_fit_in_memory_is_not_called_damaged(sample, monkeypatch):
     """Or a sound file might be thrown away."""
     with Container.open(sample) as container:
         array = container.arrays["mlp/weight_1"]
-        monkeypatch.setattr(array, "_decode", lambda index, lod: (_ for _ in ()).throw(MemoryError()))
+        monkeypatch.setattr(
+            array, "_decode", lambda index, lod: (_ for _ in ()).throw(MemoryError())
+        )
         with pytest.raises(MemoryError):
             array.read()
 
@@ -131,7 +133,15 @@ def test_no_file_folder_and_pipe(tmp_path):
             Container.open(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x05\x06" + bytes(18), b"\x89HDF\r\n\x1a\n" + bytes(500), b"fhash 1 sha256=" + b"0" * 64])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"PK\x05\x06" + bytes(18),
+        b"\x89HDF\r\n\x1a\n" + bytes(500),
+        b"fhash 1 sha256=" + b"0" * 64,
+    ],
+)
 def test_another_file_is_refused(tmp_path, content):
     path = tmp_path / "other.fhz"
     path.write_bytes(content)

@@ -47,14 +47,24 @@ def test_compact_header_is_valid_and_can_be_written(tmp_path, samples):
     with Container.open(tmp_path / "a.fhz") as container:
         assert container.header == header
         assert container.coordinate("x").name == "lon"
-    for key in ("coordinates", *header["model"], *header["coordinates"]["x"], "values", "attributes"):
+    for key in (
+        "coordinates",
+        *header["model"],
+        *header["coordinates"]["x"],
+        "values",
+        "attributes",
+    ):
         assert f"`{key}`" in DOCUMENT
     for name in ("occupancy/bits", "occupancy/mask", "tables/level_1"):
         assert f"`{name}`" in DOCUMENT
 
 
 def test_sharded_array_is_what_the_writer_writes(monkeypatch):
-    monkeypatch.setitem(ARRAY_CODECS, "fhash.transform", lambda codecs, dtype, shape: PlainCoder(plain_codecs(dtype)[:2], dtype, shape))
+    monkeypatch.setitem(
+        ARRAY_CODECS,
+        "fhash.transform",
+        lambda codecs, dtype, shape: PlainCoder(plain_codecs(dtype)[:2], dtype, shape),
+    )
     values = example("sharded-array")
     metadata = ArrayMetadata.from_dict(values)
     assert metadata.to_dict() == values

@@ -114,7 +114,9 @@ BAD = [
 def test_wrong_key_is_named(samples, path, value):
     header = {**FIXED, **samples.header()}
     validate_header(header)
-    with pytest.raises(DamagedFileError, match=rf"header key {path.replace('.', '[.]')}\b") as caught:
+    with pytest.raises(
+        DamagedFileError, match=rf"header key {path.replace('.', '[.]')}\b"
+    ) as caught:
         validate_header(changed(header, path, value))
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
@@ -181,7 +183,14 @@ def test_array_that_does_not_fit_is_named(tmp_path, samples, name):
 
 
 @pytest.mark.parametrize(
-    "fields", [{"tables": "uint8"}, {"tables": "float32"}, {"hidden_layers": 0}, {"hidden_layers": 3}, {"embedding_size": 1}]
+    "fields",
+    [
+        {"tables": "uint8"},
+        {"tables": "float32"},
+        {"hidden_layers": 0},
+        {"hidden_layers": 3},
+        {"embedding_size": 1},
+    ],
 )
 def test_other_models_fit(tmp_path, samples, fields):
     header = samples.header()
@@ -204,7 +213,10 @@ def test_one_step_of_one_vertex(tmp_path, samples):
         assert container.verify() == len(arrays)
 
 
-@pytest.mark.parametrize("attributes", [{}, {"offset": 0.0}, {"offset": "0", "scale": 1.0}, {"offset": 0.0, "scale": -1.0}])
+@pytest.mark.parametrize(
+    "attributes",
+    [{}, {"offset": 0.0}, {"offset": "0", "scale": 1.0}, {"offset": 0.0, "scale": -1.0}],
+)
 def test_quantised_tables_need_offset_and_scale(tmp_path, samples, attributes):
     header = samples.header()
     header["model"]["tables"] = "uint8"
@@ -219,7 +231,10 @@ def test_quantised_tables_need_offset_and_scale(tmp_path, samples, attributes):
     ("change", "message"),
     [
         ({"model.tables": "transform"}, "required_features"),
-        ({"model.tables": "transform", "required_features": ["transform"]}, "array tables/level_1/component_1 is missing"),
+        (
+            {"model.tables": "transform", "required_features": ["transform"]},
+            "array tables/level_1/component_1 is missing",
+        ),
         ({"model.tables_loss_db": "0.1"}, "tables_loss_db"),
     ],
     ids=str,
@@ -236,10 +251,16 @@ def test_coded_tables_need_their_feature_and_their_components(tmp_path, samples,
 @pytest.mark.parametrize("mixing", [None, 1.0, [1.0], [1.0, "2"], [1.0, 2.0, 3.0]])
 def test_components_need_their_mixing(tmp_path, samples, mixing):
     header = samples.header()
-    arrays = {name: array for name, array in samples.arrays(header).items() if not name.startswith("tables/")}
+    arrays = {
+        name: array
+        for name, array in samples.arrays(header).items()
+        if not name.startswith("tables/")
+    }
     header["model"]["tables"], header["required_features"] = "transform", ["transform"]
     for number, level in enumerate(header["model"]["levels"], start=1):
-        arrays |= {f"tables/level_{number}/component_{part}": np.ones(level, np.float32) for part in (1, 2)}
+        arrays |= {
+            f"tables/level_{number}/component_{part}": np.ones(level, np.float32) for part in (1, 2)
+        }
     for good in (True, False):
         with ContainerWriter(tmp_path / "a.fhz") as writer:
             for name, array in arrays.items():
@@ -250,11 +271,15 @@ def test_components_need_their_mixing(tmp_path, samples, mixing):
                     if mixing is None
                     else {"mixing": mixing}
                 )
-                writer.add_whole(name, array, attributes=attributes if name.startswith("tables/") else None)
+                writer.add_whole(
+                    name, array, attributes=attributes if name.startswith("tables/") else None
+                )
             if good:
                 writer.preview(header).close()
             else:
-                with pytest.raises(InputError, match="array tables/level_2/component_1 attribute mixing"):
+                with pytest.raises(
+                    InputError, match="array tables/level_2/component_1 attribute mixing"
+                ):
                     writer.commit(header)
 
 
@@ -299,7 +324,14 @@ def test_key_frames_increase():
 
 
 @pytest.mark.parametrize(
-    ("size", "count"), [((1, 1, 1), 1), ((2, 2, 2), 1), ((3, 2, 2), 2), ((25, 125, 125), 65536), ((64, 64, 64), 32768)]
+    ("size", "count"),
+    [
+        ((1, 1, 1), 1),
+        ((2, 2, 2), 1),
+        ((3, 2, 2), 2),
+        ((25, 125, 125), 65536),
+        ((64, 64, 64), 32768),
+    ],
 )
 def test_occupancy_bytes(size, count):
     assert occupancy_bytes([(5, 5 + n) for n in size]) == count

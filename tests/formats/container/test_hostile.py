@@ -73,7 +73,21 @@ def test_directory_entry(sample, samples, case):
 
 
 @pytest.mark.parametrize(
-    "name", ["../evil", "a/../../evil", "/etc/evil", "a\\evil", "folder/", "a//b", ".", "C:evil", "a b", "a\nb", ".hidden", ""]
+    "name",
+    [
+        "../evil",
+        "a/../../evil",
+        "/etc/evil",
+        "a\\evil",
+        "folder/",
+        "a//b",
+        ".",
+        "C:evil",
+        "a b",
+        "a\nb",
+        ".hidden",
+        "",
+    ],
 )
 def test_member_names(sample, samples, name):
     parts = samples.unpack(sample.read_bytes())
@@ -82,7 +96,11 @@ def test_member_names(sample, samples, name):
 
 def test_name_beyond_ascii(sample, samples):
     parts = [("coordx", b""), *samples.unpack(sample.read_bytes())]
-    refused(sample, samples.reseal(samples.pack(parts).replace(b"coordx", "coor\u00e9".encode())), "not allowed")
+    refused(
+        sample,
+        samples.reseal(samples.pack(parts).replace(b"coordx", "coor\u00e9".encode())),
+        "not allowed",
+    )
 
 
 def test_duplicate_member(sample, samples):
@@ -155,7 +173,9 @@ def test_chunks_are_never_deflated(sample, samples):
     for other, content in parts:
         packed = deflated(content) if other == name else content
         full = len(content) if other == name else None
-        member = Member(name=other, offset=position, size=len(packed), crc=zlib.crc32(content), full_size=full)
+        member = Member(
+            name=other, offset=position, size=len(packed), crc=zlib.crc32(content), full_size=full
+        )
         members.append(member)
         chunks += [local_header(member), packed]
         position = member.end
@@ -209,7 +229,9 @@ def test_newer_layout(sample):
 def edited(sample, samples, name, change):
     """The file with one JSON document changed in place by `change`."""
     parts = samples.unpack(sample.read_bytes())
-    return samples.pack([(n, changed_json(data, change) if n == name else data) for n, data in parts])
+    return samples.pack(
+        [(n, changed_json(data, change) if n == name else data) for n, data in parts]
+    )
 
 
 def changed_json(data, change):
@@ -221,39 +243,93 @@ def changed_json(data, change):
 DOCUMENT = "coords/time/zarr.json"
 ARRAYS = {
     "huge shape": (lambda v: v.update(shape=[2**60]), "chunks; .* are declared", DamagedFileError),
-    "huge chunk": (lambda v: v["chunk_grid"].update(configuration={"chunk_shape": [2**60]}), "limit", DamagedFileError),
-    "both huge": (
-        lambda v: v.update(shape=[2**60], chunk_grid={"name": "regular", "configuration": {"chunk_shape": [2**60]}}),
+    "huge chunk": (
+        lambda v: v["chunk_grid"].update(configuration={"chunk_shape": [2**60]}),
         "limit",
         DamagedFileError,
     ),
-    "larger chunk": (lambda v: v["chunk_grid"].update(configuration={"chunk_shape": [2**20]}), "zstd declares", DamagedFileError),
+    "both huge": (
+        lambda v: v.update(
+            shape=[2**60], chunk_grid={"name": "regular", "configuration": {"chunk_shape": [2**60]}}
+        ),
+        "limit",
+        DamagedFileError,
+    ),
+    "larger chunk": (
+        lambda v: v["chunk_grid"].update(configuration={"chunk_shape": [2**20]}),
+        "zstd declares",
+        DamagedFileError,
+    ),
     "beyond": (lambda v: v.update(shape=[2**80]), "shape", DamagedFileError),
     "negative": (lambda v: v.update(shape=[-4]), "shape", DamagedFileError),
     "bool length": (lambda v: v.update(shape=[True]), "shape", DamagedFileError),
     "float length": (lambda v: v.update(shape=[4.0]), "shape", DamagedFileError),
     "many axes": (lambda v: v.update(shape=[1] * 99), "axes", DamagedFileError),
     "other rank": (lambda v: v.update(shape=[4, 1]), "axes", DamagedFileError),
-    "wrong dtype": (lambda v: v.update(data_type="float32"), "zstd declares|asks for float64", DamagedFileError),
-    "unknown dtype": (lambda v: v.update(data_type="complex128"), "data_type", UnsupportedFileError),
-    "dtype object": (lambda v: v.update(data_type={"name": "object"}), "data_type", UnsupportedFileError),
-    "unknown codec": (lambda v: v["codecs"].insert(1, {"name": "pickle"}), "codecs", UnsupportedFileError),
-    "first codec": (lambda v: v["codecs"].__setitem__(0, {"name": "vlen-utf8"}), "codecs", UnsupportedFileError),
-    "big endian": (lambda v: v["codecs"][0]["configuration"].update(endian="big"), "codecs", UnsupportedFileError),
+    "wrong dtype": (
+        lambda v: v.update(data_type="float32"),
+        "zstd declares|asks for float64",
+        DamagedFileError,
+    ),
+    "unknown dtype": (
+        lambda v: v.update(data_type="complex128"),
+        "data_type",
+        UnsupportedFileError,
+    ),
+    "dtype object": (
+        lambda v: v.update(data_type={"name": "object"}),
+        "data_type",
+        UnsupportedFileError,
+    ),
+    "unknown codec": (
+        lambda v: v["codecs"].insert(1, {"name": "pickle"}),
+        "codecs",
+        UnsupportedFileError,
+    ),
+    "first codec": (
+        lambda v: v["codecs"].__setitem__(0, {"name": "vlen-utf8"}),
+        "codecs",
+        UnsupportedFileError,
+    ),
+    "big endian": (
+        lambda v: v["codecs"][0]["configuration"].update(endian="big"),
+        "codecs",
+        UnsupportedFileError,
+    ),
     "no checksum": (lambda v: v["codecs"].pop(), "codecs", UnsupportedFileError),
     "no codecs": (lambda v: v.update(codecs=[]), "codecs", UnsupportedFileError),
     "codecs no list": (lambda v: v.update(codecs={"a": 1}), "codecs", DamagedFileError),
     "codec no object": (lambda v: v.update(codecs=["bytes", 5]), "codecs", DamagedFileError),
     "fill value": (lambda v: v.update(fill_value=1.0), "fill_value", UnsupportedFileError),
-    "chunk keys": (lambda v: v["chunk_key_encoding"].update(name="v2"), "chunk_key_encoding", UnsupportedFileError),
-    "chunk grid": (lambda v: v["chunk_grid"].update(name="rectangular"), "chunk_grid", UnsupportedFileError),
-    "transformers": (lambda v: v.update(storage_transformers=[{"name": "x"}]), "storage_transformers", UnsupportedFileError),
-    "unknown key": (lambda v: v.update(surprise={"must_understand": True}), "surprise", UnsupportedFileError),
+    "chunk keys": (
+        lambda v: v["chunk_key_encoding"].update(name="v2"),
+        "chunk_key_encoding",
+        UnsupportedFileError,
+    ),
+    "chunk grid": (
+        lambda v: v["chunk_grid"].update(name="rectangular"),
+        "chunk_grid",
+        UnsupportedFileError,
+    ),
+    "transformers": (
+        lambda v: v.update(storage_transformers=[{"name": "x"}]),
+        "storage_transformers",
+        UnsupportedFileError,
+    ),
+    "unknown key": (
+        lambda v: v.update(surprise={"must_understand": True}),
+        "surprise",
+        UnsupportedFileError,
+    ),
     "attributes": (lambda v: v.update(attributes=[1]), "attributes", DamagedFileError),
     "missing key": (lambda v: v.pop("codecs"), "codecs is missing", DamagedFileError),
     "zarr 2": (lambda v: v.update(zarr_format=2), "Zarr v3", UnsupportedFileError),
     "node type": (lambda v: v.update(node_type="table"), "Zarr v3", UnsupportedFileError),
-    "dimension names": (lambda v: v.update(dimension_names=[1]), "dimension_names", DamagedFileError),
+    "dimension names": (
+        lambda v: v.update(dimension_names=[1]),
+        "dimension_names",
+        DamagedFileError,
+    ),
 }
 
 
@@ -264,7 +340,9 @@ def test_array_metadata(sample, samples, case):
 
 
 def test_key_that_need_not_be_understood(sample, samples):
-    sample.write_bytes(edited(sample, samples, DOCUMENT, lambda v: v.update(surprise={"must_understand": False})))
+    sample.write_bytes(
+        edited(sample, samples, DOCUMENT, lambda v: v.update(surprise={"must_understand": False}))
+    )
     read_everything(sample)
 
 
@@ -278,25 +356,53 @@ def extra_array(shape):
         "node_type": "array",
     }
     grid = {"name": "regular", "configuration": {"chunk_shape": [1] * len(shape)}}
-    codecs = [{"name": "bytes"}, {"name": "zstd", "configuration": {"level": 1, "checksum": False}}, {"name": "crc32c"}]
+    codecs = [
+        {"name": "bytes"},
+        {"name": "zstd", "configuration": {"level": 1, "checksum": False}},
+        {"name": "crc32c"},
+    ]
     return json.dumps({**metadata, "chunk_grid": grid, "codecs": codecs}).encode()
 
 
 PLACES = {
-    "chunk missing": (lambda p: [part for part in p if part[0] != "coords/time/c/0"], "coords/time has 0 chunks"),
+    "chunk missing": (
+        lambda p: [part for part in p if part[0] != "coords/time/c/0"],
+        "coords/time has 0 chunks",
+    ),
     "all but the root missing": (lambda p: p[-1:], "array coords/time is missing"),
     "root missing": (lambda p: p[:-1], "zarr.json is missing"),
     "nothing": (lambda p: [], "zarr.json is missing"),
-    "group missing": (lambda p: [part for part in p if part[0] != "coords/zarr.json"], "lies in no group"),
+    "group missing": (
+        lambda p: [part for part in p if part[0] != "coords/zarr.json"],
+        "lies in no group",
+    ),
     "chunk outside the grid": (lambda p: [("coords/time/c/1", b"x"), *p], "member coords/time/c/1"),
-    "chunk of other rank": (lambda p: [("coords/time/c/0/0", b"x"), *p], "member coords/time/c/0/0"),
-    "chunk under another name": (lambda p: [("coords/time/c/00", b"x"), *p], "member coords/time/c/00"),
-    "chunk number too long": (lambda p: [("coords/time/c/" + "9" * 400, b"x"), *p], "member coords/time/c/999"),
+    "chunk of other rank": (
+        lambda p: [("coords/time/c/0/0", b"x"), *p],
+        "member coords/time/c/0/0",
+    ),
+    "chunk under another name": (
+        lambda p: [("coords/time/c/00", b"x"), *p],
+        "member coords/time/c/00",
+    ),
+    "chunk number too long": (
+        lambda p: [("coords/time/c/" + "9" * 400, b"x"), *p],
+        "member coords/time/c/999",
+    ),
     "chunk of no array": (lambda p: [("coords/none/c/0", b"x"), *p], "belongs to no array"),
     "file of no array": (lambda p: [("readme.txt", b"x"), *p], "belongs to no array"),
-    "array in an array": (lambda p: [("coords/time/a/zarr.json", extra_array([1])), *p], "lies in no group"),
-    "many chunks declared": (lambda p: [("more/zarr.json", extra_array([2**31, 2**31])), *p], "has 0 chunks"),
-    "table missing": (lambda p: [part for part in p if not part[0].startswith("tables/level_2")], "tables/level_2 is missing"),
+    "array in an array": (
+        lambda p: [("coords/time/a/zarr.json", extra_array([1])), *p],
+        "lies in no group",
+    ),
+    "many chunks declared": (
+        lambda p: [("more/zarr.json", extra_array([2**31, 2**31])), *p],
+        "has 0 chunks",
+    ),
+    "table missing": (
+        lambda p: [part for part in p if not part[0].startswith("tables/level_2")],
+        "tables/level_2 is missing",
+    ),
 }
 
 
@@ -330,7 +436,11 @@ TEXTS = {
 def test_metadata_text(sample, samples, case, name):
     text, message = TEXTS[case]
     parts = samples.unpack(sample.read_bytes())
-    refused(sample, samples.pack([(n, text if n == name else data) for n, data in parts]), f"member {name}: .*{message}")
+    refused(
+        sample,
+        samples.pack([(n, text if n == name else data) for n, data in parts]),
+        f"member {name}: .*{message}",
+    )
 
 
 ROOTS = {
@@ -340,8 +450,16 @@ ROOTS = {
         UnsupportedFileError,
     ),
     "older major": (lambda v: v.update(format_version=[0, 9]), "format_version", DamagedFileError),
-    "feature": (lambda v: v.update(required_features=["teleport"]), "feature 'teleport'", UnsupportedFileError),
-    "profile": (lambda v: v["model"].update(profile="magic"), "profile is 'magic'", UnsupportedFileError),
+    "feature": (
+        lambda v: v.update(required_features=["teleport"]),
+        "feature 'teleport'",
+        UnsupportedFileError,
+    ),
+    "profile": (
+        lambda v: v["model"].update(profile="magic"),
+        "profile is 'magic'",
+        UnsupportedFileError,
+    ),
     "another format": (lambda v: v.update(format="zhash"), "format is 'zhash'", DamagedFileError),
 }
 
@@ -349,15 +467,31 @@ ROOTS = {
 @pytest.mark.parametrize("case", ROOTS)
 def test_root(sample, samples, case):
     change, message, kind = ROOTS[case]
-    refused(sample, edited(sample, samples, ROOT, lambda v: change(v["attributes"]["fhash"])), message, kind)
+    refused(
+        sample,
+        edited(sample, samples, ROOT, lambda v: change(v["attributes"]["fhash"])),
+        message,
+        kind,
+    )
 
 
 def test_root_is_an_ordinary_zarr_group(sample, samples):
-    refused(sample, edited(sample, samples, ROOT, lambda v: v.update(attributes={})), "not the group of an fhash container")
+    refused(
+        sample,
+        edited(sample, samples, ROOT, lambda v: v.update(attributes={})),
+        "not the group of an fhash container",
+    )
 
 
 def test_newer_minor_is_read(sample, samples):
-    sample.write_bytes(edited(sample, samples, ROOT, lambda v: v["attributes"]["fhash"].update(format_version=[1, 7], novelty={"a": 1})))
+    sample.write_bytes(
+        edited(
+            sample,
+            samples,
+            ROOT,
+            lambda v: v["attributes"]["fhash"].update(format_version=[1, 7], novelty={"a": 1}),
+        )
+    )
     read_everything(sample)
     with Container.open(sample) as container:
         assert container.header["novelty"] == {"a": 1}
@@ -368,7 +502,11 @@ def test_key_frames_increase_within_the_domain(sample, samples, steps):
     coded = numcodecs.zstd.compress(np.array(steps, dtype="<i8"), 1)
     coded += struct.pack("<I", crc32c(coded))
     parts = samples.unpack(sample.read_bytes())
-    refused(sample, samples.pack([(n, coded if n == "key_frames/c/0" else data) for n, data in parts]), "key_frames")
+    refused(
+        sample,
+        samples.pack([(n, coded if n == "key_frames/c/0" else data) for n, data in parts]),
+        "key_frames",
+    )
 
 
 # -- the data of a chunk -------------------------------------------------------------------------------------------------------
@@ -376,12 +514,19 @@ def test_key_frames_increase_within_the_domain(sample, samples, steps):
 
 def frame(content, *, size=None):
     """A zstd frame of one raw block, which declares `size` bytes of content or, without, none (RFC 8878)."""
-    head = struct.pack("<IB", 0xFD2FB528, 0x00) + b"\x58" if size is None else struct.pack("<IBQ", 0xFD2FB528, 0xE0, size)
+    head = (
+        struct.pack("<IB", 0xFD2FB528, 0x00) + b"\x58"
+        if size is None
+        else struct.pack("<IBQ", 0xFD2FB528, 0xE0, size)
+    )
     return head + struct.pack("<I", len(content) << 3 | 1)[:3] + content
 
 
 CHUNKS = {
-    "bomb": (lambda right: numcodecs.zstd.compress(bytes(1 << 26), 1), "zstd declares 67108864 bytes; the chunk has 32"),
+    "bomb": (
+        lambda right: numcodecs.zstd.compress(bytes(1 << 26), 1),
+        "zstd declares 67108864 bytes; the chunk has 32",
+    ),
     "bomb of unknown size": (lambda right: frame(bytes(1 << 16)), "zstd declares None"),
     "bomb that lies": (lambda right: frame(bytes(1 << 16), size=32), "zstd data are damaged"),
     "two frames": (lambda right: numcodecs.zstd.compress(right, 1) * 2, "zstd data are damaged"),
@@ -389,7 +534,10 @@ CHUNKS = {
     "declares 2^63": (lambda right: frame(right, size=2**63), "zstd declares"),
     "other content": (lambda right: right, "not a zstd frame"),
     "empty": (lambda right: b"", "not a zstd frame"),
-    "header only": (lambda right: frame(right, size=32)[:8], "the header of the zstd frame is cut short"),
+    "header only": (
+        lambda right: frame(right, size=32)[:8],
+        "the header of the zstd frame is cut short",
+    ),
 }
 
 
@@ -409,10 +557,14 @@ def test_a_frame_cannot_declare_more_than_zstd_packs_into_its_bytes():
     most = PlainCoder(plain_codecs(float64)[:-1], float64, (2**17,))
     assert not most.decode(memoryview(numcodecs.zstd.compress(bytes(2**20), 19))).any()
     with pytest.raises(DamagedFileError, match="which 17 bytes cannot hold"):
-        PlainCoder(plain_codecs(float64)[:-1], float64, (2**40,)).decode(memoryview(frame(b"abc"[:1], size=2**43)))
+        PlainCoder(plain_codecs(float64)[:-1], float64, (2**40,)).decode(
+            memoryview(frame(b"abc"[:1], size=2**43))
+        )
 
 
-@pytest.mark.parametrize("coded", [b"", b"abc", b"abcd", numcodecs.zstd.compress(bytes(32), 1) + b"abcd"])
+@pytest.mark.parametrize(
+    "coded", [b"", b"abc", b"abcd", numcodecs.zstd.compress(bytes(32), 1) + b"abcd"]
+)
 def test_chunk_without_its_crc(sample, samples, coded):
     parts = samples.unpack(sample.read_bytes())
     data = samples.pack([(n, coded if n == "coords/time/c/0" else old) for n, old in parts])
@@ -425,6 +577,8 @@ def test_frame_made_by_hand_is_read(sample, samples):
     coded = frame(right.tobytes(), size=32)
     coded += struct.pack("<I", crc32c(coded))
     parts = samples.unpack(sample.read_bytes())
-    sample.write_bytes(samples.pack([(n, coded if n == "coords/time/c/0" else old) for n, old in parts]))
+    sample.write_bytes(
+        samples.pack([(n, coded if n == "coords/time/c/0" else old) for n, old in parts])
+    )
     with Container.open(sample) as container:
         np.testing.assert_array_equal(container.arrays["coords/time"].read(), right)

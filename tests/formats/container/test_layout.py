@@ -31,7 +31,10 @@ def test_bytes_of_a_far_directory_entry():
 
 
 def test_comment_is_a_digest():
-    assert comment(b"") == b"fhash 2 sha256=e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+    assert (
+        comment(b"")
+        == b"fhash 2 sha256=e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+    )
 
 
 class Sparse(io.RawIOBase):
@@ -42,7 +45,9 @@ class Sparse(io.RawIOBase):
 
     def read(self, *arguments):
         """`read(offset, size)` as a source, `read(size)` or `read()` as a file."""
-        offset, size = arguments if len(arguments) == 2 else (self.at, *(arguments or (self.size - self.at,)))
+        offset, size = (
+            arguments if len(arguments) == 2 else (self.at, *(arguments or (self.size - self.at,)))
+        )
         start = offset - self.begin
         self.at = offset + size
         # zipfile looks for the end record a little further back than it is.

@@ -34,7 +34,9 @@ def test_the_threads_grow_with_what_is_asked_for(monkeypatch: pytest.MonkeyPatch
 
 def test_calls_within_calls_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "usable_threads", lambda: 3)
-    found = in_threads(lambda outer: sum(in_threads(lambda inner: outer * inner, range(30))), range(30))
+    found = in_threads(
+        lambda outer: sum(in_threads(lambda inner: outer * inner, range(30))), range(30)
+    )
     assert list(found) == [outer * sum(range(30)) for outer in range(30)]
 
 

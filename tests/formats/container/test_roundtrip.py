@@ -47,7 +47,13 @@ def everything(tmp_path, samples):
         for dtype, (name, (shape, chunk)) in product(DTYPES, SHAPES.items()):
             arrays[f"extra/{name}/{dtype}"] = array = values_of(dtype, shape)
             names = [f"axis_{n}" for n in range(len(shape))]
-            writer.add_whole(f"extra/{name}/{dtype}", array, chunk_shape=chunk, dimension_names=names, attributes={"of": name})
+            writer.add_whole(
+                f"extra/{name}/{dtype}",
+                array,
+                chunk_shape=chunk,
+                dimension_names=names,
+                attributes={"of": name},
+            )
         writer.commit(header)
     return path, arrays
 
@@ -85,8 +91,12 @@ def test_zipfile_finds_a_sound_zip_of_stored_chunks(sample):
     with zipfile.ZipFile(sample) as archive:
         assert archive.testzip() is None
         assert archive.namelist()[-1] == "zarr.json"
-        assert {(info.date_time, info.create_system) for info in archive.infolist()} == {((1980, 1, 1, 0, 0, 0), 3)}
-        methods = {(info.filename.endswith("zarr.json"), info.compress_type) for info in archive.infolist()}
+        assert {(info.date_time, info.create_system) for info in archive.infolist()} == {
+            ((1980, 1, 1, 0, 0, 0), 3)
+        }
+        methods = {
+            (info.filename.endswith("zarr.json"), info.compress_type) for info in archive.infolist()
+        }
         assert methods >= {(True, zipfile.ZIP_DEFLATED), (False, zipfile.ZIP_STORED)}
         assert (False, zipfile.ZIP_DEFLATED) not in methods
         assert json.loads(archive.read("zarr.json"))["attributes"]["fhash"]["format"] == "fhash"
@@ -94,14 +104,22 @@ def test_zipfile_finds_a_sound_zip_of_stored_chunks(sample):
 
 def test_header_comes_back(sample, samples):
     with Container.open(sample) as container:
-        assert container.header == {**samples.header(), "format": "fhash", "format_version": [1, 1], "required_features": []}
+        assert container.header == {
+            **samples.header(),
+            "format": "fhash",
+            "format_version": [1, 1],
+            "required_features": [],
+        }
         assert container.size == sample.stat().st_size
         assert container.path == sample
 
 
 def test_overhead_and_chunk_data_are_the_file(sample):
     with Container.open(sample) as container:
-        assert container.overhead() + sum(array.nbytes_stored for array in container.arrays.values()) == sample.stat().st_size
+        assert (
+            container.overhead() + sum(array.nbytes_stored for array in container.arrays.values())
+            == sample.stat().st_size
+        )
         assert 0 < container.overhead() < container.size
 
 
@@ -121,7 +139,13 @@ def test_chunks_of_one_array_may_come_from_a_generator(tmp_path, samples):
         for name, array in arrays.items():
             writer.add_whole(name, array)
         chunks = (table[t : t + 1, z : z + 2] for t in range(2) for z in (0, 2))
-        writer.add_array("tables/level_1", shape=table.shape, dtype=">f2", chunk_shape=(1, 2, 4, 6, 2), chunks=chunks)
+        writer.add_array(
+            "tables/level_1",
+            shape=table.shape,
+            dtype=">f2",
+            chunk_shape=(1, 2, 4, 6, 2),
+            chunks=chunks,
+        )
         writer.commit(header)
     with Container.open(tmp_path / "a.fhz") as container:
         np.testing.assert_array_equal(container.arrays["tables/level_1"].read(), table)
@@ -138,12 +162,21 @@ def regions(shape, count):
 def test_region_is_the_same_part_of_the_whole(everything):
     path, arrays = everything
     with Container.open(path) as container:
-        for name in ("extra/five/float64", "extra/larger/uint16", "extra/line/int8", "tables/level_1"):
+        for name in (
+            "extra/five/float64",
+            "extra/larger/uint16",
+            "extra/line/int8",
+            "tables/level_1",
+        ):
             for region in regions(arrays[name].shape, 60):
-                np.testing.assert_array_equal(container.arrays[name].read(region), arrays[name][region])
+                np.testing.assert_array_equal(
+                    container.arrays[name].read(region), arrays[name][region]
+                )
 
 
-@pytest.mark.parametrize("part", [slice(-1, 2), slice(0, 8), slice(3, 2), slice(0, 7, 2), slice(0, 7, -1), slice(8, 8)])
+@pytest.mark.parametrize(
+    "part", [slice(-1, 2), slice(0, 8), slice(3, 2), slice(0, 7, 2), slice(0, 7, -1), slice(8, 8)]
+)
 def test_region_outside_is_refused(everything, part):
     path, _ = everything
     with Container.open(path) as container, pytest.raises(RegionError, match="axis 0"):
@@ -158,7 +191,8 @@ def test_region_of_other_axes_is_refused(sample):
 def test_open_ends_of_slices_are_the_array_ends(sample, samples):
     with Container.open(sample) as container:
         np.testing.assert_array_equal(
-            container.arrays["coords/x"].read((slice(2, None),)), samples.arrays(samples.header())["coords/x"][2:]
+            container.arrays["coords/x"].read((slice(2, None),)),
+            samples.arrays(samples.header())["coords/x"][2:],
         )
 
 
@@ -166,11 +200,17 @@ def test_region_touches_only_its_chunks_and_once(sample, monkeypatch):
     with Container.open(sample) as container:
         reads = []
         read = container._source.read
-        monkeypatch.setattr(container._source, "read", lambda offset, size: reads.append(offset) or read(offset, size))
+        monkeypatch.setattr(
+            container._source,
+            "read",
+            lambda offset, size: reads.append(offset) or read(offset, size),
+        )
         table = container.arrays["tables/level_1"]
         region = (slice(0, 1), slice(1, 3), slice(0, 3), slice(0, 6), slice(0, 2))
         table.read(region)
-        assert sorted(reads) == sorted(table.chunks[index].offset for index in [(0, 0, 0, 0, 0), (0, 1, 0, 0, 0)])
+        assert sorted(reads) == sorted(
+            table.chunks[index].offset for index in [(0, 0, 0, 0, 0), (0, 1, 0, 0, 0)]
+        )
         table.read(region)
         assert len(reads) == 2
 
@@ -189,7 +229,9 @@ def test_cache_holds_no_more_than_its_limit(sample):
         for _ in range(2):
             table.read(tuple(slice(0, n) for n in table.shape))
         assert 0 < container._cache._bytes <= 200
-        assert container._cache._bytes == sum(chunk.nbytes for chunk in container._cache._chunks.values())
+        assert container._cache._bytes == sum(
+            chunk.nbytes for chunk in container._cache._chunks.values()
+        )
     with Container.open(sample, cache_bytes=0) as container:
         table = container.arrays["tables/level_1"]
         table.read(tuple(slice(0, n) for n in table.shape))
@@ -201,7 +243,9 @@ def test_threads_read_what_one_reads(everything):
     table = arrays["extra/five/float64"]
     with Container.open(path, cache_bytes=1000) as container, ThreadPoolExecutor(8) as pool:
         asked = list(regions(table.shape, 300))
-        for region, read in zip(asked, pool.map(container.arrays["extra/five/float64"].read, asked), strict=True):
+        for region, read in zip(
+            asked, pool.map(container.arrays["extra/five/float64"].read, asked), strict=True
+        ):
             np.testing.assert_array_equal(read, table[region])
 
 
@@ -217,7 +261,12 @@ def test_is_container(sample, tmp_path):
     assert is_container(sample)
     assert is_container(str(sample))
     data = sample.read_bytes()
-    for name, other in {"cut": data[:-1], "longer": data + b"\n", "empty": b"", "text": b"fhash 1"}.items():
+    for name, other in {
+        "cut": data[:-1],
+        "longer": data + b"\n",
+        "empty": b"",
+        "text": b"fhash 1",
+    }.items():
         (tmp_path / name).write_bytes(other)
         assert not is_container(tmp_path / name)
     assert not is_container(tmp_path)

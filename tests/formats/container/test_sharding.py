@@ -36,10 +36,19 @@ def write(path, samples, values, chunk_shape, shard_shape, chunks=None, **option
     """A compact container with one more array, which is sharded."""
     header = samples.compact_header()
     if chunks is None:
-        chunks = (cut(values, index, chunk_shape) for index in shard_order(values.shape, chunk_shape, shard_shape))
+        chunks = (
+            cut(values, index, chunk_shape)
+            for index in shard_order(values.shape, chunk_shape, shard_shape)
+        )
     with ContainerWriter(path, force=True) as writer:
         writer.add_whole("tables/level_1", np.zeros(header["model"]["levels"][0], dtype=np.float32))
-        settings = {"shape": values.shape, "dtype": values.dtype, "chunk_shape": chunk_shape, "shard_shape": shard_shape, **options}
+        settings = {
+            "shape": values.shape,
+            "dtype": values.dtype,
+            "chunk_shape": chunk_shape,
+            "shard_shape": shard_shape,
+            **options,
+        }
         writer.add_sharded(NAME, chunks=chunks, **settings)
         writer.commit(header)
     return path
@@ -60,11 +69,23 @@ def file(tmp_path, samples):
 def test_every_region_reads_equal(tmp_path, samples, case):
     shape, chunk_shape, shard_shape = CASES[case]
     values = numbers(shape)
-    path = write(tmp_path / "a.fhz", samples, values, chunk_shape, shard_shape, dimension_names=["a"] * len(shape), attributes={"a": 1})
+    path = write(
+        tmp_path / "a.fhz",
+        samples,
+        values,
+        chunk_shape,
+        shard_shape,
+        dimension_names=["a"] * len(shape),
+        attributes={"a": 1},
+    )
     rng = np.random.default_rng(0)
     with Container.open(path) as container:
         array = container.arrays[NAME]
-        assert (array.shape, array.chunk_shape, array.shard_shape) == (shape, chunk_shape, shard_shape)
+        assert (array.shape, array.chunk_shape, array.shard_shape) == (
+            shape,
+            chunk_shape,
+            shard_shape,
+        )
         assert array.grid == tuple(-(-n // c) for n, c in zip(shape, chunk_shape, strict=True))
         assert array.attributes == {"a": 1}
         np.testing.assert_array_equal(array.read(), values)
@@ -105,7 +126,9 @@ def test_region_reads_only_the_index_and_its_inner_chunks(file):
         before = container.bytes_read
         reads = []
         read = container._source.read
-        container._source.read = lambda offset, size: reads.append((offset, size)) or read(offset, size)
+        container._source.read = lambda offset, size: (
+            reads.append((offset, size)) or read(offset, size)
+        )
         np.testing.assert_array_equal(array.read((slice(2, 4), slice(3, 5))), values[2:4, 3:5])
         member = array.chunks[0, 0]
         index_bytes = 4 * 16 + 4
@@ -128,7 +151,9 @@ def test_of_a_large_index_only_the_entries_that_are_needed_are_read(tmp_path, sa
         array = container.arrays[NAME]
         member = array.chunks[0, 0]
         start, reads, read = member.end - 4 - 40 * 16, [], container._source.read
-        container._source.read = lambda offset, size: reads.append((offset, size)) or read(offset, size)
+        container._source.read = lambda offset, size: (
+            reads.append((offset, size)) or read(offset, size)
+        )
         np.testing.assert_array_equal(array.read((slice(3, 5), slice(0, 2))), values[3:5, :2])
         entries = [at for at in reads if at[0] >= start]
         assert entries == [(start + 2 * 16, 16), (start + 4 * 16, 16)]
@@ -181,7 +206,9 @@ def test_coded_chunks_and_levels_of_detail(tmp_path, samples, monkeypatch):
     # In any order within a shard.
     chunks = [((1, 0), coded[1, 0]), ((0, 0), coded[0, 0]), ((2, 0), coded[2, 0])]
     path = write(tmp_path / "a.fhz", samples, values, (4, 2), (8, 2), chunks=chunks, codecs=codecs)
-    again = write(tmp_path / "b.fhz", samples, values, (4, 2), (8, 2), chunks=coded.values(), codecs=codecs)
+    again = write(
+        tmp_path / "b.fhz", samples, values, (4, 2), (8, 2), chunks=coded.values(), codecs=codecs
+    )
     assert path.read_bytes() == again.read_bytes()
     with Container.open(path) as container:
         array = container.arrays[NAME]
@@ -242,7 +269,10 @@ def test_chunks_that_do_not_fit(tmp_path, samples, case):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("chunk_shape", "shard_shape"), [((2, 3), (4, 7)), ((2,), (4, 6)), ((2, 0), (4, 6)), ((1, 1), (2048, 2048))])
+@pytest.mark.parametrize(
+    ("chunk_shape", "shard_shape"),
+    [((2, 3), (4, 7)), ((2,), (4, 6)), ((2, 0), (4, 6)), ((1, 1), (2048, 2048))],
+)
 def test_shards_that_do_not_fit(tmp_path, samples, chunk_shape, shard_shape):
     with pytest.raises(InputError, match="sharding_indexed"):
         write(tmp_path / "a.fhz", samples, numbers((7, 6)), chunk_shape, shard_shape, chunks=[])
@@ -253,8 +283,17 @@ def test_shards_need_the_feature(tmp_path, samples):
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         for name, array in samples.arrays(header).items():
             writer.add_whole(name, array)
-        writer.add_sharded(NAME, shape=(2,), dtype="uint8", chunk_shape=(1,), shard_shape=(2,), chunks=[np.zeros(1, np.uint8)] * 2)
-        with pytest.raises(InputError, match="array extra/values has codecs of the feature transform"):
+        writer.add_sharded(
+            NAME,
+            shape=(2,),
+            dtype="uint8",
+            chunk_shape=(1,),
+            shard_shape=(2,),
+            chunks=[np.zeros(1, np.uint8)] * 2,
+        )
+        with pytest.raises(
+            InputError, match="array extra/values has codecs of the feature transform"
+        ):
             writer.commit(header)
         writer.commit({**header, "required_features": ["transform"]})
 
@@ -265,7 +304,10 @@ BIG = 2**60
 INDICES = {
     "offset outside": (lambda t: t[1].__setitem__(0, BIG), "overlap"),
     "size outside": (lambda t: t[1].__setitem__(1, BIG), "larger than the shard"),
-    "sizes that overflow": (lambda t: (t[0].__setitem__(1, 2**63), t[1].__setitem__(1, 2**63)), "larger than the shard"),
+    "sizes that overflow": (
+        lambda t: (t[0].__setitem__(1, 2**63), t[1].__setitem__(1, 2**63)),
+        "larger than the shard",
+    ),
     "overlap": (lambda t: t[1].__setitem__(0, 0), "overlap"),
     "two at one place": (lambda t: t.__setitem__(1, list(t[0])), "overlap"),
     "gap": (lambda t: t[1].__setitem__(1, t[1][1] - 1), "overlap"),
@@ -273,7 +315,14 @@ INDICES = {
     "missing": (lambda t: t.__setitem__(1, [ABSENT, ABSENT]), "missing"),
     "half missing": (lambda t: t[1].__setitem__(0, ABSENT), "missing"),
     "beyond the array": (lambda t: t.__setitem__(3, [0, 5]), "beyond the end"),
-    "empty": (lambda t: (t[2].__setitem__(1, 0), t[1].__setitem__(1, t[1][1] + t[2][1]), t[2].__setitem__(0, t[2][0] + 10**6)), "overlap"),
+    "empty": (
+        lambda t: (
+            t[2].__setitem__(1, 0),
+            t[1].__setitem__(1, t[1][1] + t[2][1]),
+            t[2].__setitem__(0, t[2][0] + 10**6),
+        ),
+        "overlap",
+    ),
 }
 
 
@@ -287,7 +336,11 @@ def line(tmp_path, samples):
 
 def refused(path, samples, parts, message, kind=DamagedFileError):
     path.write_bytes(samples.pack(parts))
-    for act in (lambda c: c.arrays[NAME].read(), lambda c: c.arrays[NAME].read((slice(2, 3),)), lambda c: c.verify()):
+    for act in (
+        lambda c: c.arrays[NAME].read(),
+        lambda c: c.arrays[NAME].read((slice(2, 3),)),
+        lambda c: c.verify(),
+    ):
         tracemalloc.start()
         with pytest.raises(kind, match=message) as caught, Container.open(path) as container:
             act(container)
@@ -337,7 +390,9 @@ def test_hostile_entry_that_is_read_alone(tmp_path, samples, case):
     parts[at] = name, data[:-index] + coded + struct.pack("<I", crc32c(coded))
     path.write_bytes(samples.pack(parts))
     with Container.open(path) as container:
-        np.testing.assert_array_equal(container.arrays[NAME].read((slice(16, 18),)), numbers((40,))[16:18])
+        np.testing.assert_array_equal(
+            container.arrays[NAME].read((slice(16, 18),)), numbers((40,))[16:18]
+        )
         tracemalloc.start()
         with pytest.raises(DamagedFileError, match=f"member {NAME}/c/0: .*{message}"):
             container.arrays[NAME].read((slice(18, 20),))
@@ -367,7 +422,9 @@ def test_shards_that_declare_much(line, samples):
     path, parts, _ = line
     place = [name for name, _ in parts].index(f"{NAME}/zarr.json")
     text = parts[place][1].decode()
-    many = text.replace('"chunk_shape":[8]', f'"chunk_shape":[{2**48}]').replace('"chunk_shape":[2]', f'"chunk_shape":[{2**28}]')
+    many = text.replace('"chunk_shape":[8]', f'"chunk_shape":[{2**48}]').replace(
+        '"chunk_shape":[2]', f'"chunk_shape":[{2**28}]'
+    )
     assert MAX_SHARD_CHUNKS == 2**20
     parts[place] = parts[place][0], many.replace('"shape":[5]', f'"shape":[{2**48}]').encode()
     refused(path, samples, parts, "too few for the index|memory")
@@ -375,12 +432,21 @@ def test_shards_that_declare_much(line, samples):
 
 SETTINGS = {
     "index at the beginning": ({"index_location": "start"}, UnsupportedFileError),
-    "index without checksum": ({"index_codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]}, UnsupportedFileError),
+    "index without checksum": (
+        {"index_codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
+        UnsupportedFileError,
+    ),
     "another setting": ({"surprise": 1}, UnsupportedFileError),
     "no codecs": ({"codecs": []}, UnsupportedFileError),
     "codecs no list": ({"codecs": {"a": 1}}, DamagedFileError),
-    "inner codecs without checksum": ({"codecs": coding.plain_codecs(np.dtype("f4"))[:-1]}, UnsupportedFileError),
-    "shards in shards": ({"codecs": sharding_codecs([1], coding.plain_codecs(np.dtype("f4")))}, UnsupportedFileError),
+    "inner codecs without checksum": (
+        {"codecs": coding.plain_codecs(np.dtype("f4"))[:-1]},
+        UnsupportedFileError,
+    ),
+    "shards in shards": (
+        {"codecs": sharding_codecs([1], coding.plain_codecs(np.dtype("f4")))},
+        UnsupportedFileError,
+    ),
     "chunk no list": ({"chunk_shape": 2}, DamagedFileError),
     "chunk of other rank": ({"chunk_shape": [2, 2]}, DamagedFileError),
     "chunk of a fraction": ({"chunk_shape": [2.0]}, DamagedFileError),
@@ -400,7 +466,9 @@ def test_settings_that_are_refused(line, samples, case):
     refused(path, samples, parts, f"member {NAME}/zarr.json: ", kind)
 
 
-@pytest.mark.parametrize("change", [lambda c: c.append({"name": "crc32c"}), lambda c: c[0].pop("configuration")])
+@pytest.mark.parametrize(
+    "change", [lambda c: c.append({"name": "crc32c"}), lambda c: c[0].pop("configuration")]
+)
 def test_sharding_stands_alone(line, samples, change):
     path, parts, _ = line
     place = [name for name, _ in parts].index(f"{NAME}/zarr.json")
@@ -420,10 +488,16 @@ def test_every_flip_in_a_shard_is_found(file):
             damaged = bytearray(sound)
             damaged[at] ^= 4
             path.write_bytes(damaged)
-            with pytest.raises(DamagedFileError, match=f"member {NAME}/c/"), Container.open(path) as container:
+            with (
+                pytest.raises(DamagedFileError, match=f"member {NAME}/c/"),
+                Container.open(path) as container,
+            ):
                 container.verify()
             if at >= member.data_offset:
-                with pytest.raises(DamagedFileError, match=f"member {NAME}/c/"), Container.open(path) as container:
+                with (
+                    pytest.raises(DamagedFileError, match=f"member {NAME}/c/"),
+                    Container.open(path) as container,
+                ):
                     container.arrays[NAME].read()
 
 
@@ -435,8 +509,12 @@ def test_damage_in_one_inner_chunk_leaves_the_others(file):
     damaged[member.data_offset + 5] ^= 1
     path.write_bytes(damaged)
     with Container.open(path) as container:
-        np.testing.assert_array_equal(container.arrays[NAME].read((slice(2, 7), slice(0, 6))), values[2:])
-        with pytest.raises(DamagedFileError, match=f"member {NAME}/c/0/0: inner chunk 0: its CRC-32C"):
+        np.testing.assert_array_equal(
+            container.arrays[NAME].read((slice(2, 7), slice(0, 6))), values[2:]
+        )
+        with pytest.raises(
+            DamagedFileError, match=f"member {NAME}/c/0/0: inner chunk 0: its CRC-32C"
+        ):
             container.arrays[NAME].read((slice(0, 1), slice(0, 1)))
 
 

@@ -10,7 +10,9 @@ from fhash_formats.container.strict_json import MAX_DEPTH, dumps, loads
 from fhash_formats.errors import DamagedFileError, InputError
 
 
-@pytest.mark.parametrize("value", [{}, {"b": [1, 2.5, None, True, 'ü"\\\n[{'], "a": {"ä": -1e-300}}, {"n": 2**63}])
+@pytest.mark.parametrize(
+    "value", [{}, {"b": [1, 2.5, None, True, 'ü"\\\n[{'], "a": {"ä": -1e-300}}, {"n": 2**63}]
+)
 def test_reading_what_was_written(value):
     assert loads(dumps(value, "it")) == value
 
@@ -19,7 +21,17 @@ def test_keys_are_sorted_and_compact():
     assert dumps({"b": {"d": 1, "c": 2}, "a": "ü"}, "it") == '{"a":"ü","b":{"c":2,"d":1}}'.encode()
 
 
-@pytest.mark.parametrize("value", [{"a": float("nan")}, {"a": float("inf")}, {"a": b"x"}, {"a": {1}}, {"a": "\ud800"}, {1: 0, "a": 0}])
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"a": float("nan")},
+        {"a": float("inf")},
+        {"a": b"x"},
+        {"a": {1}},
+        {"a": "\ud800"},
+        {1: 0, "a": 0},
+    ],
+)
 def test_what_json_cannot_hold_is_refused(value):
     with pytest.raises(InputError, match="the header cannot be stored as JSON"):
         dumps(value, "the header")
@@ -37,7 +49,15 @@ def test_depth():
 
 
 @pytest.mark.parametrize(
-    "text", [b'"' * 10**6, b'"\\' * 10**6, b'"' + b'\\"' * 10**6, b'{"a":"' + b"\\" * 10**6, b'{"' + b"a" * 10**6, b"[]" * 10**6]
+    "text",
+    [
+        b'"' * 10**6,
+        b'"\\' * 10**6,
+        b'"' + b'\\"' * 10**6,
+        b'{"a":"' + b"\\" * 10**6,
+        b'{"' + b"a" * 10**6,
+        b"[]" * 10**6,
+    ],
 )
 def test_no_text_takes_more_than_linear_time(text):
     begun = time.perf_counter()

@@ -22,7 +22,12 @@ def test_preview_is_the_final_file(tmp_path, samples):
     with ContainerWriter(path) as writer:
         fill(writer, samples, header)
         with writer.preview(header) as preview:
-            before = (preview.size, preview.overhead(), preview.header, {name: array.read() for name, array in preview.arrays.items()})
+            before = (
+                preview.size,
+                preview.overhead(),
+                preview.header,
+                {name: array.read() for name, array in preview.arrays.items()},
+            )
             assert preview.verify() == len(preview.arrays)
             preview_bytes = preview._source.read(0, preview.size)
         assert not path.exists()
@@ -117,12 +122,20 @@ def test_missing_folder(tmp_path, samples):
         samples.write(tmp_path / "none" / "a.fhz", samples.header(), {})
 
 
-GOOD = {"shape": (4,), "dtype": "int16", "chunk_shape": (3,), "chunks": [np.zeros(3, "int16"), np.zeros(1, "int16")]}
+GOOD = {
+    "shape": (4,),
+    "dtype": "int16",
+    "chunk_shape": (3,),
+    "chunks": [np.zeros(3, "int16"), np.zeros(1, "int16")],
+}
 
 BAD_ARRAYS = {
     "too few chunks": ({"chunks": GOOD["chunks"][:1]}, r"chunk \(1,\) was not given"),
     "too many chunks": ({"chunks": [*GOOD["chunks"], np.zeros(1, "int16")]}, "more chunks"),
-    "padded chunk": ({"chunks": [np.zeros(3, "int16"), np.zeros(3, "int16")]}, r"int16 \(1,\) is needed"),
+    "padded chunk": (
+        {"chunks": [np.zeros(3, "int16"), np.zeros(3, "int16")]},
+        r"int16 \(1,\) is needed",
+    ),
     "other type": ({"chunks": [np.zeros(3, "int32"), np.zeros(1, "int32")]}, "int16 .* is needed"),
     "bool": ({"dtype": "bool"}, "data_type"),
     "complex": ({"dtype": "complex64"}, "data_type"),
@@ -134,7 +147,10 @@ BAD_ARRAYS = {
     "names": ({"dimension_names": ["a", "b"]}, "dimension names"),
     "attributes": ({"attributes": {"x": np.nan}}, "JSON"),
     "codec": ({"codecs": [{"name": "gzip"}, {"name": "crc32c"}]}, "codecs"),
-    "no checksum": ({"codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]}, "crc32c"),
+    "no checksum": (
+        {"codecs": [{"name": "bytes", "configuration": {"endian": "little"}}]},
+        "crc32c",
+    ),
     "name": ({"name": "../a"}, "not allowed"),
     "absolute": ({"name": "/a"}, "not allowed"),
     "document": ({"name": "a/zarr.json"}, "not allowed"),
@@ -167,7 +183,12 @@ def test_header_must_fit_the_arrays(tmp_path, samples):
     header = samples.header()
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         fill(writer, samples, header)
-        for wrong in ({"model": {**header["model"], "width": 6}}, {"background": float("nan")}, {"dilation": -1}, {"features": {1, 2}}):
+        for wrong in (
+            {"model": {**header["model"], "width": 6}},
+            {"background": float("nan")},
+            {"dilation": -1},
+            {"features": {1, 2}},
+        ):
             with pytest.raises(InputError):
                 writer.commit({**header, **wrong})
         writer.commit(header)

@@ -12,7 +12,16 @@ from fhash_formats.transform.basis import fit_basis
 from fhash_formats.transform.prior import KINDS
 from fhash_formats.transform.spec import WAVELETS, AxisTransform, TransformSpec
 
-SHAPES = [(1, 1, 1, 1), (2, 3, 5, 7), (4, 9, 17, 33), (16, 1, 2, 64), (1, 2, 1, 40), (2, 2, 40, 1), (7, 13, 31, 29), (5, 1, 6, 6)]
+SHAPES = [
+    (1, 1, 1, 1),
+    (2, 3, 5, 7),
+    (4, 9, 17, 33),
+    (16, 1, 2, 64),
+    (1, 2, 1, 40),
+    (2, 2, 40, 1),
+    (7, 13, 31, 29),
+    (5, 1, 6, 6),
+]
 MIXES = [
     ("none", "none", "none", "none"),
     ("haar", "5/3", "9/7", "9/7"),
@@ -25,7 +34,9 @@ MIXES = [
 ]
 
 
-def spec_of(kinds: tuple[str, ...], depth: int, shape: tuple[int, ...], step: float = 1.0) -> TransformSpec:
+def spec_of(
+    kinds: tuple[str, ...], depth: int, shape: tuple[int, ...], step: float = 1.0
+) -> TransformSpec:
     """Bases drop the weakest vectors; a huge step drops them all."""
     axes = []
     for kind, n in zip(kinds, shape, strict=True):
@@ -43,7 +54,11 @@ def box(row: Table) -> tuple[slice, ...]:
 
 
 CASES = [
-    pytest.param(spec_of(kinds, depth, shape, 8.0), shape, id=f"{'-'.join(kinds)}-{depth}-{'x'.join(map(str, shape))}")
+    pytest.param(
+        spec_of(kinds, depth, shape, 8.0),
+        shape,
+        id=f"{'-'.join(kinds)}-{depth}-{'x'.join(map(str, shape))}",
+    )
     for kinds, depth, shape in product(MIXES, (1, 2, 10), SHAPES)
 ]
 
@@ -52,20 +67,29 @@ CASES = [
 def test_each_coefficient_is_in_one_band(spec: TransformSpec, shape: tuple[int, ...]) -> None:
     covered = np.zeros(shape, dtype=int)
     for row in band_table(spec, shape):
-        assert all(0 <= low < high <= n for low, high, n in zip(row[:4], row[4:8], shape, strict=True))
+        assert all(
+            0 <= low < high <= n for low, high, n in zip(row[:4], row[4:8], shape, strict=True)
+        )
         covered[box(row)] += 1
-    kept = tuple(slice(n if axis.basis is None else axis.basis.rank) for axis, n in zip(spec.axes, shape, strict=True))
+    kept = tuple(
+        slice(n if axis.basis is None else axis.basis.rank)
+        for axis, n in zip(spec.axes, shape, strict=True)
+    )
     assert (covered[kept] == 1).all()
     assert covered.sum() == covered[kept].size
 
 
 @pytest.mark.parametrize(("spec", "shape"), CASES)
-def test_references_point_back_to_what_lies_there(spec: TransformSpec, shape: tuple[int, ...]) -> None:
+def test_references_point_back_to_what_lies_there(
+    spec: TransformSpec, shape: tuple[int, ...]
+) -> None:
     table = band_table(spec, shape)
     sizes = table[:, 4:8] - table[:, :4]
     for number, row in enumerate(table):
         # Which axes each reference keeps: parent and sibling (t, z), before along t (z, y, x), before along z (t, y, x).
-        for reference, same in zip(row[9:].reshape(4, 5), ([0, 1], [1, 2, 3], [0, 2, 3], [0, 1]), strict=True):
+        for reference, same in zip(
+            row[9:].reshape(4, 5), ([0, 1], [1, 2, 3], [0, 2, 3], [0, 1]), strict=True
+        ):
             to, shifts = int(reference[0]), reference[1:]
             if to < 0:
                 assert to == -1
@@ -76,7 +100,9 @@ def test_references_point_back_to_what_lies_there(spec: TransformSpec, shape: tu
             assert (row[same] == table[to, same]).all()
             assert (row[np.add(same, 4)] == table[to, np.add(same, 4)]).all()
             for axis in range(4):
-                places = np.minimum(np.arange(sizes[number, axis]) >> shifts[axis], sizes[to, axis] - 1)
+                places = np.minimum(
+                    np.arange(sizes[number, axis]) >> shifts[axis], sizes[to, axis] - 1
+                )
                 assert places.min() >= 0
                 # The band that is referred to is as long, or half as long, up to the odd one at its end.
                 if axis in same or shifts[axis]:

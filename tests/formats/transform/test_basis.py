@@ -67,14 +67,22 @@ def test_bytes_there_and_back(n: int, step: float) -> None:
 @pytest.mark.parametrize("n", [1, 2, 3, 5, 64, 127, MAX_LENGTH])
 def test_the_cosines_are_those_of_the_library(n: int) -> None:
     rows = np.array(_dct(n))
-    exact = [[math.cos(math.pi * (2 * i + 1) * k / (2 * n)) * math.sqrt((2 if k else 1) / n) for i in range(n)] for k in range(n)]
+    exact = [
+        [
+            math.cos(math.pi * (2 * i + 1) * k / (2 * n)) * math.sqrt((2 if k else 1) / n)
+            for i in range(n)
+        ]
+        for k in range(n)
+    ]
     assert np.allclose(rows, exact, rtol=0, atol=2e-14)
 
 
 def test_the_bits_of_a_basis_are_fixed() -> None:
     integers = np.array([[3, -1, 0, 1], [1, 2, 0, 0]], np.int32)
     basis = Basis(integers=integers, exponents=(3, 2))
-    assert [[f"{bits:08x}" for bits in row] for row in basis.synthesis.view(np.uint32).tolist()] == [
+    assert [
+        [f"{bits:08x}" for bits in row] for row in basis.synthesis.view(np.uint32).tolist()
+    ] == [
         ["3eca4183", "3f673d75"],
         ["3e5093f1", "3f0545ea"],
         ["3f5b6271", "bca8bd3e"],
@@ -136,7 +144,9 @@ def test_a_basis_for_another_length_is_refused() -> None:
         (np.ones((1, MAX_LENGTH + 1), np.int32), (2,)),
     ],
 )
-def test_impossible_bases_are_refused(integers: NDArray[np.int32], exponents: tuple[int, ...]) -> None:
+def test_impossible_bases_are_refused(
+    integers: NDArray[np.int32], exponents: tuple[int, ...]
+) -> None:
     with pytest.raises(InputError):
         Basis(integers=integers, exponents=exponents)
 

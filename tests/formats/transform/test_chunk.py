@@ -28,7 +28,9 @@ def field(shape: tuple[int, ...], scale: float, dtype: npt.DTypeLike) -> npt.NDA
 def worst(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> float:
     if one.dtype.kind == "f":
         return float(np.abs(one.astype(np.float64) - other.astype(np.float64)).max(initial=0))
-    return max((abs(int(a) - int(b)) for a, b in zip(one.ravel(), other.ravel(), strict=True)), default=0)
+    return max(
+        (abs(int(a) - int(b)) for a, b in zip(one.ravel(), other.ravel(), strict=True)), default=0
+    )
 
 
 def check(values: npt.NDArray[Any], error: float, **quality: float) -> bytes:
@@ -54,7 +56,16 @@ def test_the_bound_holds(dtype: str, shape: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("dtype", "scale"), [("f2", 1e-6), ("f2", 6e4), ("f4", 1e-42), ("f4", 1e-38), ("f4", 3e38), ("f8", 1e-310), ("f8", 8e307)]
+    ("dtype", "scale"),
+    [
+        ("f2", 1e-6),
+        ("f2", 6e4),
+        ("f4", 1e-42),
+        ("f4", 1e-38),
+        ("f4", 3e38),
+        ("f8", 1e-310),
+        ("f8", 8e307),
+    ],
 )
 def test_the_bound_holds_at_the_ends_of_the_types(dtype: str, scale: float) -> None:
     values = field((6, 7), scale, dtype)
@@ -69,7 +80,9 @@ def test_the_bound_holds_at_the_ends_of_the_types(dtype: str, scale: float) -> N
 def test_the_ends_of_whole_numbers(dtype: str) -> None:
     limits = np.iinfo(dtype)
     values = (
-        np.random.default_rng(1).integers(limits.min, limits.max, (5, 6), np.dtype(dtype).newbyteorder("="), endpoint=True).astype(dtype)
+        np.random.default_rng(1)
+        .integers(limits.min, limits.max, (5, 6), np.dtype(dtype).newbyteorder("="), endpoint=True)
+        .astype(dtype)
     )
     values.flat[:2] = limits.min, limits.max
     for error in (0, 2, 1e6):
@@ -82,7 +95,12 @@ def test_whole_numbers_without_loss_are_smaller_than_themselves() -> None:
 
 
 def test_constants_and_nothing_take_a_few_bytes() -> None:
-    for values in (np.full((20, 30), 0.1), np.full((20, 30), 7, "u1"), np.full((20, 30), np.nan, "f4"), np.full((20, 30), 2**63 - 1)):
+    for values in (
+        np.full((20, 30), 0.1),
+        np.full((20, 30), 7, "u1"),
+        np.full((20, 30), np.nan, "f4"),
+        np.full((20, 30), 2**63 - 1),
+    ):
         assert len(check(values, 0, max_error=0)) < 130
     assert encode_chunk(np.empty((0, 3), "f4"), max_error=1) == b""
     assert decode_chunk(b"", (0, 3), "f4").shape == (0, 3)
@@ -124,11 +142,16 @@ def test_a_given_transform_is_taken() -> None:
 
 @pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
 @pytest.mark.parametrize("quality", [{"max_error": 0.02}, {"step": 0.1}, {"max_error_rel": 1e-6}])
-def test_both_engines_give_the_same_bytes(quality: dict[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_engines_give_the_same_bytes(
+    quality: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     chunks = [field((3, 6, 7), 1, "f4"), field((40,), 1, "f8"), field((5, 8), 50, "i2")]
     chunks[0][1, 2, 3:] = np.nan
     data = [encode_chunk(chunk, **quality) for chunk in chunks]  # type: ignore[arg-type]
-    values = [decode_chunk(each, chunk.shape, chunk.dtype) for each, chunk in zip(data, chunks, strict=True)]
+    values = [
+        decode_chunk(each, chunk.shape, chunk.dtype)
+        for each, chunk in zip(data, chunks, strict=True)
+    ]
     monkeypatch.setenv("FHASH_NATIVE", "0")
     assert [encode_chunk(chunk, **quality) for chunk in chunks] == data  # type: ignore[arg-type]
     for each, chunk, expected in zip(data, chunks, values, strict=True):

@@ -15,7 +15,14 @@ from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform import coder_portable, prior
 from fhash_formats.transform.bands import Table, band_table, single_band
 from fhash_formats.transform.basis import fit_basis
-from fhash_formats.transform.coder import MAX_INTEGER, Encoded, decode_block, decode_integers, encode_block, encode_integers
+from fhash_formats.transform.coder import (
+    MAX_INTEGER,
+    Encoded,
+    decode_block,
+    decode_integers,
+    encode_block,
+    encode_integers,
+)
 from fhash_formats.transform.prior import blank_state, pack_prior
 from fhash_formats.transform.spec import WAVELETS, AxisTransform, TransformSpec
 
@@ -102,7 +109,10 @@ def nearest(scaled: NDArray[np.float32]) -> Integers:
 
 @pytest.mark.parametrize("content", ["zero", "sparse", "dense", "mixed", "huge"])
 @pytest.mark.parametrize("kinds", [NONE, COUPLED, PACKETS, BASES])
-@pytest.mark.parametrize("shape", [(1, 1, 1, 1), (2, 3, 5, 7), (1, 2, 1, 67), (3, 2, 37, 2), (5, 4, 13, 31), (2, 1, 20, 20)])
+@pytest.mark.parametrize(
+    "shape",
+    [(1, 1, 1, 1), (2, 3, 5, 7), (1, 2, 1, 67), (3, 2, 37, 2), (5, 4, 13, 31), (2, 1, 20, 20)],
+)
 @pytest.mark.usefixtures("fast_engine")
 def test_there_and_back(shape: Shape, kinds: tuple[str, ...], content: str) -> None:
     table, integers = table_of(kinds, 3, shape), make(content, shape)
@@ -116,7 +126,15 @@ def test_there_and_back(shape: Shape, kinds: tuple[str, ...], content: str) -> N
 
 
 def test_each_way_to_write_a_magnitude(engine: str) -> None:
-    magnitudes = [*range(1, 19), 4094, 4095, 4096, *(2**k for k in range(5, 30)), *(2**k - 1 for k in range(5, 30)), MAX_INTEGER]
+    magnitudes = [
+        *range(1, 19),
+        4094,
+        4095,
+        4096,
+        *(2**k for k in range(5, 30)),
+        *(2**k - 1 for k in range(5, 30)),
+        MAX_INTEGER,
+    ]
     integers = np.array([[[[value, 0, -value, value] for value in magnitudes]]], dtype=np.int32)
     assert (decode_block(encode_block(integers), integers.shape) == integers).all()
 
@@ -141,7 +159,9 @@ def work(kinds: tuple[str, ...], depth: int, shape: Shape, content: str) -> Resu
     prior_used = encode_integers(chosen.integers, table)
     decoded = decode_integers(prior_used.data, shape, table)
     assert (decoded == inside(chosen.integers, table)).all()
-    states = [array for state in (first, second) for array in (state.slots, state.weights, state.simples)]
+    states = [
+        array for state in (first, second) for array in (state.slots, state.weights, state.simples)
+    ]
     return [plain.data, chosen.data, prior_used.data, chosen.integers, decoded, *states]
 
 
@@ -156,9 +176,17 @@ def work(kinds: tuple[str, ...], depth: int, shape: Shape, content: str) -> Resu
     ],
 )
 def test_every_engine_gives_the_same(
-    engine_name: str, kinds: tuple[str, ...], depth: int, shape: Shape, content: str, monkeypatch: pytest.MonkeyPatch
+    engine_name: str,
+    kinds: tuple[str, ...],
+    depth: int,
+    shape: Shape,
+    content: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    reference = {"compiled": "native", "plain": "compiled" if native.library() is None else "native"}[engine_name]
+    reference = {
+        "compiled": "native",
+        "plain": "compiled" if native.library() is None else "native",
+    }[engine_name]
     results = []
     for name in (reference, engine_name):
         with monkeypatch.context() as patch:
@@ -186,7 +214,9 @@ def rows_that_are_chosen_away() -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("choosing", [False, True])
-def test_a_second_try_with_more_room_gives_the_same(choosing: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_try_with_more_room_gives_the_same(
+    choosing: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scaled = rows_that_are_chosen_away()
     table, results = single_band(scaled.shape), list[tuple[Encoded, NDArray[np.uint16]]]()
     for name in ("native", "compiled"):
@@ -194,7 +224,12 @@ def test_a_second_try_with_more_room_gives_the_same(choosing: bool, monkeypatch:
             use(name, patch)
             state = blank_state()
             chosen = scaled if choosing else None
-            results.append((encode_integers(nearest(scaled), table, scaled=chosen, weight=0.3, state=state), state.slots))
+            results.append(
+                (
+                    encode_integers(nearest(scaled), table, scaled=chosen, weight=0.3, state=state),
+                    state.slots,
+                )
+            )
     (one, one_state), (other, other_state) = results
     assert len(one.data) > max(4096, scaled.size // 2)
     assert one.data == other.data
@@ -215,7 +250,10 @@ def test_choosing_saves_bytes_for_little_error() -> None:
         assert (magnitude[most >= 14] == most[most >= 14]).all()
         assert (decode_integers(chosen.data, shape, table) == chosen.integers).all()
         # Squared error plus weight per bit: what was asked to be least is less.
-        errors = [float(np.sum((scaled.astype(float) - q) ** 2)) for q in (plain.integers, chosen.integers)]
+        errors = [
+            float(np.sum((scaled.astype(float) - q) ** 2))
+            for q in (plain.integers, chosen.integers)
+        ]
         assert errors[1] + weight * 8 * len(chosen.data) <= errors[0] + weight * 8 * len(plain.data)
         assert weight > 0 or np.array_equal(chosen.integers, plain.integers)
     assert len(chosen.data) < 0.95 * len(plain.data)
@@ -225,9 +263,14 @@ def test_a_state_is_left_behind_and_helps(engine: str) -> None:
     shape = (2, 2, 8, 20)
     table, integers, state = single_band(shape), make("dense", shape), blank_state()
     first = encode_integers(integers, table, state=state)
-    assert any((left != right).any() for left, right in zip(vars(state).values(), vars(blank_state()).values(), strict=True))
+    assert any(
+        (left != right).any()
+        for left, right in zip(vars(state).values(), vars(blank_state()).values(), strict=True)
+    )
     second = encode_integers(make("dense", shape, seed=1), table, state=state)
-    assert len(second.data) < len(encode_integers(make("dense", shape, seed=1), table, state=blank_state()).data)
+    assert len(second.data) < len(
+        encode_integers(make("dense", shape, seed=1), table, state=blank_state()).data
+    )
     assert first.data == encode_integers(integers, table, state=blank_state()).data
 
 
@@ -238,12 +281,19 @@ def test_the_prior_stays_as_it_is() -> None:
     first = encode_block(integers)
     assert encode_block(integers) == first
     decode_block(first, integers.shape)
-    assert all((left == right).all() for left, right in zip(vars(before).values(), vars(prior.prior_state()).values(), strict=True))
+    assert all(
+        (left == right).all()
+        for left, right in zip(
+            vars(before).values(), vars(prior.prior_state()).values(), strict=True
+        )
+    )
 
 
 def test_a_packed_prior_is_a_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     state = blank_state()
-    encode_integers(make("mixed", (3, 3, 20, 30)), table_of(COUPLED, 2, (3, 3, 20, 30)), state=state)
+    encode_integers(
+        make("mixed", (3, 3, 20, 30)), table_of(COUPLED, 2, (3, 3, 20, 30)), state=state
+    )
     (tmp_path / "prior.bin").write_bytes(pack_prior(state))
     monkeypatch.setattr(prior, "_FILE", tmp_path / "prior.bin")
     again = prior.prior_state.__wrapped__()
@@ -370,7 +420,9 @@ def test_threads_do_not_meet() -> None:
     shape = (3, 2, 9, 26)
     alone = [encode_block(make("mixed", shape, seed)) for seed in range(8)]
     with ThreadPoolExecutor(4) as pool:
-        assert list(pool.map(lambda seed: encode_block(make("mixed", shape, seed)), range(8))) == alone
+        assert (
+            list(pool.map(lambda seed: encode_block(make("mixed", shape, seed)), range(8))) == alone
+        )
 
 
 def before_rounding() -> dict[str, NDArray[np.float64]]:
@@ -379,7 +431,12 @@ def before_rounding() -> dict[str, NDArray[np.float64]]:
     stretch = np.log(p / (1 - p)) * 256
     return {
         "stretch": stretch[np.abs(stretch) < coder_portable.STRETCH_MAX + 1] + 0.5,
-        "squash": 65536 / (1 + np.exp(-np.arange(-coder_portable.STRETCH_MAX, coder_portable.STRETCH_MAX + 1) / 256)) + 0.5,
+        "squash": 65536
+        / (
+            1
+            + np.exp(-np.arange(-coder_portable.STRETCH_MAX, coder_portable.STRETCH_MAX + 1) / 256)
+        )
+        + 0.5,
         "cost": -np.log2(np.arange(1, 65537) / 65536) * 2048 + 0.5,
         "log": np.log2(np.arange(1, 4096)) * 16 + 0.5,
         "probabilities": 65536 / (1 + np.exp(-(np.arange(256) - 128) / 12)) + 0.5,
@@ -399,6 +456,15 @@ def test_the_tables_are_those_values_rounded() -> None:
         "log": np.floor,
     }
     for name, rule in rounded.items():
-        assert np.array_equal(getattr(coder_portable._ARRAYS, name)[-len(before_rounding()[name]) :], rule(before_rounding()[name]))
-    assert np.array_equal(prior._PROBABILITIES, np.clip(np.floor(before_rounding()["probabilities"]), 1, 65535))
-    assert coder_portable._ARRAYS.stretch.min() == -coder_portable._ARRAYS.stretch.max() == -coder_portable.STRETCH_MAX
+        assert np.array_equal(
+            getattr(coder_portable._ARRAYS, name)[-len(before_rounding()[name]) :],
+            rule(before_rounding()[name]),
+        )
+    assert np.array_equal(
+        prior._PROBABILITIES, np.clip(np.floor(before_rounding()["probabilities"]), 1, 65535)
+    )
+    assert (
+        coder_portable._ARRAYS.stretch.min()
+        == -coder_portable._ARRAYS.stretch.max()
+        == -coder_portable.STRETCH_MAX
+    )

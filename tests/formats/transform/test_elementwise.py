@@ -11,7 +11,15 @@ import pytest
 
 from fhash_formats import native
 from fhash_formats.transform import elementwise
-from fhash_formats.transform.elementwise import all_finite, cast, clip_shifted, corrected, free_values, residual_of, within
+from fhash_formats.transform.elementwise import (
+    all_finite,
+    cast,
+    clip_shifted,
+    corrected,
+    free_values,
+    residual_of,
+    within,
+)
 
 Values = npt.NDArray[Any]
 SHAPE = (2, 5, 7, 311)  # more than a native piece, and not a multiple of anything
@@ -29,7 +37,20 @@ def values(dtype: npt.DTypeLike, seed: int = 0, special: bool = True) -> Values:
     found = rng.normal(0, 2, SHAPE).astype(kind)
     if special:
         limits_of = np.finfo(kind)
-        hard = [np.nan, np.inf, -np.inf, 0.0, -0.0, limits_of.max, limits_of.min, limits_of.tiny, 0.5, 1.5, 2.5, -0.5]
+        hard = [
+            np.nan,
+            np.inf,
+            -np.inf,
+            0.0,
+            -0.0,
+            limits_of.max,
+            limits_of.min,
+            limits_of.tiny,
+            0.5,
+            1.5,
+            2.5,
+            -0.5,
+        ]
         found.reshape(-1)[100 : 100 + 144] = np.repeat(np.array(hard, kind), 12)
         found.reshape(-1)[300:312] = np.array(hard, kind)
     return found
@@ -50,7 +71,9 @@ def both(function: Callable[[], Any], patch: pytest.MonkeyPatch) -> Any:
 def _bytes(result: Any) -> Any:
     if isinstance(result, tuple):
         return [_bytes(part) for part in result]
-    return (result.dtype, result.shape, result.tobytes()) if isinstance(result, np.ndarray) else result
+    return (
+        (result.dtype, result.shape, result.tobytes()) if isinstance(result, np.ndarray) else result
+    )
 
 
 def marks(seed: int = 3) -> npt.NDArray[np.bool_]:
@@ -83,7 +106,9 @@ def test_bounds(dtype: str, counts: Any, monkeypatch: pytest.MonkeyPatch) -> Non
 @pytest.mark.parametrize("base", ["f4", "f8"])
 @pytest.mark.parametrize("quantum", [0.5, 0.1, 3.0, 1e-3])
 @pytest.mark.parametrize("counts", [None, marks()])
-def test_residuals(dtype: str, base: str, quantum: float, counts: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_residuals(
+    dtype: str, base: str, quantum: float, counts: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one, other = values(dtype, 1, special=False), values(base, 2, special=False)
     # Halves are rounded to even, and an error of half a quantum is none.
     one[0, 0, 0, :40] = np.arange(40) * np.dtype(dtype).type(quantum / 2)
@@ -124,9 +149,14 @@ def test_every_type_has_residuals_and_bounds(dtype: str) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
-@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (0.0, 2.0), (-0.0, 2.0), (-2.0, -0.0), (-0.0, 0.0), (-1e300, 1e300)])
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [(-1.0, 1.0), (0.0, 2.0), (-0.0, 2.0), (-2.0, -0.0), (-0.0, 0.0), (-1e300, 1e300)],
+)
 @pytest.mark.parametrize("center", [0.0, -0.0, 0.75])
-def test_clipping(dtype: str, low: float, high: float, center: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clipping(
+    dtype: str, low: float, high: float, center: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with np.errstate(over="ignore"):
         clipped = both(lambda: clip_shifted(values(dtype), center, low, high), monkeypatch)
         known = clipped[~np.isnan(clipped)]
@@ -156,7 +186,13 @@ def test_nothing_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
     none = np.zeros((0, 1, 2, 3), np.float32)
     assert both(lambda: within(none, none, 0.0), monkeypatch)
     assert both(lambda: residual_of(none, none, None, 1.0, LARGEST), monkeypatch)[1] == 0
-    assert both(lambda: corrected(none, np.zeros(none.shape, np.int32), 1.0, np.dtype("f8")), monkeypatch).size == 0
+    assert (
+        both(
+            lambda: corrected(none, np.zeros(none.shape, np.int32), 1.0, np.dtype("f8")),
+            monkeypatch,
+        ).size
+        == 0
+    )
     assert both(lambda: free_values(none.copy(), none, None, 0.0, 1.0), monkeypatch) == 0
     assert all_finite(none)
 

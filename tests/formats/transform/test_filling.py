@@ -15,7 +15,9 @@ from fhash_formats.transform.tile import encode_tile, transform_for
 
 SHAPE = (1, 4, 32, 40)
 NINE = AxisTransform(kind="9/7", depth=3)
-SPEC = TransformSpec(axes=(AxisTransform(kind="none"), AxisTransform(kind="9/7", depth=1), NINE, NINE))
+SPEC = TransformSpec(
+    axes=(AxisTransform(kind="none"), AxisTransform(kind="9/7", depth=1), NINE, NINE)
+)
 SETTINGS = Settings(transform=SPEC, step=0.1, center=0.0, low=-100.0, high=100.0)
 
 Values = npt.NDArray[np.float32]
@@ -27,7 +29,12 @@ def field(outside: str) -> tuple[Values, npt.NDArray[np.bool_]]:
     values = (np.sin(0.2 * y + 0.1 * z) + np.cos(0.15 * x)).astype(np.float32)
     counts = (y - 16) ** 2 + (x - 20) ** 2 + 4 * z**2 < 150
     noise = np.random.default_rng(0).normal(0, 20, SHAPE).astype(np.float32)
-    around = {"the same": values, "noise": noise, "far away": np.full(SHAPE, -99, np.float32), "rough": values + noise / 50}[outside]
+    around = {
+        "the same": values,
+        "noise": noise,
+        "far away": np.full(SHAPE, -99, np.float32),
+        "rough": values + noise / 50,
+    }[outside]
     return np.where(counts, values, around), counts
 
 
@@ -35,7 +42,9 @@ def field(outside: str) -> tuple[Values, npt.NDArray[np.bool_]]:
 @pytest.mark.parametrize("density", list(RATIOS))
 def test_what_counts_stays_and_the_rest_costs_less(outside: str, density: int) -> None:
     values, counts = field(outside)
-    found = filled(values, counts, np.ones(SHAPE, bool), transform_for(SETTINGS, SHAPE), SETTINGS, density)
+    found = filled(
+        values, counts, np.ones(SHAPE, bool), transform_for(SETTINGS, SHAPE), SETTINGS, density
+    )
     np.testing.assert_array_equal(found[counts], values[counts])
     before, after = (len(encode_tile(target, SETTINGS).data) for target in (values, found))
     if outside == "the same":
@@ -46,7 +55,9 @@ def test_what_counts_stays_and_the_rest_costs_less(outside: str, density: int) -
 
 def test_more_thresholds_find_a_better_filling() -> None:
     values, counts = field("rough")
-    sizes = [len(encode_tile(values, SETTINGS, care=counts, density=density).data) for density in RATIOS]
+    sizes = [
+        len(encode_tile(values, SETTINGS, care=counts, density=density).data) for density in RATIOS
+    ]
     assert sizes[-1] < sizes[0]
 
 

@@ -19,10 +19,21 @@ def random_head(hidden=(12, 8), seed=0, sigma=0.1, low=LOW, high=HIGH, spread=8.
     random = np.random.default_rng(seed)
     layers = []
     for inputs, outputs in zip(layer_inputs(hidden, cross), [*hidden, 1], strict=True):
-        weights = np.rint(np.clip(random.normal(size=(outputs, inputs)) * spread, -MAX_WEIGHT, MAX_WEIGHT)).astype(np.int8)
+        weights = np.rint(
+            np.clip(random.normal(size=(outputs, inputs)) * spread, -MAX_WEIGHT, MAX_WEIGHT)
+        ).astype(np.int8)
         biases = random.integers(-127, 128, outputs).astype(np.int8)
-        layers.append(Layer(weights=weights, biases=biases, weight_scale=float(np.float16(0.02)), bias_scale=float(np.float16(0.003))))
-    return Head(layers=tuple(layers), sigma=float(np.float32(sigma)), low=low, high=high, cross=cross)
+        layers.append(
+            Layer(
+                weights=weights,
+                biases=biases,
+                weight_scale=float(np.float16(0.02)),
+                bias_scale=float(np.float16(0.003)),
+            )
+        )
+    return Head(
+        layers=tuple(layers), sigma=float(np.float32(sigma)), low=low, high=high, cross=cross
+    )
 
 
 def random_tile(shape, seed=1):
@@ -49,7 +60,17 @@ def assert_same_bits(first, second):
 
 @pytest.mark.parametrize("cross", [False, True])
 @pytest.mark.parametrize(
-    "shape", [(1, 1, 1, 1), (2, 1, 3, 2), (1, 2, 1, 65), (3, 2, 1, 64), (5, 4, 3, 70), (1, 9, 9, 130), (4, 12, 5, 63), (2, 3, 300, 260)]
+    "shape",
+    [
+        (1, 1, 1, 1),
+        (2, 1, 3, 2),
+        (1, 2, 1, 65),
+        (3, 2, 1, 64),
+        (5, 4, 3, 70),
+        (1, 9, 9, 130),
+        (4, 12, 5, 63),
+        (2, 3, 300, 260),
+    ],
 )
 def test_native_and_portable_give_the_same_bits(shape, cross, monkeypatch):
     tile = random_tile(shape)
@@ -64,21 +85,35 @@ def test_every_width_gives_the_same_bits(hidden, monkeypatch):
 
 @pytest.mark.parametrize("hidden", [(1, 1), (13, 7), (MAX_CROSS_WIDTH, 64)])
 def test_every_width_of_a_cross_gives_the_same_bits(hidden, monkeypatch):
-    assert_same_bits(*both(random_head(hidden, seed=3, cross=True), random_tile((4, 6, 7, 70)), monkeypatch))
+    assert_same_bits(
+        *both(random_head(hidden, seed=3, cross=True), random_tile((4, 6, 7, 70)), monkeypatch)
+    )
 
 
-@pytest.mark.parametrize(("hidden", "cross"), [((64, 64, 64), False), ((MAX_CROSS_WIDTH, 64), True)])
+@pytest.mark.parametrize(
+    ("hidden", "cross"), [((64, 64, 64), False), ((MAX_CROSS_WIDTH, 64), True)]
+)
 def test_the_largest_sums_are_exact(hidden, cross, monkeypatch):
     layers = []
     for inputs, outputs in zip(layer_inputs(hidden, cross), [*hidden, 1], strict=True):
         weights = np.full((outputs, inputs), MAX_WEIGHT, dtype=np.int8)
-        layers.append(Layer(weights=weights, biases=np.full(outputs, 127, np.int8), weight_scale=1024.0, bias_scale=1024.0))
+        layers.append(
+            Layer(
+                weights=weights,
+                biases=np.full(outputs, 127, np.int8),
+                weight_scale=1024.0,
+                bias_scale=1024.0,
+            )
+        )
     head = Head(layers=tuple(layers), sigma=2.0**-90, low=LOW, high=HIGH, cross=cross)
     assert_same_bits(*both(head, random_tile((2, 5, 6, 30)), monkeypatch))
 
 
 @pytest.mark.parametrize("cross", [False, True])
-@pytest.mark.parametrize(("low", "high", "sigma"), [(0.0, 0.0, 1.0), (-3e38, 3e38, 1e-20), (0.0, 1e-44, 1e-20), (-1.0, 1.0, 1e30)])
+@pytest.mark.parametrize(
+    ("low", "high", "sigma"),
+    [(0.0, 0.0, 1.0), (-3e38, 3e38, 1e-20), (0.0, 1e-44, 1e-20), (-1.0, 1.0, 1e30)],
+)
 def test_extreme_constants_and_values_give_the_same_bits(low, high, sigma, cross, monkeypatch):
     low, high = float(np.float32(low)), float(np.float32(high))
     tile = random_tile((2, 6, 4, 20))
@@ -111,7 +146,10 @@ def test_a_nearly_constant_tile_takes_the_short_way_with_the_same_bits(cross, mo
 def test_plateaus_that_meet_give_the_same_bits(axis, monkeypatch):
     """Whole blocks are flat, and a cross at their border reaches into another plateau or a rough block."""
     shape = (7, 9, 10, 260)
-    along = np.arange(shape[axis]).reshape([-1 if number == axis else 1 for number in range(4)]) / shape[axis]
+    along = (
+        np.arange(shape[axis]).reshape([-1 if number == axis else 1 for number in range(4)])
+        / shape[axis]
+    )
     tile = np.broadcast_to(np.where(along < 0.5, 0.25, 1.5), shape).astype(np.float32)
     rough = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     fast, slow = both(random_head(cross=True), np.where(along > 0.8, rough, tile), monkeypatch)
@@ -128,10 +166,15 @@ def test_the_arithmetic_is_the_stated_one(environment, cross, monkeypatch):
     hidden, expected = np.empty((*tile.shape, head.hidden[0])), np.empty(tile.shape)
 
     def moved(at, step):
-        return tuple(min(max(i + s, 0), size - 1) for i, s, size in zip(at, step, tile.shape, strict=True))
+        return tuple(
+            min(max(i + s, 0), size - 1) for i, s, size in zip(at, step, tile.shape, strict=True)
+        )
 
     def outputs(layer, inputs, leaky=True):
-        values = layer.weight_scale * (layer.weights.astype(float) @ inputs) + layer.bias_scale * layer.biases
+        values = (
+            layer.weight_scale * (layer.weights.astype(float) @ inputs)
+            + layer.bias_scale * layer.biases
+        )
         return np.where(values > 0, values, values / 8) if leaky else values
 
     def logarithm(d):
@@ -140,12 +183,19 @@ def test_the_arithmetic_is_the_stated_one(environment, cross, monkeypatch):
 
     for at in np.ndindex(tile.shape):
         centre = float(tile[at])
-        inputs = [logarithm((float(tile[moved(at, step)]) - centre) / (2 * head.sigma)) for step in STEPS]
-        inputs += [2 * (centre - LOW) / (HIGH - LOW) - 1, logarithm((centre - LOW) / (2 * head.sigma))]
+        inputs = [
+            logarithm((float(tile[moved(at, step)]) - centre) / (2 * head.sigma)) for step in STEPS
+        ]
+        inputs += [
+            2 * (centre - LOW) / (HIGH - LOW) - 1,
+            logarithm((centre - LOW) / (2 * head.sigma)),
+        ]
         hidden[at] = outputs(head.layers[0], np.array(inputs))
     for at in np.ndindex(tile.shape):
         seen = np.array([hidden[moved(at, step)] for step in (CROSS if cross else CROSS[:1])])
-        correction = outputs(head.layers[2], outputs(head.layers[1], seen.T.ravel()), leaky=False)[0]
+        correction = outputs(head.layers[2], outputs(head.layers[1], seen.T.ravel()), leaky=False)[
+            0
+        ]
         expected[at] = np.clip(tile[at] + head.sigma * correction, LOW, HIGH)
     np.testing.assert_allclose(head.apply(tile), expected, atol=0.02 * head.sigma)
     assert np.abs(expected - tile).max() > head.sigma  # the comparison is about something
@@ -156,7 +206,9 @@ def test_the_logarithm_is_monotone_and_odd():
     compressed = compress(values)
     assert (np.diff(compressed) >= 0).all()
     np.testing.assert_array_equal(compress(-values), -compressed)
-    np.testing.assert_array_equal(compress(np.array([1, 3, 1e30, np.inf], np.float32)), [512, 1024, 4095, 4095])
+    np.testing.assert_array_equal(
+        compress(np.array([1, 3, 1e30, np.inf], np.float32)), [512, 1024, 4095, 4095]
+    )
 
 
 def test_neighbours_are_26_and_lie_in_opposite_pairs():
@@ -165,7 +217,11 @@ def test_neighbours_are_26_and_lie_in_opposite_pairs():
 
 
 def test_the_cross_is_the_voxel_and_one_step_either_way_along_each_axis():
-    axes = [tuple(sign * (number == axis) for number in range(4)) for axis in range(4) for sign in (-1, 1)]
+    axes = [
+        tuple(sign * (number == axis) for number in range(4))
+        for axis in range(4)
+        for sign in (-1, 1)
+    ]
     assert ((0, 0, 0, 0), *axes) == CROSS
 
 
@@ -181,14 +237,27 @@ def test_other_tiles_are_refused(tile):
 
 
 @pytest.mark.parametrize(
-    ("hidden", "cross"), [((12, 8), False), ((1,), False), ((24, 12), False), ((64, 64, 64), False), ((8, 8), True), ((14, 64), True)]
+    ("hidden", "cross"),
+    [
+        ((12, 8), False),
+        ((1,), False),
+        ((24, 12), False),
+        ((64, 64, 64), False),
+        ((8, 8), True),
+        ((14, 64), True),
+    ],
 )
 def test_bytes_there_and_back(hidden, cross):
     head = random_head(hidden, cross=cross)
     assert head.to_bytes()[0] == (0x82 if cross else len(hidden))
     again = Head.from_bytes(head.to_bytes())
     assert again.cross == cross
-    assert (again.hidden, again.sigma, again.low, again.high) == (head.hidden, head.sigma, head.low, head.high)
+    assert (again.hidden, again.sigma, again.low, again.high) == (
+        head.hidden,
+        head.sigma,
+        head.low,
+        head.high,
+    )
     for first, second in zip(head.layers, again.layers, strict=True):
         np.testing.assert_array_equal(first.weights, second.weights)
         np.testing.assert_array_equal(first.biases, second.biases)
@@ -216,14 +285,28 @@ def test_damaged_bytes_are_refused_or_are_another_sound_head(head):
             Head.from_bytes(data[:length])
 
 
-@pytest.mark.parametrize("start", [b"\x80", b"\x81", b"\x83\x04\x04\x04", b"\x82\x04", b"\x82\x0f\x04", b"\x82\x04\x41", b"\x82\x00\x04"])
+@pytest.mark.parametrize(
+    "start",
+    [
+        b"\x80",
+        b"\x81",
+        b"\x83\x04\x04\x04",
+        b"\x82\x04",
+        b"\x82\x0f\x04",
+        b"\x82\x04\x41",
+        b"\x82\x00\x04",
+    ],
+)
 def test_other_layers_under_a_cross_are_refused(start):
     rest = random_head((4, 4), cross=True).to_bytes()[3:]
     with pytest.raises(DamagedFileError, match=r"hidden layers|widths"):
         Head.from_bytes(start + rest if len(start) > 2 else start)
 
 
-@pytest.mark.parametrize(("hidden", "message"), [((8,), "2 hidden layers"), ((8, 8, 8), "2 hidden layers"), ((15, 8), "15 outputs")])
+@pytest.mark.parametrize(
+    ("hidden", "message"),
+    [((8,), "2 hidden layers"), ((8, 8, 8), "2 hidden layers"), ((15, 8), "15 outputs")],
+)
 def test_a_cross_needs_two_hidden_layers_and_exact_sums(hidden, message):
     with pytest.raises(InputError, match=message):
         random_head(hidden, cross=True)
@@ -249,7 +332,15 @@ def test_longer_bytes_are_refused(tail):
 def test_bad_heads_are_refused(change, message):
     head = random_head()
     with pytest.raises(InputError, match=message):
-        Head(**{"layers": head.layers, "sigma": head.sigma, "low": head.low, "high": head.high, **change})
+        Head(
+            **{
+                "layers": head.layers,
+                "sigma": head.sigma,
+                "low": head.low,
+                "high": head.high,
+                **change,
+            }
+        )
 
 
 @pytest.mark.parametrize(

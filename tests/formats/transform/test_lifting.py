@@ -18,7 +18,16 @@ from fhash_formats.transform.basis import fit_basis
 from fhash_formats.transform.lifting import MAX_LOD, Transform
 from fhash_formats.transform.spec import KINDS, WAVELETS, AxisTransform, TransformSpec
 
-SHAPES = [(1, 1, 1, 1), (2, 3, 5, 7), (4, 9, 17, 33), (16, 1, 2, 64), (3, 8, 64, 65), (1, 2, 1, 40), (2, 2, 40, 1), (7, 13, 31, 29)]
+SHAPES = [
+    (1, 1, 1, 1),
+    (2, 3, 5, 7),
+    (4, 9, 17, 33),
+    (16, 1, 2, 64),
+    (3, 8, 64, 65),
+    (1, 2, 1, 40),
+    (2, 2, 40, 1),
+    (7, 13, 31, 29),
+]
 MIXES = [
     ("haar", "5/3", "9/7", "9/7"),
     ("9/7", "haar", "5/3", "5/3"),
@@ -39,8 +48,12 @@ def axis_of(kind: str, depth: int, n: int, step: float = 1e-4) -> AxisTransform:
     return AxisTransform(kind=kind, depth=depth if kind in WAVELETS else 0)
 
 
-def spec_of(kinds: tuple[str, ...], depths: tuple[int, ...], shape: tuple[int, ...], step: float = 1e-4) -> TransformSpec:
-    t, z, y, x = (axis_of(kind, depth, n, step) for kind, depth, n in zip(kinds, depths, shape, strict=True))
+def spec_of(
+    kinds: tuple[str, ...], depths: tuple[int, ...], shape: tuple[int, ...], step: float = 1e-4
+) -> TransformSpec:
+    t, z, y, x = (
+        axis_of(kind, depth, n, step) for kind, depth, n in zip(kinds, depths, shape, strict=True)
+    )
     return TransformSpec(axes=(t, z, y, x))
 
 
@@ -52,7 +65,9 @@ def noise(shape: tuple[int, ...], dtype: Any, seed: int = 0) -> NDArray[Any]:
 @pytest.mark.parametrize("depth", [1, 3, 7])
 @pytest.mark.parametrize("kinds", MIXES)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_there_and_back(shape: tuple[int, ...], kinds: tuple[str, ...], depth: int, dtype: Any) -> None:
+def test_there_and_back(
+    shape: tuple[int, ...], kinds: tuple[str, ...], depth: int, dtype: Any
+) -> None:
     transform = Transform(spec_of(kinds, (depth,) * 4, shape), shape, dtype)
     values = noise(shape, dtype)
     coefficients = transform.forward(values)
@@ -68,7 +83,11 @@ def test_there_and_back(shape: tuple[int, ...], kinds: tuple[str, ...], depth: i
 @pytest.mark.parametrize("kinds", MIXES)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_both_engines_give_the_same_bits(
-    shape: tuple[int, ...], kinds: tuple[str, ...], depths: tuple[int, ...], dtype: Any, monkeypatch: pytest.MonkeyPatch
+    shape: tuple[int, ...],
+    kinds: tuple[str, ...],
+    depths: tuple[int, ...],
+    dtype: Any,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     spec = spec_of(kinds, depths, shape, step=2.0)
     values = noise(shape, dtype, 1) * dtype(100)
@@ -90,7 +109,9 @@ def test_both_engines_give_the_same_bits(
     depths=st.tuples(*(st.integers(1, 6),) * 4),
     seed=st.integers(0, 9),
 )
-def test_any_mix_comes_back(shape: tuple[int, ...], kinds: tuple[str, ...], depths: tuple[int, ...], seed: int) -> None:
+def test_any_mix_comes_back(
+    shape: tuple[int, ...], kinds: tuple[str, ...], depths: tuple[int, ...], seed: int
+) -> None:
     transform = Transform(spec_of(kinds, depths, shape), shape, np.float64)
     values = noise(shape, np.float64, seed)
     assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-10
@@ -98,7 +119,9 @@ def test_any_mix_comes_back(shape: tuple[int, ...], kinds: tuple[str, ...], dept
 
 @pytest.mark.parametrize("kinds", MIXES)
 @pytest.mark.parametrize("shape", [(2, 3, 5, 7), (3, 8, 16, 12)])
-def test_norms_are_those_of_the_synthesis_vectors(shape: tuple[int, ...], kinds: tuple[str, ...]) -> None:
+def test_norms_are_those_of_the_synthesis_vectors(
+    shape: tuple[int, ...], kinds: tuple[str, ...]
+) -> None:
     transform = Transform(spec_of(kinds, (1, 2, 3, 3), shape), shape, np.float64)
     places = np.random.default_rng(2).choice(int(np.prod(shape)), 25, replace=False)
     for place in places:
@@ -114,17 +137,26 @@ def test_white_noise_in_the_coefficients_is_as_large_in_the_values(kinds: tuple[
     assert np.var(transform.inverse(noise(shape, np.float64))) == pytest.approx(1.0, rel=0.05)
     band = np.zeros(shape)
     band[4:, :4, 16:, :16] = noise((4, 4, 16, 16), np.float64)
-    assert np.sum(transform.inverse(band) ** 2) / band[4:, :4, 16:, :16].size == pytest.approx(1.0, rel=0.15)
+    assert np.sum(transform.inverse(band) ** 2) / band[4:, :4, 16:, :16].size == pytest.approx(
+        1.0, rel=0.15
+    )
 
 
 def test_a_coupled_plane_splits_only_the_low_low_quadrant() -> None:
     shape = (1, 1, 16, 16)
     values = noise(shape, np.float64)
-    one, two = (Transform(spec_of(("none", "none", "9/7", "9/7"), (0, 0, depth, depth), shape), shape, np.float64) for depth in (1, 2))
+    one, two = (
+        Transform(
+            spec_of(("none", "none", "9/7", "9/7"), (0, 0, depth, depth), shape), shape, np.float64
+        )
+        for depth in (1, 2)
+    )
     first, second = one.forward(values), two.forward(values)
     assert np.array_equal(first[:, :, 8:, :], second[:, :, 8:, :])
     assert np.array_equal(first[:, :, :, 8:], second[:, :, :, 8:])
-    packet = Transform(spec_of(("none", "none", "9/7", "9/7"), (0, 0, 2, 1), shape), shape, np.float64).forward(values)
+    packet = Transform(
+        spec_of(("none", "none", "9/7", "9/7"), (0, 0, 2, 1), shape), shape, np.float64
+    ).forward(values)
     assert not np.allclose(packet[:, :, 4:8, 8:], first[:, :, 4:8, 8:])
 
 
@@ -132,7 +164,9 @@ def test_a_coupled_plane_splits_only_the_low_low_quadrant() -> None:
 def test_a_ramp_leaves_the_high_bands_empty(kind: str) -> None:
     shape = (1, 1, 1, 64)
     ramp = np.broadcast_to(np.arange(64.0), shape).copy()
-    coefficients = Transform(spec_of(("none", "none", "none", kind), (0, 0, 0, 1), shape), shape, np.float64).forward(ramp)
+    coefficients = Transform(
+        spec_of(("none", "none", "none", kind), (0, 0, 0, 1), shape), shape, np.float64
+    ).forward(ramp)
     assert np.abs(coefficients[..., 34:62]).max() < 1e-8
     assert np.abs(coefficients[..., :32]).min() >= 0
     assert np.abs(coefficients[..., 16]).max() > 10
@@ -141,12 +175,18 @@ def test_a_ramp_leaves_the_high_bands_empty(kind: str) -> None:
 @pytest.mark.parametrize("dtype", TYPES)
 @pytest.mark.parametrize("kinds", [kinds for kinds in MIXES if "klt" not in kinds])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_constant_stays_itself_at_every_resolution(shape: tuple[int, ...], kinds: tuple[str, ...], dtype: Any) -> None:
+def test_a_constant_stays_itself_at_every_resolution(
+    shape: tuple[int, ...], kinds: tuple[str, ...], dtype: Any
+) -> None:
     transform = Transform(spec_of(kinds, (2, 3, 4, 4), shape), shape, dtype)
     coefficients = transform.forward(np.full(shape, 3.25, dtype))
     for lod in range(MAX_LOD + 1):
         reduced = transform.inverse(coefficients, lod)
-        assert reduced.shape == transform.lod_shape(lod) == (shape[0], *(-(-n // 2**lod) for n in shape[1:]))
+        assert (
+            reduced.shape
+            == transform.lod_shape(lod)
+            == (shape[0], *(-(-n // 2**lod) for n in shape[1:]))
+        )
         assert reduced.dtype == dtype
         assert np.abs(reduced - 3.25).max() < (3e-5 if dtype is np.float32 else 1e-12)
 
@@ -157,9 +197,14 @@ def test_reduced_vertices_stand_at_every_2_to_the_nth(kind: str, lod: int) -> No
     shape = (2, 32, 33, 40)
     t, z, y, x = np.meshgrid(*(np.arange(n) / 40.0 for n in shape), indexing="ij")
     values = 1.0 + t + z * 2 + y * 3 + np.sin(2 * x)
-    transform = Transform(spec_of(("none", kind, kind, kind), (0, 2, 2, 2), shape), shape, np.float64)
+    transform = Transform(
+        spec_of(("none", kind, kind, kind), (0, 2, 2, 2), shape), shape, np.float64
+    )
     step = 1 << lod
-    reduced, expected = transform.inverse(transform.forward(values), lod), values[:, ::step, ::step, ::step]
+    reduced, expected = (
+        transform.inverse(transform.forward(values), lod),
+        values[:, ::step, ::step, ::step],
+    )
     inside = (slice(None), *(slice(2, -2),) * 3)
     assert np.abs(reduced - expected)[inside].max() < 0.01
 
@@ -174,7 +219,9 @@ def test_a_haar_low_band_is_the_mean() -> None:
 
 def test_entries_beyond_the_rank_are_zero() -> None:
     shape = (2, 12, 5, 9)
-    transform = Transform(spec_of(("none", "klt", "none", "klt"), (0,) * 4, shape, step=30.0), shape)
+    transform = Transform(
+        spec_of(("none", "klt", "none", "klt"), (0,) * 4, shape, step=30.0), shape
+    )
     z, x = (transform.spec.axes[axis].basis for axis in (1, 3))
     assert z is not None
     assert x is not None
@@ -193,7 +240,10 @@ def test_entries_beyond_the_rank_are_zero() -> None:
 def test_a_basis_of_rank_0_gives_zeros(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FHASH_NATIVE", setting)
     shape = (2, 3, 4, 5)
-    none, empty = AxisTransform(kind="none"), (AxisTransform(kind="klt", basis=fit_basis(np.zeros((n, n)), 1.0)) for n in (3, 5))
+    none, empty = (
+        AxisTransform(kind="none"),
+        (AxisTransform(kind="klt", basis=fit_basis(np.zeros((n, n)), 1.0)) for n in (3, 5)),
+    )
     z, x = empty
     transform = Transform(TransformSpec(axes=(none, z, none, x)), shape)
     assert not transform.forward(noise(shape, np.float32)).any()
@@ -232,7 +282,10 @@ def test_threads_share_a_transform() -> None:
     with ThreadPoolExecutor(4) as pool:
         together = list(pool.map(lambda tile: transform.inverse(transform.forward(tile), 1), tiles))
     fresh = Transform(transform.spec, shape)
-    assert all(np.array_equal(one, fresh.inverse(fresh.forward(tile), 1)) for one, tile in zip(together, tiles, strict=True))
+    assert all(
+        np.array_equal(one, fresh.inverse(fresh.forward(tile), 1))
+        for one, tile in zip(together, tiles, strict=True)
+    )
 
 
 @pytest.mark.parametrize("setting", ["1", "0"])

@@ -18,9 +18,24 @@ from fhash_formats.transform.mask import decode_mask, encode_mask, mask_prior_st
 from fhash_formats.transform.mask_levels import BOUNDS, MAX_SCORE, MaskLevels
 from fhash_formats.transform.settings import Settings
 from fhash_formats.transform.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.tile import CodedTile, decode_tile, decode_tile_mask, encode_tile, exact_tile
+from fhash_formats.transform.tile import (
+    CodedTile,
+    decode_tile,
+    decode_tile_mask,
+    encode_tile,
+    exact_tile,
+)
 
-SHAPES = [(1, 1, 1, 1), (2, 3, 4, 5), (3, 2, 9, 33), (1, 1, 1, 50), (5, 1, 1, 1), (1, 7, 1, 1), (2, 5, 16, 16), (1, 1, 11, 17)]
+SHAPES = [
+    (1, 1, 1, 1),
+    (2, 3, 4, 5),
+    (3, 2, 9, 33),
+    (1, 1, 1, 50),
+    (5, 1, 1, 1),
+    (1, 7, 1, 1),
+    (2, 5, 16, 16),
+    (1, 1, 11, 17),
+]
 
 
 @pytest.fixture(params=["native", "compiled", "plain"])
@@ -51,7 +66,9 @@ def masks(shape: tuple[int, ...]) -> dict[str, npt.NDArray[np.bool_]]:
     }
 
 
-def levels_for(kind: str, mask: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+def levels_for(
+    kind: str, mask: npt.NDArray[np.bool_]
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
     rng = np.random.default_rng(2)
     if kind == "nothing known":
         return np.zeros(mask.shape, np.uint8), np.zeros(mask.shape, np.uint8)
@@ -76,7 +93,10 @@ def test_every_form_gives_the_same_bytes(form: str) -> None:
     found = {}
     for name, mask in masks((3, 2, 9, 33)).items():
         for kind in ("nothing known", "noise", "likely"):
-            found[f"{name}, {kind}"] = len(data := encode_mask(mask, levels_for(kind, mask))), sum(data) % 251
+            found[f"{name}, {kind}"] = (
+                len(data := encode_mask(mask, levels_for(kind, mask))),
+                sum(data) % 251,
+            )
     assert found == PINNED
 
 
@@ -115,7 +135,9 @@ def test_damaged_bytes_give_some_mask(form: str) -> None:
     levels = levels_for("likely", mask)
     data = encode_mask(mask, levels)
     rng = np.random.default_rng(3)
-    damaged = [data[:n] for n in range(len(data))] + [bytes(rng.integers(0, 256, n, np.uint8)) for n in (0, 1, 5, 500)]
+    damaged = [data[:n] for n in range(len(data))] + [
+        bytes(rng.integers(0, 256, n, np.uint8)) for n in (0, 1, 5, 500)
+    ]
     for other in damaged:
         assert decode_mask(other, levels).shape == mask.shape
 
@@ -131,10 +153,14 @@ def test_levels_rise_with_the_value_and_reach_as_far_as_the_feature_grew() -> No
     values = np.zeros((1, 1, 3, 9), np.float32)
     values[0, 0, 1, 4] = 5.0
     levels, others = MaskLevels(edges=(1.0, 4.0), scores=(0, 128, 2000), reach=2).levels(values)
-    np.testing.assert_array_equal(levels[0, 0, 1] > 0, [False, False, True, True, True, True, True, False, False])
+    np.testing.assert_array_equal(
+        levels[0, 0, 1] > 0, [False, False, True, True, True, True, True, False, False]
+    )
     assert levels.max() == sum(bound <= 2000 for bound in BOUNDS)
     np.testing.assert_array_equal(np.argwhere(others), [[0, 0, 1, 4]])
-    rising = MaskLevels(edges=(1.0, 4.0), scores=(0, 128, 2000)).levels(np.array([0, 1, 3.9, 4], np.float64).reshape(1, 1, 1, 4))[0]
+    rising = MaskLevels(edges=(1.0, 4.0), scores=(0, 128, 2000)).levels(
+        np.array([0, 1, 3.9, 4], np.float64).reshape(1, 1, 1, 4)
+    )[0]
     assert list(rising.ravel()) == [0, 16, 16, levels.max()]
     assert all(low < high <= MAX_SCORE for low, high in pairwise(BOUNDS))
 
@@ -165,7 +191,10 @@ def test_settings_that_are_not_allowed(change: Any) -> None:
 
 
 def test_settings_are_what_their_values_say() -> None:
-    for levels in (MaskLevels(), MaskLevels(edges=(-1.0, 2.5), scores=(0, 7, 9), others=(9, 7, 0), reach=3)):
+    for levels in (
+        MaskLevels(),
+        MaskLevels(edges=(-1.0, 2.5), scores=(0, 7, 9), others=(9, 7, 0), reach=3),
+    ):
         assert MaskLevels.from_dict(levels.to_dict()) == levels
 
 
@@ -174,7 +203,9 @@ def test_settings_are_what_their_values_say() -> None:
 SHAPE = (2, 3, 12, 17)
 NINE = AxisTransform(kind="9/7", depth=2)
 SETTINGS = Settings(
-    transform=TransformSpec(axes=(AxisTransform(kind="haar", depth=1), AxisTransform(kind="none"), NINE, NINE)),
+    transform=TransformSpec(
+        axes=(AxisTransform(kind="haar", depth=1), AxisTransform(kind="none"), NINE, NINE)
+    ),
     step=2.0,
     center=50.0,
     low=0.0,
@@ -191,7 +222,11 @@ def tile(dtype: str = "f4") -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8", "f2", "i2", "u1"])
-@pytest.mark.parametrize("options", [{}, {"weight": 0.09, "rounds": 2, "density": 2}, {"error": 0.5}, {"error": 1e-9}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"weight": 0.09, "rounds": 2, "density": 2}, {"error": 0.5}, {"error": 1e-9}],
+    ids=str,
+)
 @pytest.mark.parametrize("own", [False, True])
 def test_a_tile_says_what_is_occupied(dtype: str, options: dict[str, Any], own: bool) -> None:
     values, care = tile(dtype)
@@ -205,7 +240,9 @@ def test_a_tile_says_what_is_occupied(dtype: str, options: dict[str, Any], own: 
         np.testing.assert_array_equal(np.isnan(decoded), ~care)
     else:
         assert (decoded[~care] == decoded[~care][0]).all()
-    assert np.abs(decoded.astype(float) - values.astype(float))[care].max() <= options.get("error", 4.0)
+    assert np.abs(decoded.astype(float) - values.astype(float))[care].max() <= options.get(
+        "error", 4.0
+    )
     assert coded.data[0] >> 5 == 2
 
 
@@ -240,7 +277,9 @@ def test_what_is_not_finite_is_not_occupied_and_comes_back() -> None:
         decoded, mask = decode_tile_mask(coded.data, SHAPE, "f4", SETTINGS)
         np.testing.assert_array_equal(mask, care & np.isfinite(values))
         np.testing.assert_array_equal(decoded[~np.isfinite(values)], values[~np.isfinite(values)])
-    dropped = decode_tile(encode_tile(values, SETTINGS, care=care, keep_missing=False).data, SHAPE, "f4", SETTINGS)
+    dropped = decode_tile(
+        encode_tile(values, SETTINGS, care=care, keep_missing=False).data, SHAPE, "f4", SETTINGS
+    )
     np.testing.assert_array_equal(np.isnan(dropped), ~(care & np.isfinite(values)))
 
 
@@ -277,7 +316,11 @@ def test_damage_to_a_tile_with_a_mask_is_found(name: str) -> None:
     }[name]
     sound, mask = decode_tile_mask(data, small, "f4")
     damaged = [data[:n] for n in range(len(data))] + [data + b"\0", data + b"\x01a"]
-    damaged += [data[:n] + bytes([data[n] ^ 1 << bit]) + data[n + 1 :] for n in range(len(data)) for bit in range(8)]
+    damaged += [
+        data[:n] + bytes([data[n] ^ 1 << bit]) + data[n + 1 :]
+        for n in range(len(data))
+        for bit in range(8)
+    ]
     refused = 0
     for other in damaged:
         try:

@@ -10,7 +10,8 @@ import pytest
 from fhash_formats import native
 
 pytestmark = pytest.mark.skipif(
-    sys.platform != "linux" or native.library() is None, reason="needs the native library and limits on memory as Linux has them"
+    sys.platform != "linux" or native.library() is None,
+    reason="needs the native library and limits on memory as Linux has them",
 )
 
 SCRIPT = """
@@ -50,7 +51,15 @@ except MemoryError as error:
 
 
 @pytest.mark.parametrize(
-    "name", ["decode_integers", "encode_integers", "decode_mask", "encode_mask", "decode_predicted", "encode_predicted"]
+    "name",
+    [
+        "decode_integers",
+        "encode_integers",
+        "decode_mask",
+        "encode_mask",
+        "decode_predicted",
+        "encode_predicted",
+    ],
 )
 def test_coders_say_where_memory_runs_out(name):
     done = subprocess.run([sys.executable, "-c", SCRIPT, name], capture_output=True, text=True)

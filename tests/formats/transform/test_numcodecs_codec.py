@@ -15,14 +15,20 @@ from fhash_formats.transform.numcodecs_codec import NumcodecsTransform
 
 def test_it_is_found_by_its_name_and_configuration() -> None:
     transform = {"t": "none", "z": "none", "y": ["9/7", 1], "x": ["9/7", 1]}
-    for config in ({"max_error": 0.5}, {"max_error_rel": 0.01}, {"step": 2.0, "transform": transform}):
+    for config in (
+        {"max_error": 0.5},
+        {"max_error_rel": 0.01},
+        {"step": 2.0, "transform": transform},
+    ):
         codec = numcodecs.get_codec({"id": "fhash.transform", **config})
         assert isinstance(codec, NumcodecsTransform)
         assert codec.get_config() == {"id": "fhash.transform", **config}
         assert numcodecs.get_codec(codec.get_config()) == codec
 
 
-@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"])
+@pytest.mark.parametrize(
+    "dtype", ["f2", "f4", "f8", ">f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"]
+)
 @pytest.mark.parametrize("shape", [(), (0, 3), (40,), (6, 8), (2, 3, 4, 5), (2, 1, 3, 4, 5)])
 def test_shape_and_type_come_back(dtype: str, shape: tuple[int, ...]) -> None:
     values = (np.arange(np.prod(shape)).reshape(shape) % 120).astype(dtype)
@@ -40,7 +46,13 @@ def test_zarr_format_2(tmp_path: Path) -> None:
     values = np.sin(np.arange(12 * 20) / 30).reshape(12, 20).astype("f4")
     codec = NumcodecsTransform(max_error=0.001)
     array = zarr.create_array(
-        tmp_path / "a.zarr", shape=(12, 20), chunks=(6, 20), dtype="f4", zarr_format=2, filters=None, compressors=codec
+        tmp_path / "a.zarr",
+        shape=(12, 20),
+        chunks=(6, 20),
+        dtype="f4",
+        zarr_format=2,
+        filters=None,
+        compressors=codec,
     )
     array[...] = values
     assert np.abs(zarr.open_array(tmp_path / "a.zarr", mode="r")[...] - values).max() <= 0.001

@@ -13,18 +13,39 @@ from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform import predict
 from fhash_formats.transform.coder import state_arguments
-from fhash_formats.transform.predict import LARGEST, decode_predicted, encode_predicted, integers_of, values_of
+from fhash_formats.transform.predict import (
+    LARGEST,
+    decode_predicted,
+    encode_predicted,
+    integers_of,
+    values_of,
+)
 from fhash_formats.transform.predictor import Predictor, passes_of
 from fhash_formats.transform.prior import State
 
-SHAPES = [(1, 1, 1, 1), (2, 1, 1, 1), (1, 1, 1, 2), (1, 2, 3, 5), (3, 7, 2, 11), (5, 4, 9, 8), (2, 13, 1, 17)]
+SHAPES = [
+    (1, 1, 1, 1),
+    (2, 1, 1, 1),
+    (1, 1, 1, 2),
+    (1, 2, 3, 5),
+    (3, 7, 2, 11),
+    (5, 4, 9, 8),
+    (2, 13, 1, 17),
+]
 NATIVE = pytest.mark.skipif(native.library() is None, reason="compares with the native library")
 
 
 def _predictor(levels=(2, 3, 3, 3), order=(0, 1, 2, 3), reach=1, seed=0, step=1.0, origin=0.0):
     count = sum(len(part.taps) for part in passes_of(levels, order, reach))
     weights = np.random.default_rng(seed).integers(-300, 301, count)
-    return Predictor(step=step, origin=origin, levels=levels, order=order, reach=reach, weights=tuple(weights.tolist()))
+    return Predictor(
+        step=step,
+        origin=origin,
+        levels=levels,
+        order=order,
+        reach=reach,
+        weights=tuple(weights.tolist()),
+    )
 
 
 def _smooth(shape, scale=40.0, seed=0):
@@ -36,7 +57,8 @@ def _smooth(shape, scale=40.0, seed=0):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(
-    ("levels", "order", "reach"), [((2, 3, 3, 3), (0, 1, 2, 3), 1), ((0, 1, 2, 0), (3, 2, 1, 0), 2), ((0,) * 4, (0, 3, 2, 1), 0)]
+    ("levels", "order", "reach"),
+    [((2, 3, 3, 3), (0, 1, 2, 3), 1), ((0, 1, 2, 0), (3, 2, 1, 0), 2), ((0,) * 4, (0, 3, 2, 1), 0)],
 )
 def test_what_was_coded_comes_back(shape, levels, order, reach):
     predictor = _predictor(levels, order, reach)
@@ -50,13 +72,24 @@ def test_what_was_coded_comes_back(shape, levels, order, reach):
 def test_from_nothing_to_the_largest(scale):
     integers = np.clip(_smooth((3, 5, 6, 21), scale), -LARGEST, LARGEST).astype(np.int32)
     predictor = _predictor()
-    np.testing.assert_array_equal(decode_predicted(encode_predicted(integers, None, predictor)[0], integers.shape, predictor), integers)
+    np.testing.assert_array_equal(
+        decode_predicted(encode_predicted(integers, None, predictor)[0], integers.shape, predictor),
+        integers,
+    )
 
 
 def test_both_ends_of_the_numbers():
-    integers = np.random.default_rng(1).choice(np.array([-LARGEST, 0, LARGEST], dtype=np.int32), (3, 5, 6, 7))
-    predictor = replace(_predictor(), weights=tuple(32767 if i % 2 else -32767 for i in range(len(_predictor().weights))))
-    np.testing.assert_array_equal(decode_predicted(encode_predicted(integers, None, predictor)[0], integers.shape, predictor), integers)
+    integers = np.random.default_rng(1).choice(
+        np.array([-LARGEST, 0, LARGEST], dtype=np.int32), (3, 5, 6, 7)
+    )
+    predictor = replace(
+        _predictor(),
+        weights=tuple(32767 if i % 2 else -32767 for i in range(len(_predictor().weights))),
+    )
+    np.testing.assert_array_equal(
+        decode_predicted(encode_predicted(integers, None, predictor)[0], integers.shape, predictor),
+        integers,
+    )
 
 
 def test_a_constant_costs_next_to_nothing():
@@ -65,10 +98,15 @@ def test_a_constant_costs_next_to_nothing():
 
 
 def test_prediction_pays_on_smooth_values():
-    integers = np.rint(_smooth((8, 16, 24, 24), 0.0) + 300 * np.sin(np.arange(24) / 5)).astype(np.int32)
+    integers = np.rint(_smooth((8, 16, 24, 24), 0.0) + 300 * np.sin(np.arange(24) / 5)).astype(
+        np.int32
+    )
     noise = np.random.default_rng(0).permutation(integers.ravel()).reshape(integers.shape)
     plain = replace(_predictor(), weights=(0,) * len(_predictor().weights))
-    assert len(encode_predicted(integers, None, plain)[0]) < len(encode_predicted(noise, None, plain)[0]) / 2
+    assert (
+        len(encode_predicted(integers, None, plain)[0])
+        < len(encode_predicted(noise, None, plain)[0]) / 2
+    )
 
 
 def test_what_does_not_count_is_cheap_and_free():
@@ -84,7 +122,10 @@ def test_what_does_not_count_is_cheap_and_free():
 
 @NATIVE
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(("scale", "reach", "order"), [(0.5, 0, (0, 1, 2, 3)), (30.0, 1, (0, 3, 2, 1)), (4000.0, 2, (3, 2, 1, 0))])
+@pytest.mark.parametrize(
+    ("scale", "reach", "order"),
+    [(0.5, 0, (0, 1, 2, 3)), (30.0, 1, (0, 3, 2, 1)), (4000.0, 2, (3, 2, 1, 0))],
+)
 def test_without_the_native_library_the_bytes_are_the_same(monkeypatch, shape, scale, reach, order):
     integers = _smooth(shape, scale)
     care = np.random.default_rng(2).random(shape) < 0.8
@@ -102,9 +143,15 @@ def test_without_the_native_library_the_bytes_are_the_same(monkeypatch, shape, s
 def test_hostile_bytes_end_the_same_way_everywhere(monkeypatch):
     """Whatever the bytes: integers within bounds or an error, and native and portable agree."""
     shape, generator, found = (2, 3, 4, 9), np.random.default_rng(3), set()
-    predictor = replace(_predictor(), weights=tuple(generator.integers(-32767, 32768, len(_predictor().weights)).tolist()))
+    predictor = replace(
+        _predictor(),
+        weights=tuple(generator.integers(-32767, 32768, len(_predictor().weights)).tolist()),
+    )
     for number in range(40):
-        data = bytes([0 if number % 2 else 255] * (number % 7)) + generator.integers(0, 256, 60).astype(np.uint8).tobytes()
+        data = (
+            bytes([0 if number % 2 else 255] * (number % 7))
+            + generator.integers(0, 256, 60).astype(np.uint8).tobytes()
+        )
         ends = []
         for setting in ("1", "0"):
             monkeypatch.setenv("FHASH_NATIVE", setting)
@@ -136,7 +183,9 @@ def test_integers_that_are_too_large_are_refused():
     values = np.array([0.0, 1e30, np.nan, np.inf]).reshape(1, 1, 1, 4)
     predictor = _predictor()
     assert integers_of(values, np.isfinite(values), predictor) is None
-    found = integers_of(values, np.array([True, False, False, False]).reshape(1, 1, 1, 4), predictor)
+    found = integers_of(
+        values, np.array([True, False, False, False]).reshape(1, 1, 1, 4), predictor
+    )
     np.testing.assert_array_equal(found, np.zeros((1, 1, 1, 4)))
 
 
@@ -190,7 +239,11 @@ def test_taps_are_known_when_they_are_needed():
 def test_arguments_hold_the_arrays_that_they_point_to():
     """Of a state that several threads make at once all but one are held by nothing else: what they point to must not go."""
     arguments = state_arguments(
-        State(slots=np.zeros((8, 4), np.uint16), weights=np.zeros(8, np.int32), simples=np.zeros((8, 2), np.uint16))
+        State(
+            slots=np.zeros((8, 4), np.uint16),
+            weights=np.zeros(8, np.int32),
+            simples=np.zeros((8, 2), np.uint16),
+        )
     )
     held = [part._arr for part in arguments if isinstance(part, ctypes.c_void_p)]
     assert [array.shape[0] for array in held] == [8, 8, 8]
@@ -203,5 +256,7 @@ def test_threads_that_decode_for_the_first_time_at_once():
     with ThreadPoolExecutor(8) as workers:
         for _ in range(20):
             predict._blank.cache_clear()
-            for found in workers.map(lambda _: decode_predicted(data, coded.shape, predictor), range(16)):
+            for found in workers.map(
+                lambda _: decode_predicted(data, coded.shape, predictor), range(16)
+            ):
                 np.testing.assert_array_equal(found, coded)

@@ -31,7 +31,9 @@ def test_there_and_back() -> None:
 def test_there_and_back_with_a_basis() -> None:
     basis = some_basis()
     y, x = AxisTransform(kind="5/3", depth=1), AxisTransform(kind="none")
-    spec = TransformSpec(axes=(AxisTransform(kind="klt", basis=basis), AxisTransform(kind="klt", basis=basis), y, x))
+    spec = TransformSpec(
+        axes=(AxisTransform(kind="klt", basis=basis), AxisTransform(kind="klt", basis=basis), y, x)
+    )
     again = TransformSpec.from_dict(json.loads(json.dumps(spec.to_dict())))
     assert again == spec
     assert again.axes[0].basis == basis
@@ -39,7 +41,12 @@ def test_there_and_back_with_a_basis() -> None:
 
 @pytest.mark.parametrize(
     ("y", "x", "coupled"),
-    [(["9/7", 3], ["9/7", 3], True), (["9/7", 3], ["9/7", 2], False), (["9/7", 3], ["5/3", 3], False), ("none", "none", False)],
+    [
+        (["9/7", 3], ["9/7", 3], True),
+        (["9/7", 3], ["9/7", 2], False),
+        (["9/7", 3], ["5/3", 3], False),
+        ("none", "none", False),
+    ],
 )
 def test_the_plane_is_coupled_by_equal_wavelets(y: Any, x: Any, coupled: bool) -> None:
     assert TransformSpec.from_dict({**PLAIN, "y": y, "x": x}).coupled is coupled

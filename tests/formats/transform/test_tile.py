@@ -28,7 +28,9 @@ SPEC = TransformSpec(
         AxisTransform(kind="9/7", depth=2),
     )
 )
-SETTINGS = Settings(transform=SPEC, step=0.1, center=0.5, low=-2.0, high=3.0, quantum=0.08 * (1 - 1e-6))
+SETTINGS = Settings(
+    transform=SPEC, step=0.1, center=0.5, low=-2.0, high=3.0, quantum=0.08 * (1 - 1e-6)
+)
 
 
 def wave(shape: tuple[int, ...] = SHAPE, dtype: npt.DTypeLike = np.float32) -> npt.NDArray[Any]:
@@ -41,20 +43,32 @@ def same(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> bool:
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-@pytest.mark.parametrize("options", [{}, {"weight": 0.09}, {"error": 0.04}, {"weight": 0.09, "error": 0.04, "passes": 2, "rounds": 1}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"weight": 0.09},
+        {"error": 0.04},
+        {"weight": 0.09, "error": 0.04, "passes": 2, "rounds": 1},
+    ],
+)
 @pytest.mark.parametrize("own", [False, True])
 def test_the_encoder_knows_what_is_decoded(dtype: Any, options: dict[str, Any], own: bool) -> None:
     values = wave(dtype=dtype)
     coded = encode_tile(values, SETTINGS, own=own, **options)
     assert same(decode_tile(coded.data, SHAPE, dtype, None if own else SETTINGS), coded.decoded)
-    assert np.abs(coded.decoded.astype(float) - values.astype(float)).max() <= options.get("error", 0.4)
+    assert np.abs(coded.decoded.astype(float) - values.astype(float)).max() <= options.get(
+        "error", 0.4
+    )
 
 
 def test_values_that_are_not_finite_come_back_as_they_were() -> None:
     values = wave()
     values[0, 1, 2, 3:6] = [np.nan, np.inf, -np.inf]
     values[1, 0] = np.nan
-    decoded = decode_tile(encode_tile(values, SETTINGS, error=0.04).data, SHAPE, np.float32, SETTINGS)
+    decoded = decode_tile(
+        encode_tile(values, SETTINGS, error=0.04).data, SHAPE, np.float32, SETTINGS
+    )
     finite = np.isfinite(values)
     assert same(decoded[~finite], values[~finite])
     assert np.abs(decoded[finite] - values[finite]).max() <= 0.04
@@ -63,7 +77,9 @@ def test_values_that_are_not_finite_come_back_as_they_were() -> None:
 def test_what_does_not_count_costs_little_and_leaves_the_bound() -> None:
     values, care = wave((1, 4, 16, 16)), np.zeros((1, 4, 16, 16), bool)
     care[:, :, :, :8] = True
-    noisy = np.where(care, values, np.random.default_rng(0).normal(0, 50, values.shape).astype(np.float32))
+    noisy = np.where(
+        care, values, np.random.default_rng(0).normal(0, 50, values.shape).astype(np.float32)
+    )
     coded = encode_tile(noisy, SETTINGS, care=care, error=0.04)
     assert np.abs(coded.decoded - noisy)[care].max() <= 0.04
     assert 2 * len(coded.data) < len(encode_tile(noisy, SETTINGS, error=0.04).data)
@@ -72,7 +88,9 @@ def test_what_does_not_count_costs_little_and_leaves_the_bound() -> None:
 def test_nothing_counts() -> None:
     values = np.full(SHAPE, np.nan, np.float32)
     values[0, 0, 0, 0] = -np.inf
-    assert same(decode_tile(encode_tile(values, SETTINGS).data, SHAPE, np.float32, SETTINGS), values)
+    assert same(
+        decode_tile(encode_tile(values, SETTINGS).data, SHAPE, np.float32, SETTINGS), values
+    )
     dropped = encode_tile(values, SETTINGS, keep_missing=False)
     assert len(dropped.data) == 1
     assert (decode_tile(dropped.data, SHAPE, np.float32, SETTINGS) == np.float32(0.5)).all()
@@ -117,11 +135,20 @@ def streams() -> dict[str, tuple[npt.NDArray[Any], bytes]]:
     coarse = replace(SETTINGS, quantum=0.0)
     return {
         "plain": (values, encode_tile(values, coarse, own=True).data),
-        "residual": (values, encode_tile(values, replace(SETTINGS, quantum=0.002), error=0.001, own=True).data),
+        "residual": (
+            values,
+            encode_tile(values, replace(SETTINGS, quantum=0.002), error=0.001, own=True).data,
+        ),
         "missing": (holes, encode_tile(holes, SETTINGS, error=0.04, own=True).data),
-        "empty": (holes, encode_tile(holes, coarse, care=np.zeros(holes.shape, bool), own=True).data),
+        "empty": (
+            holes,
+            encode_tile(holes, coarse, care=np.zeros(holes.shape, bool), own=True).data,
+        ),
         "exact": (holes, exact_tile(holes).data),
-        "whole numbers": ((values * 50).astype("i2"), encode_tile((values * 50).astype("i2"), replace(SETTINGS, high=99.0), own=True).data),
+        "whole numbers": (
+            (values * 50).astype("i2"),
+            encode_tile((values * 50).astype("i2"), replace(SETTINGS, high=99.0), own=True).data,
+        ),
     }
 
 
@@ -130,7 +157,11 @@ def test_damage_is_found(name: str) -> None:
     values, data = streams()[name]
     sound = decode_tile(data, values.shape, values.dtype)
     damaged = [data[:n] for n in range(len(data))] + [data + b"\0", data + b"\x01a"]
-    damaged += [data[:n] + bytes([data[n] ^ 1 << bit]) + data[n + 1 :] for n in range(len(data)) for bit in range(8)]
+    damaged += [
+        data[:n] + bytes([data[n] ^ 1 << bit]) + data[n + 1 :]
+        for n in range(len(data))
+        for bit in range(8)
+    ]
     refused = 0
     for other in damaged:
         try:
@@ -141,7 +172,9 @@ def test_damage_is_found(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(streams()))
-def test_other_sections_than_the_flags_say_are_damage_before_anything_is_decoded(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_sections_than_the_flags_say_are_damage_before_anything_is_decoded(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     values, data = streams()[name]
     parts = parts_of(data)
     head = data[:5] if parts.coded else data[:1]
@@ -157,8 +190,20 @@ def test_other_sections_than_the_flags_say_are_damage_before_anything_is_decoded
             decode_tile(head + b"".join(map(section, sections)), values.shape, values.dtype)
 
 
-@pytest.mark.parametrize("change", [{"step": 10**400}, {"step": 1e300}, {"step": "1"}, {"range": 3}, {"transform": []}, {"center": None}])
-def test_hostile_settings_are_damage(change: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"step": 10**400},
+        {"step": 1e300},
+        {"step": "1"},
+        {"range": 3},
+        {"transform": []},
+        {"center": None},
+    ],
+)
+def test_hostile_settings_are_damage(
+    change: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     values = {**SETTINGS.to_dict(), **change}
     monkeypatch.setattr(Settings, "to_dict", lambda self: values)
     data = encode_tile(wave(), SETTINGS, own=True).data
@@ -173,7 +218,10 @@ def test_shared_settings_are_needed() -> None:
 
 PLAIN = TransformSpec(axes=(AxisTransform(kind="none"),) * 4)
 BEYOND: dict[str, tuple[dict[str, Any], str]] = {
-    "range beyond the type": ({"step": 1e299, "low": -1e300, "high": 1e300, "double": True}, "float32"),
+    "range beyond the type": (
+        {"step": 1e299, "low": -1e300, "high": 1e300, "double": True},
+        "float32",
+    ),
     "range beyond the arithmetic": ({"step": 1e38, "low": -1e300, "high": 1e300}, "float64"),
     "centre beyond the type": ({"center": 1e300, "high": 1e301, "double": True}, "float32"),
     "centre beyond the arithmetic": ({"center": 1e300, "high": 1e301}, "float64"),
@@ -185,11 +233,23 @@ BEYOND: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("native", ["0", "1"])
 @pytest.mark.parametrize("case", BEYOND)
-def test_numbers_that_end_in_infinities_are_damage(case: str, native: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_that_end_in_infinities_are_damage(
+    case: str, native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Infinities of the source have marks of their own: what else decodes to one was made to."""
     changes, dtype = BEYOND[case]
     monkeypatch.setenv("FHASH_NATIVE", native)
-    settings = Settings(**{"transform": PLAIN, "step": 1.0, "center": 0.0, "low": -9.0, "high": 9.0, "quantum": 0.1, **changes})
+    settings = Settings(
+        **{
+            "transform": PLAIN,
+            "step": 1.0,
+            "center": 0.0,
+            "low": -9.0,
+            "high": 9.0,
+            "quantum": 0.1,
+            **changes,
+        }
+    )
     integers = np.full(SHAPE, 100, np.int32)
     coded = encode_integers(integers, single_band(SHAPE)).data
     for residual in (None, integers) if "residual" not in case else (integers,):
@@ -202,27 +262,37 @@ def test_numbers_that_end_in_infinities_are_damage(case: str, native: str, monke
 
 
 @pytest.mark.parametrize("native", ["0", "1"])
-def test_a_transform_that_overflows_gives_no_warning(native: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_transform_that_overflows_gives_no_warning(
+    native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("FHASH_NATIVE", native)
     settings = replace(SETTINGS, step=3e38, quantum=0.0)
     integers = np.full(SHAPE, 1000, np.int32)
-    data = assembled(None, b"", encode_integers(integers, band_table(SPEC, SHAPE)).data, integers, None, None)
+    data = assembled(
+        None, b"", encode_integers(integers, band_table(SPEC, SHAPE)).data, integers, None, None
+    )
     assert not np.isinf(decode_tile(data, SHAPE, np.float32, settings)).any()
 
 
 @pytest.mark.parametrize("axis", range(4))
 @pytest.mark.parametrize("native", ["0", "1"])
-def test_a_basis_longer_than_the_tile_is_damage_before_anything_is_decoded(axis: int, native: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_basis_longer_than_the_tile_is_damage_before_anything_is_decoded(
+    axis: int, native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its bands would lie beyond the tile: the decoder wrote behind the end of its array."""
     monkeypatch.setenv("FHASH_NATIVE", native)
     n = SHAPE[axis] + 3
     basis = Basis(integers=np.eye(n, dtype=np.int32), exponents=(0,) * n)
     axes = [AxisTransform(kind="none")] * 4
     axes[axis] = AxisTransform(kind="klt", basis=basis)
-    settings = replace(SETTINGS, transform=TransformSpec(axes=(axes[0], axes[1], axes[2], axes[3])), quantum=0.0)
+    settings = replace(
+        SETTINGS, transform=TransformSpec(axes=(axes[0], axes[1], axes[2], axes[3])), quantum=0.0
+    )
     integers = np.zeros(SHAPE, np.int32)
     for coded in (b"", bytes(range(40))):
         with pytest.raises(DamagedFileError, match="do not fit its shape"):
-            decode_tile(assembled(None, b"", coded, integers, None, None), SHAPE, np.float32, settings)
+            decode_tile(
+                assembled(None, b"", coded, integers, None, None), SHAPE, np.float32, settings
+            )
     with pytest.raises(InputError, match="basis along"):
         band_table(settings.transform, SHAPE)

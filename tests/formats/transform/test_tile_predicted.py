@@ -25,7 +25,14 @@ def _settings(values, error, **more):
     levels, order = (1, 2, 2, 2), (0, 3, 2, 1)
     count = sum(len(part.taps) for part in passes_of(levels, order, 1))
     weights = tuple(np.random.default_rng(0).integers(-200, 200, count).tolist())
-    predictor = Predictor(step=step, origin=float(np.rint(finite.mean())), levels=levels, order=order, reach=1, weights=weights)
+    predictor = Predictor(
+        step=step,
+        origin=float(np.rint(finite.mean())),
+        levels=levels,
+        order=order,
+        reach=1,
+        weights=weights,
+    )
     return Settings(
         transform=TransformSpec(axes=(NONE,) * 4),
         step=step,
@@ -41,12 +48,30 @@ def _settings(values, error, **more):
 
 def _values(dtype="float32", shape=SHAPE):
     axes = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
-    values = 60 + 25 * np.sin(axes[3] / 3 + axes[0]) + 20 * np.cos(axes[2] / 4) + np.random.default_rng(1).normal(0, 3, shape)
+    values = (
+        60
+        + 25 * np.sin(axes[3] / 3 + axes[0])
+        + 20 * np.cos(axes[2] / 4)
+        + np.random.default_rng(1).normal(0, 3, shape)
+    )
     return np.clip(values, 1, 120).astype(dtype)
 
 
 @pytest.mark.parametrize(
-    "dtype", ["float16", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"]
+    "dtype",
+    [
+        "float16",
+        "float32",
+        "float64",
+        "int8",
+        "uint8",
+        "int16",
+        "uint16",
+        "int32",
+        "uint32",
+        "int64",
+        "uint64",
+    ],
 )
 @pytest.mark.parametrize("error", [0.5, 2.0, 7.3])
 def test_the_bound_is_kept_in_every_type(dtype, error):
@@ -65,7 +90,9 @@ def test_numbers_that_float64_cannot_hold_are_stored_exactly():
     values = (np.int64(2**62) + np.arange(np.prod(SHAPE)).reshape(SHAPE)).astype(np.int64)
     coded = encode_tile(values, _settings(values, 1.0), error=1.0)
     assert coded.data[0] & EXACT
-    np.testing.assert_array_equal(decode_tile(coded.data, SHAPE, "int64", _settings(values, 1.0)), values)
+    np.testing.assert_array_equal(
+        decode_tile(coded.data, SHAPE, "int64", _settings(values, 1.0)), values
+    )
 
 
 def test_a_constant_tile():
@@ -106,7 +133,8 @@ def test_a_level_of_detail_is_every_other_vertex(lod):
     data = encode_tile(values, settings, error=0.5).data
     every = slice(None, None, 1 << lod)
     np.testing.assert_array_equal(
-        decode_tile(data, SHAPE, "float32", settings, lod=lod), decode_tile(data, SHAPE, "float32", settings)[:, every, every, every]
+        decode_tile(data, SHAPE, "float32", settings, lod=lod),
+        decode_tile(data, SHAPE, "float32", settings)[:, every, every, every],
     )
 
 
@@ -116,7 +144,10 @@ def test_every_flipped_or_cut_byte_is_noticed():
     data = encode_tile(values, settings, error=2.0).data
     generator = np.random.default_rng(6)
     for at in (*range(8), *generator.integers(8, len(data), 30).tolist()):
-        for changed in (data[:at], data[:at] + bytes([data[at] ^ (1 << int(generator.integers(8)))]) + data[at + 1 :]):
+        for changed in (
+            data[:at],
+            data[:at] + bytes([data[at] ^ (1 << int(generator.integers(8)))]) + data[at + 1 :],
+        ):
             with pytest.raises(DamagedFileError):
                 decode_tile(changed, SHAPE, "float32", settings)
 

@@ -20,20 +20,31 @@ from fhash_formats.transform.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile import encode_tile
 from fhash_formats.transform.zarr_codec import TransformCodec
 
-WAVES = TransformSpec(axes=(AxisTransform(kind="haar", depth=1), *(AxisTransform(kind="9/7", depth=1),) * 3))
+WAVES = TransformSpec(
+    axes=(AxisTransform(kind="haar", depth=1), *(AxisTransform(kind="9/7", depth=1),) * 3)
+)
 SHARED = Settings(transform=WAVES, step=0.05, center=0.0, low=-3.0, high=3.0)
 
 
-def field(shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32, scale: float = 1.0) -> npt.NDArray[Any]:
+def field(
+    shape: tuple[int, ...], dtype: npt.DTypeLike = np.float32, scale: float = 1.0
+) -> npt.NDArray[Any]:
     grid = np.meshgrid(*(np.linspace(0, 3, n) for n in shape), indexing="ij")
     return (scale * (1 + np.sin(sum((i + 1) * x for i, x in enumerate(grid))))).astype(dtype)
 
 
 def create(store: Any, values: npt.NDArray[Any], chunks: tuple[int, ...], **options: Any) -> Any:
-    options = {"serializer": TransformCodec(max_error=0.01), "compressors": None, "fill_value": np.nan, **options}
+    options = {
+        "serializer": TransformCodec(max_error=0.01),
+        "compressors": None,
+        "fill_value": np.nan,
+        **options,
+    }
     if values.dtype.kind != "f":
         options["fill_value"] = 0
-    array = zarr.create_array(store, shape=values.shape, chunks=chunks, dtype=values.dtype, **options)
+    array = zarr.create_array(
+        store, shape=values.shape, chunks=chunks, dtype=values.dtype, **options
+    )
     array[...] = values
     return array
 
@@ -44,14 +55,19 @@ def test_arrays_come_back_within_the_bound(tmp_path: Path, shape: tuple[int, ...
     values.flat[3] = np.nan
     create(tmp_path / "a.zarr", values, tuple((n + 1) // 2 for n in shape))
     read = zarr.open_array(tmp_path / "a.zarr", mode="r")
-    assert json.loads((tmp_path / "a.zarr" / "zarr.json").read_text())["codecs"][0]["name"] == "fhash.transform"
+    assert (
+        json.loads((tmp_path / "a.zarr" / "zarr.json").read_text())["codecs"][0]["name"]
+        == "fhash.transform"
+    )
     assert np.isnan(read[...].flat[3])
     assert np.nanmax(np.abs(read[...] - values)) <= 0.01
     region = tuple(slice(1, n - 1) for n in shape)
     assert np.array_equal(read[region], read[...][region], equal_nan=True)
 
 
-@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"])
+@pytest.mark.parametrize(
+    "dtype", ["f2", "f4", "f8", ">f4", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"]
+)
 def test_every_type(tmp_path: Path, dtype: str) -> None:
     values = field((9, 12), dtype, 50)
     read = create(tmp_path / "a.zarr", values, (5, 6), serializer=TransformCodec(max_error=1))[...]
@@ -76,7 +92,11 @@ def test_all_three_qualities_are_kept_in_the_metadata(tmp_path: Path) -> None:
 def test_settings_that_all_chunks_share_in_shards_with_checksums(tmp_path: Path) -> None:
     values = field((4, 4, 8, 8))
     for n, codec in enumerate((TransformCodec(settings=SHARED), TransformCodec(max_error=0.05))):
-        shards = ShardingCodec(chunk_shape=(2, 4, 4, 8), codecs=[codec, Crc32cCodec()], index_codecs=[BytesCodec(), Crc32cCodec()])
+        shards = ShardingCodec(
+            chunk_shape=(2, 4, 4, 8),
+            codecs=[codec, Crc32cCodec()],
+            index_codecs=[BytesCodec(), Crc32cCodec()],
+        )
         create(tmp_path / f"{n}.zarr", values, (4, 4, 8, 8), serializer=shards)
         read = zarr.open_array(tmp_path / f"{n}.zarr", mode="r")
         assert np.abs(read[...] - values).max() <= 0.1
@@ -88,7 +108,14 @@ def test_an_empty_configuration_reads_streams_with_their_own_settings(tmp_path: 
     create(tmp_path / "a.zarr", values, values.shape)
     written = zarr.open_array(tmp_path / "a.zarr", mode="r")[...]
     path = tmp_path / "a.zarr" / "zarr.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "codecs": [{"name": "fhash.transform", "configuration": {}}]}))
+    path.write_text(
+        json.dumps(
+            {
+                **json.loads(path.read_text()),
+                "codecs": [{"name": "fhash.transform", "configuration": {}}],
+            }
+        )
+    )
     array = zarr.open_array(tmp_path / "a.zarr", mode="r+")
     assert np.array_equal(array[...], written)
     with pytest.raises(InputError, match="only decodes"):
@@ -98,19 +125,29 @@ def test_an_empty_configuration_reads_streams_with_their_own_settings(tmp_path: 
 def test_shared_settings_give_the_tile_that_containers_have(tmp_path: Path) -> None:
     values = field((2, 3, 8, 8))
     create(tmp_path / "a.zarr", values, values.shape, serializer=TransformCodec(settings=SHARED))
-    assert (tmp_path / "a.zarr" / "c" / "0" / "0" / "0" / "0").read_bytes() == encode_tile(values, SHARED).data
+    assert (tmp_path / "a.zarr" / "c" / "0" / "0" / "0" / "0").read_bytes() == encode_tile(
+        values, SHARED
+    ).data
 
 
 def test_padding_with_nan_leaves_the_relative_bound(tmp_path: Path) -> None:
     values = field((7, 11)) + 1000
-    read = create(tmp_path / "a.zarr", values, (5, 8), serializer=TransformCodec(max_error_rel=0.001))[...]
+    read = create(
+        tmp_path / "a.zarr", values, (5, 8), serializer=TransformCodec(max_error_rel=0.001)
+    )[...]
     assert np.abs(read - values).max() <= 0.001 * np.ptp(values)
 
 
 def test_xarray_writes_and_reads_lazily(tmp_path: Path) -> None:
     values = field((3, 4, 8, 10))
     data = xarray.Dataset({"speed": (("t", "z", "y", "x"), values)}, {"t": [0.0, 0.5, 1.0]})
-    encoding = {"speed": {"serializer": TransformCodec(max_error=0.01), "compressors": None, "chunks": (2, 4, 4, 10)}}
+    encoding = {
+        "speed": {
+            "serializer": TransformCodec(max_error=0.01),
+            "compressors": None,
+            "chunks": (2, 4, 4, 10),
+        }
+    }
     data.to_zarr(tmp_path / "a.zarr", zarr_format=3, encoding=encoding, consolidated=False)
     with xarray.open_zarr(tmp_path / "a.zarr", consolidated=False) as read:
         assert isinstance(read["speed"].data, dask.array.Array)
@@ -147,7 +184,14 @@ def test_a_damaged_chunk_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dtype", ["bool", "complex64"])
 def test_unsuitable_types_are_refused_at_creation(dtype: str) -> None:
     with pytest.raises(InputError, match="codes float16"):
-        zarr.create_array({}, shape=(4,), chunks=(4,), dtype=dtype, serializer=TransformCodec(max_error=1), compressors=None)
+        zarr.create_array(
+            {},
+            shape=(4,),
+            chunks=(4,),
+            dtype=dtype,
+            serializer=TransformCodec(max_error=1),
+            compressors=None,
+        )
 
 
 def test_unsuitable_configurations_are_refused() -> None:
@@ -155,6 +199,10 @@ def test_unsuitable_configurations_are_refused() -> None:
         TransformCodec()
     with pytest.raises(InputError, match="nothing else"):
         TransformCodec(max_error=1, settings=SHARED)
-    for configuration, said in (({"max_eror": 1}, "max_eror"), ({"max_error": "a"}, "max_error"), ({"center": 1}, "transform|missing")):
+    for configuration, said in (
+        ({"max_eror": 1}, "max_eror"),
+        ({"max_error": "a"}, "max_error"),
+        ({"center": 1}, "transform|missing"),
+    ):
         with pytest.raises(InputError, match=said):
             TransformCodec.from_dict({"name": "fhash.transform", "configuration": configuration})

@@ -29,10 +29,18 @@ TARGETS = tuple(HERE / f"{name}.cpp" for name in ("targets", "target_encode", "t
 SOURCES = ("coder", "mask", "predict", "lifting", "head", "quantise", "values", "march_light")
 MARCH = ("march", "march_bricks")
 """Besides, where it is asked for: compiled without optimisation, for which the compiler takes a minute; otherwise it takes ten."""
-SANITIZE = ("-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all", "-fno-omit-frame-pointer", "-g")
+SANITIZE = (
+    "-fsanitize=address,undefined,float-cast-overflow",
+    "-fno-sanitize-recover=all",
+    "-fno-omit-frame-pointer",
+    "-g",
+)
 # One build for one machine: functions chosen when a library is loaded run before the sanitizers are ready.
 FLAGS = ("-std=c++17", "-ffp-contract=off", "-Dtarget_clones(...)=", "-Wno-attributes")
-ENVIRONMENT = {"ASAN_OPTIONS": "detect_leaks=1:abort_on_error=0:exitcode=99", "UBSAN_OPTIONS": "print_stacktrace=1"}
+ENVIRONMENT = {
+    "ASAN_OPTIONS": "detect_leaks=1:abort_on_error=0:exitcode=99",
+    "UBSAN_OPTIONS": "print_stacktrace=1",
+}
 
 
 class CannotBuild(Exception):
@@ -62,15 +70,25 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
     jobs: list[tuple[Path, tuple[str, ...]]] = [(HERE / "driver.cpp", ("-fsanitize=address", "-g"))]
     if march:
         # Lanes of vectors that are not wanted may hold what is no number.
-        jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing, "-fno-sanitize=float-cast-overflow", "-O0")) for name in MARCH]
+        jobs += [
+            (
+                NATIVE / f"{name}.cpp",
+                (*SANITIZE, *tracing, "-fno-sanitize=float-cast-overflow", "-O0"),
+            )
+            for name in MARCH
+        ]
         jobs += [(HERE / "target_march.cpp", (*SANITIZE, f"-I{NATIVE}"))]
     jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing)) for name in SOURCES]
-    jobs += [(target, (*SANITIZE, *(["-DFHASH_FUZZ_MARCH"] if march else []))) for target in TARGETS]
+    jobs += [
+        (target, (*SANITIZE, *(["-DFHASH_FUZZ_MARCH"] if march else []))) for target in TARGETS
+    ]
 
     def compiled(job: tuple[Path, tuple[str, ...]]) -> Path:
         source, flags = job
         result = folder / f"{source.stem}.o"
-        _compile([*compiler.split(), optimise, *FLAGS, *flags, "-c", str(source), "-o", str(result)])
+        _compile(
+            [*compiler.split(), optimise, *FLAGS, *flags, "-c", str(source), "-o", str(result)]
+        )
         return result
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -84,7 +102,9 @@ def _compile(command: list[str]) -> None:
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         last = (done.stderr.strip() or "no message").splitlines()[-1]
-        raise CannotBuild(f"{command[0]} does not build this with {SANITIZE[0]} and trace-pc: {last}")
+        raise CannotBuild(
+            f"{command[0]} does not build this with {SANITIZE[0]} and trace-pc: {last}"
+        )
 
 
 def prepare(folder: Path) -> dict[str, str]:
@@ -98,13 +118,18 @@ def prepare(folder: Path) -> dict[str, str]:
     return {**os.environ, **ENVIRONMENT, "FHASH_FUZZ_SETUPS": str(folder / "setups")}
 
 
-def fuzz(folder: Path, crashes: Path, *, seconds: float, processes: int, seed: int = 0, **options: Any) -> Found:
+def fuzz(
+    folder: Path, crashes: Path, *, seconds: float, processes: int, seed: int = 0, **options: Any
+) -> Found:
     """Build, with options of `build`, and run; raises CannotBuild."""
     binary = build(folder, **options)
     environment = prepare(folder)
     result = Found()
     with ThreadPoolExecutor(processes) as pool:
-        work = [pool.submit(_one, folder, binary, environment, crashes, seconds, seed, number) for number in range(processes)]
+        work = [
+            pool.submit(_one, folder, binary, environment, crashes, seconds, seed, number)
+            for number in range(processes)
+        ]
         for one in work:
             found = one.result()
             result.executions += found.executions
@@ -114,12 +139,26 @@ def fuzz(folder: Path, crashes: Path, *, seconds: float, processes: int, seed: i
     return result
 
 
-def _one(folder: Path, binary: Path, environment: dict[str, str], crashes: Path, seconds: float, seed: int, number: int) -> Found:
+def _one(
+    folder: Path,
+    binary: Path,
+    environment: dict[str, str],
+    crashes: Path,
+    seconds: float,
+    seed: int,
+    number: int,
+) -> Found:
     """One process after the other, until the time is over: after a crash another one with another seed."""
     result, end, turn = Found(), time.monotonic() + seconds, 0
     while (left := end - time.monotonic()) > 0:
         current = folder / f"current-{number}"
-        command = [str(binary), str(folder / "corpus"), str(current), f"{left:.1f}", str(1_000_003 * seed + 1009 * number + turn)]
+        command = [
+            str(binary),
+            str(folder / "corpus"),
+            str(current),
+            f"{left:.1f}",
+            str(1_000_003 * seed + 1009 * number + turn),
+        ]
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
         turn += 1
         if done.returncode == 0:
@@ -133,7 +172,9 @@ def _one(folder: Path, binary: Path, environment: dict[str, str], crashes: Path,
         crashes.mkdir(parents=True, exist_ok=True)
         path = crashes / f"crash-{hashlib.sha256(data).hexdigest()[:16]}"
         path.write_bytes(data)
-        path.with_suffix(".txt").write_text(f"exit code {done.returncode}\n{done.stderr}", encoding="utf-8")
+        path.with_suffix(".txt").write_text(
+            f"exit code {done.returncode}\n{done.stderr}", encoding="utf-8"
+        )
         result.crashes.append(path)
     return result
 
@@ -146,7 +187,9 @@ def repeat(path: Path, march: bool) -> int:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seconds", type=float, default=60.0, help="how long each process runs")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=0)
@@ -159,16 +202,32 @@ def main() -> int:
     kept = options.crashes or Path(tempfile.mkdtemp(prefix="fhash-fuzz-crashes-"))
     with tempfile.TemporaryDirectory(prefix="fhash-fuzz-") as folder:
         try:
-            found = fuzz(Path(folder), kept, seconds=options.seconds, processes=options.processes, seed=options.seed, march=options.march)
+            found = fuzz(
+                Path(folder),
+                kept,
+                seconds=options.seconds,
+                processes=options.processes,
+                seed=options.seed,
+                march=options.march,
+            )
         except CannotBuild as error:
             print(f"fuzz: {error}", file=sys.stderr)
             return 2
     sys.path.insert(0, str(HERE.parent))
     from reporting import record
 
-    figures = {"seconds": options.seconds, "processes": options.processes, "executions": found.executions}
-    record("the native code under sanitizers", {**figures, "edges": found.edges, "crashes": len(found.crashes)})
-    print(f"{found.executions} executions, {found.edges} edges, {found.kept} inputs kept, {len(found.crashes)} crashes")
+    figures = {
+        "seconds": options.seconds,
+        "processes": options.processes,
+        "executions": found.executions,
+    }
+    record(
+        "the native code under sanitizers",
+        {**figures, "edges": found.edges, "crashes": len(found.crashes)},
+    )
+    print(
+        f"{found.executions} executions, {found.edges} edges, {found.kept} inputs kept, {len(found.crashes)} crashes"
+    )
     for path in found.crashes:
         print(f"{path}: {path.with_suffix('.txt').read_text(encoding='utf-8').splitlines()[1:2]}")
     if not found.crashes and options.crashes is None:

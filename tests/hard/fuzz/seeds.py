@@ -34,17 +34,44 @@ SPECS: tuple[tuple[tuple[str, int], ...], ...] = (
     (("9/7", 10), ("9/7", 10), ("9/7", 10), ("9/7", 10)),
     (("none", 0), ("haar", 3), ("none", 0), ("5/3", 5)),
 )
-SHAPES = ((1, 1, 1, 1), (2, 3, 4, 5), (1, 1, 1, 40), (5, 1, 7, 3), (3, 6, 9, 17), (1, 4, 16, 33), (11, 2, 1, 2))
-PREDICTORS = (((0, 0, 0, 0), 0), ((1, 1, 1, 1), 1), ((2, 3, 3, 3), 2), ((0, 0, 2, 3), 2), ((8, 0, 1, 8), 1), ((1, 0, 0, 0), 0))
+SHAPES = (
+    (1, 1, 1, 1),
+    (2, 3, 4, 5),
+    (1, 1, 1, 40),
+    (5, 1, 7, 3),
+    (3, 6, 9, 17),
+    (1, 4, 16, 33),
+    (11, 2, 1, 2),
+)
+PREDICTORS = (
+    ((0, 0, 0, 0), 0),
+    ((1, 1, 1, 1), 1),
+    ((2, 3, 3, 3), 2),
+    ((0, 0, 2, 3), 2),
+    ((8, 0, 1, 8), 1),
+    ((1, 0, 0, 0), 0),
+)
 
 
 def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
     """Write the file that setups.hpp reads; the bands as (shape, table) and the passes as (shape, Predictor) in its order."""
     bands = [(shape, single_band(shape)) for shape in SHAPES]
     bands += [(shape, band_table(_spec(axes), shape)) for axes in SPECS for shape in SHAPES]
-    bands += [(shape, band_table(settings.transform, shape)) for _, settings, shape in golden_streams() if np.prod(shape) < 1 << 14]
-    passes = [(shape, _predictor(levels, order, reach)) for levels, reach in PREDICTORS for shape, order in _orders()]
-    passes += [(shape, settings.predictor) for _, settings, shape in golden_streams() if settings.predictor is not None]
+    bands += [
+        (shape, band_table(settings.transform, shape))
+        for _, settings, shape in golden_streams()
+        if np.prod(shape) < 1 << 14
+    ]
+    passes = [
+        (shape, _predictor(levels, order, reach))
+        for levels, reach in PREDICTORS
+        for shape, order in _orders()
+    ]
+    passes += [
+        (shape, settings.predictor)
+        for _, settings, shape in golden_streams()
+        if settings.predictor is not None
+    ]
     with path.open("wb") as file:
 
         def put(array: npt.NDArray[Any]) -> None:
@@ -61,7 +88,12 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
         file.write(struct.pack("<q", len(passes)))
         for shape, predictor in passes:
             rows, taps, _ = pass_arrays(predictor)
-            for part in (np.array(shape, np.int64), np.array(predictor.levels, np.int64), rows, taps):
+            for part in (
+                np.array(shape, np.int64),
+                np.array(predictor.levels, np.int64),
+                rows,
+                taps,
+            ):
                 put(part)
     return bands, passes
 
@@ -83,10 +115,21 @@ def write_seeds(folder: Path, bands: list[Any], passes: list[Any]) -> int:
         weights = np.array(predictor.weights, np.int16).tobytes()
         smooth = np.cumsum(rng.integers(-3, 4, shape), axis=-1)
         for integers in (smooth, rng.integers(-(1 << 20), 1 << 20, shape)):
-            put(PREDICTOR, struct.pack("<H", number), weights, encode_predicted(integers.astype(np.int32), None, predictor)[0])
-    known = {(shape, table.tobytes()): number for number, (shape, table) in reversed(list(enumerate(bands)))}
+            put(
+                PREDICTOR,
+                struct.pack("<H", number),
+                weights,
+                encode_predicted(integers.astype(np.int32), None, predictor)[0],
+            )
+    known = {
+        (shape, table.tobytes()): number
+        for number, (shape, table) in reversed(list(enumerate(bands)))
+    }
     for stream, settings, shape in golden_streams():
-        data, found = coefficients_of(stream), known.get((shape, band_table(settings.transform, shape).tobytes()))
+        data, found = (
+            coefficients_of(stream),
+            known.get((shape, band_table(settings.transform, shape).tobytes())),
+        )
         if data and found is not None:
             put(CODER, struct.pack("<H", found), data)
     for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (4, 8, 8, 24)):
@@ -106,7 +149,11 @@ def golden_streams() -> Iterator[tuple[bytes, Settings, tuple[int, int, int, int
     for path in sorted(GOLDENS.glob("*.fhz")):
         with Container.open(path) as container:
             for array in container.arrays.values():
-                inner = array._metadata.codecs if array._metadata.sharding is None else array._metadata.sharding.codecs
+                inner = (
+                    array._metadata.codecs
+                    if array._metadata.sharding is None
+                    else array._metadata.sharding.codecs
+                )
                 if inner[0]["name"] != TRANSFORM:
                     continue
                 settings = Settings.from_dict(inner[0]["configuration"])
@@ -116,13 +163,21 @@ def golden_streams() -> Iterator[tuple[bytes, Settings, tuple[int, int, int, int
                     assert sharding is not None
                     for offset, size in array._shard_index(sharding, shard):
                         if size:
-                            yield container._source.read(member.data_offset + int(offset), int(size))[:-4], settings, (t, z, y, x)
+                            yield (
+                                container._source.read(member.data_offset + int(offset), int(size))[
+                                    :-4
+                                ],
+                                settings,
+                                (t, z, y, x),
+                            )
 
 
 def coefficients_of(stream: bytes) -> bytes:
     """The section of coded coefficients; nothing where there is none."""
     parts = parts_of(stream)
-    return bytes(parts.body) if parts.coded and not parts.predicted and parts.body is not None else b""
+    return (
+        bytes(parts.body) if parts.coded and not parts.predicted and parts.body is not None else b""
+    )
 
 
 def _spec(axes: tuple[tuple[str, int], ...]) -> TransformSpec:
@@ -131,7 +186,9 @@ def _spec(axes: tuple[tuple[str, int], ...]) -> TransformSpec:
 
 
 def _orders() -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    return [(shape, (3, 2, 1, 0) if number % 2 else (0, 1, 2, 3)) for number, shape in enumerate(SHAPES)]
+    return [
+        (shape, (3, 2, 1, 0) if number % 2 else (0, 1, 2, 3)) for number, shape in enumerate(SHAPES)
+    ]
 
 
 def _predictor(levels: tuple[int, ...], order: tuple[int, ...], reach: int) -> Predictor:

@@ -24,7 +24,9 @@ def test_the_native_decoders_under_sanitizers(folder):
         found = run.fuzz(folder, folder / "crashes", seconds=SECONDS, processes=1, optimise="-O0")
     except run.CannotBuild as error:
         pytest.skip(str(error))
-    assert not found.crashes, found.crashes[0].with_suffix(".txt").read_text(encoding="utf-8")[:4000]
+    assert not found.crashes, (
+        found.crashes[0].with_suffix(".txt").read_text(encoding="utf-8")[:4000]
+    )
     # All seeds, which reach most of what there is, and more.
     assert found.executions > len(list((folder / "corpus").iterdir()))
     assert found.edges > 3000
@@ -35,14 +37,22 @@ def test_an_overrun_is_found(folder, tmp_path, monkeypatch):
     source = (run.NATIVE / "quantise.cpp").read_text(encoding="utf-8")
     loop = "for (std::int64_t i = 0; i < count; i++) {\n        const std::int32_t q"
     assert source.count(loop) == 1
-    (tmp_path / "quantise.cpp").write_text(source.replace(loop, loop.replace("i < count", "i <= count")), encoding="utf-8")
-    (tmp_path / "core.hpp").write_text((run.NATIVE / "core.hpp").read_text(encoding="utf-8"), encoding="utf-8")
+    (tmp_path / "quantise.cpp").write_text(
+        source.replace(loop, loop.replace("i < count", "i <= count")), encoding="utf-8"
+    )
+    (tmp_path / "core.hpp").write_text(
+        (run.NATIVE / "core.hpp").read_text(encoding="utf-8"), encoding="utf-8"
+    )
     monkeypatch.setattr(run, "NATIVE", tmp_path)
     monkeypatch.setattr(run, "SOURCES", ("quantise",))
     monkeypatch.setattr(run, "TARGETS", (run.HERE / "overrun.cpp",))
     try:
-        found = run.fuzz(folder / "overrun", tmp_path / "crashes", seconds=2.0, processes=1, optimise="-O0")
+        found = run.fuzz(
+            folder / "overrun", tmp_path / "crashes", seconds=2.0, processes=1, optimise="-O0"
+        )
     except run.CannotBuild as error:
         pytest.skip(str(error))
     assert found.crashes
-    assert "heap-buffer-overflow" in found.crashes[0].with_suffix(".txt").read_text(encoding="utf-8")
+    assert "heap-buffer-overflow" in found.crashes[0].with_suffix(".txt").read_text(
+        encoding="utf-8"
+    )
