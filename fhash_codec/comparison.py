@@ -6,10 +6,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from fhash_codec.metrics import measure_quality
+from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.measure.metrics import measure_quality
 from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
-from fhash_codec.selection import Source, opened
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
@@ -22,7 +22,7 @@ def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> di
     Raises InputError if the shapes differ, DamagedFileError for a damaged container.
     """
     begun = time.perf_counter()
-    with opened(source) as series, open_volume(path) as volume:
+    with open_source(source) as series, open_volume(path) as volume:
         if series.shape != volume.shape:
             raise InputError(
                 f"{series.source} has shape {series.shape}, {path} has {volume.shape} in (t, z, y, x); give the same --var, --axes, --t"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from typing import Any
 
 from fhash_codec.volume import Volume
@@ -45,12 +44,6 @@ def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[s
     }
 
 
-MOST_POINTS = 24
-"""Of a training's history in a file."""
-DIGITS, STEP_DIGITS = 6, 5
-"""Significant digits of figures in a file: over all steps, of one step."""
-
-
 def curve(
     history: Sequence[Mapping[str, Any]] | Mapping[str, Sequence[Any]],
 ) -> list[dict[str, Any]]:
@@ -60,48 +53,3 @@ def curve(
             dict(zip(history, point, strict=True)) for point in zip(*history.values(), strict=True)
         ]
     return [{"seconds": None, "psnr": None, **point} for point in history]
-
-
-def brief_quality(quality: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures (`metrics.Quality` as JSON values) as a header has them: rounded to the worse side, those of the steps as lists."""
-    brief = {
-        name: _figure(name, value, DIGITS) if isinstance(value, float) else value
-        for name, value in quality.items()
-    }
-    steps = quality["per_step"]
-    brief["per_step"] = {
-        name: [_figure(name, step[name], STEP_DIGITS) for step in steps]
-        for name in ("psnr", "rmse", "max_abs_error")
-    }
-    return brief
-
-
-def brief_history(
-    history: Sequence[Mapping[str, float | None]], *, timings: bool
-) -> list[dict[str, float]]:
-    """The history of a training as a header has it: at most 24 points, the last among them; milliseconds and hundredths of a dB."""
-    kept = min(len(history), MOST_POINTS)
-    chosen = [history[(number + 1) * len(history) // kept - 1] for number in range(kept)]
-    points = [
-        {
-            "seconds": _rounded(point["seconds"], 3) if timings else None,
-            "epoch": point["epoch"],
-            "psnr": _rounded(point["psnr"], 2),
-        }
-        for point in chosen
-    ]
-    return [{name: value for name, value in point.items() if value is not None} for point in points]
-
-
-def _figure(name: str, value: float | None, digits: int) -> float | None:
-    """A figure with so many significant digits, never better than it was."""
-    rounding = ROUND_FLOOR if name.startswith(("psnr", "ssim")) else ROUND_CEILING
-    return (
-        None
-        if value is None
-        else float(Context(prec=digits, rounding=rounding).create_decimal_from_float(value))
-    )
-
-
-def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits)

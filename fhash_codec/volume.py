@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset import Box, crop
-from fhash_codec.key_frames import KeyTimes, strictly_monotonic, time_axis
-from fhash_codec.normalise import ValueRange
+from fhash_codec.coreset.boxes import Box, crop
+from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume_model import open_model
 from fhash_formats.container import Container

@@ -7,9 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.decoder import Box
-from fhash_codec.lattice import Lattice
-from fhash_codec.paper import PaperModel
+from fhash_codec.compact.model import CompactModel
+from fhash_codec.paper.model import PaperModel
+from fhash_codec.paper.regions import Box
 from fhash_formats.container import Container
 
 Positions = npt.NDArray[np.float64]
@@ -54,7 +54,7 @@ class VolumeModel(Protocol):
 def open_model(container: Container) -> VolumeModel:
     """The model of a container; nothing is read yet."""
     return (
-        Lattice(container.arrays)
+        CompactModel(container.arrays)
         if container.header["model"]["profile"] == "compact"
         else PaperModel(container)
     )

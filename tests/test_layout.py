@@ -27,7 +27,8 @@ ALLOWED = {
     "fhash_cli": {"fhash_cli", "fhash_codec", "fhash_formats"},
 }
 TORCH_FILES = re.compile(
-    r"(head_training|model|tesseract|train)\.py|(engines|bench)/.+\.py|render/torch_arrays\.py"
+    r"paper/(fhash|tesseract)\.py|paper/(training|engines)/.+\.py|training/.+\.py|bench/.+\.py"
+    r"|compact/choices/head_training\.py|rendering/task/torch_arrays\.py"
 )
 """Modules of fhash_codec in which tensors are trained or evaluated, or marched through, or that start a training."""
 SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy")

@@ -31,7 +31,7 @@ def check_writable(
     Raises InputError throughout (exit code 2), since nothing has failed yet but the command as it was written.
     """
     from fhash_formats import save_check
-    from fhash_formats.writers.atomic import check_output
+    from fhash_formats.support.atomic import check_output
 
     try:
         (save_check if region else check_output)(Path(path), force, sources=sources)

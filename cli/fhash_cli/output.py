@@ -12,8 +12,8 @@ from typing import Any, TextIO
 
 import click
 
-from fhash_formats.attributes import plain_text
 from fhash_formats.errors import FhashError, OutputError
+from fhash_formats.support.attributes import plain_text
 
 NO_MEMORY = ("can't allocate memory", "memory allocation failed")
 QUIET_SECONDS = 2.0

@@ -16,7 +16,7 @@ from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     from fhash_codec import Volume
-    from fhash_codec.render.scene import Scene
+    from fhash_codec.rendering.scene.scene import Scene
 
 __all__ = ["SceneOptions", "scene_options"]
 
@@ -93,7 +93,7 @@ class SceneOptions:
 
     def scene(self, volume: Volume) -> Scene:
         """The scene; raises InputError for what it may not hold."""
-        from fhash_codec.render.scene import Scene
+        from fhash_codec.rendering.scene.scene import Scene
 
         base = Scene() if self.file is None else Scene.load(self.file)
         values = base.to_dict()
@@ -280,7 +280,7 @@ def _put(values: dict[str, Any], place: str, value: Any) -> None:
 
 def _effect(name: str) -> str:
     """The field of Effects that a word stands for."""
-    from fhash_codec.render.scene import Effects
+    from fhash_codec.rendering.scene.scene import Effects
 
     known = [
         field.name

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 import time
 from collections.abc import Sequence
 from math import prod
@@ -13,14 +11,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from fhash_codec.architecture import Architecture
+from fhash_codec.bench.machine import machine
 from fhash_codec.config import ENGINES, EncodeConfig
-from fhash_codec.coreset import Coreset
-from fhash_codec.engines import choose_device, make_engine
-from fhash_codec.engines.threads import threads_for
+from fhash_codec.coreset.bricks import Coreset
+from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.selection import select
+from fhash_codec.paper.training.train import Plan, plan_training, probe_psnr
 from fhash_codec.progress import Progress, silent
-from fhash_codec.selection import Source, opened, select
-from fhash_codec.train import Plan, plan_training, probe_psnr
+from fhash_codec.training.devices import choose_device
+from fhash_codec.training.threads import threads_for
 from fhash_formats.errors import InputError
 
 TURNS = 3
@@ -50,7 +51,7 @@ def bench_train(
             f"seconds is {seconds:g} for {len(engines)} engines; a positive time and at least one engine are needed"
         )
     device = choose_device(config.device)
-    with opened(source) as series:
+    with open_source(source) as series:
         selected = select(series, config, progress)
         coreset, architecture = selected.coreset, selected.architecture
         name = f"{series.source} {series.name}"
@@ -176,14 +177,3 @@ def matrix_product_rate(device: torch.device, size: int = 1536) -> float:
         float((a @ b)[0, 0])
         best = min(best, time.perf_counter() - begun)
     return 2 * size**3 / best
-
-
-def machine(device: torch.device) -> dict[str, Any]:
-    """What the figures were taken on."""
-    return {
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
-        "processor": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
-    }

@@ -12,24 +12,27 @@ from typing import Any
 
 import numpy as np
 
-from fhash_codec.compact import heads, prediction, surroundings
-from fhash_codec.compact.blocks import Blocks
-from fhash_codec.compact.choice import choose_transform, refit, usual_transform
-from fhash_codec.compact.foresight import foreseen_size, foreseen_step, tile_costs
-from fhash_codec.compact.masks import mask_levels
-from fhash_codec.compact.sample import OFFSETS, Outcome, Sample, Way
-from fhash_codec.compact.steps import Goal, solve, with_step
-from fhash_codec.compact.tiling import even_tile, first_tile, parse_tile, tile_for
+from fhash_codec.compact.choices import fillings as surroundings
+from fhash_codec.compact.choices import head as heads
+from fhash_codec.compact.choices import predictor as prediction
+from fhash_codec.compact.choices.estimate import foreseen_size, foreseen_step, tile_costs
+from fhash_codec.compact.choices.mask import mask_levels
+from fhash_codec.compact.choices.step import solve, with_step
+from fhash_codec.compact.choices.transform import choose_transform, refit, usual_transform
+from fhash_codec.compact.goal import Goal
+from fhash_codec.compact.tiles.blocks import Blocks
+from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
+from fhash_codec.compact.tiles.sample import Sample
+from fhash_codec.compact.tiles.tiling import even_tile, first_tile, parse_tile, tile_for
 from fhash_codec.config import EncodeConfig
-from fhash_codec.features import Feature
-from fhash_codec.normalise import ValueRange
+from fhash_codec.coreset.features import Feature
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
-from fhash_formats.transform.mask_levels import MaskLevels
-from fhash_formats.transform.settings import Settings
-from fhash_formats.transform.tile import Shape
+from fhash_formats.transform.entropy.mask_levels import MaskLevels
+from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.settings import TileSettings
 
-DEFAULT_PSNR = 50.0
-LARGEST_VALUE, SMALLEST_RANGE = 1e145, 1e-145
+MAX_VALUE, MIN_RANGE = 1e145, 1e-145
 """Squared errors of larger values or of a smaller range do not fit float64."""
 LOOK_VERTICES, TRIAL_VERTICES, SAMPLE_VERTICES = 1 << 18, 3 << 20, 6 << 20
 """Of the tiles that are coded for an idea of the size, for each trial of a transform, and for the search of the step."""
@@ -37,7 +40,7 @@ ALL_VERTICES = 12 << 20
 """Of a series for which that search has all tiles."""
 PRICE_OF_TILES = 1.3
 """By what factor small tiles may make a file larger."""
-MOST_TILE_VERTICES, SMALL_FILE_BYTES = 12 << 20, 60_000
+MAX_TILE_VERTICES, SMALL_FILE_BYTES = 12 << 20, 60_000
 """Of a tile chosen for its bytes alone; and only a file that is read in a moment as a whole may have such tiles."""
 LONGEST_TILE, PRICE_OF_STEPS = 32, 0.97
 """Steps of a tile that is chosen to have all of them, and what part of the bytes is worth that a step alone takes longer to decode."""
@@ -50,24 +53,12 @@ class Planned:
     """Settings and tiles for the whole series. gains: what each step of the way bought, history: of the training."""
 
     blocks: Blocks
-    settings: Settings
-    way: Way
+    settings: TileSettings
+    coding: Coding
     goal: Goal
     sample: Sample | None = None
     gains: list[dict[str, Any]] = field(default_factory=list)
     history: list[dict[str, float | None]] = field(default_factory=list)
-
-
-def goal_of(config: EncodeConfig, value_range: ValueRange, raw_bytes: int, overhead: int) -> Goal:
-    """The one promise of the settings (that there is no other, `EncodeConfig` has seen to). overhead: see `Goal`."""
-    data_range = value_range.high - value_range.low
-    if config.max_error is not None:
-        return Goal(error=config.max_error, data_range=data_range)
-    if config.max_error_rel is not None:
-        return Goal(error=config.max_error_rel * data_range, data_range=data_range)
-    if config.ratio is not None:
-        return Goal(size=raw_bytes / config.ratio, data_range=data_range, overhead=overhead)
-    return Goal(psnr=DEFAULT_PSNR if config.psnr is None else config.psnr, data_range=data_range)
 
 
 def plan(
@@ -85,8 +76,8 @@ def plan(
     fixed = parse_tile(config.tile, blocks.shape)
     first = fixed or first_tile(blocks.shape)
     if (
-        max(abs(value_range.low), abs(value_range.high)) > LARGEST_VALUE
-        or 0 < goal.data_range < SMALLEST_RANGE
+        max(abs(value_range.low), abs(value_range.high)) > MAX_VALUE
+        or 0 < goal.data_range < MIN_RANGE
     ):
         return _exact(blocks, first, value_range, goal)
     gains: list[dict[str, Any]] = []
@@ -100,12 +91,12 @@ def plan(
             }
         )
 
-    def sampled(tiled: Blocks, settings: Settings, most: int) -> Sample:
+    def sampled(tiled: Blocks, settings: TileSettings, most: int) -> Sample:
         # What a tile costs does not depend much on the transform.
         usual = replace(settings, transform=usual_transform(tiled.tile))
         return Sample(tiled, most, workers, tile_costs(tiled, usual, workers)).filled(usual, 1)
 
-    def masked(settings: Settings, error: float) -> Settings:
+    def masked(settings: TileSettings, error: float) -> TileSettings:
         return (
             settings
             if blocks.complete
@@ -114,7 +105,7 @@ def plan(
 
     progress("planning", 0, 4, "")
     thorough = 8 if config.effort >= 4 else 4 if config.effort > 1 else 1
-    way = Way(filled=blocks.complete, density=0)
+    coding = Coding(filled=blocks.complete, density=0)
     tiled = blocks.retile(first)
     settings = _first(Sample(tiled, LOOK_VERTICES, workers), value_range, goal)
     if (
@@ -136,13 +127,15 @@ def plan(
             )
         settings = replace(settings, transform=usual_transform(tiled.tile))
         step = foreseen_step(
-            tiled, settings, way, psnr=goal.psnr, data_range=goal.data_range, workers=workers
+            tiled, settings, coding, psnr=goal.psnr, data_range=goal.data_range, workers=workers
         )
         progress("planning", 4, 4, "")
-        return Planned(blocks=tiled, settings=with_step(settings, step, goal), way=way, goal=goal)
+        return Planned(
+            blocks=tiled, settings=with_step(settings, step, goal), coding=coding, goal=goal
+        )
     sample = sampled(tiled, settings, LOOK_VERTICES)
     settings = masked(settings, goal.expected)
-    settings, outcome = solve(sample, settings, way, goal, tries=2)
+    settings, outcome = solve(sample, settings, coding, goal, tries=2)
     note("start", outcome)
     if fixed is None:
         tiled = blocks.retile(tile_for(blocks.shape, outcome.size))
@@ -150,40 +143,40 @@ def plan(
     progress("planning", 1, 4, "")
     sample = sampled(tiled, settings, TRIAL_VERTICES)
     if config.effort > 1:
-        settings, outcome = _tried(sample, settings, way, goal)
+        settings, outcome = _tried(sample, settings, coding, goal)
         if fixed is None:
             for tile in _other_tiles(tiled, outcome.size):
                 other = sampled(
                     blocks.retile(tile),
                     settings,
-                    MOST_TILE_VERTICES if tiled.complete else TRIAL_VERTICES,
+                    MAX_TILE_VERTICES if tiled.complete else TRIAL_VERTICES,
                 )
-                changed, found = _tried(other, settings, way, goal, quick=True)
+                changed, found = _tried(other, settings, coding, goal, quick=True)
                 if found.size < outcome.size * (
                     1 / PRICE_OF_TILES if prod(tile[1:]) > prod(tiled.tile[1:]) else PRICE_OF_STEPS
                 ):
                     sample, settings, outcome = other, changed, found
             if not tiled.complete and sample.blocks.tile != tiled.tile:
-                settings, outcome = _tried(sample, settings, way, goal)
+                settings, outcome = _tried(sample, settings, coding, goal)
         sample = sample.wider(
             ALL_VERTICES if prod(blocks.shape) <= ALL_VERTICES else SAMPLE_VERTICES
         )
     progress("planning", 2, 4, "")
-    way = replace(
-        way,
+    coding = replace(
+        coding,
         passes=2 if config.effort > 2 else 1,
         rounds=0 if config.effort == 1 else 2 if config.effort < 7 else 4,
     )
     if not blocks.complete:
-        way = replace(way, rounds=2, filled=True)
+        coding = replace(coding, rounds=2, filled=True)
         sample = (
-            surroundings.race(sample, settings, way, goal, thorough)
+            surroundings.race(sample, settings, coding, goal, thorough)
             if config.effort > 1
             else sample.filled(settings, thorough)
         )
     outcomes: list[Outcome] = []
     settings, outcome = solve(
-        sample, settings, way, goal, tries=3 if config.effort == 1 else 5, tried=outcomes
+        sample, settings, coding, goal, tries=3 if config.effort == 1 else 5, tried=outcomes
     )
     if goal.psnr is None and outcome.count:
         settings = masked(settings, math.sqrt(outcome.squares / outcome.count))
@@ -193,7 +186,7 @@ def plan(
         if refitted is settings:
             break
         before = settings.step
-        settings, outcome = solve(sample, refitted, way, goal, tried=outcomes)
+        settings, outcome = solve(sample, refitted, coding, goal, tried=outcomes)
         if abs(math.log(settings.step / before)) < 0.1:
             break
     if config.effort > 1:
@@ -207,8 +200,8 @@ def plan(
             sample,
             settings,
             outcome,
-            way,
-            lambda now, tried: solve(sample, now, way, goal, tries=4, tried=tried),
+            coding,
+            lambda now, tried: solve(sample, now, coding, goal, tries=4, tried=tried),
             outcomes,
             strict=goal.error is not None,
             data_range=goal.data_range,
@@ -226,12 +219,12 @@ def plan(
     progress("planning", 4, 4, "")
     if not blocks.complete and not (sample.complete and blocks.dtype.kind == "f"):
         # Whole numbers where nothing counts would cost more than what they were rounded from.
-        way = replace(way, filled=False, density=thorough)
+        coding = replace(coding, filled=False, density=thorough)
     return Planned(
         blocks=sample.blocks,
         sample=sample,
         settings=settings,
-        way=goal.bounded(way),
+        coding=goal.bounded(coding),
         goal=goal,
         gains=gains,
         history=history,
@@ -240,7 +233,7 @@ def plan(
 
 def _exact(blocks: Blocks, tile: Shape, value_range: ValueRange, goal: Goal) -> Planned:
     """Tiles without loss, for values whose squares overflow."""
-    settings = Settings(
+    settings = TileSettings(
         transform=usual_transform(tile),
         step=1.0,
         center=0.0,
@@ -250,17 +243,19 @@ def _exact(blocks: Blocks, tile: Shape, value_range: ValueRange, goal: Goal) -> 
         double=True,
     )
     settings = settings if blocks.complete else replace(settings, mask=MaskLevels())
-    return Planned(blocks=blocks.retile(tile), settings=settings, way=Way(exact=True), goal=goal)
+    return Planned(
+        blocks=blocks.retile(tile), settings=settings, coding=Coding(exact=True), goal=goal
+    )
 
 
 def _tried(
-    sample: Sample, settings: Settings, way: Way, goal: Goal, *, quick: bool = False
-) -> tuple[Settings, Outcome]:
+    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal, *, quick: bool = False
+) -> tuple[TileSettings, Outcome]:
     """The transform by trial, and what it gives where the promise is kept, so that tiles are compared at equal quality."""
     return solve(
         sample,
-        choose_transform(sample, settings, goal.bounded(way), quick=quick)[0],
-        way,
+        choose_transform(sample, settings, goal.bounded(coding), quick=quick)[0],
+        coding,
         goal,
         tries=3 if quick else 4,
     )
@@ -283,11 +278,11 @@ def _other_tiles(tiled: Blocks, size: int) -> list[Shape]:
     return [
         tile
         for tile in dict.fromkeys(found)
-        if prod(tile) <= MOST_TILE_VERTICES and tile != tiled.tile
+        if prod(tile) <= MAX_TILE_VERTICES and tile != tiled.tile
     ]
 
 
-def _first(sample: Sample, value_range: ValueRange, goal: Goal) -> Settings:
+def _first(sample: Sample, value_range: ValueRange, goal: Goal) -> TileSettings:
     """Settings to begin with: a guess of the step."""
     if goal.psnr is not None:
         step = 4 * goal.expected
@@ -303,7 +298,7 @@ def _first(sample: Sample, value_range: ValueRange, goal: Goal) -> Settings:
         ]
     mean = float(np.average(means, weights=sample.weights))
     center = mean if math.isfinite(mean) else center
-    settings = Settings(
+    settings = TileSettings(
         transform=usual_transform(sample.blocks.tile),
         step=1.0,
         center=float(np.float32(center)) if abs(center) < 3e38 else center,

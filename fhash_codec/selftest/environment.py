@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from importlib.metadata import version
 
 from fhash_formats import native
-from fhash_formats.container.parallel import usable_threads
+from fhash_formats.support.threads import usable_threads
 
 __all__ = ["environment", "surroundings"]
 
 
 def surroundings() -> str:
     """Versions, machine and what is used of it, in a line. Loads torch."""
-    from fhash_codec.engines import choose_device
+    from fhash_codec.training.devices import choose_device
 
     parts = [
         f"fhash {version('fhash')}",

@@ -14,7 +14,7 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.selftest.case import Case
 from fhash_codec.selftest.environment import environment
 from fhash_codec.selftest.results import CaseResult, Summary
-from fhash_formats.container.parallel import usable_threads
+from fhash_formats.support.threads import usable_threads
 
 __all__ = ["LONGEST", "run_cases"]
 
@@ -124,7 +124,7 @@ def _broken(case: Case, line: str) -> CaseResult:
 
 def _serve(pipe: Connection, everything: bool) -> None:
     """Run the cases whose names come in, until the other end closes."""
-    from fhash_codec.selftest.catalogue import chosen
+    from fhash_codec.selftest.cases.catalogue import chosen
     from fhash_codec.selftest.runner import run_case
 
     try:

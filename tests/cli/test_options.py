@@ -8,7 +8,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from fhash_cli.encode import command as encode
+from fhash_cli.commands.encode import command as encode
 from fhash_cli.options import IntervalsType, RealRange, SliceType, parse_slice
 from fhash_codec.config import EncodeConfig
 

@@ -21,9 +21,10 @@ from fhash_codec import (
     OutputExistsError,
     QualityError,
 )
-from fhash_codec.engines.slab import SlabEngine
-from fhash_codec.model import FHash
-from fhash_codec.report import brief_history, brief_quality, curve
+from fhash_codec.header import brief_history, brief_quality
+from fhash_codec.paper.engines.slab import SlabEngine
+from fhash_codec.paper.fhash import FHash
+from fhash_codec.report import curve
 from fhash_formats.container import Container
 from fhash_formats.errors import TrainingError
 from fhash_formats.series import ArraySeries
@@ -202,7 +203,7 @@ def test_the_file_decodes_to_what_the_torch_model_gives(tmp_path):
     )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         network = volume._model.network
-        from fhash_codec.architecture import Architecture
+        from fhash_codec.paper.architecture import Architecture
 
         architecture = Architecture.for_box((8, 10, 18), 3, width=16)
         assert network.levels == architecture.levels
@@ -306,7 +307,7 @@ def test_going_on_after_a_restart_gives_the_same_bytes(tmp_path):
 
 @pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
 def test_a_training_that_diverges_at_every_rate_writes_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr("fhash_codec.train.DIVERGED", 0.0)
+    monkeypatch.setattr("fhash_codec.paper.training.train.DIVERGED", 0.0)
     with pytest.raises(TrainingError, match="diverged"):
         fhash_codec.encode(field(), tmp_path / "a.fhz", replace(WILD, learning_rate=0.01))
     assert not list(tmp_path.iterdir())
@@ -319,7 +320,7 @@ def test_numbers_that_are_not_finite_are_never_written(tmp_path, monkeypatch):
             found.coarse[-1] = float("nan")
             return found
 
-    monkeypatch.setattr("fhash_codec.engines.slab.SlabEngine", Spoilt)
+    monkeypatch.setattr("fhash_codec.paper.engines.slab.SlabEngine", Spoilt)
     with pytest.raises(TrainingError, match="not finite"):
         fhash_codec.encode(field(), tmp_path / "a.fhz", replace(WILD, learning_rate=0.01))
     assert not list(tmp_path.iterdir())
@@ -488,7 +489,7 @@ def test_a_promise_cannot_hold_where_the_psnr_is_unknown(tmp_path):
 
 
 def test_a_failure_after_the_training_leaves_its_checkpoint(tmp_path, monkeypatch):
-    monkeypatch.setattr("fhash_codec.trained.KEEP_SECONDS", 0.0)
+    monkeypatch.setattr("fhash_codec.paper.training.fit.KEEP_SECONDS", 0.0)
     config = EncodeConfig(profile="paper", epochs=2, width=16, timings=False)
     fhash_codec.encode(field(), tmp_path / "whole.fhz", config)
     trained = []
@@ -513,8 +514,8 @@ def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_training(tmp_path
     def full(*args):
         raise OutputError("no space left")
 
-    monkeypatch.setattr("fhash_codec.trained.KEEP_SECONDS", 0.0)
-    monkeypatch.setattr("fhash_codec.checkpoint.save_checkpoint", full)
+    monkeypatch.setattr("fhash_codec.paper.training.fit.KEEP_SECONDS", 0.0)
+    monkeypatch.setattr("fhash_codec.paper.training.checkpoint.save_checkpoint", full)
     with pytest.warns(fhash_codec.FhashWarning, match="no checkpoint: no space left"):
         fhash_codec.encode(field(), tmp_path / "a.fhz", QUICK)
     assert decoded(tmp_path / "a.fhz").shape == field().shape

@@ -9,7 +9,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, MissingInputError, RegionError
-from fhash_codec.occupancy import pack
+from fhash_codec.coreset.occupancy import pack
 from fhash_codec.volume import decoded_type
 from fhash_formats.container import ContainerWriter
 from fhash_formats.series import ArraySeries, Coordinate

@@ -9,8 +9,8 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError
-from fhash_codec.lattice import Lattice
-from fhash_codec.paper import PaperModel
+from fhash_codec.compact.model import CompactModel
+from fhash_codec.paper.model import PaperModel
 from fhash_codec.volume_model import VolumeModel, open_model
 from fhash_formats.container import Container
 
@@ -39,7 +39,7 @@ def model(request, tmp_path_factory):
 
 def test_each_profile_has_its_model(model):
     name, found = model
-    assert isinstance(found, Lattice if name == "compact" else PaperModel)
+    assert isinstance(found, CompactModel if name == "compact" else PaperModel)
     assert tuple(found.chunks) == ((2, 3, 4, 4) if name == "compact" else (1, 7, 8, 9))
     for method, wanted in inspect.getmembers(VolumeModel, inspect.isfunction):
         if not method.startswith("_"):

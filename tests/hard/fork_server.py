@@ -14,18 +14,18 @@ from typing import Any
 
 import injections
 
-import fhash_cli.animation
-import fhash_cli.decode
-import fhash_cli.encode
-import fhash_cli.render  # noqa: F401 - imported for the forks
+import fhash_cli.animation_options
+import fhash_cli.commands.decode
+import fhash_cli.commands.encode
+import fhash_cli.commands.render  # noqa: F401 - imported for the forks
 from fhash_cli.main import main
 
 MODULES = (
     "fhash_codec",
     "fhash_codec.encoding",
-    "fhash_codec.compact.encoder",
+    "fhash_codec.compact.tiles_to_promise",
     "fhash_codec.isosurface",
-    "fhash_codec.render.render",
+    "fhash_codec.rendering.renderer",
 )
 OTHERS = (
     "h5py",
@@ -37,7 +37,12 @@ OTHERS = (
     "fhash_formats.container",
     "scipy.special",
 )
-TRAINING = ("torch", "fhash_codec.engines.portable", "fhash_codec.checkpoint", "fhash_codec.train")
+TRAINING = (
+    "torch",
+    "fhash_codec.paper.engines.portable",
+    "fhash_codec.paper.training.checkpoint",
+    "fhash_codec.paper.training.train",
+)
 
 
 def run(words: list[str], log: str, inject: list[list[Any]]) -> None:

@@ -119,9 +119,11 @@ def eager_checkpoints() -> None:
     """A training saves its checkpoint as often as it may."""
     import functools
 
-    import fhash_codec.train
+    import fhash_codec.paper.training.train
 
-    fhash_codec.train.train = functools.partial(fhash_codec.train.train, save_seconds=0.0)
+    fhash_codec.paper.training.train.train = functools.partial(
+        fhash_codec.paper.training.train.train, save_seconds=0.0
+    )
 
 
 def change_at(stage: str, done: int, path: str, how: str) -> None:

@@ -18,20 +18,14 @@ from numcodecs.zstd import compress, decompress
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.sharding import Sharding, pack_index, parse_index
 from fhash_formats.errors import FhashError
-from fhash_formats.transform.bands import band_table, single_band
-from fhash_formats.transform.coder import decode_integers
-from fhash_formats.transform.decoding import linear_values, predicted_values, transform_for
-from fhash_formats.transform.mask import decode_mask
-from fhash_formats.transform.predict import decode_predicted
-from fhash_formats.transform.sections import (
-    MISSING,
-    OWN,
-    RESIDUAL,
-    little,
-    parts_of,
-    section,
-)
-from fhash_formats.transform.settings import Settings
+from fhash_formats.transform.axes.bands import band_table
+from fhash_formats.transform.entropy.coder import decode_integers
+from fhash_formats.transform.entropy.mask import decode_mask
+from fhash_formats.transform.entropy.predict import decode_predicted
+from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform.tile.decoding import linear_values, predicted_values, transform_for
+from fhash_formats.transform.tile.sections import MISSING, OWN, RESIDUAL, little, parts_of, section
+from fhash_formats.transform.tile.settings import TileSettings
 
 Change = Callable[[random.Random, bytes], bytes]
 
@@ -191,13 +185,13 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
     _, document, member, data = chosen(chance, parts, True)
     sharding, present, chunks = inner_chunks(document, member, data)
     at = chance.randrange(len(chunks))
-    settings, shape = Settings.from_dict(configuration_of(document)), sharding.chunk_shape
+    settings, shape = TileSettings.from_dict(configuration_of(document)), sharding.chunk_shape
     chunks[at] = with_crc(_restreamed(chance, chunks[at][:-4], settings, shape))
     return replaced(parts, {member: shard_of(sharding, present, chunks)})
 
 
 def _restreamed(
-    chance: random.Random, stream: bytes, settings: Settings, shape: tuple[int, ...]
+    chance: random.Random, stream: bytes, settings: TileSettings, shape: tuple[int, ...]
 ) -> bytes:
     parts = parts_of(stream)
     flags, sections = parts.flags, parts.sections()
@@ -233,7 +227,7 @@ def _restreamed(
 
 
 def _mask_section(
-    coded: bytes, integers: Any, settings: Settings, shape: tuple[int, ...], predicted: bool
+    coded: bytes, integers: Any, settings: TileSettings, shape: tuple[int, ...], predicted: bool
 ) -> bytes:
     """A coded mask behind the digest of what it decodes to."""
     assert settings.mask is not None

@@ -30,11 +30,11 @@ from mutated_payload import (
 
 from fhash_formats.container.array import DTYPES
 from fhash_formats.container.sharding import Sharding
-from fhash_formats.transform.basis import Basis
-from fhash_formats.transform.coder import encode_block
-from fhash_formats.transform.head import Head, Layer, layer_inputs
-from fhash_formats.transform.predictor import passes_of
-from fhash_formats.transform.sections import EMPTY, EXACT, FORMAT, MASKED, OWN, PREDICTED
+from fhash_formats.transform.axes.basis import Basis
+from fhash_formats.transform.entropy.coder import encode_block
+from fhash_formats.transform.entropy.predictor import passes_of
+from fhash_formats.transform.head.head import Layer, NeighbourHead, layer_inputs
+from fhash_formats.transform.tile.sections import EMPTY, EXACT, FORMAT, MASKED, OWN, PREDICTED
 
 
 def _flags(chance: random.Random, parts: Parts) -> Parts:
@@ -161,7 +161,9 @@ def _head(chance: random.Random) -> str:
         for value in chance.choices((-3.4e38, -1.0, 0.0, 1e-45, 1.0, 2.0, 3.4e38), k=2)
     )
     sigma = float(np.float32(chance.choice((2.0**-100, 1e-6, 1.0, 2.0**100))))
-    packed = Head(layers=layers, sigma=sigma, low=ends[0], high=ends[1], cross=cross).to_bytes()
+    packed = NeighbourHead(
+        layers=layers, sigma=sigma, low=ends[0], high=ends[1], cross=cross
+    ).to_bytes()
     return base64.b64encode(damaged(chance, packed) if chance.random() < 0.3 else packed).decode()
 
 

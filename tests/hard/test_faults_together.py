@@ -158,21 +158,21 @@ def test_a_source_that_may_not_be_read_is_said_in_one_line(
 
 
 PLACES = [
-    ("encode compact", "fhash_codec.scan", "range_and_sum"),
-    ("encode compact", "fhash_formats.transform.tile", "encode_integers"),
-    ("encode compact", "fhash_codec.compact.encoder", "code"),
+    ("encode compact", "fhash_codec.coreset.scan", "range_and_sum"),
+    ("encode compact", "fhash_formats.transform.tile.encoding", "encode_integers"),
+    ("encode compact", "fhash_codec.compact.tiles_to_promise", "code"),
     ("encode compact", "fhash_codec.encoding", "measure"),
     ("encode compact", "fhash_formats.container.writer", "ContainerWriter._tail"),
-    ("encode paper", "fhash_codec.checkpoint", "load_checkpoint"),
-    ("encode paper", "fhash_codec.train", "train"),
+    ("encode paper", "fhash_codec.paper.training.checkpoint", "load_checkpoint"),
+    ("encode paper", "fhash_codec.paper.training.train", "train"),
     ("encode paper", "fhash_codec.encoding", "write_tables"),
     ("decode h5", "fhash_codec.volume", "Volume.read"),
     ("decode h5", "fhash_formats.writers.hdf5", "_create"),
-    ("decode zarr", "fhash_formats.writers.zarr_", "_flush"),
+    ("decode zarr", "fhash_formats.writers.zarr_store", "_flush"),
     ("decode nc", "fhash_formats.container.reader", "Container.open"),
     ("decode vtp", "fhash_codec.isosurface", "isosurface"),
-    ("render png", "fhash_codec.render.render", "Renderer.render"),
-    ("render gif", "fhash_codec.render.image", "Image.to_uint8"),
+    ("render png", "fhash_codec.rendering.renderer", "Renderer.render"),
+    ("render gif", "fhash_codec.rendering.picture.image", "Image.to_uint8"),
 ]
 
 

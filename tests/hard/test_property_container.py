@@ -64,11 +64,11 @@ def places() -> Iterator[list[Path]]:
 
 def write(path: Path, extra: Any, **changes: Any) -> None:
     """A container with more arrays: `extra` writes them."""
-    from fhash_formats.transform.settings import Settings
-    from fhash_formats.transform.spec import AxisTransform, TransformSpec
+    from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
+    from fhash_formats.transform.tile.settings import TileSettings
 
     spec = TransformSpec(axes=(AxisTransform(kind="none"),) * 4)
-    settings = Settings(transform=spec, step=0.1, center=0.5, low=0.0, high=400.0)
+    settings = TileSettings(transform=spec, step=0.1, center=0.5, low=0.0, high=400.0)
     codecs = [{**TABLE, "configuration": settings.to_dict()}, {"name": "crc32c"}]
     with ContainerWriter(path) as writer:
         writer.add_whole(

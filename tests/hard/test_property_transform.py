@@ -14,19 +14,20 @@ from hypothesis.extra import numpy as hnp
 from properties import FLOATS, Draw, arrays, looking, same
 
 from fhash_formats import native
-from fhash_formats.transform import coder_portable
-from fhash_formats.transform.bands import band_table, single_band
-from fhash_formats.transform.basis import fit_basis
+from fhash_formats.transform.axes.bands import band_table
+from fhash_formats.transform.axes.basis import fit_basis
+from fhash_formats.transform.axes.lifting import Transform
+from fhash_formats.transform.axes.spec import KINDS, WAVELETS, AxisTransform, TransformSpec
 from fhash_formats.transform.chunk import decode_chunk, encode_chunk
-from fhash_formats.transform.coder import (
+from fhash_formats.transform.entropy import coder_portable
+from fhash_formats.transform.entropy.coder import (
     MAX_INTEGER,
     decode_block,
     decode_integers,
     encode_block,
     encode_integers,
 )
-from fhash_formats.transform.lifting import Transform
-from fhash_formats.transform.spec import KINDS, WAVELETS, AxisTransform, TransformSpec
+from fhash_formats.transform.entropy.table import single_band
 
 NATIVE = pytest.mark.skipif(
     native.library() is None, reason="the native library was not built here"

@@ -106,7 +106,7 @@ class PlainCoder:
         return values.astype(self._native, copy=False)
 
 
-MOST_TILE_VERTICES = 1 << 27
+MAX_TILE_VERTICES = 1 << 27
 """Of a tile of the codec `fhash.transform`: decoding takes some 30 bytes for each, and a damaged file may claim any number."""
 
 
@@ -114,9 +114,9 @@ def _transform_coder(
     codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
 ) -> ChunkCoder:
     """The coder of `fhash.transform`; raises DamagedFileError for tiles that are too large."""
-    if prod(shape) > MOST_TILE_VERTICES:
+    if prod(shape) > MAX_TILE_VERTICES:
         raise DamagedFileError(
-            f"tiles of {prod(shape):,} vertices; the limit is {MOST_TILE_VERTICES:,}"
+            f"tiles of {prod(shape):,} vertices; the limit is {MAX_TILE_VERTICES:,}"
         )
     # Containers without it are read without loading it.
     from fhash_formats.transform.stream import TransformCoder

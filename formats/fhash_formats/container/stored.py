@@ -16,11 +16,11 @@ import numpy.typing as npt
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.layout import Member
-from fhash_formats.container.parallel import in_threads
 from fhash_formats.container.sharding import ENTRY_BYTES, Sharding, parse_entry, parse_index
 from fhash_formats.container.source import Source
 from fhash_formats.container.zip_checked import check_member, read_member
 from fhash_formats.errors import DamagedFileError, RegionError
+from fhash_formats.support.threads import in_threads
 
 FEW = 4
 """Entries are read alone where fewer than one in so many of a shard's index is wanted."""

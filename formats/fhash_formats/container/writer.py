@@ -25,8 +25,8 @@ from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.container.source import FileSource, PreviewSource
 from fhash_formats.container.zip_checked import DOCUMENT, MAX_MEMBER, MAX_NAME, NAME
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
-from fhash_formats.slabs import slab_shape
-from fhash_formats.writers.atomic import replacing
+from fhash_formats.support.atomic import replacing
+from fhash_formats.support.slabs import slab_shape
 
 USUAL_CHUNK_BYTES = 2 << 20
 

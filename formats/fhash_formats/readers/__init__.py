@@ -9,8 +9,8 @@ hdf5_tree    the datasets of an HDF5 file     cf_packing    packed values in zar
 flat         values without chunks
 """
 
+from fhash_formats.readers.common.request import RawLayout, parse_shape
 from fhash_formats.readers.masks import Mask, open_mask
 from fhash_formats.readers.registry import REGISTRY, Reader, open_series
-from fhash_formats.readers.request import RawLayout, parse_shape
 
 __all__ = ["REGISTRY", "Mask", "RawLayout", "Reader", "open_mask", "open_series", "parse_shape"]

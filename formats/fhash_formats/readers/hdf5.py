@@ -6,9 +6,9 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from fhash_formats.attributes import json_attributes, plain_text, text_of
-from fhash_formats.readers.failures import Stamp, refusing
-from fhash_formats.readers.hdf5_tree import (
+from fhash_formats.readers.common.failures import Stamp, refusing
+from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.hdf5_tree import (
     column,
     columns,
     datasets,
@@ -18,12 +18,12 @@ from fhash_formats.readers.hdf5_tree import (
     require_sources,
     variables,
 )
-from fhash_formats.readers.lattice import FileSeries
-from fhash_formats.readers.positions import beside, coordinate, usable
-from fhash_formats.readers.request import Request
-from fhash_formats.readers.roles import assign_axes, role_of_coordinate, role_of_name
-from fhash_formats.readers.variables import choose
+from fhash_formats.readers.common.positions import beside, coordinate, usable
+from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate, role_of_name
+from fhash_formats.readers.common.variables import choose
 from fhash_formats.series import Coordinate
+from fhash_formats.support.attributes import json_attributes, plain_text, text_of
 
 PACKED = {"scale_factor": 1, "add_offset": 0, "_FillValue": "NaN", "missing_value": "NaN"}
 """Attributes by which NetCDF files pack values, and with which value they change none."""

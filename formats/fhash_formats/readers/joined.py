@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingInputError
-from fhash_formats.readers.failures import FolderStamp, Stamp
-from fhash_formats.readers.lattice import FileSeries
+from fhash_formats.readers.common.failures import FolderStamp, Stamp
+from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.series import Coordinate, Series, index_coordinate
 
 

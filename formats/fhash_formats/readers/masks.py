@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.registry import open_whole
-from fhash_formats.readers.request import Request
 from fhash_formats.series import Series
 
 

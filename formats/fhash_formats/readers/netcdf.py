@@ -18,18 +18,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.attributes import PACKING, PLUMBING, json_attributes, text_of
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.cf_packing import packing
-from fhash_formats.readers.failures import Stamp, condense, refusing
+from fhash_formats.readers.common.cf_packing import packing
+from fhash_formats.readers.common.failures import Stamp, condense, refusing
+from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.hdf5_tree import require_filters
+from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
+from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate, role_of_name
+from fhash_formats.readers.common.variables import Variable, choose
 from fhash_formats.readers.hdf5 import is_hdf5
-from fhash_formats.readers.hdf5_tree import require_filters
-from fhash_formats.readers.lattice import FileSeries
-from fhash_formats.readers.positions import Column, beside, coordinate, usable
-from fhash_formats.readers.request import Request
-from fhash_formats.readers.roles import assign_axes, role_of_coordinate, role_of_name
-from fhash_formats.readers.variables import Variable, choose
 from fhash_formats.series import AXES, Coordinate
+from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
 if TYPE_CHECKING:
     import xarray as xr

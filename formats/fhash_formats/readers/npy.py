@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.failures import Stamp, refusing
-from fhash_formats.readers.flat import FlatArray
-from fhash_formats.readers.lattice import FileSeries
-from fhash_formats.readers.request import Request
-from fhash_formats.readers.roles import assign_axes
-from fhash_formats.readers.variables import Variable, choose
+from fhash_formats.readers.common.failures import Stamp, refusing
+from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.flat import FlatArray
+from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.roles import assign_axes
+from fhash_formats.readers.common.variables import Variable, choose
 
 MAGIC = b"\x93NUMPY"
 

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.failures import Stamp
-from fhash_formats.readers.flat import FlatArray
-from fhash_formats.readers.lattice import FileSeries
-from fhash_formats.readers.request import ENDIANS, RawLayout, Request, parse_dtype
+from fhash_formats.readers.common.failures import Stamp
+from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.flat import FlatArray
+from fhash_formats.readers.common.request import ENDIANS, RawLayout, Request, parse_dtype
 from fhash_formats.series import AXES
 
 NAME = re.compile(

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from fhash_formats.errors import FhashError, InputError, MissingInputError
 from fhash_formats.readers import hdf5, netcdf, npy, raw, zarr_store
-from fhash_formats.readers.failures import condense, refusing
+from fhash_formats.readers.common.failures import condense, refusing
+from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.request import RawLayout, Request, parse_axes
 from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern
-from fhash_formats.readers.lattice import FileSeries
-from fhash_formats.readers.request import RawLayout, Request, parse_axes
 from fhash_formats.series import Series, StepsSeries
 
 HEAD_BYTES = 4096

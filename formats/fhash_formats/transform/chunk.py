@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.transform.settings import Settings
-from fhash_formats.transform.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.tile import (
+from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile.encoding import (
     CodedTile,
     Shape,
     decode_tile,
@@ -26,6 +25,7 @@ from fhash_formats.transform.tile import (
     transform_for,
     within,
 )
+from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["Quality", "decode_chunk", "encode_chunk", "supported", "tile_shape"]
 
@@ -140,7 +140,7 @@ def _encode(tile: Values, quality: Quality, specs: tuple[TransformSpec, ...]) ->
     finite = np.isfinite(tile)
     every = bool(finite.all())
     counted = tile if every else tile[finite]
-    plain = Settings(
+    plain = TileSettings(
         transform=_candidates((1, 1, 1, 1))[0], step=1.0, center=0.0, low=0.0, high=0.0, double=True
     )
     nothing = np.zeros(tile.shape, bool)
@@ -166,7 +166,7 @@ def _encode(tile: Values, quality: Quality, specs: tuple[TransformSpec, ...]) ->
     too_fine = with_bound and reach < error / 2
     if too_fine or not (first >= _SMALLEST and largest <= _LARGEST and span / first < _SAFE):
         return exact_tile(tile)
-    settings = Settings(
+    settings = TileSettings(
         transform=specs[0],
         step=first,
         center=center,
@@ -210,11 +210,11 @@ def _double(dtype: np.dtype[Any], largest: float, span: float, step: float) -> b
 
 def _chosen(
     tile: Values,
-    settings: Settings,
+    settings: TileSettings,
     specs: tuple[TransformSpec, ...],
     bound: float | None,
     reach: float,
-) -> Settings:
+) -> TileSettings:
     """The settings with the transform, then the step, by which a window takes the fewest bytes; the first of equals."""
     trials = [replace(settings, transform=spec) for spec in specs]
     ratios = _RATIOS[1:] if bound is not None else ()
@@ -222,7 +222,7 @@ def _chosen(
         return trials[0]
     window = _window(tile)
 
-    def size(trial: Settings) -> int:
+    def size(trial: TileSettings) -> int:
         return len(encode_tile(window, trial, weight=_WEIGHT, error=bound).data)
 
     sizes = [size(trial) for trial in trials]

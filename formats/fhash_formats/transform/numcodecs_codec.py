@@ -17,8 +17,8 @@ from numcodecs.abc import Codec
 from numcodecs.compat import ensure_bytes, ndarray_copy
 
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.chunk import Quality, decode_chunk, encode_chunk, supported
-from fhash_formats.transform.spec import TransformSpec
 
 __all__ = ["NumcodecsTransform"]
 

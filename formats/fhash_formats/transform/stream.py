@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
-from fhash_formats.transform.settings import Settings
-from fhash_formats.transform.tile import Shape, decode_tile, decode_tile_mask, encode_tile
+from fhash_formats.transform.tile.encoding import Shape, decode_tile, decode_tile_mask, encode_tile
+from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["TransformCoder"]
 
@@ -37,7 +37,7 @@ class TransformCoder:
         configuration = codecs[0].get("configuration", {})
         try:
             self.settings = (
-                Settings.from_dict(configuration) if "transform" in configuration else None
+                TileSettings.from_dict(configuration) if "transform" in configuration else None
             )
         except InputError as error:
             raise DamagedFileError(f"codec fhash.transform: {error}") from error

@@ -17,10 +17,10 @@ import numpy as np
 from zarr.abc.codec import ArrayBytesCodec
 
 from fhash_formats.errors import InputError
+from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.chunk import Quality, decode_chunk, encode_chunk, supported, tile_shape
-from fhash_formats.transform.settings import Settings
-from fhash_formats.transform.spec import TransformSpec
-from fhash_formats.transform.tile import decode_tile, encode_tile
+from fhash_formats.transform.tile.encoding import decode_tile, encode_tile
+from fhash_formats.transform.tile.settings import TileSettings
 
 if TYPE_CHECKING:
     from zarr.core.array_spec import ArraySpec
@@ -50,7 +50,7 @@ class TransformCodec(ArrayBytesCodec):
     max_error_rel: float | None = None
     step: float | None = None
     transform: TransformSpec | Mapping[str, Any] | None = None
-    settings: Settings | None = None
+    settings: TileSettings | None = None
     reading: bool = False
 
     def __post_init__(self) -> None:
@@ -74,7 +74,7 @@ class TransformCodec(ArrayBytesCodec):
                 f"codec {data.get('name')!r:.40} with {configuration!r:.60} is no {NAME}"
             )
         if "center" in configuration:
-            return cls(settings=Settings.from_dict(configuration))
+            return cls(settings=TileSettings.from_dict(configuration))
         if not configuration:
             return cls(reading=True)
         known = ("max_error", "max_error_rel", "step", "transform")

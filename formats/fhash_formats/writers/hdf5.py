@@ -13,15 +13,22 @@ from pathlib import Path
 from typing import Any
 
 from fhash_formats.series import AXES
-from fhash_formats.writers.held_file import held_hdf5
-from fhash_formats.writers.labels import (
+from fhash_formats.writers.common.held_file import held_hdf5
+from fhash_formats.writers.common.labels import (
     coordinate_attributes,
     hdf5_value,
     safe_names,
     variable_attributes,
 )
-from fhash_formats.writers.region import Region
-from fhash_formats.writers.writer import Frame, Put, Writer, chunk_shape, little_endian, one_output
+from fhash_formats.writers.common.region import Region
+from fhash_formats.writers.common.writer import (
+    Frame,
+    Put,
+    Writer,
+    chunk_shape,
+    little_endian,
+    one_output,
+)
 
 COMPRESSION: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.writers.atomic import check_output, replacing
-from fhash_formats.writers.labels import printable
+from fhash_formats.support.atomic import check_output, replacing
+from fhash_formats.writers.common.labels import printable
 
 __all__ = ["MESH_SUFFIXES", "Mesh", "check_mesh_output", "save_mesh"]
 

@@ -8,8 +8,15 @@ from pathlib import Path
 
 from numpy.lib import format as npy_format
 
-from fhash_formats.writers.region import Region
-from fhash_formats.writers.writer import Frame, Put, Writer, little_endian, one_output, write_frame
+from fhash_formats.writers.common.region import Region
+from fhash_formats.writers.common.writer import (
+    Frame,
+    Put,
+    Writer,
+    little_endian,
+    one_output,
+    write_frame,
+)
 
 
 @contextmanager

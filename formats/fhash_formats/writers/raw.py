@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import InputError
+from fhash_formats.readers.common.request import ENDIANS, parse_dtype
 from fhash_formats.readers.raw import layout_of_name
-from fhash_formats.readers.request import ENDIANS, parse_dtype
 from fhash_formats.series import AXES
-from fhash_formats.writers.labels import printable
-from fhash_formats.writers.region import Region
-from fhash_formats.writers.spacing import even_spacing
-from fhash_formats.writers.writer import Frame, Put, Writer, little_endian, write_frame
+from fhash_formats.writers.common.labels import printable
+from fhash_formats.writers.common.region import Region
+from fhash_formats.writers.common.spacing import even_spacing
+from fhash_formats.writers.common.writer import Frame, Put, Writer, little_endian, write_frame
 
 NRRD_TYPES = {"float32": "float", "float64": "double"}  # the integers are called as in numpy
 

@@ -10,16 +10,16 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import FhashError, InputError, MissingDependencyError
-from fhash_formats.writers.atomic import check_output, replacing_all
+from fhash_formats.support.atomic import check_output, replacing_all
+from fhash_formats.writers.common.region import Region
+from fhash_formats.writers.common.writer import Frame, Writer
 from fhash_formats.writers.hdf5 import HDF5
 from fhash_formats.writers.netcdf import NETCDF
 from fhash_formats.writers.npy import NPY
 from fhash_formats.writers.raw import RAW
-from fhash_formats.writers.region import Region
 from fhash_formats.writers.vti import VTK
 from fhash_formats.writers.vtkhdf import VTKHDF
-from fhash_formats.writers.writer import Frame, Writer
-from fhash_formats.writers.zarr_ import ZARR
+from fhash_formats.writers.zarr_store import ZARR
 
 WRITERS = (NPY, HDF5, NETCDF, ZARR, RAW, VTK, VTKHDF)
 

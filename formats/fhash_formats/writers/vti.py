@@ -19,10 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.writers.labels import printable
-from fhash_formats.writers.region import Region
-from fhash_formats.writers.spacing import even_spacing
-from fhash_formats.writers.writer import Frame, Put, Writer, little_endian, write_frame
+from fhash_formats.writers.common.labels import printable
+from fhash_formats.writers.common.region import Region
+from fhash_formats.writers.common.spacing import even_spacing
+from fhash_formats.writers.common.writer import Frame, Put, Writer, little_endian, write_frame
 
 SPACE = ("z", "y", "x")
 

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import InputError
+from fhash_formats.writers.common.held_file import held_hdf5
+from fhash_formats.writers.common.labels import safe_name
+from fhash_formats.writers.common.region import Region
+from fhash_formats.writers.common.spacing import even_spacing
+from fhash_formats.writers.common.writer import Frame, Put, Writer, chunk_shape, little_endian
 from fhash_formats.writers.hdf5 import COMPRESSION
-from fhash_formats.writers.held_file import held_hdf5
-from fhash_formats.writers.labels import safe_name
-from fhash_formats.writers.region import Region
-from fhash_formats.writers.spacing import even_spacing
 from fhash_formats.writers.vti import SPACE, direction
-from fhash_formats.writers.writer import Frame, Put, Writer, chunk_shape, little_endian
 
 VERSION = (2, 0)
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import zarr
 
-from fhash_formats.container import Container, ContainerWriter, coding, parallel, shard_order
+from fhash_formats.container import Container, ContainerWriter, coding, shard_order
 from fhash_formats.container.coding import crc32c
 from fhash_formats.container.sharding import ABSENT, MAX_SHARD_CHUNKS, parse_index, sharding_codecs
 from fhash_formats.errors import DamagedFileError, InputError, RegionError, UnsupportedFileError
+from fhash_formats.support import threads as parallel
 
 NAME = "extra/values"
 CASES = {

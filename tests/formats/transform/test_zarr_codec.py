@@ -15,15 +15,15 @@ import zarr
 from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.settings import Settings
-from fhash_formats.transform.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.tile import encode_tile
+from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.tile.encoding import encode_tile
+from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.zarr_codec import TransformCodec
 
 WAVES = TransformSpec(
     axes=(AxisTransform(kind="haar", depth=1), *(AxisTransform(kind="9/7", depth=1),) * 3)
 )
-SHARED = Settings(transform=WAVES, step=0.05, center=0.0, low=-3.0, high=3.0)
+SHARED = TileSettings(transform=WAVES, step=0.05, center=0.0, low=-3.0, high=3.0)
 
 
 def field(

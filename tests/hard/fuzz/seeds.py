@@ -13,15 +13,16 @@ import numpy.typing as npt
 
 from fhash_formats.container import Container
 from fhash_formats.container.coding import TRANSFORM
-from fhash_formats.transform.bands import band_table, single_band
-from fhash_formats.transform.coder import encode_integers
-from fhash_formats.transform.mask import encode_mask, mask_prior_state
-from fhash_formats.transform.predict import _blank, encode_predicted
-from fhash_formats.transform.predictor import Predictor, pass_arrays, passes_of
-from fhash_formats.transform.prior import prior_state
-from fhash_formats.transform.sections import parts_of
-from fhash_formats.transform.settings import Settings
-from fhash_formats.transform.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.axes.bands import band_table
+from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.entropy.coder import encode_integers
+from fhash_formats.transform.entropy.mask import encode_mask, mask_prior_state
+from fhash_formats.transform.entropy.predict import _blank, encode_predicted
+from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
+from fhash_formats.transform.entropy.prior import prior_state
+from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform.tile.sections import parts_of
+from fhash_formats.transform.tile.settings import TileSettings
 
 GOLDENS = Path(__file__).parents[2] / "golden"
 CODER, MASK, PREDICTOR, TRANSFORMS, HEAD, VALUES, ENCODE, LIGHT, MARCH = range(9)
@@ -144,7 +145,7 @@ def write_seeds(folder: Path, bands: list[Any], passes: list[Any]) -> int:
     return next(numbers)
 
 
-def golden_streams() -> Iterator[tuple[bytes, Settings, tuple[int, int, int, int]]]:
+def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int, int]]]:
     """Every coded tile of the goldens with its settings and shape."""
     for path in sorted(GOLDENS.glob("*.fhz")):
         with Container.open(path) as container:
@@ -156,7 +157,7 @@ def golden_streams() -> Iterator[tuple[bytes, Settings, tuple[int, int, int, int
                 )
                 if inner[0]["name"] != TRANSFORM:
                     continue
-                settings = Settings.from_dict(inner[0]["configuration"])
+                settings = TileSettings.from_dict(inner[0]["configuration"])
                 t, z, y, x = array.chunk_shape
                 for shard, member in array.chunks.items():
                     sharding = array._metadata.sharding

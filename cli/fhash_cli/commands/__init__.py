@@ -1,0 +1,1 @@
+"""The commands of `fhash`, one file each."""

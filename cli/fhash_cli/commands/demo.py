@@ -1,0 +1,148 @@
+"""`fhash demo`: the whole way once, on a small simulation: data, container, comparison, picture."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fhash_cli.options import check_writable, force_option, json_option, quiet_option
+from fhash_cli.output import (
+    Progress,
+    compared,
+    emit,
+    extent,
+    number,
+    quality_rows,
+    say,
+    size,
+    table,
+)
+from fhash_codec.demo.simulate import SCENES, simulate
+from fhash_formats.errors import InputError
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+    from fhash_codec import Volume
+    from fhash_formats.series import Series
+
+COLUMNS = 4
+
+
+@click.command("demo")
+@click.option(
+    "--scene",
+    type=click.Choice(tuple(SCENES)),
+    default="vortex",
+    show_default=True,
+    help="What to simulate.",
+)
+@click.option(
+    "-o",
+    "folder",
+    metavar="DIR",
+    type=click.Path(),
+    default="demo",
+    show_default=True,
+    help="Folder for the three files.",
+)
+@force_option
+@json_option
+@quiet_option
+def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) -> None:
+    """Simulate a small series, encode it, decode it, compare and draw: DIR/SCENE.h5, .fhz and .png."""
+    from fhash_codec.config import EncodeConfig
+    from fhash_formats import Region, open_series, save_region
+    from fhash_formats.support.atomic import replacing
+
+    data, run, picture = (Path(folder) / f"{scene}.{suffix}" for suffix in ("h5", "fhz", "png"))
+    try:
+        Path(folder).mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: {error.strerror}; give a folder that exists or whose parent does"
+        ) from error
+    for output in (data, run, picture):
+        check_writable(
+            output, force, sources=[other for other in (data, run, picture) if other != output]
+        )
+    if not quiet:
+        say(f"simulating '{scene}', {SCENES[scene].help}")
+    simulated = simulate(scene)
+    region = Region(
+        name=simulated.name,
+        units=simulated.units,
+        dtype=simulated.dtype,
+        shape=simulated.shape,
+        coords=simulated.coords,
+        attributes=simulated.attributes,
+    )
+    save_region(data, region, simulated.frames(), force=force)
+
+    import fhash_codec
+
+    config = EncodeConfig(features=(SCENES[scene].feature,))
+    with Progress(quiet=quiet) as progress:
+        encoded = fhash_codec.encode(data, run, config, force=force, progress=progress)
+        start = time.perf_counter()
+        report = fhash_codec.diff(data, run, progress=progress)
+        seconds = time.perf_counter() - start
+    with (
+        open_series(data) as series,
+        fhash_codec.open(run) as volume,
+        replacing(picture, force=force) as temporary,
+    ):
+        _draw(scene, series, volume, report).save(temporary, format="PNG", optimize=True)
+    settings = f"--feature {config.features[0]}"
+    made = {
+        "scene": scene,
+        "data": str(data),
+        "path": str(run),
+        "picture": str(picture),
+        "settings": settings,
+    }
+    result = {**report, "seconds": encoded["seconds"], "diff_seconds": seconds, **made}
+    emit(result, table(_rows(result, series)), as_json)
+
+
+def _draw(scene: str, series: Series, volume: Volume, report: dict[str, Any]) -> Image.Image:
+    """The picture: the slice of constant z with the most of the coreset, at steps spread evenly over the series."""
+    from fhash_codec.demo.comparison_picture import Pair, compare
+
+    steps = [round((index + 0.5) * series.shape[0] / COLUMNS) for index in range(COLUMNS)]
+    layer = int(sum(volume.occupancy(step).sum(axis=(1, 2), dtype=int) for step in steps).argmax())
+    times, heights = series.coords["t"].values, series.coords["z"].values
+    window = ((layer, layer + 1), (0, series.shape[2]), (0, series.shape[3]))
+    pairs = [
+        Pair(
+            label=f"t = {times[step]:.2g} s",
+            original=series.read(step)[layer].astype(float),
+            decoded=volume.read(step, window)[0].astype(float),
+        )
+        for step in steps
+    ]
+    saved = f"{size(report['raw_bytes'])} in {size(report['bytes'])} ({number(report['ratio'], digits=3)}x)"
+    quality = f"{number(report['psnr'], 'dB', digits=3)} in the coreset, largest error {number(report['max_abs_error'], digits=2)}"
+    return compare(
+        pairs,
+        title=f"fhash demo: {scene}",
+        subtitle=f"{extent(series.shape)} values, {saved}, {quality}",
+        quantity=series.name if series.units == "1" else f"{series.name} ({series.units})",
+        footer=f"outside the coreset, not kept.   Slice z = {heights[layer]:.2g} m; error = decoded - original",
+    )
+
+
+def _rows(result: dict[str, Any], series: Series) -> list[tuple[str, str]]:
+    return [
+        ("data", f"{result['data']}, {extent(series.shape)} {series.dtype}"),
+        ("container", f"{result['path']}, by fhash encode {result['settings']}"),
+        ("picture", result["picture"]),
+        ("size", compared(result)),
+        ("coreset", f"{result['coreset_fraction']:.3%} of the domain"),
+        *quality_rows(result),
+        ("encoding", f"{number(result['seconds'], 's', digits=3)} on {result['device']}"),
+        ("comparing", number(result["diff_seconds"], "s", digits=3)),
+    ]

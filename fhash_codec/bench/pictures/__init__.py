@@ -1,0 +1,1 @@
+"""Pictures: what each effect costs, and VTK beside."""

@@ -1,0 +1,306 @@
+"""`fhash bench render`: what effects and accelerations cost, ARM beside streaming, VTK beside this renderer, and quality against time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from fhash_codec.bench.machine import machine
+from fhash_codec.bench.pictures.beside_vtk import Comparison
+from fhash_codec.bench.pictures.likeness import picture_psnr
+from fhash_codec.bench.pictures.results import PARTS, Quality, RenderBench, Stream, Switch
+from fhash_codec.progress import Progress, silent
+from fhash_codec.rendering.picture.image import Image
+from fhash_codec.rendering.renderer import Renderer
+from fhash_codec.rendering.scene.scene import (
+    AmbientOcclusion,
+    Effects,
+    Isosurface,
+    Scene,
+    Shading,
+    Shadows,
+    TransferFunctionSpec,
+)
+from fhash_codec.training.devices import choose_device
+from fhash_codec.volume import Volume
+from fhash_formats.errors import InputError, MissingDependencyError
+
+__all__ = ["bench_render", "in_turns"]
+
+TURNS = 5
+SIZE = 512
+STREAM_SIZE = 128
+"""Pixels along a side where rays are streamed through the model, which takes long on a CPU."""
+NEAREST = 1e-2
+"""Zoom down to which one is looked for at which a pixel is as wide as several vertices."""
+STEPS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
+THRESHOLDS = (0.3, 0.1, 0.03, 0.01, 1 / 256, 1 / 1024)
+LEVELS = (3, 2, 1)
+FINEST = {"step": 1 / 32, "threshold": 0.0, "lod": 0.0}
+"""What the qualities of each knob are measured against."""
+NOTES = (
+    "milliseconds are medians of runs in turns: each turn runs every variant once, from another side in comparisons with VTK",
+    "pictures are compared over black; 'ours' against VTK is marching a decoded frame, 'whole' all of Renderer.render with the frame kept",
+    "VTK's time is that of Render less that of a window with nothing in it; both take as many threads as there are processors",
+    "playback: decoding counts here, VTK has its frames decoded and takes them up",
+    "VTK takes its samples at whole steps from the entry of a ray, here they lie in the middle of steps; its gradients are central "
+    "differences over two vertices, here they are those of the cell; its highlights follow the mirrored ray: 'by its rules' is the PSNR of "
+    "VTK's picture to a slow one that does all three as VTK does",
+)
+
+
+def bench_render(
+    volume: Volume,
+    scene: Scene | None = None,
+    *,
+    parts: Sequence[str] = PARTS,
+    size: int = SIZE,
+    turns: int = TURNS,
+    progress: Progress = silent,
+) -> RenderBench:
+    """Measure pictures of a volume.
+
+    scene: what is shown where effects, accelerations, streams and curves are measured; its size and effects are not. size: pixels along
+    both sides; VTK is compared at twice the size too. turns: runs that medians are of.
+    Raises InputError for parts that are not known, a size or turns below 1; without VTK its parts are refused in the result.
+    """
+    scene = scene or Scene()
+    for part in parts:
+        if part not in PARTS:
+            raise InputError(f"part is '{part}'; allowed: {', '.join(PARTS)}")
+    if not parts or turns < 1 or size < 16:
+        raise InputError(
+            f"{len(parts)} parts, {turns} turns, {size} pixels; at least one part, one turn and 16 pixels are needed"
+        )
+    plain = replace(
+        scene,
+        size=(size, size),
+        effects=Effects(isosurfaces=scene.effects.isosurfaces),
+        background="black",
+    )
+    bench = _Bench(volume, plain, turns, progress)
+    found: dict[str, tuple[Any, ...]] = {}
+    refused: dict[str, str] = {}
+
+    @cache
+    def beside() -> Comparison:
+        return Comparison(volume, plain, turns, progress)
+
+    ways: Mapping[str, Callable[[], tuple[Any, ...]]] = {
+        "effects": bench.effects,
+        "accelerations": bench.accelerations,
+        "streams": bench.streams,
+        "vtk": lambda: beside().against(),
+        "exactness": lambda: beside().exactness(),
+        "playback": lambda: beside().playback(),
+        "curves": bench.curves,
+    }
+    for part in dict.fromkeys(parts):
+        try:
+            found[part] = ways[part]()
+        except MissingDependencyError as error:
+            refused[part] = str(error)
+    used = machine(choose_device("cpu"))
+    if beside.cache_info().currsize:
+        used["vtk"] = beside().version
+    return RenderBench(
+        series=f"{volume.path} {volume.name}",
+        shape=volume.shape,
+        step=bench.step,
+        size=size,
+        turns=turns,
+        effects=found.get("effects", ()),
+        accelerations=found.get("accelerations", ()),
+        streams=found.get("streams", ()),
+        against=found.get("vtk", ()),
+        exactness=found.get("exactness", ()),
+        playback=found.get("playback", ()),
+        curves=found.get("curves", ()),
+        refused=refused,
+        machine=used,
+        notes=NOTES,
+    )
+
+
+def in_turns(runs: Mapping[str, Callable[[], Image]], turns: int) -> dict[str, tuple[float, Image]]:
+    """Run every variant once without counting, then in turns; the median milliseconds and the last picture of each."""
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    images = {name: run() for name, run in runs.items()}
+    for _ in range(turns):
+        for name, run in runs.items():
+            begun = time.perf_counter()
+            images[name] = run()
+            seconds[name].append(time.perf_counter() - begun)
+    return {name: (1e3 * median(seconds[name]), images[name]) for name in runs}
+
+
+class _Bench:
+    """What needs no peer."""
+
+    def __init__(self, volume: Volume, scene: Scene, turns: int, progress: Progress) -> None:
+        self.volume, self.scene, self.turns, self.progress = volume, scene, turns, progress
+        self.renderer = Renderer(volume)
+        self.step = self.renderer.plan(scene).step
+
+    def effects(self) -> tuple[Switch, ...]:
+        """Each effect alone beside the scene without any."""
+        middle = float(np.mean(self.renderer.plan(self.scene).function.span))
+        none = self.scene.effects
+        variants = {
+            "shading": replace(none, shading=Shading()),
+            "shadows": replace(none, shadows=Shadows()),
+            "ambient occlusion": replace(none, ambient_occlusion=AmbientOcclusion()),
+            "shading, shadows, ambient occlusion": replace(
+                none, shading=Shading(), shadows=Shadows(), ambient_occlusion=AmbientOcclusion()
+            ),
+            "isosurface": replace(none, isosurfaces=(*none.isosurfaces, Isosurface(value=middle))),
+            "translucent isosurface": replace(
+                none, isosurfaces=(*none.isosurfaces, Isosurface(value=middle, opacity=0.4))
+            ),
+            "maximum intensity": replace(none, maximum_intensity=True),
+            "depth buffer": replace(none, buffers=("depth",)),
+            "depth and normal buffers": replace(none, buffers=("depth", "normal")),
+            "jitter": replace(none, jitter=True),
+            "antialiasing 2": replace(none, antialiasing=2),
+            "box and axes": replace(none, box=True, axes=True),
+            "colour bar and time label": replace(none, colour_bar=True, time_label=True),
+        }
+        return self._switches(
+            {
+                name: (self.scene, replace(self.scene, effects=effects))
+                for name, effects in variants.items()
+            },
+            "effects",
+        )
+
+    def accelerations(self) -> tuple[Switch, ...]:
+        """Skipping, early termination and level of detail on and off; their pictures are compared."""
+        scene, march = self.scene, self.scene.march
+        opaque = replace(scene, transfer_function=_dense(scene.transfer_function))
+        pairs = {
+            "skipping": (
+                replace(scene, march=replace(march, skipping=False)),
+                replace(scene, march=replace(march, skipping=True)),
+            ),
+            "early termination": (
+                replace(scene, march=replace(march, threshold=0.0)),
+                replace(scene, march=replace(march, threshold=1 / 1024)),
+            ),
+            "early termination, density 50": (
+                replace(opaque, march=replace(march, threshold=0.0)),
+                replace(opaque, march=replace(march, threshold=1 / 1024)),
+            ),
+        }
+        far = replace(scene, march=replace(march, lod=None))
+        while (level := self.renderer.plan(far).lod) == 0 and far.camera.zoom > NEAREST:
+            far = replace(far, camera=replace(far.camera, zoom=far.camera.zoom / 2))
+        if level > 0:
+            pairs[f"level of detail {level}, zoom {far.camera.zoom:g}"] = (
+                replace(far, march=replace(march, lod=0)),
+                far,
+            )
+        return self._switches(pairs, "accelerations", compare=True)
+
+    def _switches(
+        self, pairs: Mapping[str, tuple[Scene, Scene]], stage: str, *, compare: bool = False
+    ) -> tuple[Switch, ...]:
+        found = []
+        for number, (name, (without, with_)) in enumerate(pairs.items()):
+            measured = in_turns(
+                {
+                    "off": partial(self.renderer.render, without),
+                    "on": partial(self.renderer.render, with_),
+                },
+                self.turns,
+            )
+            (off_ms, off), (on_ms, on) = measured["off"], measured["on"]
+            found.append(
+                Switch(
+                    name=name,
+                    off_ms=off_ms,
+                    on_ms=on_ms,
+                    counters_off=dict(off.counters),
+                    counters_on=dict(on.counters),
+                    psnr=picture_psnr(on.rgba, off.rgba, 1.0) if compare else None,
+                )
+            )
+            self.progress(stage, number + 1, len(pairs), name)
+        return tuple(found)
+
+    def streams(self) -> tuple[Stream, ...]:
+        """Marching the cache, streaming, and adaptive ray marching with N_r of the rays and of 2^20, of a small picture."""
+        small = replace(
+            self.scene, size=(STREAM_SIZE, STREAM_SIZE), march=replace(self.scene.march, lod=0)
+        )
+        variants = {
+            "cache": replace(small, march=replace(small.march, mode="cache")),
+            "stream": replace(small, march=replace(small.march, mode="stream")),
+            "arm": replace(small, march=replace(small.march, mode="arm", samples_per_pass=None)),
+            "arm, N_r 2^20": replace(
+                small, march=replace(small.march, mode="arm", samples_per_pass=2**20)
+            ),
+        }
+        # A whole turn takes seconds through the model: the fewest that have a median.
+        measured = in_turns(
+            {name: partial(self.renderer.render, scene) for name, scene in variants.items()},
+            min(self.turns, 3),
+        )
+        self.progress("streams", 1, 1, "")
+        _, cached = measured["cache"]
+        return tuple(
+            Stream(
+                mode=variants[name].march.mode,
+                budget=variants[name].march.samples_per_pass,
+                milliseconds=milliseconds,
+                passes=int(image.counters["passes"]),
+                samples=int(image.counters["samples"]),
+                evaluations=int(image.counters["evaluations"]),
+                psnr=picture_psnr(image.rgba, cached.rgba, 1.0),
+                largest=float(np.max(np.abs(image.rgba - cached.rgba))),
+            )
+            for name, (milliseconds, image) in measured.items()
+        )
+
+    def curves(self) -> tuple[Quality, ...]:
+        """Each knob swept, the others as the scene has them, against its finest setting."""
+        knobs: dict[str, Sequence[float]] = {"step": STEPS, "threshold": THRESHOLDS}
+        if self.volume.profile == "compact":
+            most = max(
+                int(np.log2(max(min(high - low for low, high in self.volume.box) - 1, 1))), 0
+            )
+            knobs["lod"] = [level for level in LEVELS if level <= most]
+        found = []
+        for knob, values in knobs.items():
+            scenes = {f"{value:g}": self._with(knob, value) for value in (*values, FINEST[knob])}
+            measured = in_turns(
+                {name: partial(self.renderer.render, scene) for name, scene in scenes.items()},
+                self.turns,
+            )
+            finest = measured[f"{FINEST[knob]:g}"][1]
+            found += [
+                Quality(
+                    knob=knob,
+                    value=float(name),
+                    milliseconds=milliseconds,
+                    samples=int(image.counters["samples"]),
+                    psnr=picture_psnr(image.rgba, finest.rgba, 1.0),
+                )
+                for name, (milliseconds, image) in measured.items()
+            ]
+            self.progress("curves", len(found), sum(map(len, knobs.values())) + len(knobs), knob)
+        return tuple(found)
+
+    def _with(self, knob: str, value: float) -> Scene:
+        march = self.scene.march
+        changed = {"lod": 0, knob: int(value) if knob == "lod" else value}
+        return replace(self.scene, march=replace(march, **changed))  # type: ignore[arg-type]
+
+
+def _dense(spec: TransferFunctionSpec) -> TransferFunctionSpec:
+    return replace(spec, density=50 * spec.density)

@@ -1,0 +1,215 @@
+"""VTK as a peer of the renderer: the same decoded frame, transfer function, camera and steps through VTK's own volume mappers."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import time
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.rendering.camera.camera import Grid, Rays
+from fhash_codec.rendering.task.task import Lighting, Table
+from fhash_formats.errors import MissingDependencyError
+
+__all__ = ["MAPPERS", "VtkPeer", "require_vtk"]
+
+Single = npt.NDArray[np.float32]
+Pixels = npt.NDArray[np.uint8]
+
+MAPPERS = ("cpu", "gpu")
+"""vtkFixedPointVolumeRayCastMapper, and the mapper for graphics cards, which a software OpenGL runs as well."""
+POINTS = 2048
+"""Points of the transfer functions that VTK is given."""
+MODULES = {
+    "vtkCommonCore": ("vtkLogger", "vtkUnsignedCharArray", "vtkVersion"),
+    "vtkCommonDataModel": ("vtkImageData", "vtkPiecewiseFunction"),
+    "vtkRenderingCore": (
+        "vtkColorTransferFunction",
+        "vtkRenderer",
+        "vtkRenderWindow",
+        "vtkVolume",
+        "vtkVolumeProperty",
+    ),
+    "vtkRenderingOpenGL2": (),
+    "vtkRenderingVolume": ("vtkFixedPointVolumeRayCastMapper",),
+    "vtkRenderingVolumeOpenGL2": ("vtkOpenGLGPUVolumeRayCastMapper",),
+    "util.numpy_support": ("numpy_to_vtk", "vtk_to_numpy"),
+}
+
+
+def require_vtk() -> SimpleNamespace:
+    """The names of VTK that are used here; raises MissingDependencyError."""
+    found = {}
+    try:
+        for module, names in MODULES.items():
+            loaded = importlib.import_module(f"vtkmodules.{module}")
+            found.update({name: getattr(loaded, name) for name in names})
+    except ImportError as error:
+        raise MissingDependencyError(
+            "comparing with VTK needs it: pip install 'fhash[vtk]'"
+        ) from error
+    return SimpleNamespace(**found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """Bytes (H, W, 3) over black, the first row the top, and the seconds of `Render`."""
+
+    pixels: Pixels
+    seconds: float
+
+
+class VtkPeer:
+    """A window of VTK with one volume; what it shows is set by `look`, `load` and `shade`."""
+
+    def __init__(
+        self,
+        values: Single,
+        grid: Grid,
+        table: Table,
+        *,
+        unit: float,
+        size: tuple[int, int],
+        step: float,
+        mapper: str = "cpu",
+        lighting: Lighting | None = None,
+        threads: int | None = None,
+        empty: bool = False,
+    ) -> None:
+        """values: (z, y, x), all finite, of all the domain. unit: length that VTK's opacities are of, in units of the coordinates, as step.
+
+        lighting: from the camera, whatever its lamp, or none. empty: a window with nothing in it.
+        """
+        self.vtk = vtk = require_vtk()
+        self.grid = grid
+        self.image = vtk.vtkImageData()
+        nx, ny, nz = grid.counts
+        self.image.SetDimensions(nx, ny, nz)
+        self.image.SetSpacing(*(abs(float(part)) for part in grid.spacing))
+        self.image.SetOrigin(*(float(min(part)) for part in grid.corners))
+        self.load(values)
+        self.mapper = (
+            vtk.vtkFixedPointVolumeRayCastMapper()
+            if mapper == "cpu"
+            else vtk.vtkOpenGLGPUVolumeRayCastMapper()
+        )
+        self.mapper.SetInputData(self.image)
+        self.mapper.AutoAdjustSampleDistancesOff()
+        self.mapper.SetSampleDistance(step)
+        if mapper == "cpu":
+            self.mapper.SetInteractiveSampleDistance(step)
+            self.mapper.LockSampleDistanceToInputSpacingOff()
+            self.mapper.SetNumberOfThreads(threads or os.cpu_count() or 1)
+        else:
+            self.mapper.SetUseJittering(False)
+        self.property = vtk.vtkVolumeProperty()
+        self.property.SetInterpolationTypeToLinear()
+        self.property.SetScalarOpacityUnitDistance(unit)
+        self._give(table, unit)
+        self.shade(lighting)
+        volume = vtk.vtkVolume()
+        volume.SetMapper(self.mapper)
+        volume.SetProperty(self.property)
+        self.renderer = vtk.vtkRenderer()
+        if not empty:
+            self.renderer.AddVolume(volume)
+        self.renderer.SetBackground(0, 0, 0)
+        vtk.vtkLogger.SetStderrVerbosity(
+            vtk.vtkLogger.VERBOSITY_ERROR
+        )  # it warns of every display that it tries in vain
+        self.window = vtk.vtkRenderWindow()
+        if not self.window.SupportsOpenGL():
+            raise MissingDependencyError(
+                "VTK finds no OpenGL; install a software one such as Mesa's EGL (libegl1, libgl1-mesa-dri)"
+            )
+        self.window.SetOffScreenRendering(1)
+        self.window.SetMultiSamples(0)
+        self.window.SetSize(*size)
+        self.window.AddRenderer(self.renderer)
+
+    def load(self, values: Single) -> None:
+        """Another frame; the mapper takes it up when it draws."""
+        turned = np.ascontiguousarray(
+            values[
+                tuple(slice(None, None, -1 if part < 0 else 1) for part in self.grid.spacing[::-1])
+            ]
+        )
+        scalars = self.vtk.numpy_to_vtk(turned.ravel(), deep=1)
+        self.image.GetPointData().SetScalars(scalars)
+        self.image.Modified()
+
+    def shade(self, lighting: Lighting | None) -> None:
+        """Light from the camera, or none."""
+        self.property.SetShade(lighting is not None)
+        if lighting is not None:
+            self.property.SetAmbient(lighting.ambient)
+            self.property.SetDiffuse(lighting.diffuse)
+            self.property.SetSpecular(lighting.specular)
+            self.property.SetSpecularPower(lighting.specular_power)
+
+    def look(self, rays: Rays) -> None:
+        """Take the camera of rays."""
+        spacing = rays.grid.spacing
+        eye = rays.eye * spacing + rays.grid.origin
+        forward, up = rays.forward * spacing, rays.up * spacing
+        half = float(np.linalg.norm(up))
+        distance = float(np.linalg.norm(rays.grid.corners.mean(axis=1) - eye))
+        camera = self.renderer.GetActiveCamera()
+        camera.SetPosition(*eye)
+        camera.SetFocalPoint(*(eye + forward * distance))
+        camera.SetViewUp(*(up / half))
+        camera.SetParallelProjection(rays.parallel)
+        if rays.parallel:
+            camera.SetParallelScale(half)
+        else:
+            camera.SetViewAngle(2 * float(np.degrees(np.arctan(half))))
+        self.renderer.ResetCameraClippingRange()
+
+    def draw(self) -> Drawn:
+        """Render once."""
+        self.window.Modified()
+        begun = time.perf_counter()
+        self.window.Render()
+        seconds = time.perf_counter() - begun
+        width, height = self.window.GetSize()
+        data = self.vtk.vtkUnsignedCharArray()
+        self.window.GetPixelData(0, 0, width - 1, height - 1, 0, data, 0)
+        pixels = self.vtk.vtk_to_numpy(data).reshape(height, width, 3)[::-1]
+        return Drawn(pixels=np.ascontiguousarray(pixels), seconds=seconds)
+
+    @property
+    def version(self) -> str:
+        """Of VTK, and the OpenGL that it found."""
+        lines = str(self.window.ReportCapabilities()).splitlines()
+        graphics = next(
+            (
+                line.partition(":")[2].strip()
+                for line in lines
+                if line.startswith("OpenGL renderer string")
+            ),
+            "no OpenGL",
+        )
+        return f"VTK {self.vtk.vtkVersion.GetVTKVersion()}, {graphics}"
+
+    def _give(self, table: Table, unit: float) -> None:
+        """The transfer function as VTK has them: colours, and opacities after the unit distance."""
+        values = np.linspace(table.low, table.high, POINTS)
+        entries = np.linspace(table.low, table.high, len(table.extinctions))
+        opacities = -np.expm1(-np.interp(values, entries, table.extinctions) * unit)
+        shades = np.stack(
+            [np.interp(values, entries, channel) for channel in table.colours.T], axis=-1
+        )
+        colour, opacity = self.vtk.vtkColorTransferFunction(), self.vtk.vtkPiecewiseFunction()
+        for value, shade, part in zip(values, shades, opacities, strict=True):
+            colour.AddRGBPoint(float(value), *(float(each) for each in shade))
+            opacity.AddPoint(float(value), float(part))
+        self.property.SetColor(colour)
+        self.property.SetScalarOpacity(opacity)
+
+    def close(self) -> None:
+        """Release the window."""
+        self.window.Finalize()

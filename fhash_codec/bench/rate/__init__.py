@@ -1,0 +1,1 @@
+"""Bytes and speed beside other codecs."""

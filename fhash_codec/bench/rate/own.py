@@ -1,0 +1,102 @@
+"""fhash's own profiles in `fhash bench rate`, through the public functions alone, each encoding in a file of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import fhash_codec
+from fhash_codec.bench.rate.search import EXACT, Trial
+from fhash_codec.config import EncodeConfig
+from fhash_codec.coreset.boxes import Box
+from fhash_codec.measure.metrics import Errors
+from fhash_formats.errors import QualityError
+from fhash_formats.series import Series
+
+PROFILES: tuple[str, ...] = EncodeConfig.__dataclass_fields__["profile"].metadata["choices"]
+"""Every profile there is."""
+
+
+def promised(settings: Mapping[str, Any], profile: str, goal: str, asked: float) -> EncodeConfig:
+    """Those of the settings that a profile has, for PSNR `asked` (dB), or for "bound" a largest error of `asked` (share of the range).
+
+    The paper profile is not steered by quality: its settings are the same for every goal.
+    """
+    others = {
+        field.name
+        for field in dataclasses.fields(EncodeConfig)
+        if field.metadata["profile"] not in ("", profile)
+    }
+    promise = {} if profile == "paper" else {"psnr" if goal == "psnr" else "max_error_rel": asked}
+    own = {name: value for name, value in settings.items() if name not in others}
+    return EncodeConfig.from_dict(own | {"profile": profile} | promise)
+
+
+class Own:
+    """Encodings of one series, each made once, and what was measured of it.
+
+    Attributes:
+        seconds: of each encoding so far, by its settings.
+    """
+
+    def __init__(self, series: Series, data_range: float, folder: Path) -> None:
+        """folder: where the files go, which the caller removes. data_range: of the series."""
+        self._series = series
+        self._range = data_range
+        self._folder = folder
+        self._paths: dict[EncodeConfig, Path] = {}
+        self._trials: dict[EncodeConfig, Trial] = {}
+        self.seconds: dict[EncodeConfig, list[float]] = {}
+
+    def encode(self, config: EncodeConfig) -> float:
+        """Encode once more; the seconds it took."""
+        path = self._paths.setdefault(config, self._folder / f"{len(self._paths)}.fhz")
+        begun = time.perf_counter()
+        with suppress(QualityError):  # the file is written, and what it reaches is measured here
+            fhash_codec.encode(self._series, path, config, force=True)
+        spent = time.perf_counter() - begun
+        self.seconds.setdefault(config, []).append(spent)
+        return spent
+
+    def trial(self, config: EncodeConfig) -> Trial:
+        """The figures of the file of these settings, from every frame as it decodes."""
+        if config not in self._trials:
+            self.encode(config)
+            errors = Errors(self._range)
+            with fhash_codec.open(self._paths[config]) as volume:
+                for step in range(volume.shape[0]):
+                    errors.add(step, self._series.read(step), volume.read(step))
+            self._trials[config] = trial_of(errors, 0.0, self._paths[config].stat().st_size)
+        return self._trials[config]
+
+    def decode(self, config: EncodeConfig) -> float:
+        """Decode every frame of a file that is opened for it; the seconds that took."""
+        begun = time.perf_counter()
+        with fhash_codec.open(self._paths[config]) as volume:
+            for step in range(volume.shape[0]):
+                volume.read(step)
+        return time.perf_counter() - begun
+
+    def read_region(self, config: EncodeConfig, step: int, region: Box) -> tuple[int, float]:
+        """Read a region of one step of a file that is opened for it; the bytes that were read of the file, and the seconds it took."""
+        begun = time.perf_counter()
+        with fhash_codec.open(self._paths[config]) as volume:
+            volume.read(step, region)
+            count = volume.container.bytes_read
+        return count, time.perf_counter() - begun
+
+
+def trial_of(errors: Errors, level: float, count: int) -> Trial:
+    """The Trial that stands for measured errors and a number of bytes."""
+    exact = errors.rmse == 0 or errors.psnr is None
+    largest = errors.max_abs_error or 0.0
+    return Trial(
+        level=level,
+        bytes=count,
+        psnr=EXACT if exact else float(errors.psnr or 0.0),
+        max_error=largest / errors.data_range,
+    )

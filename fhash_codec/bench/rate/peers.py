@@ -1,0 +1,283 @@
+"""The peers of `fhash bench rate`: other codecs, each with the layouts and settings it is at its best with, kept in HDF5 files.
+
+SZ3, SPERR, ZFP and Blosc are the HDF5 filters of hdf5plugin; BitRound is numcodecs' followed by Blosc (zstd, shuffle). What there is to
+know: SPERR's filter takes the axes in reverse unless `swap` is set; its PSNR refers to the range of one chunk, so that a constant error
+over all frames takes a setting for each; it crashes on NaN, and ZFP silently replaces it; ZFP's tolerance is rounded down to a power of
+two. Chunk caches are off: reading back would otherwise return what was written.
+"""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.coreset.boxes import Box
+from fhash_formats.errors import InputError, MissingDependencyError
+
+Values = npt.NDArray[Any]
+Filter = Mapping[str, Any]
+
+LADDER = 20 * math.log10(2)
+"""dB between settings that are powers of two apart."""
+SMALL_CHUNK = 32
+"""Vertices along an axis of the chunks that a user who wants regions would choose."""
+LAYOUTS = {"frame": 0, "plane": 1, "series": None}
+"""A chunk is one step, all steps of one z, or everything; each name with the axis that is cut, a dataset for each part."""
+MAX_CHUNK = 2**31
+"""Bytes; HDF5 has no chunks of 4 GiB or more."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One way to use a peer.
+
+    Attributes:
+        peer: its name. mode: what its setting is, for people. layout: one of LAYOUTS.
+        goals: what it is tried for, "psnr", "bound" or both.
+        setting: the HDF5 filter for (part of the data, range of the data, level). level: quality aimed at in dB, a scale on which a
+            uniform tolerance of range * 10^(-level / 20) stands at `level`.
+        step: distance in dB of levels that differ at all, 0 for any.
+        prepare: what happens to the values before the filter, at a level.
+        chunk: the largest length of a chunk along an axis of its layout, None for no limit.
+        lossless: there is nothing to set, and the values may be of any type and not finite.
+    """
+
+    peer: str
+    mode: str
+    layout: str
+    goals: tuple[str, ...]
+    setting: Callable[[Values, float, float], Filter]
+    step: float = 0.0
+    prepare: Callable[[Values, float], Values] | None = None
+    chunk: int | None = None
+    lossless: bool = False
+
+    @property
+    def name(self) -> str:
+        """For people: "SPERR rate, a chunk per frame"."""
+        return f"{self.peer} {self.mode}, {'a chunk' if self.chunk is None else f'chunks of {self.chunk}'} per {self.layout}"
+
+    def chunk_shape(self, part: Values) -> tuple[int, ...]:
+        """The shape of chunks of a dataset: all of it, or even parts within the limits."""
+        if self.chunk is not None:
+            return tuple(-(-n // -(-n // self.chunk)) for n in part.shape)
+        first, *others = part.shape
+        return (max(1, min(first, MAX_CHUNK * first // part.nbytes)), *others)
+
+
+def tolerance(data_range: float, level: float) -> float:
+    """The absolute error at a level."""
+    return data_range * math.pow(10.0, -level / 20)
+
+
+def peers() -> dict[str, tuple[Variant, ...]]:
+    """Every peer by name. Raises MissingDependencyError without hdf5plugin."""
+    try:
+        plugins = importlib.import_module("hdf5plugin")
+    except ImportError as error:
+        raise MissingDependencyError(
+            "bench rate compares with the codecs of hdf5plugin; pip install 'fhash[bench]'"
+        ) from error
+
+    def absolute(part: Values, data_range: float, level: float) -> Filter:
+        return plugins.SZ3(absolute=tolerance(data_range, level))  # type: ignore[no-any-return]
+
+    def sperr_tolerance(part: Values, data_range: float, level: float) -> Filter:
+        return plugins.Sperr(absolute=tolerance(data_range, level), swap=True)  # type: ignore[no-any-return]
+
+    def sperr_psnr(part: Values, data_range: float, level: float) -> Filter:
+        own = max(float(part.max()) - float(part.min()), 1e-9 * data_range)
+        psnr = max(0.1, level + 20 * math.log10(own / data_range))
+        return plugins.Sperr(peak_signal_to_noise_ratio=psnr, swap=True)  # type: ignore[no-any-return]
+
+    def sperr_rate(part: Values, data_range: float, level: float) -> Filter:
+        # Bits a value; a fixed ratio for each 6 dB is near the truth at low rates, and the search does the rest.
+        return plugins.Sperr(rate=min(63.9, max(2.0**-15, 2.0 ** (level / 6 - 9))), swap=True)  # type: ignore[no-any-return]
+
+    def zfp(part: Values, data_range: float, level: float) -> Filter:
+        return plugins.Zfp(accuracy=tolerance(data_range, level))  # type: ignore[no-any-return]
+
+    def blosc(part: Values, data_range: float, level: float) -> Filter:
+        return plugins.Blosc(cname="zstd", clevel=5, shuffle=plugins.Blosc.SHUFFLE)  # type: ignore[no-any-return]
+
+    both, quality, bound = (
+        ("psnr", "bound"),
+        ("psnr",),
+        ("bound",),
+    )  # a tolerance of SPERR costs more bytes at equal PSNR
+    return {
+        "SZ3": tuple(
+            Variant(peer="SZ3", mode="tolerance", layout=layout, goals=both, setting=absolute)
+            for layout in ("frame", "series")
+        ),
+        "SPERR": tuple(
+            Variant(peer="SPERR", mode=mode, layout=layout, goals=goals, setting=setting)
+            for mode, goals, setting in (
+                ("PSNR", quality, sperr_psnr),
+                ("rate", quality, sperr_rate),
+                ("tolerance", bound, sperr_tolerance),
+            )
+            for layout in ("frame", "plane")
+        ),
+        "ZFP": tuple(
+            Variant(
+                peer="ZFP", mode="tolerance", layout=layout, goals=both, setting=zfp, step=LADDER
+            )
+            for layout in ("frame", "series")
+        ),
+        "BitRound": (
+            Variant(
+                peer="BitRound",
+                mode="bits",
+                layout="frame",
+                goals=both,
+                setting=blosc,
+                step=LADDER,
+                prepare=_bit_round,
+            ),
+        ),
+        "Blosc": (
+            Variant(
+                peer="Blosc",
+                mode="lossless",
+                layout="frame",
+                goals=both,
+                setting=blosc,
+                lossless=True,
+            ),
+        ),
+    }
+
+
+def small_chunks(variants: Sequence[Variant]) -> Variant:
+    """How to use a peer for random access: small chunks of a frame, with one tolerance for all, as chunks differ in range and detail."""
+    return replace(
+        next(variant for variant in reversed(variants) if variant.layout == "frame"),
+        chunk=SMALL_CHUNK,
+    )
+
+
+def _bit_round(values: Values, level: float) -> Values:
+    """Values with as many bits of the mantissa as a level has steps."""
+    from numcodecs import BitRound
+
+    bits = min(max(round(level / LADDER), 1), np.finfo(values.dtype).nmant)
+    codec = BitRound(bits)
+    return np.asarray(codec.decode(codec.encode(np.array(values))), dtype=values.dtype).reshape(
+        values.shape
+    )
+
+
+@contextmanager
+def stored(
+    values: Values, variant: Variant, data_range: float, level: float, path: Path | None = None
+) -> Iterator[Any]:
+    """An open HDF5 file that holds values (t, z, y, x), in memory, or at `path` if one is given.
+
+    Raises InputError for a shape or a setting that the filter refuses.
+    """
+    import h5py
+
+    if variant.prepare is not None:
+        values = variant.prepare(values, level)
+    axis = LAYOUTS[variant.layout]
+    place: dict[str, Any] = {"driver": "core", "backing_store": False} if path is None else {}
+    with h5py.File(path or f"{id(values)}.h5", "w", rdcc_nbytes=0, **place) as file:
+        try:
+            for number, part in enumerate(
+                [values] if axis is None else np.moveaxis(values, axis, 0)
+            ):
+                filters = variant.setting(part, data_range, level)
+                file.create_dataset(
+                    str(number),
+                    data=part,
+                    chunks=variant.chunk_shape(part),
+                    track_times=False,
+                    **filters,
+                )
+        except (OSError, ValueError, RuntimeError) as error:
+            raise InputError(f"{variant.name}: {error}") from error
+        yield file
+
+
+def opened_file(path: Path) -> Any:
+    """The file of `stored` at a path, for reading, without a chunk cache; a context manager."""
+    import h5py
+
+    return h5py.File(path, "r", rdcc_nbytes=0)
+
+
+def stored_bytes(file: Any) -> int:
+    """Bytes of the chunks alone: the file's own structure is left out, which favours the peers."""
+    return sum(int(dataset.id.get_storage_size()) for dataset in file.values())
+
+
+def read_all(file: Any, variant: Variant) -> Values:
+    """Every value (t, z, y, x), decoded."""
+    axis = LAYOUTS[variant.layout]
+    if axis is None:
+        return np.asarray(file["0"][...])
+    return np.moveaxis(np.stack([file[str(number)][...] for number in range(len(file))]), 0, axis)
+
+
+def read_region(file: Any, variant: Variant, step: int, region: Box) -> Values:
+    """A region (z, y, x) of one step."""
+    parts = [
+        dataset[tuple(slice(*span) for span in spans)]
+        for dataset, spans in _parts(file, variant, step, region)
+    ]
+    return np.concatenate([part.reshape(-1, *part.shape[-2:]) for part in parts])
+
+
+def touched_bytes(file: Any, variant: Variant, step: int, region: Box) -> int:
+    """Stored bytes of the chunks that a region of one step meets."""
+    total = 0
+    for dataset, spans in _parts(file, variant, step, region):
+        firsts = [
+            range(low // n * n, high, n)
+            for (low, high), n in zip(spans, dataset.chunks, strict=True)
+        ]
+        total += sum(
+            int(dataset.id.get_chunk_info_by_coord(corner).size)
+            for corner in itertools.product(*firsts)
+        )
+    return total
+
+
+def _parts(
+    file: Any, variant: Variant, step: int, region: Box
+) -> list[tuple[Any, list[tuple[int, int]]]]:
+    """The datasets that hold a region of one step, with its spans in them."""
+    time = (step, step + 1)
+    if variant.layout == "frame":
+        return [(file[str(step)], [*region])]
+    if variant.layout == "plane":
+        return [(file[str(number)], [time, *region[1:]]) for number in range(*region[0])]
+    return [(file["0"], [time, *region])]
+
+
+def filled(values: Values) -> Values:
+    """Values with every one that is not finite replaced by the nearest finite one before it in its row along x, else behind it.
+
+    Where a row has none, the same along y, z and t. There must be a finite value.
+    """
+    result = values.copy()
+    for axis in (3, 2, 1, 0):
+        for line in (result, np.flip(result, axis)):
+            known = np.isfinite(line)
+            if known.all():
+                return result
+            shape = [-1 if number == axis else 1 for number in range(4)]
+            places = np.where(known, np.arange(line.shape[axis]).reshape(shape), 0)
+            np.maximum.accumulate(places, axis=axis, out=places)
+            line[...] = np.take_along_axis(line, places, axis)
+    return result

@@ -1,0 +1,135 @@
+"""`fhash bench rate`: bytes, speed and access of fhash's profiles and of other codecs, at equal quality on one series."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fhash_codec.bench.machine import machine
+from fhash_codec.bench.rate.measuring import Bench
+from fhash_codec.bench.rate.own import PROFILES, promised
+from fhash_codec.bench.rate.peers import peers
+from fhash_codec.bench.rate.results import PEERS, RateBench
+from fhash_codec.coreset.scan import scan
+from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.progress import Progress, silent
+from fhash_codec.training.devices import choose_device
+from fhash_formats.errors import InputError
+from fhash_formats.series import ArraySeries
+
+TARGETS = (35.0, 40.0, 45.0, 50.0, 60.0)
+"""PSNR in dB."""
+BOUNDS = (0.05, 0.02, 0.01, 0.005, 0.001)
+"""Largest errors as shares of the range."""
+SPEED_AT = 50.0
+"""dB at which speed and access are measured, or the target nearest to it."""
+NOTES = (
+    "the whole series is held in memory",
+    "bytes of a peer are those of its stored chunks alone, the structure of its file is left out; bytes of fhash are the whole file",
+    "of every peer the smallest of its layouts and modes counts; for a bound, the coarsest setting whose decoded values keep it",
+    "tolerances of ZFP are powers of two and BitRound keeps whole bits: both may exceed what was asked by up to 6 dB, as their PSNR says",
+    "peers run on one thread as HDF5 filters; fhash takes the threads it takes by default",
+    "access opens the file anew, the operating system has it in memory; bytes read are those of whole chunks for a peer, "
+    "and all that is read of the file, directory included, for fhash",
+)
+
+
+def bench_rate(
+    source: Source,
+    settings: Mapping[str, Any] | None = None,
+    *,
+    targets: Sequence[float] = TARGETS,
+    bounds: Sequence[float] = BOUNDS,
+    names: Sequence[str] = PEERS,
+    profiles: Sequence[str] = PROFILES,
+    speed: bool = True,
+    progress: Progress = silent,
+) -> RateBench:
+    """Measure fhash's `profiles` and the peers `names` on a series, which is held in memory whole.
+
+    settings: further ones of fhash by name, as `EncodeConfig.from_dict` takes them; each profile takes those it has. All of the domain
+    counts here, so a feature is refused. targets: PSNR in dB over every finite value of all frames, the range being the global one of
+    the series. bounds: largest errors as shares of that range. Everything is measured on what is really decoded. speed: also measure
+    encoding, decoding and access at the target nearest to SPEED_AT, unless there is none.
+    Raises InputError for what cannot be measured, MissingDependencyError without hdf5plugin.
+    """
+    settings = settings or {}
+    _check(settings, targets, bounds, names, profiles)
+    known = peers() if names else {}
+    with (
+        open_source(source) as series,
+        tempfile.TemporaryDirectory(prefix="fhash-bench-") as folder,
+    ):
+        scanned = scan(series, progress)
+        value_range = (scanned.value_range.low, scanned.value_range.high)
+        if value_range[0] == value_range[1]:
+            raise InputError(
+                f"{series.source}: '{series.name}' is constant; there is no quality to compare"
+            )
+        values = np.stack(list(series.frames()))
+        missing = values.size - scanned.finite_count
+        plain = ArraySeries(values, name=series.name, units=series.units, coords=series.coords)
+        goals = [("psnr", target) for target in sorted(targets)] + [
+            ("bound", bound) for bound in sorted(bounds, reverse=True)
+        ]
+        bench = Bench(plain, value_range, missing, Path(folder), goals, progress)
+        chosen = [variant for name in names for variant in known[name]]
+        bench.total = sum(goal in variant.goals for variant in chosen for goal, _ in goals) + len(
+            goals
+        ) * len(profiles)
+        for variant in chosen:
+            bench.search(variant)
+        for profile in profiles:
+            bench.search_own(settings, profile)
+        if speed and targets:
+            bench.measure_speed(
+                min(targets, key=lambda target: (abs(target - SPEED_AT), target)), known
+            )
+        return RateBench(
+            series=f"{series.source} {series.name}",
+            shape=series.shape,
+            dtype=series.dtype.name,
+            raw_bytes=values.nbytes,
+            value_range=value_range,
+            missing=missing,
+            points=tuple(bench.points()),
+            speeds=tuple(bench.speeds),
+            access=tuple(bench.access),
+            refused=bench.refused,
+            machine=machine(choose_device("cpu")),
+            notes=NOTES,
+        )
+
+
+def _check(
+    settings: Mapping[str, Any],
+    targets: Sequence[float],
+    bounds: Sequence[float],
+    names: Sequence[str],
+    profiles: Sequence[str],
+) -> None:
+    """Raise InputError for arguments of `bench_rate` that are not allowed."""
+    for what, given, allowed in (("peer", names, PEERS), ("profile", profiles, PROFILES)):
+        for name in given:
+            if name not in allowed:
+                raise InputError(f"{what} is '{name}'; allowed: {', '.join(allowed)}")
+    for target in targets:
+        if not 5 <= target <= 200:
+            raise InputError(f"target is {target:g} dB; allowed: 5 to 200")
+    for bound in bounds:
+        if not 1e-9 <= bound <= 0.5:
+            raise InputError(f"bound is {bound:g} of the range; allowed: 1e-9 to 0.5")
+    if not (targets or bounds) or not (names or profiles):
+        raise InputError(
+            "nothing to measure; give at least one target or bound, and one peer or profile"
+        )
+    if tuple(settings.get("features", ("all",))) != ("all",):
+        raise InputError(
+            f"feature is {', '.join(settings['features'])}; bench rate compares whole domains, leave it out"
+        )
+    for profile in profiles:
+        promised(settings, profile, "psnr", SPEED_AT)

@@ -1,0 +1,1 @@
+"""One file per choice: a sample and settings in, better settings out."""

@@ -1,0 +1,1 @@
+"""A series as tiles, and some of the tiles as a sample."""

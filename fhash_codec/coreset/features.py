@@ -1,0 +1,264 @@
+"""Which vertices of a frame a user cares about (paper, Feature Extraction and Feature Dilation)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.coreset.scan import finite_values
+from fhash_codec.measure.value_range import ValueRange, pieces
+from fhash_codec.progress import Progress
+from fhash_formats.errors import InputError
+from fhash_formats.series import Series
+
+Frame = npt.NDArray[Any]
+Selection = npt.NDArray[np.bool_]
+OpenMask = Callable[[str, tuple[int, int, int, int]], Callable[[int], Selection]]
+"""(path, shape of the series) -> (step -> bool (z, y, x)), as fhash_formats.readers.open_mask."""
+
+KINDS = "interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE, all"
+BINS = 1024
+
+
+class Feature(ABC):
+    """A region of interest; `str` of it is the text that `parse_feature` reads.
+
+    Thresholds are rounded to the number type of a floating frame before they are compared, as numpy does: in a float32 frame
+    `interval:0.1:0.3` includes the value 0.3. Integers are compared as float64. NaN and infinite vertices are never selected.
+    """
+
+    @abstractmethod
+    def select(self, frame: Frame, step: int) -> Selection:
+        """The vertices of the feature in a frame (z, y, x) of data values: bool of the same shape."""
+
+
+@dataclass(frozen=True)
+class Everything(Feature):
+    """Every finite vertex."""
+
+    def select(self, frame: Frame, step: int) -> Selection:
+        return np.isfinite(frame)
+
+    def __str__(self) -> str:
+        return "all"
+
+
+@dataclass(frozen=True)
+class Interval(Feature):
+    """Vertices with low <= value <= high; an end may be infinite."""
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.high:
+            raise InputError(f"feature '{self}' is empty; write interval:LO:HI with LO <= HI")
+
+    def select(self, frame: Frame, step: int) -> Selection:
+        selected: Selection = np.isfinite(frame)
+        selected &= frame >= _alike(self.low, frame)
+        selected &= frame <= _alike(self.high, frame)
+        return selected
+
+    def __str__(self) -> str:
+        return f"interval:{_text(self.low)}:{_text(self.high)}"
+
+
+@dataclass(frozen=True)
+class Isosurface(Feature):
+    """Both ends of every lattice edge (along z, y or x) whose ends lie strictly on either side of the value, and vertices exactly on it."""
+
+    value: float
+
+    def select(self, frame: Frame, step: int) -> Selection:
+        value, finite = _alike(self.value, frame), np.isfinite(frame)
+        selected: Selection = frame == value
+        selected &= finite
+        above: Selection = (frame > value) & finite
+        below: Selection = (frame < value) & finite
+        for axis in range(3):
+            high, low, ends = (np.moveaxis(mask, axis, 0) for mask in (above, below, selected))
+            crossed = (high[:-1] & low[1:]) | (low[:-1] & high[1:])
+            ends[:-1] |= crossed
+            ends[1:] |= crossed
+        return selected
+
+    def __str__(self) -> str:
+        return f"isosurface:{_text(self.value)}"
+
+
+@dataclass(frozen=True)
+class Segmentation(Feature):
+    """The foreground: vertices strictly above the threshold. None stands for Otsu's, which `resolve_features` fills in."""
+
+    threshold: float | None = None
+
+    def select(self, frame: Frame, step: int) -> Selection:
+        if self.threshold is None:
+            raise InputError(
+                "feature 'segmentation' has no threshold yet; resolve_features finds Otsu's from the data"
+            )
+        selected: Selection = np.isfinite(frame)
+        selected &= frame > _alike(self.threshold, frame)
+        return selected
+
+    def __str__(self) -> str:
+        return "segmentation" if self.threshold is None else f"segmentation:{_text(self.threshold)}"
+
+
+@dataclass(frozen=True)
+class Mask(Feature):
+    """Vertices that a file of booleans marks, so that any detector fits; `read` gives its mask (z, y, x) of a step once it is open."""
+
+    path: str
+    read: Callable[[int], Selection] | None = field(default=None, compare=False, repr=False)
+
+    def select(self, frame: Frame, step: int) -> Selection:
+        if self.read is None:
+            raise InputError(f"feature '{self}' is not open yet; resolve_features opens it")
+        marked = self.read(step)
+        if marked.shape != frame.shape:
+            raise InputError(
+                f"feature '{self}': the mask of step {step} has shape {marked.shape}; the frame has {frame.shape} (z, y, x)"
+            )
+        return np.isfinite(frame) & marked
+
+    def __str__(self) -> str:
+        return f"mask:{self.path}"
+
+
+def parse_feature(text: str) -> Feature:
+    """The feature that a text names, such as "interval:0.2:1"; raises InputError with the forms that are allowed."""
+    kind, *rest = text.split(":", 1)
+    values = rest[0] if rest else None
+    if kind == "all" and values is None:
+        return Everything()
+    if kind == "interval":
+        low, high = _numbers(text, values, 2, "interval:LO:HI with LO <= HI")
+        return Interval(low, high)
+    if kind == "isosurface":
+        return Isosurface(
+            *_numbers(text, values, 1, "isosurface:V with a finite number V", finite=True)
+        )
+    if kind == "segmentation":
+        form = "segmentation or segmentation:T with a finite number T"
+        return (
+            Segmentation()
+            if values is None
+            else Segmentation(*_numbers(text, values, 1, form, finite=True))
+        )
+    if kind == "mask" and values:
+        return Mask(values)
+    raise InputError(f"feature '{text}' is not known; allowed: {KINDS}")
+
+
+def resolve_features(
+    texts: Sequence[str],
+    series: Series,
+    key_frames: Sequence[int],
+    value_range: ValueRange,
+    progress: Progress,
+    open_mask: OpenMask | None = None,
+) -> tuple[Feature, ...]:
+    """Parsed features that are ready to select: Otsu's threshold filled in, masks open.
+
+    Otsu's threshold comes from one histogram (BINS bins over the global range) of the finite values of all key frames; they are read
+    only if a feature needs it. `open_mask` defaults to fhash_formats.readers.open_mask. Progress stage: "thresholding".
+    """
+    features = [parse_feature(text) for text in texts]
+    if Segmentation() in features:
+        edges = value_range.from_unit(np.linspace(0.0, 1.0, BINS + 1))
+        filled = Segmentation(
+            otsu_threshold(_histogram(series, key_frames, value_range, progress), edges)
+        )
+        features = [filled if feature == Segmentation() else feature for feature in features]
+    if any(isinstance(feature, Mask) for feature in features) and open_mask is None:
+        from fhash_formats.readers import open_mask as open_mask_file
+
+        open_mask = open_mask_file
+    return tuple(
+        dataclasses.replace(feature, read=open_mask(feature.path, series.shape))
+        if isinstance(feature, Mask) and open_mask
+        else feature
+        for feature in features
+    )
+
+
+def otsu_threshold(counts: npt.ArrayLike, edges: npt.ArrayLike) -> float:
+    """Otsu's threshold of a histogram: the inner edge with the largest variance between the two classes (Otsu 1979, equation 18).
+
+    counts (n,), edges (n + 1,) equally spaced. Where an empty gap makes several edges equal, the middle one.
+    """
+    weights, bounds = np.asarray(counts, dtype=np.float64), np.asarray(edges, dtype=np.float64)
+    moments = weights * np.arange(weights.size)
+    below, total = np.cumsum(weights)[:-1], weights.sum()
+    above = total - below
+    difference = np.cumsum(moments)[:-1] * total - moments.sum() * below
+    variance = np.divide(
+        difference**2, below * above, out=np.zeros_like(below), where=below * above > 0
+    )
+    best = np.flatnonzero(variance == variance.max())
+    return float(bounds[best[best.size // 2] + 1])
+
+
+def dilate(mask: Selection, vertices: int) -> Selection:
+    """A mask (z, y, x) grown by that many vertices in the 26-neighbourhood (paper, Feature Dilation); nothing wraps around an edge.
+
+    The cube is grown one axis after another, and along an axis by shifts that double, since a reach r may be shifted by r + 1.
+    """
+    for axis in range(3):
+        reach = 0
+        while reach < vertices:
+            shift = min(reach + 1, vertices - reach)
+            lines, grown = np.moveaxis(mask, axis, 0), mask.copy()
+            out = np.moveaxis(grown, axis, 0)
+            out[shift:] |= lines[:-shift]
+            out[:-shift] |= lines[shift:]
+            mask, reach = grown, reach + shift
+    return mask
+
+
+def _alike(value: float, frame: Frame) -> np.generic:
+    """The value as a scalar that compares with a frame without converting it: of its own floating type, float64 for integers."""
+    with np.errstate(over="ignore"):
+        return np.float64(value).astype(frame.dtype if frame.dtype.kind == "f" else np.float64)
+
+
+def _histogram(
+    series: Series, key_frames: Sequence[int], value_range: ValueRange, progress: Progress
+) -> npt.NDArray[np.int64]:
+    counts = np.zeros(BINS, dtype=np.int64)
+    for done, step in enumerate(key_frames):
+        for part in pieces(series.read(step)):
+            unit = value_range.to_unit(finite_values(part))
+            counts += np.bincount(
+                np.minimum((unit * BINS).astype(np.int64), BINS - 1), minlength=BINS
+            )
+        progress("thresholding", done + 1, len(key_frames), "")
+    return counts
+
+
+def _numbers(
+    text: str, values: str | None, count: int, form: str, *, finite: bool = False
+) -> list[float]:
+    parts = [] if values is None else values.split(":")
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or any(
+        math.isnan(number) or (finite and math.isinf(number)) for number in numbers
+    ):
+        raise InputError(f"feature '{text}' is malformed; write {form}")
+    return numbers
+
+
+def _text(value: float) -> str:
+    return repr(float(value)).removesuffix(".0")

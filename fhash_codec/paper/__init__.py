@@ -1,0 +1,1 @@
+"""The paper profile: the published F-Hash."""

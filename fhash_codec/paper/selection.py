@@ -1,0 +1,44 @@
+"""The coreset and the architecture that the paper profile trains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy.typing as npt
+
+from fhash_codec.config import EncodeConfig
+from fhash_codec.coreset.boxes import box_size
+from fhash_codec.coreset.bricks import Coreset, build_coreset
+from fhash_codec.coreset.features import Feature
+from fhash_codec.coreset.scan import Scan
+from fhash_codec.coreset.selection import resolve_selection
+from fhash_codec.paper.architecture import Architecture
+from fhash_codec.progress import Progress
+from fhash_formats.series import Series
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """What the settings select of a series, and the model that is to be fitted to it."""
+
+    scanned: Scan
+    features: tuple[Feature, ...]
+    coreset: Coreset
+    architecture: Architecture
+
+
+def select(
+    series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None
+) -> Selection:
+    """As `find`, and gather the coreset for training."""
+    scanned, key_frames, features = resolve_selection(series, config, progress, mask)
+    coreset = build_coreset(series, scanned, key_frames, features, config.dilation, progress)
+    architecture = Architecture.for_box(
+        box_size(coreset.box),
+        len(key_frames),
+        fold=config.fold,
+        embedding_size=config.embedding_size,
+        hidden_layers=config.hidden_layers,
+        width=config.width,
+    )
+    return Selection(scanned=scanned, features=features, coreset=coreset, architecture=architecture)

@@ -1,0 +1,1 @@
+"""The training loop of the paper profile, its restarts and its checkpoints."""

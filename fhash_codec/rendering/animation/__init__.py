@@ -1,0 +1,1 @@
+"""Several pictures: animations, evolutions and tracked features."""

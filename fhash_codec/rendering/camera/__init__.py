@@ -1,0 +1,1 @@
+"""Cameras, poses and rays: where a picture is seen from."""

@@ -1,0 +1,1 @@
+"""Colour and opacity of a value."""

@@ -1,0 +1,74 @@
+"""Marching rays through a frame of values: natively in packets, or slower streamed in numpy where the native library is not there."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from fhash_codec.rendering.native.march import MAX_SURFACES, MAX_VALUES, march_native
+from fhash_codec.rendering.stream.fields import FrameField
+from fhash_codec.rendering.stream.stream import stream
+from fhash_codec.rendering.task.bricks import Bricks
+from fhash_codec.rendering.task.task import Frame, Marched, Task
+from fhash_formats import native
+from fhash_formats.errors import InputError
+
+__all__ = ["march"]
+
+
+def march(
+    frame: Frame, task: Task, *, bricks: Bricks | None = None, threads: int | None = None
+) -> Marched:
+    """The picture of a task.
+
+    A sample of a last, shorter step that lies beyond the box is taken at the nearest place in it. Outside a frame smaller than the
+    domain nothing is seen. Surfaces are looked for between the entry, the samples and the exit of a ray, and lie in front of the sample
+    behind them. Beside a maximum they are drawn over it. The depth is where less than half of the light is left, or where the maximum
+    is; of several rays of a pixel the nearest.
+
+    bricks: of the frame, for further pictures of it. threads: at most so many; as many as there are processors by default.
+    Raises InputError for more than MAX_SURFACES surfaces and a step that is not above 0.
+    """
+    if not task.step > 0:
+        raise InputError(f"a step has the length {task.step:g}; it must be above 0")
+    if len(task.surfaces) > MAX_SURFACES:
+        raise InputError(f"a picture has {len(task.surfaces)} surfaces; allowed: {MAX_SURFACES}")
+    if bricks is None:
+        bricks = Bricks.of(frame)
+    if task.maximum and task.surfaces:
+        return _over(
+            _march(
+                frame,
+                dataclasses.replace(task, maximum=False, table=None, shaded=False),
+                bricks,
+                threads,
+            ),
+            _march(frame, dataclasses.replace(task, surfaces=()), bricks, threads),
+        )
+    return _march(frame, task, bricks, threads)
+
+
+def _march(frame: Frame, task: Task, bricks: Bricks, threads: int | None) -> Marched:
+    library = native.library()
+    if library is None or bricks.values.size > MAX_VALUES:
+        streamed = stream(FrameField(frame, task.rays.grid, bricks), task, adaptive=True)
+        # A decoded frame is no model that is evaluated.
+        return dataclasses.replace(streamed, counters={**streamed.counters, "evaluations": 0})
+    return march_native(library, frame, task, bricks, threads)
+
+
+def _over(front: Marched, back: Marched) -> Marched:
+    """Two pictures of the same rays, one behind the other."""
+    depth, normal = front.depth, front.normal
+    hidden = front.rgba[..., 3] > 0.5
+    if depth is not None and back.depth is not None:
+        depth = np.where(hidden, depth, back.depth)
+    if normal is not None and back.normal is not None:
+        normal = np.where(hidden[..., None], normal, back.normal)
+    return Marched(
+        rgba=front.rgba + (1 - front.rgba[..., 3:]) * back.rgba,
+        depth=depth,
+        normal=normal,
+        counters={key: front.counters[key] + back.counters[key] for key in front.counters},
+    )

@@ -1,0 +1,1 @@
+"""The task as the C++ marcher takes it."""

@@ -1,0 +1,1 @@
+"""One picture: planned, explained and finished."""

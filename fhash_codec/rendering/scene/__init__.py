@@ -1,0 +1,1 @@
+"""What is asked of a picture, as records and text. No arrays."""

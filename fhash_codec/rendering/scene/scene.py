@@ -1,0 +1,251 @@
+"""What a picture shows: camera, image, time, transfer function and effects, as one record that is written as TOML or JSON.
+
+An effect that the scene does not name is off, and costs nothing. Every record refuses an unknown key and names the nearest known one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+from fhash_codec.rendering.scene.record import Record, limits
+from fhash_codec.rendering.task.devices import DEVICES
+from fhash_formats.errors import InputError
+
+__all__ = [
+    "AmbientOcclusion",
+    "Camera",
+    "Effects",
+    "Evolution",
+    "Isosurface",
+    "Marching",
+    "Scene",
+    "Shading",
+    "Shadows",
+    "TransferFunctionSpec",
+]
+
+Vector = tuple[float, float, float]
+Point = tuple[float, float]
+MAX_SIDE = 16384
+"""Pixels along a side of an image."""
+VIEWS = ("iso", "xy", "xz", "yz", "yx", "zx", "zy")
+"""Directions a camera looks from by name, as PyVista has them: `xy` has x to the right and y upwards."""
+MARCHES = ("auto", "cache", "arm", "stream")
+BUFFERS = ("depth", "normal")
+GRADIENTS = ("cell", "central")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera(Record):
+    """Where the picture is taken from, in the physical coordinates of the series (x, y, z).
+
+    `position` with `focal_point` and `view_up` (as in PyVista), or a `view` by name that `azimuth` and `elevation` turn.
+    """
+
+    view: str = limits("iso", "direction to look from", choices=VIEWS)
+    azimuth: float = limits(
+        0.0, "degrees to turn about the upward direction", low=-36000, high=36000
+    )
+    elevation: float = limits(0.0, "degrees to rise", low=-90, high=90)
+    zoom: float = limits(1.0, "magnification", low=1e-3, high=1e6)
+    position: Vector | None = limits(None, "where the camera stands", low=-1e100, high=1e100)
+    focal_point: Vector | None = limits(
+        None, "what it looks at; the middle of the volume if left out", low=-1e100, high=1e100
+    )
+    view_up: Vector | None = limits(None, "what is upwards in the picture")
+    projection: str = limits(
+        "perspective", "kind of projection", choices=("perspective", "parallel")
+    )
+    view_angle: float = limits(
+        30.0, "vertical angle of the picture in degrees, of a perspective", low=0.1, high=170
+    )
+    parallel_scale: float | None = limits(
+        None,
+        "half the height of the picture in units of the coordinates, of a parallel projection",
+        low=1e-100,
+        high=1e100,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransferFunctionSpec(Record):
+    """Colour and opacity of values in data units."""
+
+    colours: str | tuple[tuple[float, str], ...] = limits(
+        "viridis", "name of a colour map, file of a ParaView preset, or points [value, '#rrggbb']"
+    )
+    range: Point | None = limits(
+        None,
+        "values that the colour map reaches from and to; those of the feature or the series if left out",
+    )
+    opacity: str | tuple[Point, ...] = limits(
+        "auto", "name of an opacity preset, or points [value, opacity]"
+    )
+    density: float = limits(1.0, "factor of the extinction", low=0, high=1e6)
+    unit_distance: float | None = limits(
+        None,
+        "length after which the opacity is as given, in units of the coordinates; a vertex spacing if left out",
+        low=1e-100,
+        high=1e100,
+    )
+    nothing: bool = limits(False, "show no volume at all, for surfaces alone")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shading(Record):
+    """Phong shading by the gradient, two-sided; shares of the light."""
+
+    ambient: float = limits(0.2, "light from everywhere", low=0, high=10)
+    diffuse: float = limits(0.8, "scattered light", low=0, high=10)
+    specular: float = limits(0.2, "mirrored light", low=0, high=10)
+    specular_power: float = limits(16.0, "sharpness of the highlights", low=1, high=1000)
+    light: Vector | None = limits(
+        None, "direction towards the light (x, y, z); the camera's if left out"
+    )
+    gradient: str = limits(
+        "cell",
+        "that within the cell, exact, or central differences over two vertices, smoother",
+        choices=GRADIENTS,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shadows(Record):
+    """Light that the volume takes away on its way to a sample."""
+
+    strength: float = limits(0.8, "share of the light that a shadow takes", low=0, high=1)
+    light: Vector | None = limits(
+        None,
+        "direction towards the light (x, y, z); from above the camera's left shoulder if left out",
+    )
+    resolution: float = limits(2.0, "vertices between two samples of the shadow", low=0.5, high=64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AmbientOcclusion(Record):
+    """Light from everywhere that the surroundings take away."""
+
+    strength: float = limits(0.7, "share of the ambient light that it takes", low=0, high=1)
+    radius: float = limits(8.0, "how far the surroundings reach, in vertices", low=1, high=256)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Isosurface(Record):
+    """A surface of equal value, shaded."""
+
+    value: float = limits(dataclasses.MISSING, "value in data units", low=-1.7e308, high=1.7e308)
+    colour: str | None = limits(
+        None, "'#rrggbb' or a name; that of the transfer function if left out"
+    )
+    opacity: float = limits(1.0, "of the surface", low=0, high=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effects(Record):
+    """Each is off unless it is named; `true` switches one on with its defaults."""
+
+    shading: Shading | None = None
+    shadows: Shadows | None = None
+    ambient_occlusion: AmbientOcclusion | None = None
+    isosurfaces: tuple[Isosurface, ...] = ()
+    maximum_intensity: bool = limits(
+        False, "show the largest value along each ray instead of the volume"
+    )
+    buffers: tuple[str, ...] = limits((), "pictures beside the colours", choices=BUFFERS)
+    antialiasing: int = limits(1, "rays per side of a pixel", low=1, high=8)
+    jitter: bool = limits(
+        False, "begin each ray at a place of its own within the first step, against rings"
+    )
+    box: bool = limits(False, "the edges of the volume")
+    axes: bool = limits(False, "names and ends of the axes")
+    colour_bar: bool = limits(False, "the colours and their values")
+    time_label: bool = limits(False, "step and time")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Marching(Record):
+    """How rays are sampled: what accuracy costs in time."""
+
+    mode: str = limits("auto", "way to march", choices=MARCHES)
+    step: float = limits(0.5, "length of a step in vertex spacings", low=1e-6, high=64)
+    threshold: float = limits(
+        1 / 1024, "share of the light behind a sample below which a ray ends", low=0, high=1
+    )
+    lod: int | None = limits(
+        None,
+        "level of detail, 0 for the finest; by the size of a pixel if left out",
+        low=0,
+        high=10,
+    )
+    samples_per_pass: int | None = limits(
+        None,
+        "N_r of adaptive ray marching: samples in a pass; the number of rays if left out",
+        low=1,
+        high=2**40,
+    )
+    device: str = limits(
+        "auto",
+        "where arm and stream compute: on the first GPU if there is one, or as named",
+        choices=DEVICES,
+    )
+    skipping: bool = limits(True, "whether bricks without anything visible are passed over")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evolution(Record):
+    """Several steps side by side in one picture, each of the size of the scene."""
+
+    steps: tuple[float, ...] = limits(
+        dataclasses.MISSING, "steps of the series, between two of them too", low=0, high=1e15
+    )
+    columns: int | None = limits(
+        None, "pictures beside each other; by the shape of the whole if left out", low=1, high=1000
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene(Record):
+    """All that a picture is made from beside the volume."""
+
+    camera: Camera = Camera()
+    size: tuple[int, int] = limits((512, 512), "pixels across and down", low=1, high=MAX_SIDE)
+    scale: Vector | None = limits(
+        None,
+        "factors by which the axes (x, y, z) are stretched; if left out, one in other units than the rest has its vertices as far apart. "
+        "The camera lives in the stretched coordinates",
+        low=1e-30,
+        high=1e30,
+    )
+    background: str = limits("#ffffff", "'#rrggbb', a name, or 'transparent'")
+    step: float | None = limits(
+        None,
+        "step of the series, between two of them too; the first if neither it nor time is given",
+        low=0,
+        high=1e15,
+    )
+    time: float | None = limits(
+        None, "physical time, instead of a step", low=-1.7e308, high=1.7e308
+    )
+    transfer_function: TransferFunctionSpec = TransferFunctionSpec()
+    effects: Effects = Effects()
+    march: Marching = Marching()
+    evolution: Evolution | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.step is not None and self.time is not None:
+            raise InputError("scene: step and time exclude each other")
+        if self.evolution is not None and (self.step is not None or self.time is not None):
+            raise InputError("scene: an evolution has steps of its own; leave step and time out")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scene:
+        """From a file: TOML by its suffix .toml, the text in a PNG that `fhash render` wrote, else JSON. Raises InputError."""
+        path = Path(path)
+        if path.suffix.lower() == ".png":
+            from fhash_codec.rendering.scene.png_text import scene_in_png
+
+            return scene_in_png(path)
+        return cls.read(path, "a scene", "no such scene")

@@ -1,0 +1,1 @@
+"""The march pass by pass over arrays, in numpy or torch."""

@@ -1,0 +1,144 @@
+"""What streamed rays have seen: events joined front to back, lit, and the buffers beside the picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fhash_codec.rendering.stream.beams import Beams
+from fhash_codec.rendering.stream.fields import Field, central_slopes
+from fhash_codec.rendering.stream.phong import LightAt, Phong
+from fhash_codec.rendering.task.arrays import Array
+from fhash_codec.rendering.task.palette import Palette
+from fhash_codec.rendering.task.task import Task
+
+__all__ = ["Canvas", "Events"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Events:
+    """What a pass meets along each ray, (rays, events), the nearest first: before each sample the surfaces, then the sample itself.
+
+    opacity: 0 where there is nothing. at: in samples. which: of the surfaces, their number for the volume. values: (rays, samples).
+    """
+
+    opacity: Array
+    at: Array
+    which: Array
+    values: Array
+
+
+class Canvas:
+    """Colour (n, 3) and depth, normal (n, 3) of rays, and `clear` (n,), the share of the light behind that comes through.
+
+    gradients: how many it took.
+    """
+
+    def __init__(self, field: Field, task: Task, beams: Beams, palette: Palette | None) -> None:
+        self.field, self.task, self.beams, self.palette, self.arrays = (
+            field,
+            task,
+            beams,
+            palette,
+            field.arrays,
+        )
+        count = len(beams.end)
+        self.colour, self.clear = self.arrays.full((count, 3), 0.0), self.arrays.full(count, 1.0)
+        self.depth, self.normal = self.arrays.full(count, np.inf), self.arrays.full((count, 3), 0.0)
+        self.gradients = 0
+        self._phong = Phong.of(task, field)
+        self._light = None if task.light is None else LightAt(task.light, self.arrays)
+        self._surfaces = [self.arrays.array(surface.colour, "float64") for surface in task.surfaces]
+        self._spacing = self.arrays.array(task.rays.grid.spacing)
+
+    def add(self, alive: Array, events: Events) -> None:
+        """Join a pass to its rays, front to back."""
+        arrays, xp = self.arrays, self.arrays.xp
+        each = len(self._surfaces) + 1
+        # Light behind each event; the first column is what was left before.
+        left = xp.cumprod(
+            xp.concatenate([self.clear[alive][:, None], 1 - events.opacity], axis=1), axis=1
+        )
+        # A ray ends after a sample, never between a surface and the sample behind it.
+        ended = left[:, :-1:each] < self.task.threshold
+        ended[:, 0] = False
+        ended = xp.broadcast_to(ended[..., None], (*ended.shape, each)).reshape(
+            events.opacity.shape
+        )
+        weight = xp.where(ended, 0.0, left[:, :-1] * events.opacity)
+        after = xp.where(ended, np.inf, left[:, 1:])
+        self.clear[alive] = xp.amin(after, axis=1)
+        row, column = arrays.nonzero(weight)
+        if not len(row):
+            return
+        # One event of a ray after the other, as in any other number of passes.
+        arrays.add_rows(
+            self.colour,
+            alive[row],
+            self._colours(alive[row], events, row, column) * weight[row, column][:, None],
+        )
+        if self.task.depth or self.task.normal:
+            behind = after < 0.5
+            new = xp.isinf(self.depth[alive]) & xp.any(behind, axis=1)
+            event = xp.argmax(arrays.whole(behind[new]), axis=1)
+            self.see(alive[new], arrays.take_along(events.at[new], event[:, None], 1)[:, 0])
+
+    def see(self, rays: Array, at: Array) -> None:
+        """Depth and normal of rays (n,) at samples (n,)."""
+        xp = self.arrays.xp
+        self.depth[rays] = self.beams.depth[rays] + at * self.beams.step
+        if not self.task.normal or not len(rays):
+            return
+        self.gradients += len(rays)
+        slopes = self.field.slopes(self.beams.places(rays, at)) / self._spacing
+        # Towards the eye, of unit length.
+        slopes = xp.where(
+            xp.sum(slopes * self.beams.along[rays], axis=1)[:, None] > 0, -slopes, slopes
+        )
+        length = xp.sqrt(xp.sum(slopes * slopes, axis=1))[:, None]
+        self.normal[rays] = slopes / xp.where(length > 0, length, 1.0)
+
+    def show_peaks(self, peak: Array, at: Array) -> None:
+        """The largest value along each ray (n,), where it is finite, opaque, behind what surfaces there are."""
+        assert self.palette is not None
+        (known,) = self.arrays.nonzero(self.arrays.xp.isfinite(peak))
+        if self.task.depth or self.task.normal:
+            # As if surfaces of little opacity were not there.
+            front = known[self.clear[known] >= 0.5]
+            self.see(front, at[front])
+        self.colour[known] += self.clear[known][:, None] * self.palette.colour(peak[known])
+        self.clear[known] = 0.0
+
+    def _colours(self, rays: Array, events: Events, row: Array, column: Array) -> Array:
+        """Colours (n, 3) of events, lit."""
+        arrays, task, surfaces = self.arrays, self.task, len(self._surfaces)
+        which = events.which[row, column]
+        colours = arrays.full((len(rays), 3), 0.0)
+        of_volume = which == surfaces
+        if self.palette is not None:
+            colours[of_volume] = self.palette.colour(
+                events.values[row[of_volume], column[of_volume] // (surfaces + 1)]
+            )
+        for number, colour in enumerate(self._surfaces):
+            colours[which == number] = colour
+        (lit,) = arrays.nonzero(of_volume | ~of_volume if task.shaded else ~of_volume)
+        if self._light is None and not len(lit):
+            return colours
+        places = self.beams.places(rays, events.at[row, column])
+        lamp, around = (
+            (arrays.full(len(rays), 1.0),) * 2 if self._light is None else self._light(places)
+        )
+        result = colours * (lamp * around)[:, None]
+        if len(lit):
+            assert self._phong is not None
+            self.gradients += len(lit)
+            slopes = (
+                central_slopes(self.field, places[lit])
+                if self._phong.lighting.central
+                else self.field.slopes(places[lit])
+            )
+            result[lit] = self._phong(
+                colours[lit], slopes, self.beams.along[rays[lit]], lamp[lit], around[lit]
+            )
+        return result

@@ -1,0 +1,1 @@
+"""The task and the frame that every marcher is given."""

@@ -1,0 +1,136 @@
+"""Cases of features: at the borders, of one vertex, far apart, empty at times, everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.config import EncodeConfig
+from fhash_codec.selftest.case import Case
+from fhash_codec.selftest.cases.fields import SHAPE, lattice, series, waves
+from fhash_codec.selftest.cases.settings import MORE, QUICK, Settings, of_all
+
+__all__ = ["CASES"]
+
+Values = npt.NDArray[Any]
+
+INSIDE = "interval:10:30"
+"""What `_marked` lifts there."""
+
+
+def _case(
+    name: str,
+    about: str,
+    make: Callable[[], Values],
+    features: tuple[str, ...] = (INSIDE,),
+    dilation: int = 0,
+    **rest: Any,
+) -> Case:
+    settings: Settings = rest.pop("settings", QUICK)
+    return Case(
+        name=name,
+        group="features",
+        about=about,
+        make=lambda: series(make().astype(np.float32)),
+        settings=of_all(settings, features=features, dilation=dilation),
+        more=of_all(rest.pop("more", MORE), features=features, dilation=dilation),
+        **rest,
+    )
+
+
+def _marked(where: Callable[..., Values]) -> Callable[[], Values]:
+    """Waves in 0..1, lifted to 10..11 in the feature."""
+    return lambda: np.where(where(*lattice()), 10.0, 0.0) + waves()
+
+
+def _borders(t: Values, z: Values, y: Values, x: Values) -> Values:
+    ends = [(part == 0) | (part == n - 1) for part, n in zip((z, y, x), SHAPE[1:], strict=True)]
+    return np.asarray(np.logical_or.reduce(ends))
+
+
+def _corners(t: Values, z: Values, y: Values, x: Values) -> Values:
+    low, high = (z <= 1) & (y <= 1) & (x <= 1), (z >= 7) & (y >= 8) & (x >= 9)
+    return np.asarray(np.where(t % 2 == 0, low, high) | (low & (t == 3)))
+
+
+def _vertex(t: Values, z: Values, y: Values, x: Values) -> Values:
+    return np.asarray((z == 4) & (y == 5) & (x == 2 + t))
+
+
+def _ends(t: Values, z: Values, y: Values, x: Values) -> Values:
+    """Two vertices that span the whole domain."""
+    return np.asarray(((z == 0) & (y == 0) & (x == 0)) | ((z == 8) & (y == 9) & (x == 10)))
+
+
+def _with_holes() -> Values:
+    """The feature meets what is missing."""
+    values = _marked(lambda t, z, y, x: x > 4)()
+    t, _, y, x = lattice()
+    values[(y == 5) | ((t == 2) & (x < 6))] = np.nan
+    return values
+
+
+KEYS = EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0,2,3", tables="transform")
+
+CASES: tuple[Case, ...] = (
+    _case("at-every-border", "a feature that is the surface of the domain", _marked(_borders)),
+    _case(
+        "at-every-border-grown", "the same, grown beyond the domain", _marked(_borders), dilation=64
+    ),
+    _case("one-vertex", "a feature of one vertex that moves", _marked(_vertex)),
+    _case(
+        "one-vertex-grown", "a feature of one vertex, grown by one", _marked(_vertex), dilation=1
+    ),
+    _case("opposite-corners", "in opposite corners in turns", _marked(_corners)),
+    _case("whole-box", "two vertices whose bounding box is the domain", _marked(_ends)),
+    _case("everything", "an interval that holds all values", waves, ("interval:-1:2",)),
+    _case(
+        "empty-key-frames",
+        "nothing to be kept in some of the key frames",
+        _marked(lambda t, z, y, x: (t == 2) & (x > 3)),
+        settings={**QUICK, "paper-keys": KEYS},
+    ),
+    _case(
+        "one-key-frame-filled",
+        "the feature is there at the last step alone",
+        _marked(lambda t, z, y, x: (t == 3) & (y == 2)),
+    ),
+    _case(
+        "every-second-vertex",
+        "no two vertices of the feature touch",
+        _marked(lambda t, z, y, x: (t + z + y + x) % 2 == 0),
+    ),
+    _case("beside-missing", "a feature that meets missing values", _with_holes, dilation=1),
+    _case("open-interval", "an interval without ends", waves, ("interval:-inf:inf",)),
+    _case(
+        "one-value", "an interval of one value", lambda: np.rint(10 * waves()), ("interval:5:5",)
+    ),
+    _case(
+        "surface-on-vertices",
+        "an isosurface through vertices",
+        lambda: np.rint(10 * waves()),
+        ("isosurface:5",),
+    ),
+    _case("surface-at-the-end", "an isosurface at the largest value", waves, ("isosurface:1",)),
+    _case(
+        "two-features", "two features that overlap", waves, ("interval:0.2:0.6", "isosurface:0.6")
+    ),
+    _case(
+        "segmented-step",
+        "a threshold found in values of two kinds",
+        _marked(lambda t, z, y, x: x > 5),
+        ("segmentation",),
+        1,
+    ),
+    _case(
+        "nothing-selected",
+        "refused: the feature is nowhere",
+        waves,
+        ("interval:5:6",),
+        more={},
+        refused="selects nothing",
+    ),
+)

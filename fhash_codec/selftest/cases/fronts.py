@@ -1,0 +1,115 @@
+"""Cases of fronts: noise, spikes, steps on and between vertices, fronts that move less than a vertex a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.selftest.case import Case
+from fhash_codec.selftest.cases.fields import SHAPE, lattice, noise, series
+from fhash_codec.selftest.cases.settings import EXACT, MORE, QUICK, Settings
+
+__all__ = ["CASES"]
+
+Values = npt.NDArray[Any]
+
+
+def _case(
+    name: str,
+    about: str,
+    make: Callable[[], Values],
+    settings: Settings = QUICK,
+    dtype: str = "float32",
+    **rest: Any,
+) -> Case:
+    def made() -> Any:
+        return series(make().astype(dtype))
+
+    return Case(
+        name=name, group="fronts", about=about, make=made, settings=settings, more=MORE, **rest
+    )
+
+
+def _checkerboard() -> Values:
+    t, z, y, x = lattice()
+    return np.asarray((t + z + y + x) % 2)
+
+
+def _spike() -> Values:
+    values = np.zeros(SHAPE)
+    values[1, 4, 5, 6] = 1e6
+    return values
+
+
+def _spikes() -> Values:
+    t, z, y, x = lattice()
+    return np.where((z % 4 == 0) & (y % 4 == 1) & (x % 4 == 2) & (t % 2 == 0), 1e6, 0.0) * np.where(
+        x > 5, 1, -1
+    )
+
+
+def _step(place: float) -> Callable[[], Values]:
+    """0 before a place along x, 1 behind it, a half on it."""
+    return lambda: np.heaviside(lattice()[3] - place, 0.5)
+
+
+def _front(speed: float, width: float) -> Callable[[], Values]:
+    """A plane front across all axes that moves so many vertices a step."""
+
+    def make() -> Values:
+        t, z, y, x = lattice()
+        return np.asarray(np.tanh(((x + 2 * y + 3 * z) / np.sqrt(14) - 7.3 - speed * t) / width))
+
+    return make
+
+
+def _shell() -> Values:
+    t, z, y, x = lattice()
+    radius = np.sqrt((z - 4) ** 2 + (y - 4.5) ** 2 + (x - 5) ** 2)
+    return np.where(radius < 1.5 + 0.3 * t, 1e3, np.where(radius < 2.5 + 0.3 * t, -1e3, 0.0))
+
+
+CASES: tuple[Case, ...] = (
+    _case("checkerboard", "0 and 1 alternate along every axis", _checkerboard, {**QUICK, **EXACT}),
+    _case(
+        "checkerboard-uint8",
+        "0 and 1 alternate along every axis",
+        _checkerboard,
+        {**QUICK, **EXACT},
+        dtype="uint8",
+    ),
+    _case(
+        "flicker",
+        "the sign changes with every step",
+        lambda: (-1) ** lattice()[0] * (1 + lattice()[3]),
+    ),
+    _case("white-noise", "nothing can be foretold", noise),
+    _case("white-noise-float64", "nothing can be foretold", noise, dtype="float64", quick=False),
+    _case(
+        "white-noise-int16",
+        "nothing can be foretold",
+        lambda: 1e4 * noise(),
+        {**QUICK, **EXACT},
+        dtype="int16",
+    ),
+    _case("spike", "one value of 1e6, all others 0", _spike),
+    _case("spikes", "values of 1e6 and -1e6, four vertices apart", _spikes),
+    _case("step-on-vertex", "a step whose middle is on a vertex", _step(5.0)),
+    _case("step-between", "a step between two vertices", _step(5.5)),
+    _case(
+        "slow-front",
+        "a front narrower than a vertex that moves 0.3 vertices a step",
+        _front(0.3, 0.05),
+    ),
+    _case(
+        "creeping-front",
+        "a front that moves 0.001 vertices a step",
+        _front(0.001, 0.05),
+        quick=False,
+    ),
+    _case("fast-front", "a front that moves 4 vertices a step", _front(4.0, 0.05), quick=False),
+    _case("thin-shell", "a shell one vertex thick that grows 0.3 vertices a step", _shell),
+)

@@ -1,0 +1,1 @@
+"""What must hold for every case of the self-test."""

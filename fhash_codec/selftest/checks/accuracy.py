@@ -1,0 +1,217 @@
+"""Properties of values: finite where they must be, missing where they must be, within the bound, the range and the promise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.compact.goal import promise
+from fhash_codec.selftest.case import Finding, Run
+
+__all__ = ["CHECKS", "coreset", "largest_difference"]
+
+Values = npt.NDArray[Any]
+Mask = npt.NDArray[np.bool_]
+
+
+def presence(run: Run) -> Iterator[Finding]:
+    """Every vertex of the coreset is finite, every other one NaN: Inf of the source is missing just like NaN."""
+    wanted = coreset(run)
+    yield Finding(
+        name="finite in the coreset",
+        worst=_count(wanted & ~np.isfinite(run.decoded)),
+        limit=0.0,
+        unit="values",
+    )
+    yield Finding(
+        name="NaN outside of it",
+        worst=_count(~wanted & ~np.isnan(run.decoded)),
+        limit=0.0,
+        unit="values",
+    )
+
+
+def bound(run: Run) -> Iterator[Finding]:
+    """The strict bound, in exact arithmetic; a bound of 0 by the number of values that differ."""
+    error = _bound_of(run)
+    if error is None:
+        return
+    worst = largest_difference(run.values, run.decoded, np.isfinite(run.decoded))
+    if error == 0:
+        same = run.values.astype(run.decoded.dtype) == run.decoded
+        yield Finding(
+            name="lossless",
+            worst=_count(~same & np.isfinite(run.decoded)),
+            limit=0.0,
+            unit="values",
+        )
+    else:
+        yield Finding(
+            name="strict bound", worst=float(worst / error), limit=1.0, unit="of the bound"
+        )
+
+
+def quality(run: Run) -> Iterator[Finding]:
+    """The PSNR that was promised, and that the figures in the file are no better than the truth."""
+    where = np.isfinite(run.decoded)
+    reached = _psnr(run, where)
+    promised = (
+        promise(run.config).get("psnr") if run.config.profile == "compact" else run.config.psnr
+    )
+    if promised is not None and reached > 0:
+        yield Finding(
+            name="promised PSNR", worst=promised / reached, limit=1.0, unit="of the dB reached"
+        )
+    stated = run.volume.container.header["quality"]
+    worst = largest_difference(run.values, run.decoded, where)
+    if stated["max_abs_error"]:
+        # Differences of float64 are rounded while they are measured.
+        beyond = max(float(worst / Fraction(stated["max_abs_error"]) - 1), 0.0)
+        yield Finding(
+            name="beyond the stated error", worst=beyond, limit=1e-12, unit="of the stated error"
+        )
+    else:
+        beyond = float(worst) if stated["max_abs_error"] == 0 else 0.0
+        yield Finding(name="beyond the stated error", worst=beyond, limit=0.0, unit="in data units")
+    if stated["psnr"] is not None and reached > 0:
+        yield Finding(
+            name="below the stated PSNR",
+            worst=max(stated["psnr"] - reached, 0.0),
+            limit=1e-6,
+            unit="dB",
+        )
+
+
+def constants(run: Run) -> Iterator[Finding]:
+    """A constant series comes back exactly, as far as the type of the volume has the number."""
+    finite = run.values[np.isfinite(run.values)]
+    if finite.min() == finite.max():
+        same = run.values.astype(run.decoded.dtype) == run.decoded
+        yield Finding(
+            name="exact constant",
+            worst=_count(~same & np.isfinite(run.decoded)),
+            limit=0.0,
+            unit="values",
+        )
+
+
+def within_range(run: Run) -> Iterator[Finding]:
+    """No decoded value lies beyond those of the series, by more than the bound where there is one."""
+    finite = run.values[np.isfinite(run.values)]
+    low, high = Fraction(finite.min().item()), Fraction(finite.max().item())
+    decoded = run.decoded[np.isfinite(run.decoded)]
+    if run.values.dtype.kind in "iu" and run.values.dtype.itemsize == 8:
+        low, high = Fraction(float(low)), Fraction(float(high))
+    excess = max(
+        low - Fraction(decoded.min().item()), Fraction(decoded.max().item()) - high, Fraction(0)
+    )
+    allowed = _bound_of(run) or Fraction(0)
+    span = high - low if high > low else Fraction(1)
+    yield Finding(
+        name="beyond the range",
+        worst=float(excess / span),
+        limit=float(allowed / span),
+        unit="of the range",
+    )
+
+
+CHECKS = (presence, bound, quality, constants, within_range)
+
+
+def coreset(run: Run) -> Mask:
+    """The vertices (t, z, y, x) that have to be there, found anew for intervals; by the file's own mask for what values do not tell."""
+    finite: Mask = np.isfinite(run.values)
+    if "all" in run.config.features:
+        return finite
+    if not all(feature.startswith("interval:") for feature in run.config.features):
+        return np.asarray([run.volume.occupancy(step) for step in range(run.values.shape[0])])
+    selected = np.zeros(run.values.shape, dtype=bool)
+    for feature in run.config.features:
+        low, high = (np.float64(part) for part in feature.split(":")[1:])
+        if run.values.dtype.kind == "f":
+            low, high = low.astype(run.values.dtype), high.astype(run.values.dtype)
+        selected |= finite & (run.values >= low) & (run.values <= high)
+    keys = run.volume.key_times.key_frames
+    grown = [_grown(selected[step], run.config.dilation) & finite[step] for step in keys]
+    found = np.zeros(run.values.shape, dtype=bool)
+    for step in range(len(found)):
+        # A step between two key frames has what either of them has.
+        after = int(np.clip(np.searchsorted(keys, step), 0, len(keys) - 1))
+        before = after if keys[after] == step or after == 0 or step > keys[-1] else after - 1
+        found[step] = grown[before] | grown[after]
+    return np.asarray(found & finite)
+
+
+def _grown(mask: Mask, reach: int) -> Mask:
+    """A mask grown by so many vertices in the 26-neighbourhood, by sums over windows."""
+    for axis, length in enumerate(mask.shape):
+        sums = np.insert(np.cumsum(mask, axis=axis, dtype=np.int64), 0, 0, axis=axis)
+        at = np.arange(length)
+        high, low = np.minimum(at + reach + 1, length), np.maximum(at - reach, 0)
+        mask = np.asarray(np.take(sums, high, axis=axis) > np.take(sums, low, axis=axis))
+    return mask
+
+
+def largest_difference(values: Values, decoded: Values, where: Mask) -> Fraction:
+    """max |value - decoded| where it counts, exactly."""
+    one, other = values[where], decoded[where]
+    if not one.size:
+        return Fraction(0)
+    if one.dtype.kind in "iu" and one.dtype.itemsize == 8:
+        return max(
+            abs(Fraction(a) - Fraction(b))
+            for a, b in zip(one.tolist(), other.tolist(), strict=True)
+        )
+    # Halves do not overflow; the few that look largest are compared exactly.
+    rough = np.abs(one.astype(np.float64) / 2 - other.astype(np.float64) / 2)
+    near = np.flatnonzero(rough >= rough.max() * (1 - 1e-12))[:8]
+    return max(abs(Fraction(one[n].item()) - Fraction(other[n].item())) for n in near)
+
+
+def _psnr(run: Run, where: Mask) -> float:
+    """In dB over the coreset, with differences in parts of the range; infinite without error, 0 without a range."""
+    finite = run.values[np.isfinite(run.values)]
+    span = Fraction(finite.max().item()) - Fraction(finite.min().item())
+    if span == 0:
+        return 0.0
+    one, other = run.values[where], run.decoded[where]
+    if one.dtype.kind in "iu" and one.dtype.itemsize == 8:
+        parts = np.array(
+            [
+                float((a - Fraction(b)) / span)
+                for a, b in zip(one.tolist(), other.tolist(), strict=True)
+            ]
+        )
+    else:
+        # By a power of two, which is exact, so that differences neither overflow nor vanish.
+        exponent = math.frexp(
+            float(max(abs(Fraction(finite.max().item())), abs(Fraction(finite.min().item()))))
+        )[1]
+        scaled = np.ldexp(one.astype(np.float64), -exponent) - np.ldexp(
+            other.astype(np.float64), -exponent
+        )
+        parts = scaled / float(span / Fraction(2) ** exponent)
+    mean = float(np.mean(np.square(parts))) if parts.size else 0.0
+    return -10 * math.log10(mean) if mean > 0 else math.inf
+
+
+def _bound_of(run: Run) -> Fraction | None:
+    """The strict bound in data units; that of a range beyond float64 is a number, too."""
+    config = run.config
+    if config.max_error is not None:
+        return Fraction(config.max_error)
+    if config.max_error_rel is None:
+        return None
+    if math.isfinite(run.data_range):
+        return Fraction(config.max_error_rel * run.data_range)
+    low, high = run.volume.value_range.low, run.volume.value_range.high
+    return Fraction(config.max_error_rel) * (Fraction(high) - Fraction(low))
+
+
+def _count(mask: Mask) -> float:
+    return float(np.count_nonzero(mask))

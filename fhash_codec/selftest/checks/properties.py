@@ -1,0 +1,10 @@
+"""What every run has to keep, whatever the case."""
+
+from __future__ import annotations
+
+from fhash_codec.selftest.case import Check
+from fhash_codec.selftest.checks import access, accuracy, pictures, repeating
+
+__all__ = ["EVERY"]
+
+EVERY: tuple[Check, ...] = (*accuracy.CHECKS, *access.CHECKS, *repeating.CHECKS, *pictures.CHECKS)

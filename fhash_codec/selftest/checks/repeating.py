@@ -1,0 +1,104 @@
+"""Properties of repeating: the same bytes again and with any number of threads, the same bits by the native and the portable decoder."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from fhash_codec.encoding import encode
+from fhash_codec.selftest.case import Finding, Run
+from fhash_codec.selftest.checks.access import rounding
+from fhash_codec.selftest.environment import environment
+from fhash_codec.volume import open as open_volume
+from fhash_formats import native
+
+__all__ = ["CHECKS"]
+
+THREADS = (1, 2)
+"""Beside `case.RUN_THREADS`, by which the file of a run was made."""
+
+
+def same_bytes(run: Run) -> Iterator[Finding]:
+    """The same input gives the same bytes; a compact file with 1, 2 and 4 threads, too, of which the quick set takes one by turns."""
+    written = run.path.read_bytes()
+    again = run.folder / "again.fhz"
+    if run.config.profile == "paper":
+        encode(run.series, again, run.config, force=True)
+        yield Finding(
+            name="same bytes again", worst=_unlike(written, again), limit=0.0, unit="bytes"
+        )
+        return
+    wrong = 0.0
+    turn = zlib.crc32(f"{run.case.name} {run.under}".encode()) % len(THREADS)
+    for count in THREADS if run.thorough else THREADS[turn : turn + 1]:
+        with environment(FHASH_THREADS=str(count)):
+            encode(run.series, again, run.config, force=True)
+        wrong = max(wrong, _unlike(written, again))
+    yield Finding(name="same bytes by other threads", worst=wrong, limit=0.0, unit="bytes")
+
+
+def portable_encoder(run: Run) -> Iterator[Finding]:
+    """In the long set: a compact file of effort 1 has the same bytes without the native library, which takes its time with more effort."""
+    if (
+        native.library() is None
+        or not run.thorough
+        or run.config.profile != "compact"
+        or run.config.effort > 1
+    ):
+        return
+    again = run.folder / "portable.fhz"
+    with environment(FHASH_NATIVE="0"):
+        encode(run.series, again, run.config)
+    yield Finding(
+        name="same bytes, portable encoder",
+        worst=_unlike(run.path.read_bytes(), again),
+        limit=0.0,
+        unit="bytes",
+    )
+
+
+def portable(run: Run) -> Iterator[Finding]:
+    """What the native decoder gives, the portable one gives as well."""
+    if native.library() is None:
+        return
+    with environment(FHASH_NATIVE="0"), open_volume(run.path) as volume:
+        other = volume[...]
+    if run.volume.profile == "compact":
+        kind = f"u{other.dtype.itemsize}"
+        wrong = int(np.count_nonzero(other.view(kind) != run.decoded.view(kind)))
+        yield Finding(name="portable = native", worst=float(wrong), limit=0.0, unit="values")
+        return
+    lost = float(np.count_nonzero(np.isnan(other) != np.isnan(run.decoded)))
+    yield Finding(name="portable: finite as native", worst=lost, limit=0.0, unit="values")
+    yield Finding(
+        name="portable = native",
+        worst=rounding(run, other, run.decoded),
+        limit=1.0,
+        unit="of 1e-5 of the range",
+    )
+
+
+def sound(run: Run) -> Iterator[Finding]:
+    """The file passes `verify`, which raises where it does not."""
+    yield Finding(
+        name="verify",
+        worst=0.0 if run.volume.verify() > 0 else 1.0,
+        limit=0.0,
+        unit="damaged parts",
+    )
+
+
+CHECKS = (same_bytes, portable_encoder, portable, sound)
+
+
+def _unlike(written: bytes, path: Path) -> float:
+    """How many bytes differ."""
+    other = path.read_bytes()
+    one, two = (
+        np.frombuffer(data[: min(len(written), len(other))], dtype=np.uint8)
+        for data in (written, other)
+    )
+    return float(np.count_nonzero(one != two) + abs(len(written) - len(other)))

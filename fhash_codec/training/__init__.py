@@ -1,0 +1,1 @@
+"""What every training shares: Adam, threads and devices."""

@@ -1,0 +1,142 @@
+"""A series in a file: whatever the order of the file's dimensions, frames come out as (z, y, x), one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
+from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
+from fhash_formats.support.attributes import plain_text
+
+SLAB_BYTES = 64 * 2**20
+"""The most that is kept of a file between frames. A chunk that spans many steps would be decompressed again for each of them; with this
+much, chunks of several frames of 128^3 float64 are decompressed once, and memory stays small beside the encoder's own."""
+
+Fetch = Callable[[tuple[slice, ...]], npt.NDArray[Any]]
+
+
+def native(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of the frames of stored values: native byte order, booleans as the numbers 0 and 1."""
+    return np.dtype(np.uint8) if dtype.kind == "b" else dtype.newbyteorder("=")
+
+
+class FileSeries(Series):
+    """A series whose frames are fetched from a file as slices in the file's own order of dimensions.
+
+    Arguments: `shape` and `axes` in the file's order; `fetch(slices)` returns a fresh array of the file's dimensions, in physical values
+    of type `dtype` (any byte order); `chunks` is the shape of a stored chunk, None without chunks: as many steps of one chunk as fit
+    SLAB_BYTES are fetched at once and kept until the next fetch, a frame alone otherwise; `stamp` is checked before and after every
+    fetch; `beside` are files that hold values of it, other than `source`, and are checked likewise; `folder` is the stamp of all its
+    files, which `check` alone looks at. Raises InputError for a shape or type that cannot be a series.
+
+    Attributes:
+        given: the axes whose coordinate the file gives.
+        stamps: of all that it is read from when it was opened.
+    """
+
+    def __init__(
+        self,
+        *,
+        source: str,
+        name: str,
+        shape: Sequence[int],
+        dtype: np.dtype[Any],
+        axes: Sequence[str],
+        fetch: Fetch,
+        stamp: Stamp,
+        coords: Mapping[str, Coordinate] | None = None,
+        attributes: Mapping[str, Any] | None = None,
+        chunks: Sequence[int] | None = None,
+        close: Callable[[], None] = lambda: None,
+        beside: Sequence[Path] = (),
+        folder: FolderStamp | None = None,
+    ) -> None:
+        lengths = dict(zip(axes, shape, strict=True))
+        self.source, self.name, self.dtype = source, plain_text(name), native(dtype)
+        self.files = (Path(source), *beside)
+        self.shape = check_values(source, [lengths.get(axis, 1) for axis in AXES], self.dtype)
+        self.attributes = dict(attributes or {})
+        self.units = str(self.attributes.get("units", ""))
+        self.given = frozenset(coords or {})
+        self.coords = {
+            axis: index_coordinate(axis, length)
+            for axis, length in zip(AXES, self.shape, strict=True)
+        } | dict(coords or {})
+        self._axes, self._fetch, self._close = tuple(axes), fetch, close
+        self._quick = (stamp, *map(Stamp.of, beside))
+        self.stamps: tuple[Stamp | FolderStamp, ...] = (
+            self._quick if folder is None else (*self._quick, folder)
+        )
+        frame_bytes = self.dtype.itemsize * prod(self.shape[1:])
+        self._together = max(
+            1, min(_steps_of_a_chunk(self._axes, shape, chunks), SLAB_BYTES // frame_bytes)
+        )
+        self._slab: tuple[int, npt.NDArray[Any]] | None = None
+
+    def read(self, step: int) -> npt.NDArray[Any]:
+        self.require_step(step)
+        start = step - step % self._together
+        if self._together == 1:
+            return np.ascontiguousarray(self._block(step, step + 1)[0], dtype=self.dtype)
+        slab = self._slab
+        if slab is None or slab[0] != start:
+            self._slab = None  # before the fetch, so that two slabs are never held
+            slab = self._slab = (
+                start,
+                self._block(start, min(start + self._together, self.shape[0])),
+            )
+        else:
+            self._check_files()
+        return np.array(slab[1][step - start], dtype=self.dtype, order="C")
+
+    def check(self) -> None:
+        for stamp in self.stamps:
+            stamp.check()
+
+    def close(self) -> None:
+        self._slab = None
+        self._close()
+
+    def _check_files(self) -> None:
+        for stamp in self._quick:
+            stamp.check()
+
+    def _block(self, start: int, stop: int) -> npt.NDArray[Any]:
+        """Steps start to stop as (t, z, y, x)."""
+        steps = f"step {start}" if stop == start + 1 else f"steps {start} to {stop - 1}"
+        self._check_files()
+        with refusing(f"{self.source}: {steps} of {self.name} cannot be read"):
+            ranges = {
+                axis: slice(0, length) for axis, length in zip(AXES, self.shape, strict=True)
+            } | {"t": slice(start, stop)}
+            values = self._fetch(tuple(ranges[axis] for axis in self._axes))
+        self._check_files()
+        expected = {**dict(zip(AXES, self.shape, strict=True)), "t": stop - start}
+        if values.shape != tuple(expected[axis] for axis in self._axes):
+            raise InputError(
+                f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed while it was being read"
+            )
+        present = [axis for axis in AXES if axis in self._axes]
+        ordered = values.transpose([self._axes.index(axis) for axis in present])
+        return np.expand_dims(
+            ordered, tuple(place for place, axis in enumerate(AXES) if axis not in present)
+        )
+
+
+def _steps_of_a_chunk(
+    axes: Sequence[str], shape: Sequence[int], chunks: Sequence[int] | None
+) -> int:
+    """Steps in one chunk; without chunks one, or all where time is not the slowest dimension."""
+    if "t" not in axes:
+        return 1
+    place = axes.index("t")
+    if chunks is not None:
+        return chunks[place]
+    return 1 if place == 0 else shape[place]

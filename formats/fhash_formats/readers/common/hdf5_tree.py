@@ -1,0 +1,185 @@
+"""What an HDF5 file holds: its datasets, which of them are coordinates, and whether they can be read here."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.readers.common.positions import Column, usable
+from fhash_formats.readers.common.variables import Variable
+from fhash_formats.support.attributes import text_of
+
+FILTER_NAMES = {
+    305: "LZO",
+    307: "bzip2",
+    32000: "LZF",
+    32001: "Blosc",
+    32004: "LZ4",
+    32008: "bitshuffle",
+    32013: "ZFP",
+    32015: "Zstandard",
+    32017: "SZ",
+    32018: "FCIDECOMP",
+    32019: "JPEG",
+    32024: "SZ3",
+    32026: "Blosc2",
+    32028: "SPERR",
+}
+"""Names of registered HDF5 filters, for messages; the name in the file is often empty."""
+
+
+def datasets(root: Any) -> Iterator[tuple[str, Any]]:
+    """Every dataset under a group with its full name (no leading slash), each once, in the order of names.
+
+    Soft and external links are followed where they lead somewhere (visititems would pass them by); an object reached a second time,
+    by a hard link or by a cycle of groups, is passed over.
+    """
+    import h5py
+
+    seen: set[tuple[int, int]] = set()
+    waiting = [("", root)]
+    while waiting:
+        path, node = waiting.pop()
+        info = h5py.h5o.get_info(node.id)
+        if (info.fileno, info.addr) in seen:
+            continue
+        seen.add((info.fileno, info.addr))
+        if isinstance(node, h5py.Dataset):
+            yield path, node
+        elif isinstance(node, h5py.Group):
+            for name in sorted(node, reverse=True):
+                child = _follow(node, name)
+                # what a link leads to comes last, so that an object goes by its own name and not by the link's
+                place = (
+                    len(waiting) if isinstance(node.get(name, getlink=True), h5py.HardLink) else 0
+                )
+                if child is not None:
+                    waiting.insert(place, (f"{path}/{name}".lstrip("/"), child))
+
+
+def _follow(group: Any, name: str) -> Any:
+    try:
+        return group[name]
+    except (KeyError, OSError):
+        return None  # a link to nowhere: there is no dataset behind it to offer
+
+
+def own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
+    """The name under which `datasets` lists an object that the user called by another of its names; the given name if there is none."""
+    import h5py
+
+    other = _follow(file, name)
+    return (
+        next((known for known, dataset in tree.items() if dataset == other), name)
+        if isinstance(other, h5py.Dataset)
+        else name
+    )
+
+
+def variables(tree: Mapping[str, Any]) -> list[Variable]:
+    """The datasets that hold something, as Variables; dimension scales and the bounds of others are auxiliary."""
+    bounds = set()
+    for name, dataset in tree.items():
+        if isinstance(dataset.attrs.get("bounds"), str | bytes):
+            bounds.add(sibling(name, text_of(dataset.attrs["bounds"])))
+    return [
+        Variable(
+            name=name,
+            shape=dataset.shape,
+            dtype=dataset.dtype,
+            auxiliary=dataset.is_scale or name in bounds,
+            handle=dataset,
+        )
+        for name, dataset in tree.items()
+        if dataset.shape is not None
+    ]
+
+
+def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
+    """The datasets directly in a group that may be coordinates, by lower-case name: 1-D numbers, or one number alone."""
+    found = {}
+    for path, dataset in tree.items():
+        place, _, name = path.rpartition("/")
+        if (
+            place == group
+            and dataset.shape is not None
+            and len(dataset.shape) < 2
+            and usable(dataset.dtype)
+        ):
+            found[name.lower()] = column(path, dataset)
+    return found
+
+
+def column(path: str, dataset: Any) -> Column:
+    """A dataset of at most one dimension as a Column."""
+    return Column(
+        name=path, length=dataset.size, read=lambda: dataset[()], attributes=dataset.attrs
+    )
+
+
+def sibling(path: str, name: str) -> str:
+    """The full name of another dataset in the same group."""
+    return f"{path.rpartition('/')[0]}/{name}".lstrip("/")
+
+
+def require_filters(source: str, name: str, dataset: Any) -> None:
+    """See to it that the filters of a dataset can be undone, with hdf5plugin if need be.
+
+    Raises MissingDependencyError that names the filter and what to install, or InputError where no plug-in known here has it.
+    """
+    import h5py
+
+    plist = dataset.id.get_create_plist()
+    for place in range(plist.get_nfilters()):
+        code, _, _, stored = plist.get_filter(place)
+        if h5py.h5z.filter_avail(code):
+            continue
+        label = (
+            f"{FILTER_NAMES.get(code) or text_of(stored).split(' ')[0] or 'unknown'} (id {code})"
+        )
+        try:
+            importlib.import_module("hdf5plugin")
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"{source}: {name} is compressed with the HDF5 filter {label}, which needs hdf5plugin; pip install 'fhash[formats]'"
+            ) from error
+        if not h5py.h5z.filter_avail(code):
+            raise InputError(
+                f"{source}: {name} is compressed with the HDF5 filter {label}, which neither h5py nor hdf5plugin has"
+            )
+
+
+def require_sources(source: str, path: Path, name: str, dataset: Any) -> None:
+    """Raise InputError if a virtual dataset draws on a file that is not there: HDF5 would silently give fill values for it."""
+    if not dataset.is_virtual:
+        return
+    for mapped in dataset.virtual_sources():
+        file = mapped.file_name
+        if (
+            file != "."
+            and "%b" not in file
+            and not (path.parent / file).exists()
+            and not Path(file).exists()
+        ):
+            raise InputError(
+                f"{source}: {name} is a virtual dataset that draws on {file}, which is not there"
+            )
+
+
+def files_beside(path: Path, dataset: Any) -> list[Path]:
+    """The other files from which a dataset draws its values: that of an external link, raw ones, those behind a virtual dataset."""
+    names = [] if Path(dataset.file.filename) == path else [dataset.file.filename]
+    names += [name for name, _, _ in dataset.external or ()]
+    if dataset.is_virtual:
+        names += [
+            mapped.file_name for mapped in dataset.virtual_sources() if mapped.file_name != "."
+        ]
+    # HDF5 looks for a relative name beside the file, then in the current folder
+    return list(
+        dict.fromkeys(
+            found for name in names for found in (path.parent / name, Path(name)) if found.exists()
+        )
+    )

@@ -1,0 +1,135 @@
+"""Which array of a file is meant: the only suitable one, or the one that was asked for."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fhash_formats.errors import InputError
+
+MAX_LISTED = 12
+"""Names in one message; a file with hundreds of arrays would fill the screen."""
+
+KINDS = {
+    "b": "boolean",
+    "S": "text",
+    "U": "text",
+    "T": "text",
+    "O": "objects",
+    "M": "dates",
+    "m": "time spans",
+}
+
+
+def kind_of(dtype: np.dtype[Any]) -> str:
+    """A type in words: "float32", "boolean", "text", "compound" and so on."""
+    if dtype.kind == "V":
+        return "compound" if dtype.names else "opaque"
+    return KINDS[dtype.kind] if dtype.kind in KINDS else dtype.newbyteorder("=").name
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variable:
+    """One array of a file.
+
+    Attributes:
+        name: full, "group/density".
+        shape: in the file's order.
+        dtype: of the values.
+        auxiliary: it only describes others (coordinates, bounds).
+        error: why a library cannot open it, "" if it can.
+        handle: whatever the reader needs to find it again.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    auxiliary: bool = False
+    error: str = ""
+    handle: Any = None
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.shape}"
+
+    def problem(self, booleans: bool) -> str:
+        """Why this array cannot be a series, "" if it can."""
+        if self.error:
+            return f"what cannot be opened: {self.error}"
+        if self.dtype.kind == "b" and not booleans:
+            return "boolean values; a mask is given with --feature mask:FILE, values are integers or floats"
+        if self.dtype.kind not in "iufb" or self.dtype.itemsize > 8:
+            return f"values of type {kind_of(self.dtype)}; integers and floats up to 64 bits can be read"
+        if len(self.shape) not in (3, 4):
+            return f"{len(self.shape)} dimensions {self.shape}; 3 or 4 can be read"
+        if 0 in self.shape:
+            return f"an axis of length 0, shape {self.shape}; there is nothing to read"
+        return ""
+
+
+def choose(
+    source: str, variables: Sequence[Variable], var: str | None, *, booleans: bool = False
+) -> Variable:
+    """The variable named `var` (full name, or its last part where only one has it), or the only suitable one.
+
+    Raises InputError: no such name, an unsuitable one, several to choose from, or none.
+    """
+    suitable = [each for each in variables if not each.problem(booleans)]
+    candidates = [each for each in suitable if not each.auxiliary]
+    if var is not None:
+        return _named(source, variables, candidates or suitable, var, booleans)
+    if len(candidates) == 1:
+        return candidates[0]
+    if candidates:
+        raise InputError(
+            f"{source} holds {len(candidates)} variables: {_listed(candidates)}; choose one with --var"
+        )
+    if not variables:
+        raise InputError(f"{source} holds no array at all")
+    found = "; ".join(
+        f"{each.name}: {each.problem(booleans) or 'a coordinate or its bounds'}"
+        for each in variables[:MAX_LISTED]
+    )
+    rest = f"; and {len(variables) - MAX_LISTED} more" if len(variables) > MAX_LISTED else ""
+    raise InputError(
+        f"{source} holds no variable of 3 or 4 dimensions with integer or float values; found {found}{rest}"
+    )
+
+
+def _named(
+    source: str,
+    variables: Sequence[Variable],
+    candidates: Sequence[Variable],
+    var: str,
+    booleans: bool,
+) -> Variable:
+    wanted = var.strip("/")
+    found = [each for each in variables if each.name == wanted]
+    found = found or [each for each in variables if each.name.rsplit("/", 1)[-1] == wanted]
+    if len(found) > 1:
+        raise InputError(
+            f"{source}: --var {var} means {len(found)} variables: {_listed(found)}; give the whole name"
+        )
+    if found:
+        problem = found[0].problem(booleans)
+        if problem:
+            raise InputError(f"{source}: variable {found[0].name} has {problem}")
+        return found[0]
+    nearest = sorted(
+        candidates,
+        key=lambda each: -difflib.SequenceMatcher(None, wanted.lower(), each.name.lower()).ratio(),
+    )
+    raise InputError(
+        f"{source} has no variable '{var}'; "
+        + (f"it holds {_listed(nearest)}" if nearest else "nor any other that can be read")
+    )
+
+
+def _listed(variables: Sequence[Variable]) -> str:
+    text = ", ".join(str(each) for each in variables[:MAX_LISTED])
+    return (
+        text if len(variables) <= MAX_LISTED else f"{text} and {len(variables) - MAX_LISTED} more"
+    )

@@ -1,0 +1,128 @@
+"""Work in threads, for what releases the interpreter's lock."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from itertools import count
+from threading import Lock
+from typing import TypeVar
+
+from fhash_formats.errors import InputError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+MAX_THREADS = 1024
+ITEMS_PER_THREAD = 8
+"""Items of `share_out` below which a further thread does not pay."""
+SHARES_PER_THREAD = 4
+
+
+def usable_threads(threads: int | None = None) -> int:
+    """Number of threads to use: `threads` if given, else the processors that this process may use.
+
+    The environment variable FHASH_THREADS=N stands for the processors; it is read at each call.
+    Raises InputError for a number of threads that is not allowed.
+    """
+    if threads is not None:
+        if threads < 1:
+            raise InputError(f"threads is {threads}; at least 1 is needed")
+        return threads
+    given = os.environ.get("FHASH_THREADS")
+    if given is not None:
+        if not (given.isascii() and given.isdigit() and 1 <= int(given) <= MAX_THREADS):
+            raise InputError(f"FHASH_THREADS is '{given:.40}'; allowed: 1 to {MAX_THREADS}")
+        return int(given)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def in_threads(
+    function: Callable[[Item], Result], items: Iterable[Item], threads: int | None = None
+) -> Iterator[Result]:
+    """Yield `function(item)` for each item, in the order of the items.
+
+    Up to `threads` threads compute at once (default: `usable_threads()`); the caller's own is one
+    of them. The first failure is raised; items that were not begun by then are left out.
+    """
+    work = list(items)
+    results: list[Future[Result]] = [Future() for _ in work]
+    numbers = count()
+    stopped = False
+
+    def compute_next() -> bool:
+        """Compute the next item; False where none is left."""
+        number = next(numbers)
+        if stopped or number >= len(work):
+            return False
+        try:
+            results[number].set_result(function(work[number]))
+        except BaseException as error:
+            results[number].set_exception(error)
+        return True
+
+    def compute_all() -> None:
+        while compute_next():
+            pass
+
+    helpers: list[Future[None]] = []
+    with suppress(RuntimeError):  # no more threads can be started: those that run are enough
+        more = min(usable_threads() if threads is None else threads, len(work)) - 1
+        for _ in range(more):
+            helpers.append(_threads.pool(more).submit(compute_all))
+    try:
+        for future in results:
+            while not future.done() and compute_next():
+                pass
+            yield future.result()
+    finally:
+        stopped = True
+        for helper in helpers:
+            # A helper that never began, because the pool is busy, has nothing left to do.
+            if not helper.cancel():
+                helper.result()
+
+
+def share_out(work: Callable[[Sequence[Item]], None], items: Sequence[Item], threads: int) -> None:
+    """Call `work` on shares of `items`, in up to `threads` threads.
+
+    Each thread gets several shares, since the processors of a machine are rarely equally free.
+    """
+    workers = min(threads, len(items) // ITEMS_PER_THREAD)
+    if workers <= 1:
+        work(items)
+        return
+    shares = min(SHARES_PER_THREAD * workers, len(items))
+    for _ in in_threads(work, [items[share::shares] for share in range(shares)], workers):
+        pass
+
+
+class _Threads:
+    """Threads that wait for work: starting new ones for every call would take longer than small work itself."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._pool: ThreadPoolExecutor | None = None
+        self._size = 0
+
+    def pool(self, size: int) -> ThreadPoolExecutor:
+        """A pool of at least so many threads."""
+        with self._lock:
+            if self._pool is None or self._size < size:
+                if self._pool is not None:
+                    self._pool.shutdown(wait=False)  # what it has begun it ends
+                self._pool, self._size = ThreadPoolExecutor(size, thread_name_prefix="fhash"), size
+            return self._pool
+
+
+def _forked() -> None:
+    """A forked process has none of its parent's threads, and their pool would hang there."""
+    global _threads
+    _threads = _Threads()
+
+
+_threads = _Threads()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)

@@ -1,0 +1,1 @@
+"""The transform along each axis, and the bands that it leaves."""

@@ -1,0 +1,261 @@
+"""The data's own basis along an axis (Karhunen-Loeve), quantised so that it can be stored in a few hundred bytes.
+
+Each vector is held as integers in its DCT domain, at its own scale 2^(e / 2). The decoder turns them into the synthesis matrix S (n, r)
+with its own cosine and sums in a stated order, so every machine gets the same bits; a tile is then S c, with no orthonormalisation. The
+encoder's analysis is the least-squares inverse of that same S, so what the quantisation of S costs shows up in c and not as an error.
+
+A packed basis: n and r as 16-bit little-endian; the scale exponents, from MAX_EXPONENT downwards, in unary (a one for each vector, a zero
+for each step down), most significant bit first, padded with zeros to a byte; the integers (r, n) as one coded block.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fhash_formats.errors import DamagedFileError, InputError
+
+__all__ = ["MAX_EXPONENT", "MAX_LENGTH", "Basis", "fit_basis"]
+
+MAX_LENGTH = 512
+"""Longest axis with a basis of its own."""
+MAX_EXPONENT = 24
+"""Largest scale exponent: integers up to 2^12."""
+
+_SQRT_HALF = 0.7071067811865476
+_LEAST_NEW = 0.3  # of a vector's length that must be new, or it adds noise and no information
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Basis:
+    """A quantised synthesis matrix.
+
+    integers: int32 (r, n), DCT coefficients of each vector, largest first, at most 2^(e / 2) + 1 in size and no row all zero.
+    exponents: e of each row, MAX_EXPONENT down to 0, never rising. Raises InputError.
+    """
+
+    integers: NDArray[np.int32]
+    exponents: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if self.integers.ndim != 2 or self.integers.dtype != np.int32:
+            raise InputError("the integers of a basis are an int32 array (r, n)")
+        rank, n = self.integers.shape
+        if not 1 <= n <= MAX_LENGTH or rank > n or len(self.exponents) != rank:
+            raise InputError(
+                f"a basis has at most n vectors of length n, n at most {MAX_LENGTH}, not {rank} of {n} with {len(self.exponents)} exponents"
+            )
+        falling = [MAX_EXPONENT, *self.exponents, 0]
+        if any(before < after for before, after in pairwise(falling)):
+            raise InputError(
+                f"the exponents of a basis fall from at most {MAX_EXPONENT} to at least 0"
+            )
+        largest = (
+            np.abs(self.integers.astype(np.int64)).max(axis=1) if rank else np.zeros(0, np.int64)
+        )
+        if any(
+            not 0 < size <= (1 << exponent // 2) * 1.5 + 1
+            for size, exponent in zip(largest.tolist(), self.exponents, strict=True)
+        ):
+            raise InputError("a vector of the basis is zero or longer than 1")
+        self.integers.setflags(write=False)
+
+    @property
+    def n(self) -> int:
+        """Length of the axis."""
+        return int(self.integers.shape[1])
+
+    @property
+    def rank(self) -> int:
+        """Number of vectors, at most n."""
+        return int(self.integers.shape[0])
+
+    @cached_property
+    def synthesis(self) -> NDArray[np.float32]:
+        """S, float32 (n, r): the vectors are its columns, about 1 long. The same bits on every machine."""
+        vectors = np.zeros((self.rank, self.n), np.float64)
+        for k, row in enumerate(_dct(self.n)):
+            vectors += self.integers[:, k : k + 1].astype(np.float64) * row
+        scales = np.array([_shrink(exponent) for exponent in self.exponents], np.float64)
+        result = np.ascontiguousarray((vectors * scales[:, None]).T.astype(np.float32))
+        result.setflags(write=False)
+        return result
+
+    @cached_property
+    def analysis(self) -> NDArray[np.float64]:
+        """(S^T S)^-1 S^T, float64 (r, n): the least-squares coefficients of a column. For the encoder; raises InputError where S is
+        singular."""
+        wide = self.synthesis.astype(np.float64)
+        gram = np.zeros((self.rank, self.rank))
+        for row in wide:
+            gram += row[:, None] * row
+        result = _solve(gram, np.ascontiguousarray(wide.T))
+        result.setflags(write=False)
+        return result
+
+    def to_bytes(self) -> bytes:
+        """The packed basis; see the module."""
+        from fhash_formats.transform.entropy.coder import (
+            encode_block,  # here, because the coder's bands are made from a spec, and a spec from this
+        )
+
+        bits: list[int] = []
+        level = MAX_EXPONENT
+        for exponent in self.exponents:
+            bits += [0] * (level - exponent) + [1]
+            level = exponent
+        block = encode_block(self.integers.reshape(1, 1, self.rank, self.n)) if self.rank else b""
+        return (
+            struct.pack("<HH", self.n, self.rank)
+            + np.packbits(np.array(bits, np.uint8)).tobytes()
+            + block
+        )
+
+    @classmethod
+    def from_bytes(cls, data: bytes, n: int | None = None) -> Basis:
+        """The inverse of `to_bytes`. n: the length it must have, if given. Raises DamagedFileError."""
+        from fhash_formats.transform.entropy.coder import decode_block  # see to_bytes
+
+        if len(data) < 4:
+            raise DamagedFileError(f"a packed basis has at least 4 bytes, not {len(data)}")
+        length, rank = struct.unpack("<HH", data[:4])
+        if not 1 <= length <= MAX_LENGTH or rank > length or n not in (None, length):
+            raise DamagedFileError(
+                f"a packed basis of {rank} vectors of length {length} where {n or f'at most {MAX_LENGTH}'} is wanted"
+            )
+        exponents, used = _read_exponents(data[4:], rank)
+        rest = data[4 + used :]
+        if not rank and rest:
+            raise DamagedFileError("a packed basis has bytes after its end")
+        integers = (
+            decode_block(rest, (1, 1, rank, length)).reshape(rank, length)
+            if rank
+            else np.zeros((0, length), np.int32)
+        )
+        try:
+            return cls(integers=integers, exponents=exponents)
+        except InputError as error:
+            raise DamagedFileError(f"a packed basis: {error}") from error
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Basis)
+            and self.exponents == other.exponents
+            and np.array_equal(self.integers, other.integers)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.exponents, self.integers.tobytes()))
+
+
+def fit_basis(gram: NDArray[np.float64], step: float) -> Basis:
+    """The basis of data whose columns have the Gram matrix `gram`.
+
+    gram: float64 (n, n), the sum over all columns v of v v^T (a sum, not a mean). step: the quantiser's step in data units, > 0. A vector
+    whose total amplitude, the root of its eigenvalue, is below the step is dropped; the others get a scale of amplitude / step, to half
+    an octave and at most 2^12, so that quantising a vector costs no more than quantising its coefficients. For the encoder. Raises
+    InputError.
+    """
+    if gram.ndim != 2 or gram.shape[0] != gram.shape[1] or not 1 <= len(gram) <= MAX_LENGTH:
+        raise InputError(
+            f"a Gram matrix is square with at most {MAX_LENGTH} rows, not {gram.shape}"
+        )
+    if not np.isfinite(gram).all() or not (math.isfinite(step) and step > 0):
+        raise InputError(f"a basis needs finite data and a positive step, not {step!r}")
+    values, vectors = np.linalg.eigh(gram)
+    amplitudes = np.sqrt(np.maximum(values[::-1], 0.0))
+    spectra = vectors[:, ::-1].T @ np.array(_dct(len(gram))).T
+    rows: list[NDArray[np.int32]] = []
+    exponents: list[int] = []
+    found = np.zeros((0, len(gram)))
+    for amplitude, spectrum in zip(amplitudes.tolist(), spectra, strict=True):
+        if amplitude < step:
+            break
+        exponent = min(MAX_EXPONENT, round(2 * math.log2(amplitude / step)))
+        sign = 1.0 if spectrum[np.argmax(np.abs(spectrum))] > 0 else -1.0
+        row = np.rint(spectrum * (sign / _shrink(exponent))).astype(np.int32)
+        new = row.astype(np.float64)
+        length = math.sqrt(new @ new)
+        for _ in range(2):
+            new = new - (found @ new) @ found
+        left = math.sqrt(new @ new)
+        if length == 0 or left < _LEAST_NEW * length:
+            continue
+        found = np.vstack([found, new / left])
+        rows.append(row)
+        exponents.append(exponent)
+    return Basis(
+        integers=np.array(rows, np.int32).reshape(len(rows), len(gram)), exponents=tuple(exponents)
+    )
+
+
+def _shrink(exponent: int) -> float:
+    """2^(-exponent / 2), from exact powers of two and one constant."""
+    return math.ldexp(_SQRT_HALF if exponent % 2 else 1.0, -(exponent // 2))
+
+
+def _read_exponents(data: bytes, rank: int) -> tuple[tuple[int, ...], int]:
+    """The exponents at the start of `data`, and the bytes they took."""
+    room = (rank + MAX_EXPONENT + 7) // 8
+    bits = np.unpackbits(np.frombuffer(data[:room], np.uint8)).tolist()
+    exponents: list[int] = []
+    level, at = MAX_EXPONENT, 0
+    while len(exponents) < rank:
+        if at == len(bits) or level < 0:
+            raise DamagedFileError("the exponents of a packed basis are cut or out of range")
+        if bits[at]:
+            exponents.append(level)
+        else:
+            level -= 1
+        at += 1
+    used = (at + 7) // 8
+    if any(bits[at : 8 * used]):
+        raise DamagedFileError("the exponents of a packed basis are not padded with zeros")
+    return tuple(exponents), used
+
+
+@lru_cache(maxsize=32)
+def _dct(n: int) -> tuple[NDArray[np.float64], ...]:
+    """The rows k of the orthonormal DCT-II of length n, c_k cos(pi (2 i + 1) k / 2 n), with + - * / and sqrt only."""
+    table = np.array([_cosine(m, n) for m in range(4 * n)])
+    places = 2 * np.arange(n, dtype=np.int64) + 1
+    return tuple(table[places * k % (4 * n)] * math.sqrt((2.0 if k else 1.0) / n) for k in range(n))
+
+
+def _cosine(m: int, n: int) -> float:
+    """cos(pi m / 2 n) for 0 <= m < 4 n, to about 1e-16: folded into an eighth of the circle, then the Taylor series in float64."""
+    if m > 2 * n:
+        m = 4 * n - m
+    if m > n:
+        return -_cosine(2 * n - m, n)
+    sine = 2 * m > n
+    angle = math.pi * (n - m if sine else m) / (2 * n)
+    square = angle * angle
+    total = 1.0
+    for k in range(21 if sine else 20, 1, -2):
+        total = 1.0 - square / (k * (k - 1)) * total
+    return angle * total if sine else total
+
+
+def _solve(gram: NDArray[np.float64], right: NDArray[Any]) -> NDArray[np.float64]:
+    """gram^-1 right for a symmetric positive definite matrix, by elimination in a fixed order."""
+    left, result = gram.copy(), right.astype(np.float64)
+    for k in range(len(left)):
+        if not left[k, k] > 1e-9 * gram[k, k]:
+            raise InputError(
+                "the vectors of a basis depend on each other, so nothing can be encoded with it"
+            )
+        ratios = left[k + 1 :, k] / left[k, k]
+        left[k + 1 :] -= ratios[:, None] * left[k]
+        result[k + 1 :] -= ratios[:, None] * result[k]
+    for k in range(len(left) - 1, -1, -1):
+        result[k] = result[k] / left[k, k]
+        result[:k] -= left[:k, k, None] * result[k]
+    return result

@@ -1,0 +1,101 @@
+"""The exact L2 norms of the synthesis vectors, by which coefficients are multiplied so that one quantiser's step serves all of them.
+
+All in float64 with sums in a fixed order. A vector of the tile is a product of one vector per axis (in a coupled plane, per band), and so
+is its norm. Axes of up to LONGEST_EXACT vertices have their own norm at each place, with what the mirrored ends do; longer ones the norm
+of each band's interior.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fhash_formats.transform.axes.lifting_portable import inverse_axis
+from fhash_formats.transform.axes.spec import AxisTransform
+
+__all__ = ["LONGEST_EXACT", "axis_norms", "band_lengths", "plane_norms"]
+
+LONGEST_EXACT = 512
+
+Norms = NDArray[np.float64]
+
+
+def band_lengths(n: int, depth: int) -> list[int]:
+    """Lengths of the low band after 0 to `depth` levels."""
+    lengths = [n]
+    for _ in range(depth):
+        lengths.append((lengths[-1] + 1) // 2)
+    return lengths
+
+
+def axis_norms(axis: AxisTransform, n: int) -> Norms:
+    """Norms along one axis on its own, float64 (n,); entries beyond a basis's rank have 1."""
+    norms = np.ones(n)
+    if axis.basis is not None:
+        total = np.zeros(axis.basis.rank)
+        for row in axis.basis.synthesis.astype(np.float64):
+            total += row * row
+        norms[: axis.basis.rank] = np.sqrt(total)
+    elif axis.wavelet:
+        lengths, low, high = band_lengths(n, axis.depth), *_level_norms(axis.kind, axis.depth, n)
+        norms[: lengths[-1]] = low[-1]
+        for level in range(1, axis.depth + 1):
+            norms[lengths[level] : lengths[level - 1]] = high[level]
+    return norms
+
+
+def plane_norms(y: AxisTransform, x: AxisTransform, rows: int, columns: int) -> Norms:
+    """Norms in the plane, float64 (rows, columns)."""
+    if not y.wavelet or (y.kind, y.depth) != (x.kind, x.depth):
+        return axis_norms(y, rows)[:, None] * axis_norms(x, columns)
+    ys, xs = band_lengths(rows, y.depth), band_lengths(columns, x.depth)
+    (low_y, high_y), (low_x, high_x) = (
+        _level_norms(y.kind, y.depth, rows),
+        _level_norms(x.kind, x.depth, columns),
+    )
+    norms = np.ones((rows, columns))
+    for level in range(1, y.depth + 1):
+        norms[: ys[level], xs[level] : xs[level - 1]] = low_y[level][:, None] * high_x[level]
+        norms[ys[level] : ys[level - 1], : xs[level]] = high_y[level][:, None] * low_x[level]
+        norms[ys[level] : ys[level - 1], xs[level] : xs[level - 1]] = (
+            high_y[level][:, None] * high_x[level]
+        )
+    norms[: ys[-1], : xs[-1]] = low_y[-1][:, None] * low_x[-1]
+    return norms
+
+
+@lru_cache(maxsize=128)
+def _level_norms(kind: str, depth: int, n: int) -> tuple[list[Norms], list[Norms]]:
+    """Norms of the low and of the high band after 0 to `depth` levels; the high band of level 0 is empty."""
+    low, high = [np.ones(n)], [np.ones(0)]
+    lengths = band_lengths(n, depth)
+    for level in range(1, depth + 1):
+        m = lengths[level]
+        if n <= LONGEST_EXACT:
+            norms = _synthesis_norms(kind, lengths[: level + 1], np.eye(lengths[level - 1]))
+            low.append(norms[:m])
+            high.append(norms[m:])
+        else:
+            # 32 entries in the band: a vector from its middle does not reach the ends.
+            interior = band_lengths(32 << level, level)
+            impulses = np.zeros((interior[level - 1], 2))
+            impulses[16, 0] = impulses[interior[level] + 16, 1] = 1.0
+            norms = _synthesis_norms(kind, interior, impulses)
+            low.append(np.full(m, norms[0]))
+            high.append(np.full(lengths[level - 1] - m, norms[1]))
+    return low, high
+
+
+def _synthesis_norms(kind: str, lengths: list[int], bands: NDArray[np.float64]) -> Norms:
+    """Norms of the columns that `bands` (both bands of the deepest level) become."""
+    values = inverse_axis(bands, 0, kind)
+    for n in lengths[-3::-1]:
+        padded = np.zeros((n, values.shape[1]))
+        padded[: len(values)] = values
+        values = inverse_axis(padded, 0, kind)
+    total = np.zeros(values.shape[1])
+    for row in values:
+        total += row * row
+    return np.sqrt(total)

@@ -1,0 +1,1 @@
+"""Integers and masks to bytes, and back."""

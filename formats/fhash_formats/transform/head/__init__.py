@@ -1,0 +1,1 @@
+"""The trained correction of decoded values."""

@@ -1,0 +1,1 @@
+"""Transforms element by element: quantising and comparing."""

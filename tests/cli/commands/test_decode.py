@@ -1,0 +1,349 @@
+"""`fhash decode`: what comes out of any region, time and format is what the volume itself gives."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import Result
+
+import fhash_codec
+import fhash_formats
+from fhash_cli.commands.decode import TYPES, Statistics, convert
+from fhash_cli.selection import region_of_box
+from fhash_formats.errors import InputError, RegionError
+from fhash_formats.series import Coordinate
+
+Fhash = Callable[..., Result]
+
+
+@pytest.fixture(scope="module")
+def whole(run: Path) -> np.ndarray:
+    with fhash_codec.open(run) as volume:
+        return np.asarray(volume)
+
+
+def saved(fhash: Fhash, run: Path, output: Path, *words: object) -> np.ndarray:
+    result = fhash("decode", run, "-o", output, *words)
+    assert (result.exit_code, result.stderr) == (0, "")
+    return np.load(output)
+
+
+@pytest.mark.parametrize(
+    ("words", "index"),
+    [
+        ([], np.s_[:]),
+        (["--t", "1"], np.s_[1:2]),
+        (["--t", "-1"], np.s_[-1:]),
+        (["--t", "::2"], np.s_[::2]),
+        (["--t", "-2:"], np.s_[-2:]),
+        (["--roi", "1:3,:,-4:-1"], np.s_[:, 1:3, :, -4:-1]),
+        (["--t", "0:2", "--roi", ":4,2:3,5:"], np.s_[0:2, :4, 2:3, 5:]),
+        (["--box", "0.5:1.25,:,4:9"], np.s_[:, 1:3, :, 1:7]),
+        (["--box", ":,2:2,:"], np.s_[:, :, 2:3, :]),
+        (["--box", ":,:,6.5:"], np.s_[:, :, :, 0:4]),
+        (["--time", "4", "--time", "0"], np.s_[[2, 0]]),
+    ],
+)
+def test_a_region_is_that_part_of_the_whole(
+    fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path, words: list[str], index: object
+) -> None:
+    np.testing.assert_array_equal(saved(fhash, run, tmp_path / "out.npy", *words), whole[index])
+
+
+def test_a_time_between_steps_is_the_volume_at_that_step(
+    fhash: Fhash, run: Path, tmp_path: Path
+) -> None:
+    with fhash_codec.open(run) as volume:
+        expected = volume.read(1.5)
+    np.testing.assert_array_equal(
+        saved(fhash, run, tmp_path / "out.npy", "--time", "2.5"), expected[None]
+    )
+
+
+def test_outside_background_leaves_no_nan(
+    fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path
+) -> None:
+    filled = saved(fhash, run, tmp_path / "out.npy", "--outside", "background")
+    assert np.isnan(whole).any()
+    assert not np.isnan(filled).any()
+    np.testing.assert_array_equal(filled[~np.isnan(whole)], whole[~np.isnan(whole)])
+
+
+def test_coordinates_and_attributes_travel_with_the_region(
+    fhash: Fhash, run: Path, tmp_path: Path
+) -> None:
+    assert (
+        fhash(
+            "decode",
+            run,
+            "-o",
+            tmp_path / "out.h5",
+            "--time",
+            "0.5",
+            "--time",
+            "2.5",
+            "--roi",
+            "1:3,:,2:5",
+        ).exit_code
+        == 0
+    )
+    with h5py.File(tmp_path / "out.h5") as file:
+        values = file["density"]
+        assert values.shape == (2, 2, 7, 3)
+        assert values.attrs["units"] == "kg m-3"
+        got = [values.dims[axis][0][...].tolist() for axis in range(4)]
+    assert got == [[0.5, 2.5], [0.5, 1.0], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [8.0, 7.0, 6.0]]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["out.npy", "out.h5", "out.nc", "out.zarr", "out.raw", "out.vti", "out.pvd", "out.vtkhdf"],
+)
+def test_every_format_is_written_and_named(
+    fhash: Fhash, run: Path, tmp_path: Path, name: str
+) -> None:
+    result = fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3", "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    paths = [Path(path) for path in json.loads(result.stdout)["paths"]]
+    assert paths
+    assert all(path.exists() for path in paths)
+    assert fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3").exit_code == 2
+    assert fhash("decode", run, "-o", tmp_path / name, "--roi", ":,:,:3", "--force").exit_code == 0
+
+
+def test_statistics_are_those_of_the_region(
+    fhash: Fhash, run: Path, whole: np.ndarray, tmp_path: Path
+) -> None:
+    report = json.loads(fhash("decode", run, "--t", "1", "--roi", "2:5,:,:", "--json").stdout)
+    part = whole[1:2, 2:5]
+    assert report["min"] == np.nanmin(part)
+    assert report["max"] == np.nanmax(part)
+    assert report["mean"] == pytest.approx(np.nanmean(part, dtype=float))
+    assert report["inside_fraction"] == (~np.isnan(part)).mean()
+    assert (report["shape"], report["steps"], report["region"]) == (
+        [1, 3, 7, 8],
+        [1.0],
+        [[2, 5], [0, 7], [0, 8]],
+    )
+    filled = json.loads(
+        fhash(
+            "decode", run, "--t", "1", "--roi", "2:5,:,:", "--outside", "background", "--json"
+        ).stdout
+    )
+    assert filled["inside_fraction"] == report["inside_fraction"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_statistics_of_nothing_have_no_numbers(fhash: Fhash, run: Path) -> None:
+    result = fhash("decode", run, "--t", "0", "--roi", ":1,:1,-1:", "--json")
+    report = json.loads(result.stdout)
+    assert (report["min"], report["mean"], report["inside_fraction"]) == (None, None, 0.0)
+    assert "smallest        -\n" in fhash("decode", run, "--t", "0", "--roi", ":1,:1,-1:").stdout
+
+
+def test_dtype_rounds_to_integers(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    exact = saved(fhash, run, tmp_path / "exact.npy", "--outside", "background")
+    rounded = saved(
+        fhash, run, tmp_path / "rounded.npy", "--outside", "background", "--dtype", "uint8"
+    )
+    assert rounded.dtype == np.uint8
+    np.testing.assert_array_equal(rounded, np.rint(exact))
+
+
+@pytest.mark.parametrize("name", [name for name in TYPES if "int" in name])
+def test_integers_are_clipped_to_the_limits_of_their_type(name: str) -> None:
+    kind = np.dtype(name)
+    limits = np.iinfo(kind)
+    wide = convert(np.array([-1e30, 1e30, 0.5, 1.5, 2.4]), kind)
+    assert wide.dtype == kind
+    assert wide.tolist() == [limits.min, limits.max, 0, 2, 2]
+    narrow = convert(np.array([-1e30, 1e30], dtype=np.float32), kind)
+    assert narrow.tolist() == [limits.min, limits.max]
+
+
+def test_conversions_that_would_lose_a_value_are_refused() -> None:
+    with pytest.raises(InputError, match="add --outside background"):
+        convert(np.array([1.0, np.nan]), np.dtype(np.int16))
+    with pytest.raises(InputError, match="does not fit float16"):
+        convert(np.array([1.0, 1e6]), np.dtype(np.float16))
+    assert np.isnan(convert(np.array([np.nan]), np.dtype(np.float16))).all()
+
+
+def test_statistics_of_huge_values_do_not_overflow() -> None:
+    statistics = Statistics()
+    for _ in range(3):
+        statistics.add(np.array([[5e307, 1.5e308, np.nan]]), 2)
+    assert statistics.result() == {
+        "min": 5e307,
+        "max": 1.5e308,
+        "mean": 1e308,
+        "inside_fraction": 2 / 3,
+    }
+
+
+def test_huge_values_are_decoded_to_valid_json(fhash: Fhash, tmp_path: Path) -> None:
+    np.save(tmp_path / "huge.npy", np.linspace(-5e307, 5e307, 120).reshape(2, 3, 4, 5))
+    assert (
+        fhash(
+            "encode", tmp_path / "huge.npy", "-o", tmp_path / "run.fhz", "--effort", "1", "-q"
+        ).exit_code
+        == 0
+    )
+    result = fhash("decode", tmp_path / "run.fhz", "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    report = json.loads(result.stdout)
+    assert report["min"] <= report["mean"] <= report["max"]
+
+
+def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(
+    refused: Callable[..., str], fhash: Fhash, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="the data have no value") as caught:
+        convert(np.array([1.0, np.nan]), np.dtype(np.uint8), filled=True)
+    assert "--outside" not in str(caught.value)
+    values = np.arange(120, dtype=np.float32).reshape(2, 3, 4, 5)
+    values[0, 0, 0, 0] = np.nan
+    np.save(tmp_path / "gap.npy", values)
+    assert (
+        fhash(
+            "encode", tmp_path / "gap.npy", "-o", tmp_path / "run.fhz", "--effort", "1", "-q"
+        ).exit_code
+        == 0
+    )
+    assert "the data have no value" in refused(
+        2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8"
+    )
+
+
+@pytest.mark.parametrize(
+    ("positions", "box", "expected"),
+    [
+        ([0.0, 5.0, 1.0, 6.0], (0.5, 2.0), (2, 3)),
+        ([0.0, 5.0, 1.0, 6.0], (0.0, 6.0), (0, 4)),
+        ([0.0, 5.0, 1.0, 6.0], (0.0, 1.0), None),
+        ([0.0, 1.0, 1.0, 2.0], (1.0, 1.0), (1, 3)),
+        ([3.0, 2.0, 1.0, 0.0], (1.0, 2.0), (1, 3)),
+    ],
+)
+def test_a_box_never_gives_vertices_outside_it(
+    positions: list[float], box: tuple[float, float], expected: tuple[int, int] | None
+) -> None:
+    coordinate = Coordinate(name="x", values=np.array(positions))
+    volume = cast(
+        fhash_codec.Volume,
+        SimpleNamespace(coords={"x": coordinate, "y": coordinate, "z": coordinate}),
+    )
+    if expected is None:
+        with pytest.raises(RegionError, match=r"neither ascend nor descend.*--roi"):
+            region_of_box(volume, [(None, None), (None, None), box])
+    else:
+        assert region_of_box(volume, [(None, None), (None, None), box])[2] == expected
+
+
+def test_a_box_outside_by_little_says_by_how_much() -> None:
+    coordinate = Coordinate(name="x", values=347921.0 + np.arange(3) / 1000)
+    volume = cast(fhash_codec.Volume, SimpleNamespace(coords=dict.fromkeys("zyx", coordinate)))
+    with pytest.raises(
+        RegionError, match=r"347921:347921\.003; the domain has positions 347921 to 347921\.002"
+    ):
+        region_of_box(volume, [(347921.0, 347921.003), (None, None), (None, None)])
+
+
+def test_an_output_name_that_is_no_utf8(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    result = fhash("decode", run, "-o", tmp_path / "\udcff.npy")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert (tmp_path / "\udcff.npy").exists()
+
+
+def test_a_level_of_detail_has_every_second_position(
+    fhash: Fhash, refused: Callable[..., str], data: Path, tmp_path: Path
+) -> None:
+    run, out = tmp_path / "run.fhz", tmp_path / "out.h5"
+    assert fhash("encode", data, "-o", run, "--effort", "1", "-q").exit_code == 0
+    result = fhash("decode", run, "--lod", "1", "--t", "1:3", "-o", out, "--json", "-q")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert json.loads(result.stdout)["shape"] == [2, 3, 4, 4]
+    with fhash_formats.open_series(out) as series, fhash_codec.open(run) as volume:
+        assert series.shape == (2, 3, 4, 4)
+        np.testing.assert_array_equal(series.read(0), volume.read_lod(1, 1))
+        for axis in "zyx":
+            np.testing.assert_array_equal(
+                series.coords[axis].values, volume.coords[axis].values[::2]
+            )
+    part = tmp_path / "part.h5"
+    result = fhash(
+        "decode", run, "--lod", "1", "--t", "1", "--roi", "1:5,:,3:7", "-o", part, "--json", "-q"
+    )
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert json.loads(result.stdout)["shape"] == [1, 2, 4, 2]
+    assert json.loads(result.stdout)["region"][0] == [2, 5]
+    with fhash_formats.open_series(part) as series, fhash_codec.open(run) as volume:
+        np.testing.assert_array_equal(series.read(0), volume.read_lod(1, 1)[1:3, :, 2:4])
+        np.testing.assert_array_equal(series.coords["z"].values, volume.coords["z"].values[2:5:2])
+        np.testing.assert_array_equal(series.coords["x"].values, volume.coords["x"].values[4:7:2])
+    words = ["--profile", "paper", "--epochs", "1", "--width", "4", "-q"]
+    assert fhash("encode", data, "-o", tmp_path / "paper.fhz", *words).exit_code == 0
+    assert "no levels of detail" in refused(2, "decode", tmp_path / "paper.fhz", "--lod", "1")
+
+
+@pytest.mark.parametrize("suffix", ["vtp", "ply"])
+def test_an_isosurface_is_written_in_physical_positions(
+    fhash: Fhash, run: Path, tmp_path: Path, suffix: str
+) -> None:
+    result = fhash(
+        "decode", run, "--t", "1", "--isosurface", "8", "-o", tmp_path / f"s.{suffix}", "--json"
+    )
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert json.loads(result.stdout)["paths"] == [str(tmp_path / f"s.{suffix}")]
+    if suffix == "ply":
+        head, _, body = (tmp_path / "s.ply").read_bytes().partition(b"end_header\n")
+        count = int(head.split(b"element vertex ")[1].split()[0])
+        vertices = np.frombuffer(body[: 24 * count], "<f8").reshape(count, 3)
+        with fhash_codec.open(run) as volume:
+            for column, axis in enumerate("xyz"):
+                ends = np.sort(volume.coords[axis].values[[0, -1]])
+                assert np.all((vertices[:, column] >= ends[0]) & (vertices[:, column] <= ends[1]))
+            z, y, x = (
+                np.interp(
+                    vertices[:, column],
+                    *(
+                        part[:: -1 if axis == "x" else 1]
+                        for part in (volume.coords[axis].values, np.arange(n))
+                    ),
+                )
+                for column, axis, n in ((2, "z", 6), (1, "y", 7), (0, "x", 8))
+            )
+            np.testing.assert_allclose(volume.sample(t=1, z=z, y=y, x=x), 8, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--t", "0", "-o", "s.npy"], "cannot write a surface with the suffix '.npy'"),
+        (["-o", "s.ply"], "of one step; 3 were chosen"),
+        (["--t", "0"], "give -o s.vtp or -o s.ply"),
+        (["--t", "0", "-o", "s.ply", "--dtype", "float64"], "no --dtype"),
+        (["--t", "0", "-o", "s.ply", "--roi", ":1,:,:"], "two vertices along each axis"),
+    ],
+)
+def test_isosurfaces_that_cannot_be_written(
+    refused: Callable[..., str],
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(2, "decode", run, "--isosurface", "8", *words)
+    assert "no surface of the value 1000" in refused(
+        2, "decode", run, "--isosurface", "1000", "--t", "0", "-o", "s.ply"
+    )
+    assert list(tmp_path.iterdir()) == []

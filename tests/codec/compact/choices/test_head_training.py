@@ -1,0 +1,163 @@
+"""Training of the neighbourhood head: what it gains, for whom, and how reproducibly."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+
+from fhash_codec.compact.choices.head_training import train_head
+from fhash_formats.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def front():
+    """A travelling step between two plateaus, and what a smoothing codec leaves of it: a three-voxel mean with a ripple and noise."""
+    t, z, y, x = np.meshgrid(
+        np.arange(3), np.arange(12), np.arange(14), np.arange(40), indexing="ij"
+    )
+    original = np.where(x + 0.4 * y - 2 * t + 0.3 * z > 18, 2.0, -1.0).astype(np.float32)
+    wide = np.pad(original, ((0, 0), (0, 0), (0, 0), (1, 1)), mode="edge")
+    decoded = (wide[..., :-2] + wide[..., 1:-1] + wide[..., 2:]) / 3 + 0.05 * np.sin(x)
+    decoded += np.random.default_rng(0).normal(scale=0.6, size=decoded.shape)
+    return decoded.astype(np.float32), original
+
+
+def mse(first, second):
+    return float(np.mean((first.astype(np.float64) - second) ** 2))
+
+
+def test_a_front_is_sharpened_by_what_the_gain_says(front):
+    decoded, original = front
+    trained = train_head([(decoded, original, None)], low=-1.0, high=2.0, steps=300, device="cpu")
+    gained = 10 * np.log10(
+        mse(np.clip(decoded, -1, 2), original) / mse(trained.head.apply(decoded), original)
+    )
+    assert trained.gain_db > 6
+    assert gained == pytest.approx(trained.gain_db, abs=1.0)
+    assert trained.history[-1][1:] == (300, trained.gain_db)
+    assert len(trained.head.to_bytes()) <= 530
+
+
+@pytest.fixture(scope="module")
+def far():
+    """What lies beyond the neighbourhood: the error of a voxel is that of the signal three steps before it along x."""
+    random = np.random.default_rng(0)
+    original = random.normal(size=(2, 10, 12, 40)).astype(np.float32)
+    decoded = original + 0.5 * np.roll(original, 3, axis=3)
+    return decoded.astype(np.float32), original
+
+
+def test_a_cross_sees_farther(far):
+    settings = {
+        "low": -8.0,
+        "high": 8.0,
+        "hidden": (8, 8),
+        "samples": 100_000,
+        "steps": 400,
+        "device": "cpu",
+    }
+    near, cross = (train_head([(*far, None)], cross=cross, **settings) for cross in (False, True))
+    assert cross.gain_db > near.gain_db + 0.3
+    gained = 10 * np.log10(mse(*far) / mse(cross.head.apply(far[0]), far[1]))
+    assert gained == pytest.approx(cross.gain_db, abs=0.3)
+    assert cross.head.cross
+
+
+def test_noise_gains_nothing_much():
+    random = np.random.default_rng(0)
+    original = random.normal(size=(2, 16, 16, 32)).astype(np.float32)
+    decoded = (original + 0.1 * random.normal(size=original.shape)).astype(np.float32)
+    trained = train_head([(decoded, original, None)], low=-6.0, high=6.0, steps=150, device="cpu")
+    assert abs(trained.gain_db) < 0.5
+
+
+@pytest.mark.parametrize("cross", [False, True])
+def test_the_same_seed_gives_the_same_head(front, cross):
+    settings = {
+        "low": -1.0,
+        "high": 2.0,
+        "hidden": (4, 4),
+        "cross": cross,
+        "samples": 40_000,
+        "steps": 60,
+        "device": "cpu",
+    }
+    runs = [
+        train_head([(*front, None)], seed=seed, **settings).head.to_bytes() for seed in (4, 4, 5)
+    ]
+    assert runs[0] == runs[1] != runs[2]
+
+
+def test_voxels_that_do_not_count_do_not_matter(front):
+    decoded, original = front
+    care = np.zeros(original.shape, dtype=bool)
+    care[:, 2:9] = True
+    other = np.where(care, original, np.nan).astype(np.float32)
+    heads = [
+        train_head([(decoded, values, care)], low=-1.0, high=2.0, steps=60, device="cpu").head
+        for values in (original, other)
+    ]
+    assert heads[0].to_bytes() == heads[1].to_bytes()
+
+
+def test_several_tiles_of_several_shapes_and_a_tile_that_does_not_count(front):
+    decoded, original = front
+    pairs = [
+        (decoded, original, None),
+        (decoded[:1, :5, :, :7], original[:1, :5, :, :7], None),
+        (decoded, original * np.float32(np.nan), np.zeros(original.shape, dtype=bool)),
+    ]
+    trained = train_head(
+        pairs,
+        low=-1.0,
+        high=2.0,
+        hidden=(6, 4),
+        cross=True,
+        samples=100_000,
+        steps=200,
+        device="cpu",
+    )
+    assert trained.head.hidden == (6, 4)
+    assert trained.gain_db > 3
+
+
+def test_seconds_end_the_training_and_progress_reaches_one(front):
+    parts: list[float] = []
+    trained = train_head(
+        [(*front, None)], low=-1.0, high=2.0, seconds=0.3, device="cpu", progress=parts.append
+    )
+    assert parts == sorted(parts)
+    assert parts[-1] == 1.0
+    assert trained.history[-1][0] >= 0.3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pairs": []}, "no voxel counts"),
+        ({"pairs": [(np.zeros((1, 2, 2, 2), np.float32),) * 2 + (None,)]}, "nothing to learn"),
+        ({"steps": 5, "seconds": 1.0}, "not both"),
+        ({"device": "tpu"}, "device 'tpu'"),
+    ],
+)
+def test_impossible_trainings_are_refused(front, change, message):
+    with pytest.raises(InputError, match=message):
+        train_head(**{"pairs": [(*front, None)], "low": -1.0, "high": 2.0, **change})
+
+
+def test_two_trainings_at_once_give_what_each_gives_alone_and_leave_torch_as_it_was(front):
+    decoded, original = front
+    before = torch.get_num_threads()
+
+    def trained(seed):
+        return train_head(
+            [(decoded, original, None)], low=-1.0, high=2.0, steps=60, seed=seed, device="cpu"
+        ).head.to_bytes()
+
+    with ThreadPoolExecutor(2) as workers:
+        together = list(workers.map(trained, (1, 2)))
+    assert together == [trained(1), trained(2)]
+    assert torch.get_num_threads() == before

@@ -1,0 +1,252 @@
+"""Features: their text, what they select, dilation and thresholds, against plain loops."""
+
+import numpy as np
+import pytest
+
+from fhash_codec.coreset.features import (
+    Everything,
+    Interval,
+    Isosurface,
+    Mask,
+    Segmentation,
+    dilate,
+    otsu_threshold,
+    parse_feature,
+    resolve_features,
+)
+from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.progress import silent
+from fhash_formats.errors import InputError
+from fhash_formats.series import ArraySeries
+
+SHAPES = [(1, 1, 1), (1, 5, 6), (4, 1, 5), (3, 4, 1), (5, 6, 7)]
+
+
+def random_frame(shape, dtype=np.float32, seed=0):
+    return (np.random.default_rng(seed).random(shape) * 10).astype(dtype)
+
+
+@pytest.mark.parametrize(
+    ("text", "feature"),
+    [
+        ("all", Everything()),
+        ("interval:0.25:1", Interval(0.25, 1.0)),
+        ("interval:-1e-30:1e+30", Interval(-1e-30, 1e30)),
+        ("interval:-inf:-5", Interval(-np.inf, -5.0)),
+        ("interval:2:2", Interval(2.0, 2.0)),
+        ("isosurface:-3.5", Isosurface(-3.5)),
+        ("segmentation", Segmentation()),
+        ("segmentation:7", Segmentation(7.0)),
+        ("mask:a:b/c.h5", Mask("a:b/c.h5")),
+    ],
+)
+def test_text_and_feature_name_each_other(text, feature):
+    assert parse_feature(text) == feature
+    assert str(feature) == text
+    assert parse_feature(str(feature)) == feature
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("intervall:1:2", "not known; allowed: interval:LO:HI, isosurface:V, segmentation"),
+        ("", "not known"),
+        ("all:1", "not known"),
+        ("mask:", "not known"),
+        ("mask", "not known"),
+        ("interval", "malformed; write interval:LO:HI with LO <= HI"),
+        ("interval:1", "malformed"),
+        ("interval:1:2:3", "malformed"),
+        ("interval:a:b", "malformed"),
+        ("interval:nan:1", "malformed"),
+        ("interval:2:1", "write interval:LO:HI with LO <= HI"),
+        ("isosurface:", "malformed; write isosurface:V"),
+        ("isosurface:inf", "malformed"),
+        ("isosurface:1:2", "malformed"),
+        ("segmentation:", "malformed; write segmentation or segmentation:T"),
+        ("segmentation:x", "malformed"),
+    ],
+)
+def test_malformed_text_is_refused_in_one_line(text, message):
+    with pytest.raises(InputError, match=message) as caught:
+        parse_feature(text)
+    assert "\n" not in str(caught.value)
+
+
+def brute_force_isosurface(frame, value):
+    selected = frame == value
+    for vertex in np.ndindex(frame.shape):
+        for axis in range(3):
+            other = tuple(v + (a == axis) for a, v in enumerate(vertex))
+            if other[axis] < frame.shape[axis]:
+                ends = sorted([frame[vertex], frame[other]])
+                if np.isfinite(ends).all() and ends[0] < value < ends[1]:
+                    selected[vertex] = selected[other] = True
+    return selected
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int16, np.uint8])
+@pytest.mark.parametrize("value", [5.0, 3.3, -1.0])
+def test_isosurface_takes_both_ends_of_every_crossed_edge(shape, dtype, value):
+    frame = random_frame(shape, dtype)
+    np.testing.assert_array_equal(
+        Isosurface(value).select(frame, 0), brute_force_isosurface(frame, value)
+    )
+
+
+def test_isosurface_does_not_cross_to_a_missing_neighbour():
+    frame = np.array([[[0, np.inf, 0, np.nan, 0, 2]]])
+    np.testing.assert_array_equal(
+        Isosurface(1.0).select(frame, 0)[0, 0], [False, False, False, False, True, True]
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+@pytest.mark.parametrize(
+    "feature",
+    [
+        Everything(),
+        Interval(-np.inf, np.inf),
+        Isosurface(1.0),
+        Segmentation(-5.0),
+        Mask("m", lambda step: np.ones((1, 1, 4), bool)),
+    ],
+    ids=str,
+)
+def test_missing_vertices_are_never_selected(feature, dtype):
+    frame = np.array([[[np.nan, np.inf, -np.inf, 1.0]]], dtype=dtype)
+    np.testing.assert_array_equal(feature.select(frame, 0)[0, 0], [False, False, False, True])
+
+
+def test_the_ends_of_an_interval_belong_to_it_and_a_threshold_does_not():
+    frame = np.array([[[0.1, 0.2, 0.3, 0.4]]], dtype=np.float32)
+    np.testing.assert_array_equal(
+        Interval(0.2, 0.3).select(frame, 0)[0, 0], [False, True, True, False]
+    )
+    np.testing.assert_array_equal(
+        Segmentation(0.2).select(frame, 0)[0, 0], [False, False, True, True]
+    )
+    np.testing.assert_array_equal(Interval(-1e300, 1e300).select(frame, 0), True)
+    np.testing.assert_array_equal(
+        Interval(0.5, 1.5).select(np.array([[[0, 1, 2]]], np.uint8), 0)[0, 0], [False, True, False]
+    )
+    np.testing.assert_array_equal(
+        Interval(-1.0, 300.0).select(np.array([[[0, 255]]], np.uint8), 0), True
+    )
+
+
+def test_selecting_leaves_the_frame_and_the_mask_alone():
+    frame, marked = random_frame((3, 3, 3)), np.zeros((3, 3, 3), bool)
+    before = frame.copy()
+    for feature in (Mask("m", lambda step: marked), Everything()):
+        feature.select(frame, 0)[:] = True
+    np.testing.assert_array_equal(frame, before)
+    assert not marked.any()
+
+
+def test_features_that_are_not_ready_say_so():
+    frame = np.zeros((1, 1, 1))
+    for feature in (Segmentation(), Mask("m")):
+        with pytest.raises(InputError, match="resolve_features"):
+            feature.select(frame, 0)
+    with pytest.raises(InputError, match=r"shape \(1, 2, 1\)"):
+        Mask("m", lambda step: np.ones((1, 2, 1), bool)).select(frame, 0)
+
+
+def brute_force_dilation(mask, vertices):
+    grown = np.zeros_like(mask)
+    for vertex in np.argwhere(mask):
+        grown[tuple(slice(max(v - vertices, 0), v + vertices + 1) for v in vertex)] = True
+    return grown
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, (9, 2, 20)])
+@pytest.mark.parametrize("vertices", [0, 1, 2, 3, 5, 64])
+@pytest.mark.parametrize("density", [0.0, 0.02, 0.3])
+def test_dilation_is_the_26_neighbourhood_without_wrap_around(shape, vertices, density):
+    mask = np.random.default_rng(vertices).random(shape) < density
+    before = mask.copy()
+    np.testing.assert_array_equal(dilate(mask, vertices), brute_force_dilation(mask, vertices))
+    np.testing.assert_array_equal(mask, before)
+
+
+def test_dilation_is_extensive_monotone_additive_and_idempotent_on_the_whole():
+    rng = np.random.default_rng(3)
+    a = rng.random((6, 7, 8)) < 0.03
+    b = a | (rng.random((6, 7, 8)) < 0.03)
+    for n in (1, 2, 3):
+        assert (dilate(a, n) >= a).all()
+        assert (dilate(b, n) >= dilate(a, n)).all()
+        np.testing.assert_array_equal(dilate(dilate(a, n), 2), dilate(a, n + 2))
+        np.testing.assert_array_equal(dilate(a | b, n), dilate(a, n) | dilate(b, n))
+    assert dilate(np.ones((3, 4, 5), bool), 1).all()
+    assert not dilate(np.zeros((3, 4, 5), bool), 9).any()
+
+
+def brute_force_otsu(counts, edges):
+    """The variance of every split of the repeated bin numbers; the middle of the best ones."""
+    numbers = np.repeat(np.arange(len(counts)), counts)
+    scores = []
+    for split in range(1, len(counts)):
+        low, high = numbers[numbers < split], numbers[numbers >= split]
+        scores.append(
+            low.size * high.size * (low.mean() - high.mean()) ** 2
+            if low.size and high.size
+            else 0.0
+        )
+    best = np.flatnonzero(np.isclose(scores, max(scores), rtol=1e-12))
+    return edges[best[best.size // 2] + 1]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_otsu_against_every_split(seed):
+    rng = np.random.default_rng(seed)
+    counts = rng.integers(0, 30, size=12) * (rng.random(12) < 0.7)
+    edges = np.linspace(-3, 5, 13)
+    assert otsu_threshold(counts, edges) == pytest.approx(brute_force_otsu(counts, edges))
+
+
+def test_otsu_splits_two_values_in_the_middle_of_the_gap():
+    counts = np.zeros(1024)
+    counts[0], counts[-1] = 900, 100
+    assert otsu_threshold(counts, np.linspace(0, 1, 1025)) == pytest.approx(0.5, abs=2e-3)
+
+
+class CountedSeries(ArraySeries):
+    reads = 0
+
+    def read(self, step):
+        self.reads += 1
+        return super().read(step)
+
+
+def test_resolving_reads_the_key_frames_once_and_only_for_otsu():
+    array = np.zeros((4, 3, 4, 5), np.float32)
+    array[..., 2:] = 100.0
+    array[0, 0, 0, 0] = np.nan
+    array[1] = -1e3  # not a key frame, must not count
+    series = CountedSeries(array)
+    texts = ["segmentation", "segmentation:3", "all", "segmentation"]
+    found = resolve_features(texts, series, (0, 2, 3), ValueRange(-1e3, 100.0), silent)
+    assert series.reads == 3
+    assert found[0] == found[3]
+    assert 0 < found[0].threshold < 100
+    assert found[1:3] == (Segmentation(3.0), Everything())
+    resolve_features(["all", "isosurface:3"], series, (0, 2, 3), ValueRange(0.0, 1.0), silent)
+    assert series.reads == 3
+
+
+def test_masks_are_opened_with_the_shape_of_the_series():
+    asked = []
+
+    def open_mask(path, shape):
+        asked.append((path, shape))
+        return lambda step: np.full(shape[1:], step == 1)
+
+    series = ArraySeries(np.ones((2, 3, 4, 5)))
+    (feature,) = resolve_features(
+        ["mask:m.npy"], series, (0, 1), ValueRange(0.0, 1.0), silent, open_mask
+    )
+    assert asked == [("m.npy", (2, 3, 4, 5))]
+    assert [feature.select(series.read(step), step).all() for step in (0, 1)] == [False, True]

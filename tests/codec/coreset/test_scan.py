@@ -1,0 +1,68 @@
+"""The first pass: range, mean and missing values."""
+
+import numpy as np
+import pytest
+
+from fhash_codec.coreset.scan import scan
+from fhash_codec.progress import silent
+from fhash_formats.errors import InputError
+from fhash_formats.series import ArraySeries
+
+
+@pytest.mark.parametrize(
+    "dtype", [np.uint8, np.int32, np.uint64, np.float16, np.float32, np.float64]
+)
+def test_range_and_mean_are_numpys(dtype):
+    array = (np.random.default_rng(0).random((3, 4, 5, 6)) * 100).astype(dtype)
+    seen = scan(ArraySeries(array), silent)
+    assert (seen.value_range.low, seen.value_range.high) == (array.min(), array.max())
+    assert seen.mean == pytest.approx(array.mean(dtype=np.float64), rel=1e-14)
+    assert (seen.finite_count, seen.missing) == (array.size, {})
+    assert seen.finite(0, (4, 5, 6)) is None
+
+
+def test_missing_values_are_left_out_and_known_by_step():
+    array = np.random.default_rng(1).random((5, 3, 4, 5)).astype(np.float32)
+    array[1, 0, 0, 0], array[1, 2, 3, 4], array[3, 1, 1] = np.nan, np.inf, -np.inf
+    seen = scan(ArraySeries(array), silent)
+    finite = np.isfinite(array)
+    assert sorted(seen.missing) == [1, 3]
+    assert seen.finite_count == finite.sum()
+    assert (seen.value_range.low, seen.value_range.high) == (
+        array[finite].min(),
+        array[finite].max(),
+    )
+    assert seen.mean == pytest.approx(array[finite].mean(dtype=np.float64))
+    for step in range(5):
+        mask = seen.finite(step, (3, 4, 5))
+        np.testing.assert_array_equal(finite[step], True if mask is None else mask)
+
+
+def test_a_mask_that_stays_is_kept_once():
+    array = np.zeros((4, 2, 3, 3))
+    array[:, 0] = np.nan
+    array[3, 1] = np.nan
+    array[3, 0] = 1.0
+    missing = scan(ArraySeries(array), silent).missing
+    assert missing[0] is missing[1] is missing[2]
+    assert missing[3] is not missing[2]
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(1e8, 1e8 + 1e-3), (-1.7e308, 1.7e308), (5e-324, 1e-322)]
+)
+def test_extreme_ranges_are_exact(low, high):
+    seen = scan(ArraySeries(np.array([low, high, low, high]).reshape(2, 1, 1, 2)), silent)
+    assert (seen.value_range.low, seen.value_range.high) == (low, high)
+    assert low <= seen.mean <= high
+
+
+def test_no_finite_value_at_all_is_refused():
+    with pytest.raises(InputError, match="no finite value"):
+        scan(ArraySeries(np.full((2, 2, 2, 2), np.nan)), silent)
+
+
+def test_progress_counts_the_steps():
+    calls = []
+    scan(ArraySeries(np.zeros((3, 1, 1, 1))), lambda *call: calls.append(call))
+    assert calls == [("scanning", 1, 3, ""), ("scanning", 2, 3, ""), ("scanning", 3, 3, "")]

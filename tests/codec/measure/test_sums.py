@@ -1,0 +1,123 @@
+"""Sums in a stated order: the same bits native and in numpy, and the figures of plain numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fhash_codec.compact.choices.estimate import magnitudes
+from fhash_codec.measure.sums import range_and_sum, squared_errors
+from fhash_formats import native
+
+needs_native = pytest.mark.skipif(
+    native.library() is None, reason="the native library was not built here"
+)
+SIZES = [1, 255, 256, 257, 16383, 16384, 16385, 50_000]
+
+
+def pair(size, dtype, *, missing=False):
+    rng = np.random.default_rng(size)
+    original = (rng.standard_normal(size) * 1e3).astype(dtype)
+    decoded = (original + rng.standard_normal(size)).astype(dtype)
+    if missing:
+        original[rng.random(size) < 0.1] = np.nan
+        original[:1] = np.inf
+    return original, decoded
+
+
+@pytest.mark.parametrize("missing", [False, True])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("size", SIZES)
+def test_range_and_sum_are_those_of_numpy(size, dtype, missing):
+    values, _ = pair(size, dtype, missing=missing)
+    finite = values[np.isfinite(values)].astype(np.float64)
+    count, low, high, total = range_and_sum(values, 0.5)
+    assert count == finite.size
+    assert (low, high) == ((finite.min(), finite.max()) if count else (np.inf, -np.inf))
+    assert total == pytest.approx(finite.sum() / 2, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("library", ["1", "0"])
+def test_zeros_have_no_sign_and_sums_may_be_infinite(monkeypatch, library):
+    monkeypatch.setenv("FHASH_NATIVE", library)
+    for values in ([0.0, -0.0], [-0.0, 0.0], [-0.0]):
+        _, low, high, _ = range_and_sum(np.array(values))
+        assert not np.signbit([low, high]).any()
+    largest = np.finfo(np.float64).max
+    assert range_and_sum(np.full(1000, largest)) == (1000, largest, largest, np.inf)
+    assert range_and_sum(np.full(1000, largest), 2.0**-20)[3] == pytest.approx(
+        largest * (1000 * 2.0**-20)
+    )
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize(
+    "dtypes",
+    [
+        (np.float32, np.float32),
+        (np.float64, np.float64),
+        (np.uint8, np.float32),
+        (np.float32, np.float64),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("size", SIZES)
+def test_errors_are_those_of_numpy(size, dtypes, masked):
+    original, decoded = (
+        part.astype(dtype) for part, dtype in zip(pair(size, np.float64), dtypes, strict=True)
+    )
+    mask = np.random.default_rng(1).random(size) < 0.5 if masked else None
+    difference = (original.astype(np.float64) - decoded)[slice(None) if mask is None else mask] / 8
+    count, squares, largest = squared_errors(original, decoded, mask, 0.125)
+    assert count == difference.size
+    assert squares == pytest.approx(np.square(difference).sum(), rel=1e-12)
+    assert largest == np.abs(difference).max(initial=0)
+
+
+@needs_native
+@pytest.mark.parametrize("missing", [False, True])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("size", SIZES)
+def test_native_and_numpy_agree_bit_for_bit(monkeypatch, size, dtype, missing):
+    original, decoded = pair(size, dtype, missing=missing)
+    mask = np.random.default_rng(2).random(size) < 0.7
+    found = []
+    for choice in ("1", "0"):
+        monkeypatch.setenv("FHASH_NATIVE", choice)
+        seen = magnitudes(decoded.astype(np.float32))
+        found.append(
+            (
+                range_and_sum(original, 0.3),
+                squared_errors(original, decoded, None, 0.3),
+                squared_errors(original, decoded, mask, 0.3),
+                squared_errors(original.astype(np.float32), decoded.astype(np.float64), mask, 0.3),
+                seen.counts.tobytes(),
+                seen.squares.tobytes(),
+            )
+        )
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("choice", ["1", "0"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_told(monkeypatch, choice, value):
+    monkeypatch.setenv("FHASH_NATIVE", choice)
+    original, decoded = pair(20_000, np.float32)
+    decoded[-3] = value
+    assert squared_errors(original, decoded, None, 1.0)[0] == -1
+    mask = np.ones(20_000, bool)
+    mask[-3] = False
+    assert squared_errors(original, decoded, mask, 1.0)[0] == 19_999
+    original[-3] = value
+    assert squared_errors(original, decoded, None, 1.0)[0] == 19_999
+
+
+def test_arrays_need_not_be_contiguous():
+    original, decoded = (part.reshape(10, 20, 25) for part in pair(5000, np.float32))
+    mask = original > 0
+    assert squared_errors(
+        original[::2, :, ::-1], decoded[::2, :, ::-1], mask[::2, :, ::-1], 1.0
+    ) == squared_errors(
+        original[::2, :, ::-1].copy(), decoded[::2, :, ::-1].copy(), mask[::2, :, ::-1].copy(), 1.0
+    )
+    assert range_and_sum(original[:, ::3]) == range_and_sum(original[:, ::3].copy())

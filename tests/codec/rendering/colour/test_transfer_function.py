@@ -1,0 +1,257 @@
+"""Colour and extinction of values, and what a scene's words make of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_codec.rendering.colour.opacity import INTERVAL, PRESETS
+from fhash_codec.rendering.colour.transfer_function import (
+    OPAQUE,
+    TransferFunction,
+    alpha,
+    extinction_of,
+)
+from fhash_codec.rendering.scene.scene import TransferFunctionSpec
+from fhash_formats.errors import FhashWarning, InputError
+
+VALUES = np.linspace(-2, 12, 1401)
+
+
+def made(spec: dict[str, Any] | None = None, **arguments: Any) -> TransferFunction:
+    return TransferFunction.of(
+        TransferFunctionSpec.from_dict(spec or {}),
+        **{"value_range": (0.0, 10.0), "spacing": 1.0, **arguments},
+    )
+
+
+def test_alpha_does_not_depend_on_the_steps() -> None:
+    extinction = extinction_of(0.7, 2.0)
+    assert alpha(extinction, 2.0) == pytest.approx(0.7, rel=1e-15)
+    for steps in (10, 10_000, 10_000_000):
+        through = (1 - 0.7) ** (1 / steps)
+        assert float(alpha(extinction, 2.0 / steps)) == pytest.approx(1 - through, rel=1e-8)
+    assert float(alpha(extinction_of(1e-9, 1.0), 1e-9)) == pytest.approx(1e-18, rel=1e-8)
+
+
+def test_opacity_of_one_is_capped_and_finite() -> None:
+    assert float(extinction_of(1.0, 0.5)) == OPAQUE / 0.5
+    assert float(alpha(extinction_of(1.0, 1.0), 0.0)) == 0.0
+    assert float(alpha(extinction_of(1.0, 1.0), 1.0)) == 1.0
+
+
+def test_points_are_in_data_units_and_hold_beyond_the_ends() -> None:
+    found = made({"opacity": [[2, 0.5], [4, 0]], "unit_distance": 3.0, "density": 2.0})
+    np.testing.assert_allclose(found.opacity([-9, 2, 3, 4, 99]), [0.5, 0.5, 0.25, 0, 0])
+    np.testing.assert_allclose(
+        found.extinction([2, 3, 9]), [2 * np.log(2) / 3, -2 * np.log(0.75) / 3, 0]
+    )
+    assert found.extinction(np.nan) == 0
+    assert np.all(np.isfinite(found.colour([np.nan, np.inf, -np.inf])))
+
+
+def test_the_unit_distance_is_a_vertex_spacing_unless_said() -> None:
+    assert made(spacing=0.25).unit_distance == 0.25
+    assert made({"unit_distance": 7}, spacing=0.25).unit_distance == 7
+
+
+def test_colours_by_name_points_and_range() -> None:
+    np.testing.assert_allclose(made({"colours": "grey"}).colour([0, 5, 10])[:, 0], [0, 0.5, 1])
+    np.testing.assert_allclose(
+        made({"colours": "grey", "range": [4, 6]}).colour([0, 5, 10])[:, 0], [0, 0.5, 1]
+    )
+    points = made({"colours": [[2, "#000000"], [4, "white"]]})
+    np.testing.assert_allclose(points.colour([0, 3, 9])[:, 0], [0, 0.5, 1])
+
+
+@pytest.mark.parametrize(
+    ("positions", "spec", "ends"),
+    [
+        ((0.0, 1.0), {}, (0, 10)),
+        ((-1.0, 1.0), {"range": [2, 3]}, (2, 3)),
+        ((3.0, 7.0), {}, (3, 7)),
+        ((3.0, 7.0), {"range": [0, 1]}, (0, 1)),
+    ],
+)
+def test_presets_of_paraview(
+    tmp_path: Path, positions: tuple[float, float], spec: dict[str, Any], ends: tuple[float, float]
+) -> None:
+    low, high = positions
+    path = tmp_path / "p.json"
+    path.write_text(
+        json.dumps(
+            {
+                "RGBPoints": [low, 0, 0, 0, high, 1, 1, 1],
+                "Points": [low, 0, 0.5, 0, high, 0.5, 0.5, 0],
+            }
+        )
+    )
+    found = made({"colours": str(path), **spec})
+    assert tuple(found.colours.positions) == ends
+    np.testing.assert_allclose(found.points, [[ends[0], 0], [ends[1], 0.5]])
+    assert len(made({"colours": str(path), **spec, "opacity": "opaque"}).points) == 1
+
+
+@pytest.mark.parametrize("density", [0.01, 1.0])
+@pytest.mark.parametrize(
+    "opacity", [*PRESETS[2:], "auto", [[1, 0], [2, 0.9], [2.5, 0], [6, 0], [7, 1.0]]]
+)
+def test_a_table_is_the_function_and_the_marker_of_visible_values(
+    opacity: Any, density: float
+) -> None:
+    found = made({"opacity": opacity, "density": density})
+    low, high, colours, extinctions = found.table()
+    assert (colours.shape, colours.dtype, extinctions.shape, extinctions.dtype) == (
+        (4096, 3),
+        np.float32,
+        (4096,),
+        np.float64,
+    )
+    inside = VALUES[(VALUES >= 0) & (VALUES <= 10)]
+    place = (inside - low) / (high - low) * 4095
+    tabled = np.interp(place, np.arange(4096), 1 - np.exp(-extinctions))
+    # Towards opacity 1 the extinction of the last entry rises without bound, so the entries beside a point may differ.
+    away = np.min(np.abs(inside[:, None] - found.points[:, 0]), axis=1) > (high - low) / 4095
+    np.testing.assert_allclose(
+        tabled[away], (1 - np.exp(-found.extinction(inside)))[away], rtol=0, atol=0.02
+    )
+    shown = found.extinction(inside) > 0
+    mixed = np.stack(
+        [np.interp(place, np.arange(4096), colours[:, channel]) for channel in range(3)], axis=-1
+    )
+    np.testing.assert_allclose(mixed[shown], found.colour(inside)[shown], rtol=0, atol=2e-3)
+    assert np.all(found.visible(inside, inside)[tabled > 0])
+
+
+def test_visible_is_a_query_by_range() -> None:
+    found = made({"opacity": [[1, 0], [2, 0.5], [3, 0], [6, 0], [7, 0.5], [8, 0]]})
+    rng = np.random.default_rng(3)
+    ends = np.sort(rng.uniform(-1, 11, (3000, 2)))
+    low, high = ends.T.copy()
+    high[:1000] = low[:1000]
+    entry = (found.span[1] - found.span[0]) / 4095
+    truth = np.array(
+        [np.any(((a < 3) & (b > 1)) | ((a < 8) & (b > 6))) for a, b in zip(low, high, strict=True)]
+    )
+    wider = np.array(
+        [
+            np.any(((a - entry < 3) & (b + entry > 1)) | ((a - entry < 8) & (b + entry > 6)))
+            for a, b in zip(low, high, strict=True)
+        ]
+    )
+    np.testing.assert_array_equal(found.visible(low, high), wider)
+    assert 100 < truth.sum() < 2900
+    assert not np.any(truth & ~wider)
+
+
+def test_visible_beyond_the_ends_and_of_nothing() -> None:
+    found = made({"opacity": [[2, 0.5], [4, 0]]})
+    assert found.visible([-5, 5, 3.9], [-4, 6, 8]).tolist() == [True, False, True]
+    assert found.visible([np.nan, np.inf, 3, 0], [1, -np.inf, 2, np.nan]).tolist() == [False] * 4
+    assert found.visible(np.zeros((2, 3)), np.ones((2, 3))).shape == (2, 3)
+    assert bool(made({"opacity": "opaque"}).visible(1e30, 1e31))
+
+
+def test_a_narrow_range_gets_the_whole_table() -> None:
+    found = made({"opacity": [[0, 0], [5, 0], [5.0005, 1], [5.001, 0], [10, 0]]})
+    assert found.span == (5.0, 5.001)
+    assert found.table()[3].max() > 5
+
+
+def test_a_peak_that_a_table_misses_is_told() -> None:
+    found = made(
+        {
+            "opacity": [
+                [1, 0],
+                [2, 0.5],
+                [3, 0],
+                [6.00031, 0],
+                [6.00032, 1],
+                [6.00033, 0],
+                [8, 0],
+                [9, 0.2],
+            ]
+        }
+    )
+    with pytest.warns(FhashWarning, match="peak of the opacity is narrower"):
+        found.table(64)
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ({"opacity": "liner"}, r"opacity 'liner' is not known; did you mean 'linear'\?"),
+        ({"colours": "virids"}, "did you mean 'viridis'"),
+        ({"colours": "none.json"}, "no such preset"),
+        ({"colours": "v" * 5000}, "is not known"),
+        ({"colours": "a\0b.json"}, "not a preset"),
+        ({"colours": [[1, "red"], [1, "blue"]]}, "values of 'colours' do not ascend"),
+        ({"colours": []}, "values of 'colours' do not ascend"),
+        ({"colours": [[1, "rot"]]}, "colour 'rot' is not known"),
+        ({"opacity": []}, "no points"),
+        ({"opacity": [[2, 0], [1, 1]]}, "values of 'opacity' do not ascend"),
+        ({"opacity": [[1, 0], [2, 1.5]]}, "opacity is 1.5 at the value 2; allowed: 0 to 1"),
+        ({"opacity": [[1, 0], [2, 0]]}, "shows nothing"),
+        ({"opacity": [[20, 0], [30, 1]]}, "shows nothing"),
+        ({"density": 0}, "shows nothing"),
+        ({"range": [3, 3]}, "range is 3 to 3"),
+        ({"opacity": "feature"}, "'feature' needs a file of an interval"),
+    ],
+)
+def test_words_that_make_no_function(spec: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        made(spec)
+    assert "\n" not in str(caught.value)
+
+
+def test_nothing_is_allowed_where_it_is_asked_for() -> None:
+    found = made({"nothing": True})
+    assert not found.visible(-1e9, 1e9)
+    assert found.table()[3].max() == 0
+
+
+def test_a_constant_series_and_json() -> None:
+    found = made({"opacity": "opaque"}, value_range=(3.0, 3.0))
+    low, high, *_ = found.table()
+    assert low < high
+    assert bool(found.visible(3.0, 3.0))
+    assert np.all(found.extinction([3.0]) == OPAQUE)
+    assert json.loads(json.dumps(found.to_dict()))["opacity"] == [[3.0, 1.0]]
+    assert made({}, value_range=(3.0, 3.0), features=("isosurface:3",)).visible(3.0, 3.0)
+
+
+LARGEST = float(np.finfo(np.float64).max)
+
+
+@pytest.mark.parametrize("value", [LARGEST, -LARGEST, 5e-324, 0.0])
+@pytest.mark.parametrize("opacity", ["auto", "linear", "opaque"])
+def test_a_constant_at_the_end_of_float64_has_a_table(value: float, opacity: str) -> None:
+    with np.errstate(all="raise", under="ignore"):
+        found = made(
+            {"opacity": opacity},
+            value_range=(value, value),
+            features=("isosurface:" + repr(value),),
+        )
+        low, high, colours, extinctions = found.table()
+    assert -LARGEST <= low < high <= LARGEST
+    assert np.isfinite(colours).all()
+    assert np.isfinite(extinctions).all()
+    assert bool(found.visible(value, value))
+
+
+@pytest.mark.parametrize("reach", [LARGEST, 1e300, 1.0])
+def test_a_range_whose_width_overflows_is_drawn_like_any_other(reach: float) -> None:
+    features = ("interval:-inf:" + repr(reach / 2),)
+    with np.errstate(all="raise", under="ignore"):
+        found = made({}, value_range=(-reach, reach), features=features)
+        opacities = found.opacity(reach * np.array([-1, -0.5, 0.4, 0.425, 0.5, 1]))
+        found.table()
+        linear = made({"opacity": "linear"}, value_range=(-reach, reach)).opacity(
+            reach * np.array([-1, -0.5, 0, 1])
+        )
+    np.testing.assert_allclose(opacities / INTERVAL, [1, 1, 2 / 3, 0.5, 0, 0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(linear, [0, 0.25, 0.5, 1])

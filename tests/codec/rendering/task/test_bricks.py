@@ -1,0 +1,93 @@
+"""What bricks of a frame hold, and which of them matter."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fhash_codec.rendering.camera.camera import Grid, Rays
+from fhash_codec.rendering.scene.scene import Camera
+from fhash_codec.rendering.task.bricks import FARTHEST, SIDE, Bricks
+from fhash_codec.rendering.task.task import Frame, Surface, Table, Task
+
+
+def bricks_of(values):
+    return Bricks.of(Frame(values=np.asarray(values, dtype=np.float32), first=(0, 0, 0)))
+
+
+def task_of(shape, extinctions, surfaces=()):
+    table = Table(
+        low=0.0,
+        high=1.0,
+        colours=np.ones((len(extinctions), 3), dtype=np.float32),
+        extinctions=np.array(extinctions),
+    )
+    grid = Grid(counts=shape[::-1], origin=np.zeros(3), spacing=np.ones(3))
+    return Task(
+        rays=Rays.of(Camera(), grid, (4, 4)),
+        step=0.5,
+        threshold=0.0,
+        table=table,
+        surfaces=surfaces,
+    )
+
+
+@pytest.mark.parametrize("shape", [(20, 17, 33), (9, 8, 10), (1, 30, 2), (1, 1, 1), (70, 70, 70)])
+def test_a_brick_has_the_extremes_of_its_vertices(way, shape):
+    values = np.random.default_rng(3).normal(size=shape).astype(np.float32)
+    values[values > 1.5] = np.nan
+    bricks = bricks_of(values)
+    for at in np.ndindex(bricks.low.shape):
+        part = values[tuple(slice(i * SIDE, i * SIDE + SIDE + 1) for i in at)]
+        known = part[~np.isnan(part)]
+        assert bricks.low[at] == (known.min() if known.size else np.inf)
+        assert bricks.high[at] == (known.max() if known.size else -np.inf)
+    assert all(
+        count == max(-(-(size - 1) // SIDE), 1)
+        for count, size in zip(bricks.low.shape, shape, strict=True)
+    )
+
+
+def test_what_is_infinite_has_no_value(way):
+    values = np.zeros((10, 10, 10))
+    values[1, 1, 1], values[2, 2, 2] = np.inf, -np.inf
+    bricks = bricks_of(values)
+    assert bricks.value_range == (0.0, 0.0)
+    assert np.isnan(bricks.values[1, 1, 1])
+    assert np.isnan(bricks.values[2, 2, 2])
+    assert bricks_of(np.full((3, 3, 3), np.nan)).value_range == (0.0, 0.0)
+
+
+def test_bricks_matter_where_something_can_be_seen(way):
+    values = np.zeros((33, 33, 33))
+    values[22, 2, 10] = 1.0
+    values[2, 26, 26] = 0.4
+    bricks = bricks_of(values)
+    peak = task_of(values.shape, [0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    assert np.argwhere(bricks.matters(peak)).tolist() == [[5, 0, 2]]
+    surface = Surface(value=0.3, colour=np.ones(3), opacity=1.0)
+    assert bricks.matters(task_of(values.shape, [0.0, 0.0], (surface,))).sum() == 2
+    assert not bricks.matters(task_of(values.shape, [0.0, 0.0])).any()
+    assert bricks.matters(task_of(values.shape, [1.0, 0.0])).all()
+
+
+def test_a_table_of_denormal_width_is_one():
+    values = np.zeros((6, 6, 6), dtype=np.float32)
+    values[1, 1, 1] = 1.0
+    colours = np.ones((4097, 3), dtype=np.float32)
+    task = task_of(values.shape, [0.0, 1.0])
+    for extinctions, expected in ((np.ones(4097), True), (np.zeros(4097), False)):
+        table = Table(low=0.0, high=5e-324, colours=colours, extinctions=extinctions)
+        assert np.all(bricks_of(values).matters(replace(task, table=table)) == expected)
+
+
+def test_the_distance_is_that_to_the_nearest_brick_that_matters(way):
+    values = np.zeros((60, 50, 90))
+    for z, y, x in ((4, 4, 4), (50, 20, 60), (33, 44, 85)):
+        values[z, y, x] = 1.0
+    bricks, task = bricks_of(values), task_of(values.shape, [0.0, 0.0, 1.0])
+    matters = np.argwhere(bricks.matters(task))
+    every = np.array(list(np.ndindex(bricks.low.shape)))
+    exact = np.abs(every[:, None] - matters).max(axis=2).min(axis=1)
+    assert np.array_equal(bricks.distance(task).ravel(), exact)
+    assert np.all(bricks.distance(task_of(values.shape, [0.0, 0.0])) == FARTHEST)

@@ -1,0 +1,507 @@
+"""Marching against closed forms, and the native library against numpy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fhash_codec.rendering.camera.camera import Grid, Rays
+from fhash_codec.rendering.march import march
+from fhash_codec.rendering.scene.scene import AmbientOcclusion, Camera, Shadows
+from fhash_codec.rendering.task.light import light_grid
+from fhash_codec.rendering.task.task import Frame, Lighting, Surface, Table, Task
+from fhash_formats import native
+from fhash_formats.errors import InputError
+
+LIGHTING = Lighting(ambient=0.2, diffuse=0.8, specular=0.3, specular_power=16.0, lamp=None)
+FRONT = Camera(view="xy", projection="parallel")
+WHITE = np.ones(3)
+
+
+def frame_of(values):
+    return Frame(values=np.asarray(values, dtype=np.float32), first=(0, 0, 0))
+
+
+def grid_of(shape, spacing=(1.0, 1.0, 1.0)):
+    return Grid(counts=tuple(shape[::-1]), origin=np.zeros(3), spacing=np.array(spacing))
+
+
+def table_of(extinctions, low=0.0, high=1.0, colour=(1.0, 1.0, 1.0)):
+    extinctions = np.asarray(extinctions, dtype=np.float64)
+    return Table(
+        low=low,
+        high=high,
+        colours=np.tile(np.float32(colour), (len(extinctions), 1)),
+        extinctions=extinctions,
+    )
+
+
+def task_of(
+    shape,
+    table,
+    *,
+    camera=FRONT,
+    size=(8, 8),
+    step=0.5,
+    spacing=(1.0, 1.0, 1.0),
+    threshold=0.0,
+    **more,
+):
+    rays = Rays.of(camera, grid_of(shape, spacing), size)
+    return Task(rays=rays, step=step, threshold=threshold, table=table, lighting=LIGHTING, **more)
+
+
+def waves(shape=(20, 17, 30)):
+    z, y, x = np.meshgrid(*(np.linspace(0, 1, size) for size in shape), indexing="ij")
+    return (0.5 + 0.25 * np.sin(7 * x + 3 * y) + 0.25 * np.cos(5 * y - 6 * z + 2 * x)).astype(
+        np.float32
+    )
+
+
+def sphere(count=33):
+    axis = np.linspace(-1, 1, count)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    return np.sqrt(x * x + y * y + z * z).astype(np.float32)
+
+
+@pytest.mark.parametrize("extinction", [1e-9, 1e-3, 0.3, 5.0, 64.0])
+@pytest.mark.parametrize("step", [0.02, 0.3, 0.5, 7.0, 100.0])
+def test_a_constant_slab_has_its_closed_form_at_every_step(way, extinction, step):
+    table = table_of([extinction, extinction], colour=(0.8, 0.4, 0.2))
+    shape = (21, 8, 8)
+    rgba = march(frame_of(np.full(shape, 0.3)), task_of(shape, table, step=step, size=(4, 4))).rgba[
+        2, 2
+    ]
+    exact = -np.expm1(-extinction * 20)
+    np.testing.assert_allclose(
+        rgba, exact * np.array([0.8, 0.4, 0.2, 1.0]), rtol=1e-3 if exact < 1e-6 else 1e-5
+    )
+
+
+def test_thin_fog_holds_down_to_tiny_steps(way):
+    table = table_of([0.0, 1e-4])
+    ramp = np.broadcast_to(np.linspace(0, 1, 41, dtype=np.float32)[:, None, None], (41, 6, 6))
+    for step in (1.0, 0.1, 0.02):
+        rgba = march(frame_of(ramp), task_of(ramp.shape, table, step=step, size=(1, 1))).rgba[0, 0]
+        assert rgba[3] == pytest.approx(-np.expm1(-1e-4 * 20), rel=1e-3)
+
+
+def test_a_linear_ramp_in_front_of_colours_has_its_integral(way):
+    ramp = np.broadcast_to(np.linspace(1, 0, 65, dtype=np.float32)[:, None, None], (65, 6, 6))
+    n = 257
+    table = Table(
+        low=0.0,
+        high=1.0,
+        colours=np.linspace([0, 0, 0], [1, 0, 0], n, dtype=np.float32),
+        extinctions=np.linspace(0, 0.1, n),
+    )
+    red, _, _, opacity = march(
+        frame_of(ramp), task_of(ramp.shape, table, step=0.05, size=(1, 1))
+    ).rgba[0, 0]
+    s = (np.arange(200_000) + 0.5) / 200_000
+    left = np.exp(-6.4 * s**2 / 2)  # the ray begins at the last layer, of value 0
+    assert opacity == pytest.approx(1 - np.exp(-3.2), rel=1e-4)
+    assert red == pytest.approx(np.mean(left * 6.4 * s * s), rel=1e-3)
+
+
+@pytest.mark.parametrize("position", [(16.0, 16.0, 90.0), (30.0, -40.0, 50.0)])
+def test_the_surface_of_a_sphere_lies_where_it_is(way, position):
+    values = sphere()
+    surface = Surface(value=0.5, colour=np.array([1.0, 0.5, 0.25]), opacity=1.0)
+    camera = Camera(position=position, view_up=(0, 1, 0))
+    task = task_of(
+        values.shape,
+        None,
+        camera=camera,
+        size=(33, 33),
+        surfaces=(surface,),
+        depth=True,
+        normal=True,
+    )
+    marched = march(frame_of(values), task)
+    assert marched.depth is not None
+    assert marched.normal is not None
+    eye, direction = task.rays.pixels()
+    direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+    away = eye - 16.0
+    half = (away * direction).sum(-1)
+    inside = half**2 - (away**2).sum(-1) + 64.0
+    clear, hit = inside < -8, inside > 8
+    assert hit.sum() > 50
+    assert np.all(np.isinf(marched.depth[clear]))
+    assert np.all(marched.rgba[clear] == 0)
+    np.testing.assert_allclose(
+        marched.depth[hit], (-half - np.sqrt(np.maximum(inside, 0)))[hit], atol=0.08
+    )  # of what is linear between vertices
+    exact = away[hit] + marched.depth[hit][:, None] * direction[hit]
+    np.testing.assert_allclose(marched.normal[hit], exact / 8, atol=0.12)
+    assert np.all(marched.rgba[hit][:, 3] == 1)
+
+
+def test_roots_of_a_plane_are_exact(way):
+    x = np.broadcast_to(np.linspace(0, 1, 11, dtype=np.float32)[:, None, None] ** 2, (11, 5, 5))
+    surfaces = tuple(
+        Surface(value=value, colour=WHITE, opacity=0.6) for value in (0.005, 0.333, 0.995)
+    )
+    task = task_of(x.shape, None, surfaces=surfaces, depth=True, size=(4, 4), step=0.7)
+    marched = march(frame_of(x), task)
+    assert marched.depth is not None
+    assert marched.rgba[2, 2, 3] == pytest.approx(1 - 0.4**3, rel=1e-5)
+    eye, _ = task.rays.pixels()
+    # The one nearest to the eye takes 0.6: the value 0.995 lies in the first tenth of a cell, before the first sample.
+    place = 9 + (0.995 - 0.81) / 0.19
+    assert marched.depth[2, 2] == pytest.approx(eye[2, 2, 2] - place, abs=1e-4)
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.3, 0.7, 0.9)])
+def test_a_surface_of_the_value_of_a_face_is_that_face(way, spacing):
+    """Whatever rounding makes of where rays enter: all that meet the face from outside see it, of either sign of the slope."""
+    shape = (9, 8, 7)
+    for low, high in ((2.0, 6.0), (6.0, 2.0)):
+        ramp = np.broadcast_to(np.linspace(low, high, 9, dtype=np.float32)[:, None, None], shape)
+        camera = Camera(azimuth=7, elevation=50)
+        task = task_of(
+            shape,
+            None,
+            camera=camera,
+            size=(64, 64),
+            spacing=spacing,
+            surfaces=(Surface(value=6.0, colour=WHITE, opacity=1.0),),
+        )
+        seen = march(frame_of(ramp), replace(task, depth=True))
+        origin, direction = (part.reshape(-1, 3) for part in task.rays.pixels())
+        face = 8.0 if high == 6.0 else 0.0
+        with np.errstate(divide="ignore"):
+            place = origin + ((face - origin[:, 2]) / direction[:, 2])[:, None] * direction
+        inside = np.all(
+            (place[:, :2] > 0.01) & (place[:, :2] < np.array([5.99, 6.99])), axis=1
+        ).reshape(64, 64)
+        outside = np.any(
+            (place[:, :2] < -0.01) | (place[:, :2] > np.array([6.01, 7.01])), axis=1
+        ).reshape(64, 64)
+        assert inside.sum() > 200
+        assert seen.rgba[inside, 3].min() == 1
+        assert seen.rgba[outside, 3].max() == 0
+
+
+def test_surfaces_are_drawn_in_the_order_in_which_a_ray_meets_them(way):
+    ramp = np.broadcast_to(np.linspace(0, 1, 11, dtype=np.float32)[:, None, None], (11, 5, 5))
+    red, blue = (
+        Surface(value=v, colour=np.array(c), opacity=0.5)
+        for v, c in ((0.81, (1.0, 0, 0)), (0.83, (0, 0, 1.0)))
+    )
+    lighting = Lighting(ambient=1.0, diffuse=0.0, specular=0.0, specular_power=1.0, lamp=None)
+    task = replace(task_of(ramp.shape, None, surfaces=(red, blue), size=(4, 4)), lighting=lighting)
+    np.testing.assert_allclose(
+        march(frame_of(ramp), task).rgba[2, 2], [0.25, 0, 0.5, 0.75], atol=1e-5
+    )
+
+
+def test_an_empty_scene_is_empty_and_an_opaque_one_is_opaque(way):
+    values = waves()
+    assert not march(frame_of(values), task_of(values.shape, table_of([0.0, 0.0]))).rgba.any()
+    assert not march(frame_of(values), task_of(values.shape, None)).rgba.any()
+    opaque = march(frame_of(values), task_of(values.shape, table_of([64.0, 64.0]), step=1.0)).rgba
+    assert np.allclose(opaque[4, 4], 1)
+
+
+def test_a_camera_may_be_inside_and_rays_may_run_along_faces(way):
+    values = np.full((9, 9, 9), 0.5)
+    table = table_of([0.1, 0.1])
+    camera = Camera(position=(4.0, 4.0, 4.0), focal_point=(4.0, 4.0, -10.0), view_up=(0, 1, 0))
+    middle = march(frame_of(values), task_of(values.shape, table, camera=camera, size=(1, 1))).rgba[
+        0, 0, 3
+    ]
+    assert middle == pytest.approx(-np.expm1(-0.4), rel=1e-5)
+    task = task_of(values.shape, table, size=(2, 1))
+    along = replace(
+        task,
+        rays=replace(task.rays, eye=np.array([8.0, 0.0, 20.0]), right=np.zeros(3), up=np.zeros(3)),
+    )
+    assert march(frame_of(values), along).rgba[0, 0, 3] == pytest.approx(-np.expm1(-0.8), rel=1e-5)
+    beside = replace(along, rays=replace(along.rays, eye=np.array([8.0 + 1e-9, 0.0, 20.0])))
+    assert march(frame_of(values), beside).rgba[0, 0, 3] == 0
+
+
+@pytest.mark.parametrize("shape", [(1, 6, 6), (6, 1, 6), (1, 1, 1), (2, 2, 2)])
+def test_volumes_of_one_vertex_are_drawn(way, shape):
+    rgba = march(
+        frame_of(np.full(shape, 0.5)), task_of(shape, table_of([0.5, 0.5]), shaded=True)
+    ).rgba
+    thickness = 1 if shape[0] == 1 else shape[0] - 1
+    assert rgba[4, 4, 3] == pytest.approx(-np.expm1(-0.5 * thickness), rel=1e-5)
+    assert np.all(np.isfinite(rgba))
+
+
+def test_what_has_no_value_never_reaches_a_pixel(way):
+    values = waves()
+    values[5:9, 4:8, 3:20] = np.nan
+    values[12, 3, 3], values[13, 5, 5] = np.inf, -np.inf
+    table = table_of([0.05, 0.2])
+    surface = Surface(value=0.6, colour=WHITE, opacity=0.5)
+    for camera in (FRONT, Camera()):
+        task = task_of(
+            values.shape,
+            table,
+            camera=camera,
+            size=(40, 40),
+            shaded=True,
+            surfaces=(surface,),
+            depth=True,
+            normal=True,
+        )
+        marched = march(frame_of(values), task)
+        assert np.all(np.isfinite(marched.rgba))
+        assert marched.normal is not None
+        assert np.all(np.isfinite(marched.normal))
+    assert not march(frame_of(np.full((5, 5, 5), np.nan)), task_of((5, 5, 5), table)).rgba.any()
+
+
+def test_a_face_of_vertices_with_values_is_seen_though_what_lies_behind_has_none(way):
+    values = np.full((3, 5, 5), 0.5)
+    values[0] = np.nan
+    camera = Camera(view="xz", projection="parallel")
+    task = task_of(values.shape, table_of([0.1, 0.1]), camera=camera, size=(1, 1))
+    task = replace(
+        task,
+        rays=replace(task.rays, eye=np.array([2.0, -9.0, 1.0]), right=np.zeros(3), up=np.zeros(3)),
+    )
+    assert march(frame_of(values), task).rgba[0, 0, 3] == pytest.approx(-np.expm1(-0.4), rel=1e-5)
+
+
+def test_the_maximum_is_that_of_the_samples(way):
+    values = waves()
+    n = 1000
+    table = Table(
+        low=0.0,
+        high=1.0,
+        colours=np.linspace([0, 0, 0], [1, 1, 1], n, dtype=np.float32),
+        extinctions=np.ones(n),
+    )
+    task = task_of(values.shape, table, size=(17, 17), maximum=True, step=0.25, depth=True)
+    marched = march(frame_of(values), task)
+    everything = march(frame_of(values), replace(task, skipping=False))
+    np.testing.assert_array_equal(marched.rgba, everything.rgba)
+    np.testing.assert_array_equal(marched.depth, everything.depth)
+    hit = marched.rgba[..., 3] > 0
+    assert set(np.unique(marched.rgba[..., 3])) <= {0.0, 1.0}
+    assert hit.any()
+    assert marched.rgba[hit].max() <= values.max() + 1e-3 or values.max() > 1
+    assert marched.counters["gradients"] == 0
+
+
+CASES = {
+    "fog": {},
+    "shaded": {"shaded": True},
+    "buffers": {"shaded": True, "depth": True, "normal": True},
+    "antialiased": {"antialiasing": 2, "jitter": True},
+    "jitter": {"jitter": True, "step": 1.7},
+    "surfaces": {
+        "surfaces": (
+            Surface(value=0.62, colour=np.array([1, 0, 0.0]), opacity=0.4),
+            Surface(value=0.3, colour=WHITE, opacity=0.7),
+        ),
+        "shaded": True,
+    },
+    "maximum": {"maximum": True},
+    "maximum and surface": {
+        "maximum": True,
+        "surfaces": (Surface(value=0.8, colour=WHITE, opacity=0.5),),
+    },
+    "all": {"skipping": False, "shaded": True},
+}
+
+
+@pytest.mark.parametrize("spacing", [(1.0, 1.0, 1.0), (0.5, -2.0, 1.5), (1e-9, 1e-9, 2e-9)])
+@pytest.mark.parametrize("case", CASES)
+def test_native_and_numpy_make_one_picture(case, spacing):
+    if native.library() is None:
+        pytest.skip("no native library")
+    values = waves()
+    unit = float(np.exp(np.mean(np.log(np.abs(spacing)))))
+    table = table_of(
+        np.concatenate([np.zeros(30), np.linspace(0, 0.4, 71)]) / unit, colour=(0.9, 0.5, 0.3)
+    )
+    more = {"step": 0.5, **CASES[case]}
+    more["step"] *= unit
+    task = task_of(
+        values.shape, table, camera=Camera(azimuth=20.0), size=(45, 35), spacing=spacing, **more
+    )
+    one, other = march(frame_of(values), task), march_numpy(values, task)
+    assert one.rgba[..., 3].max() > 0.2
+    np.testing.assert_allclose(one.rgba, other.rgba, atol=2e-4)
+    if task.depth:
+        both = np.isfinite(one.depth) & np.isfinite(other.depth)
+        assert np.mean(np.isfinite(one.depth) == np.isfinite(other.depth)) > 0.99
+        assert np.mean(np.abs(one.depth[both] - other.depth[both]) < 1e-3 * unit) > 0.99
+
+
+def march_numpy(values, task):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FHASH_NATIVE", "0")
+        return march(frame_of(values), task)
+
+
+def test_values_of_any_magnitude_make_the_same_picture(way):
+    values = waves()
+    table = table_of(np.linspace(0, 0.3, 100))
+    task = task_of(
+        values.shape,
+        table,
+        size=(20, 20),
+        shaded=True,
+        surfaces=(Surface(value=0.5, colour=WHITE, opacity=0.5),),
+    )
+    plain = march(frame_of(values), task).rgba
+    for unit in (1e-33, 1e12, 2e38):
+        scaled = replace(table, high=unit)
+        surface = Surface(value=0.5 * unit, colour=WHITE, opacity=0.5)
+        found = march(
+            frame_of(values * np.float32(unit)), replace(task, table=scaled, surfaces=(surface,))
+        ).rgba
+        np.testing.assert_allclose(found, plain, atol=5e-3)
+
+
+def test_skipping_and_the_end_of_rays_change_no_picture(way):
+    values = waves((40, 33, 50))
+    table = table_of(np.where(np.arange(200) > 170, 0.5, 0.0))
+    surface = Surface(value=0.9, colour=WHITE, opacity=0.5)
+    for surfaces in ((), (surface,)):
+        task = task_of(values.shape, table, camera=Camera(), size=(40, 40), surfaces=surfaces)
+        with_, without = (
+            march(frame_of(values), task),
+            march(frame_of(values), replace(task, skipping=False)),
+        )
+        np.testing.assert_allclose(with_.rgba, without.rgba, atol=1e-5)
+        ended = march(frame_of(values), replace(task, threshold=1 / 1024))
+        np.testing.assert_allclose(ended.rgba, without.rgba, atol=2 / 1024)
+        if not surfaces:
+            assert with_.counters["samples"] < without.counters["samples"]
+
+
+def test_a_part_of_the_domain_is_sampled_where_the_whole_is(way):
+    values = waves((24, 24, 24))
+    values[:, :, :8], values[:, :9, :], values[20:] = 0, 0, 0
+    table = table_of(np.concatenate([np.zeros(1), np.linspace(0, 0.3, 99)]))
+    task = task_of(values.shape, table, camera=Camera(), size=(30, 30), shaded=True)
+    part = Frame(values=values[:21, 8:, 7:], first=(0, 8, 7))
+    whole = march(frame_of(values), task)
+    np.testing.assert_allclose(march(part, task).rgba, whole.rgba, atol=1e-4)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_surfaces_of_a_part_are_seen_up_to_its_faces(stride):
+    if native.library() is None:
+        pytest.skip("no native library")
+    n = np.arange(0, 40, stride)
+    z, y, x = np.meshgrid(n, n, n, indexing="ij")
+    values = (0.5 + 0.5 * np.sin((x + 2 * y - z) / 9)).astype(np.float32)[1:, :-2, 2:]
+    frame = Frame(values=values, first=(stride, 0, 2 * stride), stride=stride)
+    surfaces = (Surface(value=0.6, colour=WHITE, opacity=0.5),)
+    table, camera = table_of(np.linspace(0, 0.3, 100)), Camera(azimuth=10)
+    task = task_of(
+        (43, 43, 43),
+        table,
+        size=(50, 50),
+        camera=camera,
+        shaded=True,
+        surfaces=surfaces,
+        depth=True,
+    )
+    one = march(frame, task)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FHASH_NATIVE", "0")
+        other = march(frame, task)
+    np.testing.assert_allclose(other.rgba, one.rgba, atol=1e-4)
+    np.testing.assert_allclose(other.depth, one.depth, atol=1e-3)
+
+
+def test_a_coarse_frame_covers_the_same_box(way):
+    z, y, x = np.meshgrid(*(np.arange(22.0),) * 3, indexing="ij")
+    values = ((x + y + z) / 66).astype(np.float32)
+    table = table_of(np.linspace(0, 0.2, 100))
+    fine = march(
+        frame_of(values), task_of(values.shape, table, size=(24, 24), camera=Camera(), shaded=True)
+    )
+    coarse = Frame(values=values[::2, ::2, ::2], first=(0, 0, 0), stride=2)
+    found = march(coarse, task_of(values.shape, table, size=(24, 24), camera=Camera(), shaded=True))
+    assert np.array_equal(fine.rgba[..., 3] > 0, found.rgba[..., 3] > 0)
+    np.testing.assert_allclose(found.rgba, fine.rgba, atol=0.03)
+
+
+def test_shading_is_stable_where_the_gradient_vanishes(way):
+    values = np.full((12, 12, 12), 1000.0)
+    values += np.random.default_rng(1).uniform(-3e-5, 3e-5, values.shape)
+    table = table_of([0.3, 0.3], low=0.0, high=1000.0)
+    rgba = march(frame_of(values), task_of(values.shape, table, size=(16, 16), shaded=True)).rgba
+    np.testing.assert_allclose(rgba[..., :3], 0.2 * rgba[..., 3:] * np.ones(3), atol=0.15)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-6])
+def test_light_has_a_direction_where_one_axis_is_much_shorter_than_the_others(way, unit):
+    """Its derivative is as much larger, of a narrow range even more so, and no square of it may leave float32."""
+    values = np.broadcast_to(np.linspace(0, 1, 12)[:, None, None], (12, 12, 12))
+    table = table_of([50 / unit, 50 / unit], low=0.5, high=0.5 + 1e-14)
+    task = task_of(
+        values.shape,
+        table,
+        size=(8, 8),
+        step=0.5 * unit,
+        spacing=(1 / unit, 1 / unit, unit),
+        shaded=True,
+    )
+    np.testing.assert_allclose(
+        march(frame_of(values), task).rgba[4, 4], [1.3, 1.3, 1.3, 1.0], rtol=1e-3
+    )
+
+
+def test_counters_show_that_nothing_is_done_unasked(way):
+    values = waves()
+    task = task_of(values.shape, table_of([0.1, 0.3]), size=(20, 20), depth=True)
+    counters = march(frame_of(values), task).counters
+    assert counters["gradients"] == counters["secondary_rays"] == counters["evaluations"] == 0
+    shaded = march(frame_of(values), replace(task, shaded=True)).counters
+    assert shaded["samples"] == counters["samples"] >= shaded["gradients"] > 0
+
+
+def test_a_light_grid_darkens(way):
+    values = waves()
+    grid, frame = grid_of(values.shape), frame_of(values)
+    table = table_of([0.1, 0.5])
+    light = light_grid(
+        frame,
+        grid,
+        table,
+        shadows=Shadows(),
+        lamp=np.array([0, 0, 1.0]),
+        ambient_occlusion=AmbientOcclusion(),
+    )
+    for shading in (False, True):
+        task = task_of(values.shape, table, size=(20, 20), shaded=shading)
+        plain, lit = march(frame, task).rgba, march(frame, replace(task, light=light)).rgba
+        np.testing.assert_allclose(lit[..., 3], plain[..., 3], atol=1e-6)
+        assert np.all(lit[..., :3] <= plain[..., :3] + 1e-6)
+        assert lit[..., 0].sum() < 0.9 * plain[..., 0].sum()
+        np.testing.assert_allclose(
+            march_numpy(values, replace(task, light=light)).rgba, lit, atol=2e-4
+        )
+
+
+def test_threads_make_the_same_picture():
+    values = waves()
+    task = task_of(values.shape, table_of([0.1, 0.3]), size=(100, 70), shaded=True, camera=Camera())
+    one, many = (march(frame_of(values), task, threads=threads) for threads in (1, 4))
+    np.testing.assert_array_equal(one.rgba, many.rgba)
+    assert one.counters == many.counters
+
+
+@pytest.mark.parametrize("step", [0.0, -1.0, float("nan")])
+def test_a_step_of_no_length_is_refused(step):
+    with pytest.raises(InputError, match="above 0"):
+        march(frame_of(np.zeros((3, 3, 3))), task_of((3, 3, 3), None, step=step))
+
+
+def test_too_many_surfaces_are_refused():
+    surfaces = tuple(Surface(value=float(n), colour=WHITE, opacity=0.5) for n in range(65))
+    with pytest.raises(InputError, match="64"):
+        march(frame_of(np.zeros((3, 3, 3))), task_of((3, 3, 3), None, surfaces=surfaces))

@@ -1,0 +1,261 @@
+"""Pictures of whole files: the function, what a renderer keeps, the counters."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec import Renderer, Scene, Volume
+from fhash_codec.rendering import renderer as module
+from fhash_codec.rendering.scene.png_text import scene_in_png
+from fhash_codec.rendering.task.counters import COUNTERS, complete, rows
+from fhash_codec.rendering.task.units import Units
+from fhash_formats import native
+from fhash_formats.errors import DamagedFileError, InputError
+
+pytestmark = pytest.mark.skipif(native.library() is None, reason="marched natively")
+SMALL = {"size": [40, 32]}
+
+
+def scene(**parts: Any) -> Scene:
+    return Scene.from_dict({**SMALL, **parts})
+
+
+def test_the_package_is_the_function(volume: Volume) -> None:
+    image = fhash_codec.rendering(volume, scene())
+    assert image.rgba.shape == (32, 40, 4)
+    assert image.rgba[..., 3].max() > 0.1
+    assert image.source == volume.path.name
+    assert image.seconds > 0
+    assert image._repr_png_().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import fhash_codec; f = fhash_codec.rendering",
+        "import fhash_codec.rendering.scene.scene; f = fhash_codec.rendering",
+        "import fhash_codec.rendering.renderer; f = fhash_codec.rendering",
+        "from fhash_codec import render as f; import fhash_codec.rendering.scene.scene as s; s.Scene()",
+        "from fhash_codec import *; f = render; from fhash_codec.rendering.scene.scene import Scene",
+    ],
+)
+def test_the_package_is_the_function_whatever_was_imported_before(statement: str) -> None:
+    subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            f"{statement}; assert callable(f); import fhash_codec; assert fhash_codec.rendering is f",
+        ],
+        check=True,
+    )
+
+
+def test_a_picture_is_what_its_file_says(volume: Volume, tmp_path: Path) -> None:
+    wanted = scene(effects={"box": True, "colour_bar": True}, step=1)
+    image = fhash_codec.rendering(volume, wanted)
+    image.save(tmp_path / "view.png")
+    assert scene_in_png(tmp_path / "view.png") == wanted
+    again = fhash_codec.rendering(volume, scene_in_png(tmp_path / "view.png"))
+    np.testing.assert_array_equal(again.rgba, image.rgba)
+
+
+def test_what_was_decoded_is_kept(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[float] = []
+    original = module.decoded_frame
+
+    def counted(volume: Volume, step: float, *others: Any) -> Any:
+        decoded.append(step)
+        return original(volume, step, *others)
+
+    monkeypatch.setattr(module, "decoded_frame", counted)
+    first = renderer.render(scene())
+    renderer.render(scene(camera={"azimuth": 40}))
+    renderer.render(scene(step=2))
+    last = renderer.render(scene())
+    assert decoded == [0, 2]
+    np.testing.assert_array_equal(first.rgba, last.rgba)
+
+
+def test_what_comes_next_is_decoded_beside(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[tuple[float, bool]] = []
+    original = module.decoded_frame
+
+    def counted(volume: Volume, step: float, *others: Any) -> Any:
+        decoded.append((step, threading.current_thread() is threading.main_thread()))
+        return original(volume, step, *others)
+
+    monkeypatch.setattr(module, "decoded_frame", counted)
+    renderer, alone = Renderer(volume), Renderer(volume)
+    shown = [scene(step=step) for step in (0, 1, 2)]
+    for each, following in zip(shown, [*shown[1:], None], strict=True):
+        np.testing.assert_array_equal(
+            renderer.render(each, upcoming=following).rgba, alone.render(each).rgba
+        )
+    assert [entry for entry in decoded if not entry[1]] == [(1, False), (2, False)]
+    assert sorted(entry[0] for entry in decoded) == [0, 0, 1, 1, 2, 2]
+    # What nobody came for, what cannot be planned and what is not decoded at all do no harm.
+    renderer.render(shown[0], upcoming=scene(step=0.5))
+    assert renderer.render(scene(step=1.5)).rgba.any()
+    renderer.render(shown[0], upcoming=scene(step=99))
+    renderer.render(shown[0], upcoming=scene(step=1.25, march={"mode": "arm"}))
+    with pytest.raises(InputError, match="step 99 is outside"):
+        renderer.render(scene(step=99))
+
+
+def test_a_failure_beside_is_that_of_its_own_picture(
+    volume: Volume, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = module.decoded_frame
+
+    def failing(volume: Volume, step: float, *others: Any) -> Any:
+        if step == 1:
+            raise DamagedFileError("step 1 is damaged")
+        return original(volume, step, *others)
+
+    monkeypatch.setattr(module, "decoded_frame", failing)
+    renderer = Renderer(volume)
+    assert renderer.render(scene(step=0), upcoming=scene(step=1)).rgba.any()
+    assert renderer.render(scene(step=2)).rgba.any()
+    renderer.render(scene(step=0), upcoming=scene(step=1))
+    with pytest.raises(DamagedFileError, match="step 1"):
+        renderer.render(scene(step=1))
+
+
+def test_what_does_not_fit_is_not_kept(volume: Volume) -> None:
+    frame = int(np.prod(volume.shape[1:])) * 4
+    small = Renderer(volume, memory=frame + 10)
+    for step in (0, 1, 2):
+        small.render(scene(step=step))
+    assert [key[0] for key in small._decoded] == [2]
+    none = Renderer(volume, memory=10)
+    assert none.render(scene()).rgba[..., 3].any()
+    assert not none._decoded
+
+
+def test_a_part_of_the_volume_makes_the_picture_of_all(volume: Volume) -> None:
+    volume.chunks = (1, 4, 4, 4)
+    close = scene(camera={"zoom": 6, "projection": "parallel", "view": "xy"})
+    renderer = Renderer(volume)
+    frame = renderer._frame(renderer.plan(close), lambda *_: None).frame
+    assert frame.values.size < np.prod(volume.shape[1:])
+    part = renderer.render(close)
+    full = Renderer(volume)
+    full.render(scene())
+    np.testing.assert_allclose(full.render(close).rgba, part.rgba, atol=1e-5)
+
+
+def test_nothing_in_the_picture_is_an_empty_picture(volume: Volume) -> None:
+    away = scene(camera={"position": [100, 100, 100], "focal_point": [200, 200, 200]})
+    for mode in ("cache", "arm"):
+        image = fhash_codec.rendering(
+            volume, scene(camera=away.camera.to_dict(), march={"mode": mode})
+        )
+        assert not image.rgba.any()
+        assert image.counters["samples"] == 0
+
+
+def test_a_step_between_is_the_mean_of_values(volume: Volume) -> None:
+    frame = module.decoded_frame(volume, 0.5, 0, ((0, 20), (0, 24), (0, 28)), Units())
+    np.testing.assert_allclose(frame.values, (volume.read(0) + volume.read(1)) / 2, atol=1e-5)
+    coarse = module.decoded_frame(volume, 0.5, 1, ((0, 20), (0, 24), (0, 28)), Units())
+    np.testing.assert_allclose(
+        coarse.values, (volume.read_lod(0, 1) + volume.read_lod(1, 1)) / 2, atol=1e-5
+    )
+    assert coarse.stride == 2
+
+
+def test_what_lies_outside_the_coreset_is_not_seen(files: dict[str, Path]) -> None:
+    with fhash_codec.open(files["feature"]) as volume:
+        frame = module.decoded_frame(volume, 0.0, 0, ((0, 20), (0, 24), (0, 28)), Units())
+        assert np.isnan(frame.values).any()
+        assert frame.first == tuple(low for low, _ in volume.box)
+        image = fhash_codec.rendering(volume, scene(transfer_function={"opacity": "opaque"}))
+        assert 0 < (image.rgba[..., 3] > 0.5).mean() < 0.5
+
+
+def test_counters_prove_the_plan(renderer: Renderer) -> None:
+    plain = renderer.render(scene()).counters
+    assert list(plain) == list(COUNTERS)
+    assert plain["gradients"] == plain["secondary_rays"] == plain["evaluations"] == 0
+    assert plain["samples"] > 0
+    shaded = renderer.render(scene(effects={"shading": True})).counters
+    assert {**shaded, "gradients": 0} == plain
+    assert 0 < shaded["gradients"] <= shaded["samples"]
+    assert renderer.render(scene(effects={"box": True, "time_label": True})).counters == plain
+
+
+def test_light_costs_secondary_rays_and_nothing_else(renderer: Renderer) -> None:
+    plain, shaded = (renderer.render(scene(effects=effects)) for effects in ({}, {"shading": True}))
+    for name in ("shadows", "ambient_occlusion"):
+        dark = renderer.render(scene(effects={name: True}))
+        assert dark.counters["secondary_rays"] > 0
+        assert {**dark.counters, "secondary_rays": 0} == plain.counters
+        np.testing.assert_allclose(dark.rgba[..., 3], plain.rgba[..., 3], atol=1e-6)
+        assert dark.rgba[..., :3].sum() < plain.rgba[..., :3].sum()
+        both = renderer.render(scene(effects={name: True, "shading": True}))
+        assert both.counters == {
+            **shaded.counters,
+            "secondary_rays": dark.counters["secondary_rays"],
+        }
+        assert renderer.render(scene(effects={name: {"strength": 0}})).counters == plain.counters
+
+
+def test_where_there_is_no_volume_there_is_no_light_to_take_away(renderer: Renderer) -> None:
+    surface = {"isosurfaces": [{"value": 5}]}
+    alone = {"transfer_function": {"nothing": True}}
+    lit, dark = (
+        renderer.render(scene(effects={**surface, **more}, **alone))
+        for more in ({}, {"shadows": True})
+    )
+    assert lit.counters["secondary_rays"] == dark.counters["secondary_rays"] == 0
+
+
+def test_the_histogram_does_not_depend_on_the_step(renderer: Renderer) -> None:
+    first, last = (renderer.plan(scene(step=step)).function for step in (0, 2))
+    np.testing.assert_array_equal(first.points, last.points)
+    edges, counts = renderer.histogram()
+    assert counts.sum() > 0
+    assert len(edges) == len(counts) + 1
+
+
+@pytest.mark.parametrize("factor", [5e-324, 1e307, -1e307], ids=str)
+def test_values_at_the_ends_of_float64_have_a_picture(tmp_path: Path, factor: float) -> None:
+    values = np.linspace(-17, 17, 5 * 6 * 7).reshape(1, 5, 6, 7).round() * factor
+    fhash_codec.encode(values, tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume, np.errstate(all="raise", under="ignore"):
+        shown = Renderer(volume)
+        image = shown.render(scene())
+        assert shown.histogram()[1].sum() == values.size
+    assert np.isfinite(image.rgba).all()
+    assert image.rgba[..., 3].max() > 0.1
+
+
+def test_counters_are_complete_and_known() -> None:
+    assert complete({"rays": 2}, {"rays": 3, "samples": 1}) == {
+        **dict.fromkeys(COUNTERS, 0),
+        "rays": 5,
+        "samples": 1,
+    }
+    with pytest.raises(KeyError):
+        complete({"raise": 1})
+    assert rows({"samples": 12345})[2][1] == "12,345"
+
+
+def test_progress_is_reported(volume: Volume) -> None:
+    said: list[tuple[str, int, int]] = []
+    Renderer(volume).render(
+        scene(march={"mode": "arm"}),
+        progress=lambda stage, done, total, note: said.append((stage, done, total)),
+    )
+    assert said[0][0] == "decoding"
+    assert said[-1][0] == "marching"
+    assert all(0 <= done <= total for _, done, total in said)
+    assert said[-1][1] == said[-1][2]

@@ -1,0 +1,351 @@
+"""The transform's laws: reconstruction, equal bits of both engines, reduced resolution, white noise, and fixed bits."""
+
+from __future__ import annotations
+
+import hashlib
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from fhash_formats import native
+from fhash_formats.errors import InputError
+from fhash_formats.transform.axes.basis import fit_basis
+from fhash_formats.transform.axes.lifting import MAX_LOD, Transform
+from fhash_formats.transform.axes.spec import KINDS, WAVELETS, AxisTransform, TransformSpec
+
+SHAPES = [
+    (1, 1, 1, 1),
+    (2, 3, 5, 7),
+    (4, 9, 17, 33),
+    (16, 1, 2, 64),
+    (3, 8, 64, 65),
+    (1, 2, 1, 40),
+    (2, 2, 40, 1),
+    (7, 13, 31, 29),
+]
+MIXES = [
+    ("haar", "5/3", "9/7", "9/7"),
+    ("9/7", "haar", "5/3", "5/3"),
+    ("5/3", "9/7", "haar", "haar"),
+    ("klt", "none", "9/7", "5/3"),
+    ("none", "klt", "haar", "klt"),
+    ("klt", "klt", "klt", "klt"),
+    ("none", "none", "none", "none"),
+    ("9/7", "5/3", "klt", "9/7"),
+]
+TYPES = [np.float32, np.float64]
+
+
+def axis_of(kind: str, depth: int, n: int, step: float = 1e-4) -> AxisTransform:
+    if kind == "klt":
+        columns = np.cumsum(np.random.default_rng(n).standard_normal((n, 2 * n + 9)), axis=0)
+        return AxisTransform(kind=kind, basis=fit_basis(columns @ columns.T, step))
+    return AxisTransform(kind=kind, depth=depth if kind in WAVELETS else 0)
+
+
+def spec_of(
+    kinds: tuple[str, ...], depths: tuple[int, ...], shape: tuple[int, ...], step: float = 1e-4
+) -> TransformSpec:
+    t, z, y, x = (
+        axis_of(kind, depth, n, step) for kind, depth, n in zip(kinds, depths, shape, strict=True)
+    )
+    return TransformSpec(axes=(t, z, y, x))
+
+
+def noise(shape: tuple[int, ...], dtype: Any, seed: int = 0) -> NDArray[Any]:
+    return np.random.default_rng(seed).standard_normal(shape).astype(dtype)
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize("depth", [1, 3, 7])
+@pytest.mark.parametrize("kinds", MIXES)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_there_and_back(
+    shape: tuple[int, ...], kinds: tuple[str, ...], depth: int, dtype: Any
+) -> None:
+    transform = Transform(spec_of(kinds, (depth,) * 4, shape), shape, dtype)
+    values = noise(shape, dtype)
+    coefficients = transform.forward(values)
+    again = transform.inverse(coefficients)
+    assert coefficients.shape == again.shape == shape
+    assert coefficients.dtype == again.dtype == dtype
+    assert np.abs(again - values).max() < (5e-5 if dtype is np.float32 else 2e-12)
+
+
+@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize("depths", [(1, 1, 1, 1), (2, 3, 4, 4), (2, 1, 3, 5)])
+@pytest.mark.parametrize("kinds", MIXES)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_both_engines_give_the_same_bits(
+    shape: tuple[int, ...],
+    kinds: tuple[str, ...],
+    depths: tuple[int, ...],
+    dtype: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    spec = spec_of(kinds, depths, shape, step=2.0)
+    values = noise(shape, dtype, 1) * dtype(100)
+    results = []
+    for setting in ("1", "0"):
+        monkeypatch.setenv("FHASH_NATIVE", setting)
+        transform = Transform(spec, shape, dtype)
+        coefficients = transform.forward(values)
+        results.append([coefficients, *(transform.inverse(values, lod) for lod in (0, 1, 2, 5))])
+    for one, other in zip(*results, strict=True):
+        assert one.shape == other.shape
+        assert one.tobytes() == other.tobytes()
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    shape=st.tuples(*(st.integers(1, 23),) * 4),
+    kinds=st.tuples(*(st.sampled_from(KINDS),) * 4),
+    depths=st.tuples(*(st.integers(1, 6),) * 4),
+    seed=st.integers(0, 9),
+)
+def test_any_mix_comes_back(
+    shape: tuple[int, ...], kinds: tuple[str, ...], depths: tuple[int, ...], seed: int
+) -> None:
+    transform = Transform(spec_of(kinds, depths, shape), shape, np.float64)
+    values = noise(shape, np.float64, seed)
+    assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-10
+
+
+@pytest.mark.parametrize("kinds", MIXES)
+@pytest.mark.parametrize("shape", [(2, 3, 5, 7), (3, 8, 16, 12)])
+def test_norms_are_those_of_the_synthesis_vectors(
+    shape: tuple[int, ...], kinds: tuple[str, ...]
+) -> None:
+    transform = Transform(spec_of(kinds, (1, 2, 3, 3), shape), shape, np.float64)
+    places = np.random.default_rng(2).choice(int(np.prod(shape)), 25, replace=False)
+    for place in places:
+        impulse = np.zeros(shape)
+        impulse.flat[place] = 1.0
+        assert np.sqrt(np.sum(transform.inverse(impulse) ** 2)) == pytest.approx(1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("kinds", [("haar",) * 4, ("9/7",) * 4])
+def test_white_noise_in_the_coefficients_is_as_large_in_the_values(kinds: tuple[str, ...]) -> None:
+    shape = (8, 16, 32, 32)
+    transform = Transform(spec_of(kinds, (2, 2, 3, 3), shape), shape, np.float64)
+    assert np.var(transform.inverse(noise(shape, np.float64))) == pytest.approx(1.0, rel=0.05)
+    band = np.zeros(shape)
+    band[4:, :4, 16:, :16] = noise((4, 4, 16, 16), np.float64)
+    assert np.sum(transform.inverse(band) ** 2) / band[4:, :4, 16:, :16].size == pytest.approx(
+        1.0, rel=0.15
+    )
+
+
+def test_a_coupled_plane_splits_only_the_low_low_quadrant() -> None:
+    shape = (1, 1, 16, 16)
+    values = noise(shape, np.float64)
+    one, two = (
+        Transform(
+            spec_of(("none", "none", "9/7", "9/7"), (0, 0, depth, depth), shape), shape, np.float64
+        )
+        for depth in (1, 2)
+    )
+    first, second = one.forward(values), two.forward(values)
+    assert np.array_equal(first[:, :, 8:, :], second[:, :, 8:, :])
+    assert np.array_equal(first[:, :, :, 8:], second[:, :, :, 8:])
+    packet = Transform(
+        spec_of(("none", "none", "9/7", "9/7"), (0, 0, 2, 1), shape), shape, np.float64
+    ).forward(values)
+    assert not np.allclose(packet[:, :, 4:8, 8:], first[:, :, 4:8, 8:])
+
+
+@pytest.mark.parametrize("kind", ["5/3", "9/7"])
+def test_a_ramp_leaves_the_high_bands_empty(kind: str) -> None:
+    shape = (1, 1, 1, 64)
+    ramp = np.broadcast_to(np.arange(64.0), shape).copy()
+    coefficients = Transform(
+        spec_of(("none", "none", "none", kind), (0, 0, 0, 1), shape), shape, np.float64
+    ).forward(ramp)
+    assert np.abs(coefficients[..., 34:62]).max() < 1e-8
+    assert np.abs(coefficients[..., :32]).min() >= 0
+    assert np.abs(coefficients[..., 16]).max() > 10
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize("kinds", [kinds for kinds in MIXES if "klt" not in kinds])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_constant_stays_itself_at_every_resolution(
+    shape: tuple[int, ...], kinds: tuple[str, ...], dtype: Any
+) -> None:
+    transform = Transform(spec_of(kinds, (2, 3, 4, 4), shape), shape, dtype)
+    coefficients = transform.forward(np.full(shape, 3.25, dtype))
+    for lod in range(MAX_LOD + 1):
+        reduced = transform.inverse(coefficients, lod)
+        assert (
+            reduced.shape
+            == transform.lod_shape(lod)
+            == (shape[0], *(-(-n // 2**lod) for n in shape[1:]))
+        )
+        assert reduced.dtype == dtype
+        assert np.abs(reduced - 3.25).max() < (3e-5 if dtype is np.float32 else 1e-12)
+
+
+@pytest.mark.parametrize("kind", ["none", "5/3", "9/7", "klt"])
+@pytest.mark.parametrize("lod", [1, 2])
+def test_reduced_vertices_stand_at_every_2_to_the_nth(kind: str, lod: int) -> None:
+    shape = (2, 32, 33, 40)
+    t, z, y, x = np.meshgrid(*(np.arange(n) / 40.0 for n in shape), indexing="ij")
+    values = 1.0 + t + z * 2 + y * 3 + np.sin(2 * x)
+    transform = Transform(
+        spec_of(("none", kind, kind, kind), (0, 2, 2, 2), shape), shape, np.float64
+    )
+    step = 1 << lod
+    reduced, expected = (
+        transform.inverse(transform.forward(values), lod),
+        values[:, ::step, ::step, ::step],
+    )
+    inside = (slice(None), *(slice(2, -2),) * 3)
+    assert np.abs(reduced - expected)[inside].max() < 0.01
+
+
+def test_a_haar_low_band_is_the_mean() -> None:
+    shape = (2, 4, 8, 8)
+    values = noise(shape, np.float64)
+    transform = Transform(spec_of(("haar",) * 4, (1, 2, 2, 2), shape), shape, np.float64)
+    means = values.reshape(2, 2, 2, 4, 2, 4, 2).mean(axis=(2, 4, 6))
+    assert np.allclose(transform.inverse(transform.forward(values), 1), means, atol=1e-12)
+
+
+def test_entries_beyond_the_rank_are_zero() -> None:
+    shape = (2, 12, 5, 9)
+    transform = Transform(
+        spec_of(("none", "klt", "none", "klt"), (0,) * 4, shape, step=30.0), shape
+    )
+    z, x = (transform.spec.axes[axis].basis for axis in (1, 3))
+    assert z is not None
+    assert x is not None
+    assert z.rank < 12
+    assert x.rank < 9
+    coefficients = transform.forward(noise(shape, np.float32))
+    assert not coefficients[:, z.rank :].any()
+    assert not coefficients[..., x.rank :].any()
+    assert coefficients[:, : z.rank, :, : x.rank].all()
+    changed = coefficients.copy()
+    changed[:, z.rank :] = np.nan
+    assert transform.inverse(changed).tobytes() == transform.inverse(coefficients).tobytes()
+
+
+@pytest.mark.parametrize("setting", ["1", "0"])
+def test_a_basis_of_rank_0_gives_zeros(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", setting)
+    shape = (2, 3, 4, 5)
+    none, empty = (
+        AxisTransform(kind="none"),
+        (AxisTransform(kind="klt", basis=fit_basis(np.zeros((n, n)), 1.0)) for n in (3, 5)),
+    )
+    z, x = empty
+    transform = Transform(TransformSpec(axes=(none, z, none, x)), shape)
+    assert not transform.forward(noise(shape, np.float32)).any()
+    assert not transform.inverse(noise(shape, np.float32)).any()
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1500), (600, 1, 2, 3), (1, 1, 700, 530)])
+def test_long_axes_come_back_and_have_the_norms_of_the_inside(shape: tuple[int, ...]) -> None:
+    transform = Transform(spec_of(("9/7",) * 4, (4,) * 4, shape), shape, np.float64)
+    values = noise(shape, np.float64)
+    assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-11
+    middle = tuple(n * 3 // 4 if n > 512 else 0 for n in shape)  # inside the finest high band
+    impulse = np.zeros(shape)
+    impulse[middle] = 1.0
+    assert np.sum(transform.inverse(impulse) ** 2) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_input_is_left_alone_and_may_lie_anyhow() -> None:
+    shape = (3, 4, 6, 8)
+    transform = Transform(spec_of(("haar", "klt", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
+    values = noise(shape, np.float32)
+    kept = values.copy()
+    coefficients = transform.forward(values)
+    strided = np.asfortranarray(values)
+    assert transform.forward(strided).tobytes() == coefficients.tobytes()
+    held = coefficients.copy()
+    transform.inverse(coefficients)
+    assert np.array_equal(values, kept)
+    assert np.array_equal(coefficients, held)
+
+
+def test_threads_share_a_transform() -> None:
+    shape = (4, 8, 16, 16)
+    transform = Transform(spec_of(("9/7", "klt", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
+    tiles = [noise(shape, np.float32, seed) for seed in range(12)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda tile: transform.inverse(transform.forward(tile), 1), tiles))
+    fresh = Transform(transform.spec, shape)
+    assert all(
+        np.array_equal(one, fresh.inverse(fresh.forward(tile), 1))
+        for one, tile in zip(together, tiles, strict=True)
+    )
+
+
+@pytest.mark.parametrize("setting", ["1", "0"])
+@pytest.mark.filterwarnings("error")
+def test_hostile_coefficients_raise_nothing(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", setting)
+    shape = (2, 4, 8, 8)
+    transform = Transform(spec_of(("haar", "none", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
+    coefficients = np.full(shape, np.float32(3e38))
+    coefficients[0, 0, 0, :3] = np.nan, np.inf, -np.inf
+    for lod in (0, 1, 3):
+        assert transform.inverse(coefficients, lod).shape == transform.lod_shape(lod)
+
+
+@pytest.mark.parametrize("setting", ["1", "0"])
+def test_the_bits_of_the_transform_are_fixed(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file written today must decode to the same bits for ever, so these digests may not change within a format version."""
+    monkeypatch.setenv("FHASH_NATIVE", setting)
+    shape = (3, 5, 13, 18)
+    integers = (np.arange(np.prod(shape), dtype=np.int64) * 7919 % 1009 - 504).reshape(shape)
+    digests = {}
+    for kinds in (("haar", "5/3", "9/7", "9/7"), ("9/7", "none", "haar", "5/3")):
+        for dtype in TYPES:
+            transform = Transform(spec_of(kinds, (1, 2, 2, 2), shape), shape, dtype)
+            digest = hashlib.sha256(transform.forward(integers.astype(dtype)).tobytes())
+            for lod in (0, 1, 3):
+                digest.update(transform.inverse(integers.astype(dtype), lod).tobytes())
+            digests[kinds[0], np.dtype(dtype).name] = digest.hexdigest()[:16]
+    assert digests == {
+        ("haar", "float32"): "133040732743fa0a",
+        ("haar", "float64"): "8ca439a2a86d2789",
+        ("9/7", "float32"): "ea64a3b5d62271cf",
+        ("9/7", "float64"): "07f0e9ae04a1cccc",
+    }
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "message"),
+    [
+        ((2, 3, 4), np.float32, "four axes"),
+        ((0, 1, 1, 1), np.float32, "four axes"),
+        ((1, 1, 1, 1), np.float16, "float16"),
+        ((1, 9, 1, 1), np.float32, "along z is for 6"),
+    ],
+)
+def test_bad_tiles_are_refused(shape: tuple[int, ...], dtype: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Transform(spec_of(("none", "klt", "none", "none"), (0,) * 4, (1, 6, 1, 1)), shape, dtype)
+
+
+@pytest.mark.parametrize("lod", [-1, MAX_LOD + 1, 1.0, True, "1"])
+def test_bad_resolutions_are_refused(lod: Any) -> None:
+    transform = Transform(spec_of(("none",) * 4, (0,) * 4, (1, 1, 2, 2)), (1, 1, 2, 2))
+    with pytest.raises(InputError, match="lod is 0 to"):
+        transform.inverse(np.zeros((1, 1, 2, 2), np.float32), lod)
+
+
+def test_other_arrays_are_refused() -> None:
+    transform = Transform(spec_of(("none",) * 4, (0,) * 4, (1, 1, 2, 2)), (1, 1, 2, 2))
+    with pytest.raises(InputError, match="float32 of shape"):
+        transform.forward(np.zeros((1, 1, 2, 2)))
+    with pytest.raises(InputError, match="float32 of shape"):
+        transform.inverse(np.zeros((1, 1, 2, 3), np.float32))

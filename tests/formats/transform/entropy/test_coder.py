@@ -1,0 +1,471 @@
+"""The adaptive coder: there and back, the same bytes from every engine, and damaged or hostile bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fhash_formats import native
+from fhash_formats.errors import DamagedFileError
+from fhash_formats.transform.axes.bands import band_table
+from fhash_formats.transform.axes.basis import fit_basis
+from fhash_formats.transform.axes.spec import WAVELETS, AxisTransform, TransformSpec
+from fhash_formats.transform.entropy import coder_portable, prior
+from fhash_formats.transform.entropy.coder import (
+    MAX_INTEGER,
+    Encoded,
+    decode_block,
+    decode_integers,
+    encode_block,
+    encode_integers,
+)
+from fhash_formats.transform.entropy.prior import blank_state, pack_prior
+from fhash_formats.transform.entropy.table import Table, single_band
+
+Integers = NDArray[np.int32]
+Shape = tuple[int, ...]
+
+COUPLED = ("haar", "5/3", "9/7", "9/7")
+PACKETS = ("9/7", "haar", "5/3", "9/7")
+BASES = ("klt", "haar", "klt", "klt")
+NONE = ("none", "none", "none", "none")
+
+
+def use(engine: str, patch: pytest.MonkeyPatch) -> None:
+    """native, or portable: compiled or plain Python."""
+    if engine == "native":
+        if native.library() is None:
+            pytest.skip("the native library is not built or not wanted")
+        return
+    patch.setenv("FHASH_NATIVE", "0")
+    if engine == "plain":
+        patch.setattr(coder_portable, "_RUN", [None])
+    elif coder_portable._compiled() is None:
+        pytest.skip("numba is not installed")
+
+
+@pytest.fixture(params=["native", "compiled", "plain"])
+def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    use(request.param, monkeypatch)
+    return str(request.param)
+
+
+@pytest.fixture(params=["native", "compiled"])
+def fast_engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    use(request.param, monkeypatch)
+
+
+def table_of(kinds: tuple[str, ...], depth: int, shape: Shape, step: float = 8.0) -> Table:
+    axes = []
+    for kind, n in zip(kinds, shape, strict=True):
+        if kind == "klt":
+            columns = np.cumsum(np.random.default_rng(n).standard_normal((n, 4 * n)), axis=0)
+            axes.append(AxisTransform(kind=kind, basis=fit_basis(columns @ columns.T, step)))
+        else:
+            axes.append(AxisTransform(kind=kind, depth=depth if kind in WAVELETS else 0))
+    t, z, y, x = axes
+    return band_table(TransformSpec(axes=(t, z, y, x)), shape)
+
+
+def inside(integers: Integers, table: Table) -> Integers:
+    """Zeros outside the bands."""
+    kept = np.zeros_like(integers)
+    for row in table:
+        box = tuple(slice(int(low), int(high)) for low, high in zip(row[:4], row[4:8], strict=True))
+        kept[box] = integers[box]
+    return kept
+
+
+def make(kind: str, shape: Shape, seed: int = 0) -> Integers:
+    random = np.random.default_rng(seed)
+    if kind == "zero":
+        return np.zeros(shape, dtype=np.int32)
+    if kind == "huge":
+        huge = random.integers(-MAX_INTEGER, MAX_INTEGER, shape, dtype=np.int32, endpoint=True)
+        huge.flat[:: max(huge.size // 3, 1)] = MAX_INTEGER
+        huge.flat[-1] = -MAX_INTEGER
+        return huge
+    values = random.standard_normal(shape)
+    if kind == "mixed":  # all magnitudes, in rows that differ
+        return np.rint(values * np.exp2(random.uniform(-6, 14, (*shape[:-1], 1)))).astype(np.int32)
+    values *= 9 if kind == "dense" else np.where(random.random(shape) < 0.02, 4, 0)
+    return np.rint(values).astype(np.int32)
+
+
+def coefficients(shape: Shape, seed: int = 0) -> NDArray[np.float32]:
+    """Coefficients / step: mostly small, smooth in magnitude, some beyond what is chosen."""
+    random = np.random.default_rng(seed)
+    scale = np.exp2(random.uniform(-4, 3, (*shape[:2], 1, 1)) + random.uniform(-2, 2, shape[2:]))
+    return (random.standard_normal(shape) * scale).astype(np.float32)
+
+
+def nearest(scaled: NDArray[np.float32]) -> Integers:
+    return (np.sign(scaled) * np.floor(np.abs(scaled) + 0.5)).astype(np.int32)
+
+
+@pytest.mark.parametrize("content", ["zero", "sparse", "dense", "mixed", "huge"])
+@pytest.mark.parametrize("kinds", [NONE, COUPLED, PACKETS, BASES])
+@pytest.mark.parametrize(
+    "shape",
+    [(1, 1, 1, 1), (2, 3, 5, 7), (1, 2, 1, 67), (3, 2, 37, 2), (5, 4, 13, 31), (2, 1, 20, 20)],
+)
+@pytest.mark.usefixtures("fast_engine")
+def test_there_and_back(shape: Shape, kinds: tuple[str, ...], content: str) -> None:
+    table, integers = table_of(kinds, 3, shape), make(content, shape)
+    given = integers.copy()
+    encoded = encode_integers(integers, table)
+    assert (integers == given).all()
+    assert (encoded.integers == given).all()
+    again = decode_integers(encoded.data, shape, table)
+    assert again.dtype == np.int32
+    assert (again == inside(integers, table)).all()
+
+
+def test_each_way_to_write_a_magnitude(engine: str) -> None:
+    magnitudes = [
+        *range(1, 19),
+        4094,
+        4095,
+        4096,
+        *(2**k for k in range(5, 30)),
+        *(2**k - 1 for k in range(5, 30)),
+        MAX_INTEGER,
+    ]
+    integers = np.array([[[[value, 0, -value, value] for value in magnitudes]]], dtype=np.int32)
+    assert (decode_block(encode_block(integers), integers.shape) == integers).all()
+
+
+@pytest.mark.usefixtures("fast_engine")
+def test_nothing_to_code_takes_no_bytes() -> None:
+    table = table_of(("none", "klt", "9/7", "9/7"), 1, (3, 4, 5, 6), 1e9)
+    assert len(table) == 0
+    assert encode_integers(make("dense", (3, 4, 5, 6)), table).data == b""
+    assert not decode_integers(b"", (3, 4, 5, 6), table).any()
+
+
+Results = list[Any]
+
+
+def work(kinds: tuple[str, ...], depth: int, shape: Shape, content: str) -> Results:
+    """Bytes, chosen integers, what they decode to, and the states left behind."""
+    table, scaled = table_of(kinds, depth, shape), coefficients(shape)
+    first, second = blank_state(), blank_state()
+    plain = encode_integers(make(content, shape), table, state=first)
+    chosen = encode_integers(nearest(scaled), table, scaled=scaled, weight=0.09, state=second)
+    prior_used = encode_integers(chosen.integers, table)
+    decoded = decode_integers(prior_used.data, shape, table)
+    assert (decoded == inside(chosen.integers, table)).all()
+    states = [
+        array for state in (first, second) for array in (state.slots, state.weights, state.simples)
+    ]
+    return [plain.data, chosen.data, prior_used.data, chosen.integers, decoded, *states]
+
+
+@pytest.mark.parametrize("engine_name", ["compiled", "plain"])
+@pytest.mark.parametrize(
+    ("kinds", "depth", "shape", "content"),
+    [
+        (COUPLED, 3, (3, 2, 9, 26), "mixed"),
+        (PACKETS, 2, (2, 3, 7, 11), "dense"),
+        (BASES, 1, (3, 2, 6, 9), "huge"),
+        (NONE, 0, (1, 1, 1, 1), "huge"),
+    ],
+)
+def test_every_engine_gives_the_same(
+    engine_name: str,
+    kinds: tuple[str, ...],
+    depth: int,
+    shape: Shape,
+    content: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reference = {
+        "compiled": "native",
+        "plain": "compiled" if native.library() is None else "native",
+    }[engine_name]
+    results = []
+    for name in (reference, engine_name):
+        with monkeypatch.context() as patch:
+            use(name, patch)
+            results.append(work(kinds, depth, shape, content))
+    for left, right in zip(*results, strict=True):
+        assert np.array_equal(left, right) if isinstance(left, np.ndarray) else left == right
+
+
+def test_compiled_and_native_agree_on_a_larger_tile(monkeypatch: pytest.MonkeyPatch) -> None:
+    use("native", monkeypatch)
+    shape, kinds = (6, 5, 41, 53), COUPLED
+    here = work(kinds, 4, shape, "mixed")
+    use("compiled", monkeypatch)
+    for left, right in zip(here, work(kinds, 4, shape, "mixed"), strict=True):
+        assert np.array_equal(left, right) if isinstance(left, np.ndarray) else left == right
+
+
+def rows_that_are_chosen_away() -> NDArray[np.float32]:
+    """Lone coefficients that are not worth their bits, before many that need more room than there is at first."""
+    scaled = np.zeros((1, 1, 600, 16), dtype=np.float32)
+    scaled[:, :, :300, 3] = 0.56
+    scaled[:, :, 300:] = np.random.default_rng(0).integers(-(2**29), 2**29, (300, 16))
+    return scaled
+
+
+@pytest.mark.parametrize("choosing", [False, True])
+def test_a_second_try_with_more_room_gives_the_same(
+    choosing: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scaled = rows_that_are_chosen_away()
+    table, results = single_band(scaled.shape), list[tuple[Encoded, NDArray[np.uint16]]]()
+    for name in ("native", "compiled"):
+        with monkeypatch.context() as patch:
+            use(name, patch)
+            state = blank_state()
+            chosen = scaled if choosing else None
+            results.append(
+                (
+                    encode_integers(nearest(scaled), table, scaled=chosen, weight=0.3, state=state),
+                    state.slots,
+                )
+            )
+    (one, one_state), (other, other_state) = results
+    assert len(one.data) > max(4096, scaled.size // 2)
+    assert one.data == other.data
+    assert np.array_equal(one.integers, other.integers)
+    assert np.array_equal(one_state, other_state)
+
+
+@pytest.mark.usefixtures("fast_engine")
+def test_choosing_saves_bytes_for_little_error() -> None:
+    shape = (4, 3, 21, 30)
+    table, scaled = table_of(COUPLED, 2, shape), coefficients(shape)
+    plain = encode_integers(nearest(scaled), table)
+    for weight in (0.0, 0.1, 0.3):
+        chosen = encode_integers(nearest(scaled), table, scaled=scaled, weight=weight)
+        magnitude, most = np.abs(chosen.integers), np.abs(nearest(scaled))
+        assert ((magnitude == most) | (magnitude == most - 1) | (magnitude == 0)).all()
+        assert (chosen.integers[magnitude > 0] * scaled[magnitude > 0] > 0).all()
+        assert (magnitude[most >= 14] == most[most >= 14]).all()
+        assert (decode_integers(chosen.data, shape, table) == chosen.integers).all()
+        # Squared error plus weight per bit: what was asked to be least is less.
+        errors = [
+            float(np.sum((scaled.astype(float) - q) ** 2))
+            for q in (plain.integers, chosen.integers)
+        ]
+        assert errors[1] + weight * 8 * len(chosen.data) <= errors[0] + weight * 8 * len(plain.data)
+        assert weight > 0 or np.array_equal(chosen.integers, plain.integers)
+    assert len(chosen.data) < 0.95 * len(plain.data)
+
+
+def test_a_state_is_left_behind_and_helps(engine: str) -> None:
+    shape = (2, 2, 8, 20)
+    table, integers, state = single_band(shape), make("dense", shape), blank_state()
+    first = encode_integers(integers, table, state=state)
+    assert any(
+        (left != right).any()
+        for left, right in zip(vars(state).values(), vars(blank_state()).values(), strict=True)
+    )
+    second = encode_integers(make("dense", shape, seed=1), table, state=state)
+    assert len(second.data) < len(
+        encode_integers(make("dense", shape, seed=1), table, state=blank_state()).data
+    )
+    assert first.data == encode_integers(integers, table, state=blank_state()).data
+
+
+@pytest.mark.usefixtures("fast_engine")
+def test_the_prior_stays_as_it_is() -> None:
+    integers = make("mixed", (2, 2, 8, 20))
+    before = prior.prior_state().copy()
+    first = encode_block(integers)
+    assert encode_block(integers) == first
+    decode_block(first, integers.shape)
+    assert all(
+        (left == right).all()
+        for left, right in zip(
+            vars(before).values(), vars(prior.prior_state()).values(), strict=True
+        )
+    )
+
+
+def test_a_packed_prior_is_a_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    state = blank_state()
+    encode_integers(
+        make("mixed", (3, 3, 20, 30)), table_of(COUPLED, 2, (3, 3, 20, 30)), state=state
+    )
+    (tmp_path / "prior.bin").write_bytes(pack_prior(state))
+    monkeypatch.setattr(prior, "_FILE", tmp_path / "prior.bin")
+    again = prior.prior_state.__wrapped__()
+    assert (again.weights == state.weights).all()
+    assert (again.simples[:, 0] == state.simples[:, 0]).all()
+    assert again.slots[:, 2].max() == again.simples[:, 1].max() == prior.TRUST
+    seen = state.slots[:, 2] > 0
+    assert (again.slots[~seen, 0] == 32768).all()
+    off = np.abs(logit(again.slots[seen, 0]) - logit(state.slots[seen, 0].clip(2, 65534)))
+    assert off[np.abs(logit(state.slots[seen, 0])) < 10].max() < 1 / 12
+    assert prior.prior_state.__wrapped__().slots.flags.writeable is False
+
+
+def logit(p: NDArray[Any]) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = np.log(p / (65536.0 - p))
+    return values
+
+
+def tries(data: bytes, count: int) -> list[bytes]:
+    """Cuts, flips, and noise."""
+    random = np.random.default_rng(len(data))
+    found = [data[:cut] for cut in random.integers(0, len(data), count)]
+    for at in random.integers(0, 8 * len(data), count):
+        flipped = bytearray(data)
+        flipped[at // 8] ^= 1 << (at % 8)
+        found.append(bytes(flipped))
+    found += [random.bytes(int(size)) for size in random.integers(0, 2 * len(data), count)]
+    return [*found, b"\xff" * len(data), b"\0" * 9, b""]
+
+
+def survives(count: int, shape: Shape, table: Table) -> int:
+    """How many streams are refused; all others give integers."""
+    data, refused = encode_integers(make("mixed", shape), table).data, 0
+    for damaged in tries(data, count):
+        try:
+            integers = decode_integers(damaged, shape, table)
+        except DamagedFileError:
+            refused += 1
+        else:
+            assert integers.shape == shape
+            assert not (integers != inside(integers, table)).any()
+    return refused
+
+
+@pytest.mark.parametrize("kinds", [NONE, COUPLED, BASES])
+@pytest.mark.usefixtures("fast_engine")
+def test_damage_is_refused_or_gives_other_integers(kinds: tuple[str, ...]) -> None:
+    shape = (3, 2, 9, 26)
+    survives(60, shape, table_of(kinds, 2, shape))
+
+
+def test_damage_in_plain_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    use("plain", monkeypatch)
+    survives(2, (1, 2, 3, 8), single_band((1, 2, 3, 8)))
+
+
+@pytest.mark.usefixtures("fast_engine")
+def test_an_endless_magnitude_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The largest exponent ends with a 0. A 1 lies below it, so a somewhat smaller number says that the exponent goes on.
+    table = single_band((1, 1, 1, 1))
+    largest = encode_integers(np.full((1, 1, 1, 1), 2**31 - 1, dtype=np.int32), table).data
+    endless = []
+    for bit in range(8 * len(largest)):
+        smaller = int.from_bytes(largest, "big") - (1 << bit)
+        data = max(smaller, 0).to_bytes(len(largest), "big")
+        try:
+            decode_integers(data, (1, 1, 1, 1), table)
+        except DamagedFileError:
+            endless.append(data)
+    assert endless
+    use("plain", monkeypatch)
+    with pytest.raises(DamagedFileError):
+        decode_integers(endless[0], (1, 1, 1, 1), table)
+
+
+@pytest.mark.usefixtures("fast_engine")
+def test_zeros_at_the_end_go_without_saying() -> None:
+    shape = (2, 2, 9, 26)
+    for seed in range(30):
+        integers = make("mixed", shape, seed)
+        data = encode_block(integers)
+        assert data[-1] != 0
+        assert (decode_integers(data + b"\0\0\0\0\0", shape, single_band(shape)) == integers).all()
+        with pytest.raises(DamagedFileError):
+            decode_block(data + b"\0", shape)
+
+
+def test_a_block_has_one_way_to_be_written(engine: str) -> None:
+    shape = (1, 2, 3, 4)
+    integers = make("mixed", shape)
+    data = encode_block(integers)
+    assert (decode_block(memoryview(data), shape) == integers).all()
+    refused = 0
+    for damaged in tries(data, 1 if engine == "plain" else 60):
+        try:
+            other = decode_block(damaged, shape)
+        except DamagedFileError:
+            refused += 1
+        else:
+            assert encode_block(other) == damaged
+    assert refused > 0
+
+
+@pytest.mark.usefixtures("fast_engine")
+def test_a_magnitude_beyond_the_largest_is_no_block() -> None:
+    for value in (MAX_INTEGER + 1, -MAX_INTEGER - 1):
+        integers = np.full((1, 1, 1, 2), value, dtype=np.int32)
+        data = encode_integers(integers, single_band(integers.shape)).data
+        with pytest.raises(DamagedFileError):
+            decode_block(data, integers.shape)
+
+
+@pytest.mark.parametrize("shape", [(0, 1, 1, 1), (1, 1, 0, 3), (2, 2, 2, 0)])
+@pytest.mark.usefixtures("fast_engine")
+def test_a_block_of_nothing(shape: Shape) -> None:
+    assert encode_block(np.zeros(shape, dtype=np.int32)) == b""
+    assert decode_block(b"", shape).shape == shape
+    with pytest.raises(DamagedFileError):
+        decode_block(b"\xff", shape)
+
+
+@pytest.mark.usefixtures("fast_engine")
+def test_threads_do_not_meet() -> None:
+    shape = (3, 2, 9, 26)
+    alone = [encode_block(make("mixed", shape, seed)) for seed in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        assert (
+            list(pool.map(lambda seed: encode_block(make("mixed", shape, seed)), range(8))) == alone
+        )
+
+
+def before_rounding() -> dict[str, NDArray[np.float64]]:
+    """Every value that a table rounds down, where rounding can change the table."""
+    p = (np.arange(65536) + 0.5) / 65536
+    stretch = np.log(p / (1 - p)) * 256
+    return {
+        "stretch": stretch[np.abs(stretch) < coder_portable.STRETCH_MAX + 1] + 0.5,
+        "squash": 65536
+        / (
+            1
+            + np.exp(-np.arange(-coder_portable.STRETCH_MAX, coder_portable.STRETCH_MAX + 1) / 256)
+        )
+        + 0.5,
+        "cost": -np.log2(np.arange(1, 65537) / 65536) * 2048 + 0.5,
+        "log": np.log2(np.arange(1, 4096)) * 16 + 0.5,
+        "probabilities": 65536 / (1 + np.exp(-(np.arange(256) - 128) / 12)) + 0.5,
+    }
+
+
+@pytest.mark.parametrize("name", ["stretch", "squash", "cost", "log", "probabilities"])
+def test_no_table_depends_on_the_c_library(name: str) -> None:
+    values = before_rounding()[name]
+    assert np.abs(values - np.rint(values)).min() > 1e-9
+
+
+def test_the_tables_are_those_values_rounded() -> None:
+    rounded: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
+        "squash": lambda v: np.clip(np.floor(v), 1, 65535),
+        "cost": np.floor,
+        "log": np.floor,
+    }
+    for name, rule in rounded.items():
+        assert np.array_equal(
+            getattr(coder_portable._ARRAYS, name)[-len(before_rounding()[name]) :],
+            rule(before_rounding()[name]),
+        )
+    assert np.array_equal(
+        prior._PROBABILITIES, np.clip(np.floor(before_rounding()["probabilities"]), 1, 65535)
+    )
+    assert (
+        coder_portable._ARRAYS.stretch.min()
+        == -coder_portable._ARRAYS.stretch.max()
+        == -coder_portable.STRETCH_MAX
+    )

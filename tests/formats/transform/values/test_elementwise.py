@@ -1,0 +1,222 @@
+"""Passes over values: the native ones and the portable ones give the same bits, wherever they are hard to get right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from fhash_formats import native
+from fhash_formats.transform.values import elementwise
+from fhash_formats.transform.values.elementwise import (
+    all_finite,
+    cast,
+    clip_shifted,
+    corrected,
+    free_values,
+    residual_of,
+    within,
+)
+
+Values = npt.NDArray[Any]
+SHAPE = (2, 5, 7, 311)  # more than a native piece, and not a multiple of anything
+LARGEST = 2**30 - 1
+TYPES = ["f2", "f4", "f8", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"]
+
+
+def values(dtype: npt.DTypeLike, seed: int = 0, special: bool = True) -> Values:
+    rng, kind = np.random.default_rng(seed), np.dtype(dtype)
+    if kind.kind != "f":
+        limits = np.iinfo(kind)
+        found = rng.integers(limits.min, limits.max, SHAPE, dtype=kind, endpoint=True)
+        found.flat[:3] = limits.min, limits.max, 0
+        return found
+    found = rng.normal(0, 2, SHAPE).astype(kind)
+    if special:
+        limits_of = np.finfo(kind)
+        hard = [
+            np.nan,
+            np.inf,
+            -np.inf,
+            0.0,
+            -0.0,
+            limits_of.max,
+            limits_of.min,
+            limits_of.tiny,
+            0.5,
+            1.5,
+            2.5,
+            -0.5,
+        ]
+        found.reshape(-1)[100 : 100 + 144] = np.repeat(np.array(hard, kind), 12)
+        found.reshape(-1)[300:312] = np.array(hard, kind)
+    return found
+
+
+def both(function: Callable[[], Any], patch: pytest.MonkeyPatch) -> Any:
+    """The result, which the native and the portable pass must agree on."""
+    if native.library() is None:
+        pytest.skip("the native library is not built or not wanted")
+    one = function()
+    with patch.context() as portable:
+        portable.setenv("FHASH_NATIVE", "0")
+        other = function()
+    assert _bytes(one) == _bytes(other)
+    return one
+
+
+def _bytes(result: Any) -> Any:
+    if isinstance(result, tuple):
+        return [_bytes(part) for part in result]
+    return (
+        (result.dtype, result.shape, result.tobytes()) if isinstance(result, np.ndarray) else result
+    )
+
+
+def marks(seed: int = 3) -> npt.NDArray[np.bool_]:
+    return np.random.default_rng(seed).random(SHAPE) < 0.7
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize("counts", [None, marks()])
+def test_bounds(dtype: str, counts: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = values(dtype, special=False)
+    step = np.dtype(dtype).type(0.25)
+    other = one + step
+    error = float(np.abs(one.astype("f8") - other.astype("f8")).max())
+    assert both(lambda: within(one, other, np.nextafter(error, 1), counts), monkeypatch)
+    assert not both(lambda: within(one, other, 0.24, counts), monkeypatch)
+    at = (1, 4, 6, 310)
+    for bad in (np.nan, np.inf):
+        other = one.copy()
+        other[at] = bad
+        expected = counts is not None and not counts[at]
+        assert both(lambda other=other: within(one, other, 1.0, counts), monkeypatch) == expected  # type: ignore[misc]
+    special = values(dtype)
+    assert not both(lambda: within(special, special, 0.0), monkeypatch)  # NaN is near nothing
+    plain = np.where(np.isnan(special), 0, special).astype(dtype)
+    assert both(lambda: within(plain, plain, 0.0), monkeypatch)
+    assert both(lambda: within(plain, plain[::-1].copy(), float("inf")), monkeypatch)
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize("base", ["f4", "f8"])
+@pytest.mark.parametrize("quantum", [0.5, 0.1, 3.0, 1e-3])
+@pytest.mark.parametrize("counts", [None, marks()])
+def test_residuals(
+    dtype: str, base: str, quantum: float, counts: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other = values(dtype, 1, special=False), values(base, 2, special=False)
+    # Halves are rounded to even, and an error of half a quantum is none.
+    one[0, 0, 0, :40] = np.arange(40) * np.dtype(dtype).type(quantum / 2)
+    other[0, 0, 0, :40] = 0
+    found = both(lambda: residual_of(one, other, counts, quantum, LARGEST), monkeypatch)
+    assert found is not None
+    assert found[1] == np.count_nonzero(found[0]) > 0
+    for out in ("f4", "f8", "f2", "i2"):
+        both(lambda out=out: corrected(other, found[0], quantum, np.dtype(out)), monkeypatch)  # type: ignore[misc]
+    rest = one.astype("f8") - corrected(other, found[0], quantum, np.dtype("f8"))
+    assert np.abs(rest if counts is None else rest[counts]).max() <= quantum / 2 * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+def test_residuals_that_do_not_fit(dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, zeros = values(dtype), np.zeros(SHAPE, dtype)
+    assert both(lambda: residual_of(one, zeros, None, 0.5, LARGEST), monkeypatch) is None
+    counts = np.isfinite(one) & (np.abs(one) < 1e3)
+    assert both(lambda: residual_of(one, zeros, counts, 0.5, LARGEST), monkeypatch)[1] > 0
+    assert both(lambda: residual_of(one, zeros, counts, 0.0, LARGEST), monkeypatch) is None
+    last = np.zeros(SHAPE, dtype)
+    last[-1, -1, -1, -1] = 1000
+    assert both(lambda: residual_of(last, zeros, None, 1.0, 999), monkeypatch) is None
+    assert both(lambda: residual_of(last, zeros, None, 1.0, 1000), monkeypatch)[1] == 1
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_every_type_has_residuals_and_bounds(dtype: str) -> None:
+    one = values(dtype, special=False)
+    base = one.astype("f8") * (1 - 1e-3) + 0.3
+    found = residual_of(one, base, None, 2.0 ** (np.dtype(dtype).itemsize * 4), LARGEST)
+    assert found is not None
+    decoded = corrected(base, found[0], 2.0 ** (np.dtype(dtype).itemsize * 4), np.dtype(dtype))
+    assert decoded.dtype == dtype
+    assert within(one, decoded, 2.0**64)
+    assert within(one, one, 0.0)
+    assert not within(one, one[::-1].copy(), 0.0)
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [(-1.0, 1.0), (0.0, 2.0), (-0.0, 2.0), (-2.0, -0.0), (-0.0, 0.0), (-1e300, 1e300)],
+)
+@pytest.mark.parametrize("center", [0.0, -0.0, 0.75])
+def test_clipping(
+    dtype: str, low: float, high: float, center: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with np.errstate(over="ignore"):
+        clipped = both(lambda: clip_shifted(values(dtype), center, low, high), monkeypatch)
+        known = clipped[~np.isnan(clipped)]
+        assert known.min() >= np.dtype(dtype).type(low)
+        assert known.max() <= np.dtype(dtype).type(high)
+    assert np.isnan(clipped).sum() == np.isnan(values(dtype)).sum()
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize("counts", [None, marks()])
+def test_what_is_free(dtype: str, counts: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    rebuilt = values(dtype, 5)
+
+    def run() -> tuple[int, Values]:
+        target = values(dtype, 4)
+        return free_values(target, rebuilt, counts, -1.0, 1.5), target
+
+    found, target = both(run, monkeypatch)
+    before = values(dtype, 4)
+    free = ((before <= -1) & (rebuilt < before)) | ((before >= 1.5) & (rebuilt > before))
+    free = free if counts is None else free | ~counts
+    assert found == free.sum() > 0
+    assert np.array_equal(target, np.where(free, rebuilt, before), equal_nan=True)
+
+
+def test_nothing_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    none = np.zeros((0, 1, 2, 3), np.float32)
+    assert both(lambda: within(none, none, 0.0), monkeypatch)
+    assert both(lambda: residual_of(none, none, None, 1.0, LARGEST), monkeypatch)[1] == 0
+    assert (
+        both(
+            lambda: corrected(none, np.zeros(none.shape, np.int32), 1.0, np.dtype("f8")),
+            monkeypatch,
+        ).size
+        == 0
+    )
+    assert both(lambda: free_values(none.copy(), none, None, 0.0, 1.0), monkeypatch) == 0
+    assert all_finite(none)
+
+
+def test_finite() -> None:
+    assert all_finite(np.arange(5))
+    for bad in (np.nan, np.inf, -np.inf):
+        one = np.zeros(3 * elementwise.PIECE + 5, np.float32)
+        assert all_finite(one)
+        one[-1] = bad
+        assert not all_finite(one)
+
+
+def test_casts_stay_in_the_type() -> None:
+    wide = np.array([np.nan, np.inf, -np.inf, 1e30, -1e30, 2.5, 3.5, -0.5])
+    assert cast(wide, np.dtype("i2")).tolist() == [0, 32767, -32768, 32767, -32768, 2, 4, 0]
+    assert cast(wide, np.dtype("u8")).tolist()[1] == 2**64 - 2048
+    assert cast(wide, np.dtype("f4"))[3] == np.float32(1e30)
+
+
+def test_arrays_that_are_not_in_order() -> None:
+    one = values("f4", special=False)
+    turned = np.asfortranarray(one)
+    assert within(turned, one, 0.0)
+    found = residual_of(turned, one + np.float32(1), None, 0.5, LARGEST)
+    assert found is not None
+    assert (found[0] == -2).all()

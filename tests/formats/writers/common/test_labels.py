@@ -1,0 +1,287 @@
+"""Names and attributes in files; even spacing; chunks; signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_formats.series import Coordinate
+from fhash_formats.support.interrupts import signals_held
+from fhash_formats.writers.common.labels import (
+    coordinate_attributes,
+    hdf5_value,
+    safe_name,
+    safe_names,
+    variable_attributes,
+)
+from fhash_formats.writers.common.region import Region
+from fhash_formats.writers.common.spacing import even_spacing
+from fhash_formats.writers.common.writer import CHUNK_BYTES, chunk_shape
+
+
+def region(
+    shape: tuple[int, int, int, int] = (1, 1, 1, 1),
+    dtype: str = "f4",
+    names: str = "tzyx",
+    **changes: Any,
+) -> Region:
+    # One value that is shared: a test of chunks needs long axes and no memory.
+    coords = {
+        axis: Coordinate(name=name, values=np.zeros(n))
+        for axis, name, n in zip("tzyx", names, shape, strict=True)
+    }
+    return Region(
+        **{"name": "wind", "dtype": np.dtype(dtype), "shape": shape, "coords": coords, **changes}
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "safe"),
+    [
+        ("wind", "wind"),
+        ("air temperature", "air temperature"),
+        ("Größe", "Größe"),
+        ("group/wind", "group_wind"),
+        ("/", "values"),
+        ("..", "values"),
+        (" . ", "values"),
+        ("__wind", "_wind"),
+        ("a\nb\0c\\d", "a_b_c_d"),
+        ("zarr.json", "zarr.json"),
+    ],
+)
+def test_safe_names(name: str, safe: str) -> None:
+    assert safe_name(name) == safe
+    assert safe_name(safe) == safe
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ("tzyx", "t z y x"),
+        ("aaaa", "a a_2 a_3 a_4"),
+        (["x", "wind", "wind", "x"], "x wind_2 wind_3 x_2"),
+        (["", "/", "b", "b_2"], "t values b b_2"),
+    ],
+)
+def test_all_names_of_a_file_differ(names: Any, expected: str) -> None:
+    variable, found = safe_names(region(names=names))
+    assert variable == "wind"
+    assert list(found) == ["t", "z", "y", "x"]
+    assert list(found.values()) == expected.split()
+
+
+def test_no_attribute_that_changes_the_values_is_kept() -> None:
+    packing = {
+        name: 1
+        for name in (
+            "scale_factor",
+            "add_offset",
+            "_FillValue",
+            "missing_value",
+            "valid_range",
+            "valid_min",
+            "valid_max",
+        )
+    }
+    references = {
+        name: "x"
+        for name in (
+            "coordinates",
+            "grid_mapping",
+            "bounds",
+            "DIMENSION_LIST",
+            "_Netcdf4Dimid",
+            "CLASS",
+        )
+    }
+    made = region(
+        name="group/wind",
+        units="m s-1",
+        attributes={
+            **packing,
+            **references,
+            "standard_name": "wind_speed",
+            "units": "knots",
+            "": 1,
+        },
+    )
+    assert variable_attributes(made) == {
+        "standard_name": "wind_speed",
+        "units": "m s-1",
+        "long_name": "group/wind",
+    }
+    time = Coordinate(
+        name="t",
+        values=np.zeros(1),
+        attributes={
+            "units": "hours since 1970-01-01",
+            "calendar": "gregorian",
+            "bounds": "time_bnds",
+        },
+    )
+    assert coordinate_attributes("t", time) == {
+        "axis": "T",
+        "units": "hours since 1970-01-01",
+        "calendar": "gregorian",
+    }
+    assert coordinate_attributes(
+        "z", Coordinate(name="z", values=np.zeros(1), attributes={"axis": "z", "positive": "up"})
+    ) == {
+        "axis": "z",
+        "positive": "up",
+    }
+
+
+def test_attributes_are_json_and_what_cannot_be_is_left_out() -> None:
+    odd = {
+        "a": np.float32(1.5),
+        "b": np.arange(3),
+        "c": (1, "x"),
+        "d": float("nan"),
+        "e2": "\udcff",
+        "e": b"raw",
+        "f": {"g": None},
+        "h": Path("p"),
+        "i": True,
+    }
+    kept = variable_attributes(region(attributes=odd))
+    assert kept == {
+        "a": 1.5,
+        "b": [0, 1, 2],
+        "c": [1, "x"],
+        "d": "NaN",
+        "e": "raw",
+        "e2": "?",
+        "f": {"g": None},
+        "i": True,
+    }
+    assert json.loads(json.dumps(kept, allow_nan=False)) == kept
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("text", "text"),
+        ("nul\0", "nul"),
+        (True, 1),
+        (3, 3),
+        (2**63, "9223372036854775808"),
+        (0.5, 0.5),
+        ([1, 2], [1, 2]),
+        ([0.5, 1.5], [0.5, 1.5]),
+        (["a", "b"], ["a", "b"]),
+        ([1, "a"], '[1, "a"]'),
+        ([2**70], "[1180591620717411303424]"),
+        ([], "[]"),
+        (None, "null"),
+        ({"a": 1}, '{"a": 1}'),
+    ],
+)
+def test_attributes_of_hdf5(tmp_path: Path, value: Any, expected: Any) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["a"] = hdf5_value(value)
+        read = file.attrs["a"]
+        assert (read.tolist() if isinstance(read, np.ndarray) else read) == expected
+
+
+def test_a_long_list_fits_into_hdf5(tmp_path: Path) -> None:
+    import h5py
+
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["a"] = hdf5_value(list(range(20000)))
+        assert json.loads(file.attrs["a"]) == list(range(20000))
+
+
+@pytest.mark.parametrize(
+    ("values", "step"),
+    [
+        ([3.0], 1.0),
+        ([0, 0.5, 1], 0.5),
+        ([1, 0.5, 0], -0.5),
+        (np.linspace(-7.3, 11.1, 1001), 18.4 / 1000),
+        (np.linspace(50, 60, 101).astype("f4"), 0.1),  # as a file that keeps float32 would give it
+        ([0, 1, 3], None),
+        ([0, 1, 2.00001], None),
+        ([0, 1, 1.0000001 * 2], 1.0000001),
+        ([2, 2], None),
+        ([0, 1, 0], None),
+        ([0, np.nan, 2], None),
+        ([0, np.inf], None),
+        ([np.nan], None),
+    ],
+)
+def test_even_spacing(values: Any, step: float | None) -> None:
+    found = even_spacing(np.asarray(values, dtype=np.float64))
+    assert found == (None if step is None else pytest.approx(step, rel=1e-6))
+
+
+@pytest.mark.parametrize("dtype", ["u1", "f4", "f8"])
+@pytest.mark.parametrize(
+    "shape",
+    [
+        (1, 1, 1, 1),
+        (100, 64, 64, 64),
+        (3, 256, 256, 256),
+        (2, 3, 5000, 5000),
+        (1, 1, 1, 10**8),
+        (1, 7, 1, 3 * 10**7),
+    ],
+)
+def test_chunks_are_bounded_and_never_span_steps(
+    shape: tuple[int, int, int, int], dtype: str
+) -> None:
+    made = region((1, 1, 1, 1), dtype)
+    object.__setattr__(made, "shape", shape)
+    chunk = chunk_shape(made)
+    assert chunk[0] == 1
+    assert all(1 <= part <= whole for part, whole in zip(chunk, (1, *shape[1:]), strict=True))
+    size = int(np.prod(chunk)) * made.dtype.itemsize
+    assert size <= CHUNK_BYTES
+    frame = int(np.prod(shape[1:])) * made.dtype.itemsize
+    assert size == frame if frame <= CHUNK_BYTES else size > CHUNK_BYTES / 4
+
+
+def test_a_signal_waits_until_the_block_has_ended() -> None:
+    done = []
+
+    def block() -> None:
+        with signals_held():
+            signal.raise_signal(signal.SIGINT)
+            done.append("block")
+
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        block()
+    assert done == ["block"]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_signals_are_left_alone_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[Callable[..., Any] | int | None] = []
+
+    def block() -> None:
+        with signals_held():
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=block)  # only the main thread may set a handler
+    thread.start()
+    thread.join()
+    assert seen == [signal.getsignal(signal.SIGINT)]
+    ignored = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        block()
+        os.kill(os.getpid(), signal.SIGINT)
+        assert seen[1] == signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, ignored)
