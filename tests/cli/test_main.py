@@ -32,7 +32,7 @@ def test_help_lists_every_command(fhash: Fhash) -> None:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_its_file_and_help(fhash: Fhash, name: str) -> None:
-    command = importlib.import_module(f"fhash_cli.{name}").command
+    command = importlib.import_module(f"fhash_cli.commands.{name}").command
     assert isinstance(command, click.Command)
     assert command.name == name
     result = fhash(name, "--help")
