@@ -1,4 +1,4 @@
-"""`fhash`: finds the command, runs it, and turns any error into one line on stderr and an exit code.
+"""`fhash`: finds and runs a command; turns an error into one line on stderr and an exit code.
 
 Exit codes: 0 success; 1 failure; 2 usage or unsuitable input; 3 a quality gate missed; 4 damaged or
 unsupported file; 130 interrupted.
@@ -31,8 +31,7 @@ COMMANDS = {
     "bench": "measure speed on this machine",
     "selftest": "check hard cases on this machine",
 }
-"""Help line of each command. Its module `fhash_cli.commands.NAME` is imported on use: `--help` stays
-quick."""
+"""Help line of each command; its module `fhash_cli.commands.NAME` is imported only on use."""
 
 
 class Program(click.Group):
@@ -92,7 +91,7 @@ class Program(click.Group):
 @click.version_option(package_name="fhash", message="%(prog)s %(version)s")
 @click.pass_context
 def program(context: click.Context) -> None:
-    """A codec for time-varying volumes: keeps the features you name, reads back any region at any time.
+    """A codec for time-varying volumes: keeps the features you name, reads any region at any time.
 
     Results go to stdout (one JSON object with --json), log and progress to stderr.
     Exit codes: 0 success, 1 failure, 2 usage or unsuitable input, 3 quality gate missed,

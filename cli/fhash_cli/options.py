@@ -1,4 +1,4 @@
-"""Options that several commands share, and their types: slices, regions, settings of an encoding."""
+"""Options that several commands share, and their types: slices, regions, encoding settings."""
 
 from __future__ import annotations
 

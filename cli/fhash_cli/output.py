@@ -1,4 +1,4 @@
-"""Output of the command line: results on stdout (a table, or one JSON object), the rest on stderr."""
+"""Output of the command line: results on stdout (a table or JSON), everything else on stderr."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def describe_error(error: Exception) -> tuple[str, int]:
 
 
 def _is_no_memory(error: Exception) -> bool:
-    """Whether an error means that memory ran out; torch and HDF5 have errors of their own for it."""
+    """Whether an error means that memory ran out, also in the words of torch and HDF5."""
     if isinstance(error, RuntimeError):
         return type(error).__name__ == "OutOfMemoryError" or any(
             words in str(error) for words in NO_MEMORY
@@ -208,12 +208,15 @@ class Progress:
         self._erase()
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Report that `done` of `total` parts of a stage are done; note: a remark such as "41.2 dB"."""
+        """Report that `done` of `total` parts of a stage are done.
+
+        note: a remark such as "41.2 dB".
+        """
         if self.quiet:
             return
         now = time.monotonic()
         if stage != self.stage:
-            # The first report comes after the first part: the stage began when the one before ended.
+            # The first report follows the first part: the stage began at the end of the last.
             self._erase()
             self.stage, self.start, self.tenth = stage, self.last, 0
         self.last = now

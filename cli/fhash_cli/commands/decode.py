@@ -337,7 +337,7 @@ def convert(
 ) -> npt.NDArray[Any]:
     """Convert a decoded frame to another number type; for integers it is rounded and clipped.
 
-    filled: vertices outside the coreset hold the background's value; NaN then means a missing value.
+    filled: vertices outside the coreset hold the background's value; NaN means a missing value.
     Raises InputError where the type cannot hold a value.
     """
     import numpy as np

@@ -57,8 +57,8 @@ def command(
     """Find the features of DATA, encode them and write them as RUN.fhz.
 
     DATA is a file of HDF5, NetCDF, numpy or raw values, a Zarr folder, or a pattern of such files
-    in quotes ('step_*.raw'). With --profile paper Ctrl-C saves a checkpoint beside RUN.fhz; the same
-    command resumes from it.
+    in quotes ('step_*.raw'). With --profile paper Ctrl-C saves a checkpoint beside RUN.fhz; the
+    same command resumes from it.
     """
     import fhash_codec
 

@@ -59,8 +59,8 @@ def command(
 ) -> None:
     """Draw RUN.fhz at one time; unless options say more, the file's features decide what is shown.
 
-    With --animate the output is NAME.png for numbered pictures, of which only missing ones are drawn,
-    or a film NAME.mp4 or NAME.gif.
+    With --animate the output is NAME.png for numbered pictures, of which only missing ones are
+    drawn, or a film NAME.mp4 or NAME.gif.
     """
     import fhash_codec
     from fhash_codec.rendering.renderer import Renderer

@@ -55,8 +55,9 @@ def command(
 ) -> None:
     """Encode, decode and draw data on which codecs break; exit code 1 if anything does not hold.
 
-    Constant, infinite and missing values, extremes of every number type, thin and tiny shapes, steep
-    fronts, features at the borders, strange times: each must keep its bounds, promises and bytes.
+    Constant, infinite and missing values, extremes of every number type, thin and tiny shapes,
+    steep fronts, features at the borders, strange times: each must keep its bounds, promises and
+    bytes.
     What does not hold is listed with its figures.
     """
     if report is not None:
