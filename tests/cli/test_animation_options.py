@@ -1,4 +1,4 @@
-"""The options that make several pictures: what they come to, which exclude each other, and what is written."""
+"""Options for several pictures: their values, which exclude each other, and what is written."""
 
 from __future__ import annotations
 

@@ -150,7 +150,8 @@ class OutOfMemoryError(RuntimeError):
         (OutOfMemoryError("CUDA"), "out of memory; take fewer", 1),
         (
             RuntimeError(
-                "[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: 8 bytes"
+                "[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator:"
+                " can't allocate memory: 8 bytes"
             ),
             "out of memory; take",
             1,

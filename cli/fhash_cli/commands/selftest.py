@@ -1,4 +1,4 @@
-"""`fhash selftest`: hard cases through encode, decode and render on this machine, and whether what must hold does."""
+"""`fhash selftest`: encodes, decodes and draws hard cases, and checks what must hold."""
 
 from __future__ import annotations
 
@@ -53,10 +53,12 @@ def command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Encode, decode and draw data on which codecs break; exit code 1 if anything that must hold does not.
+    """Encode, decode and draw data on which codecs break; exit code 1 if anything does not hold.
 
-    Constant, infinite and missing values, extremes of every number type, thin and tiny shapes, steep fronts, features at the borders,
-    strange times: each with bounds, promises and equal bytes to be kept. What does not hold is listed with its figures.
+    Constant, infinite and missing values, extremes of every number type, thin and tiny shapes,
+    steep fronts, features at the borders, strange times: each must keep its bounds, promises and
+    bytes.
+    What does not hold is listed with its figures.
     """
     if report is not None:
         check_writable(report, force)

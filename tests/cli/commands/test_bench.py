@@ -1,4 +1,4 @@
-"""`fhash bench`: figures for the engines or codecs asked for, and the machine they were taken on."""
+"""`fhash bench`: figures of the engines or codecs asked for, and of the machine."""
 
 from __future__ import annotations
 
