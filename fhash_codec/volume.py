@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box, crop
+from fhash_codec.coreset.boxes import Box, Spans
 from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
@@ -59,7 +59,7 @@ class Volume:
         self.name: str = header["variable"]["name"]
         self.units: str = header["variable"]["units"]
         self.attrs: Mapping[str, Any] = header["variable"]["attributes"]
-        self.box: Box = tuple((low, high) for low, high in header["feature_bounding_box"])  # type: ignore[assignment]
+        self.box = Box.of(header["feature_bounding_box"])
         self.profile: str = header["model"]["profile"]
         self.value_range = ValueRange(*header["value_range"])
         self.background = float(header["background"])
@@ -118,7 +118,7 @@ class Volume:
     # -- reading -----------------------------------------------------------------------------------------------------------
 
     def read(
-        self, t: float, region: Box | None = None, *, outside: str = "nan"
+        self, t: float, region: Spans | None = None, *, outside: str = "nan"
     ) -> npt.NDArray[Any]:
         """Values (z, y, x) of `self.dtype` of a region (all if None) at step `t`, which may lie between steps.
 
@@ -130,7 +130,7 @@ class Volume:
             raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
         key = self._key_index(t)
         region = self._checked(region)
-        result = np.full([high - low for low, high in region], np.nan, dtype=self.dtype)
+        result = np.full(region.shape, np.nan, dtype=self.dtype)
         found = self._within_box(region)
         if found is not None:
             target, local = found
@@ -144,10 +144,10 @@ class Volume:
             result[np.isnan(result)] = self.background
         missing = self._missing_at(t)
         if missing is not None:
-            result[crop(missing, region)] = np.nan
+            result[missing[region.slices()]] = np.nan
         return result
 
-    def read_lod(self, t: float, lod: int, region: Box | None = None) -> npt.NDArray[Any]:
+    def read_lod(self, t: float, lod: int, region: Spans | None = None) -> npt.NDArray[Any]:
         """Every 2^lod-th vertex (z, y, x) of the feature bounding box at step `t`, low-passed, of `self.dtype`; compact files only.
 
         lod: 0 to 10; 0 is the box as `read` gives it. region: those that lie in it, in vertices of the domain (all if None); see
@@ -159,16 +159,16 @@ class Volume:
         if not float(t).is_integer():
             raise InputError(f"step {t:g} lies between two; levels of detail are of whole steps")
         step = int(self._key_index(t))
-        part: Box = tuple(
+        part = Box.of(
             ((v[0] - low) >> lod, ((v[-1] - low) >> lod) + 1)
-            for v, (low, _) in zip(vertices, self.box, strict=True)
-        )  # type: ignore[assignment]
+            for v, low in zip(vertices, self.box.first, strict=True)
+        )
         values = self._model.coarse(step, int(lod), part).astype(self.dtype)
-        surrounding: Box = tuple((v[0], v[-1] + 1) for v in vertices)  # type: ignore[assignment]
+        surrounding = Box.of((v[0], v[-1] + 1) for v in vertices)
         values[~self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]] = np.nan
         return values
 
-    def lod_vertices(self, lod: int, region: Box | None = None) -> tuple[range, range, range]:
+    def lod_vertices(self, lod: int, region: Spans | None = None) -> tuple[range, range, range]:
         """The vertices (z, y, x) of the domain that `read_lod` gives: every 2^lod-th of the feature bounding box, within a region.
 
         Raises InputError for another lod than 0 to 10, RegionError for a region outside the domain or without such a vertex.
@@ -204,8 +204,8 @@ class Volume:
         steps, *space = picked
         result = np.empty([len(p) for p in picked], dtype=self.dtype)
         if result.size:
-            region: Box = tuple((min(p), max(p) + 1) for p in space)  # type: ignore[assignment]
-            local = np.ix_(*(np.array(p) - low for p, (low, _) in zip(space, region, strict=True)))
+            region = Box.of((min(p), max(p) + 1) for p in space)
+            local = np.ix_(*(np.array(p) - low for p, low in zip(space, region.first, strict=True)))
             for number, step in enumerate(steps):
                 result[number] = self.read(step, region)[local]
         return result[
@@ -252,7 +252,7 @@ class Volume:
         shape = points[0].shape
         steps, *space = (p.ravel() for p in points)
         keys = self.key_times.key_indices(steps)
-        local = [p - low for p, (low, _) in zip(space, self.box, strict=True)]
+        local = [p - low for p, low in zip(space, self.box.first, strict=True)]
         inside = self._interpolable(steps, keys, space)
         values: npt.NDArray[Any] = np.full(inside.shape, np.nan)
         slopes = np.full((*inside.shape, 4), np.nan)
@@ -271,20 +271,20 @@ class Volume:
         values = values.reshape(shape).astype(self.dtype)
         return (values, slopes.reshape(*shape, 4).astype(self.dtype)) if gradient else values
 
-    def occupancy(self, t: float, region: Box | None = None) -> npt.NDArray[np.bool_]:
+    def occupancy(self, t: float, region: Spans | None = None) -> npt.NDArray[np.bool_]:
         """Which vertices (z, y, x) of a region (all if None) are in the coreset at step `t`.
 
         Between key frames those that are at either of them, in the profile compact at both. Raises RegionError.
         """
         key = self._key_index(t)
         region = self._checked(region)
-        result = np.zeros([high - low for low, high in region], dtype=bool)
+        result = np.zeros(region.shape, dtype=bool)
         found = self._within_box(region)
         if found is not None:
             target, local = found
             result[target] = self._occupied(key, local)
         missing = self._missing_at(t)
-        return result if missing is None else result & ~crop(missing, region)
+        return result if missing is None else result & ~missing[region.slices()]
 
     def step_of_time(self, time: float) -> float:
         """The step, fractional between steps, at a time in the units of the series; RegionError outside its times.
@@ -308,30 +308,23 @@ class Volume:
             raise RegionError(f"{self.path}: step {t:g} is outside 0..{last}")
         return self.key_times.key_index(float(t))
 
-    def _checked(self, region: Box | None) -> Box:
+    def _checked(self, region: Spans | None) -> Box:
         if region is None:
-            return tuple((0, length) for length in self.shape[1:])  # type: ignore[return-value]
+            return Box.of_shape(self.shape[1:])
         for axis, (low, high), length in zip(AXES[1:], region, self.shape[1:], strict=True):
             if not 0 <= low < high <= length:
                 raise RegionError(
                     f"{self.path}: region {low}:{high} of axis {axis} is empty or outside 0:{length}"
                 )
-        return region
+        return Box.of(region)
 
     def _within_box(self, region: Box) -> tuple[tuple[slice, ...], Box] | None:
         """Where a region of the domain and the box meet: as slices of the region, and in vertices of the box; None where they do not."""
-        inner = [
-            (max(low, b0), min(high, b1))
-            for (low, high), (b0, b1) in zip(region, self.box, strict=True)
-        ]
-        if not all(low < high for low, high in inner):
+        inner = self.box.intersect(region)
+        if inner is None:
             return None
-        target = tuple(
-            slice(low - r0, high - r0) for (low, high), (r0, _) in zip(inner, region, strict=True)
-        )
-        return target, tuple(
-            (low - b0, high - b0) for (low, high), (b0, _) in zip(inner, self.box, strict=True)
-        )  # type: ignore[return-value]
+        target = inner.shift(-first for first in region.first)
+        return target.slices(), inner.shift(-first for first in self.box.first)
 
     def _occupied(self, key: float, local: Box) -> npt.NDArray[np.bool_]:
         """Which vertices of a part of the box count at a key index."""
@@ -369,14 +362,14 @@ class Volume:
                 continue
             low = [np.floor(p[chosen]).astype(np.int64) for p in space]
             high = [np.ceil(p[chosen]).astype(np.int64) for p in space]
-            around: Box = tuple(
+            around = Box.of(
                 (int(b.min()), int(h.max()) + 1) for b, h in zip(low, high, strict=True)
-            )  # type: ignore[assignment]
+            )
             occupied = self.occupancy(steps[representative], around)
             for corner in np.ndindex(2, 2, 2):
                 at = (
                     (h if up else b) - start
-                    for up, b, h, (start, _) in zip(corner, low, high, around, strict=True)
+                    for up, b, h, start in zip(corner, low, high, around.first, strict=True)
                 )
                 inside[chosen] &= occupied[tuple(at)]
         return inside

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
-from fhash_codec.paper.regions import Box
 from fhash_formats.container import StoredArray
 
 Positions = npt.NDArray[np.float64]
@@ -28,7 +28,7 @@ class CompactModel:
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
         """Which vertices (z, y, x) of a region of the box are in the coreset at step `first` and at step `last`."""
         # Between steps both count: a value is no better than the two it lies between.
-        space = tuple(slice(low, high) for low, high in region)
+        space = region.slices()
         if "occupancy/mask" in self._arrays:
             mask = self._arrays["occupancy/mask"].read((slice(first, last + 1), *space))
             return np.asarray((mask[0] & mask[-1]) != 0)
@@ -44,7 +44,7 @@ class CompactModel:
         """Values (z, y, x) of a region of the box at a step, as they are stored; between steps, linear in the step, float64."""
         first = int(np.floor(step))
         weight = step - first
-        space = tuple(slice(low, high) for low, high in region)
+        space = region.slices()
         steps = self._array.read((slice(first, first + (2 if weight else 1)), *space))
         values: npt.NDArray[Any] = steps[0]
         if weight:
@@ -54,7 +54,7 @@ class CompactModel:
     def coarse(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
         """Every 2^lod-th vertex (z, y, x) of the box at a step, low-passed by each tile on its own; a region of them in coarse vertices."""
         tile, stride = self._array.chunk_shape, 1 << lod
-        result = np.empty([high - low for low, high in region], dtype=self._array.dtype)
+        result = np.empty(region.shape, dtype=self._array.dtype)
         grid = [
             range(low * stride // n, (high - 1) * stride // n + 1)
             for (low, high), n in zip(region, tile[1:], strict=True)
@@ -119,17 +119,16 @@ class CompactModel:
         weights = [p - i for p, i in zip([steps, *space], low, strict=True)]
         high = [np.minimum(i + 1, n - 1) for i, n in zip(low, shape, strict=True)]
         corners = np.empty((2, 2, 2, 2, steps.size))
-        box = tuple(
+        region = Box.of(
             (int(i.min()), int(h.max()) + 1) for i, h in zip(low[1:], high[1:], strict=True)
         )
-        space_slices = tuple(slice(*part) for part in box)
         for step in np.unique(np.concatenate([low[0], high[0]])):
-            frame = self._array.read((slice(int(step), int(step) + 1), *space_slices))[0]
+            frame = self._array.read((slice(int(step), int(step) + 1), *region.slices()))[0]
             for corner in product((0, 1), repeat=4):
                 at = [(high if up else low)[axis] for axis, up in enumerate(corner)]
                 chosen = at[0] == step
                 if chosen.any():
-                    where = tuple(at[axis + 1][chosen] - box[axis][0] for axis in range(3))
+                    where = tuple(at[axis + 1][chosen] - region.first[axis] for axis in range(3))
                     corners[(*corner, chosen)] = frame[where]
         values = np.zeros(steps.size)
         for corner in product((0, 1), repeat=4):
