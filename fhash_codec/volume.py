@@ -134,11 +134,11 @@ class Volume:
         found = self._within_box(region)
         if found is not None:
             target, local = found
-            wanted = self._occupied(key, local)
+            requested = self._occupied(key, local)
             np.copyto(
                 result[target],
-                self._model.region(key, local, wanted).astype(self.dtype, copy=False),
-                where=wanted,
+                self._model.read(key, local, requested).astype(self.dtype, copy=False),
+                where=requested,
             )
         if outside == "background":
             result[np.isnan(result)] = self.background
@@ -163,7 +163,7 @@ class Volume:
             ((v[0] - low) >> lod, ((v[-1] - low) >> lod) + 1)
             for v, low in zip(vertices, self.box.first, strict=True)
         )
-        values = self._model.coarse(step, int(lod), part).astype(self.dtype)
+        values = self._model.read_lod(step, int(lod), part).astype(self.dtype)
         surrounding = Box.of((v[0], v[-1] + 1) for v in vertices)
         values[~self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]] = np.nan
         return values
@@ -259,7 +259,9 @@ class Volume:
         if inside.any():
             chosen = [p[inside] for p in (keys, *local)]
             if gradient:
-                values[inside], slopes[inside] = self._model.slopes(chosen[0], chosen[1:])
+                values[inside], slopes[inside] = self._model.sample_with_gradient(
+                    chosen[0], chosen[1:]
+                )
                 # From per key frame to per step: between two steps the key index runs evenly.
                 first = np.minimum(np.floor(steps[inside]), max(self.shape[0] - 2, 0))
                 after = np.minimum(first + 1, self.shape[0] - 1)
@@ -267,7 +269,7 @@ class Volume:
                     first
                 )
             else:
-                values[inside] = self._model.points(chosen[0], chosen[1:])
+                values[inside] = self._model.sample(chosen[0], chosen[1:])
         values = values.reshape(shape).astype(self.dtype)
         return (values, slopes.reshape(*shape, 4).astype(self.dtype)) if gradient else values
 

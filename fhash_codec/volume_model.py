@@ -29,22 +29,22 @@ class VolumeModel(Protocol):
         """Which vertices (z, y, x) of a region are in the coreset between two neighbouring key frames, or at one given twice."""
         ...
 
-    def region(self, key: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
-        """Values (z, y, x) of a region, of any number type; what stands where `wanted` is False is open."""
+    def read(self, key: float, region: Box, requested: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+        """Values (z, y, x) of a region, of any number type; what stands where `requested` is False is open."""
         ...
 
-    def coarse(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
+    def read_lod(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
         """Every 2^lod-th vertex (z, y, x), low-passed. region: which of them, counted in coarse vertices.
 
         Raises InputError where the profile has no levels of detail.
         """
         ...
 
-    def points(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+    def sample(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
         """Values (n,) at points: key indices and (z, y, x), all inside."""
         ...
 
-    def slopes(
+    def sample_with_gradient(
         self, keys: Positions, space: list[Positions]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Values (n,) and derivatives (n, 4) by key index, z, y and x; on the border of two cells those of the cell after it."""

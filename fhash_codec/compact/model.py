@@ -40,7 +40,7 @@ class CompactModel:
         z, y, x = self._array.shape[1:]
         return unpack(bits[0] & bits[-1], (z, y, x))[space]
 
-    def region(self, step: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+    def read(self, step: float, region: Box, requested: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
         """Values (z, y, x) of a region of the box at a step, as they are stored; between steps, linear in the step, float64."""
         first = int(np.floor(step))
         weight = step - first
@@ -51,7 +51,7 @@ class CompactModel:
             values = values.astype(np.float64) * (1 - weight) + steps[1].astype(np.float64) * weight
         return values
 
-    def coarse(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
+    def read_lod(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
         """Every 2^lod-th vertex (z, y, x) of the box at a step, low-passed by each tile on its own; a region of them in coarse vertices."""
         tile, stride = self._array.chunk_shape, 1 << lod
         result = np.empty(region.shape, dtype=self._array.dtype)
@@ -81,11 +81,11 @@ class CompactModel:
             result[tuple(target)] = part[np.ix_(*source)]
         return result
 
-    def points(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+    def sample(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
         """Values at points, quadrilinear: steps and (z, y, x) in vertices of the box, all inside."""
         return self._interpolated(steps, space)[0]
 
-    def slopes(
+    def sample_with_gradient(
         self, steps: Positions, space: list[Positions]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Values, and derivatives (points, 4) by step, z, y and x; on the border of two cells those of the cell after it."""

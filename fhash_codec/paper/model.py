@@ -40,23 +40,23 @@ class PaperModel:
         """Which vertices (z, y, x) of a region are in the coreset at either of two key frames."""
         return self._unpacked(first, last)[region.slices()]
 
-    def region(
-        self, key: float, region: Box, wanted: npt.NDArray[np.bool_]
+    def read(
+        self, key: float, region: Box, requested: npt.NDArray[np.bool_]
     ) -> npt.NDArray[np.float64]:
-        """Values (z, y, x) of a region; blocks without a wanted vertex are NaN and cost nothing."""
-        return self._range.from_unit(decode_region(self.network, key, region, wanted=wanted))
+        """Values (z, y, x) of a region; blocks without a requested vertex are NaN and cost nothing."""
+        return self._range.from_unit(decode_region(self.network, key, region, wanted=requested))
 
-    def coarse(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
+    def read_lod(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
         """Raises InputError: the embeddings of a coarser level alone give no values."""
         raise InputError(
             f"{self._container.path}: a file of the profile paper has no levels of detail; decode it whole"
         )
 
-    def points(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+    def sample(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
         """Values (n,) at points, all inside the box."""
         return self._range.from_unit(sample_points(self.network, keys, *space))
 
-    def slopes(
+    def sample_with_gradient(
         self, keys: Positions, space: list[Positions]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Values (n,) and analytic derivatives (n, 4) by key index, z, y and x."""

@@ -62,9 +62,9 @@ def test_regions_are_parts_of_the_whole(model, region):
         assert 0 < occupied.mean() < 1
         np.testing.assert_array_equal(found.occupied(first, last, region), occupied[inner])
         key = (first + last) / 2
-        whole = found.region(key, REGIONS[0], occupied)
+        whole = found.read(key, REGIONS[0], occupied)
         assert whole.dtype == np.float64
-        part = found.region(key, region, occupied[inner])
+        part = found.read(key, region, occupied[inner])
         np.testing.assert_array_equal(part[occupied[inner]], whole[inner][occupied[inner]])
 
 
@@ -73,9 +73,9 @@ def test_points_at_vertices_are_the_region_and_slopes_have_the_same_values(model
     occupied = found.occupied(1, 1, REGIONS[0])
     places = np.argwhere(occupied).T.astype(np.float64)
     keys = np.ones(places.shape[1])
-    values = found.points(keys, list(places))
-    np.testing.assert_allclose(values, found.region(1, REGIONS[0], occupied)[occupied], atol=1e-5)
-    again, slopes = found.slopes(keys, list(places))
+    values = found.sample(keys, list(places))
+    np.testing.assert_allclose(values, found.read(1, REGIONS[0], occupied)[occupied], atol=1e-5)
+    again, slopes = found.sample_with_gradient(keys, list(places))
     np.testing.assert_allclose(again, values, atol=1e-6)
     assert slopes.shape == (len(values), 4)
     assert slopes.dtype == np.float64
@@ -84,10 +84,10 @@ def test_points_at_vertices_are_the_region_and_slopes_have_the_same_values(model
 def test_levels_of_detail_are_given_or_refused(model):
     name, found = model
     if name == "compact":
-        whole = found.coarse(1, 1, Box.of_shape((3, 3, 4)))
+        whole = found.read_lod(1, 1, Box.of_shape((3, 3, 4)))
         np.testing.assert_array_equal(
-            found.coarse(1, 1, Box((1, 3), (2, 3), (0, 2))), whole[1:3, 2:3, 0:2]
+            found.read_lod(1, 1, Box((1, 3), (2, 3), (0, 2))), whole[1:3, 2:3, 0:2]
         )
     else:
         with pytest.raises(InputError, match="no levels of detail"):
-            found.coarse(1, 1, Box.of_shape((3, 3, 4)))
+            found.read_lod(1, 1, Box.of_shape((3, 3, 4)))
