@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
-from fhash_codec.paper.regions import Box
 from fhash_formats.container import StoredArray
 
 Positions = npt.NDArray[np.float64]
@@ -28,7 +28,7 @@ class CompactModel:
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
         """Which vertices (z, y, x) of a region of the box are in the coreset at step `first` and at step `last`."""
         # Between steps both count: a value is no better than the two it lies between.
-        space = tuple(slice(low, high) for low, high in region)
+        space = region.slices()
         if "occupancy/mask" in self._arrays:
             mask = self._arrays["occupancy/mask"].read((slice(first, last + 1), *space))
             return np.asarray((mask[0] & mask[-1]) != 0)
@@ -40,21 +40,21 @@ class CompactModel:
         z, y, x = self._array.shape[1:]
         return unpack(bits[0] & bits[-1], (z, y, x))[space]
 
-    def region(self, step: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+    def read(self, step: float, region: Box, requested: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
         """Values (z, y, x) of a region of the box at a step, as they are stored; between steps, linear in the step, float64."""
         first = int(np.floor(step))
         weight = step - first
-        space = tuple(slice(low, high) for low, high in region)
+        space = region.slices()
         steps = self._array.read((slice(first, first + (2 if weight else 1)), *space))
         values: npt.NDArray[Any] = steps[0]
         if weight:
             values = values.astype(np.float64) * (1 - weight) + steps[1].astype(np.float64) * weight
         return values
 
-    def coarse(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
+    def read_lod(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
         """Every 2^lod-th vertex (z, y, x) of the box at a step, low-passed by each tile on its own; a region of them in coarse vertices."""
         tile, stride = self._array.chunk_shape, 1 << lod
-        result = np.empty([high - low for low, high in region], dtype=self._array.dtype)
+        result = np.empty(region.shape, dtype=self._array.dtype)
         grid = [
             range(low * stride // n, (high - 1) * stride // n + 1)
             for (low, high), n in zip(region, tile[1:], strict=True)
@@ -81,11 +81,11 @@ class CompactModel:
             result[tuple(target)] = part[np.ix_(*source)]
         return result
 
-    def points(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+    def sample(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
         """Values at points, quadrilinear: steps and (z, y, x) in vertices of the box, all inside."""
         return self._interpolated(steps, space)[0]
 
-    def slopes(
+    def sample_with_gradient(
         self, steps: Positions, space: list[Positions]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Values, and derivatives (points, 4) by step, z, y and x; on the border of two cells those of the cell after it."""
@@ -119,17 +119,16 @@ class CompactModel:
         weights = [p - i for p, i in zip([steps, *space], low, strict=True)]
         high = [np.minimum(i + 1, n - 1) for i, n in zip(low, shape, strict=True)]
         corners = np.empty((2, 2, 2, 2, steps.size))
-        box = tuple(
+        region = Box.of(
             (int(i.min()), int(h.max()) + 1) for i, h in zip(low[1:], high[1:], strict=True)
         )
-        space_slices = tuple(slice(*part) for part in box)
         for step in np.unique(np.concatenate([low[0], high[0]])):
-            frame = self._array.read((slice(int(step), int(step) + 1), *space_slices))[0]
+            frame = self._array.read((slice(int(step), int(step) + 1), *region.slices()))[0]
             for corner in product((0, 1), repeat=4):
                 at = [(high if up else low)[axis] for axis, up in enumerate(corner)]
                 chosen = at[0] == step
                 if chosen.any():
-                    where = tuple(at[axis + 1][chosen] - box[axis][0] for axis in range(3))
+                    where = tuple(at[axis + 1][chosen] - region.first[axis] for axis in range(3))
                     corners[(*corner, chosen)] = frame[where]
         values = np.zeros(steps.size)
         for corner in product((0, 1), repeat=4):

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset import occupancy
-from fhash_codec.coreset.boxes import Box, Sizes, box_size, crop
+from fhash_codec.coreset.boxes import Box, Sizes
 from fhash_codec.coreset.extent import find_extent
 from fhash_codec.coreset.features import Feature
 from fhash_codec.coreset.scan import Scan
@@ -75,7 +75,7 @@ def build_coreset(
     """
     extent = find_extent(series, scan, key_frames, features, dilation, progress)
     box, samples = extent.box, extent.samples
-    size = box_size(box)
+    size = box.shape
     shape = brick or brick_shape(size)
     grid = (-(-size[0] // shape[0]), -(-size[1] // shape[1]), -(-size[2] // shape[2]))
     values = np.empty(samples, dtype=np.float32)
@@ -83,7 +83,7 @@ def build_coreset(
     for key, step in enumerate(key_frames):
         mask = extent.mask(key)
         grids.append(occupancy.pack(mask))
-        frame = crop(series.read(step), box)
+        frame = series.read(step)[box.slices()]
         for layer in range(grid[0]):
             rows = slice(layer * shape[0], (layer + 1) * shape[0])
             tiles = tile(mask[rows], shape)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box, Sizes, bounding_box, crop, fuse
+from fhash_codec.coreset.boxes import Box, Sizes, bounding_box, fuse
 from fhash_codec.coreset.features import Everything, Feature, dilate
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import Mean
@@ -52,7 +52,7 @@ class Extent:
             .view(np.bool_)
             .reshape(self.domain)
         )
-        return crop(whole, self.box)
+        return whole[self.box.slices()]
 
 
 def find_extent(
@@ -73,7 +73,7 @@ def find_extent(
         for done in range(len(key_frames)):
             progress("selecting", done + 1, len(key_frames), "")
         return Extent(
-            box=((0, z), (0, y), (0, x)),
+            box=Box.of_shape((z, y, x)),
             key_frames=tuple(key_frames),
             packed=[whole] * len(key_frames),
             domain=(z, y, x),

@@ -17,6 +17,7 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Spans
 from fhash_codec.paper.network import ArrayTable, DenseLayers, Floats, Network, TableSource
 from fhash_codec.paper.points import sample_points
 from fhash_formats.errors import InputError, RegionError
@@ -24,16 +25,12 @@ from fhash_formats.support.threads import share_out, usable_threads
 
 __all__ = [
     "ArrayTable",
-    "Box",
     "Network",
     "TableSource",
     "block_shape",
     "decode_region",
     "sample_points",
 ]
-
-Box = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
-"""((z0, z1), (y0, y1), (x0, x1)), half-open, in vertices of the feature bounding box."""
 
 BLOCK_VERTICES = 8192
 READ_NUMBERS = 2**24
@@ -60,7 +57,7 @@ class Piece:
 def decode_region(
     network: Network,
     key_index: float,
-    region: Box,
+    region: Spans,
     *,
     wanted: npt.NDArray[np.bool_] | None = None,
     threads: int | None = None,
@@ -116,7 +113,7 @@ def block_shape(box_size: tuple[int, int, int]) -> tuple[int, int, int]:
 
 
 def _check(
-    network: Network, key_index: float, region: Box, wanted: npt.NDArray[np.bool_] | None
+    network: Network, key_index: float, region: Spans, wanted: npt.NDArray[np.bool_] | None
 ) -> None:
     if not 0 <= key_index <= network.key_frames - 1:
         raise RegionError(f"key index {key_index} is outside 0..{network.key_frames - 1}")
@@ -131,7 +128,7 @@ def _check(
 
 
 def _blocks(
-    shape: Sequence[int], region: Box, wanted: npt.NDArray[np.bool_] | None
+    shape: Sequence[int], region: Spans, wanted: npt.NDArray[np.bool_] | None
 ) -> list[tuple[int, int, int]]:
     """Numbers (z, y, x) of the blocks that touch the region and hold a wanted vertex."""
     z, y, x = (
@@ -145,7 +142,7 @@ def _blocks(
 
 
 def _crop(
-    block: Sequence[int], shape: Sequence[int], region: Box
+    block: Sequence[int], shape: Sequence[int], region: Spans
 ) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
     """Where a block and a region meet: slices of the block and slices of the region."""
     inside, outside = [], []

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.boxes import box_size
 from fhash_codec.coreset.bricks import Coreset, build_coreset
 from fhash_codec.coreset.features import Feature
 from fhash_codec.coreset.scan import Scan
@@ -34,7 +33,7 @@ def select(
     scanned, key_frames, features = resolve_selection(series, config, progress, mask)
     coreset = build_coreset(series, scanned, key_frames, features, config.dilation, progress)
     architecture = Architecture.for_box(
-        box_size(coreset.box),
+        coreset.box.shape,
         len(key_frames),
         fold=config.fold,
         embedding_size=config.embedding_size,

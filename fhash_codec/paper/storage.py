@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats, Network, TableSource
@@ -79,7 +80,7 @@ def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
     padded = blocks.transpose(0, 3, 1, 4, 2, 5, 6).reshape(
         *(g * s for g, s in zip(grid, shape, strict=True)), size
     )
-    return np.ascontiguousarray(padded[tuple(slice(high - low) for low, high in coreset.box)])
+    return np.ascontiguousarray(padded[tuple(slice(length) for length in coreset.box.shape)])
 
 
 def load_network(container: Container) -> Network:
@@ -99,7 +100,7 @@ def load_network(container: Container) -> Network:
                 _table(container, n, model["embedding_size"]) for n in range(1, len(levels) + 1)
             ],
             layers=layers,
-            box_size=tuple(high - low for low, high in header["feature_bounding_box"]),
+            box_size=Box.of(header["feature_bounding_box"]).shape,
             key_frames=levels[0][0],
         )
     except InputError as error:

@@ -156,7 +156,7 @@ class Renderer:
             )
             counts = np.zeros(BINS, dtype=np.int64)
             if volume.profile == "compact":
-                size = float(np.prod([high - low for low, high in volume.box]))
+                size = float(np.prod(volume.box.shape))
                 lod = 0
                 while size / 8**lod > COARSE:
                     lod += 1
@@ -260,31 +260,25 @@ def _decode(volume: Volume, plan: Plan) -> _Decoded:
 
 def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Units) -> Frame:
     """The values of a region of the feature bounding box at a step, of every 2^lod-th vertex, as a marcher takes them."""
-    inner: Box = tuple(  # type: ignore[assignment]
-        (max(low, first), min(high, last))
-        for (low, high), (first, last) in zip(region, volume.box, strict=True)
-    )
-    if any(low >= high for low, high in inner):
+    inner = volume.box.intersect(region)
+    if inner is None:
         # Nothing of the feature is in the picture.
-        low, _ = zip(*volume.box, strict=True)
         return Frame(
             values=np.full((1, 1, 1), np.nan, dtype=np.float32),
-            first=(low[0], low[1], low[2]),
+            first=volume.box.first,
             stride=1 << lod,
         )
     if lod == 0:
-        values, first = volume.read(step, inner), [low for low, _ in inner]
+        values, first = volume.read(step, inner), inner.first
     else:
         vertices = volume.lod_vertices(lod, inner)
-        first = [part.start for part in vertices]
+        first = (vertices[0].start, vertices[1].start, vertices[2].start)
         before, after = int(np.floor(step)), int(np.ceil(step))
         values = volume.read_lod(before, lod, inner)
         if after != before:
             share = volume.key_times.key_index(step) - volume.key_times.key_index(before)
             values = values * (1 - share) + volume.read_lod(after, lod, inner) * share
-    return Frame(
-        values=_single(values, units), first=(first[0], first[1], first[2]), stride=1 << lod
-    )
+    return Frame(values=_single(values, units), first=first, stride=1 << lod)
 
 
 def _single(values: npt.NDArray[np.floating], units: Units) -> npt.NDArray[np.float32]:

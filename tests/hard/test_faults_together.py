@@ -165,7 +165,7 @@ PLACES = [
     ("encode compact", "fhash_formats.container.writer", "ContainerWriter._tail"),
     ("encode paper", "fhash_codec.paper.training.checkpoint", "load_checkpoint"),
     ("encode paper", "fhash_codec.paper.training.train", "train"),
-    ("encode paper", "fhash_codec.encoding", "write_tables"),
+    ("encode paper", "fhash_codec.paper.encode", "write_tables"),
     ("decode h5", "fhash_codec.volume", "Volume.read"),
     ("decode h5", "fhash_formats.writers.hdf5", "_create"),
     ("decode zarr", "fhash_formats.writers.zarr_store", "_flush"),

@@ -271,9 +271,7 @@ class _Bench:
         """Each knob swept, the others as the scene has them, against its finest setting."""
         knobs: dict[str, Sequence[float]] = {"step": STEPS, "threshold": THRESHOLDS}
         if self.volume.profile == "compact":
-            most = max(
-                int(np.log2(max(min(high - low for low, high in self.volume.box) - 1, 1))), 0
-            )
+            most = max(int(np.log2(max(min(self.volume.box.shape) - 1, 1))), 0)
             knobs["lod"] = [level for level in LEVELS if level <= most]
         found = []
         for knob, values in knobs.items():

@@ -273,9 +273,7 @@ class Bench:
                 int(rng.integers(0, n - length + 1)) for n, length in zip(space, size, strict=True)
             ]
             step = int(rng.integers(0, steps))
-            box: Box = tuple(
-                (start, start + length) for start, length in zip(low, size, strict=True)
-            )  # type: ignore[assignment]
+            box = Box.of_shape(size).shift(low)
             if place:
                 measured.append(read(step, box))
             else:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import box_size, crop
 from fhash_codec.coreset.extent import Extent
 from fhash_formats.series import Series
 from fhash_formats.transform.tile.encoding import Shape
@@ -43,7 +42,7 @@ class Blocks:
     def __init__(self, series: Series, extent: Extent, tile: Shape) -> None:
         self._series, self._extent = series, extent
         self.dtype: np.dtype[Any] = series.dtype.newbyteorder("=")
-        self.shape: Shape = (series.shape[0], *box_size(extent.box))
+        self.shape: Shape = (series.shape[0], *extent.box.shape)
         self.tile: Shape = tuple(min(n, length) for n, length in zip(tile, self.shape, strict=True))  # type: ignore[assignment]
         self.grid: Index = tuple(
             -(-length // n) for length, n in zip(self.shape, self.tile, strict=True)
@@ -106,7 +105,7 @@ class Blocks:
     def _load(self, steps: range) -> tuple[Values, Care]:
         values = np.empty((len(steps), *self.shape[1:]), dtype=self.dtype)
         for number, step in enumerate(steps):
-            values[number] = crop(self._series.read(step), self._extent.box)
+            values[number] = self._series.read(step)[self._extent.box.slices()]
         return values, None if self.complete else np.stack(
             [self._extent.mask(step) for step in steps]
         )

@@ -135,7 +135,7 @@ def _vertices(coreset: Coreset, chosen: npt.NDArray[np.int64]) -> npt.NDArray[np
     ).reshape(-1, 3)
     bricks = coreset.bricks[chosen].astype(np.int64)
     space = bricks[:, None, 1:] * np.array(coreset.brick_shape) + inside
-    last = np.array([high - low - 1 for low, high in coreset.box])
+    last = np.array(coreset.box.shape) - 1
     key = np.broadcast_to(bricks[:, None, :1], (*space.shape[:2], 1))
     return np.concatenate([key, np.minimum(space, last)], axis=-1)
 

@@ -8,10 +8,9 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Sizes
+from fhash_codec.coreset.boxes import Box, Sizes
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats
-from fhash_codec.paper.regions import Box
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 Mask = npt.NDArray[np.bool_]

@@ -8,11 +8,11 @@ from math import fsum
 
 import numpy as np
 
-from fhash_codec.coreset.boxes import box_size
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats, Network
 from fhash_codec.paper.points import feature_slopes
-from fhash_codec.paper.regions import Box, decode_region
+from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.tables.bricks import Bricks
 from fhash_codec.paper.tables.tiles import Index
 from fhash_formats.transform.tile.encoding import Shape
@@ -31,7 +31,7 @@ class Samples:
 
     def __init__(self, coreset: Coreset, bricks: Bricks, tile: Shape) -> None:
         self._bricks = bricks
-        self.tile, self.sizes = tile, (len(coreset.key_frames), *box_size(coreset.box))
+        self.tile, self.sizes = tile, (len(coreset.key_frames), *coreset.box.shape)
         corners = coreset.bricks[:, 1:].astype(np.int64) * np.array(coreset.brick_shape)
         touched: set[Index] = set()
         for (key, *_), corner in zip(coreset.bricks.tolist(), corners.tolist(), strict=True):
@@ -88,9 +88,7 @@ class Samples:
         for index in tiles[:: -(-len(tiles) // SLOPE_TILES)]:
             _, keys, box = self._at(index)
             places = np.argwhere(np.stack([self._bricks.mask(key, box) for key in keys]))
-            places = places[:: -(-len(places) // SLOPE_POINTS)] + np.array(
-                [keys[0], *(low for low, _ in box)]
-            )
+            places = places[:: -(-len(places) // SLOPE_POINTS)] + np.array([keys[0], *box.first])
             found.append(feature_slopes(network, places.T.astype(np.float64)))
         return np.concatenate(found, axis=1)
 
@@ -100,4 +98,4 @@ class Samples:
             (i * n, min((i + 1) * n, size))
             for i, n, size in zip(index, self.tile, self.sizes, strict=True)
         ]
-        return index, range(*spans[0]), (spans[1], spans[2], spans[3])
+        return index, range(*spans[0]), Box.of(spans[1:])

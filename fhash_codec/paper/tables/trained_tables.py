@@ -8,11 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset import occupancy
-from fhash_codec.coreset.boxes import box_size
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats
-from fhash_codec.paper.regions import Box
 from fhash_codec.paper.tables.bricks import Bricks
 
 Region = tuple[slice, ...]
@@ -41,7 +40,7 @@ class FinestTable:
         self._bricks, self._fine = bricks, fine
         self.shape: tuple[int, ...] = (
             len(coreset.key_frames),
-            *box_size(coreset.box),
+            *coreset.box.shape,
             fine.shape[1],
         )
 
@@ -114,4 +113,4 @@ def spread(mask: Mask, axis: int, resolution: int) -> Mask:
 
 def _keys_and_box(region: Region) -> tuple[range, Box]:
     t, z, y, x = ((part.start, part.stop) for part in region[:4])
-    return range(*t), (z, y, x)
+    return range(*t), Box(z, y, x)

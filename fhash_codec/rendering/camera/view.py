@@ -44,13 +44,13 @@ def part_in_view(rays: Rays, volume: Volume) -> Box:
 
     One vertex where the picture shows nothing of the volume.
     """
-    everything: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
+    everything = Box.of_shape(volume.shape[1:])
     with np.errstate(
         over="ignore", divide="ignore", invalid="ignore"
     ):  # of cameras at the ends of float64
         seen = _seen(rays)
     if seen is None:
-        return ((0, 1), (0, 1), (0, 1))
+        return Box.of_shape((1, 1, 1))
     found = []
     for low, high, length, chunk, (first, _) in zip(
         *seen[::-1].T, volume.shape[1:], volume.chunks[1:], volume.box, strict=True
@@ -61,7 +61,7 @@ def part_in_view(rays: Rays, volume: Volume) -> Box:
         stop = min(first - (first - stop) // chunk * chunk, length)
         found.append((start, max(stop, start + 1)))
     share = np.prod([stop - start for start, stop in found]) / np.prod(volume.shape[1:])
-    return everything if share > WHOLE else (found[0], found[1], found[2])
+    return everything if share > WHOLE else Box.of(found)
 
 
 def _seen(rays: Rays) -> Floats | None:

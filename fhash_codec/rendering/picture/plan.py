@@ -167,7 +167,7 @@ class Plan:
                 "march 'cache' computes on the CPU; take 'arm' or 'stream' for device 'cuda'"
             )
         # Light comes from all of the volume, seen or not.
-        everything: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
+        everything = Box.of_shape(volume.shape[1:])
         region = part_in_view(rays, volume) if shadows is None and occlusion is None else everything
         plan = cls(
             scene=scene,
@@ -275,7 +275,7 @@ def _level(volume: Volume, scene: Scene, rays: Rays) -> tuple[int, str]:
         return 0, f"files of the profile {volume.profile} have but one"
     across = pixel_vertices(rays)
     most = min(
-        (int(high - low - 1).bit_length() - 1 for low, high in volume.box if high - low > 1),
+        ((size - 1).bit_length() - 1 for size in volume.box.shape if size > 1),
         default=0,
     )
     lod = max(0, min(math.floor(math.log2(across)) if across >= 2 else 0, most, MAX_LOD))

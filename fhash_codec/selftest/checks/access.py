@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box, crop
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.selftest.case import Finding, Run
 
 __all__ = ["CHECKS", "rounding"]
@@ -30,7 +30,7 @@ def regions(run: Run) -> Iterator[Finding]:
     for _ in range(REGIONS):
         step = int(generator.integers(run.values.shape[0]))
         region = _region(generator, run.volume.shape[1:])
-        wrong += _unlike(run.volume.read(step, region), crop(run.decoded[step], region))
+        wrong += _unlike(run.volume.read(step, region), run.decoded[step][region.slices()])
     t, z, y, x = (
         slice(*sorted(generator.integers(0, n + 1, 2).tolist())) for n in run.volume.shape
     )
@@ -106,14 +106,13 @@ def levels_of_detail(run: Run) -> Iterator[Finding]:
     """Level 0 is what `read` gives, coarser ones are finite where the vertices count."""
     if run.volume.profile != "compact":
         return
+    box = run.volume.box.slices()
     wrong, lost = 0, 0
     for step in {0, run.volume.shape[0] - 1}:
-        wrong += _unlike(run.volume.read_lod(step, 0), crop(run.decoded[step], run.volume.box))
+        wrong += _unlike(run.volume.read_lod(step, 0), run.decoded[step][box])
         for lod in (1, 2):
             coarse = run.volume.read_lod(step, lod)
-            known = np.isfinite(
-                crop(run.decoded[step], run.volume.box)[(slice(None, None, 1 << lod),) * 3]
-            )
+            known = np.isfinite(run.decoded[step][box][(slice(None, None, 1 << lod),) * 3])
             lost += int(np.count_nonzero(np.isfinite(coarse) != known))
     yield Finding(name="level 0 = read", worst=float(wrong), limit=0.0, unit="values")
     yield Finding(name="coarse levels finite", worst=float(lost), limit=0.0, unit="values")
@@ -158,5 +157,4 @@ def _region(generator: np.random.Generator, shape: tuple[int, ...]) -> Box:
     for length in shape:
         low, high = sorted(generator.choice(length + 1, 2, replace=False).tolist())
         spans.append((int(low), int(high)))
-    z, y, x = spans
-    return z, y, x
+    return Box.of(spans)

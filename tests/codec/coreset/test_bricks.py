@@ -5,7 +5,6 @@ from math import prod
 import numpy as np
 import pytest
 
-from fhash_codec.coreset.boxes import bounding_box, box_size, crop, fuse
 from fhash_codec.coreset.bricks import brick_shape, build_coreset
 from fhash_codec.coreset.features import Everything, Interval, Isosurface, Segmentation, dilate
 from fhash_codec.coreset.occupancy import unpack
@@ -31,7 +30,7 @@ def unpack_frame(coreset, key):
     whole = tiles.transpose(0, 3, 1, 4, 2, 5).reshape(
         [count * step for count, step in zip(grid, shape, strict=True)]
     )
-    z_size, y_size, x_size = box_size(coreset.box)
+    z_size, y_size, x_size = coreset.box.shape
     return whole[:z_size, :y_size, :x_size]
 
 
@@ -67,9 +66,9 @@ def check_against_direct_crop(array, features, keys, dilation, **kwargs):
     )
     for key, (step, mask) in enumerate(zip(keys, masks, strict=True)):
         expected = np.where(mask, seen.value_range.to_unit(array[step]), np.float32(np.nan))
-        np.testing.assert_array_equal(unpack_frame(coreset, key), crop(expected, coreset.box))
+        np.testing.assert_array_equal(unpack_frame(coreset, key), expected[coreset.box.slices()])
         np.testing.assert_array_equal(
-            unpack(coreset.occupancy[key], box_size(coreset.box)), crop(mask, coreset.box)
+            unpack(coreset.occupancy[key], coreset.box.shape), mask[coreset.box.slices()]
         )
     assert coreset.fraction == pytest.approx(np.mean(masks))
     left = [
@@ -100,8 +99,7 @@ def check_structure(coreset):
     order = np.ravel_multi_index(coreset.bricks.T, (len(coreset.key_frames), *coreset.brick_grid))
     assert (np.diff(order) > 0).all()
     grid = tuple(
-        -(-size // step)
-        for size, step in zip(box_size(coreset.box), coreset.brick_shape, strict=True)
+        -(-size // step) for size, step in zip(coreset.box.shape, coreset.brick_shape, strict=True)
     )
     assert coreset.brick_grid == grid
 
@@ -200,19 +198,6 @@ def test_default_bricks_have_at_most_1024_vertices_and_few_beyond_the_box():
             for edge, length, count in zip(brick, size, counts, strict=True)
         )
         assert prod(brick) >= 200 or prod(counts) < 40
-
-
-def test_boxes_are_the_smallest_and_their_fusion_holds_all():
-    mask = np.zeros((5, 6, 7), bool)
-    assert bounding_box(mask) is None
-    assert fuse([None, None]) is None
-    mask[1, 2, 3] = mask[4, 2, 6] = True
-    assert bounding_box(mask) == ((1, 5), (2, 3), (3, 7))
-    assert fuse([((1, 5), (2, 3), (3, 7)), None, ((0, 2), (4, 6), (3, 4))]) == (
-        (0, 5),
-        (2, 6),
-        (3, 7),
-    )
 
 
 def test_progress_has_two_stages():

@@ -7,7 +7,6 @@ from math import prod
 import numpy as np
 import pytest
 
-from fhash_codec.coreset.boxes import box_size
 from fhash_codec.coreset.bricks import Coreset, build_coreset
 from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.scan import scan
@@ -37,7 +36,7 @@ class Stored:
 
 def written(coreset: Coreset, kind: str, values: list[float]) -> np.ndarray:
     """The coarsest table, as it is read back, of a model whose every level holds `values` and else 0."""
-    architecture = Architecture.for_box(box_size(coreset.box), 2, embedding_size=1)
+    architecture = Architecture.for_box(coreset.box.shape, 2, embedding_size=1)
     fine = np.zeros((len(coreset.bricks), 1, prod(coreset.brick_shape)), np.float32)
     tables = [np.zeros((prod(level), 1), np.float32) for level in architecture.levels[1:]]
     for table in (fine, *tables):

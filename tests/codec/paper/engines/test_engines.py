@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from fhash_codec.coreset.boxes import box_size
 from fhash_codec.coreset.bricks import Coreset, build_coreset
 from fhash_codec.coreset.features import Interval
 from fhash_codec.coreset.scan import scan
@@ -54,7 +53,7 @@ def coreset_of(shape: tuple[int, int, int, int], low: float = 0.3) -> Coreset:
 def engines_of(shape, settings, *, steps=200, rate=0.01):
     coreset = coreset_of(shape, settings.get("low", 0.3))
     settings = {name: value for name, value in settings.items() if name != "low"}
-    architecture = Architecture.for_box(box_size(coreset.box), shape[0], width=16, **settings)
+    architecture = Architecture.for_box(coreset.box.shape, shape[0], width=16, **settings)
     rates = np.full(steps + 1, rate)
     slab = SlabEngine(architecture, coreset, rates, seed=7, device=CPU)
     oracle = NaiveEngine(architecture, coreset, rates, seed=7, device=CPU, dtype=torch.float64)
@@ -118,7 +117,7 @@ def test_gradients_equal_those_of_autograd_in_float64():
 @pytest.mark.parametrize("engine", ["slab", "naive"])
 def test_restoring_a_state_goes_on_bit_for_bit(engine):
     coreset = coreset_of((3, 9, 10, 20))
-    architecture = Architecture.for_box(box_size(coreset.box), 3, width=8)
+    architecture = Architecture.for_box(coreset.box.shape, 3, width=8)
     rates = np.linspace(0.01, 0.001, 21)
     batches = np.random.default_rng(0).integers(0, len(coreset.bricks), (20, 1))
 
@@ -178,7 +177,7 @@ def test_embeddings_that_no_sample_moved_are_stored_as_zero():
 
 def test_the_start_depends_on_the_seed_alone():
     coreset = coreset_of((2, 5, 6, 7))
-    architecture = Architecture.for_box(box_size(coreset.box), 2)
+    architecture = Architecture.for_box(coreset.box.shape, 2)
     one, same, other = (initial_parameters(architecture, coreset, seed) for seed in (4, 4, 5))
     assert torch.equal(one.fine, same.fine)
     assert torch.equal(one.coarse, same.coarse)

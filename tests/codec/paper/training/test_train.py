@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.boxes import box_size
 from fhash_codec.coreset.bricks import build_coreset
 from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.scan import scan
@@ -42,7 +41,7 @@ def setup(coreset, epochs=4, **settings):
         **{"epochs": epochs, "learning_rate": 0.01, "schedule": "cosine", "batch": 0, "seed": 5}
         | settings,
     )
-    architecture = Architecture.for_box(box_size(coreset.box), 3, width=16)
+    architecture = Architecture.for_box(coreset.box.shape, 3, width=16)
     return plan, make_engine(
         "slab", architecture, coreset, plan.rates, seed=5, device=torch.device("cpu")
     )
@@ -164,9 +163,7 @@ def test_training_that_diverges_is_an_error(coreset):
 @pytest.mark.parametrize("hidden_layers", [0, 1, 2])
 def test_an_error_of_more_than_twice_the_range_is_seen_at_its_batch(coreset, hidden_layers):
     plan = plan_training(coreset, epochs=4, learning_rate=1.0, schedule="constant", batch=0, seed=5)
-    architecture = Architecture.for_box(
-        box_size(coreset.box), 3, width=64, hidden_layers=hidden_layers
-    )
+    architecture = Architecture.for_box(coreset.box.shape, 3, width=64, hidden_layers=hidden_layers)
     engine = make_engine(
         "slab", architecture, coreset, plan.rates, seed=5, device=torch.device("cpu")
     )
