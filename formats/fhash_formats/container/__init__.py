@@ -11,14 +11,23 @@ and not through the zarr library, for three reasons:
 
 The tests prove that the zarr library reads every array equal.
 
-    layout       bytes of the ZIP              zip_checked  safe opening of the ZIP
-    source       bytes at offsets              strict_json  metadata documents
-    hierarchy    members -> header, arrays     record       checked access to a JSON object
-    header       checks of the header          coordinates  positions in the header
-    array        metadata of one array         coding       values of a chunk <-> bytes
-    chunks       arrays cut into chunks        sharding     many chunks in one member
-    stored       StoredArray                   cache        decoded chunks
-    reader       Container                     writer       ContainerWriter
+    source           bytes at offsets of a file
+    layout           bytes of the ZIP
+    zip_checked      safe opening of the ZIP
+    strict_json      metadata documents as JSON
+    hierarchy        members of the ZIP -> header and arrays
+    record           checked access to a JSON object
+    header           checks of the header
+    expected_arrays  arrays that a header asks for
+    coordinates      positions in the header
+    array            metadata of one array
+    coding           values of a chunk <-> bytes
+    chunks           arrays cut into chunks
+    sharding         many chunks in one member
+    cache            decoded chunks
+    stored           StoredArray: one array, read region by region
+    reader           Container: a file for reading
+    writer           ContainerWriter: a file for writing
 """
 
 from fhash_formats.container.coordinates import describe_coordinates
