@@ -21,14 +21,12 @@ from fhash_codec.compact.tiles.sample import pool
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
 from fhash_codec.progress import Progress
-from fhash_formats.container import ContainerWriter
+from fhash_formats.container import ContainerWriter, shard_shape
 from fhash_formats.series import Series
 from fhash_formats.support.threads import usable_threads
 
 OVERHEAD_BYTES = 3000
 """Of a container without its tiles, roughly; only the search for a ratio needs it."""
-MAX_TILES = 4096
-"""In one shard; a larger table has a shard for each layer of tiles in time."""
 PASSES = 4
 """Most times that the whole is coded to keep a promise that the sample did not foretell."""
 SAFE, EXCEEDED = 1e-3, 0.05
@@ -155,7 +153,7 @@ def write_table(writer: ContainerWriter, table: Table) -> None:
         shape=blocks.shape,
         dtype=blocks.dtype,
         chunk_shape=blocks.tile,
-        shard_shape=_shard(blocks.tile, blocks.grid),
+        shard_shape=shard_shape(blocks.tile, blocks.grid),
         chunks=iter(table.streams),
         dimension_names=("t", "z", "y", "x"),
         codecs=[
@@ -237,9 +235,3 @@ def _code_all(
     while waiting:
         collect()
     return streams, total(outcomes)
-
-
-def _shard(tile: Index, grid: Index) -> tuple[int, ...]:
-    """One shard for everything, or for one layer of tiles in time where there are many."""
-    layers = grid[0] if prod(grid) <= MAX_TILES else 1
-    return (layers * tile[0], *(n * count for n, count in zip(tile[1:], grid[1:], strict=True)))

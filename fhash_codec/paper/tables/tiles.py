@@ -17,6 +17,7 @@ from fhash_codec.paper.network import Floats
 from fhash_codec.paper.regions import block_shape
 from fhash_codec.paper.storage import mixed
 from fhash_codec.paper.tables.trained_tables import Region, TrainedTable
+from fhash_formats.container import shard_shape
 from fhash_formats.container.cache import ChunkCache
 from fhash_formats.transform.tile.encoding import Shape, decode_tile, encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
@@ -24,8 +25,6 @@ from fhash_formats.transform.tile.settings import TileSettings
 Index = tuple[int, int, int, int]
 TILE_STEPS, TILE_VERTICES = 8, 1 << 16
 """Time nodes of a tile, and about how many vertices of each."""
-MAX_TILES = 4096
-"""In one shard."""
 CACHE_BYTES = 64 << 20
 BATCH = 16
 """Tiles that are worked on at a time."""
@@ -87,11 +86,7 @@ class TiledTable:
     @property
     def shard(self) -> tuple[int, ...]:
         """Vertices (t, z, y, x) of a shard: everything, or one layer of tiles in time where there are many."""
-        layers = self.grid[0] if prod(self.grid) <= MAX_TILES else 1
-        return (
-            layers * self.coding.tile[0],
-            *(n * count for n, count in zip(self.coding.tile[1:], self.grid[1:], strict=True)),
-        )
+        return shard_shape(self.coding.tile, self.grid)
 
     def streams(self, component: int) -> Iterator[bytes]:
         """The coded tiles of a component, in C order."""

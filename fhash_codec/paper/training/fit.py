@@ -21,6 +21,7 @@ from fhash_formats.errors import (
     OutputError,
     TrainingError,
 )
+from fhash_formats.support.interrupts import deferred_interrupts
 
 __all__ = ["Trained", "train_model"]
 
@@ -59,7 +60,6 @@ def train_model(
     A training that diverges begins again at a lower learning rate, with a FhashWarning. Raises TrainingError where no rate helps.
     """
     # torch takes seconds to import, and nothing that comes before needs it.
-    from fhash_codec.interrupts import deferred_interrupts
     from fhash_codec.paper.engines import make_engine
     from fhash_codec.paper.training.checkpoint import (
         checkpoint_path,

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from torch import Tensor
 
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.interrupts import StopRequest
 from fhash_codec.paper.engines import Engine
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import TrainingError
+from fhash_formats.support.interrupts import StopRequest
 
 BATCH_BRICKS = 64  # of 1024 vertices: below 2^16 samples a step, its fixed cost shows; above, each epoch teaches less
 STEPS_AN_EPOCH = (20, 256)

@@ -10,12 +10,8 @@ from typing import Any
 
 from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.coordinates import described_coordinate
-from fhash_formats.container.header import (
-    POSITIONS,
-    check_arrays,
-    check_key_frames,
-    validate_header,
-)
+from fhash_formats.container.expected_arrays import check_arrays, check_key_frames
+from fhash_formats.container.header import POSITIONS, validate_header
 from fhash_formats.container.hierarchy import read_hierarchy
 from fhash_formats.container.source import CountedSource, FileSource, Source
 from fhash_formats.container.stored import StoredArray, damage_named

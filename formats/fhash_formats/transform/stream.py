@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,10 @@ from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileEr
 from fhash_formats.transform.tile.encoding import Shape, decode_tile, decode_tile_mask, encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["TransformCoder"]
+__all__ = ["MAX_TILE_VERTICES", "TransformCoder"]
+
+MAX_TILE_VERTICES = 1 << 27
+"""Vertices of a tile. Decoding takes some 30 bytes for each, and a damaged file may claim any number."""
 
 
 class TransformCoder:
@@ -25,7 +29,14 @@ class TransformCoder:
     def __init__(
         self, codecs: Sequence[Mapping[str, Any]], dtype: np.dtype[Any], shape: tuple[int, ...]
     ) -> None:
-        """Raises DamagedFileError for a configuration that is not allowed, UnsupportedFileError for a second codec."""
+        """Raises DamagedFileError for a configuration that is not allowed and for tiles that are too large.
+
+        Raises UnsupportedFileError for a second codec.
+        """
+        if prod(shape) > MAX_TILE_VERTICES:
+            raise DamagedFileError(
+                f"tiles of {prod(shape):,} vertices; the limit is {MAX_TILE_VERTICES:,}"
+            )
         if len(codecs) != 1:
             raise UnsupportedFileError(
                 "nothing may stand between the codecs fhash.transform and crc32c"

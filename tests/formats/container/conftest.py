@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.header import layer_shapes, occupancy_bytes
+from fhash_formats.container.expected_arrays import layer_shapes, occupancy_bytes
 from fhash_formats.container.layout import END, Member, comment, ending, local_header
 
 Parts = list[tuple[str, bytes]]

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import Container, ContainerWriter, validate_header
-from fhash_formats.container.header import check_key_frames, layer_shapes, occupancy_bytes
+from fhash_formats.container.expected_arrays import (
+    check_key_frames,
+    layer_shapes,
+    occupancy_bytes,
+)
 from fhash_formats.errors import DamagedFileError, InputError
 
 FIXED = {"format": "fhash", "format_version": [1, 0], "required_features": []}

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import threading
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +10,6 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.bricks import build_coreset
 from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.scan import scan
-from fhash_codec.interrupts import StopRequest, deferred_interrupts
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.training.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
@@ -22,6 +17,7 @@ from fhash_codec.paper.training.train import Course, Diverged, plan_training, tr
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError, TrainingError
 from fhash_formats.series import ArraySeries
+from fhash_formats.support.interrupts import StopRequest
 
 
 def smooth(shape=(3, 12, 20, 36)) -> np.ndarray:
@@ -192,29 +188,3 @@ def test_a_budget_ends_the_training(coreset):
     course = Course()
     assert not train(engine, plan, coreset, course, budget_seconds=0.2)
     assert course.epoch < 1000
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_the_first_signal_asks_and_the_second_interrupts(number):
-    before = signal.getsignal(number)
-    with deferred_interrupts() as stop:
-        os.kill(os.getpid(), number)
-        assert stop.asked
-        os.kill(os.getpid(), number)  # the same request, delivered twice
-        stop.since -= 2
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), number)
-    assert signal.getsignal(number) is before
-
-
-def test_other_threads_are_left_alone():
-    seen = []
-
-    def work():
-        with deferred_interrupts() as stop:
-            seen.append(stop.asked)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert seen == [False]

@@ -1,12 +1,8 @@
-"""Names and attributes in files; even spacing; chunks; signals."""
+"""Names and attributes in files; even spacing; chunks."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
-import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +10,6 @@ import numpy as np
 import pytest
 
 from fhash_formats.series import Coordinate
-from fhash_formats.support.interrupts import signals_held
 from fhash_formats.writers.common.labels import (
     coordinate_attributes,
     hdf5_value,
@@ -250,38 +245,3 @@ def test_chunks_are_bounded_and_never_span_steps(
     assert size <= CHUNK_BYTES
     frame = int(np.prod(shape[1:])) * made.dtype.itemsize
     assert size == frame if frame <= CHUNK_BYTES else size > CHUNK_BYTES / 4
-
-
-def test_a_signal_waits_until_the_block_has_ended() -> None:
-    done = []
-
-    def block() -> None:
-        with signals_held():
-            signal.raise_signal(signal.SIGINT)
-            done.append("block")
-
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        block()
-    assert done == ["block"]
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_signals_are_left_alone_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Callable[..., Any] | int | None] = []
-
-    def block() -> None:
-        with signals_held():
-            seen.append(signal.getsignal(signal.SIGINT))
-
-    thread = threading.Thread(target=block)  # only the main thread may set a handler
-    thread.start()
-    thread.join()
-    assert seen == [signal.getsignal(signal.SIGINT)]
-    ignored = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        block()
-        os.kill(os.getpid(), signal.SIGINT)
-        assert seen[1] == signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, ignored)
