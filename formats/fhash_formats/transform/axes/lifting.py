@@ -68,7 +68,6 @@ class _Plan:
     def _run_native(self, library: ctypes.CDLL, values: Values, inverse: bool) -> Values:
         direction, width = "inverse" if inverse else "forward", values.dtype.itemsize * 8
         function = getattr(library, f"fhash_transform_{direction}_f{width}")
-        function.restype = ctypes.c_int64
         result = np.empty(values.shape, values.dtype)
         rank_axis = 1 if inverse else 0
         ranks = [0 if matrix is None else matrix.shape[rank_axis] for matrix in self.matrices]
