@@ -5,7 +5,7 @@
     fhash_codec.encode("run.h5", "run.fhz", fhash_codec.EncodeConfig(features=("interval:0.5:1",)))
     with fhash_codec.open("run.fhz") as volume:
         frame = volume[42]
-        fhash_codec.rendering(volume).save("view.png")
+        fhash_codec.render(volume).save("view.png")
 
 Names load on first use, so that importing the package is cheap; torch loads only when a model is trained.
 """
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
     from fhash_codec.encoding import encode
-    from fhash_codec.rendering.renderer import Renderer, render
+    from fhash_codec.rendering import render
+    from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.rendering.scene.scene import Scene
     from fhash_codec.volume import Volume, open
 
@@ -50,6 +51,7 @@ _HOMES = {
     "diff": "comparison",
     "encode": "encoding",
     "open": "volume",
+    "render": "rendering",
 }
 
 __all__ = [
@@ -78,9 +80,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name == "render":
-        # The package is the function: importing a part of it would put the package in the function's place anyway.
-        return importlib.import_module("fhash_codec.rendering")
     if name not in _HOMES:
         raise AttributeError(f"module 'fhash_codec' has no attribute '{name}'")
     value = getattr(importlib.import_module(f"fhash_codec.{_HOMES[name]}"), name)

@@ -148,9 +148,9 @@ def run_animation(
     """
     from pathlib import Path
 
+    from fhash_codec.rendering import render
     from fhash_codec.rendering.animation.animate import animate, numbered
     from fhash_codec.rendering.animation.animation import Animation
-    from fhash_codec.rendering.animation.evolution import evolution
     from fhash_codec.rendering.animation.tracking import follow, tracking_scene
     from fhash_formats.errors import OutputExistsError
 
@@ -204,7 +204,7 @@ def run_animation(
     check_writable(output, force, sources=[volume.path])
     assert shown.evolution is not None
     steps = list(shown.evolution.steps)
-    image = evolution(volume, shown, progress=progress)
+    image = render(volume, shown, progress=progress)
     paths = [str(path) for path in image.save(output, force=force)]
     followed = follow(volume, tracked, steps) if tracked else []
     result = {
