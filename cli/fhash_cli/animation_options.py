@@ -228,7 +228,7 @@ def _draw_evolution(
     """Draw an evolution as one picture, and follow the features of `--track`."""
     from pathlib import Path
 
-    from fhash_codec.rendering.animation.evolution import evolution
+    from fhash_codec.rendering import render
     from fhash_codec.rendering.animation.tracking import follow, tracking_scene
 
     tracked = options.tracked(volume, progress)
@@ -240,7 +240,7 @@ def _draw_evolution(
     check_writable(output, force, sources=[volume.path])
     assert shown.evolution is not None
     steps = list(shown.evolution.steps)
-    image = evolution(volume, shown, progress=progress)
+    image = render(volume, shown, progress=progress)
     paths = [str(path) for path in image.save(output, force=force)]
     followed = follow(volume, tracked, steps) if tracked else []
     result = {

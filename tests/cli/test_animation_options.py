@@ -21,8 +21,7 @@ from fhash_cli.animation_options import (
 from fhash_cli.main import Program
 from fhash_cli.options import run_argument
 from fhash_cli.output import Progress
-from fhash_codec.rendering.scene.png_text import scene_in_png
-from fhash_codec.rendering.scene.scene import Scene
+from fhash_codec.rendering.scene.scene import Scene, scene_in_png
 
 SMALL = Scene(size=(24, 18))
 

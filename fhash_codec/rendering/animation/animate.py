@@ -20,8 +20,8 @@ from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.animation.animation import Animation
 from fhash_codec.rendering.animation.film import FILMS, check_film, film
 from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.scene.png_text import digest_in_png, scene_in_png
-from fhash_codec.rendering.scene.scene import Scene
+from fhash_codec.rendering.scene.png_text import digest_in_png
+from fhash_codec.rendering.scene.scene import Scene, scene_in_png
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.support.atomic import check_output

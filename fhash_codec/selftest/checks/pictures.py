@@ -57,7 +57,7 @@ CHECKS = (picture,)
 
 def _rendered(run: Run, mode: str) -> npt.NDArray[np.float32]:
     # Pictures are a package of their own, which decoding does not need.
-    from fhash_codec.rendering.renderer import render
+    from fhash_codec.rendering import render
     from fhash_codec.rendering.scene.scene import Marching, Scene
 
     step = 0.5 if run.volume.shape[0] > 1 else 0.0

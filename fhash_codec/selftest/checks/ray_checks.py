@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.picture.plan import Plan
+from fhash_codec.rendering.picture.planning import plan_picture
 from fhash_codec.rendering.renderer import Renderer, decoded_frame
 from fhash_codec.rendering.scene.scene import Scene
 from fhash_codec.rendering.task.task import Frame
@@ -85,7 +86,7 @@ def closed_form(chosen: Mapping[str, Scene], value: float) -> Check:
 def blocks(run: Run) -> Iterator[Finding]:
     """The front part of a volume over its back part is the whole: compositing is associative, wherever it is cut between two samples."""
     one = scene(camera={"view": "xy", "projection": "parallel"}, transfer_function=FOG)
-    plan = Plan.of(run.volume, one)
+    plan = plan_picture(run.volume, one)
     frame = decoded_frame(run.volume, plan.step, 0, _everything(run), plan.units)
     whole = march(frame, plan.task).rgba
     for cut in range(1, frame.values.shape[0] - 1):

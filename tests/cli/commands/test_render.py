@@ -12,7 +12,7 @@ from click.testing import Result
 from PIL import Image as Pictures
 
 import fhash_codec
-from fhash_codec.rendering.scene.png_text import scene_in_png
+from fhash_codec.rendering.scene.scene import scene_in_png
 from fhash_codec.rendering.task.counters import COUNTERS
 from fhash_formats import native
 
@@ -50,7 +50,7 @@ def test_a_picture_is_that_of_the_library(fhash: Fhash, run: Path, tmp_path: Pat
     assert scene.effects.isosurfaces[0].colour == "red"
     with fhash_codec.open(run) as volume:
         np.testing.assert_array_equal(
-            np.asarray(Pictures.open(view)), fhash_codec.rendering(volume, scene).to_uint8()
+            np.asarray(Pictures.open(view)), fhash_codec.render(volume, scene).to_uint8()
         )
 
 

@@ -14,7 +14,7 @@ import pytest
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.rendering import renderer as module
-from fhash_codec.rendering.scene.png_text import scene_in_png
+from fhash_codec.rendering.scene.scene import scene_in_png
 from fhash_codec.rendering.task.counters import COUNTERS, complete, rows
 from fhash_codec.rendering.task.units import Units
 from fhash_formats import native
@@ -28,8 +28,8 @@ def scene(**parts: Any) -> Scene:
     return Scene.from_dict({**SMALL, **parts})
 
 
-def test_the_package_is_the_function(volume: Volume) -> None:
-    image = fhash_codec.rendering(volume, scene())
+def test_the_function_renders_a_picture(volume: Volume) -> None:
+    image = fhash_codec.render(volume, scene())
     assert image.rgba.shape == (32, 40, 4)
     assert image.rgba[..., 3].max() > 0.1
     assert image.source == volume.path.name
@@ -40,19 +40,19 @@ def test_the_package_is_the_function(volume: Volume) -> None:
 @pytest.mark.parametrize(
     "statement",
     [
-        "import fhash_codec; f = fhash_codec.rendering",
-        "import fhash_codec.rendering.scene.scene; f = fhash_codec.rendering",
-        "import fhash_codec.rendering.renderer; f = fhash_codec.rendering",
+        "import fhash_codec; f = fhash_codec.render",
+        "import fhash_codec.rendering.scene.scene; f = fhash_codec.render",
+        "import fhash_codec.rendering.renderer; f = fhash_codec.render",
         "from fhash_codec import render as f; import fhash_codec.rendering.scene.scene as s; s.Scene()",
         "from fhash_codec import *; f = render; from fhash_codec.rendering.scene.scene import Scene",
     ],
 )
-def test_the_package_is_the_function_whatever_was_imported_before(statement: str) -> None:
+def test_the_function_is_the_same_whatever_was_imported_before(statement: str) -> None:
     subprocess.run(
         [
             sys.executable,
             "-c",
-            f"{statement}; assert callable(f); import fhash_codec; assert fhash_codec.rendering is f",
+            f"{statement}; import fhash_codec.rendering; assert fhash_codec.rendering.render is f",
         ],
         check=True,
     )
@@ -60,10 +60,10 @@ def test_the_package_is_the_function_whatever_was_imported_before(statement: str
 
 def test_a_picture_is_what_its_file_says(volume: Volume, tmp_path: Path) -> None:
     wanted = scene(effects={"box": True, "colour_bar": True}, step=1)
-    image = fhash_codec.rendering(volume, wanted)
+    image = fhash_codec.render(volume, wanted)
     image.save(tmp_path / "view.png")
     assert scene_in_png(tmp_path / "view.png") == wanted
-    again = fhash_codec.rendering(volume, scene_in_png(tmp_path / "view.png"))
+    again = fhash_codec.render(volume, scene_in_png(tmp_path / "view.png"))
     np.testing.assert_array_equal(again.rgba, image.rgba)
 
 
@@ -134,10 +134,10 @@ def test_what_does_not_fit_is_not_kept(volume: Volume) -> None:
     small = Renderer(volume, memory=frame + 10)
     for step in (0, 1, 2):
         small.render(scene(step=step))
-    assert [key[0] for key in small._decoded] == [2]
+    assert [key[0] for key in small._frames] == [2]
     none = Renderer(volume, memory=10)
     assert none.render(scene()).rgba[..., 3].any()
-    assert not none._decoded
+    assert not none._frames
 
 
 def test_a_part_of_the_volume_makes_the_picture_of_all(volume: Volume) -> None:
@@ -155,7 +155,7 @@ def test_a_part_of_the_volume_makes_the_picture_of_all(volume: Volume) -> None:
 def test_nothing_in_the_picture_is_an_empty_picture(volume: Volume) -> None:
     away = scene(camera={"position": [100, 100, 100], "focal_point": [200, 200, 200]})
     for mode in ("cache", "arm"):
-        image = fhash_codec.rendering(
+        image = fhash_codec.render(
             volume, scene(camera=away.camera.to_dict(), march={"mode": mode})
         )
         assert not image.rgba.any()
@@ -177,7 +177,7 @@ def test_what_lies_outside_the_coreset_is_not_seen(files: dict[str, Path]) -> No
         frame = module.decoded_frame(volume, 0.0, 0, ((0, 20), (0, 24), (0, 28)), Units())
         assert np.isnan(frame.values).any()
         assert frame.first == tuple(low for low, _ in volume.box)
-        image = fhash_codec.rendering(volume, scene(transfer_function={"opacity": "opaque"}))
+        image = fhash_codec.render(volume, scene(transfer_function={"opacity": "opaque"}))
         assert 0 < (image.rgba[..., 3] > 0.5).mean() < 0.5
 
 

@@ -16,7 +16,6 @@ import fhash_codec
 from fhash_codec import EncodeConfig, Renderer
 from fhash_codec.rendering.animation.animate import animate, numbered
 from fhash_codec.rendering.animation.animation import Animation, Key, mixed
-from fhash_codec.rendering.animation.evolution import evolution
 from fhash_codec.rendering.animation.film import film
 from fhash_codec.rendering.animation.tracking import (
     COLOURS,
@@ -27,8 +26,8 @@ from fhash_codec.rendering.animation.tracking import (
 )
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.camera.poses import CameraPath, pchip
+from fhash_codec.rendering.picture.evolution import evolution
 from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.scene.png_text import scene_in_png
 from fhash_codec.rendering.scene.scene import (
     Camera,
     Effects,
@@ -36,6 +35,7 @@ from fhash_codec.rendering.scene.scene import (
     Isosurface,
     Scene,
     TransferFunctionSpec,
+    scene_in_png,
 )
 from fhash_formats.errors import (
     FhashWarning,
@@ -588,10 +588,10 @@ def test_evolutions_that_cannot_be(volume) -> None:
 
 def test_a_renderer_draws_evolutions(files: dict[str, Path]) -> None:
     with fhash_codec.open(files["compact"]) as real:
-        image = fhash_codec.rendering(
+        image = fhash_codec.render(
             real, dataclasses.replace(SMALL, evolution=Evolution(steps=(0.0, 1.5), columns=2))
         )
-        single = fhash_codec.rendering(
+        single = fhash_codec.render(
             real, dataclasses.replace(SMALL, step=1.5, effects=Effects(time_label=True))
         )
         np.testing.assert_array_equal(image.rgba[:, -SMALL.size[0] :], single.rgba)

@@ -14,8 +14,8 @@ from PIL import Image as Pictures
 from PIL.PngImagePlugin import PngInfo
 
 from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.scene.png_text import MAX_TEXT, SCENE_KEY, scene_in_png
-from fhash_codec.rendering.scene.scene import Camera, Scene
+from fhash_codec.rendering.scene.png_text import MAX_TEXT, SCENE_KEY
+from fhash_codec.rendering.scene.scene import Camera, Scene, scene_in_png
 from fhash_formats.errors import InputError, OutputExistsError
 
 SCENE = Scene(

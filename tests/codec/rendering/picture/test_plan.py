@@ -13,14 +13,15 @@ from fhash_codec import Scene, Volume
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.camera.view import part_in_view, pixel_vertices
 from fhash_codec.rendering.colour.opacity import Histogram
-from fhash_codec.rendering.picture.plan import MAX_RAYS, Plan
+from fhash_codec.rendering.picture.plan import Plan
+from fhash_codec.rendering.picture.planning import MAX_RAYS, plan_picture
 from fhash_codec.rendering.scene.scene import Camera
 from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import FhashWarning, InputError, RegionError
 
 
 def plan(volume: Volume, **scene: Any) -> Plan:
-    return Plan.of(volume, Scene.from_dict(scene))
+    return plan_picture(volume, Scene.from_dict(scene))
 
 
 def test_what_no_effect_asks_for_is_not_in_the_task(volume: Volume) -> None:
@@ -152,7 +153,7 @@ def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]
     ):
         with fhash_codec.open(files[name]) as opened:
             asked.clear()
-            Plan.of(opened, Scene.from_dict(scene), histogram=histogram)
+            plan_picture(opened, Scene.from_dict(scene), histogram=histogram)
             assert len(asked) == expected
 
 
@@ -220,10 +221,10 @@ def test_single_precision_with_a_large_offset_is_marched_without_it(
     fhash_codec.encode(field, tmp_path / "far.fhz", fhash_codec.EncodeConfig(effort=1))
     with fhash_codec.open(tmp_path / "far.fhz") as far:
         assert np.abs(Units.of(far).to(far.read(0))).max() <= 2
-        shown = fhash_codec.rendering(far, Scene.from_dict({"size": [32, 32]}))
+        shown = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
         if mode == "portable":
             monkeypatch.setenv("FHASH_NATIVE", "0")
-        other = fhash_codec.rendering(
+        other = fhash_codec.render(
             far,
             Scene.from_dict(
                 {"size": [32, 32], "march": {"mode": "cache" if mode == "portable" else mode}}
@@ -253,7 +254,7 @@ def test_constant_values_have_a_table_that_single_precision_holds(
         assert table is not None
         assert np.float32(table.low) < np.float32(table.high)
         assert np.isfinite(
-            fhash_codec.rendering(volume, Scene.from_dict({"size": [16, 16]})).rgba
+            fhash_codec.render(volume, Scene.from_dict({"size": [16, 16]})).rgba
         ).all()
 
 
