@@ -8,7 +8,7 @@ import pytest
 from fhash_codec.coreset.key_frames import (
     KeyTimes,
     gram_matrix,
-    lattice_stride,
+    vertex_stride,
     optimal_steps,
     segment_costs,
     select_key_frames,
@@ -151,7 +151,7 @@ def test_costs_of_segments_are_the_definition():
     [((4, 4, 4), 64, 1), ((4, 4, 4), 63, 2), ((1, 1, 1000), 100, 10), ((64,) * 3, 2**16, 2)],
 )
 def test_the_lattice_is_the_finest_that_fits(shape, limit, stride):
-    assert lattice_stride(shape, limit) == stride
+    assert vertex_stride(shape, limit) == stride
 
 
 @pytest.mark.parametrize(

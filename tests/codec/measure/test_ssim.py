@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from skimage import metrics
 
-from fhash_codec.measure.metrics import ssim, ssim_steps
-from fhash_codec.paper import network
+from fhash_codec.measure.ssim import ssim, ssim_steps
 from fhash_formats import native
 from fhash_formats.errors import InputError
 
@@ -138,7 +137,7 @@ def test_no_scale_of_the_data_changes_it(factor):
 def test_number_types_and_threads_do_not_matter(monkeypatch):
     original, decoded = (np.rint(100 * field) for field in pair((34, 70, 40)))
     expected = ssim(original, decoded, 100.0, threads=1)
-    monkeypatch.setattr(network, "ITEMS_PER_THREAD", 1)
+    monkeypatch.setattr("fhash_formats.support.threads.ITEMS_PER_THREAD", 1)
     assert ssim(original, decoded, 100.0, threads=4) == expected
     assert ssim(original.astype(np.int16), decoded.astype(np.float32), 100.0) == expected
 
@@ -207,7 +206,7 @@ def test_a_decoded_value_that_is_not_finite_is_refused(monkeypatch, choice):
 MEMORY = """
 import resource
 import numpy as np
-from fhash_codec.ssim import _Frames
+from fhash_codec.measure.ssim import _Frames
 frame = np.zeros((16, 1200, 1200), np.float32)
 frame[3] = 1
 frames = _Frames(frame, frame, 1.0, None)

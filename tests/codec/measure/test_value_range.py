@@ -7,15 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fhash_codec.measure.value_range import (
-    PIECE,
-    Mean,
-    ValueRange,
-    pieces,
-    position_index,
-    power_of_two,
-    unit_position,
-)
+from fhash_codec.measure.value_range import PIECE, Mean, ValueRange, pieces, power_of_two
 from fhash_formats.errors import InputError
 
 RANGES = [
@@ -100,15 +92,6 @@ def test_pieces_do_not_change_the_result():
 def test_a_pair_that_is_no_range_is_refused(low, high):
     with pytest.raises(InputError, match="lower first"):
         ValueRange(low, high)
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 17, 200])
-def test_positions_run_from_minus_one_to_one_and_back(size):
-    index = np.arange(size)
-    position = unit_position(index, size)
-    assert (position[0], position[-1]) == ((-1, 1) if size > 1 else (0, 0))
-    np.testing.assert_allclose(position, -position[::-1], atol=1e-15)
-    np.testing.assert_allclose(position_index(position, size), index, atol=1e-13)
 
 
 @given(st.floats(min_value=0, allow_infinity=False, allow_nan=False))
