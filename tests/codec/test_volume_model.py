@@ -42,7 +42,7 @@ def model(request, tmp_path_factory):
         yield request.param, open_model(container)
 
 
-def test_each_profile_has_its_model(model):
+def test_each_profile_has_its_model(model) -> None:
     name, found = model
     assert isinstance(found, CompactModel if name == "compact" else PaperModel)
     assert tuple(found.chunks) == ((2, 3, 4, 4) if name == "compact" else (1, 7, 8, 9))
@@ -54,7 +54,7 @@ def test_each_profile_has_its_model(model):
 
 
 @pytest.mark.parametrize("region", REGIONS, ids=str)
-def test_regions_are_parts_of_the_whole(model, region):
+def test_regions_are_parts_of_the_whole(model, region) -> None:
     _, found = model
     inner = region.slices()
     for first, last in ((0, 0), (1, 2)):
@@ -68,7 +68,7 @@ def test_regions_are_parts_of_the_whole(model, region):
         np.testing.assert_array_equal(part[occupied[inner]], whole[inner][occupied[inner]])
 
 
-def test_points_at_vertices_are_the_region_and_slopes_have_the_same_values(model):
+def test_points_at_vertices_are_the_region_and_slopes_have_the_same_values(model) -> None:
     _, found = model
     occupied = found.occupied(1, 1, REGIONS[0])
     places = np.argwhere(occupied).T.astype(np.float64)
@@ -81,7 +81,7 @@ def test_points_at_vertices_are_the_region_and_slopes_have_the_same_values(model
     assert slopes.dtype == np.float64
 
 
-def test_levels_of_detail_are_given_or_refused(model):
+def test_levels_of_detail_are_given_or_refused(model) -> None:
     name, found = model
     if name == "compact":
         whole = found.read_lod(1, 1, Box.of_shape((3, 3, 4)))

@@ -26,7 +26,7 @@ def added(errors, original, decoded, mask=None):
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16, np.uint64])
 @pytest.mark.parametrize("masked", [False, True])
-def test_errors_are_those_of_plain_numpy(dtype, masked):
+def test_errors_are_those_of_plain_numpy(dtype, masked) -> None:
     rng = np.random.default_rng(1)
     original = (rng.random((3, 4, 5, 6)) * 1000).astype(dtype)
     decoded = original.astype(np.float64) + rng.standard_normal(original.shape)
@@ -44,7 +44,7 @@ def test_errors_are_those_of_plain_numpy(dtype, masked):
         assert figures.max_abs_error == pytest.approx(np.abs(one).max(), rel=1e-12)
 
 
-def test_values_that_are_not_finite_do_not_count():
+def test_values_that_are_not_finite_do_not_count() -> None:
     original, decoded = frames()
     original[0, 0, 0, :3] = np.nan, np.inf, -np.inf
     decoded[0, 0, 0, 0] = np.nan
@@ -57,7 +57,7 @@ def test_values_that_are_not_finite_do_not_count():
 
 
 @pytest.mark.parametrize("factor", [2.0**-1040, 2.0**-900, 2.0**900, 2.0**1023])
-def test_figures_scale_with_the_data_however_huge_or_tiny(factor):
+def test_figures_scale_with_the_data_however_huge_or_tiny(factor) -> None:
     original, decoded = frames()
     plain = added(Errors(1.0), original, decoded)
     scaled = added(Errors(factor), original * factor, decoded * factor)
@@ -67,7 +67,7 @@ def test_figures_scale_with_the_data_however_huge_or_tiny(factor):
     assert scaled.max_abs_error == pytest.approx(plain.max_abs_error * factor, rel=1e-6, abs=0)
 
 
-def test_the_psnr_of_denormals_does_not_come_from_their_rounding():
+def test_the_psnr_of_denormals_does_not_come_from_their_rounding() -> None:
     original = 5e-324 * np.arange(1000.0).reshape(1, 10, 100)
     decoded = original.copy()
     decoded[0, 0, :7] += 5e-324
@@ -78,7 +78,7 @@ def test_the_psnr_of_denormals_does_not_come_from_their_rounding():
     assert errors.steps[0].psnr == errors.psnr
 
 
-def test_a_range_that_overflows_leaves_only_psnr_unknown():
+def test_a_range_that_overflows_leaves_only_psnr_unknown() -> None:
     original = np.array([-1.7e308, 1.7e308, 0.0]).reshape(1, 1, 3)
     errors = Errors(math.inf)
     errors.add(0, original, original + np.array([1e300, 0, -1e300]))
@@ -90,16 +90,16 @@ def test_a_range_that_overflows_leaves_only_psnr_unknown():
 @pytest.mark.parametrize(
     ("data_range", "rmse"), [(0.0, 1.0), (1.0, 0.0), (1.0, None), (math.inf, 1.0)]
 )
-def test_psnr_is_none_where_it_has_no_finite_value(data_range, rmse):
+def test_psnr_is_none_where_it_has_no_finite_value(data_range, rmse) -> None:
     assert psnr(data_range, rmse) is None
 
 
-def test_psnr_of_extreme_ratios():
+def test_psnr_of_extreme_ratios() -> None:
     assert psnr(1e308, 1e-308) == pytest.approx(20 * 616)
     assert psnr(10.0, 1.0) == pytest.approx(20.0)
 
 
-def test_a_frame_of_which_nothing_counts_has_no_figures():
+def test_a_frame_of_which_nothing_counts_has_no_figures() -> None:
     original, decoded = frames(1)
     errors = Errors(1.0)
     figures = errors.add(4, original[0], decoded[0], np.zeros(original[0].shape, bool))
@@ -112,7 +112,7 @@ def test_a_frame_of_which_nothing_counts_has_no_figures():
     assert (errors.count, errors.psnr, errors.rmse, errors.max_abs_error) == (0, None, None, None)
 
 
-def test_wrong_frames_are_refused():
+def test_wrong_frames_are_refused() -> None:
     original, decoded = frames(1)
     with pytest.raises(InputError, match="one shape"):
         Errors(1.0).add(0, original[0], decoded[0, 1:])
@@ -125,7 +125,7 @@ def test_wrong_frames_are_refused():
         Errors(1.0).add(7, original[0], decoded[0])
 
 
-def test_quality_measures_the_coreset_and_the_domain():
+def test_quality_measures_the_coreset_and_the_domain() -> None:
     original, decoded = frames(4, (12, 13, 14), dtype=np.float32)
     outside = np.random.default_rng(3).random(original.shape) < 0.4
     outside[2] = True
@@ -179,14 +179,14 @@ def test_quality_measures_the_coreset_and_the_domain():
 
 
 @pytest.mark.parametrize(("data_range", "value"), [(0.0, 3.0), (math.inf, 1e308)])
-def test_quality_of_a_constant_or_overflowing_series_is_valid_json(data_range, value):
+def test_quality_of_a_constant_or_overflowing_series_is_valid_json(data_range, value) -> None:
     frame = np.full((3, 3, 3), value)
     quality = measure_quality(lambda _: frame, lambda _: frame, 2, data_range, 0.0)
     assert (quality.psnr, quality.rmse, quality.ssim) == (None, 0.0, None)
     json.dumps(quality.to_dict(), allow_nan=False)
 
 
-def test_quality_of_nothing_kept():
+def test_quality_of_nothing_kept() -> None:
     original, _ = frames(2)
     quality = measure_quality(
         original.__getitem__, lambda step: np.full_like(original[step], np.nan), 2, 1.0, 0.5
@@ -201,7 +201,7 @@ def test_quality_of_nothing_kept():
 
 
 @pytest.mark.parametrize("held", [1, 8])
-def test_steps_are_counted_in_order_whatever_is_held(monkeypatch, held):
+def test_steps_are_counted_in_order_whatever_is_held(monkeypatch, held) -> None:
     monkeypatch.setattr("fhash_codec.measure.metrics.FRAMES_HELD", held)
     original, decoded = frames(9)
     calls = []
