@@ -98,12 +98,12 @@ def test_missing_values_stay_out_of_range_coreset_and_figures(field, tmp_path) -
                 float(source[~holes].min()),
                 float(source[~holes].max()),
             ]
-            whole = volume[...]
-            assert np.isnan(whole[holes]).all()
+            values = volume[...]
+            assert np.isnan(values[holes]).all()
             filled = np.stack([volume.read(t, outside="background") for t in range(4)])
             np.testing.assert_array_equal(np.isnan(filled), holes)
             if not settings:
-                np.testing.assert_array_equal(np.isnan(whole), holes)
+                np.testing.assert_array_equal(np.isnan(values), holes)
 
 
 @BOTH
@@ -175,16 +175,16 @@ def test_the_input_is_never_replaced(field, tmp_path, config) -> None:
 
 def test_a_mask_in_memory_is_a_feature(field, tmp_path) -> None:
     source = field()
-    marked = source[0] > 50
-    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(effort=1, dilation=0), mask=marked)
+    mask = source[0] > 50
+    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(effort=1, dilation=0), mask=mask)
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        np.testing.assert_array_equal(volume.occupancy(3), marked)
+        np.testing.assert_array_equal(volume.occupancy(3), mask)
     both = EncodeConfig(effort=1, dilation=0, features=("interval:-300:-50",))
     fhash_codec.encode(source, tmp_path / "b.fhz", both, mask=source > 50)
     with fhash_codec.open(tmp_path / "b.fhz") as volume:
         np.testing.assert_array_equal(volume.occupancy(2), (source[2] > 50) | (source[2] <= -50))
     with pytest.raises(InputError, match="mask has shape"):
-        fhash_codec.encode(source, tmp_path / "c.fhz", QUICK, mask=marked[1:])
+        fhash_codec.encode(source, tmp_path / "c.fhz", QUICK, mask=mask[1:])
 
 
 @BOTH

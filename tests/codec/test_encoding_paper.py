@@ -201,9 +201,9 @@ def test_a_deep_network_that_diverges_at_every_other_rate_is_trained_in_the_end(
 def test_numbers_that_are_not_finite_are_never_written(field, tmp_path, monkeypatch) -> None:
     class Spoilt(SlabEngine):
         def parameters(self):
-            found = super().parameters()
-            found.coarse[-1] = float("nan")
-            return found
+            parameters = super().parameters()
+            parameters.coarse[-1] = float("nan")
+            return parameters
 
     monkeypatch.setattr("fhash_codec.paper.engines.slab.SlabEngine", Spoilt)
     with pytest.raises(TrainingError, match="not finite"):

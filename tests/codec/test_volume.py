@@ -57,9 +57,9 @@ INDICES = [
 
 @pytest.mark.parametrize("index", INDICES, ids=str)
 def test_any_part_holds_the_same_bits_as_that_slice_of_the_whole(volume, index) -> None:
-    part, whole = volume[index], volume[...]
-    np.testing.assert_array_equal(part, whole[index])
-    assert part.dtype == whole.dtype
+    part, values = volume[index], volume[...]
+    np.testing.assert_array_equal(part, values[index])
+    assert part.dtype == values.dtype
 
 
 @pytest.mark.parametrize(
@@ -119,8 +119,8 @@ def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t) -
         EncodeConfig(profile=profile, features=("interval:100:150",), dilation=0, **short),
     )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        whole = volume.occupancy(t)
-        assert 0 < whole.mean() < 0.5
+        occupied = volume.occupancy(t)
+        assert 0 < occupied.mean() < 0.5
         for region in (
             ((0, 6), (0, 7), (0, 8)),
             ((2, 5), (1, 6), (3, 4)),
@@ -128,7 +128,7 @@ def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t) -
             ((0, 1), (0, 1), (0, 1)),
         ):
             np.testing.assert_array_equal(
-                volume.occupancy(t, region), whole[tuple(slice(*part) for part in region)]
+                volume.occupancy(t, region), occupied[tuple(slice(*part) for part in region)]
             )
         with pytest.raises(RegionError, match="axis x"):
             volume.occupancy(t, ((0, 6), (0, 7), (0, 9)))
@@ -162,8 +162,8 @@ def test_sampling_between_vertices_needs_its_whole_cell(volume) -> None:
     np.testing.assert_array_equal(np.isfinite(volume.sample(t=2, z=z, y=y, x=x)), cell)
     # On a face only the face's own vertices count.
     face = occupied[:, :-1, :-1] & occupied[:, 1:, :-1] & occupied[:, :-1, 1:] & occupied[:, 1:, 1:]
-    found = volume.sample(t=2, z=np.arange(9)[:, None, None], y=y[:1], x=x[:1])
-    np.testing.assert_array_equal(np.isfinite(found), face)
+    values = volume.sample(t=2, z=np.arange(9)[:, None, None], y=y[:1], x=x[:1])
+    np.testing.assert_array_equal(np.isfinite(values), face)
 
 
 def test_sampling_outside_the_domain_is_nan_and_broadcasts(volume) -> None:
@@ -353,6 +353,6 @@ def test_what_a_compact_file_leaves_out(tmp_path, stored) -> None:
         assert volume.step_of_time(2) == 0.25
         # Between steps a value is no better than the two it lies between: both must be inside.
         for t, expected in ((0, inside[0]), (0.5, inside[0] & inside[1])):
-            whole = np.zeros(shape[1:], dtype=bool)
-            whole[1:3, 0:4, 2:5] = True if stored is None else expected
-            np.testing.assert_array_equal(volume.occupancy(t), whole)
+            occupied = np.zeros(shape[1:], dtype=bool)
+            occupied[1:3, 0:4, 2:5] = True if stored is None else expected
+            np.testing.assert_array_equal(volume.occupancy(t), occupied)

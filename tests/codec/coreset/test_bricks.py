@@ -27,11 +27,11 @@ def unpack_frame(coreset, key):
     tiles = np.full((*grid, *shape), np.nan, dtype=np.float32)
     _, z, y, x = coreset.bricks[first:last].T
     tiles[z, y, x] = held.reshape(-1, *shape)
-    whole = tiles.transpose(0, 3, 1, 4, 2, 5).reshape(
+    frame = tiles.transpose(0, 3, 1, 4, 2, 5).reshape(
         [count * step for count, step in zip(grid, shape, strict=True)]
     )
     z_size, y_size, x_size = coreset.box.shape
-    return whole[:z_size, :y_size, :x_size]
+    return frame[:z_size, :y_size, :x_size]
 
 
 def smooth(steps, shape, dtype=np.float32, low=0.0, span=1.0):

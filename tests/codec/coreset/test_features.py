@@ -137,12 +137,12 @@ def test_the_ends_of_an_interval_belong_to_it_and_a_threshold_does_not() -> None
 
 
 def test_selecting_leaves_the_frame_and_the_mask_alone() -> None:
-    frame, marked = random_frame((3, 3, 3)), np.zeros((3, 3, 3), bool)
+    frame, mask = random_frame((3, 3, 3)), np.zeros((3, 3, 3), bool)
     before = frame.copy()
-    for feature in (Mask("m", lambda step: marked), Everything()):
+    for feature in (Mask("m", lambda step: mask), Everything()):
         feature.select(frame, 0)[:] = True
     np.testing.assert_array_equal(frame, before)
-    assert not marked.any()
+    assert not mask.any()
 
 
 def test_features_that_are_not_ready_say_so() -> None:
@@ -228,11 +228,11 @@ def test_resolving_reads_the_key_frames_once_and_only_for_otsu() -> None:
     array[1] = -1e3  # not a key frame, must not count
     series = CountedSeries(array)
     texts = ["segmentation", "segmentation:3", "all", "segmentation"]
-    found = resolve_features(texts, series, (0, 2, 3), ValueRange(-1e3, 100.0), silent)
+    features = resolve_features(texts, series, (0, 2, 3), ValueRange(-1e3, 100.0), silent)
     assert series.reads == 3
-    assert found[0] == found[3]
-    assert 0 < found[0].threshold < 100
-    assert found[1:3] == (Segmentation(3.0), Everything())
+    assert features[0] == features[3]
+    assert 0 < features[0].threshold < 100
+    assert features[1:3] == (Segmentation(3.0), Everything())
     resolve_features(["all", "isosurface:3"], series, (0, 2, 3), ValueRange(0.0, 1.0), silent)
     assert series.reads == 3
 

@@ -64,8 +64,8 @@ def test_unpack_inverts_pack_and_the_index_is_injective(shape) -> None:
 
 
 def test_pack_takes_views() -> None:
-    whole = random_mask((6, 9, 12))
-    view = whole[1:6, 2:9:2, ::-1]
+    mask = random_mask((6, 9, 12))
+    view = mask[1:6, 2:9:2, ::-1]
     np.testing.assert_array_equal(pack(view), pack(np.ascontiguousarray(view)))
 
 

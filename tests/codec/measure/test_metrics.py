@@ -38,10 +38,10 @@ def test_errors_are_those_of_plain_numpy(dtype, masked) -> None:
     assert errors.max_abs_error == pytest.approx(np.abs(difference).max(), rel=1e-12)
     assert errors.psnr == pytest.approx(20 * math.log10(1000 / errors.rmse), rel=1e-12)
     for step, figures in enumerate(errors.steps):
-        one = (decoded - original.astype(np.float64))[step][mask[step]]
+        errors_of_step = (decoded - original.astype(np.float64))[step][mask[step]]
         assert figures.step == step
-        assert figures.rmse == pytest.approx(math.sqrt(np.mean(one**2)), rel=1e-12)
-        assert figures.max_abs_error == pytest.approx(np.abs(one).max(), rel=1e-12)
+        assert figures.rmse == pytest.approx(math.sqrt(np.mean(errors_of_step**2)), rel=1e-12)
+        assert figures.max_abs_error == pytest.approx(np.abs(errors_of_step).max(), rel=1e-12)
 
 
 def test_values_that_are_not_finite_do_not_count() -> None:
@@ -49,10 +49,10 @@ def test_values_that_are_not_finite_do_not_count() -> None:
     original[0, 0, 0, :3] = np.nan, np.inf, -np.inf
     decoded[0, 0, 0, 0] = np.nan
     errors = added(Errors(1.0), original, decoded)
-    known = np.isfinite(original)
-    assert errors.count == known.sum() == original.size - 3
+    finite = np.isfinite(original)
+    assert errors.count == finite.sum() == original.size - 3
     assert errors.rmse == pytest.approx(
-        math.sqrt(np.mean((original - decoded)[known] ** 2)), rel=1e-12
+        math.sqrt(np.mean((original - decoded)[finite] ** 2)), rel=1e-12
     )
 
 
@@ -135,14 +135,14 @@ def test_quality_measures_the_coreset_and_the_domain() -> None:
     quality = measure_quality(
         original.__getitem__, decoded.__getitem__, 4, 1.0, 0.5, lambda *call: calls.append(call)
     )
-    known = np.isfinite(original)
-    inside = known & ~outside
+    finite = np.isfinite(original)
+    inside = finite & ~outside
     filled = np.where(outside, np.float32(0.5), decoded)
     assert quality.rmse == pytest.approx(
         math.sqrt(np.mean((original - decoded)[inside].astype(float) ** 2)), rel=1e-5
     )
     assert quality.rmse_domain == pytest.approx(
-        math.sqrt(np.mean((original - filled)[known].astype(float) ** 2)), rel=1e-5
+        math.sqrt(np.mean((original - filled)[finite].astype(float) ** 2)), rel=1e-5
     )
     assert quality.psnr == pytest.approx(-20 * math.log10(quality.rmse))
     assert quality.psnr_domain == pytest.approx(-20 * math.log10(quality.rmse_domain))
@@ -150,7 +150,7 @@ def test_quality_measures_the_coreset_and_the_domain() -> None:
         np.abs(original - decoded)[inside].max(), rel=1e-5
     )
     assert quality.max_abs_error_domain == pytest.approx(
-        np.abs(original - filled)[known].max(), rel=1e-5
+        np.abs(original - filled)[finite].max(), rel=1e-5
     )
     assert 0.9 < quality.ssim < 1
     assert quality.ssim_window == {

@@ -26,9 +26,9 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
 def check_round_trip(values, low, high) -> None:
-    whole = ValueRange(low, high)
-    unit = whole.to_unit(values)
-    back = whole.from_unit(unit)
+    value_range = ValueRange(low, high)
+    unit = value_range.to_unit(values)
+    back = value_range.from_unit(unit)
     assert unit.dtype == np.float32
     assert back.dtype == np.float64
     assert ((unit >= 0) & (unit <= 1)).all()
@@ -43,10 +43,10 @@ def test_error_law_and_exact_ends(low, high) -> None:
     fractions = np.linspace(0, 1, 1001)
     values = np.clip(low * (1 - fractions) + high * fractions, low, high)
     check_round_trip(values, low, high)
-    whole = ValueRange(low, high)
-    np.testing.assert_array_equal(whole.to_unit([low, high]), [0, 1])
-    assert whole.from_unit(0.0) == low
-    assert (np.diff(whole.to_unit(np.sort(values))) >= 0).all()
+    value_range = ValueRange(low, high)
+    np.testing.assert_array_equal(value_range.to_unit([low, high]), [0, 1])
+    assert value_range.from_unit(0.0) == low
+    assert (np.diff(value_range.to_unit(np.sort(values))) >= 0).all()
 
 
 @given(st.lists(finite, min_size=1, max_size=20))
@@ -56,21 +56,21 @@ def test_error_law_for_any_values(numbers) -> None:
 
 @pytest.mark.parametrize("level", [0.0, -3.5, 1.7e308, 5e-324])
 def test_a_constant_range_gives_zero_and_comes_back_exactly(level) -> None:
-    whole = ValueRange(level, level)
+    value_range = ValueRange(level, level)
     np.testing.assert_array_equal(
-        whole.to_unit(np.full((2, 3), level)), np.zeros((2, 3), np.float32)
+        value_range.to_unit(np.full((2, 3), level)), np.zeros((2, 3), np.float32)
     )
-    np.testing.assert_array_equal(whole.from_unit([0.0, 0.3, 1.0]), [level] * 3)
+    np.testing.assert_array_equal(value_range.from_unit([0.0, 0.3, 1.0]), [level] * 3)
 
 
 def test_missing_values_become_nan_and_stay_so() -> None:
-    whole = ValueRange(-1.0, 1.0)
-    unit = whole.to_unit([np.nan, np.inf, -np.inf, 0.0, 7.0, -7.0])
+    value_range = ValueRange(-1.0, 1.0)
+    unit = value_range.to_unit([np.nan, np.inf, -np.inf, 0.0, 7.0, -7.0])
     np.testing.assert_array_equal(
         unit, np.array([np.nan, np.nan, np.nan, 0.5, 1.0, 0.0], np.float32)
     )
     np.testing.assert_array_equal(
-        whole.from_unit([np.nan, 0.5, 1.5, -0.5]), [np.nan, 0.0, 1.0, -1.0]
+        value_range.from_unit([np.nan, 0.5, 1.5, -0.5]), [np.nan, 0.0, 1.0, -1.0]
     )
 
 
