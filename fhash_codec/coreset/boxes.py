@@ -19,10 +19,11 @@ Spans = tuple[Span, Span, Span]
 
 
 class Box(NamedTuple):
-    """A box of vertices: one half-open span along each axis. It equals the plain tuple of its spans.
+    """A box of vertices: one half-open span along each axis.
 
-    Feature bounding boxes count vertices of the domain. Regions count vertices of the domain or of
-    the feature bounding box, as the function that takes them says.
+    It equals the plain tuple of its spans. Feature bounding boxes count vertices of the domain.
+    Regions count vertices of the domain, or of the feature bounding box: the function that takes a
+    region says which.
     """
 
     z: Span

@@ -49,10 +49,10 @@ def test_slices_cut_out_the_shape_of_a_box(box: Box) -> None:
 
 
 def test_the_intersection_holds_the_vertices_of_both_boxes() -> None:
-    for one, other in itertools.combinations_with_replacement(BOXES, 2):
-        common = one.intersect(other)
-        assert common == other.intersect(one)
-        both = mask_of(one) & mask_of(other)
+    for first, second in itertools.combinations_with_replacement(BOXES, 2):
+        common = first.intersect(second)
+        assert common == second.intersect(first)
+        both = mask_of(first) & mask_of(second)
         assert common == bounding_box(both)
         assert common is None or bool(both[common.slices()].all())
 
