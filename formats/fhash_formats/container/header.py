@@ -61,11 +61,11 @@ def validate_header(header: Mapping[str, Any]) -> None:
     top = Record(header, "header key ")
     _check_format(top)
     dtype = _check_source(top)
-    shape = top.record("domain").wholes("shape", 4, 1, MAX_LENGTH)
+    shape = top.record("domain").integers("shape", 4, 1, MAX_LENGTH)
     _check_values(top, dtype)
     box = _box(top, shape)
     top.texts("features")
-    top.whole("dilation", 0, MAX_LENGTH)
+    top.integer("dilation", 0, MAX_LENGTH)
     top.need(0 <= top.number("coreset_fraction") <= 1, "coreset_fraction", "a number from 0 to 1")
     profile = _check_model(top.record("model"), shape[0], box, dtype)
     if profile == COMPACT or header["model"]["tables"] == CODED:
@@ -86,7 +86,7 @@ def _check_format(top: Record) -> None:
         raise DamagedFileError(
             f"header key format is {ascii(top.get('format'))[:40]}; '{FORMAT}' is needed"
         )
-    major, minor = top.wholes("format_version", 2, 0, 10_000)
+    major, minor = top.integers("format_version", 2, 0, 10_000)
     if major > FORMAT_VERSION[0]:
         raise UnsupportedFileError(
             f"written by a newer fhash format {major}.{minor}; "
@@ -105,7 +105,7 @@ def _check_source(top: Record) -> np.dtype[Any]:
     """Check `encoder` and `variable`; the number type of the source."""
     encoder, variable = top.record("encoder"), top.record("variable")
     encoder.text("version")
-    encoder.whole("seed", -(2**63), 2**64 - 1)
+    encoder.integer("seed", -(2**63), 2**64 - 1)
     variable.text("name")
     variable.text("units")
     dtype = DTYPES[variable.choice("dtype", tuple(DTYPES))]
@@ -133,10 +133,10 @@ def _check_values(top: Record, dtype: np.dtype[Any]) -> None:
 def _check_training(training: Record) -> None:
     training.get("seconds")  # must be there, if only as null
     training.number_or_null("seconds")
-    training.whole("epochs", 0, MAX_LENGTH)
+    training.integer("epochs", 0, MAX_LENGTH)
     training.text("device")
     if training.has("restarts"):
-        training.whole("restarts", 0, MAX_LENGTH)
+        training.integer("restarts", 0, MAX_LENGTH)
     training.number_or_null("learning_rate")
 
 
@@ -209,16 +209,16 @@ def _check_model(model: Record, steps: int, box: Sequence[int], source: np.dtype
             f"header key model.profile is {profile[:40]!a}; this version knows {known}; upgrade"
         )
     if profile == PAPER:
-        model.whole("fold", 2, MAX_LENGTH)
-        model.whole("embedding_size", 1, MAX_EMBEDDING)
-        model.whole("hidden_layers", 0, MAX_HIDDEN_LAYERS)
-        model.whole("width", 1, MAX_WIDTH)
-        model.whole("parameters", 1, MAX_PARAMETERS)
+        model.integer("fold", 2, MAX_LENGTH)
+        model.integer("embedding_size", 1, MAX_EMBEDDING)
+        model.integer("hidden_layers", 0, MAX_HIDDEN_LAYERS)
+        model.integer("width", 1, MAX_WIDTH)
+        model.integer("parameters", 1, MAX_PARAMETERS)
         model.choice("tables", TABLE_TYPES)
         model.number_or_null("tables_loss_db")
     else:
-        model.whole("embedding_size", 1, 1)
-        model.whole("parameters", 0, MAX_PARAMETERS)
+        model.integer("embedding_size", 1, 1)
+        model.integer("parameters", 0, MAX_PARAMETERS)
         tables = DTYPES[model.choice("tables", tuple(DTYPES))]
         in_float32 = _largest_decoded(source) < np.finfo(np.float64).max
         model.need(

@@ -20,7 +20,7 @@ STOP_SIGNALS = [
 ]
 """Signals that ask to stop: Ctrl-C, the end of a batch job, a lost connection (not on Windows)."""
 SAME_REQUEST_SECONDS = 1.0
-"""Time within which a second signal repeats the first: shells, make and batch systems send several."""
+"""Time within which a second signal repeats the first: shells and batch systems send several."""
 
 Handler = Callable[[int, FrameType | None], Any]
 
