@@ -29,7 +29,7 @@ from fhash_codec.coreset.features import Feature
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
 MAX_VALUE, MIN_RANGE = 1e145, 1e-145

@@ -24,7 +24,14 @@ from fhash_formats.transform.entropy.mask import decode_mask
 from fhash_formats.transform.entropy.predict import decode_predicted
 from fhash_formats.transform.entropy.table import single_band
 from fhash_formats.transform.tile.decoding import linear_values, predicted_values, transform_for
-from fhash_formats.transform.tile.sections import MISSING, OWN, RESIDUAL, little, parts_of, section
+from fhash_formats.transform.tile.sections import (
+    MISSING,
+    OWN,
+    RESIDUAL,
+    little_endian,
+    parse_stream,
+    section,
+)
 from fhash_formats.transform.tile.settings import TileSettings
 
 Change = Callable[[random.Random, bytes], bytes]
@@ -193,7 +200,7 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
 def _restreamed(
     chance: random.Random, stream: bytes, settings: TileSettings, shape: tuple[int, ...]
 ) -> bytes:
-    parts = parts_of(stream)
+    parts = parse_stream(stream)
     flags, sections = parts.flags, parts.sections()
     if not parts.coded:
         return stream[:1] + b"".join(section(damaged(chance, part)) for part in sections)
@@ -212,10 +219,11 @@ def _restreamed(
             integers = decode_integers(
                 sections[first], shape, band_table(settings.transform, shape)
             )
-        digest = zlib.crc32(little(integers))
+        digest = zlib.crc32(little_endian(integers))
         if flags & RESIDUAL:
             digest = zlib.crc32(
-                little(decode_integers(sections[first + 1], shape, single_band(shape))), digest
+                little_endian(decode_integers(sections[first + 1], shape, single_band(shape))),
+                digest,
             )
         if parts.masked and settings.mask is not None and sections[-1]:
             sections[-1] = _mask_section(

@@ -20,7 +20,7 @@ from fhash_codec.compact.tiles.blocks import Blocks, Index
 from fhash_codec.compact.tiles.coding import SMALLEST_STEP, Coding, code
 from fhash_codec.compact.tiles.tiling import even_tile
 from fhash_formats import native
-from fhash_formats.transform.tile.encoding import transform_for
+from fhash_formats.transform.tile.decoding import transform_for
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["Magnitudes", "foreseen_size", "foreseen_step", "magnitudes", "tile_costs"]

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.extent import Extent
 from fhash_formats.series import Series
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 
 Values = npt.NDArray[Any]
 Care = npt.NDArray[np.bool_] | None

@@ -11,6 +11,7 @@ import numpy as np
 from fhash_codec.compact.tiles.blocks import Care, Values
 from fhash_codec.measure.sums import squared_errors
 from fhash_codec.measure.value_range import power_of_two
+from fhash_formats.transform.tile import encoding
 from fhash_formats.transform.tile.encoding import CodedTile, encode_tile, exact_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -27,15 +28,15 @@ SMALLEST_STEP = 2.0**-26
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coding:
-    """How tiles are coded besides their settings: see `encode_tile`. exact: without loss, by `exact_tile`."""
+class Coding(encoding.Coding):
+    """Options with which the tiles of a series are coded, besides their settings.
+
+    Attributes:
+        exact: whether tiles are stored without loss; the other options then have no effect.
+    """
 
     weight: float = WEIGHT
-    rounds: int = 0
-    passes: int = 1
-    error: float | None = None
-    filled: bool = False
-    density: int = 1
+    keep_missing: bool = False
     exact: bool = False
 
 
@@ -71,18 +72,7 @@ def code(
             else care,
         )
         return coded, Outcome(size=len(coded.data), squares=0.0, count=count, largest=0.0)
-    coded = encode_tile(
-        values,
-        settings,
-        care=care,
-        weight=coding.weight,
-        error=coding.error,
-        rounds=coding.rounds,
-        passes=coding.passes,
-        keep_missing=False,
-        filled=coding.filled,
-        density=coding.density,
-    )
+    coded = encode_tile(values, settings, coding, in_coreset=care)
     # Scaled, so that neither huge nor tiny ranges over- or underflow.
     scale = power_of_two(settings.high - settings.low)
     count, squares, largest = squared_errors(values, coded.decoded, care, scale)

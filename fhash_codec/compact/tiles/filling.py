@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fhash_codec.compact.tiles.blocks import Care, Values
-from fhash_formats.transform.tile.encoding import transform_for
+from fhash_formats.transform.tile.decoding import transform_for
 from fhash_formats.transform.tile.filling import filled
 from fhash_formats.transform.tile.settings import TileSettings
 

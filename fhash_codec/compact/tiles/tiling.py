@@ -8,7 +8,7 @@ from math import prod
 
 from fhash_formats.errors import InputError
 from fhash_formats.transform.stream import MAX_TILE_VERTICES
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 
 __all__ = ["even_tile", "first_tile", "parse_tile", "tile_for"]
 

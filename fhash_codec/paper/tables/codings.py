@@ -24,7 +24,7 @@ from fhash_codec.paper.network import Floats
 from fhash_codec.paper.tables.tiles import Coding, Index, code_tile, components_of, tile_shape
 from fhash_codec.paper.tables.trained_tables import Region, TrainedTable
 from fhash_formats.transform.axes.spec import TransformSpec
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
 LEAST = 1e-4

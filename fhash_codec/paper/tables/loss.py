@@ -15,7 +15,7 @@ from fhash_codec.paper.points import feature_slopes
 from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.tables.bricks import Bricks
 from fhash_codec.paper.tables.tiles import Index
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 
 GOLDEN = 0.6180339887498949
 SLOPE_TILES, SLOPE_POINTS = 16, 1024

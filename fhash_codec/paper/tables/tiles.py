@@ -19,7 +19,10 @@ from fhash_codec.paper.storage import mixed
 from fhash_codec.paper.tables.trained_tables import Region, TrainedTable
 from fhash_formats.container import shard_shape
 from fhash_formats.container.cache import ChunkCache
-from fhash_formats.transform.tile.encoding import Shape, decode_tile, encode_tile
+from fhash_formats.transform.tile.decoding import decode_tile
+from fhash_formats.transform.tile.encoding import Coding as TileCoding
+from fhash_formats.transform.tile.encoding import encode_tile
+from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
 Index = tuple[int, int, int, int]
@@ -173,6 +176,9 @@ def code_tile(
     """The stream of one component of a tile, and what it decodes to."""
     whole = bool(care.all())
     coded = encode_tile(
-        values, settings, care=None if whole else care, weight=WEIGHT, rounds=0 if whole else ROUNDS
+        values,
+        settings,
+        TileCoding(weight=WEIGHT, rounds=0 if whole else ROUNDS),
+        in_coreset=None if whole else care,
     )
     return coded.data, coded.decoded

@@ -16,6 +16,7 @@ from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample, strata
 from fhash_codec.compact.tiles.tiling import tile_for
+from fhash_formats.transform.tile import encoding
 from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -193,7 +194,7 @@ def test_rounding_to_the_type_of_the_source_stores_no_tile_exactly(rounding, exa
     coded = encode_tile(
         source,
         with_step(begun, 4 * error, Goal(error=error, data_range=high - low), rounding),
-        error=error,
+        encoding.Coding(error=error),
     )
     assert np.abs(coded.decoded.astype(np.float64) - source).max() <= error
     assert np.array_equal(coded.decoded, source) == exact

@@ -21,7 +21,7 @@ from fhash_formats.transform.entropy.predict import _blank, encode_predicted
 from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
 from fhash_formats.transform.entropy.prior import prior_state
 from fhash_formats.transform.entropy.table import single_band
-from fhash_formats.transform.tile.sections import parts_of
+from fhash_formats.transform.tile.sections import parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
 
 GOLDENS = Path(__file__).parents[2] / "golden"
@@ -175,7 +175,7 @@ def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int,
 
 def coefficients_of(stream: bytes) -> bytes:
     """The section of coded coefficients; nothing where there is none."""
-    parts = parts_of(stream)
+    parts = parse_stream(stream)
     return (
         bytes(parts.body) if parts.coded and not parts.predicted and parts.body is not None else b""
     )
