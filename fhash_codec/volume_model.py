@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.model import CompactModel
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.paper.model import PaperModel
-from fhash_codec.paper.regions import Box
 from fhash_formats.container import Container
 
 Positions = npt.NDArray[np.float64]

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
-from fhash_codec.paper.regions import Box
 from fhash_formats.container import StoredArray
 
 Positions = npt.NDArray[np.float64]
