@@ -18,7 +18,7 @@ from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.selection import select
-from fhash_codec.paper.training.train import Plan, plan_training, probe_psnr
+from fhash_codec.paper.training.train import TrainingPlan, plan_training, probe_psnr
 from fhash_codec.progress import Progress, silent
 from fhash_codec.training.devices import choose_device
 from fhash_codec.training.threads import threads_for
@@ -107,7 +107,7 @@ class _Run:
         name: str,
         architecture: Architecture,
         coreset: Coreset,
-        plan: Plan,
+        plan: TrainingPlan,
         seconds: float,
         device: torch.device,
     ) -> None:

@@ -1,4 +1,7 @@
-"""How many threads torch uses for training, and how they wait for each other. Import this before torch."""
+"""Number of threads that torch uses for training, and how these wait for each other.
+
+Import this module before torch.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,25 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# Between two small operations OpenMP threads spin, by default for milliseconds; on a machine that others use too, the threads that
-# spin keep those from running that are waited for (8 times slower beside a second training). 10,000 rounds are some tens of
-# microseconds, more than the pause between operations: on an idle machine the speed stays the same.
+# Between two small operations OpenMP threads spin, by default for milliseconds. On a machine in
+# shared use the spinning threads keep off the core the very threads they wait for: training runs 8
+# times slower beside a second training. 10,000 rounds take some tens of microseconds, more than the
+# pause between operations, so an idle machine stays as fast.
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
-VERTICES_A_THREAD = (
-    12_000  # of a training step; with fewer, a further thread costs more than it brings
-)
+VERTICES_A_THREAD = 12_000
+"""Vertices of a training step per thread; with fewer, a further thread costs more than it saves."""
 
 
 @contextmanager
 def threads_for(vertices: int) -> Iterator[int]:
-    """Within it torch uses as many threads as pay for training steps of so many vertices, and no more than before; their number."""
+    """Limit torch's threads, while the context lasts, to those that pay for a training.
+
+    The number never exceeds the number before. The context yields it.
+
+    Args:
+        vertices: vertices of a training step.
+    """
     import torch
 
     before = torch.get_num_threads()

@@ -12,7 +12,9 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
-from fhash_codec.paper.regions import ArrayTable, Network, decode_region, sample_points
+from fhash_codec.paper.network import ArrayTable, Network
+from fhash_codec.paper.points import sample_points
+from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.storage import NumberType
 from fhash_codec.selftest.case import Finding, Run
 from fhash_codec.selftest.checks.oracle import Oracle

@@ -9,10 +9,12 @@ from math import prod
 import numpy as np
 import pytest
 
-from fhash_codec.paper import network, points
+from fhash_codec.paper import points
 from fhash_codec.paper import regions as decoder
 from fhash_codec.paper.levels import level_resolutions
-from fhash_codec.paper.regions import ArrayTable, Network, block_shape, decode_region, sample_points
+from fhash_codec.paper.network import ArrayTable, Network
+from fhash_codec.paper.points import sample_points
+from fhash_codec.paper.regions import block_shape, decode_region
 from fhash_formats.errors import DamagedFileError, InputError, RegionError
 
 # box (z, y, x), key frames, fold, embedding size, hidden layers
@@ -107,7 +109,7 @@ def random_points(net, count, seed=1):
 
 @shapes
 def test_a_region_holds_the_bits_of_the_whole_whatever_the_threads(shape, monkeypatch):
-    monkeypatch.setattr(network, "ITEMS_PER_THREAD", 1)
+    monkeypatch.setattr("fhash_formats.support.threads.ITEMS_PER_THREAD", 1)
     monkeypatch.setattr(decoder, "BLOCK_VERTICES", 512)
     net = random_network(*shape)
     rng = np.random.default_rng(5)
@@ -234,7 +236,7 @@ def test_the_derivative_on_a_border_is_that_of_the_cell_after_it():
 
 def test_a_vertex_on_a_corner_has_exactly_its_embedding():
     net = random_network((6, 20, 40), 3, 2, 1, 0)
-    weight = np.zeros((1, net.features), np.float32)
+    weight = np.zeros((1, net.inputs), np.float32)
     weight[0, 0] = 1
     net = replace(net, layers=((weight, np.zeros(1, np.float32)),))
     for key in range(3):
@@ -263,12 +265,12 @@ def test_blocks_without_a_wanted_vertex_are_nan_and_the_others_as_ever(monkeypat
     part = frame[tuple(slice(*r) for r in region)]
     wanted = np.zeros(part.shape, bool)
     wanted[1, 3, 4] = wanted[-1, -1, -1] = True
-    decoded = decode_region(net, 0, region, wanted=wanted)
+    decoded = decode_region(net, 0, region, requested=wanted)
     known = np.isfinite(decoded)
     assert known[wanted].all()
     assert 0 < known.mean() < 0.5
     np.testing.assert_array_equal(decoded[known], part[known])
-    assert np.isnan(decode_region(net, 0, region, wanted=np.zeros(part.shape, bool))).all()
+    assert np.isnan(decode_region(net, 0, region, requested=np.zeros(part.shape, bool))).all()
 
 
 class RecordingTable(ArrayTable):
@@ -302,7 +304,7 @@ def test_a_region_reads_just_its_surroundings_once_per_level():
     decode_region(net, 3.2, ((20, 36),) * 3)
     assert net.tables[0].regions[0][0] == (3, 5)
     net = recorded(net)
-    decode_region(net, 3.2, ((20, 36),) * 3, wanted=np.zeros((16, 16, 16), bool))
+    decode_region(net, 3.2, ((20, 36),) * 3, requested=np.zeros((16, 16, 16), bool))
     assert not net.tables[0].regions
 
 
@@ -394,8 +396,8 @@ def test_a_region_outside_or_empty_is_refused(region):
 
 def test_wrong_arguments_are_refused():
     net = random_network((4, 5, 6), 1, 2, 1, 0)
-    with pytest.raises(InputError, match=r"wanted .* \(4, 5, 6\)"):
-        decode_region(net, 0, whole(net), wanted=np.ones((4, 5, 5), bool))
+    with pytest.raises(InputError, match=r"requested .* \(4, 5, 6\)"):
+        decode_region(net, 0, whole(net), requested=np.ones((4, 5, 5), bool))
     with pytest.raises(InputError, match="threads"):
         decode_region(net, 0, whole(net), threads=0)
     with pytest.raises(RegionError, match=r"point 1: x 5\.5 is outside 0\.\.5"):
@@ -413,13 +415,13 @@ def test_a_network_whose_parts_do_not_fit_is_refused():
     weight, bias = net.layers[0]
     cases = [
         ({"tables": net.tables[:-1]}, "tables for"),
-        ({"tables": [net.tables[1], *net.tables[1:]]}, "table of level 0"),
-        ({"embedding_size": 3}, "table of level 0"),
+        ({"tables": [net.tables[1], *net.tables[1:]]}, "table of level 1"),
+        ({"embedding_size": 3}, "table of level 1"),
         ({"key_frames": 0}, "at least 1"),
         ({"layers": net.layers[:1]}, "one output"),
         ({"layers": ()}, "one output"),
-        ({"layers": ((weight[:, 1:], bias), net.layers[1])}, "layer 0"),
-        ({"layers": ((weight, bias[1:]), net.layers[1])}, "layer 0"),
+        ({"layers": ((weight[:, 1:], bias), net.layers[1])}, "layer 1"),
+        ({"layers": ((weight, bias[1:]), net.layers[1])}, "layer 1"),
         ({"layers": ((weight * np.float32(np.nan), bias), net.layers[1])}, "not finite"),
     ]
     for change, message in cases:
@@ -431,9 +433,9 @@ def test_a_network_whose_parts_do_not_fit_is_refused():
 def test_a_table_that_is_not_finite_is_refused_not_decoded(bad):
     net = random_network((4, 5, 6), 2, 2, 2, 1)
     net.tables[1].values[0, 0, 0, 0, 1] = bad
-    with pytest.raises(DamagedFileError, match="level 1"):
+    with pytest.raises(DamagedFileError, match="level 2"):
         decode_region(net, 0, whole(net))
-    with pytest.raises(DamagedFileError, match="level 1"):
+    with pytest.raises(DamagedFileError, match="level 2"):
         sample_points(net, 0, 0, 0, 0)
 
 

@@ -18,10 +18,11 @@ from fhash_codec import EncodeConfig, QualityError
 from fhash_codec.coreset.occupancy import unpack
 from fhash_codec.coreset.selection import open_source
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.points import feature_slopes
-from fhash_codec.paper.regions import ArrayTable, Network, decode_region
+from fhash_codec.paper.points import input_slopes
+from fhash_codec.paper.network import ArrayTable, Network
+from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.selection import select
-from fhash_codec.paper.storage import finest_frame, mixed
+from fhash_codec.paper.storage import finest_frame, mix_components
 from fhash_codec.paper.tables.bricks import Bricks
 from fhash_codec.paper.tables.codings import squared_weights
 from fhash_codec.paper.tables.loss import Samples
@@ -223,8 +224,8 @@ def test_mixing_adds_the_components_from_the_first_on():
     expected = np.stack(
         [(parts[0] * m[0] + parts[1] * m[1]) + parts[2] * m[2] for m in mixing.T], axis=-1
     )
-    np.testing.assert_array_equal(mixed(parts, mixing), expected)
-    assert mixed(parts, mixing).dtype == np.float32
+    np.testing.assert_array_equal(mix_components(parts, mixing), expected)
+    assert mix_components(parts, mixing).dtype == np.float32
 
 
 @pytest.mark.parametrize(("length", "resolution"), [(1, 1), (5, 3), (5, 5), (9, 2), (20, 7)])
@@ -273,7 +274,7 @@ def test_nothing_that_counts_is_left_out(tmp_path):
     def network(fill: float) -> Network:
         whole = [tuple(slice(0, n) for n in table.shape) for table in trained]
         kept = [
-            np.where(table.cares(part[:4])[..., None], table.read(part), np.float32(fill))
+            np.where(table.needed(part[:4])[..., None], table.read(part), np.float32(fill))
             for table, part in zip(trained, whole, strict=True)
         ]
         assert sum(int((values == fill).sum()) for values in kept) > 100
@@ -316,7 +317,7 @@ def test_nothing_that_counts_is_left_out(tmp_path):
         direct += float(((unit - values)[mask] ** 2).sum())
     assert squares == pytest.approx(direct)
     assert sum(samples.counts.values()) == count
-    some = samples.chosen(count // 3)
+    some = samples.choose(count // 3)
     assert (
         0
         < sum(samples.counts[index] for index in some)
@@ -348,7 +349,7 @@ def test_slopes_by_the_embeddings_are_differences():
         )
 
     points = np.array([[0, 1, 2, 2], [3, 0, 1, 2], [5, 4, 0, 1], [8, 0, 3, 7]], dtype=np.float64)
-    slopes = feature_slopes(network(), points)
+    slopes = input_slopes(network(), points)
     assert slopes.shape == (architecture.inputs, 4)
     box = tuple((0, n) for n in architecture.box_size)
     for number, table in enumerate(tables):

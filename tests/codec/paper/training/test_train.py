@@ -13,7 +13,7 @@ from fhash_codec.coreset.scan import scan
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.training.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
-from fhash_codec.paper.training.train import Course, Diverged, plan_training, train
+from fhash_codec.paper.training.train import TrainingProgress, Diverged, plan_training, train
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError, TrainingError
 from fhash_formats.series import ArraySeries
@@ -78,7 +78,7 @@ def test_rates_fall_to_zero_or_stay(coreset):
 
 def test_history_tells_seconds_epoch_and_psnr_that_rises(coreset):
     plan, engine = setup(coreset, epochs=12)
-    course = Course()
+    course = TrainingProgress()
     seen = []
     assert train(engine, plan, coreset, course, progress=lambda *step: seen.append(step))
     assert [point["epoch"] for point in course.history] == list(range(1, 13))
@@ -94,10 +94,10 @@ def test_history_tells_seconds_epoch_and_psnr_that_rises(coreset):
 @pytest.mark.parametrize("moment", [1, 7, 20, 33])
 def test_going_on_from_a_checkpoint_ends_at_the_same_bits(coreset, tmp_path, moment):
     plan, whole = setup(coreset)
-    train(whole, plan, coreset, Course())
+    train(whole, plan, coreset, TrainingProgress())
 
     _, engine = setup(coreset)
-    stop, course, path = StopRequest(), Course(), tmp_path / "run.checkpoint"
+    stop, course, path = StopRequest(), TrainingProgress(), tmp_path / "run.checkpoint"
 
     def ask(stage, done, total, note):
         stop.asked = done >= moment
@@ -123,7 +123,7 @@ def test_going_on_from_a_checkpoint_ends_at_the_same_bits(coreset, tmp_path, mom
 def test_checkpoints_come_by_the_clock_too(coreset):
     plan, engine = setup(coreset, epochs=2)
     saved = []
-    assert train(engine, plan, coreset, Course(), save=saved.append, save_seconds=0.0)
+    assert train(engine, plan, coreset, TrainingProgress(), save=saved.append, save_seconds=0.0)
     assert saved
 
 
@@ -153,7 +153,7 @@ def test_training_that_diverges_is_an_error(coreset):
     plan, engine = setup(coreset)
     engine.flat.fill_(float("nan"))
     with pytest.raises(TrainingError, match="diverged"):
-        train(engine, plan, coreset, Course())
+        train(engine, plan, coreset, TrainingProgress())
 
 
 @pytest.mark.parametrize("hidden_layers", [0, 1, 2])
@@ -163,7 +163,7 @@ def test_an_error_of_more_than_twice_the_range_is_seen_at_its_batch(coreset, hid
     engine = make_engine(
         "slab", architecture, coreset, plan.rates, seed=5, device=torch.device("cpu")
     )
-    course = Course()
+    course = TrainingProgress()
     with pytest.raises(Diverged, match="training diverged in epoch 1: the error reached"):
         train(engine, plan, coreset, course)
     assert course.epoch == 0
@@ -178,13 +178,13 @@ def test_a_network_that_died_of_its_rate_is_no_result(coreset, rate, says):
     engine.layers[-1][0, -1] = float(coreset.values.mean()) if says == "mean" else 0.0
     if rate > 0.01 and says == "mean":
         with pytest.raises(Diverged, match="ended in a constant"):
-            train(engine, plan, coreset, Course())
+            train(engine, plan, coreset, TrainingProgress())
     else:  # a lower rate than the usual one would not help, nor does it where the training was too short
-        assert train(engine, plan, coreset, Course())
+        assert train(engine, plan, coreset, TrainingProgress())
 
 
 def test_a_budget_ends_the_training(coreset):
     plan, engine = setup(coreset, epochs=1000)
-    course = Course()
+    course = TrainingProgress()
     assert not train(engine, plan, coreset, course, budget_seconds=0.2)
     assert course.epoch < 1000

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fhash_codec.paper.regions import ArrayTable, Network, sample_points
+from fhash_codec.paper.network import ArrayTable, Network
+from fhash_codec.paper.points import sample_points
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.scene.scene import Camera
 from fhash_codec.rendering.task.task import Frame, Surface, Table, Task
