@@ -56,8 +56,11 @@ def encode(
         ]
         check_output(path, force, sources=[*series.files, *masks])
         with ContainerWriter(path, force=force) as writer:
-            fill = encode_compact if config.profile == "compact" else encode_paper
-            header, checkpoint = fill(writer, series, config, mask, path, progress)
+            checkpoint = None
+            if config.profile == "compact":
+                header = encode_compact(writer, series, config, mask, progress)
+            else:
+                header, checkpoint = encode_paper(writer, series, config, mask, path, progress)
             with Volume(writer.preview(header)) as volume:
                 quality = measure(series, volume, progress)
             header["quality"] = brief_quality(quality)

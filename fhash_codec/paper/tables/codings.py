@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.choices.transform import wavelet
-from fhash_codec.compact.tiles.coding import OFFSETS, SMALLEST_STEP
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, OFFSETS
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats
 from fhash_codec.paper.tables.tiles import Coding, Index, code_tile, components_of, tile_shape
@@ -119,7 +119,7 @@ def _coding(
     settings = tuple(
         TileSettings(
             transform=usual,
-            step=max(step, SMALLEST_STEP * float(b - a), SMALLEST),
+            step=max(step, MIN_STEP_SHARE * float(b - a), SMALLEST),
             center=_single(c),
             low=_single(a),
             high=_single(b),

@@ -8,6 +8,7 @@ from math import fsum
 
 import numpy as np
 
+from fhash_codec.compact.tiles.sample import spread_order
 from fhash_codec.coreset.boxes import box_size
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats, Network
@@ -17,7 +18,6 @@ from fhash_codec.paper.tables.bricks import Bricks
 from fhash_codec.paper.tables.tiles import Index
 from fhash_formats.transform.tile.encoding import Shape
 
-GOLDEN = 0.6180339887498949
 SLOPE_TILES, SLOPE_POINTS = 16, 1024
 """Tiles, and samples of each, at which derivatives are taken, about."""
 
@@ -53,9 +53,8 @@ class Samples:
     def chosen(self, most: int) -> list[Index]:
         """Evenly spread tiles of about so many samples together, at least one; in C order."""
         indices = list(self.counts)
-        order = sorted(range(len(indices)), key=lambda number: number * GOLDEN % 1.0)
         taken: list[Index] = []
-        for number in order:
+        for number in spread_order(len(indices)):
             if not taken or most >= self.counts[indices[number]]:
                 taken.append(indices[number])
                 most -= self.counts[indices[number]]

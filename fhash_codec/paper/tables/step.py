@@ -10,8 +10,8 @@ from math import prod
 
 import numpy as np
 
-from fhash_codec.compact.tiles.coding import SMALLEST_STEP
-from fhash_codec.compact.tiles.sample import pool
+from fhash_codec.compact.choices.search import Bracket, geometric_mean
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats, Network
@@ -23,6 +23,7 @@ from fhash_codec.paper.tables.tiles import Index, TiledTable, tile_shape
 from fhash_codec.paper.tables.trained_tables import TrainedTable, trained_tables
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
+from fhash_formats.support.threads import thread_pool
 
 MAX_LOSS = 0.1
 """dB that the coded tables may cost over the samples, where no PSNR is promised or it is out of reach."""
@@ -85,14 +86,14 @@ def code_tables(
         architecture, coreset.values.size, trained, samples.slopes(exact, chosen), step, workers
     )
     smallest = max(
-        SMALLEST, SMALLEST_STEP * max(s.high - s.low for coding in codings for s in coding.settings)
+        SMALLEST, MIN_STEP_SHARE * max(s.high - s.low for coding in codings for s in coding.settings)
     )
 
     def nearest(step: float, tiles: Sequence[Index], trials: int, stage: str) -> CodedTables:
         """With the largest step found that keeps what is allowed on some tiles."""
         own, count = samples.squares(exact, tiles)
         allowed = _allowed(own / count, psnr) * count - own
-        step, low, high = max(step, smallest), smallest, math.inf
+        step, bracket = max(step, smallest), Bracket(smallest, math.inf, middle=geometric_mean)
         best: CodedTables | None = None
         for trial in range(trials + MORE_TRIALS):
             progress(stage, min(trial, trials), trials, f"step {step:.3g}")
@@ -109,7 +110,7 @@ def code_tables(
             share = max(total - own, 0.0) / allowed
             if share <= 1 and (best is None or step > best.step):
                 best = found
-            low, high = (max(low, step), high) if share <= 1 else (low, min(high, step))
+            bracket = bracket.narrowed(step, too_low=share <= 1)
             if (
                 CLOSE <= share <= 1
                 or step == smallest
@@ -120,7 +121,7 @@ def code_tables(
             wanted = step * math.sqrt((1 + CLOSE) / 2 / max(share, 1e-3))
             if best is None and trial + 1 >= trials:
                 wanted = min(wanted, step / 2)
-            step = max(wanted if low < wanted < high else math.sqrt(low * high), smallest)
+            step = max(bracket.inside(wanted), smallest)
         return best or found
 
     return nearest(
@@ -142,7 +143,7 @@ def write_coded(
     progress: Progress,
 ) -> float:
     """Code trained tables as `code_tables` does and write them; the dB that it costs."""
-    with pool() as workers:
+    with thread_pool() as workers:
         coded = code_tables(architecture, coreset, fine, tables, layers, psnr, workers, progress)
         for level, table in enumerate(coded.tables, start=1):
             for number, (settings, mixing) in enumerate(

@@ -13,6 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.tiles.coding import WEIGHT
+from fhash_codec.compact.tiles.sample import MAX_TILES_AHEAD
+from fhash_codec.compact.tiles.tiling import shard_shape
 from fhash_codec.paper.network import Floats
 from fhash_codec.paper.regions import block_shape
 from fhash_codec.paper.storage import mixed
@@ -24,11 +26,7 @@ from fhash_formats.transform.tile.settings import TileSettings
 Index = tuple[int, int, int, int]
 TILE_STEPS, TILE_VERTICES = 8, 1 << 16
 """Time nodes of a tile, and about how many vertices of each."""
-MAX_TILES = 4096
-"""In one shard."""
 CACHE_BYTES = 64 << 20
-BATCH = 16
-"""Tiles that are worked on at a time."""
 ROUNDS = 2
 """Projections of what does not count."""
 
@@ -87,11 +85,7 @@ class TiledTable:
     @property
     def shard(self) -> tuple[int, ...]:
         """Vertices (t, z, y, x) of a shard: everything, or one layer of tiles in time where there are many."""
-        layers = self.grid[0] if prod(self.grid) <= MAX_TILES else 1
-        return (
-            layers * self.coding.tile[0],
-            *(n * count for n, count in zip(self.coding.tile[1:], self.grid[1:], strict=True)),
-        )
+        return shard_shape(self.coding.tile, self.grid)
 
     def streams(self, component: int) -> Iterator[bytes]:
         """The coded tiles of a component, in C order."""
@@ -109,8 +103,8 @@ class TiledTable:
 
     def _tiles(self, indices: Sequence[Index]) -> Iterator[tuple[Index, Floats]]:
         """Decoded tiles (t, z, y, x, E), full ones; a few are worked on at a time."""
-        for start in range(0, len(indices), BATCH):
-            batch = indices[start : start + BATCH]
+        for start in range(0, len(indices), MAX_TILES_AHEAD):
+            batch = indices[start : start + MAX_TILES_AHEAD]
             # What is cached, and what is read, is asked of one thread; coding is done by all.
             known = {index: self._decoded.get(("", index, 0)) for index in batch}
             pending = {index: self._begin(index) for index, found in known.items() if found is None}
