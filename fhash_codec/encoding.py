@@ -25,9 +25,6 @@ from fhash_formats.container import ContainerWriter
 from fhash_formats.errors import InputError, QualityError
 from fhash_formats.support.atomic import check_output
 
-PROFILES = {"compact": encode_compact, "paper": encode_paper}
-"""Function that writes the arrays of each profile."""
-
 DATA_SUFFIXES = frozenset(
     (".npy", ".h5", ".hdf5", ".nc", ".nc4", ".zarr", ".raw", ".vti", ".vtr", ".pvd", ".vtkhdf")
 )
@@ -65,9 +62,11 @@ def encode(
     with open_source(source) as series:
         check_output(path, force, sources=[*series.files, *_mask_files(config)])
         with ContainerWriter(path, force=force) as writer:
-            header, checkpoint = PROFILES[config.profile](
-                writer, series, config, mask, path, progress
-            )
+            checkpoint = None
+            if config.profile == "compact":
+                header = encode_compact(writer, series, config, mask, progress)
+            else:
+                header, checkpoint = encode_paper(writer, series, config, mask, path, progress)
             with Volume(writer.preview(header)) as volume:
                 quality = measure(series, volume, progress)
             header["quality"] = brief_quality(quality)

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.choices.transform import wavelet
-from fhash_codec.compact.tiles.coding import OFFSETS, SMALLEST_STEP
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, OFFSETS
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats
 from fhash_codec.paper.tables.tiles import (
@@ -144,7 +144,7 @@ def _choose_coding(
     settings = tuple(
         TileSettings(
             transform=plain,
-            step=max(quantiser_step, SMALLEST_STEP * float(last - first), MIN_STEP),
+            step=max(quantiser_step, MIN_STEP_SHARE * float(last - first), MIN_STEP),
             center=_single(middle),
             low=_single(first),
             high=_single(last),

@@ -11,6 +11,7 @@ from math import fsum
 
 import numpy as np
 
+from fhash_codec.compact.tiles.sample import spread_order
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats, Network
@@ -20,8 +21,6 @@ from fhash_codec.paper.tables.bricks import Bricks
 from fhash_codec.paper.tables.tiles import Index
 from fhash_formats.transform.tile.sections import Shape
 
-GOLDEN = 0.6180339887498949
-"""Golden ratio minus 1: multiples of it, modulo 1, spread evenly."""
 SLOPE_TILES = 16
 """About the number of tiles at which derivatives are taken."""
 SLOPE_POINTS = 1024
@@ -53,9 +52,8 @@ class Samples:
         They hold at most so many samples together, unless a single tile holds more.
         """
         indices = list(self.counts)
-        order = sorted(range(len(indices)), key=lambda number: number * GOLDEN % 1.0)
         chosen: list[Index] = []
-        for number in order:
+        for number in spread_order(len(indices)):
             if not chosen or samples >= self.counts[indices[number]]:
                 chosen.append(indices[number])
                 samples -= self.counts[indices[number]]

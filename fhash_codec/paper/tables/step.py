@@ -14,8 +14,8 @@ from math import prod
 
 import numpy as np
 
-from fhash_codec.compact.tiles.coding import SMALLEST_STEP
-from fhash_codec.compact.tiles.sample import pool
+from fhash_codec.compact.choices.search import Bracket, geometric_mean
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats, Network
@@ -27,6 +27,7 @@ from fhash_codec.paper.tables.tiles import Index, LevelCoding, TiledTable, tile_
 from fhash_codec.paper.tables.trained_tables import TrainedTable, trained_tables
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
+from fhash_formats.support.threads import thread_pool
 
 MAX_LOSS = 0.1
 """dB that coding may cost over the samples where no PSNR is promised or the promise is lost."""
@@ -138,7 +139,7 @@ class _StepSearch:
         )
         self._min_step = max(
             MIN_STEP,
-            SMALLEST_STEP
+            MIN_STEP_SHARE
             * max(
                 settings.high - settings.low
                 for coding in self._codings
@@ -161,7 +162,8 @@ class _StepSearch:
         """
         exact_squares, count = self._samples.squares(self._exact, tiles)
         allowed = _allowed_error(exact_squares / count, self._psnr) * count - exact_squares
-        step, low, high = max(step, self._min_step), self._min_step, math.inf
+        step = max(step, self._min_step)
+        bracket = Bracket(self._min_step, math.inf, middle=geometric_mean)
         best: CodedTables | None = None
         for trial in range(trials + MORE_TRIALS):
             self._progress(stage, min(trial, trials), trials, f"step {step:.3g}")
@@ -169,7 +171,7 @@ class _StepSearch:
             share = max(squares - exact_squares, 0.0) / allowed
             if share <= 1 and (best is None or step > best.step):
                 best = coded
-            low, high = (max(low, step), high) if share <= 1 else (low, min(high, step))
+            bracket = bracket.narrowed(step, too_low=share <= 1)
             last_trial = trial + 1 >= trials
             enough = best is not None and last_trial
             if CLOSE <= share <= 1 or step == self._min_step or enough:
@@ -178,9 +180,7 @@ class _StepSearch:
             next_step = step * math.sqrt((1 + CLOSE) / 2 / max(share, 1e-3))
             if last_trial:
                 next_step = min(next_step, step / 2)
-            if not low < next_step < high:
-                next_step = math.sqrt(low * high)
-            step = max(next_step, self._min_step)
+            step = max(bracket.inside(next_step), self._min_step)
         return best or coded
 
     def _coded(
@@ -228,7 +228,7 @@ def write_coded(
 
     The arguments are those of `code_tables`, after the container that is being written.
     """
-    with pool() as workers:
+    with thread_pool() as workers:
         coded = code_tables(architecture, coreset, fine, tables, layers, psnr, workers, progress)
         for level, table in enumerate(coded.tables, start=1):
             _write_table(writer, level, table)

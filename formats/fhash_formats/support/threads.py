@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -102,6 +103,36 @@ def share_out(work: Callable[[Sequence[Item]], None], items: Sequence[Item], thr
     shares = min(SHARES_PER_THREAD * workers, len(items))
     for _ in in_threads(work, [items[share::shares] for share in range(shares)], workers):
         pass
+
+
+def thread_pool() -> ThreadPoolExecutor:
+    """Create a pool of one thread per usable processor, for work that releases the GIL."""
+    return ThreadPoolExecutor(usable_threads(), thread_name_prefix="fhash-tile")
+
+
+def map_ahead(
+    pool: ThreadPoolExecutor,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    max_ahead: int,
+) -> Iterator[Result]:
+    """Yield `function(item)` for each item, in the order of the items.
+
+    The caller's thread reads the items, and at most `max_ahead` of them before their results are
+    yielded, so that memory stays bounded. Items that no thread has begun are left out if the
+    iteration ends early.
+    """
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) >= max_ahead:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
 
 
 class _Threads:
