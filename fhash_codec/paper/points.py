@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.paper.network import COLUMNS, PRODUCTS, DenseLayers, Floats, Network
+from fhash_codec.paper.pointwise import PointwiseLayers
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.support.threads import share_out, usable_threads
 
@@ -70,6 +71,7 @@ def sample_points(
     The derivatives are those of the model itself, through interpolation and network, per key frame and per vertex. On the border
     of two cells they are those of the cell after it, at the end of an axis those of the last cell, along an axis of one vertex 0;
     on a ReLU's kink those of its flat side. Points that lie close together are read together: a part of each table at a time.
+    A point has the same bits whatever other points are given with it, in whatever order (pointwise.py).
     Raises RegionError for a point outside the box, InputError for arrays that do not fit together.
     """
     threads = usable_threads(threads)
@@ -126,20 +128,17 @@ def _evaluate(
 ) -> tuple[Floats, Floats | None]:
     """Values (n,) at points (4, n) within the patches and, if asked for, derivatives (4, n)."""
     size, count = network.embedding_size, points.shape[1]
-    head = DenseLayers(network, count)
-    slopes = np.empty((4, network.features, count), np.float32)
+    layers = PointwiseLayers(network, count)
+    changes = np.zeros((4 if gradient else 0, len(layers.inputs) - 1, layers.inputs.shape[1]), "f4")
     for level, patch in enumerate(patches):
         rows = slice(level * size, (level + 1) * size)
         before, after, pace = _locate(network, level, points)
         corners = _corners(patch, before, network.levels[level])
-        head.inputs[rows, :count], changes = interpolate(corners, after, gradient)
-        for axis, change in enumerate(changes):
-            np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows])
-    values = head.run()[:count]
-    with np.errstate(over="ignore", invalid="ignore"):  # of hostile weights
-        return values, np.einsum(
-            "fn,afn->an", head.gradient()[:, :count], slopes
-        ) if gradient else None
+        layers.inputs[rows, :count], across = interpolate(corners, after, gradient)
+        for axis, change in enumerate(across):
+            np.multiply(change, np.float32(pace[axis]), out=changes[axis, rows, :count])
+    values = layers.run()[:count]
+    return values, layers.slopes(changes)[:, :count] if gradient else None
 
 
 def _points(network: Network, arrays: Sequence[npt.ArrayLike]) -> npt.NDArray[np.float64]:
