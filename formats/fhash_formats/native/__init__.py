@@ -1,7 +1,13 @@
-"""The native kernels: one shared library of C++ sources, called through ctypes, which lets go of the interpreter lock.
+"""Loader of the native library: C++ kernels that are called through ctypes.
 
-Whatever the library computes has a portable twin in numpy with the same bits, so it is a matter of speed only: where no compiler was at
-hand when the package was installed, or where the environment says `FHASH_NATIVE=0`, `library()` is None and the twins do the work.
+A call releases Python's global interpreter lock. Every native function has a portable twin in numpy
+that computes the same bits, so the library only adds speed. `library()` returns None where no
+compiler was available when the package was installed, and where the environment says
+`FHASH_NATIVE=0`. The portable twins then do the work.
+
+`PROTOTYPES` lists the exported functions that this package calls, with the types of their
+arguments. Every exported function returns an int64: at least 0 for success, below 0 for an error
+(core.hpp).
 """
 
 from __future__ import annotations
@@ -9,60 +15,155 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
+from collections.abc import Mapping
 from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
+from typing import Any
 
 from fhash_formats.errors import MissingDependencyError
 
-__all__ = ["ABI_VERSION", "library"]
+__all__ = [
+    "ABI_VERSION",
+    "ARRAY",
+    "FLOAT",
+    "INTEGER",
+    "PROTOTYPES",
+    "REAL",
+    "library",
+    "load_library",
+]
 
 ABI_VERSION = 6
-"""The number that `fhash_abi_version()` must return; `FHASH_ABI` in core.hpp is its twin."""
+"""Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
-_HERE = Path(__file__).parent
+ARRAY = ctypes.c_void_p
+"""Argument type of a pointer: an address, None, a `c_void_p`, or a ctypes array or pointer."""
+INTEGER = ctypes.c_int64
+"""Argument type of a size, a count or a flag."""
+REAL = ctypes.c_double
+"""Argument type of a float64 number."""
+FLOAT = ctypes.c_float
+"""Argument type of a float32 number."""
+
+Prototypes = Mapping[str, tuple[Any, ...]]
+"""Argument types of native functions by name; the result of each is an int64."""
+
+_SIZED = (ARRAY, INTEGER)
+_STATE = _SIZED * 3
+"""Slots, weights and simple estimates of an adaptive coder (`State`), each with its length."""
+_TRANSFORM = (ARRAY,) * 9
+_HEAD = (ARRAY, *(INTEGER,) * 5, *(ARRAY,) * 4, *(FLOAT,) * 4, ARRAY)
+_QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
+_DEQUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, REAL, ARRAY)
+_WITHIN = (ARRAY, ARRAY, ARRAY, INTEGER, REAL)
+_CLIP = (ARRAY, INTEGER, REAL, REAL, REAL)
+_FREE = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL)
+_RESIDUAL = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL, ARRAY)
+_CORRECT = (ARRAY, ARRAY, INTEGER, REAL, ARRAY)
+_TYPES = ("f32", "f64")
+_PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
+
+PROTOTYPES: Prototypes = {
+    # coder.cpp
+    "fhash_encode": (ARRAY, ARRAY, REAL, ARRAY, *_SIZED, *_STATE, INTEGER, *_SIZED),
+    "fhash_decode": (ARRAY, ARRAY, *_SIZED, *_STATE, *_SIZED),
+    # mask.cpp
+    "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
+    "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),
+    # predict.cpp
+    "fhash_encode_predicted": (*(ARRAY,) * 4, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
+    "fhash_decode_predicted": (*(ARRAY,) * 3, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
+    # lifting.cpp
+    **{f"fhash_transform_forward_{kind}": _TRANSFORM for kind in _TYPES},
+    **{f"fhash_transform_inverse_{kind}": _TRANSFORM for kind in _TYPES},
+    # head.cpp
+    "fhash_head_apply": _HEAD,
+    "fhash_head_apply_cross": _HEAD,
+    # quantise.cpp
+    **{f"fhash_quantise_{kind}": _QUANTISE for kind in _TYPES},
+    **{f"fhash_dequantise_{kind}": _DEQUANTISE for kind in _TYPES},
+    # values.cpp
+    **{f"fhash_within_{kind}": _WITHIN for kind in _TYPES},
+    **{f"fhash_clip_{kind}": _CLIP for kind in _TYPES},
+    **{f"fhash_free_{kind}": _FREE for kind in _TYPES},
+    **{f"fhash_residual_{pair}": _RESIDUAL for pair in _PAIRS},
+    **{f"fhash_correct_{pair}": _CORRECT for pair in _PAIRS},
+}
+"""Functions of this package's library that Python calls."""
+
+_FOLDER = Path(__file__).parent
 _LOCK = threading.Lock()
-_LOADED: dict[Path, ctypes.CDLL | None] = {}
+_LOADED: dict[tuple[Path, str, int], ctypes.CDLL | None] = {}
 
 
 def library() -> ctypes.CDLL | None:
-    """The loaded native library, or None where it was not built or the environment says `FHASH_NATIVE=0`.
+    """The native library of this package, or None; see `load_library`."""
+    return load_library(_FOLDER, "_core", ABI_VERSION, PROTOTYPES)
 
-    The library is loaded once; the environment is read at each call. Safe to call from several threads.
 
-    Raises MissingDependencyError where a library is there but cannot be loaded or was built from other sources (another ABI number).
+def load_library(
+    folder: Path,
+    name: str,
+    abi_version: int,
+    prototypes: Prototypes,
+    *,
+    version_symbol: str = "fhash_abi_version",
+) -> ctypes.CDLL | None:
+    """The native library `name` in a folder, its functions given their argument and result types.
+
+    The result is None where the library was not built or the environment says `FHASH_NATIVE=0`. A
+    library is loaded once; the environment is read at each call. Safe to call from several threads.
+
+    Args:
+        folder: folder of the Python package to which the extension belongs.
+        name: file name of the extension without its suffix.
+        abi_version: number that the library's function `version_symbol` must return.
+        prototypes: argument types of the functions that will be called.
+        version_symbol: exported function without arguments that returns the library's ABI number.
+
+    Raises:
+        MissingDependencyError: the library exists but cannot be loaded, lacks a function, or was
+            built from other sources (another ABI number).
     """
     if os.environ.get("FHASH_NATIVE") == "0":
         return None
-    if _HERE not in _LOADED:
+    key = (folder, name, abi_version)
+    if key not in _LOADED:
         with _LOCK:
-            if _HERE not in _LOADED:
-                _LOADED[_HERE] = _load(_HERE)
-    return _LOADED[_HERE]
+            if key not in _LOADED:
+                path = _find(folder, name)
+                _LOADED[key] = (
+                    None if path is None else _load(path, abi_version, prototypes, version_symbol)
+                )
+    return _LOADED[key]
 
 
-def _load(folder: Path) -> ctypes.CDLL | None:
-    path = next(
-        (
-            folder / f"_core{suffix}"
-            for suffix in EXTENSION_SUFFIXES
-            if (folder / f"_core{suffix}").is_file()
-        ),
-        None,
-    )
-    if path is None:
-        return None
+def _find(folder: Path, name: str) -> Path | None:
+    candidates = (folder / f"{name}{suffix}" for suffix in EXTENSION_SUFFIXES)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _load(path: Path, abi_version: int, prototypes: Prototypes, version_symbol: str) -> ctypes.CDLL:
     advice = "install the package again (pip install .), or set FHASH_NATIVE=0 to do without"
     try:
         loaded = ctypes.CDLL(str(path))
-        version = loaded.fhash_abi_version
+        _declare(loaded, version_symbol, ())
+        built = getattr(loaded, version_symbol)()
+        if built != abi_version:
+            raise MissingDependencyError(
+                f"the native library {path} has ABI {built}, "
+                f"this version of the package needs {abi_version}: {advice}"
+            )
+        for function, arguments in prototypes.items():
+            _declare(loaded, function, arguments)
     except (OSError, AttributeError) as error:
         raise MissingDependencyError(
             f"the native library {path} cannot be used ({error}): {advice}"
         ) from error
-    version.argtypes = []
-    version.restype = ctypes.c_int64
-    if version() != ABI_VERSION:
-        raise MissingDependencyError(
-            f"the native library {path} has ABI {version()}, this version of the package needs {ABI_VERSION}: {advice}"
-        )
     return loaded
+
+
+def _declare(loaded: ctypes.CDLL, name: str, arguments: tuple[Any, ...]) -> None:
+    function = getattr(loaded, name)
+    function.argtypes = arguments
+    function.restype = ctypes.c_int64

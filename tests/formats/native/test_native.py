@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from importlib.machinery import EXTENSION_SUFFIXES
@@ -11,8 +13,22 @@ import pytest
 
 from fhash_formats import native
 from fhash_formats.errors import MissingDependencyError
+from fhash_formats.native import ABI_VERSION, PROTOTYPES, load_library
 
 SOURCES = Path(native.__file__).parent
+
+needs_library = pytest.mark.skipif(
+    native.library() is None, reason="the native library was not built here"
+)
+
+
+@pytest.fixture
+def built_copy(tmp_path: Path) -> Path:
+    """A folder with a copy of the native library."""
+    paths = (SOURCES / f"_core{suffix}" for suffix in EXTENSION_SUFFIXES)
+    built = next(path for path in paths if path.is_file())
+    shutil.copy(built, tmp_path / built.name)
+    return tmp_path
 
 
 def test_the_environment_switches_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -22,39 +38,72 @@ def test_the_environment_switches_it_off(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_every_thread_gets_the_same_library() -> None:
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda _: native.library(), range(16)))
-    assert all(library is found[0] for library in found)
+        libraries = list(pool.map(lambda _: native.library(), range(16)))
+    assert all(library is libraries[0] for library in libraries)
 
 
 def test_a_folder_without_a_build_has_no_library(tmp_path: Path) -> None:
-    assert native._load(tmp_path) is None
+    assert load_library(tmp_path, "_core", ABI_VERSION, PROTOTYPES) is None
 
 
-def test_a_damaged_library_is_a_plain_error(tmp_path: Path) -> None:
-    (tmp_path / f"_core{EXTENSION_SUFFIXES[0]}").write_bytes(b"not a library")
-    with pytest.raises(MissingDependencyError, match="FHASH_NATIVE=0"):
-        native._load(tmp_path)
-
-
-@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
-def test_a_library_of_other_sources_is_a_plain_error(
+def test_a_damaged_library_is_a_plain_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    built = next(
-        path for suffix in EXTENSION_SUFFIXES if (path := SOURCES / f"_core{suffix}").is_file()
-    )
-    copy = tmp_path / built.name
-    shutil.copy(built, copy)
-    assert native._load(tmp_path) is not None
-    monkeypatch.setattr(native, "ABI_VERSION", native.ABI_VERSION + 1)
-    message = (
-        f"has ABI {native.ABI_VERSION - 1}, this version of the package needs {native.ABI_VERSION}"
-    )
+    monkeypatch.delenv("FHASH_NATIVE", raising=False)
+    (tmp_path / f"_core{EXTENSION_SUFFIXES[0]}").write_bytes(b"not a library")
+    with pytest.raises(MissingDependencyError, match="FHASH_NATIVE=0"):
+        load_library(tmp_path, "_core", ABI_VERSION, PROTOTYPES)
+
+
+@needs_library
+def test_a_library_of_other_sources_is_a_plain_error(built_copy: Path) -> None:
+    assert load_library(built_copy, "_core", ABI_VERSION, PROTOTYPES) is not None
+    message = f"has ABI {ABI_VERSION}, this version of the package needs {ABI_VERSION + 1}"
     with pytest.raises(MissingDependencyError, match=message):
-        native._load(tmp_path)
+        load_library(built_copy, "_core", ABI_VERSION + 1, PROTOTYPES)
+
+
+@needs_library
+@pytest.mark.parametrize(
+    ("prototypes", "version_symbol"),
+    [({"fhash_nothing": ()}, "fhash_abi_version"), (PROTOTYPES, "fhash_nothing")],
+)
+def test_a_library_that_lacks_a_function_is_a_plain_error(
+    built_copy: Path, prototypes: native.Prototypes, version_symbol: str
+) -> None:
+    with pytest.raises(MissingDependencyError, match=r"cannot be used .*fhash_nothing"):
+        load_library(built_copy, "_core", ABI_VERSION, prototypes, version_symbol=version_symbol)
+
+
+@needs_library
+def test_arguments_of_another_type_are_refused() -> None:
+    library = native.library()
+    assert library is not None
+    assert library.fhash_abi_version() == ABI_VERSION
+    with pytest.raises(ctypes.ArgumentError):
+        library.fhash_clip_f32(None, 0.5, 0.0, 0.0, 0.0)
 
 
 def test_the_sources_and_the_loader_agree_on_the_abi() -> None:
-    assert f"FHASH_ABI = {native.ABI_VERSION};" in (SOURCES / "core.hpp").read_text(
-        encoding="utf-8"
-    )
+    assert f"FHASH_ABI = {ABI_VERSION};" in (SOURCES / "core.hpp").read_text(encoding="utf-8")
+
+
+def test_the_prototypes_take_as_many_arguments_as_the_sources() -> None:
+    exported = re.compile(r"FHASH_EXPORT \S+ (fhash_\w+)\(([^)]*)\)")
+    checked = 0
+    for source in SOURCES.glob("*.cpp"):
+        for name, arguments in exported.findall(source.read_text(encoding="utf-8")):
+            if name in PROTOTYPES:
+                checked += 1
+                types = [
+                    "*" if "*" in argument else argument.split()[0].removeprefix("std::")
+                    for argument in arguments.split(",")
+                ]
+                names = {
+                    native.ARRAY: "*",
+                    native.INTEGER: "int64_t",
+                    native.REAL: "double",
+                    native.FLOAT: "float",
+                }
+                assert types == [names[kind] for kind in PROTOTYPES[name]], name
+    assert checked >= 16

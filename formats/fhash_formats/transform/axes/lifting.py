@@ -53,7 +53,6 @@ class _Plan:
                 )
         direction, width = "inverse" if inverse else "forward", values.dtype.itemsize * 8
         function = getattr(library, f"fhash_transform_{direction}_f{width}")
-        function.restype = ctypes.c_int64
         result = np.empty(values.shape, values.dtype)
         rank = 1 if inverse else 0
         ranks = [0 if matrix is None else matrix.shape[rank] for matrix in self.matrices]

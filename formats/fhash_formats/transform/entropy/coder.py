@@ -70,7 +70,6 @@ def encode_integers(
             integers, table, scaled, weight, state.copy() if not kept else state
         )
         return Encoded(data=data, integers=integers)
-    library.fhash_encode.restype = ctypes.c_int64
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
     capacity = max(4096, given.size // 2)
     while True:
@@ -101,7 +100,6 @@ def decode_integers(data: bytes | memoryview, shape: tuple[int, ...], table: Tab
 
         coder_portable.decode(integers, table, bytes(data), prior_state().copy())
         return integers
-    library.fhash_decode.restype = ctypes.c_int64
     source = np.frombuffer(data, dtype=np.uint8)
     code = library.fhash_decode(
         _pointer(integers),

@@ -64,7 +64,6 @@ def encode_mask(mask: Mask, levels: tuple[Levels, Levels], *, state: State | Non
         from fhash_formats.transform.entropy import mask_portable
 
         return mask_portable.encode(mask, levels, state if kept else state.copy())
-    library.fhash_encode_mask.restype = ctypes.c_int64
     bits, first, second = (np.ascontiguousarray(part, dtype=np.uint8) for part in (mask, *levels))
     capacity = max(4096, mask.size // 8)
     while True:
@@ -89,7 +88,6 @@ def decode_mask(data: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask
         from fhash_formats.transform.entropy import mask_portable
 
         return mask_portable.decode(bytes(data), levels, mask_prior_state().copy())
-    library.fhash_decode_mask.restype = ctypes.c_int64
     mask = np.empty(shape, dtype=np.uint8)
     first, second = (np.ascontiguousarray(part, dtype=np.uint8) for part in levels)
     source = np.frombuffer(data, dtype=np.uint8)

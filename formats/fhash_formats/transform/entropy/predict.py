@@ -88,7 +88,6 @@ def encode_predicted(
         from fhash_formats.transform.entropy import predict_portable
 
         return predict_portable.encode(integers, care, predictor, _blank().copy())
-    library.fhash_encode_predicted.restype = ctypes.c_int64
     marks = None if care is None else np.ascontiguousarray(care, dtype=np.uint8)
     capacity = max(4096, integers.size)
     while True:
@@ -115,7 +114,6 @@ def decode_predicted(
         from fhash_formats.transform.entropy import predict_portable
 
         return predict_portable.decode(bytes(data), shape, predictor, _blank().copy())
-    library.fhash_decode_predicted.restype = ctypes.c_int64
     integers = np.zeros(shape, dtype=np.int32)
     source = np.frombuffer(data, dtype=np.uint8)
     code = library.fhash_decode_predicted(

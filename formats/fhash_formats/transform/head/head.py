@@ -219,7 +219,6 @@ class NeighbourHead:
         )
         numbers = (ctypes.c_float(float(value)) for value in constants[3:])
         function = library.fhash_head_apply_cross if self.cross else library.fhash_head_apply
-        function.restype = ctypes.c_int64
         code = function(
             ctypes.c_void_p(source.ctypes.data),
             *sizes,

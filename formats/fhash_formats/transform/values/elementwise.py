@@ -224,7 +224,6 @@ def _native(name: str, *types: np.dtype[Any]) -> Any:
     if library is None or not all(kind in _NAMES for kind in types):
         return None
     function = getattr(library, "_".join(["fhash", name, *(_NAMES[kind] for kind in types)]))
-    function.restype = ctypes.c_int64
     return function
 
 
