@@ -23,7 +23,7 @@ from fhash_codec.rendering.colour.colour_spaces import (
 )
 from fhash_formats.errors import InputError
 
-__all__ = ["SPACES", "ColourMap", "is_map", "named_map", "parse_colour"]
+__all__ = ["SPACES", "ColourMap", "colour_code", "is_map", "named_map", "parse_colour"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -149,3 +149,8 @@ def parse_colour(text: str) -> tuple[float, float, float]:
         f"colour {text[:60]!r} is not known; write '#rrggbb' or a name"
         + (f"; did you mean '{near[0]}'?" if near else "")
     )
+
+
+def colour_code(colour: Floats) -> str:
+    """Write red, green and blue, 0..1, as '#rrggbb'."""
+    return "#" + "".join(f"{round(255 * float(channel)):02x}" for channel in colour)

@@ -15,8 +15,9 @@ from PIL import Image as Pictures
 import fhash_codec
 from fhash_codec import EncodeConfig, Renderer
 from fhash_codec.rendering.animation.animate import animate, numbered
-from fhash_codec.rendering.animation.animation import Animation, Key, mixed
+from fhash_codec.rendering.animation.animation import Animation, Key
 from fhash_codec.rendering.animation.film import film
+from fhash_codec.rendering.animation.mixing import mixed
 from fhash_codec.rendering.animation.tracking import (
     COLOURS,
     Tracked,
