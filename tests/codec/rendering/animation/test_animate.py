@@ -26,7 +26,8 @@ from fhash_codec.rendering.animation.tracking import (
     tracking_scene,
 )
 from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.camera.poses import CameraPath, pchip
+from fhash_codec.rendering.camera.curves import pchip
+from fhash_codec.rendering.camera.poses import CameraPath
 from fhash_codec.rendering.picture.evolution import evolution
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.scene.scene import (
