@@ -58,7 +58,7 @@ def test_preview_needs_no_quality_and_writing_may_go_on(tmp_path, samples) -> No
 
 
 class Stop(BaseException):
-    """As KeyboardInterrupt, without pytest's own ideas about that."""
+    """A stand-in for KeyboardInterrupt, which pytest would take for its own."""
 
 
 @pytest.mark.parametrize("failure", [None, ValueError("x"), Stop()])

@@ -1,4 +1,4 @@
-"""Leftovers of a killed writer are cleared away by the next one; a living writer keeps its files."""
+"""Leftovers of a killed writer are cleared away by the next one, those of a living one are kept."""
 
 from __future__ import annotations
 
