@@ -13,7 +13,7 @@ from fhash_codec.compact.choices.step import SLOPE
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.errors import InputError
-from fhash_formats.transform.head.inputs import CROSS, FEATURES
+from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def _widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, 
 
     def saved(hidden: tuple[int, int]) -> float:
         first, second = hidden
-        weights = FEATURES * first + len(CROSS) * first * second + second
+        weights = INPUTS * first + len(CROSS) * first * second + second
         return (
             size * (1 - 2 ** (-HEADS[hidden] * gain / octave) - WEIGHT_TIME * weights)
             - WEIGHT_BYTES * weights

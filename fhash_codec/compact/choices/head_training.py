@@ -23,8 +23,8 @@ from fhash_formats.transform.head.head import (
     NeighbourHead,
     layer_inputs,
 )
-from fhash_formats.transform.head.head_portable import centre_features, clip, compress
-from fhash_formats.transform.head.inputs import CROSS, FEATURES, STEPS
+from fhash_formats.transform.head.head_portable import centre_inputs, clip, compress
+from fhash_formats.transform.head.inputs import CROSS, INPUTS, OFFSETS
 
 __all__ = ["Pair", "TrainedHead", "train_head"]
 
@@ -56,7 +56,7 @@ class TrainedHead:
 class _Samples:
     """Batches of n voxels.
 
-    inputs: features (batches, FEATURES, voxels looked at, n), int16. targets, least and greatest useful output: (batches, n), in sigmas.
+    inputs: features (batches, INPUTS, voxels looked at, n), int16. targets, least and greatest useful output: (batches, n), in sigmas.
     """
 
     inputs: Tensor
@@ -259,7 +259,7 @@ def _samples(
     values, originals = (np.concatenate(parts) for parts in list(zip(*drawn, strict=True))[1:])
     order = random.permutation(len(values))
     batches = len(values) // _BATCH
-    inputs = np.empty((batches, FEATURES, len(seen), _BATCH), dtype=np.int16)
+    inputs = np.empty((batches, INPUTS, len(seen), _BATCH), dtype=np.int16)
     first = 0
     for (decoded, _, _), (places, _, _) in zip(pairs, drawn, strict=True):
         padded = np.pad(clip(decoded, low, high), ((1, 1), (2, 2), (2, 2), (2, 2)), mode="edge")
@@ -276,12 +276,12 @@ def _samples(
                 ]
             )
             centre = flat[at]
-            features = np.empty((FEATURES, *at.shape), dtype=np.int16)
-            for number, step in enumerate(STEPS):
+            features = np.empty((INPUTS, *at.shape), dtype=np.int16)
+            for number, step in enumerate(OFFSETS):
                 features[number] = compress(
                     (flat[at + int(strides @ np.array(step))] - centre) * inverse
                 )
-            features[-2:] = centre_features(centre, low, inverse, unit)
+            features[-2:] = centre_inputs(centre, low, inverse, unit)
             batch, slot = np.divmod(order[first : first + at.shape[1]], _BATCH)
             inputs[batch, :, :, slot] = features.transpose(2, 0, 1)
             first += at.shape[1]
@@ -335,7 +335,7 @@ def _errors(
 ) -> Tensor:
     """Corrected minus original values of a batch (starts, n) in units of sigma."""
     inputs = samples.inputs[batch].to(torch.float32).mul_(1 / 512)
-    values = inputs.reshape(1, FEATURES, -1).expand(len(parameters[0]), -1, -1)
+    values = inputs.reshape(1, INPUTS, -1).expand(len(parameters[0]), -1, -1)
     for layer in range(0, len(parameters), 2):
         weights, biases = parameters[layer : layer + 2]
         if rounded:
