@@ -13,7 +13,7 @@ from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.errors import InputError
-from fhash_formats.transform.head.inputs import CROSS, FEATURES
+from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def _best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[
 
     def saved(widths: tuple[int, int]) -> float:
         first, second = widths
-        weights = FEATURES * first + len(CROSS) * first * second + second
+        weights = INPUTS * first + len(CROSS) * first * second + second
         return (
             size * (1 - 2 ** (-GAIN_BY_WIDTHS[widths] * gain / octave) - WEIGHT_TIME * weights)
             - WEIGHT_BYTES * weights
