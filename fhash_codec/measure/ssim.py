@@ -1,5 +1,5 @@
 """Structural similarity of volumes (Wang et al. 2004): Gaussian window, population covariance, as scikit-image with
-`gaussian_weights=True, sigma=1.5, use_sample_covariance=False`. Native where it is there (fhash_formats/native/quality.cpp).
+`gaussian_weights=True, sigma=1.5, use_sample_covariance=False`. Native where it is there (fhash_codec/native/quality.cpp).
 
 In numpy filtering a tile is three products with small banded matrices, as the window is separable and short: ten times faster than adding
 shifted arrays.
@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.measure.sums import range_and_sum
 from fhash_codec.measure.value_range import pieces, power_of_two
-from fhash_formats import native
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import share_out, usable_threads
 

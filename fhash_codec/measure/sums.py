@@ -1,4 +1,4 @@
-"""Range, sum and squared errors of many values, native (fhash_formats/native/quality.cpp) or in numpy with the same bits.
+"""Range, sum and squared errors of many values, native (fhash_codec/native/quality.cpp) or in numpy with the same bits.
 
 Both add in one stated order, because what is measured steers the encoder, whose bytes must not depend on the machine: value i of a piece
 of PIECE values goes to lane i % LANES; each lane is added up in order, then the lanes, then the pieces.
@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.measure.value_range import pieces
-from fhash_formats import native
 
 __all__ = ["Values", "range_and_sum", "squared_errors"]
 

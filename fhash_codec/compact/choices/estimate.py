@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Blocks, Index
 from fhash_codec.compact.tiles.coding import SMALLEST_STEP, Coding, code
 from fhash_codec.compact.tiles.tiling import even_tile
-from fhash_formats import native
 from fhash_formats.transform.tile.encoding import transform_for
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -73,7 +73,7 @@ class Magnitudes:
 
 
 def magnitudes(coefficients: npt.NDArray[np.float32]) -> Magnitudes:
-    """How large coefficients are; the same figures native (fhash_formats/native/quality.cpp) and in numpy."""
+    """How large coefficients are; the same figures native (fhash_codec/native/quality.cpp) and in numpy."""
     flat = np.ascontiguousarray(coefficients, dtype=np.float32).reshape(-1)
     library = native.library()
     if library is None:

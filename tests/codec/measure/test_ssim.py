@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from skimage import metrics
 
+from fhash_codec import native
 from fhash_codec.measure.metrics import ssim, ssim_steps
 from fhash_codec.paper import network
-from fhash_formats import native
 from fhash_formats.errors import InputError
 
 SHAPES = [

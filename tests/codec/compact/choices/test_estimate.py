@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from fhash_codec import native
 from fhash_codec.compact.choices.estimate import foreseen_step, magnitudes
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Blocks
@@ -17,7 +18,6 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import select_features
 from fhash_codec.encoding import encode
 from fhash_codec.progress import silent
-from fhash_formats import native
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import ArraySeries
 from fhash_formats.transform.tile.settings import TileSettings
