@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.rendering.task.palette import Palette
 from fhash_codec.rendering.task.task import Frame, Task
-from fhash_formats import native
 from fhash_formats.support.threads import in_threads
 
 __all__ = ["SIDE", "Bricks"]

@@ -15,10 +15,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Shadows
 from fhash_codec.rendering.task.task import Frame, LightGrid, Table, extinctions_in
-from fhash_formats import native
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import in_threads
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, FhashWarning, Renderer, Scene, Volume
+from fhash_codec import EncodeConfig, FhashWarning, Renderer, Scene, Volume, native
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.task.arrays import Arrays
-from fhash_formats import native
 
 SHAPE = (3, 20, 24, 28)
 

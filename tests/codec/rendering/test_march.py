@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Camera, Shadows
 from fhash_codec.rendering.task.light import light_grid
 from fhash_codec.rendering.task.task import Frame, Lighting, Surface, Table, Task
-from fhash_formats import native
 from fhash_formats.errors import InputError
 
 LIGHTING = Lighting(ambient=0.2, diffuse=0.8, specular=0.3, specular_power=16.0, lamp=None)

@@ -45,6 +45,7 @@ def test_an_overrun_is_found(folder, tmp_path, monkeypatch):
     )
     monkeypatch.setattr(run, "NATIVE", tmp_path)
     monkeypatch.setattr(run, "SOURCES", ("quantise",))
+    monkeypatch.setattr(run, "CODEC_SOURCES", ())
     monkeypatch.setattr(run, "TARGETS", (run.HERE / "overrun.cpp",))
     try:
         found = run.fuzz(

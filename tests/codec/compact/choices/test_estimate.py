@@ -21,7 +21,6 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import select_features
 from fhash_codec.encoding import encode
 from fhash_codec.progress import silent
-from fhash_formats import native
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import ArraySeries
 from fhash_formats.transform.tile.settings import TileSettings
@@ -78,7 +77,7 @@ import sys, warnings
 sys.modules["numba"] = None  # compiling takes longer than this small series
 warnings.simplefilter("ignore")
 import numpy, fhash_codec
-from fhash_formats import native
+from fhash_codec import native
 assert native.library() is None
 config = fhash_codec.EncodeConfig(psnr=40.0, effort=1, timings=False, tile="3x6x5x12")
 fhash_codec.encode(numpy.load(sys.argv[1]), sys.argv[2], config)

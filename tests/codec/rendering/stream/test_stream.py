@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import Renderer, Scene, Volume
+from fhash_codec import Renderer, Scene, Volume, native
 from fhash_codec.paper.network import Network
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.picture.image import Image
@@ -29,7 +29,6 @@ from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.devices import arrays_on
 from fhash_codec.rendering.task.light import light_grid
 from fhash_codec.rendering.task.task import Frame, Lighting, Marched, Surface, Table, Task
-from fhash_formats import native
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
 
