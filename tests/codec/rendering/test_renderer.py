@@ -1,9 +1,7 @@
-"""Pictures of whole files: the function, what a renderer keeps, the counters."""
+"""Renderers: pictures of files, the frames that are kept, and the counters."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -28,41 +26,11 @@ def scene(**parts: Any) -> Scene:
     return Scene.from_dict({**SMALL, **parts})
 
 
-def test_the_function_renders_a_picture(volume: Volume) -> None:
-    image = fhash_codec.render(volume, scene())
-    assert image.rgba.shape == (32, 40, 4)
-    assert image.rgba[..., 3].max() > 0.1
-    assert image.source == volume.path.name
-    assert image.seconds > 0
-    assert image._repr_png_().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "import fhash_codec; f = fhash_codec.render",
-        "import fhash_codec.rendering.scene.scene; f = fhash_codec.render",
-        "import fhash_codec.rendering.renderer; f = fhash_codec.render",
-        "from fhash_codec import render as f; import fhash_codec.rendering.scene.scene as s; s.Scene()",
-        "from fhash_codec import *; f = render; from fhash_codec.rendering.scene.scene import Scene",
-    ],
-)
-def test_the_function_is_the_same_whatever_was_imported_before(statement: str) -> None:
-    subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            f"{statement}; import fhash_codec.rendering; assert fhash_codec.rendering.render is f",
-        ],
-        check=True,
-    )
-
-
 def test_a_picture_is_what_its_file_says(volume: Volume, tmp_path: Path) -> None:
-    wanted = scene(effects={"box": True, "colour_bar": True}, step=1)
-    image = fhash_codec.render(volume, wanted)
+    shown = scene(effects={"box": True, "colour_bar": True}, step=1)
+    image = fhash_codec.render(volume, shown)
     image.save(tmp_path / "view.png")
-    assert scene_in_png(tmp_path / "view.png") == wanted
+    assert scene_in_png(tmp_path / "view.png") == shown
     again = fhash_codec.render(volume, scene_in_png(tmp_path / "view.png"))
     np.testing.assert_array_equal(again.rgba, image.rgba)
 
@@ -95,13 +63,13 @@ def test_what_comes_next_is_decoded_beside(volume: Volume, monkeypatch: pytest.M
     monkeypatch.setattr(module, "decoded_frame", counted)
     renderer, alone = Renderer(volume), Renderer(volume)
     shown = [scene(step=step) for step in (0, 1, 2)]
-    for each, following in zip(shown, [*shown[1:], None], strict=True):
+    for current, following in zip(shown, [*shown[1:], None], strict=True):
         np.testing.assert_array_equal(
-            renderer.render(each, upcoming=following).rgba, alone.render(each).rgba
+            renderer.render(current, upcoming=following).rgba, alone.render(current).rgba
         )
     assert [entry for entry in decoded if not entry[1]] == [(1, False), (2, False)]
     assert sorted(entry[0] for entry in decoded) == [0, 0, 1, 1, 2, 2]
-    # What nobody came for, what cannot be planned and what is not decoded at all do no harm.
+    # Prefetched frames that are not needed, and scenes without a plan or a frame, do no harm.
     renderer.render(shown[0], upcoming=scene(step=0.5))
     assert renderer.render(scene(step=1.5)).rgba.any()
     renderer.render(shown[0], upcoming=scene(step=99))
@@ -146,10 +114,10 @@ def test_a_part_of_the_volume_makes_the_picture_of_all(volume: Volume) -> None:
     renderer = Renderer(volume)
     frame = renderer._frame(renderer.plan(close), lambda *_: None).frame
     assert frame.values.size < np.prod(volume.shape[1:])
-    part = renderer.render(close)
+    cropped = renderer.render(close)
     full = Renderer(volume)
     full.render(scene())
-    np.testing.assert_allclose(full.render(close).rgba, part.rgba, atol=1e-5)
+    np.testing.assert_allclose(full.render(close).rgba, cropped.rgba, atol=1e-5)
 
 
 def test_nothing_in_the_picture_is_an_empty_picture(volume: Volume) -> None:
