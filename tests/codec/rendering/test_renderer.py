@@ -35,15 +35,21 @@ def test_a_picture_is_what_its_file_says(volume: Volume, tmp_path: Path) -> None
     np.testing.assert_array_equal(again.rgba, image.rgba)
 
 
-def test_what_was_decoded_is_kept(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    decoded: list[float] = []
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The steps that renderers decode, in order."""
+    steps: list[float] = []
     original = module.decoded_frame
 
-    def counted(volume: Volume, step: float, *others: Any) -> Any:
-        decoded.append(step)
+    def noted(volume: Volume, step: float, *others: Any) -> Any:
+        steps.append(step)
         return original(volume, step, *others)
 
-    monkeypatch.setattr(module, "decoded_frame", counted)
+    monkeypatch.setattr(module, "decoded_frame", noted)
+    return steps
+
+
+def test_what_was_decoded_is_kept(renderer: Renderer, decoded: list[float]) -> None:
     first = renderer.render(scene())
     renderer.render(scene(camera={"azimuth": 40}))
     renderer.render(scene(step=2))
@@ -97,23 +103,25 @@ def test_a_failure_beside_is_that_of_its_own_picture(
         renderer.render(scene(step=1))
 
 
-def test_what_does_not_fit_is_not_kept(volume: Volume) -> None:
+def test_what_does_not_fit_is_not_kept(volume: Volume, decoded: list[float]) -> None:
     frame = int(np.prod(volume.shape[1:])) * 4
     small = Renderer(volume, memory=frame + 10)
-    for step in (0, 1, 2):
+    for step in (0, 1, 1, 2, 1):
         small.render(scene(step=step))
-    assert [key[0] for key in small._frames] == [2]
+    assert decoded == [0, 1, 2, 1]
+    decoded.clear()
     none = Renderer(volume, memory=10)
-    assert none.render(scene()).rgba[..., 3].any()
-    assert not none._frames
+    for _ in range(2):
+        assert none.render(scene()).rgba[..., 3].any()
+    assert decoded == [0, 0]
 
 
 def test_a_part_of_the_volume_makes_the_picture_of_all(volume: Volume) -> None:
     volume.chunks = (1, 4, 4, 4)
     close = scene(camera={"zoom": 6, "projection": "parallel", "view": "xy"})
     renderer = Renderer(volume)
-    frame = renderer._frame(renderer.plan(close), lambda *_: None).frame
-    assert frame.values.size < np.prod(volume.shape[1:])
+    region = renderer.plan(close).region
+    assert np.prod([high - low for low, high in region]) < np.prod(volume.shape[1:])
     cropped = renderer.render(close)
     full = Renderer(volume)
     full.render(scene())
