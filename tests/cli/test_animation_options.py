@@ -1,4 +1,4 @@
-"""Options for several pictures: their values, which exclude each other, and what is written."""
+"""Options for several pictures: values, options that exclude each other, and outputs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SMALL = Scene(size=(24, 18))
 
 @click.group(cls=Program)
 def program() -> None:
-    """Stands for fhash."""
+    """A stand-in for fhash."""
 
 
 @click.command("render")
@@ -37,7 +37,7 @@ def program() -> None:
 @click.option("--force", is_flag=True)
 @add_animation_options
 def render(run: str, output: str, force: bool, several: AnimationOptions) -> None:
-    """Stands for `fhash render`."""
+    """A stand-in for `fhash render`."""
     with fhash_codec.open(run) as volume, Progress(quiet=True) as progress:
         scene = several.over(SMALL, volume)
         if several.several(scene):

@@ -1,4 +1,4 @@
-"""`fhash decode`: what comes out of any region, time and format is what the volume itself gives."""
+"""`fhash decode`: values of any region, time and format are those that the volume gives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fhash encode`: the report, determinism, what happens to promises, warnings and Ctrl-C."""
+"""`fhash encode`: the report, determinism, promises, warnings and Ctrl-C."""
 
 from __future__ import annotations
 

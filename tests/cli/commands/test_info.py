@@ -1,4 +1,4 @@
-"""`fhash info`: what it prints of a sound file, and that each command refuses a damaged one."""
+"""`fhash info`: the description of a sound file; every command refuses a damaged one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fhash render`: pictures from the command line, their reports, and what is refused."""
+"""`fhash render`: pictures from the command line, their reports, and refusals."""
 
 from __future__ import annotations
 

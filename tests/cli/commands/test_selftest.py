@@ -16,7 +16,7 @@ from fhash_codec.selftest.results import CaseResult, Summary
 
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
-    """Puts a figure in place of every case: {"worst": figure}; what was asked for is added."""
+    """Replaces every case by a figure, {"worst": figure}; the request is added to the dict."""
     asked: dict[str, float] = {"worst": 0.5}
 
     def run(
