@@ -32,7 +32,7 @@ def series(field: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPatch) ->
 
 def test_every_engine_is_measured_in_turns(series: ArraySeries) -> None:
     calls: list[tuple[Any, ...]] = []
-    report = bench_train(series, CONFIG, seconds=0.03, progress=lambda *words: calls.append(words))
+    report = bench_train(series, CONFIG, seconds=0.01, progress=lambda *words: calls.append(words))
     assert [entry["engine"] for entry in report["engines"]] == list(ENGINES)
     measured = [words for words in calls if words[0] == "measuring"]
     assert [words[3] for words in measured] == list(ENGINES) * TURNS
@@ -48,7 +48,7 @@ def test_every_engine_is_measured_in_turns(series: ArraySeries) -> None:
 
 
 def test_there_is_no_ratio_without_the_naive_engine(series: ArraySeries) -> None:
-    (entry,) = bench_train(series, CONFIG, engines=("slab",), seconds=0.03)["engines"]
+    (entry,) = bench_train(series, CONFIG, engines=("slab",), seconds=0.01)["engines"]
     assert (entry["train_ratio"], entry["infer_ratio"]) == (None, None)
 
 
