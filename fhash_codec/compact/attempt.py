@@ -67,7 +67,7 @@ class PlanTask:
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """How the series would be coded, by the choices made so far."""
+    """The coding of the series by the choices made so far."""
 
     sample: Sample
     """Tiles that the choices are tried on; their grid is the chosen one."""

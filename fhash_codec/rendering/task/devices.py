@@ -5,19 +5,20 @@ from __future__ import annotations
 import ctypes
 import sys
 
+from fhash_codec.rendering.scene.scene import DEVICES
 from fhash_codec.rendering.task.arrays import NUMPY, Arrays
 from fhash_formats.errors import InputError
 
-DEVICES = ("auto", "cpu", "cuda")
-
-
 DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+"""Library of CUDA's driver."""
 
 
 def arrays_on(device: str) -> Arrays:
-    """The arrays of a device: 'cpu' is numpy, 'cuda' torch's, 'auto' those of CUDA where it is to be had and numpy's elsewhere.
+    """The arrays of a device.
 
-    Raises InputError for another name, and for 'cuda' where there is none. torch is imported only where there is a driver of CUDA.
+    'cpu' is numpy, 'cuda' torch on CUDA, 'auto' CUDA where it is available and numpy elsewhere. torch
+    is imported only where a driver of CUDA is installed. Raises InputError for another name, and for
+    'cuda' without a CUDA device.
     """
     if device not in DEVICES:
         raise InputError(f"device is '{device}'; allowed: {', '.join(DEVICES)}")
