@@ -14,7 +14,8 @@ import numpy as np
 
 from fhash_formats.errors import InputError
 from fhash_formats.transform.axes.spec import AXES, AxisTransform, TransformSpec
-from fhash_formats.transform.entropy.table import _NONE, COLUMNS, Table
+from fhash_formats.transform.entropy.table import COLUMNS, Table
+from fhash_formats.transform.entropy.table import NO_REFERENCE as _NONE
 
 __all__ = ["band_table"]
 
