@@ -259,8 +259,8 @@ def _bound(quality: Quality, low: Any, high: Any, dtype: np.dtype[Any]) -> tuple
             else fraction * float(high) - fraction * float(low)
         )
     if dtype.kind != "f":
-        whole = math.floor(error) if math.isfinite(error) else 1 << 64
-        return error, whole + 0.5
+        largest = math.floor(error) if math.isfinite(error) else 1 << 64
+        return error, largest + 0.5
     return error, error - max(abs(low), abs(high)) * float(np.finfo(dtype).eps)
 
 
