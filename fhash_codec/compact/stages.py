@@ -1,6 +1,6 @@
 """Stages of planning: each takes the best attempt so far and returns a better one.
 
-The order of the trials is part of the format of the encoder: another order gives other bytes.
+Another order of the trials would give other bytes in the file.
 """
 
 from __future__ import annotations
