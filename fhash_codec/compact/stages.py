@@ -192,7 +192,7 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
 
 
 def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Under a strict bound, train a predictor, and keep it if the file gets smaller by it."""
+    """Train a predictor for a strict bound, and keep it if the file gets smaller by it."""
     goal, effort = task.goal, task.config.effort
     if effort == 1 or not goal.error or goal.data_range <= 0:
         return attempt
