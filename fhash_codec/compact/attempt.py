@@ -16,7 +16,7 @@ from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Feature
 from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.transform.tile.sections import Shape
+from fhash_formats.transform.tile.encoding import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
 
@@ -67,7 +67,7 @@ class PlanTask:
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """The coding of the series by the choices made so far."""
+    """Settings and options that the series would be coded with, by the choices made so far."""
 
     sample: Sample
     """Tiles that the choices are tried on; their grid is the chosen one."""
