@@ -34,7 +34,7 @@ class PaperModel:
         header = container.header
         self._container = container
         self._range = ValueRange(*header["value_range"])
-        self._box: Box = tuple((low, high) for low, high in header["feature_bounding_box"])  # type: ignore[assignment]
+        self._box = Box.of(header["feature_bounding_box"])
         self.chunks: tuple[int, ...] = (1, *header["domain"]["shape"][1:])
         self._unpacked = lru_cache(maxsize=4)(self._unpack)
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.paper.network import MAX_GRADIENT_SAMPLES, DenseLayers, Floats, Network
+from fhash_codec.paper.pointwise import PointwiseLayers
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.support.threads import share_out, usable_threads
 
@@ -85,7 +86,8 @@ def sample_points(
     * Along an axis of one vertex they are 0.
     * On a ReLU's kink they are those of its flat side.
 
-    Points that lie close together share one read of a part of each table.
+    Points that lie close together share one read of a part of each table. A point has the same
+    bits whatever other points are given with it, in whatever order (pointwise.py).
 
     Args:
         network: the trained network.
@@ -141,7 +143,8 @@ def input_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
     slopes = np.empty((network.inputs, points.shape[1]), np.float32)
     for start in range(0, points.shape[1], CHUNK_POINTS):
         chunk = points[:, start : start + CHUNK_POINTS]
-        layers, _ = _encode(network, patches, chunk, gradient=False)
+        layers = DenseLayers(network, chunk.shape[1])
+        _encode(network, patches, chunk, layers.inputs)
         layers.run()
         slopes[:, start : start + chunk.shape[1]] = layers.gradient()[:, : chunk.shape[1]]
     return slopes
@@ -183,33 +186,36 @@ def _evaluate(
 ) -> tuple[Floats, Floats | None]:
     """Return values (n,) and, with `gradient`, derivatives (4, n) at points (4, n) in patches."""
     count = points.shape[1]
-    layers, slopes = _encode(network, patches, points, gradient)
+    layers = PointwiseLayers(network, count)
+    slopes = _encode(network, patches, points, layers.inputs, gradient=gradient)
     values = layers.run()[:count]
     if not gradient:
         return values, None
-    # Hostile weights overflow.
-    with np.errstate(over="ignore", invalid="ignore"):
-        return values, np.einsum("fn,afn->an", layers.gradient()[:, :count], slopes)
+    return values, layers.slopes(slopes)[:, :count]
 
 
 def _encode(
-    network: Network, patches: Sequence[Patch], points: npt.NDArray[np.float64], gradient: bool
-) -> tuple[DenseLayers, Floats]:
-    """Return layers whose inputs are the interpolated embeddings at points (4, n).
+    network: Network,
+    patches: Sequence[Patch],
+    points: npt.NDArray[np.float64],
+    inputs: Floats,
+    *,
+    gradient: bool = False,
+) -> Floats:
+    """Write the interpolated embeddings at points (4, n) into the first n columns of `inputs`.
 
-    With `gradient`, also return the derivatives (4, inputs, n) of the embeddings by the position.
+    Return their derivatives (4, inputs, columns) by the position; with `gradient` unset, none.
     """
     size, count = network.embedding_size, points.shape[1]
-    layers = DenseLayers(network, count)
-    slopes = np.empty((4 if gradient else 0, network.inputs, count), np.float32)
+    slopes = np.zeros((4 if gradient else 0, network.inputs, inputs.shape[1]), np.float32)
     for level, patch in enumerate(patches):
         rows = slice(level * size, (level + 1) * size)
         before, after_weights, pace = _locate(network, level, points)
         corners = _corners(patch, before, network.levels[level])
-        layers.inputs[rows, :count], changes = interpolate(corners, after_weights, gradient)
+        inputs[rows, :count], changes = interpolate(corners, after_weights, gradient)
         for axis, change in enumerate(changes):
-            np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows])
-    return layers, slopes
+            np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows, :count])
+    return slopes
 
 
 def _points(network: Network, arrays: Sequence[npt.ArrayLike]) -> npt.NDArray[np.float64]:

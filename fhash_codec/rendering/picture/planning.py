@@ -293,7 +293,7 @@ def _table(function: TransferFunction, units: Units) -> Table:
 
 
 def _surfaces(effects: Effects, function: TransferFunction, units: Units) -> tuple[Surface, ...]:
-    """The isosurfaces that can be seen, in marched units; their colour is the value's by default."""
+    """The visible isosurfaces in marched units; without a colour they take the value's."""
     return tuple(
         Surface(
             value=float(units.to(surface.value)),

@@ -1,4 +1,12 @@
-"""A network's values at scattered places of one key index, for streamed samples: by numpy, or with whole tables on a device."""
+"""A network's values at scattered places of one key index, for streamed samples.
+
+On the host the value of a place has the same bits whatever other places are evaluated with it.
+On a device it has not: a library of matrix products chooses its kernels by the number of samples.
+There two evaluations of a place differ by at most twice the rounding error of the layers' sums:
+a sum of k products is off by at most k u / (1 - k u) times the sum of their magnitudes, u = 2**-24,
+in each layer, and a layer hands on the error of the layer before it. Slopes at a place within that
+distance of a kink of a ReLU may be those of either side.
+"""
 
 from __future__ import annotations
 

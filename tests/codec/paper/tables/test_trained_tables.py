@@ -18,8 +18,8 @@ from fhash_codec import EncodeConfig, QualityError
 from fhash_codec.coreset.occupancy import unpack
 from fhash_codec.coreset.selection import open_source
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.points import input_slopes
 from fhash_codec.paper.network import ArrayTable, Network
+from fhash_codec.paper.points import input_slopes
 from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.selection import select
 from fhash_codec.paper.storage import finest_frame, mix_components

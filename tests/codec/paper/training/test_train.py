@@ -13,7 +13,7 @@ from fhash_codec.coreset.scan import scan
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.training.checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
-from fhash_codec.paper.training.train import TrainingProgress, Diverged, plan_training, train
+from fhash_codec.paper.training.train import Diverged, TrainingProgress, plan_training, train
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError, TrainingError
 from fhash_formats.series import ArraySeries

@@ -11,7 +11,8 @@ from fhash_codec.rendering.camera.box import edges, outer_edges
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.colour.colours import named_map
 from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.picture.overlay import overlay, ticks, time_text
+from fhash_codec.rendering.picture.overlay import overlay, time_text
+from fhash_codec.rendering.picture.ticks import ticks
 from fhash_codec.rendering.scene.scene import Camera, Effects, Scene
 from fhash_formats.series import Coordinate
 
