@@ -16,7 +16,7 @@ from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Feature
 from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
 

@@ -18,7 +18,7 @@ from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.transform.axes.basis import MAX_LENGTH, fit_basis
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
 Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]

@@ -25,7 +25,6 @@ _KLT_PLANE = 13
 """Kind of a plane that is spanned by a basis of the data."""
 _LEVELS_APART = 4
 """Finest levels that have kinds of their own; coarser levels share the last one's."""
-"""Columns of a reference to no band."""
 
 
 class Span(NamedTuple):
