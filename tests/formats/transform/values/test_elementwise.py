@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -94,7 +95,7 @@ def test_bounds(dtype: str, counted: Any, monkeypatch: pytest.MonkeyPatch) -> No
         other = given.copy()
         other[at] = bad
         expected = counted is not None and not counted[at]
-        assert both(lambda other=other: within(given, other, 1.0, counted), monkeypatch) == expected  # type: ignore[misc]
+        assert both(partial(within, given, other, 1.0, counted), monkeypatch) == expected
     special = values(dtype)
     assert not both(lambda: within(special, special, 0.0), monkeypatch)  # NaN is near nothing
     plain = np.where(np.isnan(special), 0, special).astype(dtype)
@@ -127,7 +128,7 @@ def test_residuals(
     assert result is not None
     assert result[1] == np.count_nonzero(result[0]) > 0
     for out in ("f4", "f8", "f2", "i2"):
-        both(lambda out=out: corrected(other, result[0], quantum, np.dtype(out)), monkeypatch)  # type: ignore[misc]
+        both(partial(corrected, other, result[0], quantum, np.dtype(out)), monkeypatch)
     rest = given.astype("f8") - corrected(other, result[0], quantum, np.dtype("f8"))
     assert np.abs(rest if counted is None else rest[counted]).max() <= quantum / 2 * (1 + 1e-9)
 
