@@ -108,7 +108,6 @@ def _call(
     name: `scan` or `errors`; the function of the type of the values is called.
     """
     function = getattr(library, f"fhash_{name}_f{values.dtype.itemsize * 8}")
-    function.restype = ctypes.c_int64
     output = (ctypes.c_double * results)()
     numbers = (ctypes.c_double(value) if isinstance(value, float) else value for value in arguments)
     return function(_pointer(values), *numbers, output), *output

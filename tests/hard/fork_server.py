@@ -20,29 +20,28 @@ import fhash_cli.commands.encode
 import fhash_cli.commands.render  # noqa: F401 - imported for the forks
 from fhash_cli.main import main
 
-MODULES = (
+OWN = (
     "fhash_codec",
     "fhash_codec.encoding",
     "fhash_codec.compact.tiles_to_promise",
     "fhash_codec.isosurface",
+    "fhash_codec.paper.engines.slab",
+    "fhash_codec.paper.training.checkpoint",
+    "fhash_codec.paper.training.train",
     "fhash_codec.rendering.renderer",
+    "fhash_formats.container",
 )
-OTHERS = (
+"""Modules of fhash that are imported before the first fork."""
+LIBRARIES = (
     "h5py",
     "zarr",
     "xarray",
     "h5netcdf",
     "PIL.PngImagePlugin",
     "PIL.GifImagePlugin",
-    "fhash_formats.container",
     "scipy.special",
 )
-TRAINING = (
-    "torch",
-    "fhash_codec.paper.engines.portable",
-    "fhash_codec.paper.training.checkpoint",
-    "fhash_codec.paper.training.train",
-)
+"""Libraries that are imported before the first fork, if they are installed."""
 
 
 def run(words: list[str], log: str, inject: list[list[Any]]) -> None:
@@ -74,7 +73,9 @@ def serve() -> None:
     import importlib
     import importlib.util
 
-    for name in (*MODULES, *OTHERS, *TRAINING):
+    for name in OWN:
+        importlib.import_module(name)
+    for name in LIBRARIES:
         if importlib.util.find_spec(name) is not None:
             importlib.import_module(name)
     print("ready", flush=True)

@@ -62,15 +62,15 @@ def command(
     """
     if report is not None:
         check_writable(report, force)
-    from fhash_codec.selftest.cases.catalogue import chosen
+    from fhash_codec.selftest.cases.catalogue import choose_cases
     from fhash_codec.selftest.workers import run_cases
 
     begun = time.perf_counter()
-    cases = chosen(names=names, groups=groups, everything=everything)
+    cases = choose_cases(names=names, groups=groups, everything=everything)
     with Progress(quiet=quiet) as progress:
         summary = run_cases(cases, everything=everything, processes=processes, progress=progress)
     if report is not None:
-        from fhash_codec.selftest.environment import surroundings
+        from fhash_codec.selftest.environment import describe_machine
         from fhash_codec.selftest.report import markdown
         from fhash_formats.support.atomic import replacing
 
@@ -81,7 +81,8 @@ def command(
                 *(f" --group {name}" for name in groups),
             ]
         )
-        where = f"It took {(time.perf_counter() - begun) / 60:.1f} minutes with {surroundings()}."
+        minutes = (time.perf_counter() - begun) / 60
+        where = f"It took {minutes:.1f} minutes with {describe_machine()}."
         with replacing(Path(report), force=force) as temporary:
             temporary.write_text(markdown(summary, options=given, where=where), encoding="utf-8")
     emit(summary.to_dict(), _text(summary), as_json)

@@ -154,13 +154,15 @@ def choose_head(
         if trained is None:
             return None
         tried_with_head: list[Outcome] = []
-        found = find_step(replace(coarser, head=trained.head), tried_with_head)
-        return _Candidate(trained, *found, tried_with_head)
+        with_head = replace(coarser, head=trained.head)
+        settings_with_head, outcome_with_head = find_step(with_head, tried_with_head)
+        return _Candidate(trained, settings_with_head, outcome_with_head, tried_with_head)
 
     shapes = [Shape(widths, cross=True), PERCEPTRON] if widths else [PERCEPTRON]
     # Side by side: a training takes one processor, and so does coding a single tile.
     with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
-        candidates = [found for found in workers.map(train, shapes) if found is not None]
+        trained_heads = list(workers.map(train, shapes))
+    candidates = [candidate for candidate in trained_heads if candidate is not None]
     return _cheapest(settings, outcome, candidates, strict=strict, data_range=data_range)
 
 

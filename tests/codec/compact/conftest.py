@@ -41,6 +41,6 @@ def feature(tmp_path_factory: pytest.TempPathFactory) -> tuple[npt.NDArray[Any],
     """A field, and its container of many tiles with vertices outside the coreset."""
     source = make_field()
     path = tmp_path_factory.mktemp("compact") / "a.fhz"
-    config = EncodeConfig(effort=2, features=("interval:20:180",), tile="2x4x5x8", psnr=45.0)
+    config = EncodeConfig(effort=1, features=("interval:20:180",), tile="2x4x5x8", psnr=45.0)
     fhash_codec.encode(source, path, config)
     return source, path

@@ -23,7 +23,7 @@ Feature = tuple[Series, Path]
 def record_decoded_tiles(
     monkeypatch: pytest.MonkeyPatch, table: Any
 ) -> list[tuple[int, int, int, int]]:
-    """Return a list that will hold the index of each tile of a table that is decoded from now on."""
+    """Return a list that takes up the index of each tile of a table that is decoded."""
     decode, indices = type(table)._decode, []
 
     def recorded(array: Any, index: Any, *rest: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Plans of a series: estimates at effort 1, tiles without loss for values whose squares overflow."""
+"""Plans: estimates at effort 1, and tiles without loss where squares of values overflow."""
 
 from __future__ import annotations
 

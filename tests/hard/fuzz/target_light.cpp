@@ -1,4 +1,4 @@
-// What the volume leaves of light, with hostile values: the numbers of a table are finite, and steps as fhash_codec/render/light.py makes them.
+// What the volume leaves of light, with hostile values: the numbers of a table are finite, and steps as fhash_codec/rendering/task/light.py makes them.
 #include <algorithm>
 #include <cmath>
 

@@ -97,7 +97,7 @@ def apply_cross(
         np.float32, high: np.float32,
     inverse: np.float32, unit: np.float32,
 ) -> Floats:  # fmt: skip
-    """As `apply_network`, for a second layer that sees the first layer's outputs over the cross.
+    """Like `apply_network`, for a second layer that sees the first layer's outputs over the cross.
 
     The weights of that layer are (out, 9 * in), the nine of each input together.
     """

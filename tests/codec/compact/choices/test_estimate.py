@@ -46,7 +46,7 @@ def test_zeros_have_no_error() -> None:
 
 
 @pytest.mark.parametrize("tile", [(6, 10, 20, 20), (6, 20, 40, 40)], ids=str)
-def test_the_estimated_step_reaches_the_psnr(tile) -> None:
+def test_the_estimated_step_reaches_the_psnr(tile: tuple[int, int, int, int]) -> None:
     rng = np.random.default_rng(0)
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (6, 20, 40, 40)), indexing="ij")
     source = np.tanh(
@@ -103,6 +103,6 @@ def test_effort_1_gives_the_same_bytes_native_and_in_numpy(tmp_path: Path) -> No
 def test_without_the_native_core_the_user_is_warned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("FHASH_NATIVE", "0")
+    monkeypatch.setattr("fhash_codec.compact.encode.native.library", lambda: None)
     with pytest.warns(FhashWarning, match="native core"):
         encode(np.zeros((1, 2, 2, 2), np.float32), tmp_path / "a.fhz", EncodeConfig(effort=1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +25,7 @@ def fronts() -> npt.NDArray[np.float32]:
     A wavelet smears it, and a head sharpens it.
     """
     t, z, y, x = np.meshgrid(
-        np.arange(6), np.arange(16), np.arange(40), np.arange(40), indexing="ij"
+        np.arange(5), np.arange(12), np.arange(40), np.arange(40), indexing="ij"
     )
     distance = x + 0.6 * y - 2 * t + 4 * np.sin(z / 5 + t / 4) - 26
     return (1 / (1 + np.exp(-2 * distance))).astype(np.float32)
@@ -39,7 +38,8 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
     monkeypatch.setattr(
         "fhash_codec.compact.choices.predictor.best_predictor", lambda *_, **__: None
     )
-    budget = Budget(updates=300, samples=60_000)
+    budget = Budget(updates=200, samples=40_000)
+    monkeypatch.setattr("fhash_codec.compact.choices.head.TRIAL_BUDGET", budget)
     monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget))
     source, sizes = fronts(), {}
     for effort in (4, 5):
@@ -53,12 +53,15 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
 
 
 def test_a_small_file_gets_no_head_and_a_large_one_a_large_head() -> None:
-    def widths(size: float, effort: int = 9) -> Any:
-        return _best_widths(size, 0.5, 4.5, effort)
+    def widths(size: float, gain: float = 0.5, effort: int = 9) -> tuple[int, int] | None:
+        return _best_widths(size, gain, 4.5, effort)
 
     assert widths(1_000) is None
-    chosen = [widths(size) for size in (3e3, 1e4, 1e5, 1e8)]
-    found = [list(GAIN_BY_WIDTHS).index(each) for each in chosen if each is not None]
-    assert found == sorted(found)
-    assert chosen[-1] == (14, 24)
-    assert widths(1e8, effort=5) == (12, 12)
+    chosen = [widths(size) for size in (1e4, 3e4, 1e5, 3e5, 1e6)]
+    ranks = [list(GAIN_BY_WIDTHS).index(each) for each in chosen if each is not None]
+    assert ranks == sorted(ranks)
+    assert len(set(ranks)) > 2
+    # Weights cost decoding time, whatever the size of the file: a small gain pays for few of them.
+    assert widths(1e9, gain=3.0) == (14, 24)
+    assert widths(1e9, gain=3.0, effort=5) == (12, 12)
+    assert widths(1e6, gain=0.01) is None

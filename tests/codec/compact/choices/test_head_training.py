@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 import torch
 
@@ -12,9 +14,11 @@ from fhash_codec.compact.choices.head_samples import Pair
 from fhash_codec.compact.choices.head_training import train_head
 from fhash_formats.errors import InputError
 
+Floats = npt.NDArray[np.float32]
+
 
 @pytest.fixture(scope="module")
-def front():
+def front() -> tuple[Floats, Floats]:
     """A travelling step between two plateaus, and a smoothed copy: three-voxel means with noise."""
     t, z, y, x = np.meshgrid(
         np.arange(3), np.arange(12), np.arange(14), np.arange(40), indexing="ij"
@@ -26,14 +30,19 @@ def front():
     return decoded.astype(np.float32), original
 
 
-def mse(first, second):
+def mse(first: Floats, second: Floats) -> float:
     return float(np.mean((first.astype(np.float64) - second) ** 2))
 
 
-def test_a_front_is_sharpened_by_what_the_gain_says(front) -> None:
+def test_a_front_is_sharpened_by_what_the_gain_says(front: tuple[Floats, Floats]) -> None:
     decoded, original = front
     trained = train_head(
-        [Pair(decoded, original, None)], low=-1.0, high=2.0, steps=300, device="cpu"
+        [Pair(decoded, original, None)],
+        low=-1.0,
+        high=2.0,
+        steps=300,
+        samples=200_000,
+        device="cpu",
     )
     gained = 10 * np.log10(
         mse(np.clip(decoded, -1, 2), original) / mse(trained.head.apply(decoded), original)
@@ -45,15 +54,15 @@ def test_a_front_is_sharpened_by_what_the_gain_says(front) -> None:
 
 
 @pytest.fixture(scope="module")
-def far():
-    """Noise with an error that the neighbourhood does not show: half the value three voxels before."""
+def far() -> tuple[Floats, Floats]:
+    """Noise with an error beyond the neighbourhood: half the value three voxels before."""
     random = np.random.default_rng(0)
     original = random.normal(size=(2, 10, 12, 40)).astype(np.float32)
     decoded = original + 0.5 * np.roll(original, 3, axis=3)
     return decoded.astype(np.float32), original
 
 
-def test_a_cross_sees_farther(far) -> None:
+def test_a_cross_sees_farther(far: tuple[Floats, Floats]) -> None:
     settings = {
         "low": -8.0,
         "high": 8.0,
@@ -76,20 +85,25 @@ def test_noise_gains_nothing_much() -> None:
     original = random.normal(size=(2, 16, 16, 32)).astype(np.float32)
     decoded = (original + 0.1 * random.normal(size=original.shape)).astype(np.float32)
     trained = train_head(
-        [Pair(decoded, original, None)], low=-6.0, high=6.0, steps=150, device="cpu"
+        [Pair(decoded, original, None)],
+        low=-6.0,
+        high=6.0,
+        steps=150,
+        samples=100_000,
+        device="cpu",
     )
     assert abs(trained.gain_db) < 0.5
 
 
 @pytest.mark.parametrize("cross", [False, True])
-def test_the_same_seed_gives_the_same_head(front, cross) -> None:
+def test_the_same_seed_gives_the_same_head(front: tuple[Floats, Floats], cross: bool) -> None:
     settings = {
         "low": -1.0,
         "high": 2.0,
         "hidden": (4, 4),
         "cross": cross,
         "samples": 40_000,
-        "steps": 60,
+        "steps": 40,
         "device": "cpu",
     }
     runs = [
@@ -99,21 +113,28 @@ def test_the_same_seed_gives_the_same_head(front, cross) -> None:
     assert runs[0] == runs[1] != runs[2]
 
 
-def test_voxels_that_do_not_count_do_not_matter(front) -> None:
+def test_voxels_that_do_not_count_do_not_matter(front: tuple[Floats, Floats]) -> None:
     decoded, original = front
     counted = np.zeros(original.shape, dtype=bool)
     counted[:, 2:9] = True
     other = np.where(counted, original, np.nan).astype(np.float32)
     heads = [
         train_head(
-            [Pair(decoded, values, counted)], low=-1.0, high=2.0, steps=60, device="cpu"
+            [Pair(decoded, values, counted)],
+            low=-1.0,
+            high=2.0,
+            steps=40,
+            samples=40_000,
+            device="cpu",
         ).head
         for values in (original, other)
     ]
     assert heads[0].to_bytes() == heads[1].to_bytes()
 
 
-def test_several_tiles_of_several_shapes_and_a_tile_that_does_not_count(front) -> None:
+def test_several_tiles_of_several_shapes_and_a_tile_that_does_not_count(
+    front: tuple[Floats, Floats],
+) -> None:
     decoded, original = front
     pairs = [
         Pair(decoded, original, None),
@@ -134,10 +155,16 @@ def test_several_tiles_of_several_shapes_and_a_tile_that_does_not_count(front) -
     assert trained.gain_db > 3
 
 
-def test_seconds_end_the_training_and_progress_reaches_one(front) -> None:
+def test_seconds_end_the_training_and_progress_reaches_one(front: tuple[Floats, Floats]) -> None:
     parts: list[float] = []
     trained = train_head(
-        [Pair(*front, None)], low=-1.0, high=2.0, seconds=0.3, device="cpu", progress=parts.append
+        [Pair(*front, None)],
+        low=-1.0,
+        high=2.0,
+        seconds=0.3,
+        samples=40_000,
+        device="cpu",
+        progress=parts.append,
     )
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
@@ -153,18 +180,28 @@ def test_seconds_end_the_training_and_progress_reaches_one(front) -> None:
         ({"device": "tpu"}, "device 'tpu'"),
     ],
 )
-def test_impossible_trainings_are_refused(front, change, message) -> None:
+def test_impossible_trainings_are_refused(
+    front: tuple[Floats, Floats], change: dict[str, Any], message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         train_head(**{"pairs": [Pair(*front, None)], "low": -1.0, "high": 2.0, **change})
 
 
-def test_two_trainings_at_once_give_what_each_gives_alone_and_leave_torch_as_it_was(front) -> None:
+def test_two_trainings_at_once_give_what_each_gives_alone_and_leave_torch_as_it_was(
+    front: tuple[Floats, Floats],
+) -> None:
     decoded, original = front
     before = torch.get_num_threads()
 
-    def trained(seed):
+    def trained(seed: int) -> bytes:
         return train_head(
-            [Pair(decoded, original, None)], low=-1.0, high=2.0, steps=60, seed=seed, device="cpu"
+            [Pair(decoded, original, None)],
+            low=-1.0,
+            high=2.0,
+            steps=40,
+            samples=40_000,
+            seed=seed,
+            device="cpu",
         ).head.to_bytes()
 
     with ThreadPoolExecutor(2) as workers:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import pytest
 
@@ -42,7 +42,9 @@ def test_a_psnr_of_uniform_rounding_is_found_in_a_few_steps() -> None:
 
 @pytest.mark.parametrize("mean", [arithmetic_mean, geometric_mean])
 @pytest.mark.parametrize("target", [1.5, 40.0, 99.0])
-def test_bisection_in_a_bracket_converges(mean, target: float) -> None:
+def test_bisection_in_a_bracket_converges(
+    mean: Callable[[float, float], float], target: float
+) -> None:
     bracket = Bracket(1.0, 100.0, middle=mean)
     for _ in range(60):
         number = bracket.inside(math.inf)
