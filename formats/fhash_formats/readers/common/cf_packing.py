@@ -24,7 +24,7 @@ from fhash_formats.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Packing:
-    """How an array is unpacked.
+    """The packing of an array.
 
     It has the stored type, the type of the values, the fill values, the scale and the offset (None:
     none).

@@ -108,7 +108,7 @@ class RawLayout:
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What to take from a file: name of the variable, axes of its dimensions, layout of raw bytes.
+    """A request to a reader: name of the variable, axes of its dimensions, layout of raw bytes.
 
     None stands for what was not said. `booleans` lets boolean arrays through (for masks), as the
     numbers 0 and 1.
