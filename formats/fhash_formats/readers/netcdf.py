@@ -67,7 +67,7 @@ def _says_netcdf(path: Path) -> bool:
 
 
 def open_netcdf(path: Path, request: Request) -> FileSeries:
-    """Open the series in a NetCDF file: the only suitable variable of its groups, or a named one."""
+    """Open the series in a NetCDF file: the only suitable variable of any group, or a named one."""
     source, stamp = str(path), Stamp.of(path)
     with path.open("rb") as file:
         head = file.read(4)
