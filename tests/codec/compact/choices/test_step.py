@@ -8,7 +8,7 @@ import pytest
 from fhash_codec.compact.choices.step import with_step
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.goal import Goal
-from fhash_formats.transform.tile.encoding import encode_tile
+from fhash_formats.transform.tile.encoding import Coding, encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
 SHAPE = (2, 16, 32, 32)
@@ -27,7 +27,7 @@ def test_rounding_to_the_type_of_the_source_stores_no_tile_exactly(
     coded = encode_tile(
         source,
         with_step(begun, 4 * error, Goal(error=error, data_range=high - low), rounding),
-        error=error,
+        Coding(error=error),
     )
     assert np.abs(coded.decoded.astype(np.float64) - source).max() <= error
     assert np.array_equal(coded.decoded, source) == exact

@@ -20,7 +20,6 @@ from fhash_codec.rendering.renderer import decoded_frame
 from fhash_codec.rendering.scene.scene import Camera
 from fhash_codec.rendering.stream import fields
 from fhash_codec.rendering.stream.beams import Beams
-from fhash_codec.rendering.stream.crossings import crossings
 from fhash_codec.rendering.stream.fields import Field, FrameField, NetworkField, central_slopes
 from fhash_codec.rendering.stream.inference import PatchInference
 from fhash_codec.rendering.stream.stream import stream
@@ -297,22 +296,6 @@ def test_nothing_is_seen_of_what_has_no_value() -> None:
     found = stream(field, task, adaptive=False)
     assert not found.rgba.any()
     assert found.counters["samples"] == 0
-
-
-def test_roots_are_exact() -> None:
-    sample = np.arange(6.0)[None]
-    found = crossings(
-        lambda row, at: (at - 2.3) ** 3,
-        sample,
-        (sample - 2.3) ** 3,
-        (
-            Surface(value=0.0, colour=np.ones(3), opacity=0.5),
-            Surface(value=-1.0, colour=np.ones(3), opacity=0.25),
-        ),
-    )
-    assert found.opacity[0].tolist() == [[0, 0], [0.25, 0], [0.5, 0], [0, 0], [0, 0]]
-    np.testing.assert_allclose(found.at[0, 1:3, 0], [1.3, 2.3], atol=1e-4)
-    assert found.which[0, 1:3, 0].tolist() == [1, 0]
 
 
 def planned(volume: Volume, scene: dict[str, Any], arrays: Arrays) -> tuple[Field, Task]:
