@@ -1,7 +1,9 @@
-"""A process that imports fhash once and runs each command line in a fork of itself; started by `forks.Server`.
+"""A process that imports fhash once and runs each command line in a fork; started by
+`forks.Server`.
 
-It takes one JSON object per line. {"words": [...], "log": path, "inject": [[name, ...], ...]} starts a command line, and its process id is
-the answer; {"wait": pid} is answered by how that process ended: its exit code, or minus the number of the signal.
+It reads one JSON object per line. {"words": [...], "log": path, "inject": [[name, ...], ...]}
+starts a command line; the answer is its process id. {"wait": pid} waits for that process; the
+answer is its exit code, or minus the number of the signal that ended it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Hostile files through the commands of `fhash`: a pool of worker processes (hostile_trial.py), and what came of all mutations.
+"""Hostile files through the commands of `fhash`, in a pool of worker processes (hostile_trial.py).
 
-Where a worker ends, or says nothing for long, the mutation that it was at counts as a crash, and another is started.
+If a worker ends or hangs, its mutation counts as a crash, and another worker is started.
 """
 
 from __future__ import annotations
@@ -23,12 +23,16 @@ from typing import Any
 import mutations
 
 HANG = 120.0
-"""Seconds until a worker that says nothing is ended."""
+"""Seconds without an answer after which a worker is ended."""
 
 
 @dataclass
 class Report:
-    """Counts of ends by command; what may not be; and the worst figures of all commands, each with the number of its mutation."""
+    """The results of all mutations.
+
+    Ends are counted by command and by kind. The worst figures are kept with the number of their
+    mutation.
+    """
 
     mutations: int = 0
     ends: dict[str, Counter[str]] = field(default_factory=dict)
@@ -38,7 +42,7 @@ class Report:
     worst_bytes: tuple[int, str] = (0, "")
 
     def add(self, answer: dict[str, Any]) -> None:
-        """Take in what a worker said of one mutation."""
+        """Add a worker's answer about one mutation."""
         self.mutations += 1
         name = f"{answer['number']} ({answer['kind']} of {answer['golden']})"
         for end in answer["ends"]:
@@ -52,7 +56,7 @@ class Report:
                 self.wrong.append(f"{name}, {end['command']}: {end['wrong']}")
 
     def figures(self) -> dict[str, Any]:
-        """JSON values."""
+        """Return JSON values."""
         return {
             "mutations": self.mutations,
             "wrong": len(self.wrong),
@@ -107,7 +111,7 @@ def _answers(waiting: SimpleQueue[int], folder: Path) -> Iterator[dict[str, Any]
 
 
 def _left(process: subprocess.Popen[str]) -> int:
-    """Let a worker end; its exit code."""
+    """Let a worker end and return its exit code."""
     assert process.stdin is not None
     assert process.stdout is not None
     with contextlib.suppress(OSError):  # what could not be written to one that has crashed
@@ -134,7 +138,7 @@ def _started(folder: Path) -> subprocess.Popen[str]:
 
 
 def _asked(process: subprocess.Popen[str], number: int) -> str:
-    """The worker's answer; nothing where it ended or hangs."""
+    """Return the worker's answer; empty if it ended or hangs."""
     assert process.stdin is not None
     assert process.stdout is not None
     try:

@@ -1,4 +1,7 @@
-"""Mutations of metadata documents, digests redone: hostile numbers, other types, keys that are missing, codecs with strange settings."""
+"""Mutations of metadata documents, with correct checksums.
+
+They put in hostile numbers and other types, remove keys, and give codecs strange settings.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +88,10 @@ def _nest(depth: int) -> Any:
 
 
 def hostile(chance: random.Random, old: Any) -> Any:
-    """A value in place of another; mostly one of the same sort, because others are refused at once."""
+    """Return a value in place of another one.
+
+    It mostly has the same type, because other types are refused at once.
+    """
     turn = chance.random()
     if isinstance(old, int) and not isinstance(old, bool) and turn < 0.6:
         return chance.choice(
@@ -132,11 +138,11 @@ def hostile(chance: random.Random, old: Any) -> Any:
 
 
 Place = tuple[Any, Any]
-"""A container and a key or index in it."""
+"""A dict or list, and a key or index in it."""
 
 
 def places(value: Any) -> Iterator[Place]:
-    """Every value of a document."""
+    """Yield the place of every value of a document."""
     for key in (
         value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
     ):
@@ -147,7 +153,7 @@ def places(value: Any) -> Iterator[Place]:
 def _changed(
     chance: random.Random, parts: Parts, change: Callable[[dict[str, Any]], None], name: str = ""
 ) -> Parts:
-    """One document changed; a random one where none is named, the root as often as all others."""
+    """Change one document: the one that is named, else the root or, as often, any other one."""
     documents = [other for other, _ in parts if other.endswith(DOCUMENT)]
     name = name or (DOCUMENT if chance.random() < 0.4 else chance.choice(documents))
     result = []
@@ -165,7 +171,7 @@ def dumped(values: Any) -> bytes:
 
 
 def _value(chance: random.Random, parts: Parts) -> Parts:
-    """A value, or a few, in place of others."""
+    """Replace one value, or a few."""
 
     def change(values: dict[str, Any]) -> None:
         for _ in range(chance.choice((1, 1, 1, 2, 4))):
@@ -176,7 +182,7 @@ def _value(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _key(chance: random.Random, parts: Parts) -> Parts:
-    """A key that is missing, is there besides, or is called otherwise."""
+    """Remove, rename or add a key."""
 
     def change(values: dict[str, Any]) -> None:
         objects = [
@@ -200,7 +206,7 @@ def _key(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _length(chance: random.Random, parts: Parts) -> Parts:
-    """One length of the volume called otherwise wherever it stands, so that all documents agree."""
+    """Replace one length of the volume in all documents, so that they agree."""
     header = json.loads(dict(parts)[DOCUMENT])["attributes"]["fhash"]
     old = chance.choice(header["domain"]["shape"])
     new = chance.choice((1, 2, old - 1, old + 1, old + 3, 2 * old, 100, 1000, *LARGE[:10]))
@@ -217,7 +223,7 @@ def _length(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _lengths(chance: random.Random, parts: Parts) -> Parts:
-    """The domain alone: larger than the box, with positions by rule."""
+    """Make the domain larger than the box, with positions by rule."""
 
     def change(values: dict[str, Any]) -> None:
         header = values["attributes"]["fhash"]
@@ -241,7 +247,8 @@ def _rule(chance: random.Random) -> dict[str, Any]:
 
 
 def _coordinates(chance: random.Random, parts: Parts) -> Parts:
-    """Positions by rule or list that are absurd: all equal, beyond their type, descending, with steps that vanish."""
+    """Replace positions by absurd ones: all equal, beyond their type, descending, with vanishing
+    steps."""
 
     def change(values: dict[str, Any]) -> None:
         header = values["attributes"]["fhash"]
@@ -260,7 +267,7 @@ def _coordinates(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _header(chance: random.Random, parts: Parts) -> Parts:
-    """Numbers of the header that decoding depends on, each allowed by itself."""
+    """Replace numbers of the header on which decoding depends; each is allowed by itself."""
 
     def change(values: dict[str, Any]) -> None:
         header = values["attributes"]["fhash"]
@@ -323,7 +330,7 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _array(chance: random.Random, parts: Parts) -> Parts:
-    """Type, shapes and codecs of one array."""
+    """Change the type, shapes or codecs of one array."""
     arrays = [name for name, data in parts if name.endswith(DOCUMENT) and b'"array"' in data]
 
     def change(values: dict[str, Any]) -> None:
@@ -378,7 +385,7 @@ def _array(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _text(chance: random.Random, parts: Parts) -> Parts:
-    """Bytes of a document changed."""
+    """Change bytes of a document."""
     documents = [name for name, _ in parts if name.endswith(DOCUMENT)]
     name = DOCUMENT if chance.random() < 0.4 else chance.choice(documents)
     snippets = (

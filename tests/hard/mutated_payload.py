@@ -1,4 +1,7 @@
-"""Mutations of what chunks hold, all checksums redone, so that the decoders see them: streams of coders, settings, values."""
+"""Mutations of the contents of chunks: streams of coders, indices and values.
+
+All checksums are correct, so the contents reach the decoders.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ Change = Callable[[random.Random, bytes], bytes]
 
 
 def documents_of(parts: Parts) -> dict[str, Any]:
-    """Metadata of the arrays by name."""
+    """Return the metadata of the arrays by name."""
     found = {
         name.rpartition("/")[0]: json.loads(data) for name, data in parts if name.endswith(DOCUMENT)
     }
@@ -48,7 +51,10 @@ def documents_of(parts: Parts) -> dict[str, Any]:
 def chosen(
     chance: random.Random, parts: Parts, coded: bool | None = None
 ) -> tuple[str, dict[str, Any], str, bytes]:
-    """An array, its metadata, and one of its members; coded: by `fhash.transform`, or not, or whichever."""
+    """Choose an array; return its name and metadata, and name and data of one of its members.
+
+    `coded` says whether the array is coded by `fhash.transform`; None allows both.
+    """
     documents = documents_of(parts)
     fitting = [
         (name, data)
@@ -72,7 +78,7 @@ def replaced(parts: Parts, new: dict[str, bytes]) -> Parts:
 
 
 def damaged(chance: random.Random, data: bytes) -> bytes:
-    """Bytes of a stream changed a little or much."""
+    """Return the bytes of a stream changed a little or much."""
     if not data:
         return chance.randbytes(chance.randrange(9))
     changed = bytearray(data)
@@ -95,7 +101,8 @@ def damaged(chance: random.Random, data: bytes) -> bytes:
 def inner_chunks(
     document: dict[str, Any], member: str, data: bytes
 ) -> tuple[Sharding, np.ndarray[Any, Any], list[bytes]]:
-    """The sharding of an array, which inner chunks of a shard are present, and these with their CRC-32C."""
+    """Return the sharding of an array, which inner chunks a shard has, and these with their
+    CRC-32C."""
     metadata = ArrayMetadata.from_dict(document)
     sharding = metadata.sharding
     assert sharding is not None
@@ -110,7 +117,7 @@ def shard_of(sharding: Sharding, present: np.ndarray[Any, Any], chunks: list[byt
 
 
 def bytes_changed(chance: random.Random, parts: Parts) -> Parts:
-    """Bytes of a chunk as they lie in the file, with their CRC-32C redone."""
+    """Change bytes of a chunk as stored, with a correct CRC-32C."""
     _, document, member, data = chosen(chance, parts)
     if not is_coded(document):
         return replaced(parts, {member: with_crc(damaged(chance, data[:-4]))})
@@ -121,7 +128,8 @@ def bytes_changed(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _index(chance: random.Random, parts: Parts) -> Parts:
-    """The index of a shard: entries that overlap, point at themselves, lie outside or are not there."""
+    """Change the index of a shard: entries overlap, point into the index, or lie outside or are
+    missing."""
     coded = [name for name, document in documents_of(parts).items() if is_coded(document)]
     if not coded:
         return bytes_changed(chance, parts)
@@ -153,7 +161,7 @@ SPECIAL = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-45, 1e38, -3.4e38, 1e300, -1e3
 
 
 def values_changed(chance: random.Random, parts: Parts) -> Parts:
-    """Values of an ordinary array: coordinates, weights, tables, occupancy, key frames."""
+    """Change values of an ordinary array: coordinates, weights, tables, occupancy, key frames."""
     _, document, member, data = chosen(chance, parts, False)
     dtype = np.dtype(document["data_type"])
     values = np.frombuffer(decompress(data[:-4]), dtype).copy()
@@ -186,7 +194,10 @@ def configuration_of(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _stream(chance: random.Random, parts: Parts) -> Parts:
-    """Sections of a coded tile changed, with the digests of what they decode to: another valid tile, unless a decoder refuses it."""
+    """Change sections of a coded tile, with correct digests of what they decode to.
+
+    The result is another valid tile, unless a decoder refuses it.
+    """
     if not any(is_coded(document) for document in documents_of(parts).values()):
         return values_changed(chance, parts)
     _, document, member, data = chosen(chance, parts, True)
@@ -237,7 +248,7 @@ def _restreamed(
 def _mask_section(
     coded: bytes, integers: Any, settings: TileSettings, shape: tuple[int, ...], predicted: bool
 ) -> bytes:
-    """A coded mask behind the digest of what it decodes to."""
+    """Return a coded mask after the digest of the mask to which it decodes."""
     assert settings.mask is not None
     with np.errstate(all="ignore"):
         if predicted and settings.predictor is not None:

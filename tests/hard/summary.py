@@ -33,7 +33,10 @@ ABOUT = {
 
 
 def text(records: list[dict[str, Any]]) -> str:
-    """A section for each case, a row for each of its records; figures that are tables themselves come after it."""
+    """Return a section for each case, with a row for each of its records.
+
+    Figures that are tables themselves follow the rows.
+    """
     cases: dict[str, list[dict[str, Any]]] = {}
     for record in records:
         cases.setdefault(record.pop("case"), []).append(record)

@@ -1,4 +1,5 @@
-"""A disk that is full from the n-th operation on, for every n: one line, and everything as it was."""
+"""A disk that is full from the n-th operation on, for every n: the command prints one line and
+changes nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""kill -9: the older output stays bit for bit, the next call gives what an undisturbed one gives, and leaves nothing else behind."""
+"""A command that is killed keeps the older output, bit for bit.
+
+The next call gives the result of an undisturbed call and removes what was left.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +30,14 @@ KILLED = (
 
 
 def leftovers(now: Listing) -> set[str]:
-    """The temporaries in a folder, by name."""
+    """Return the names of the temporary files in a folder."""
     return {
         place.split("/")[0] for place in now if place.split("/")[0].endswith((".partial", ".old"))
     }
 
 
 def check_killed(bench: Bench, name: str, before: Listing) -> None:
-    """What is there after a kill: every output old or new, and nothing else but temporaries."""
+    """Check the folder after a kill: every output is old or new, and the rest are temporary files."""
     now, after = bench.now(), bench.new(name)
     extra = leftovers(now)
     kept = {place: data for place, data in now.items() if place.split("/")[0] not in extra}
@@ -79,7 +82,8 @@ def test_a_kill_at_any_operation_loses_nothing_and_the_next_call_clears_up(
 
 
 def test_a_folder_that_was_moved_aside_comes_back_before_anything_else(bench: Bench) -> None:
-    """Whoever does not say --force is told that there is an output, although the killed one had just moved it away."""
+    """Without --force, the user is told that an output exists, even if the killed command had just
+    moved it away."""
     name, seen = "decode zarr", 0
     for number in range(bench.operations(name), 0, -1):
         before = bench.old(name)
@@ -176,7 +180,7 @@ def test_a_living_writer_is_not_disturbed_by_another(bench: Bench, name: str) ->
 
 
 def wait_stopped(pid: int) -> None:
-    """Until a process has stopped."""
+    """Wait until a process has stopped."""
     for _ in range(2000):
         if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T":
             return

@@ -1,4 +1,5 @@
-"""Ctrl-C, SIGTERM and SIGHUP at each stage and at each operation on files: exit code 130, one line, nothing half written."""
+"""Ctrl-C, SIGTERM and SIGHUP at each stage and file operation: exit code 130, one line, nothing
+half-written."""
 
 from __future__ import annotations
 
@@ -26,7 +27,8 @@ COMMITTED = (
 
 
 def stages(bench: Bench, name: str, noted: Path) -> list[tuple[str, int]]:
-    """The first and the last report of each stage of a command."""
+    """Return the first and the last report of each stage of a command; in the long set, all
+    reports."""
     noted.unlink(missing_ok=True)
     words = [word for word in bench.words(name) if word != "-q"]
     ended = bench.server.run(*words, inject=[("note_stages", noted)])

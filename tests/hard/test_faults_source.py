@@ -1,4 +1,7 @@
-"""A source that changes, shrinks, grows or vanishes while it is read: one line and exit code 2, and never a mix of two versions."""
+"""A source that changes, shrinks, grows or vanishes while it is read is refused.
+
+The command ends with one line and exit code 2, and never mixes two versions.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two writers of one output, folders that cannot be written, and memory that runs out."""
+"""Two writers of one output, folders without permission to write, and memory that runs out."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_two_at_once_leave_the_whole_output_of_one(bench: Bench, name: str, forc
 def test_what_appears_while_it_is_made_is_not_replaced_without_leave(
     bench: Bench, name: str
 ) -> None:
-    """Stopped at each operation, while another writes the same output."""
+    """The command is stopped at each operation while another one writes the same output."""
     bench.old(name)
     kept = bench.now()
     refused = 0
@@ -96,7 +96,10 @@ def test_what_appears_while_it_is_made_is_not_replaced_without_leave(
 
 @pytest.fixture
 def locked(bench: Bench) -> Iterator[Path]:
-    """A folder that may be read and not written, in which an output lies; below the temporary folder, which anyone may enter."""
+    """A folder that may be read but not written, with an output in it.
+
+    It lies in the temporary folder, which any user may enter.
+    """
     place = Path(tempfile.mkdtemp(prefix="fhash-locked-"))
     place.chmod(0o755)
     shutil.copy(bench.folder / "0" / "in.npy", place / "in.npy")

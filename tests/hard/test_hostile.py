@@ -1,7 +1,8 @@
-"""Hostile files: each is refused with one line and exit code 4, or decoded; never another exception, a hang, or a great allocation.
+"""Hostile files are refused with one line and exit code 4, or decoded.
 
-FHASH_HARD=1 takes the long set. The mutations are numbered, and a number is always the same file: `fhash` on the file that
-`python tests/hard/hostile_trial.py --write NUMBER FILE.fhz` writes shows a failure again.
+They never lead to another exception, a hang or a large allocation. FHASH_HARD=1 runs the long set.
+Mutations are numbered, and a number is always the same file: `python tests/hard/hostile_trial.py
+--write NUMBER FILE.fhz` writes it, to show a failure again.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def test_all_kinds_of_mutations_were_tried(report):
 
 
 def test_damage_is_refused_and_much_of_what_is_sealed_reaches_the_decoders(report):
-    """Or the mutations would test less than they say."""
+    """Without this, the mutations would test less than they say."""
     refused, decoded = Counter(), Counter()
     for kind, ends in report.kinds.items():
         refused[kind] += ends["refused"]
@@ -68,7 +69,7 @@ def test_a_number_is_always_the_same_file(number):
 
 
 def test_a_worker_that_crashes_is_told(tmp_path, monkeypatch):
-    """Or a crash of the native library would pass unseen."""
+    """Without this, a crash of the native library would not be noticed."""
     monkeypatch.setenv("FHASH_HOSTILE_CRASH", "1")
     found = hostile.trials([0, 1, 2], 1, tmp_path)
     assert found.mutations == 3

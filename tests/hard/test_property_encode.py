@@ -1,4 +1,7 @@
-"""Any series under any settings: what is promised is kept as an independent look at the values finds it, or is refused in one line."""
+"""Any series under any settings keeps its promise, or is refused in one line.
+
+The promise is checked on the decoded values, independently of the encoder.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +27,13 @@ Shape = tuple[int, int, int, int]
 
 
 def waves(chance: np.random.Generator, shape: Shape) -> np.ndarray:
-    """A few plane waves."""
+    """Return the sum of three plane waves."""
     places = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
     return sum(np.sin(sum(chance.normal(0, 6) * place for place in places)) for _ in range(3))
 
 
 def front(chance: np.random.Generator, shape: Shape) -> np.ndarray:
-    """A step that moves along x by part of a vertex a step."""
+    """Return a step that moves 0.3 vertices along x per time step."""
     t, x = np.arange(shape[0])[:, None, None, None], np.arange(shape[3])
     return np.broadcast_to(
         np.where(x > chance.uniform(0, shape[3]) + 0.3 * t, 1.0, 0.0), shape
@@ -38,7 +41,7 @@ def front(chance: np.random.Generator, shape: Shape) -> np.ndarray:
 
 
 def spikes(chance: np.random.Generator, shape: Shape) -> np.ndarray:
-    """Nothing but a few vertices."""
+    """Return zeros with a few random vertices."""
     return np.where(chance.random(shape) < 0.02, chance.normal(0, 1, shape), 0.0)
 
 
@@ -60,7 +63,8 @@ KINDS = {
 
 @st.composite
 def fields(draw: Draw) -> np.ndarray:
-    """A series (t, z, y, x) of some structure, type, size of values and offset; floats with holes."""
+    """Draw a series (t, z, y, x): its structure, type, magnitude and offset; floats also with
+    holes."""
     shape = tuple(draw(st.integers(1, most)) for most in (6, 9, 12, 17))
     chance = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     values = KINDS[draw(st.sampled_from(sorted(KINDS)))](chance, shape)
@@ -83,7 +87,8 @@ def fields(draw: Draw) -> np.ndarray:
 
 @st.composite
 def settings(draw: Draw, values: np.ndarray) -> EncodeConfig:
-    """Settings that do not contradict themselves; features and bounds about as large as the values."""
+    """Draw settings that do not contradict each other, with features and bounds on the scale of the
+    values."""
     finite = values[np.isfinite(values)].astype(np.float64)
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     common: dict[str, Any] = {
@@ -132,7 +137,7 @@ def settings(draw: Draw, values: np.ndarray) -> EncodeConfig:
 
 @st.composite
 def tasks(draw: Draw) -> tuple[np.ndarray, EncodeConfig]:
-    """A series and settings for it."""
+    """Draw a series and settings for it."""
     values = draw(fields())
     return values, draw(settings(values))
 
@@ -173,7 +178,7 @@ def check(
     figures: dict[str, Any],
     missed: str,
 ) -> None:
-    """What was promised, and what is said of the file, against the values themselves."""
+    """Compare the promise and the stated figures with the decoded values."""
     given, finite, found = values.astype(np.float64), np.isfinite(values), np.isfinite(decoded)
     assert decoded.shape == values.shape
     assert not np.isinf(decoded).any()

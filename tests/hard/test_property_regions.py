@@ -1,4 +1,5 @@
-"""Any part of any volume is that part of the whole: indices as numpy takes them, regions, times, levels of detail."""
+"""Any part of a volume equals that part of all values: numpy's indices, regions, times, levels of
+detail."""
 
 from __future__ import annotations
 
@@ -38,7 +39,7 @@ SETTINGS = {
 
 
 def field(shape: tuple[int, ...] = SHAPE) -> np.ndarray:
-    """Waves with holes, (t, z, y, x) float32."""
+    """Return waves with holes, float32 (t, z, y, x)."""
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
     values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
     values[1:2, 2:3, 3:4, :] = np.nan
@@ -49,7 +50,7 @@ def field(shape: tuple[int, ...] = SHAPE) -> np.ndarray:
 def volume(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Volume, np.ndarray]]:
-    """An open volume and the whole of it."""
+    """An open volume and all its values."""
     path = tmp_path_factory.mktemp("regions") / "a.fhz"
     fhash_codec.encode(field(), path, SETTINGS[request.param])
     with fhash_codec.open(path) as opened:
@@ -57,7 +58,7 @@ def volume(
 
 
 def boxes(shape: tuple[int, ...]) -> st.SearchStrategy[tuple[tuple[int, int], ...]]:
-    """Regions (z, y, x) with at least one vertex."""
+    """Draw regions (z, y, x) with at least one vertex."""
     return st.tuples(
         *(
             st.integers(0, n - 1).flatmap(

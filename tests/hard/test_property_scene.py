@@ -1,4 +1,4 @@
-"""Any scene is written and read as it is, and any volume is drawn by it in finite pixels or refuses it in one line."""
+"""Any scene is written and read unchanged, and drawn in finite pixels or refused in one line."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ QUICK_FIELDS: dict[str, st.SearchStrategy[Any]] = {
     "antialiasing": st.integers(1, 2),
     "samples_per_pass": st.none() | st.integers(1, 4000),
 }
-"""Of fields whose whole range would take minutes for a picture."""
+"""Strategies for fields whose full range would take minutes for one picture."""
 
 
 def values_of(hint: Any, each: dataclasses.Field[Any], *, quick: bool) -> st.SearchStrategy[Any]:
-    """Values of a field by its annotation and its limits."""
+    """Draw values of a field by its annotation and its limits."""
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
     low, high = each.metadata.get("low"), each.metadata.get("high")
     choices = each.metadata.get("choices", ())
@@ -82,7 +82,7 @@ def values_of(hint: Any, each: dataclasses.Field[Any], *, quick: bool) -> st.Sea
 def floats(
     name: str, low: float | None, high: float | None, *, quick: bool
 ) -> st.SearchStrategy[float]:
-    """Numbers within limits, the limits themselves and near ones often."""
+    """Draw numbers within limits; the limits themselves and numbers near them come often."""
     if quick and name == "step" and low == 1e-6:  # of a march: a small one takes as many samples
         low = 0.02
     everything = st.floats(low, high, allow_nan=False, allow_infinity=False)
@@ -104,7 +104,7 @@ def floats(
 
 
 def records(kind: type[Record], *, quick: bool) -> st.SearchStrategy[Any]:
-    """Records of any fields; those that contradict themselves are left out."""
+    """Draw records with any of their fields; those that contradict themselves are left out."""
     hints = typing.get_type_hints(kind)
     fields = {
         each.name: values_of(hints[each.name], each, quick=quick)
@@ -128,7 +128,7 @@ def records(kind: type[Record], *, quick: bool) -> st.SearchStrategy[Any]:
 
 
 def toml(values: dict[str, Any]) -> str:
-    """The values as TOML, with inline tables."""
+    """Return the values as TOML with inline tables."""
 
     def text(value: Any) -> str:
         if isinstance(value, dict):
@@ -284,7 +284,7 @@ FOUND: dict[str, dict[str, Any]] = {
     "rays without an end": {"scale": [8e29, 2.4e29, 1e-30], "camera": {"view": "yz"}},
     "a huge direction upwards": {"camera": {"view_up": [1.7976931348623157e308, 1.0, 0.0]}},
 }
-"""Scenes that the test below has found."""
+"""Scenes with which the test below has failed once."""
 
 
 @pytest.mark.parametrize("name", FOUND)
@@ -301,7 +301,7 @@ def test_any_scene_is_drawn_in_finite_pixels_or_refused_in_one_line(
 
 
 def check_picture(volume: Volume, scene: Scene) -> None:
-    """Finite pixels, depths and normals, or an error of one line."""
+    """Assert finite pixels, depths and normals, or an error of one line."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FhashWarning)

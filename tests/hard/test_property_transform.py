@@ -1,4 +1,7 @@
-"""The transform and its coder: any numbers of any shape keep their bound, and both engines write the same bytes."""
+"""The transform and its coder keep their bound for any numbers of any shape.
+
+The native and the portable engine write the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,7 @@ NATIVE = pytest.mark.skipif(
 
 @st.composite
 def specs(draw: Draw, shape: tuple[int, ...]) -> TransformSpec:
-    """A transform of any kinds and depths that fits a tile."""
+    """Draw a transform of any kinds and depths that fits a tile."""
     axes = []
     for length in shape:
         kind = draw(st.sampled_from(KINDS))
@@ -75,7 +78,8 @@ TILES = hnp.array_shapes(min_dims=4, max_dims=4, min_side=1, max_side=9)
 def test_any_tile_of_any_size_of_values_comes_back(
     shape: tuple[int, ...], dtype: str, power: int, kind: str, data: Draw
 ) -> None:
-    """Relative to the largest value: nothing is lost by how large the numbers are."""
+    """The error is relative to the largest value, so it does not depend on the magnitude of the
+    numbers."""
     spec = data.draw(
         specs(shape).filter(
             lambda spec: all(
@@ -169,7 +173,7 @@ def test_a_block_comes_back(integers: np.ndarray) -> None:
 
 
 def gap(one: np.ndarray, other: np.ndarray) -> Fraction:
-    """The largest difference of the finite values, exactly."""
+    """Return the largest difference of the finite values, exactly."""
     return max(
         (abs(Fraction(a) - Fraction(b)) for a, b in zip(one.tolist(), other.tolist(), strict=True)),
         default=Fraction(0),
