@@ -71,7 +71,7 @@ def test_a_signal_at_each_stage_leaves_the_older_output(
             stage,
             done,
         )
-    ended = bench.run(name)  # goes on from the checkpoint, if there is one
+    ended = bench.run(name)  # resumes from the checkpoint, if there is one
     assert ended.code == 0, ended.output
     assert bench.now() == bench.new(name)
     record(
@@ -87,7 +87,7 @@ def test_a_signal_at_any_operation_leaves_one_of_the_two_outputs(bench: Bench, n
         before = bench.old(name)
         ended = bench.run(name, ("at_operation", bench.out, place, -SIGNALS[turn % len(SIGNALS)]))
         now = bench.now()
-        if ended.code == 0:  # it came when everything was done
+        if ended.code == 0:  # the signal came after the end of the work
             assert now == bench.new(name), place
             continue
         assert ended.code == 130, (place, ended.output)

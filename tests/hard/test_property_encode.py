@@ -78,7 +78,7 @@ def fields(draw: Draw) -> np.ndarray:
         ).astype(dtype)
     power = draw(st.integers(-4, 3) if dtype.itemsize == 2 else st.integers(-30, 30))
     offset = draw(st.sampled_from([0.0, 0.0, 1.0, -1e3]))
-    with np.errstate(over="ignore"):  # what is beyond float16 is infinite, as in other files
+    with np.errstate(over="ignore"):  # values beyond float16 become infinite
         values = ((values + offset) * 10.0**power).astype(dtype)
     holes = draw(st.sampled_from([0.0, 0.0, 0.01, 0.5]))
     values[chance.random(shape) < holes] = draw(st.sampled_from([np.nan, np.inf, -np.inf]))
@@ -183,9 +183,7 @@ def check(
     assert decoded.shape == values.shape
     assert not np.isinf(decoded).any()
     assert not found[~finite].any()
-    if (
-        config.key_frames != "all"
-    ):  # of other steps the model knows what is between them, where they have values
+    if config.key_frames != "all":  # other steps are finite where the key frames beside them are
         pass
     elif config.features == ("all",):
         assert (found == finite).all()
@@ -210,5 +208,5 @@ def check(
     assert missed or largest <= bound
     if config.psnr is not None and span > 0:
         assert missed or psnr >= config.psnr - 1e-9
-    if missed:  # and the miss is true
+    if missed:  # the miss is real
         assert largest > bound or psnr < (config.psnr if config.psnr is not None else 50.0)

@@ -107,7 +107,7 @@ def test_zarr(values: np.ndarray, order: list[str], form: int, data: Draw) -> No
     chunk = data.draw(chunks(stored.shape))
     names = {} if form == 2 else {"dimension_names": order}
     with folder() as place, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of float16 and the like
+        warnings.simplefilter("ignore")  # on float16 and similar types
         array = zarr.create_array(
             place / "a.zarr",
             shape=stored.shape,

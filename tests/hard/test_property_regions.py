@@ -188,7 +188,7 @@ def test_any_series_of_any_tiles_keeps_its_bound_and_its_regions(
         least, most = (
             max(limits.min, -(2**53)),
             min(limits.max, 2**53),
-        )  # a volume decodes integers to floats
+        )  # volumes decode integers to float64
         values = random.integers(least, most, shape, dtype=kind, endpoint=True)
     tile = "x".join(str(data.draw(st.integers(1, 12))) for _ in range(4))
     config = (

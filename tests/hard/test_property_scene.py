@@ -83,10 +83,10 @@ def floats(
     name: str, low: float | None, high: float | None, *, quick: bool
 ) -> st.SearchStrategy[float]:
     """Draw numbers within limits; the limits themselves and numbers near them come often."""
-    if quick and name == "step" and low == 1e-6:  # of a march: a small one takes as many samples
+    if quick and name == "step" and low == 1e-6:  # a small step of a march takes many samples
         low = 0.02
     everything = st.floats(low, high, allow_nan=False, allow_infinity=False)
-    if quick and name == "scale":  # of three from everywhere most are too different to be drawn
+    if quick and name == "scale":  # three arbitrary scales are mostly too different to draw
         everything = st.one_of(
             everything, st.floats(1e-3, 1e3), st.sampled_from([1e-30, 1e-29, 1e29, 1e30])
         )
@@ -251,7 +251,7 @@ def volume(
 
 
 SMALL = {"size": [6, 5]}
-FOUND: dict[str, dict[str, Any]] = {
+ONCE_WRONG: dict[str, dict[str, Any]] = {
     "smallest scale": {"scale": [1e-30, 1e-30, 1e-30]},
     "largest scale": {"scale": [6e29, 6e29, 0.5]},
     "light over a huge length": {
@@ -287,9 +287,9 @@ FOUND: dict[str, dict[str, Any]] = {
 """Scenes with which the test below has failed once."""
 
 
-@pytest.mark.parametrize("name", FOUND)
-def test_scenes_that_were_found(volume: Volume, name: str) -> None:
-    check_picture(volume, Scene.from_dict({**SMALL, **FOUND[name]}))
+@pytest.mark.parametrize("name", ONCE_WRONG)
+def test_scenes_that_were_wrong_once_are_drawn(volume: Volume, name: str) -> None:
+    check_picture(volume, Scene.from_dict({**SMALL, **ONCE_WRONG[name]}))
 
 
 @looking(25, 1000)
@@ -312,7 +312,7 @@ def check_picture(volume: Volume, scene: Scene) -> None:
     except FhashError as error:
         pytest.fail(f"{type(error).__name__}: {error}")
     width, height = scene.size
-    if scene.evolution is not None:  # several pictures side by side
+    if scene.evolution is not None:  # several pictures, side by side
         height, width = image.rgba.shape[:2]
     assert image.rgba.shape == (height, width, 4)
     assert np.isfinite(image.rgba).all()

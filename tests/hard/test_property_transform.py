@@ -148,7 +148,7 @@ def test_both_engines_write_the_same_bytes(integers: np.ndarray, data: Draw) -> 
         patch.setenv("FHASH_NATIVE", "0")
         patch.setattr(
             coder_portable, "_RUN", [None]
-        )  # plain Python: compiling takes longer than all examples
+        )  # plain Python, since compiling takes longer than all examples
         slow = encode_integers(integers, table)
         assert slow.data == fast.data
         crossed = decode_integers(fast.data, integers.shape, table)
