@@ -38,10 +38,10 @@ half-written, and the older output stays.""",
     "a signal at an operation": "The same signals at file operations.",
     "a source that changes": """\
 The source grows, shrinks, is rewritten or vanishes while it is read: the command is refused.""",
-    "two at once": "Two processes write one output. The result is the complete output of one of them.",
+    "two at once": "Two processes write one output. The result is complete and of one of them.",
     "little memory": "Commands under ever smaller limits of memory finish, or end with one line.",
     "a large series": "",
-    "a large decode within 1 GiB": "A series larger than the memory limit is decoded within the limit.",
+    "a large decode within 1 GiB": "A series larger than the memory limit is decoded within it.",
 }
 """A text for each case, by its name in the figures."""
 

@@ -37,7 +37,7 @@ def leftovers(now: Listing) -> set[str]:
 
 
 def check_killed(bench: Bench, name: str, before: Listing) -> None:
-    """Check the folder after a kill: every output is old or new, and the rest are temporary files."""
+    """Check the folder after a kill: each output is old or new, all else is temporary files."""
     now, after = bench.now(), bench.new(name)
     extra = leftovers(now)
     kept = {place: data for place, data in now.items() if place.split("/")[0] not in extra}

@@ -33,12 +33,12 @@ def stages(bench: Bench, name: str, noted: Path) -> list[tuple[str, int]]:
     words = [word for word in bench.words(name) if word != "-q"]
     ended = bench.server.run(*words, inject=[("note_stages", noted)])
     assert ended.code == 0, ended.output
-    found = [
+    reports_of_all = [
         (line.rpartition(" ")[0], int(line.rpartition(" ")[2]))
         for line in noted.read_text().splitlines()
     ]
     chosen = []
-    for _, group in itertools.groupby(dict.fromkeys(found), key=lambda report: report[0]):
+    for _, group in itertools.groupby(dict.fromkeys(reports_of_all), key=lambda report: report[0]):
         reports = list(group)
         chosen += reports if LONG else dict.fromkeys([reports[0], reports[-1]])
     return list(dict.fromkeys(chosen))
@@ -49,15 +49,15 @@ def test_a_signal_at_each_stage_leaves_the_older_output(
     bench: Bench, name: str, tmp_path: Path
 ) -> None:
     bench.old(name)
-    found = stages(bench, name, tmp_path / "stages")
-    assert found or name.startswith("decode vtp")
+    moments_of_stages = stages(bench, name, tmp_path / "stages")
+    assert moments_of_stages or name.startswith("decode vtp")
     if name in [f"encode {profile}" for profile in PROFILES]:
-        assert {stage for stage, _ in found} >= {
+        assert {stage for stage, _ in moments_of_stages} >= {
             "scanning",
             "measuring",
             "training" if "paper" in name else "coding",
         }
-    for turn, (stage, done) in enumerate(found):
+    for turn, (stage, done) in enumerate(moments_of_stages):
         number = SIGNALS[turn % len(SIGNALS)]
         before = bench.old(name)
         ended = bench.run(name, ("signal_at", stage, done, number))
@@ -76,7 +76,11 @@ def test_a_signal_at_each_stage_leaves_the_older_output(
     assert bench.now() == bench.new(name)
     record(
         "a signal at each stage",
-        {"command": name, "stages": len({stage for stage, _ in found}), "signals": len(found)},
+        {
+            "command": name,
+            "stages": len({stage for stage, _ in moments_of_stages}),
+            "signals": len(moments_of_stages),
+        },
     )
 
 

@@ -142,7 +142,7 @@ def tasks(draw: Draw) -> tuple[np.ndarray, EncodeConfig]:
     return values, draw(settings(values))
 
 
-@looking(30, 1000)
+@looking(15, 1000)
 @given(task=tasks())
 @example(task=(np.zeros((1, 1, 1, 1)), EncodeConfig(max_error_rel=0.0)))
 def test_any_settings_keep_their_promise_or_are_refused_in_one_line(
@@ -179,19 +179,19 @@ def check(
     missed: str,
 ) -> None:
     """Compare the promise and the stated figures with the decoded values."""
-    given, finite, found = values.astype(np.float64), np.isfinite(values), np.isfinite(decoded)
+    original, finite, kept = values.astype(np.float64), np.isfinite(values), np.isfinite(decoded)
     assert decoded.shape == values.shape
     assert not np.isinf(decoded).any()
-    assert not found[~finite].any()
+    assert not kept[~finite].any()
     if config.key_frames != "all":  # other steps are finite where the key frames beside them are
         pass
     elif config.features == ("all",):
-        assert (found == finite).all()
+        assert (kept == finite).all()
     elif config.features[0].startswith("interval"):
         ends = [float(end) for end in config.features[0].split(":")[1:]]
-        assert found[finite & (given >= ends[0]) & (given <= ends[1])].all()
-    errors = np.abs(decoded[found] - given[found])
-    span = float(given[finite].max() - given[finite].min())
+        assert kept[finite & (original >= ends[0]) & (original <= ends[1])].all()
+    errors = np.abs(decoded[kept] - original[kept])
+    span = float(original[finite].max() - original[finite].min())
     largest, squares = float(errors.max()), float(np.sqrt(np.mean((errors / (span or 1.0)) ** 2)))
     assert math.isclose(largest, figures["max_abs_error"], rel_tol=1e-9), (
         largest,

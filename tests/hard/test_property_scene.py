@@ -53,19 +53,19 @@ QUICK_FIELDS: dict[str, st.SearchStrategy[Any]] = {
 """Strategies for fields whose full range would take minutes for one picture."""
 
 
-def values_of(hint: Any, each: dataclasses.Field[Any], *, quick: bool) -> st.SearchStrategy[Any]:
+def values_of(hint: Any, field: dataclasses.Field[Any], *, quick: bool) -> st.SearchStrategy[Any]:
     """Draw values of a field by its annotation and its limits."""
     origin, parts = typing.get_origin(hint), typing.get_args(hint)
-    low, high = each.metadata.get("low"), each.metadata.get("high")
-    choices = each.metadata.get("choices", ())
-    if quick and each.name in QUICK_FIELDS:
-        return QUICK_FIELDS[each.name]
+    low, high = field.metadata.get("low"), field.metadata.get("high")
+    choices = field.metadata.get("choices", ())
+    if quick and field.name in QUICK_FIELDS:
+        return QUICK_FIELDS[field.name]
     if origin in (types.UnionType, typing.Union):
-        return st.one_of(*(values_of(part, each, quick=quick) for part in parts))
+        return st.one_of(*(values_of(argument, field, quick=quick) for argument in parts))
     if origin is tuple and parts[-1] is ...:
-        return st.lists(values_of(parts[0], each, quick=quick), max_size=3).map(tuple)
+        return st.lists(values_of(parts[0], field, quick=quick), max_size=3).map(tuple)
     if origin is tuple:
-        return st.tuples(*(values_of(part, each, quick=quick) for part in parts))
+        return st.tuples(*(values_of(argument, field, quick=quick) for argument in parts))
     if isinstance(hint, type) and issubclass(hint, Record):
         return records(hint, quick=quick)
     if hint is type(None):
@@ -75,8 +75,8 @@ def values_of(hint: Any, each: dataclasses.Field[Any], *, quick: bool) -> st.Sea
     if hint is int:
         return st.integers(int(low), int(high))
     if hint is float:
-        return floats(each.name, low, high, quick=quick)
-    return st.sampled_from(choices) if choices else TEXTS.get(each.name, COLOURS)
+        return floats(field.name, low, high, quick=quick)
+    return st.sampled_from(choices) if choices else TEXTS.get(field.name, COLOURS)
 
 
 def floats(
@@ -107,11 +107,11 @@ def records(kind: type[Record], *, quick: bool) -> st.SearchStrategy[Any]:
     """Draw records with any of their fields; those that contradict themselves are left out."""
     hints = typing.get_type_hints(kind)
     fields = {
-        each.name: values_of(hints[each.name], each, quick=quick)
-        for each in dataclasses.fields(kind)
+        field.name: values_of(hints[field.name], field, quick=quick)
+        for field in dataclasses.fields(kind)
     }  # type: ignore[arg-type]
     required = {
-        each.name for each in dataclasses.fields(kind) if each.default is dataclasses.MISSING
+        field.name for field in dataclasses.fields(kind) if field.default is dataclasses.MISSING
     }  # type: ignore[arg-type]
     chosen = st.fixed_dictionaries(
         {name: strategy for name, strategy in fields.items() if name in required},
@@ -134,7 +134,7 @@ def toml(values: dict[str, Any]) -> str:
         if isinstance(value, dict):
             return (
                 "{"
-                + ", ".join(f"{json.dumps(key)} = {text(part)}" for key, part in value.items())
+                + ", ".join(f"{json.dumps(key)} = {text(item)}" for key, item in value.items())
                 + "}"
             )
         if isinstance(value, list):
@@ -180,7 +180,7 @@ ANYTHING = st.recursive(
 PLACES = [(), ("camera",), ("transfer_function",), ("effects",), ("effects", "shading"), ("march",)]
 
 
-@looking(150)
+@looking(80)
 @given(
     place=st.sampled_from(PLACES),
     name=st.sampled_from(
@@ -207,8 +207,8 @@ def test_any_values_make_a_scene_or_are_refused_in_one_line(
     place: tuple[str, ...], name: str, value: object
 ) -> None:
     values: dict[str, Any] = {name: value}
-    for part in reversed(place):
-        values = {part: values}
+    for key in reversed(place):
+        values = {key: values}
     try:
         scene = Scene.from_dict(values)
     except InputError as error:
@@ -292,7 +292,7 @@ def test_scenes_that_were_wrong_once_are_drawn(volume: Volume, name: str) -> Non
     check_picture(volume, Scene.from_dict({**SMALL, **ONCE_WRONG[name]}))
 
 
-@looking(25, 1000)
+@looking(12, 1000)
 @given(scene=records(Scene, quick=True))
 def test_any_scene_is_drawn_in_finite_pixels_or_refused_in_one_line(
     volume: Volume, scene: Scene

@@ -199,6 +199,6 @@ def _orders() -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
 
 
 def _predictor(levels: tuple[int, ...], order: tuple[int, ...], reach: int) -> Predictor:
-    taps = sum(len(each_pass.taps) for each_pass in passes_of(levels, order, reach))  # type: ignore[arg-type]
+    taps = sum(len(a_pass.taps) for a_pass in passes_of(levels, order, reach))  # type: ignore[arg-type]
     weights = tuple(int(weight) for weight in np.random.default_rng(taps).integers(-600, 600, taps))
     return Predictor(step=1.0, origin=0.0, levels=levels, order=order, reach=reach, weights=weights)  # type: ignore[arg-type]
