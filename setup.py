@@ -1,7 +1,7 @@
-"""The native kernels: every C++ source of `fhash_formats.native` in one extension. All else is in pyproject.toml.
+"""The two native extensions: the C++ of `fhash_formats.native` and that of `fhash_codec.native`.
 
-The extension is optional. Without a C++17 compiler the build says so and goes on: the package then computes the same bits in numpy, more
-slowly.
+The rest of the build is described in pyproject.toml. The extensions are optional. Without a C++17
+compiler the build says so and goes on: the package then computes the same in numpy, more slowly.
 """
 
 from pathlib import Path
@@ -9,10 +9,14 @@ from pathlib import Path
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-NATIVE = Path("formats/fhash_formats/native")
+FORMATS = Path("formats/fhash_formats/native")
+"""Sources of the file format's library; the codec's library includes core.hpp and guard.hpp."""
+CODEC = Path("fhash_codec/native")
+"""Sources of the codec's library."""
 
-# No contraction into fused multiply-adds and no fast-math: a stream must decode to the same bits on every machine. That nothing traps, and
-# loops marked as independent, change no bit; without them the compiler does not vectorise the marcher.
+# No contraction into fused multiply-adds and no fast-math: a stream must decode to the same bits on
+# every machine. That nothing traps, and loops marked as independent, change no bit; without them
+# the compiler does not vectorise the marcher.
 GNU_FLAGS = [
     "-O3",
     "-std=c++17",
@@ -36,17 +40,25 @@ class BuildNative(build_ext):
         super().build_extensions()
 
 
+def native(name: str, folder: Path) -> Extension:
+    """The extension of all C++ sources in a folder, for the limited API of Python 3.11."""
+    headers = {*folder.glob("*.hpp"), *FORMATS.glob("*.hpp")}
+    return Extension(
+        name,
+        sources=sorted(path.as_posix() for path in folder.glob("*.cpp")),
+        depends=sorted(path.as_posix() for path in headers),
+        include_dirs=[FORMATS.as_posix()],
+        define_macros=[("Py_LIMITED_API", "0x030B0000")],
+        py_limited_api=True,
+        language="c++",
+        optional=True,
+    )
+
+
 setup(
     ext_modules=[
-        Extension(
-            "fhash_formats.native._core",
-            sources=sorted(path.as_posix() for path in NATIVE.glob("*.cpp")),
-            depends=sorted(path.as_posix() for path in NATIVE.glob("*.hpp")),
-            define_macros=[("Py_LIMITED_API", "0x030B0000")],
-            py_limited_api=True,
-            language="c++",
-            optional=True,
-        )
+        native("fhash_formats.native._core", FORMATS),
+        native("fhash_codec.native._codec", CODEC),
     ],
     cmdclass={"build_ext": BuildNative},
     options={"bdist_wheel": {"py_limited_api": "cp311"}},

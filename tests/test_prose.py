@@ -26,9 +26,9 @@ MAX_COLUMNS = 100
 def docstrings(tree: ast.Module) -> Iterator[ast.Constant]:
     """Every string that stands alone: of modules, classes and functions, and below constants."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-            if isinstance(node.value.value, str):
-                yield node.value
+        constant = node.value if isinstance(node, ast.Expr) else None
+        if isinstance(constant, ast.Constant) and isinstance(constant.value, str):
+            yield constant
 
 
 def constants_together(tree: ast.Module) -> Iterator[ast.Assign]:
@@ -48,7 +48,7 @@ def relative(path: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    "text, headless",
+    ("text", "headless"),
     [
         ("Of the range: a share.", True),
         ("\n    What the header says.", True),

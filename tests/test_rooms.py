@@ -42,6 +42,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("compact",),
         ("paper",),
         ("volume_model",),
+        ("indexing", "sampling"),
         ("volume",),
         ("rendering", "report"),
         ("comparison", "demo", "isosurface"),

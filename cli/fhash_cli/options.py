@@ -122,7 +122,7 @@ def parse_slice(text: str) -> slice:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
-    """How to read the data: the options that `series_options` adds."""
+    """Options that `series_options` adds: they say how to read the data."""
 
     var: str | None
     axes: str | None

@@ -67,7 +67,7 @@ class PlanTask:
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """How the series would be coded, by the choices made so far."""
+    """Settings and options that the series would be coded with, by the choices made so far."""
 
     sample: Sample
     """Tiles that the choices are tried on; their grid is the chosen one."""

@@ -1,6 +1,6 @@
 """Stages of planning: each takes the best attempt so far and returns a better one.
 
-The order of the trials is part of the format of the encoder: another order gives other bytes.
+Another order of the trials would give other bytes in the file.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
 
 
 def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Under a strict bound, train a predictor, and keep it if the file gets smaller by it."""
+    """Train a predictor for a strict bound, and keep it if the file gets smaller by it."""
     goal, effort = task.goal, task.config.effort
     if effort == 1 or not goal.error or goal.data_range <= 0:
         return attempt

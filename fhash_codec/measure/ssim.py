@@ -1,7 +1,7 @@
 """Structural similarity (SSIM) of volumes, with a Gaussian window and population covariance.
 
 It is that of scikit-image with `gaussian_weights=True, sigma=1.5, use_sample_covariance=False`.
-Native code computes it where it is installed (fhash_formats/native/quality.cpp), else numpy. In
+Native code computes it where it is installed (fhash_codec/native/quality.cpp), else numpy. In
 numpy a tile is filtered by three products with small banded matrices, since the window is separable
 and short: ten times faster than adding shifted arrays. Source: Wang et al. 2004.
 """
@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.measure.sums import range_and_sum
 from fhash_codec.measure.value_range import pieces, power_of_two
-from fhash_formats import native
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import share_out, usable_threads
 
@@ -163,7 +163,6 @@ class _Frames:
         function = (
             library.fhash_ssim_f32 if self.original.dtype == np.float32 else library.fhash_ssim_f64
         )
-        function.restype = ctypes.c_int64
         total = ctypes.c_double()
         numbers = (self.scale, self.mean, self.c1, self.c2, *_weights()[RADIUS:])
         count = function(

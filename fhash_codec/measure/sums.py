@@ -1,6 +1,6 @@
 """Range, sum and squared errors of many values.
 
-They are computed by native code (fhash_formats/native/quality.cpp), or by numpy with the same bits.
+They are computed by native code (fhash_codec/native/quality.cpp), or by numpy with the same bits.
 Both add in one fixed order: value i of a piece of PIECE values goes to lane i % LANES, and each
 lane is summed in order, then the lanes, then the pieces. The order is fixed because these figures
 steer the encoder, and its bytes must not depend on the machine.
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.measure.value_range import pieces
-from fhash_formats import native
 
 __all__ = ["Values", "range_and_sum", "squared_errors"]
 
@@ -108,7 +108,6 @@ def _call(
     name: `scan` or `errors`; the function of the type of the values is called.
     """
     function = getattr(library, f"fhash_{name}_f{values.dtype.itemsize * 8}")
-    function.restype = ctypes.c_int64
     output = (ctypes.c_double * results)()
     numbers = (ctypes.c_double(value) if isinstance(value, float) else value for value in arguments)
     return function(_pointer(values), *numbers, output), *output

@@ -10,12 +10,12 @@ import dataclasses
 
 import numpy as np
 
+from fhash_codec import native
 from fhash_codec.rendering.native.march import MAX_SURFACES, MAX_VALUES, march_native
 from fhash_codec.rendering.stream.fields import FrameField
 from fhash_codec.rendering.stream.stream import stream
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.task import Frame, Marched, Task
-from fhash_formats import native
 from fhash_formats.errors import InputError
 
 __all__ = ["march"]

@@ -272,8 +272,7 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
 def _histogram_of(volume: Volume) -> Histogram:
     """Count the finite values of a few steps in BINS bins over the value range."""
     last = volume.shape[0] - 1
-    # By a power of two, 1 for every ordinary range, so that edges of denormals are apart and no
-    # width overflows.
+    # A power of two, 1 for every ordinary range, keeps edges of denormals apart and widths finite.
     scale = volume.value_range.scale
     edges = np.linspace(volume.value_range.low * scale, volume.value_range.high * scale, BINS + 1)
     counts = np.zeros(BINS, dtype=np.int64)

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 
-from fhash_formats import native
+import fhash_codec.native as codec_native
+import fhash_formats.native as formats_native
 from fhash_formats.support.threads import usable_threads
 
 __all__ = ["describe_machine", "environment"]
@@ -26,10 +27,15 @@ def describe_machine() -> str:
         f"torch {version('torch')}",
         f"{platform.system()} {platform.machine()}",
         f"{usable_threads()} processors",
-        "without the native core" if native.library() is None else "native core",
+        "native core" if native_code() else "without the native core",
         "CUDA" if choose_device("auto").type == "cuda" else "no CUDA",
     ]
     return ", ".join(facts)
+
+
+def native_code() -> bool:
+    """Whether both native libraries are there: that of the file format and that of the codec."""
+    return formats_native.library() is not None and codec_native.library() is not None
 
 
 @contextmanager

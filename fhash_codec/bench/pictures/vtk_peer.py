@@ -10,6 +10,7 @@ import os
 import time
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -106,20 +107,7 @@ class VtkPeer:
         self.image.SetSpacing(*(abs(float(part)) for part in grid.spacing))
         self.image.SetOrigin(*(float(min(part)) for part in grid.corners))
         self.load(values)
-        self.mapper = (
-            vtk.vtkFixedPointVolumeRayCastMapper()
-            if mapper == "cpu"
-            else vtk.vtkOpenGLGPUVolumeRayCastMapper()
-        )
-        self.mapper.SetInputData(self.image)
-        self.mapper.AutoAdjustSampleDistancesOff()
-        self.mapper.SetSampleDistance(step)
-        if mapper == "cpu":
-            self.mapper.SetInteractiveSampleDistance(step)
-            self.mapper.LockSampleDistanceToInputSpacingOff()
-            self.mapper.SetNumberOfThreads(threads or os.cpu_count() or 1)
-        else:
-            self.mapper.SetUseJittering(False)
+        self.mapper = self._mapper(mapper, step, threads)
         self.property = vtk.vtkVolumeProperty()
         self.property.SetInterpolationTypeToLinear()
         self.property.SetScalarOpacityUnitDistance(unit)
@@ -144,6 +132,24 @@ class VtkPeer:
         self.window.SetMultiSamples(0)
         self.window.SetSize(*size)
         self.window.AddRenderer(self.renderer)
+
+    def _mapper(self, name: str, step: float, threads: int | None) -> Any:
+        """One of MAPPERS with a fixed ray step, for the image."""
+        mapper = (
+            self.vtk.vtkFixedPointVolumeRayCastMapper()
+            if name == "cpu"
+            else self.vtk.vtkOpenGLGPUVolumeRayCastMapper()
+        )
+        mapper.SetInputData(self.image)
+        mapper.AutoAdjustSampleDistancesOff()
+        mapper.SetSampleDistance(step)
+        if name == "cpu":
+            mapper.SetInteractiveSampleDistance(step)
+            mapper.LockSampleDistanceToInputSpacingOff()
+            mapper.SetNumberOfThreads(threads or os.cpu_count() or 1)
+        else:
+            mapper.SetUseJittering(False)
+        return mapper
 
     def load(self, values: Single) -> None:
         """Another frame; the mapper takes it up when it draws."""

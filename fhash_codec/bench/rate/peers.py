@@ -40,6 +40,10 @@ MAX_CHUNK = 2**31
 """Bytes of the largest chunk; HDF5 allows less than 4 GiB."""
 
 
+BOTH = ("psnr", "bound")
+"""Goals of a peer that is tried for every kind of quality."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Variant:
     """One mode and layout of a peer.
@@ -94,73 +98,81 @@ def peers() -> dict[str, tuple[Variant, ...]]:
         raise MissingDependencyError(
             "bench rate compares with the codecs of hdf5plugin; pip install 'fhash[bench]'"
         ) from error
+    return {
+        "SZ3": _sz3(plugins),
+        "SPERR": _sperr(plugins),
+        "ZFP": _zfp(plugins),
+        "BitRound": _bit_round(plugins),
+        "Blosc": _blosc(plugins),
+    }
 
+
+def _sz3(plugins: Any) -> tuple[Variant, ...]:
     def absolute(part: Values, data_range: float, level: float) -> Filter:
         return plugins.SZ3(absolute=tolerance(data_range, level))  # type: ignore[no-any-return]
 
-    def sperr_tolerance(part: Values, data_range: float, level: float) -> Filter:
+    return tuple(
+        Variant(peer="SZ3", mode="tolerance", layout=layout, goals=BOTH, setting=absolute)
+        for layout in ("frame", "series")
+    )
+
+
+def _sperr(plugins: Any) -> tuple[Variant, ...]:
+    def absolute(part: Values, data_range: float, level: float) -> Filter:
         return plugins.Sperr(absolute=tolerance(data_range, level), swap=True)  # type: ignore[no-any-return]
 
-    def sperr_psnr(part: Values, data_range: float, level: float) -> Filter:
+    def psnr(part: Values, data_range: float, level: float) -> Filter:
         own = max(float(part.max()) - float(part.min()), 1e-9 * data_range)
-        psnr = max(0.1, level + 20 * math.log10(own / data_range))
-        return plugins.Sperr(peak_signal_to_noise_ratio=psnr, swap=True)  # type: ignore[no-any-return]
+        quality = max(0.1, level + 20 * math.log10(own / data_range))
+        return plugins.Sperr(peak_signal_to_noise_ratio=quality, swap=True)  # type: ignore[no-any-return]
 
-    def sperr_rate(part: Values, data_range: float, level: float) -> Filter:
+    def rate(part: Values, data_range: float, level: float) -> Filter:
         # Bits a value. Each 6 dB double them, nearly true at low rates; the search does the rest.
         return plugins.Sperr(rate=min(63.9, max(2.0**-15, 2.0 ** (level / 6 - 9))), swap=True)  # type: ignore[no-any-return]
 
-    def zfp(part: Values, data_range: float, level: float) -> Filter:
+    # At equal PSNR a tolerance costs more bytes than the other modes: it is for bounds alone.
+    modes = (("PSNR", "psnr", psnr), ("rate", "psnr", rate), ("tolerance", "bound", absolute))
+    return tuple(
+        Variant(peer="SPERR", mode=mode, layout=layout, goals=(goal,), setting=setting)
+        for mode, goal, setting in modes
+        for layout in ("frame", "plane")
+    )
+
+
+def _zfp(plugins: Any) -> tuple[Variant, ...]:
+    def accuracy(part: Values, data_range: float, level: float) -> Filter:
         return plugins.Zfp(accuracy=tolerance(data_range, level))  # type: ignore[no-any-return]
 
-    def blosc(part: Values, data_range: float, level: float) -> Filter:
+    return tuple(
+        Variant(
+            peer="ZFP", mode="tolerance", layout=layout, goals=BOTH, setting=accuracy, step=LADDER
+        )
+        for layout in ("frame", "series")
+    )
+
+
+def _bit_round(plugins: Any) -> tuple[Variant, ...]:
+    return (
+        replace(
+            _lossless(plugins, "BitRound", "bits"),
+            lossless=False,
+            step=LADDER,
+            prepare=_rounded,
+        ),
+    )
+
+
+def _blosc(plugins: Any) -> tuple[Variant, ...]:
+    return (_lossless(plugins, "Blosc", "lossless"),)
+
+
+def _lossless(plugins: Any, peer: str, mode: str) -> Variant:
+    """Blosc (zstd, shuffle) on single frames."""
+
+    def setting(part: Values, data_range: float, level: float) -> Filter:
         return plugins.Blosc(cname="zstd", clevel=5, shuffle=plugins.Blosc.SHUFFLE)  # type: ignore[no-any-return]
 
-    both = ("psnr", "bound")
-    quality = ("psnr",)
-    bound = ("bound",)  # at equal PSNR a tolerance of SPERR costs more bytes
-    return {
-        "SZ3": tuple(
-            Variant(peer="SZ3", mode="tolerance", layout=layout, goals=both, setting=absolute)
-            for layout in ("frame", "series")
-        ),
-        "SPERR": tuple(
-            Variant(peer="SPERR", mode=mode, layout=layout, goals=goals, setting=setting)
-            for mode, goals, setting in (
-                ("PSNR", quality, sperr_psnr),
-                ("rate", quality, sperr_rate),
-                ("tolerance", bound, sperr_tolerance),
-            )
-            for layout in ("frame", "plane")
-        ),
-        "ZFP": tuple(
-            Variant(
-                peer="ZFP", mode="tolerance", layout=layout, goals=both, setting=zfp, step=LADDER
-            )
-            for layout in ("frame", "series")
-        ),
-        "BitRound": (
-            Variant(
-                peer="BitRound",
-                mode="bits",
-                layout="frame",
-                goals=both,
-                setting=blosc,
-                step=LADDER,
-                prepare=_bit_round,
-            ),
-        ),
-        "Blosc": (
-            Variant(
-                peer="Blosc",
-                mode="lossless",
-                layout="frame",
-                goals=both,
-                setting=blosc,
-                lossless=True,
-            ),
-        ),
-    }
+    return Variant(peer=peer, mode=mode, layout="frame", goals=BOTH, setting=setting, lossless=True)
 
 
 def small_chunks(variants: Sequence[Variant]) -> Variant:
@@ -174,7 +186,7 @@ def small_chunks(variants: Sequence[Variant]) -> Variant:
     )
 
 
-def _bit_round(values: Values, level: float) -> Values:
+def _rounded(values: Values, level: float) -> Values:
     """Values with as many bits of the mantissa as a level has steps."""
     from numcodecs import BitRound
 

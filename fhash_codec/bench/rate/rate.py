@@ -84,22 +84,19 @@ def bench_rate(
         values = np.stack(list(series.frames()))
         missing = values.size - scanned.finite_count
         plain = ArraySeries(values, name=series.name, units=series.units, coords=series.coords)
-        goals = [("psnr", target) for target in sorted(targets)] + [
-            ("bound", bound) for bound in sorted(bounds, reverse=True)
-        ]
+        goals = [("psnr", target) for target in sorted(targets)]
+        goals += [("bound", bound) for bound in sorted(bounds, reverse=True)]
         bench = Bench(plain, value_range, missing, Path(folder), goals, progress)
         chosen = [variant for name in names for variant in variants[name]]
-        bench.total = sum(goal in variant.goals for variant in chosen for goal, _ in goals) + len(
-            goals
-        ) * len(profiles)
+        peer_trials = sum(goal in variant.goals for variant in chosen for goal, _ in goals)
+        bench.total = peer_trials + len(goals) * len(profiles)
         for variant in chosen:
             bench.search(variant)
         for profile in profiles:
             bench.search_own(settings, profile)
         if speed and targets:
-            bench.measure_speed(
-                min(targets, key=lambda target: (abs(target - SPEED_AT), target)), variants
-            )
+            nearest = min(targets, key=lambda target: (abs(target - SPEED_AT), target))
+            bench.measure_speed(nearest, variants)
         return RateBench(
             series=f"{series.source} {series.name}",
             shape=series.shape,

@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Blocks, Index
 from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Coding, code
 from fhash_codec.compact.tiles.tiling import even_tile
-from fhash_formats import native
 from fhash_formats.transform.tile.decoding import transform_for
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -93,7 +93,7 @@ class Magnitudes:
 def magnitudes(coefficients: npt.NDArray[np.float32]) -> Magnitudes:
     """Return the histogram of coefficients.
 
-    The native code (fhash_formats/native/quality.cpp) and numpy give the same figures.
+    The native code (fhash_codec/native/quality.cpp) and numpy give the same figures.
     """
     flat = np.ascontiguousarray(coefficients, dtype=np.float32).reshape(-1)
     library = native.library()

@@ -13,7 +13,7 @@ from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.errors import InputError
-from fhash_formats.transform.head.inputs import CROSS, FEATURES
+from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
 
 if TYPE_CHECKING:
@@ -154,13 +154,15 @@ def choose_head(
         if trained is None:
             return None
         tried_with_head: list[Outcome] = []
-        found = find_step(replace(coarser, head=trained.head), tried_with_head)
-        return _Candidate(trained, *found, tried_with_head)
+        with_head = replace(coarser, head=trained.head)
+        settings_with_head, outcome_with_head = find_step(with_head, tried_with_head)
+        return _Candidate(trained, settings_with_head, outcome_with_head, tried_with_head)
 
     shapes = [Shape(widths, cross=True), PERCEPTRON] if widths else [PERCEPTRON]
     # Side by side: a training takes one processor, and so does coding a single tile.
     with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
-        candidates = [found for found in workers.map(train, shapes) if found is not None]
+        trained_heads = list(workers.map(train, shapes))
+    candidates = [candidate for candidate in trained_heads if candidate is not None]
     return _cheapest(settings, outcome, candidates, strict=strict, data_range=data_range)
 
 
@@ -216,7 +218,7 @@ def _best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[
 
     def saved(widths: tuple[int, int]) -> float:
         first, second = widths
-        weights = FEATURES * first + len(CROSS) * first * second + second
+        weights = INPUTS * first + len(CROSS) * first * second + second
         return (
             size * (1 - 2 ** (-GAIN_BY_WIDTHS[widths] * gain / octave) - WEIGHT_TIME * weights)
             - WEIGHT_BYTES * weights

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.transform.head.head_portable import centre_features, clip, compress
-from fhash_formats.transform.head.inputs import FEATURES, STEPS
+from fhash_formats.transform.head.head_portable import centre_inputs, clip, compress
+from fhash_formats.transform.head.inputs import INPUTS, OFFSETS
 
 __all__ = ["BATCH_VOXELS", "Batches", "ErrorRange", "Pair", "Voxels", "batches", "draw"]
 
@@ -58,7 +58,7 @@ class Batches:
     """Batches of n voxels."""
 
     inputs: npt.NDArray[np.int16]
-    """Inputs of the network (batches, FEATURES, voxels looked at, n)."""
+    """Inputs of the network (batches, INPUTS, voxels looked at, n)."""
     targets: npt.NDArray[Any]
     """Original minus decoded values (batches, n), in units of sigma."""
     lowest: npt.NDArray[Any]
@@ -111,7 +111,7 @@ def batches(
     originals = np.concatenate([voxels.originals for voxels in drawn])
     order = random.permutation(len(values))
     count = len(values) // BATCH_VOXELS
-    inputs = np.empty((count, FEATURES, len(offsets), BATCH_VOXELS), dtype=np.int16)
+    inputs = np.empty((count, INPUTS, len(offsets), BATCH_VOXELS), dtype=np.int16)
     first = 0
     for pair, voxels in zip(pairs, drawn, strict=True):
         for piece in _inputs(pair.decoded, voxels.places, offsets, value_range):
@@ -138,7 +138,7 @@ def _inputs(
     offsets: Sequence[tuple[int, ...]],
     value_range: ErrorRange,
 ) -> Iterator[npt.NDArray[np.int16]]:
-    """Yield the inputs of voxels of a tile, (FEATURES, offsets, n), some voxels at a time.
+    """Yield the inputs of voxels of a tile, (INPUTS, offsets, n), some voxels at a time.
 
     They are the inputs that the head itself computes, for the voxels at each offset.
 
@@ -161,9 +161,9 @@ def _inputs(
             ]
         )
         centre = flat[at]
-        features = np.empty((FEATURES, *at.shape), dtype=np.int16)
-        for number, step in enumerate(STEPS):
-            neighbour = flat[at + int(strides @ np.array(step))]
-            features[number] = compress((neighbour - centre) * inverse)
-        features[-2:] = centre_features(centre, low, inverse, unit)
-        yield features
+        inputs = np.empty((INPUTS, *at.shape), dtype=np.int16)
+        for number, offset in enumerate(OFFSETS):
+            neighbour = flat[at + int(strides @ np.array(offset))]
+            inputs[number] = compress((neighbour - centre) * inverse)
+        inputs[-2:] = centre_inputs(centre, low, inverse, unit)
+        yield inputs

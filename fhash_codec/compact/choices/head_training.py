@@ -34,7 +34,7 @@ from fhash_formats.transform.head.head import (
     NeighbourHead,
     layer_inputs,
 )
-from fhash_formats.transform.head.inputs import CROSS, FEATURES
+from fhash_formats.transform.head.inputs import CROSS, INPUTS
 
 __all__ = ["TrainedHead", "train_head"]
 
@@ -282,7 +282,7 @@ def _errors(
 ) -> Tensor:
     """Return corrected minus original values of a batch (starts, n) in units of sigma."""
     inputs = samples.inputs[batch].to(torch.float32).mul_(1 / 512)
-    values = inputs.reshape(1, FEATURES, -1).expand(len(parameters[0]), -1, -1)
+    values = inputs.reshape(1, INPUTS, -1).expand(len(parameters[0]), -1, -1)
     for layer in range(0, len(parameters), 2):
         weights, biases = parameters[layer : layer + 2]
         if rounded:

@@ -24,7 +24,7 @@ from fhash_formats.transform.tile.settings import TileSettings
 Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
 """Transforms along (t, z, y, x)."""
 NONE = AxisTransform(kind="none")
-"""No transform along an axis."""
+"""Marks an axis without a transform."""
 MAX_BASIS_LENGTH = 128
 """Longest axis in vertices that gets a basis of the data's own: longer factors cost too much."""
 PLANE_WAVELETS = (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3), ("5/3", 2))

@@ -43,7 +43,7 @@ ROUNDS = 2
 
 @dataclass(frozen=True, kw_only=True)
 class LevelCoding:
-    """How the table of a level is coded.
+    """The coding of the table of a level.
 
     Attributes:
         tile: vertices (t, z, y, x) of a tile.

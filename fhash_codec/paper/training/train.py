@@ -121,7 +121,7 @@ def plan_training(
 
 @dataclass(kw_only=True)
 class TrainingProgress:
-    """How far a training has come. Checkpoints store it under the names of these fields.
+    """The progress of a training. Checkpoints store it under the names of these fields.
 
     Attributes:
         epoch: finished epochs.

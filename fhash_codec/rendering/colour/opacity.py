@@ -224,7 +224,7 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
         return np.array([[low, BACKGROUND]])
     if len(edges) != len(counts) + 1 or len(counts) == 0 or not counts.sum() > 0:
         return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
-    # By a power of two, 1 for every ordinary range, so that no difference overflows or is a
+    # Scaled by a power of two, 1 for every ordinary range, so that no difference overflows or is a
     # denormal.
     scale = ValueRange(low, high).scale
     edges, low, high = edges * scale, low * scale, high * scale

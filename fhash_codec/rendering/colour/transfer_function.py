@@ -140,8 +140,8 @@ class TransferFunction:
     def opacity(self, values: npt.ArrayLike) -> Floats:
         """Look up the opacity 0..1 after the unit distance, without the density; 0 for NaN."""
         array = np.asarray(values, dtype=np.float64)
-        # By a power of two, 1 for ordinary values: the distance of two points may overflow, and so
-        # may its reciprocal.
+        # Scaled by a power of two, 1 for ordinary values: the distance of two points may overflow,
+        # and so may its reciprocal.
         scale = ValueRange(self.points[0, 0], self.points[-1, 0]).scale
         opacity = np.interp(scale * array, scale * self.points[:, 0], self.points[:, 1])
         return np.where(np.isnan(array), 0.0, opacity)

@@ -1,1 +1,1 @@
-"""The task as the C++ marcher takes it."""
+"""The native marcher: a task in its units, its structure, and marching by it."""

@@ -1,4 +1,4 @@
-"""A task in the vertices of a frame, as the native library takes it, and what a gradient counts as."""
+"""A task in the vertices of a frame, as the native marcher takes it."""
 
 from __future__ import annotations
 
@@ -14,24 +14,34 @@ from fhash_codec.rendering.task.task import Frame, Table, Task
 __all__ = ["MarchInput", "empty_table"]
 
 Floats = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
 
-LARGEST, SMALLEST = 1e36, 1e-28
-"""Magnitude and range of values that float32 can compute with; others are scaled."""
+MAX_MAGNITUDE = 1e36
+"""Largest magnitude of values that float32 can compute with; larger values are scaled."""
+MIN_RANGE = 1e-28
+"""Smallest range of a table that float32 can compute with; values of a smaller one are scaled."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MarchInput:
-    """All places and directions are in vertices of the frame, x, y, z.
+    """The numbers of a task in the units of the native marcher.
+
+    All places and directions are in vertices of the frame, x, y, z.
 
     Attributes:
-        values: float32 (z, y, x), scaled if float32 could not compute with them. low, high: ends of the table, scaled likewise.
+        values: float32 (z, y, x), scaled where float32 could not compute with them.
+        low, high: values of the table's ends, scaled likewise.
         levels: values of the surfaces, scaled likewise.
-        eye, right, up, forward: of the rays. box: (3, 2), in which steps are counted. seen: what of it the frame has values of.
-        spacing: length of one vertex spacing. gradient: factors (3,) from differences between vertices to what is shaded by.
-        floor: magnitude of that at which light from a direction is half gone. light_offset, light_scale: from places to light grid.
+        eye, right, up, forward: camera of the rays, each (3,).
+        box: (3, 2), the drawn box, in which steps are counted.
+        seen: (3, 2), the part of the box in which the frame has values.
+        spacing: (3,), length of one vertex spacing in the coordinates.
+        gradient: (3,), factors from differences between vertices to the gradients of shading.
+        floor: gradient at which shading has faded by half.
+        light_offset, light_scale: a place is at place * scale + offset (3,) in the light grid.
     """
 
-    values: npt.NDArray[np.float32]
+    values: Single
     low: float
     high: float
     levels: tuple[float, ...]
@@ -49,44 +59,60 @@ class MarchInput:
 
     @classmethod
     def of(cls, frame: Frame, task: Task, bricks: Bricks) -> MarchInput:
-        """From a frame, its bricks and a task."""
+        """The input for a task and a frame with its bricks."""
         grid, stride = task.rays.grid, float(frame.stride)
         first = np.array(frame.first[::-1], dtype=np.float64)
-        spacing = grid.spacing * stride
         least, most = bricks.value_range
         low, high = (task.table.low, task.table.high) if task.table is not None else (least, most)
-        values, middle, unit = bricks.values, 0.0, 1.0
-        largest = max(abs(least), abs(most), abs(low), abs(high))
-        if largest > LARGEST or 0 < high - low < SMALLEST:
-            middle, unit = low / 2 + high / 2, max(high / 2 - low / 2, largest * 1e-30, 5e-324)
-            with np.errstate(over="ignore"):
-                values = (
-                    (bricks.values.astype(np.float64) / unit - middle / unit)
-                    .clip(-LARGEST, LARGEST)
-                    .astype(np.float32)
-                )
-        low, high, least, most = (
-            number / unit - middle / unit for number in (low, high, least, most)
-        )
+        scaling = _Scaling.of(low, high, max(abs(least), abs(most)))
+        low, high, least, most = map(scaling.number, (low, high, least, most))
         span, floor = flatness(low, high, least, most)
         light = task.light
         return cls(
-            values=values,
+            values=scaling.array(bricks.values),
             low=low,
             high=high if high > low else low + span,
-            levels=tuple(surface.value / unit - middle / unit for surface in task.surfaces),
+            levels=tuple(scaling.number(surface.value) for surface in task.surfaces),
             eye=(task.rays.eye - first) / stride,
             right=task.rays.right / stride,
             up=task.rays.up / stride,
             forward=task.rays.forward / stride,
             box=(grid.bounds - first[:, None]) / stride,
             seen=(frame.bounds(grid) - first[:, None]) / stride,
-            spacing=spacing,
+            spacing=grid.spacing * stride,
             gradient=slope_scale(grid, span, least, most),
             floor=floor,
             light_offset=np.zeros(3) if light is None else (first - light.first) / light.cell,
             light_scale=1.0 if light is None else stride / light.cell,
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scaling:
+    """Values as value / unit - middle / unit, so that float32 can compute with them."""
+
+    middle: float = 0.0
+    unit: float = 1.0
+
+    @classmethod
+    def of(cls, low: float, high: float, magnitude: float) -> _Scaling:
+        """The scaling for a table from `low` to `high` and values of at most a magnitude."""
+        largest = max(magnitude, abs(low), abs(high))
+        if largest <= MAX_MAGNITUDE and not 0 < high - low < MIN_RANGE:
+            return cls()
+        return cls(middle=low / 2 + high / 2, unit=max(high / 2 - low / 2, largest * 1e-30, 5e-324))
+
+    def number(self, value: float) -> float:
+        """Scale a value."""
+        return value / self.unit - self.middle / self.unit
+
+    def array(self, values: Single) -> Single:
+        """Scale values, clipped to MAX_MAGNITUDE; without scaling the result is the same array."""
+        if self == _Scaling():
+            return values
+        with np.errstate(over="ignore"):
+            scaled = values.astype(np.float64) / self.unit - self.middle / self.unit
+            return scaled.clip(-MAX_MAGNITUDE, MAX_MAGNITUDE).astype(np.float32)
 
 
 def empty_table(low: float, high: float) -> Table:

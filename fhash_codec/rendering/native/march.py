@@ -1,13 +1,14 @@
-"""Marching in packets of rays by the native library (formats/fhash_formats/native/march.cpp).
+"""Marching in packets of rays by the native library (fhash_codec/native/march.cpp).
 
-With central differences a gradient is half of the difference between the values a vertex of the frame behind and before along each axis,
-clamped to the frame; where one of them is missing that of the cell, along that axis. The normal buffer always has that of the cell.
+A central difference is half of the difference between the values one vertex of the frame behind and
+before, clamped to the frame. Where one of the two is missing, the gradient of the cell along that
+axis takes its place. The normal buffer always has the gradient of the cell.
 """
 
 from __future__ import annotations
 
 import ctypes
-from ctypes import POINTER, c_double, c_float, c_int32, c_int64, c_uint32
+from dataclasses import dataclass
 from itertools import count, product
 
 import numpy as np
@@ -15,81 +16,42 @@ import numpy.typing as npt
 
 from fhash_codec.rendering.native.cells import cells_of
 from fhash_codec.rendering.native.frame_task import MarchInput, empty_table
+from fhash_codec.rendering.native.structure import (
+    LIT,
+    MAX_SURFACES,
+    MAX_VALUES,
+    MAXIMUM,
+    POWERS,
+    SHADED,
+    TILE,
+    March,
+    box,
+    numbers,
+    surface,
+)
 from fhash_codec.rendering.task.bricks import SIDE, Bricks
-from fhash_codec.rendering.task.task import Frame, Marched, Table, Task, extinctions_in
+from fhash_codec.rendering.task.counters import complete
+from fhash_codec.rendering.task.task import Frame, Lighting, Marched, Table, Task, extinctions_in
 from fhash_formats.support.threads import in_threads, usable_threads
 
-__all__ = ["MAX_SURFACES", "march_native"]
+__all__ = ["MAX_SURFACES", "MAX_VALUES", "march_native"]
 
-MAX_SURFACES = 64
-"""In one picture: FHASH_SURFACES of march.hpp."""
-MAX_VALUES = 2**31 - 1
-"""Of a frame, for the vectors' indices of 32 bits."""
+Single = npt.NDArray[np.float32]
+
 ENTRIES = 4000
-"""Of a table, at least."""
-POWERS = 1024
-TILE = 16
+"""Entries of a table of a step, at least. So close together, opacity is linear between them as
+extinction is.
+"""
 GROUP = 8
 """Tiles that a thread takes at a time."""
 MIN_SKIPPED = 0.4
-"""Of the bricks, those of which nothing can be seen: of fewer, looking for them takes longer than marching through them."""
-SHADED, LIT, MAXIMUM = 1, 2, 4
-
-_Three = c_double * 3
-_Pair = c_double * 2
-_Ends = _Pair * 3
-_Five = c_double * 5
-
-
-class _March(ctypes.Structure):
-    """FhashMarch of march.hpp, field by field."""
-
-    _fields_ = (
-        ("values", POINTER(c_float)),
-        ("shape", c_int64 * 3),
-        ("distance", POINTER(c_int32)),
-        ("cells", POINTER(c_uint32)),
-        ("highest", POINTER(c_float)),
-        ("bricks", c_int64 * 3),
-        ("table", POINTER(c_float)),
-        ("extinction", POINTER(c_double)),
-        ("entries", c_int64),
-        ("low", c_double),
-        ("scale", c_double),
-        ("light", POINTER(c_float)),
-        ("light_shape", c_int64 * 3),
-        ("light_offset", _Three),
-        ("light_scale", c_double),
-        ("eye", _Three),
-        ("right", _Three),
-        ("up", _Three),
-        ("forward", _Three),
-        ("box", _Ends),
-        ("seen", _Ends),
-        ("spacing", _Three),
-        ("width", c_int64),
-        ("height", c_int64),
-        ("parallel", c_int64),
-        ("rays", c_int64),
-        ("step", c_double),
-        ("threshold", c_double),
-        ("jitter", c_int64),
-        ("lamp", _Three),
-        ("ambient", c_double),
-        ("diffuse", c_double),
-        ("specular", c_double),
-        ("steep", c_double),
-        ("gradient", _Three),
-        ("floor", c_double),
-        ("powers", POINTER(c_float)),
-        ("surfaces", c_int64),
-        ("surface", _Five * MAX_SURFACES),
-        ("out", POINTER(c_float)),
-        ("depth", POINTER(c_float)),
-        ("normal", POINTER(c_float)),
-        ("central", c_int64),
-        ("path", c_int64),
-    )
+"""Smallest share of invisible bricks for which leaping over them pays; below it the test costs more
+than it saves.
+"""
+SHARPEST = 16
+"""Exponent of highlights above which their table is stretched over the cosines next to 1."""
+COUNTED = ("rays", "passes", "samples", "gradients", "skipped_bricks")
+"""Names of the counters of `fhash_march`, in its order."""
 
 
 def march_native(
@@ -103,164 +65,114 @@ def march_native(
 ) -> Marched:
     """The picture of a task, as `march` describes it.
 
-    path: of the processor: 0 the quickest that it has, 1 at most AVX2, 2 neither. Pictures agree within rounding.
+    path: instructions of the processor that may be used: 0 all, 1 at most AVX2, 2 only those that
+    every processor has. The pictures agree within rounding.
     """
-    setting = MarchInput.of(frame, task, bricks)
-    table = task.table or empty_table(setting.low, setting.high)
-    width, height = task.rays.size
-    rgba = np.zeros((height, width, 4), dtype=np.float32)
-    depth = (
-        np.full((height, width), np.inf, dtype=np.float32) if task.depth or task.normal else None
-    )
-    normal = np.zeros((height, width, 3), dtype=np.float32) if task.normal else None
-    entries, extinctions = _entries(table, task.step)
-    # A step longer than a brick could pass through one in which a surface lies, from one in which nothing does to another.
-    leap = task.step / float(np.abs(setting.spacing).min()) > SIDE and bool(task.surfaces)
-    distance = bricks.distance(task) if task.skipping and not task.maximum and not leap else None
-    cells = None
-    # For the same reason no step is longer than a cell; rounding of places in float32 counts.
-    if distance is not None and not (
-        task.surfaces and task.step > 0.99 * float(np.abs(setting.spacing).min())
-    ):
-        cells = cells_of(library, bricks, task, distance)
-    if (
-        distance is not None
-        and cells is None
-        and np.count_nonzero(distance) < MIN_SKIPPED * distance.size
-    ):
-        distance = None
-    highest = (
-        bricks.high if task.skipping and task.maximum and setting.values is bricks.values else None
-    )
-    light = (
-        None if task.light is None else np.ascontiguousarray(task.light.shares, dtype=np.float32)
-    )
-    lighting = task.lighting
-    steep = max(1.0, lighting.specular_power / 16) if lighting is not None else 1.0
-    cosines = np.maximum(1 - np.arange(POWERS + 2) / (POWERS * steep), 0.0)
-    powers = (cosines ** (lighting.specular_power if lighting is not None else 1.0)).astype(
-        np.float32
-    )
-    surfaces = [
-        _Five(level, *surface.colour, surface.opacity)
-        for level, surface in zip(setting.levels, task.surfaces, strict=True)
-    ]
-    given = _March(
-        values=_floats(setting.values),
-        shape=setting.values.shape,
-        distance=None if distance is None else distance.ctypes.data_as(POINTER(c_int32)),
-        cells=None if cells is None else cells.ctypes.data_as(POINTER(c_uint32)),
-        highest=_floats(highest),
+    given = MarchInput.of(frame, task, bricks)
+    buffers = _Buffers.of(task)
+    skipping = _skipping(library, given, task, bricks)
+    structure = March(
+        values=given.values,
+        shape=given.values.shape,
         bricks=bricks.low.shape,
-        table=_floats(entries),
-        extinction=extinctions.ctypes.data_as(POINTER(c_double)),
-        entries=len(entries) - 1,
-        low=setting.low,
-        scale=(len(entries) - 2) / (setting.high - setting.low),
-        light=_floats(light),
-        light_shape=(0, 0, 0) if light is None else light.shape[:3],
-        light_offset=_Three(*setting.light_offset),
-        light_scale=setting.light_scale,
-        eye=_Three(*setting.eye),
-        right=_Three(*setting.right),
-        up=_Three(*setting.up),
-        forward=_Three(*setting.forward),
-        box=_Ends(*(_Pair(*ends) for ends in setting.box)),
-        seen=_Ends(*(_Pair(*ends) for ends in setting.seen)),
-        spacing=_Three(*setting.spacing),
-        width=width,
-        height=height,
-        parallel=task.rays.parallel,
-        rays=task.antialiasing,
-        step=task.step,
-        threshold=task.threshold,
-        jitter=task.jitter,
-        lamp=_Three(
-            *(
-                lighting.lamp
-                if lighting is not None and lighting.lamp is not None
-                else (0.0, 0.0, 0.0)
-            )
-        ),
-        ambient=lighting.ambient if lighting is not None else 1.0,
-        diffuse=lighting.diffuse if lighting is not None else 0.0,
-        specular=lighting.specular if lighting is not None else 0.0,
-        steep=steep,
-        gradient=_Three(*setting.gradient),
-        floor=setting.floor,
-        powers=_floats(powers),
-        surfaces=0 if task.maximum else len(surfaces),
-        surface=(_Five * MAX_SURFACES)(*surfaces),
-        out=_floats(rgba),
-        depth=_floats(depth),
-        normal=_floats(normal),
-        central=lighting is not None and lighting.central,
+        distance=skipping.distance,
+        cells=skipping.cells,
+        highest=skipping.highest,
+        **_table_fields(given, task),
+        **_light_fields(given, task),
+        **_ray_fields(given, task),
+        **_lighting_fields(task.lighting),
+        gradient=numbers(given.gradient),
+        floor=given.floor,
+        surfaces=0 if task.maximum else len(task.surfaces),
+        surface=_surfaces(given, task),
+        out=buffers.rgba,
+        depth=buffers.depth,
+        normal=buffers.normal,
         path=path,
     )
-    wanted = MAXIMUM if task.maximum else SHADED * task.shaded | LIT * (light is not None)
-    spans = _spans(task)
-    groups = count()
-
-    def work(_: int) -> npt.NDArray[np.int64]:
-        counters = np.zeros(5, dtype=np.int64)
-        while (group := next(groups)) < len(spans):
-            failed = library.fhash_march(
-                ctypes.byref(given),
-                c_int64(wanted),
-                c_int64(spans[group][0]),
-                c_int64(spans[group][1]),
-                ctypes.c_void_p(counters.ctypes.data),
-            )
-            assert not failed
-        return counters
-
-    workers = max(1, min(threads or usable_threads(), len(spans)))
-    found = (
-        work(0)
-        if workers == 1
-        else sum(in_threads(work, range(workers)), np.zeros(5, dtype=np.int64))
+    counters = _march(library, structure, task, threads)
+    return Marched(
+        rgba=buffers.rgba,
+        depth=buffers.depth if task.depth else None,
+        normal=buffers.normal,
+        counters=counters,
     )
-    rays, passes, samples, gradients, skipped = (int(number) for number in found)
-    counters = {
-        "rays": rays,
-        "passes": passes,
-        "samples": samples,
-        "evaluations": 0,
-        "gradients": gradients,
-        "secondary_rays": 0,
-        "skipped_bricks": skipped,
-    }
-    return Marched(rgba=rgba, depth=depth if task.depth else None, normal=normal, counters=counters)
 
 
-def _spans(task: Task) -> list[tuple[int, int]]:
-    """Tiles of the picture, first and stop in rows, of the rectangle around the box: all other rays miss it."""
-    width, height = task.rays.size
-    across, down = -(-width // TILE), -(-height // TILE)
-    with np.errstate(all="ignore"):
-        pixels, depth = task.rays.project(np.array(list(product(*task.rays.grid.bounds))))
-    left, top, right, bottom = 0, 0, across, down
-    if np.isfinite(pixels).all() and (task.rays.parallel or np.all(depth > 1e-6 * depth.max())):
-        # Rounding is far below a pixel.
-        low, high = (
-            np.floor((pixels.min(axis=0) - 1) / TILE),
-            np.ceil((pixels.max(axis=0) + 1) / TILE),
-        )
-        left, top = (
-            int(min(max(at, 0), most)) for at, most in zip(low, (across, down), strict=True)
-        )
-        right, bottom = (
-            int(min(max(at, 0), most)) for at, most in zip(high, (across, down), strict=True)
-        )
-    rows = (range(row * across + left, row * across + right, GROUP) for row in range(top, bottom))
-    return [(first, min(first + GROUP, row.stop)) for row in rows for first in row]
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Buffers:
+    """The pictures that rays are added to: rgba (H, W, 4), depth (H, W) and normal (H, W, 3).
 
-
-def _entries(table: Table, step: float) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float64]]:
-    """Colours and opacities (n + 1, 4), and extinctions (n + 1,), of a step; the last entry twice.
-
-    They lie so close that opacity is linear between them as extinction is.
+    Normals need the depth, to keep that of the nearest of several rays.
     """
+
+    rgba: Single
+    depth: Single | None
+    normal: Single | None
+
+    @classmethod
+    def of(cls, task: Task) -> _Buffers:
+        width, height = task.rays.size
+        return cls(
+            rgba=np.zeros((height, width, 4), dtype=np.float32),
+            depth=np.full((height, width), np.inf, dtype=np.float32)
+            if task.depth or task.normal
+            else None,
+            normal=np.zeros((height, width, 3), dtype=np.float32) if task.normal else None,
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Skipping:
+    """What lets rays pass over invisible parts of a frame; None where all of it is looked at.
+
+    Attributes:
+        distance: int32 (z, y, x), as `Bricks.distance` has it.
+        cells: uint32 (z, y, x, 2), as `cells_of` has it.
+        highest: float32 (z, y, x) of bricks, the largest value, for the maximum along a ray.
+    """
+
+    distance: npt.NDArray[np.int32] | None = None
+    cells: npt.NDArray[np.uint32] | None = None
+    highest: Single | None = None
+
+
+def _skipping(library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Bricks) -> _Skipping:
+    """What a task's rays may pass over."""
+    if not task.skipping:
+        return _Skipping()
+    if task.maximum:
+        # Scaled values have other extremes than the bricks.
+        return _Skipping(highest=bricks.high if given.values is bricks.values else None)
+    shortest = float(np.abs(given.spacing).min())
+    # A step longer than a brick could pass through one in which a surface lies, on its way from one
+    # in which nothing is visible to another.
+    if task.surfaces and task.step / shortest > SIDE:
+        return _Skipping()
+    distance = bricks.distance(task)
+    # For the same reason no step may be longer than a cell. Rounding of places to float32 counts.
+    by_cells = not (task.surfaces and task.step > 0.99 * shortest)
+    cells = cells_of(library, bricks, task, distance) if by_cells else None
+    if cells is None and np.count_nonzero(distance) < MIN_SKIPPED * distance.size:
+        return _Skipping()
+    return _Skipping(distance=distance, cells=cells)
+
+
+def _table_fields(given: MarchInput, task: Task) -> dict[str, object]:
+    """The fields of the transfer function."""
+    entries, extinctions = _entries(task.table or empty_table(given.low, given.high), task.step)
+    return {
+        "table": entries,
+        "extinction": extinctions,
+        "entries": len(entries) - 1,
+        "low": given.low,
+        "scale": (len(entries) - 2) / (given.high - given.low),
+    }
+
+
+def _entries(table: Table, step: float) -> tuple[Single, npt.NDArray[np.float64]]:
+    """Colours and opacities (n + 1, 4) and extinctions (n + 1,) of a step; the last entry twice."""
     last = len(table.extinctions) - 1
     places = np.append(np.linspace(0, last, last * -(-ENTRIES // last) + 1), last)
     columns = [np.interp(places, np.arange(last + 1), column) for column in table.colours.T]
@@ -268,6 +180,107 @@ def _entries(table: Table, step: float) -> tuple[npt.NDArray[np.float32], npt.ND
     return np.stack([*columns, -np.expm1(-extinctions)], axis=-1).astype(np.float32), extinctions
 
 
-def _floats(array: npt.NDArray[np.float32] | None) -> object:
-    """A pointer that keeps its array; null for None."""
-    return None if array is None else array.ctypes.data_as(POINTER(c_float))
+def _light_fields(given: MarchInput, task: Task) -> dict[str, object]:
+    """The fields of the light grid."""
+    light = task.light
+    shares = None if light is None else np.ascontiguousarray(light.shares, dtype=np.float32)
+    return {
+        "light": shares,
+        "light_shape": (0, 0, 0) if shares is None else shares.shape[:3],
+        "light_offset": numbers(given.light_offset),
+        "light_scale": given.light_scale,
+    }
+
+
+def _ray_fields(given: MarchInput, task: Task) -> dict[str, object]:
+    """The fields of the rays and their steps."""
+    width, height = task.rays.size
+    return {
+        "eye": numbers(given.eye),
+        "right": numbers(given.right),
+        "up": numbers(given.up),
+        "forward": numbers(given.forward),
+        "box": box(given.box),
+        "seen": box(given.seen),
+        "spacing": numbers(given.spacing),
+        "width": width,
+        "height": height,
+        "parallel": task.rays.parallel,
+        "rays": task.antialiasing,
+        "step": task.step,
+        "threshold": task.threshold,
+        "jitter": task.jitter,
+    }
+
+
+def _lighting_fields(lighting: Lighting | None) -> dict[str, object]:
+    """The fields of Phong's model; without one only ambient light of strength 1."""
+    if lighting is None:
+        lighting = Lighting(ambient=1.0, diffuse=0.0, specular=0.0, specular_power=1.0, lamp=None)
+    steep = max(1.0, lighting.specular_power / SHARPEST)
+    cosines = np.maximum(1 - np.arange(POWERS + 2) / (POWERS * steep), 0.0)
+    return {
+        "lamp": numbers((0.0, 0.0, 0.0) if lighting.lamp is None else lighting.lamp),
+        "ambient": lighting.ambient,
+        "diffuse": lighting.diffuse,
+        "specular": lighting.specular,
+        "steep": steep,
+        "powers": (cosines**lighting.specular_power).astype(np.float32),
+        "central": lighting.central,
+    }
+
+
+def _surfaces(given: MarchInput, task: Task) -> ctypes.Array[ctypes.Array[ctypes.c_double]]:
+    surfaces = zip(given.levels, task.surfaces, strict=True)
+    rows = (surface(level, each.colour, each.opacity) for level, each in surfaces)
+    return (ctypes.c_double * 5 * MAX_SURFACES)(*rows)
+
+
+def _march(
+    library: ctypes.CDLL, structure: March, task: Task, threads: int | None
+) -> dict[str, int]:
+    """March all rays in several threads, into the buffers of a structure; the counters."""
+    flags = MAXIMUM if task.maximum else SHADED * task.shaded | LIT * (task.light is not None)
+    spans = _spans(task)
+    groups = count()
+
+    def work(_: int) -> npt.NDArray[np.int64]:
+        counters = np.zeros(len(COUNTED), dtype=np.int64)
+        while (group := next(groups)) < len(spans):
+            first, stop = spans[group]
+            failed = library.fhash_march(
+                ctypes.byref(structure), flags, first, stop, counters.ctypes.data
+            )
+            assert not failed
+        return counters
+
+    workers = max(1, min(threads or usable_threads(), len(spans)))
+    if workers == 1:
+        total = work(0)
+    else:
+        total = sum(in_threads(work, range(workers)), np.zeros(len(COUNTED), dtype=np.int64))
+    return complete(dict(zip(COUNTED, total.tolist(), strict=True)))
+
+
+def _spans(task: Task) -> list[tuple[int, int]]:
+    """Tiles (first, stop) in rows of the picture, in the rectangle around the drawn box.
+
+    All other rays miss the box.
+    """
+    width, height = task.rays.size
+    across, down = -(-width // TILE), -(-height // TILE)
+    with np.errstate(all="ignore"):
+        pixels, depth = task.rays.project(np.array(list(product(*task.rays.grid.bounds))))
+    left, top, right, bottom = 0, 0, across, down
+    if np.isfinite(pixels).all() and (task.rays.parallel or np.all(depth > 1e-6 * depth.max())):
+        # Rounding is far below a pixel.
+        left, top = _tiles(np.floor((pixels.min(axis=0) - 1) / TILE), (across, down))
+        right, bottom = _tiles(np.ceil((pixels.max(axis=0) + 1) / TILE), (across, down))
+    rows = (range(row * across + left, row * across + right, GROUP) for row in range(top, bottom))
+    return [(first, min(first + GROUP, row.stop)) for row in rows for first in row]
+
+
+def _tiles(ends: npt.NDArray[np.float64], limits: tuple[int, int]) -> tuple[int, int]:
+    """Numbers of tiles (x, y), clipped to 0..limits."""
+    x, y = (int(min(max(end, 0), limit)) for end, limit in zip(ends, limits, strict=True))
+    return x, y

@@ -42,7 +42,7 @@ MAX_RAY_SAMPLES = 10**8
 MAX_RAYS = 2**26
 """Most rays of a picture: more would not fit in the memory of most machines."""
 SHOULDER = (-0.7, 1.0, 1.0)
-"""Default direction towards the light of shadows: to the right, upwards, towards the camera."""
+"""Default direction towards the light of shadows: components right, up and towards the camera."""
 
 
 def plan_picture(
@@ -153,6 +153,7 @@ def _function(
     value_range = (volume.value_range.low, volume.value_range.high)
 
     def function_of(counted: Histogram | None) -> TransferFunction:
+        """The function with a histogram, or without one."""
         return TransferFunction.of(
             spec,
             value_range=value_range,
@@ -257,7 +258,7 @@ def _task(
     lamp: Floats | None,
     lod: int,
 ) -> Task:
-    """What a marcher is given, without the light that is computed from a frame."""
+    """The task of a marcher, without the light that is computed from a frame."""
     effects, march = scene.effects, scene.march
     table = None if scene.transfer_function.nothing else _table(function, units)
     shading = _shading(effects)

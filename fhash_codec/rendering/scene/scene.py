@@ -13,7 +13,6 @@ from pathlib import Path
 
 from fhash_codec.rendering.scene.png_text import scene_text_in_png
 from fhash_codec.rendering.scene.record import Record, limits
-from fhash_codec.rendering.task.devices import DEVICES
 from fhash_formats.errors import InputError
 
 __all__ = [
@@ -39,6 +38,8 @@ VIEWS = ("iso", "xy", "xz", "yz", "yx", "zx", "zy")
 """Names of the directions to look from, as in PyVista: `xy` has x to the right and y upwards."""
 MARCHES = ("auto", "cache", "arm", "stream")
 """Names of the ways to march: through a decoded frame, or straight through the model."""
+DEVICES = ("auto", "cpu", "cuda")
+"""Names of the devices that rays are marched on."""
 BUFFERS = ("depth", "normal")
 """Names of the buffers beside the colours."""
 GRADIENTS = ("cell", "central")

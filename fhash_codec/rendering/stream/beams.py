@@ -1,34 +1,45 @@
-"""The rays of a picture as lines through the volume: which samples each of them takes, and where those lie."""
+"""The rays of a picture as lines through the volume: the samples of each ray and their places."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from fhash_codec.rendering.camera.camera import Rays
 from fhash_codec.rendering.task.arrays import NUMPY, Array, Arrays
 from fhash_codec.rendering.task.task import Task
 
-__all__ = ["Beams", "shares", "slab"]
+__all__ = ["ENDLESS", "Beams", "shares", "slab"]
 
 ENDLESS = 2.0**62
-"""Samples: more than a ray can have."""
+"""More samples than a ray can have."""
 NEAR = 1e-7
-"""Vertices: rounding moves a place by less, even where the camera is far away."""
+"""Largest distance from a face, in vertices, that is taken for rounding. Rounding moves a place by
+less, even where the camera is far away.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Beams:
-    """Many rays. Sample k of one lies at origin + k * pace, or the nearest place to that which the field has values of; places between
-    samples have fractions of k.
+    """The samples of many rays.
+
+    Sample k of a ray lies at origin + k * pace, or at the nearest place to that at which the field
+    has values. Places between samples have fractions of k. All attributes but `step` are arrays of
+    `arrays`, float64 unless said otherwise.
 
     Attributes:
-        origin, pace: (n, 3), of sample 0 and from one sample to the next, x, y, z in vertices of the domain.
-        begin, end: (n,), int64, the samples between which the field can have values.
-        entered, leaving: (n,), where the ray enters and leaves what the field has values of, in samples.
-        last: (n,), int64, the last sample of the whole path, and `rest` the length of its step in steps.
-        depth: (n,), of sample 0 from the eye, in units of the coordinates. step: from one sample to the next in those.
-        along: (n, 3), unit vectors in physical directions. bounds: (3, 2), of the field. All but `step` are arrays of `arrays`, float64.
+        origin: (n, 3), place of sample 0, x, y, z in vertices of the domain.
+        pace: (n, 3), from one sample to the next.
+        begin, end: int64 (n,), the samples between which the field can have values, half-open.
+        entered, leaving: (n,), where the ray enters and leaves the bounds of the field, in samples.
+        last: int64 (n,), the last sample of the whole path.
+        rest: (n,), length of the last sample's step, in steps.
+        depth: (n,), of sample 0 from the eye, in units of the coordinates.
+        along: (n, 3), unit vectors in physical directions.
+        step: length from one sample to the next, in units of the coordinates.
+        bounds: (3, 2), box in which the field has values.
     """
 
     arrays: Arrays
@@ -47,50 +58,37 @@ class Beams:
 
     @classmethod
     def of(cls, task: Task, within: Array, rows: range, arrays: Arrays = NUMPY) -> Beams:
-        """The rays of rows of the picture, those of a pixel behind one another. within: box (3, 2) that the field has values of."""
-        xp, rays, side = arrays.xp, task.rays, task.antialiasing
-        (width, height), fine = rays.size, side * side
-        number = rows.start * width * fine + arrays.range(len(rows) * width * fine)
-        pixel, part = number // fine, number % fine
-        u = 2 * (arrays.real(pixel % width) + (arrays.real(part % side) + 0.5) / side) / width - 1
-        w = (
-            1
-            - 2 * (arrays.real(pixel // width) + (arrays.real(part // side) + 0.5) / side) / height
+        """The rays of rows of the picture; the rays of a pixel follow one another.
+
+        within: box (3, 2) in which the field has values.
+        """
+        xp = arrays.xp
+        (width, _), rays_of_pixel = task.rays.size, task.antialiasing**2
+        number = rows.start * width * rays_of_pixel + arrays.range(
+            len(rows) * width * rays_of_pixel
         )
-        right, up, forward, eye, spacing = (
-            arrays.array(part)
-            for part in (rays.right, rays.up, rays.forward, rays.eye, rays.grid.spacing)
-        )
-        across = u[:, None] * right + w[:, None] * up
-        eye, direction = (
-            (eye + across, forward + 0 * across)
-            if rays.parallel
-            else (eye + 0 * across, forward + across)
-        )
-        direction = direction / xp.sqrt(xp.sum((direction * spacing) ** 2, axis=1))[:, None]
-        bounds = arrays.array(rays.grid.bounds)
-        enter, leave = slab(eye, direction, bounds, arrays)
-        first, stop = slab(eye, direction, within, arrays)
-        hit = (leave > enter) & (stop > first)
-        ends = (enter, leave, xp.maximum(first, enter), xp.minimum(stop, leave))
-        enter, leave, first, stop = (xp.where(hit, end, 0.0) for end in ends)
-        steps = (leave - enter) / task.step
+        eye, direction = _lines(task.rays, number, task.antialiasing, arrays)
+        spacing = arrays.array(task.rays.grid.spacing)
+        path = _paths(eye, direction, arrays.array(task.rays.grid.bounds), within, arrays)
+        steps = (path.leave - path.enter) / task.step
         count = xp.ceil(xp.clip(steps, None, ENDLESS))
         share = shares(number, arrays) if task.jitter else arrays.full(len(number), 0.5)
-        depth = enter + share * task.step
-        entered, leaving = ((place - enter) / task.step - share for place in (first, stop))
-        begin = xp.where(first > enter, xp.ceil(entered), 0.0)
-        end = xp.where(stop < leave, xp.floor(leaving) + 1, count)
+        depth = path.enter + share * task.step
+        entered, leaving = (
+            (place - path.enter) / task.step - share for place in (path.first, path.stop)
+        )
+        begin = xp.where(path.first > path.enter, xp.ceil(entered), 0.0)
+        end = xp.where(path.stop < path.leave, xp.floor(leaving) + 1, count)
         none = 0 * count
         return cls(
             arrays=arrays,
             origin=eye + depth[:, None] * direction,
             pace=direction * task.step,
-            begin=arrays.whole(xp.clip(begin, none, count)),
-            end=arrays.whole(xp.where(hit, xp.clip(end, none, count), 0.0)),
+            begin=arrays.to_int64(xp.clip(begin, none, count)),
+            end=arrays.to_int64(xp.where(path.hit, xp.clip(end, none, count), 0.0)),
             entered=entered,
             leaving=leaving,
-            last=arrays.whole(count) - 1,
+            last=arrays.to_int64(count) - 1,
             rest=steps - (count - 1),
             depth=depth,
             along=direction * spacing,
@@ -99,17 +97,17 @@ class Beams:
         )
 
     def places(self, rays: Array, at: Array) -> Array:
-        """Places (n, ..., 3) at samples (n, ...) of rays (n,), within what the field has values of."""
+        """Places (n, ..., 3) at samples (n, ...) of rays (n,), clipped to the field's bounds."""
         extra = (1,) * (at.ndim - 1)
-        origin, pace = (part[rays].reshape(-1, *extra, 3) for part in (self.origin, self.pace))
+        origin, pace = (ends[rays].reshape(-1, *extra, 3) for ends in (self.origin, self.pace))
         return self.arrays.xp.clip(
             origin + at[..., None] * pace, self.bounds[:, 0], self.bounds[:, 1]
         )
 
     def borders(self, rays: Array, at: Array) -> Array:
-        """The same for where rays enter or leave: what rounding keeps off a face lies on it.
+        """`places` for the samples at which rays enter or leave, snapped onto the faces.
 
-        Of a surface with the value of a whole face that decides whether it is met.
+        Otherwise rounding decides whether a ray meets an isosurface that coincides with a face.
         """
         xp, places = self.arrays.xp, self.places(rays, at)
         for face in (self.bounds[:, 0], self.bounds[:, 1]):
@@ -117,16 +115,68 @@ class Beams:
         return places
 
 
+def _lines(rays: Rays, number: Array, side: int, arrays: Arrays) -> tuple[Array, Array]:
+    """Origins (n, 3) of rays and directions (n, 3) of unit length in the coordinates.
+
+    number: int64 (n,), numbers of the rays: pixel by pixel, side * side rays for each.
+    """
+    xp, (width, height), rays_of_pixel = arrays.xp, rays.size, side * side
+    pixel, within = number // rays_of_pixel, number % rays_of_pixel
+    column = arrays.to_float64(pixel % width) + (arrays.to_float64(within % side) + 0.5) / side
+    row = arrays.to_float64(pixel // width) + (arrays.to_float64(within // side) + 0.5) / side
+    u, w = 2 * column / width - 1, 1 - 2 * row / height
+    right, up, forward, eye, spacing = (
+        arrays.array(vector)
+        for vector in (rays.right, rays.up, rays.forward, rays.eye, rays.grid.spacing)
+    )
+    across = u[:, None] * right + w[:, None] * up
+    eye, direction = (
+        (eye + across, forward + 0 * across)
+        if rays.parallel
+        else (eye + 0 * across, forward + across)
+    )
+    return eye, direction / xp.sqrt(xp.sum((direction * spacing) ** 2, axis=1))[:, None]
+
+
+class _Paths(NamedTuple):
+    """Paths of rays, each (n,), as lengths in the coordinates from the rays' origins.
+
+    enter, leave: where the drawn box begins and ends; 0 for rays that do not hit.
+    first, stop: where the part of it begins and ends in which the field has values.
+    hit: whether there is such a part.
+    """
+
+    enter: Array
+    leave: Array
+    first: Array
+    stop: Array
+    hit: Array
+
+
+def _paths(eye: Array, direction: Array, box: Array, within: Array, arrays: Arrays) -> _Paths:
+    """The paths of rays through the drawn box and the field's box (3, 2) within it."""
+    xp = arrays.xp
+    enter, leave = slab(eye, direction, box, arrays)
+    first, stop = slab(eye, direction, within, arrays)
+    hit = (leave > enter) & (stop > first)
+    first, stop = xp.maximum(first, enter), xp.minimum(stop, leave)
+    enter, leave, first, stop = (xp.where(hit, end, 0.0) for end in (enter, leave, first, stop))
+    return _Paths(enter, leave, first, stop, hit)
+
+
 def slab(origin: Array, direction: Array, bounds: Array, arrays: Arrays) -> tuple[Array, Array]:
-    """Where rays (n, 3) enter and leave a box (3, 2), in lengths of their direction; leaving is before entering where they miss it."""
+    """Where rays (n, 3) enter and leave a box (3, 2), in lengths of their direction.
+
+    A ray that misses the box leaves it before it enters.
+    """
     xp = arrays.xp
     with np.errstate(divide="ignore", invalid="ignore"):
         near, far = ((bounds[:, side] - origin) / direction for side in (0, 1))
     inside = (origin >= bounds[:, 0]) & (origin <= bounds[:, 1])
     flat = direction == 0  # along a face: inside or not, without a division
-    whole, none = arrays.full((), np.inf), arrays.full((), -np.inf)
-    low = xp.where(flat, xp.where(inside, none, whole), xp.minimum(near, far))
-    high = xp.where(flat, xp.where(inside, whole, none), xp.maximum(near, far))
+    endless = arrays.full((), np.inf)
+    low = xp.where(flat, xp.where(inside, -endless, endless), xp.minimum(near, far))
+    high = xp.where(flat, xp.where(inside, endless, -endless), xp.maximum(near, far))
     return xp.clip(xp.amax(low, axis=1), 0.0, None), xp.amin(high, axis=1)
 
 
@@ -137,4 +187,4 @@ def shares(numbers: Array, arrays: Arrays) -> Array:
         # What overflows int64 is above the 32 bits that count.
         x = ((x ^ (x >> shift)) * factor) & 0xFFFFFFFF
     x = x ^ (x >> 16)
-    return (arrays.real(x) + 0.5) / 2.0**32
+    return (arrays.to_float64(x) + 0.5) / 2.0**32

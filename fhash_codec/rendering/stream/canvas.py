@@ -1,4 +1,4 @@
-"""What streamed rays have seen: events joined front to back, lit, and the buffers beside the picture."""
+"""What streamed rays have seen: events joined front to back and lit, and the other buffers."""
 
 from __future__ import annotations
 
@@ -18,9 +18,15 @@ __all__ = ["Canvas", "Events"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Events:
-    """What a pass meets along each ray, (rays, events), the nearest first: before each sample the surfaces, then the sample itself.
+    """What the rays of a pass meet, the nearest first: surfaces before a sample, then the sample.
 
-    opacity: 0 where there is nothing. at: in samples. which: of the surfaces, their number for the volume. values: (rays, samples).
+    With s surfaces a ray has s + 1 events for each sample.
+
+    Attributes:
+        opacity: (rays, events), 0 where there is nothing.
+        at: (rays, events), places in samples of the ray.
+        which: int64 (rays, events), number of the surface; s for the volume.
+        values: (rays, samples), values of the samples.
     """
 
     opacity: Array
@@ -30,19 +36,19 @@ class Events:
 
 
 class Canvas:
-    """Colour (n, 3) and depth, normal (n, 3) of rays, and `clear` (n,), the share of the light behind that comes through.
+    """The picture of a band of rays as far as it is marched.
 
-    gradients: how many it took.
+    Attributes:
+        colour: (n, 3), colours, multiplied by the opacity.
+        clear: (n,), share of the light behind that comes through.
+        depth: (n,), distance from the eye; infinity where nothing was seen.
+        normal: (n, 3), unit vectors towards the eye; 0 where nothing was seen.
+        gradients: number of gradients that were evaluated.
     """
 
     def __init__(self, field: Field, task: Task, beams: Beams, palette: Palette | None) -> None:
-        self.field, self.task, self.beams, self.palette, self.arrays = (
-            field,
-            task,
-            beams,
-            palette,
-            field.arrays,
-        )
+        self.field, self.task, self.beams, self.palette = field, task, beams, palette
+        self.arrays = field.arrays
         count = len(beams.end)
         self.colour, self.clear = self.arrays.full((count, 3), 0.0), self.arrays.full(count, 1.0)
         self.depth, self.normal = self.arrays.full(count, np.inf), self.arrays.full((count, 3), 0.0)
@@ -53,17 +59,17 @@ class Canvas:
         self._spacing = self.arrays.array(task.rays.grid.spacing)
 
     def add(self, alive: Array, events: Events) -> None:
-        """Join a pass to its rays, front to back."""
+        """Join the events of a pass to its rays, front to back. alive: numbers of the rays."""
         arrays, xp = self.arrays, self.arrays.xp
-        each = len(self._surfaces) + 1
-        # Light behind each event; the first column is what was left before.
+        per_sample = len(self._surfaces) + 1
+        # Light behind each event; the first column is what was left before the pass.
         left = xp.cumprod(
             xp.concatenate([self.clear[alive][:, None], 1 - events.opacity], axis=1), axis=1
         )
         # A ray ends after a sample, never between a surface and the sample behind it.
-        ended = left[:, :-1:each] < self.task.threshold
+        ended = left[:, :-1:per_sample] < self.task.threshold
         ended[:, 0] = False
-        ended = xp.broadcast_to(ended[..., None], (*ended.shape, each)).reshape(
+        ended = xp.broadcast_to(ended[..., None], (*ended.shape, per_sample)).reshape(
             events.opacity.shape
         )
         weight = xp.where(ended, 0.0, left[:, :-1] * events.opacity)
@@ -72,7 +78,7 @@ class Canvas:
         row, column = arrays.nonzero(weight)
         if not len(row):
             return
-        # One event of a ray after the other, as in any other number of passes.
+        # One event of a ray after the other: so the sum does not depend on the number of passes.
         arrays.add_rows(
             self.colour,
             alive[row],
@@ -81,11 +87,11 @@ class Canvas:
         if self.task.depth or self.task.normal:
             behind = after < 0.5
             new = xp.isinf(self.depth[alive]) & xp.any(behind, axis=1)
-            event = xp.argmax(arrays.whole(behind[new]), axis=1)
+            event = xp.argmax(arrays.to_int64(behind[new]), axis=1)
             self.see(alive[new], arrays.take_along(events.at[new], event[:, None], 1)[:, 0])
 
     def see(self, rays: Array, at: Array) -> None:
-        """Depth and normal of rays (n,) at samples (n,)."""
+        """Set depth and normal of rays (n,) at samples (n,)."""
         xp = self.arrays.xp
         self.depth[rays] = self.beams.depth[rays] + at * self.beams.step
         if not self.task.normal or not len(rays):
@@ -100,29 +106,27 @@ class Canvas:
         self.normal[rays] = slopes / xp.where(length > 0, length, 1.0)
 
     def show_peaks(self, peak: Array, at: Array) -> None:
-        """The largest value along each ray (n,), where it is finite, opaque, behind what surfaces there are."""
+        """Draw the largest value along each ray, opaque, behind the surfaces that are there.
+
+        peak: (n,), the values; rays whose value is not finite show nothing.
+        at: (n,), their places in samples.
+        """
         assert self.palette is not None
-        (known,) = self.arrays.nonzero(self.arrays.xp.isfinite(peak))
+        (shown,) = self.arrays.nonzero(self.arrays.xp.isfinite(peak))
         if self.task.depth or self.task.normal:
             # As if surfaces of little opacity were not there.
-            front = known[self.clear[known] >= 0.5]
+            front = shown[self.clear[shown] >= 0.5]
             self.see(front, at[front])
-        self.colour[known] += self.clear[known][:, None] * self.palette.colour(peak[known])
-        self.clear[known] = 0.0
+        self.colour[shown] += self.clear[shown][:, None] * self.palette.colour(peak[shown])
+        self.clear[shown] = 0.0
 
     def _colours(self, rays: Array, events: Events, row: Array, column: Array) -> Array:
-        """Colours (n, 3) of events, lit."""
-        arrays, task, surfaces = self.arrays, self.task, len(self._surfaces)
-        which = events.which[row, column]
-        colours = arrays.full((len(rays), 3), 0.0)
-        of_volume = which == surfaces
-        if self.palette is not None:
-            colours[of_volume] = self.palette.colour(
-                events.values[row[of_volume], column[of_volume] // (surfaces + 1)]
-            )
-        for number, colour in enumerate(self._surfaces):
-            colours[which == number] = colour
-        (lit,) = arrays.nonzero(of_volume | ~of_volume if task.shaded else ~of_volume)
+        """Lit colours (n, 3) of events (row, column) of rays (n,)."""
+        arrays, which = self.arrays, events.which[row, column]
+        of_volume = which == len(self._surfaces)
+        colours = self._unlit(events, row, column, which)
+        is_lit = arrays.xp.ones_like(of_volume) if self.task.shaded else ~of_volume
+        (lit,) = arrays.nonzero(is_lit)
         if self._light is None and not len(lit):
             return colours
         places = self.beams.places(rays, events.at[row, column])
@@ -132,13 +136,30 @@ class Canvas:
         result = colours * (lamp * around)[:, None]
         if len(lit):
             assert self._phong is not None
-            self.gradients += len(lit)
-            slopes = (
-                central_slopes(self.field, places[lit])
-                if self._phong.lighting.central
-                else self.field.slopes(places[lit])
-            )
+            slopes = self._slopes(self._phong, places[lit])
             result[lit] = self._phong(
                 colours[lit], slopes, self.beams.along[rays[lit]], lamp[lit], around[lit]
             )
         return result
+
+    def _unlit(self, events: Events, row: Array, column: Array, which: Array) -> Array:
+        """Colours (n, 3) of events without light."""
+        surfaces = len(self._surfaces)
+        colours = self.arrays.full((len(row), 3), 0.0)
+        of_volume = which == surfaces
+        if self.palette is not None:
+            colours[of_volume] = self.palette.colour(
+                events.values[row[of_volume], column[of_volume] // (surfaces + 1)]
+            )
+        for number, colour in enumerate(self._surfaces):
+            colours[which == number] = colour
+        return colours
+
+    def _slopes(self, phong: Phong, places: Array) -> Array:
+        """Slopes (n, 3) at places (n, 3) for shading, counted."""
+        self.gradients += len(places)
+        return (
+            central_slopes(self.field, places)
+            if phong.lighting.central
+            else self.field.slopes(places)
+        )

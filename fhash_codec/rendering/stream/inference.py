@@ -1,11 +1,13 @@
 """A network's values at scattered places of one key index, for streamed samples.
 
-On the host the value of a place has the same bits whatever other places are evaluated with it.
+On the host the value of a place has the same bits whatever other places are evaluated with it
+(fhash_codec/paper/pointwise.py).
+
 On a device it has not: a library of matrix products chooses its kernels by the number of samples.
-There two evaluations of a place differ by at most twice the rounding error of the layers' sums:
-a sum of k products is off by at most k u / (1 - k u) times the sum of their magnitudes, u = 2**-24,
-in each layer, and a layer hands on the error of the layer before it. Slopes at a place within that
-distance of a kink of a ReLU may be those of either side.
+There two evaluations of a place differ by at most twice the rounding error of the layers' sums. A
+sum of k products is off by at most k u / (1 - k u) times the sum of their magnitudes, u = 2**-24,
+and each layer hands on the error of the layer before it. Slopes at a place within that distance of
+a kink of a ReLU may be those of either side.
 """
 
 from __future__ import annotations
@@ -24,19 +26,19 @@ __all__ = ["DenseInference", "Inference", "PatchInference"]
 
 
 class Inference(Protocol):
-    """A network at places (n, 3), float64, x, y, z in vertices of its box, within it."""
+    """A network at places (n, 3), float64, x, y, z in vertices of its box, within the box."""
 
     def values(self, places: Array) -> Array:
-        """Normalised values float32 (n,)."""
+        """Normalised values, float32 (n,)."""
         ...
 
     def slopes(self, places: Array) -> Array:
-        """Their derivatives float32 (n, 3) by x, y and z per vertex, as `sample_points` has them."""
+        """Derivatives by x, y and z per vertex, float32 (n, 3), as `sample_points` has them."""
         ...
 
 
 class PatchInference:
-    """On the host: places that lie close together are evaluated together, with several threads."""
+    """Inference on the host: places close together are evaluated together, in several threads."""
 
     def __init__(self, network: Network, key: float) -> None:
         tables = [
@@ -45,16 +47,17 @@ class PatchInference:
         self._network, self._key = replace(network, tables=tables), key
 
     def values(self, places: Array) -> Array:
-        """As `Inference` has it."""
         return sample_points(self._network, self._key, *places.T[::-1])
 
     def slopes(self, places: Array) -> Array:
-        """As `Inference` has it."""
         return sample_points(self._network, self._key, *places.T[::-1], gradient=True)[1][:, :0:-1]
 
 
 class DenseInference:
-    """On a device: every level's table whole, its two time nodes blended once, as a picture has but one key index."""
+    """Inference on a device, which holds the whole table of every level.
+
+    The two time nodes of a table are blended once, since a picture has one key index.
+    """
 
     def __init__(self, network: Network, key: float, arrays: Arrays) -> None:
         self._arrays = arrays
@@ -62,103 +65,106 @@ class DenseInference:
             (arrays.array(weight, "float32"), arrays.array(bias, "float32"))
             for weight, bias in network.layers
         ]
-        self._tables, self._shapes = [], [resolution[1:] for resolution in network.levels]
-        for level, shape in enumerate(self._shapes):
-            nodes = _nodes(network, level, key)
-            table = arrays.array(
-                network.read(level, (nodes, *(slice(0, length) for length in shape))), "float32"
-            )
-            share = float(_position(network, level, key) - nodes.start)
-            self._tables.append(
-                (table[0] * (1 - share) + table[-1] * share).reshape(-1, network.embedding_size)
-            )
-        spans = [max(size - 1, 1) for size in network.box_size]
-        paces = [
-            [(length - 1) / span for length, span in zip(shape, spans, strict=True)]
-            for shape in self._shapes
-        ]
-        # x, y, z as places are.
-        self._paces = [arrays.array(pace[::-1]) for pace in paces]
-        self._lasts = [
-            arrays.array([max(length - 2.0, 0.0) for length in shape[::-1]])
-            for shape in self._shapes
-        ]
+        self._levels = [_Level(network, level, key, arrays) for level in range(len(network.levels))]
 
     def values(self, places: Array) -> Array:
-        """As `Inference` has it."""
         result = self._arrays.empty((len(places),), "float32")
         for start in range(0, len(places), self._arrays.batch):
-            features, _ = self._features(places[start : start + self._arrays.batch], False)
-            result[start : start + len(features)] = self._hidden(features)[-1][:, 0]
+            inputs, _ = self._inputs(places[start : start + self._arrays.batch], False)
+            result[start : start + len(inputs)] = self._outputs(inputs)[-1][:, 0]
         return result
 
     def slopes(self, places: Array) -> Array:
-        """As `Inference` has it."""
         xp = self._arrays.xp
         result = self._arrays.empty((len(places), 3), "float32")
         for start in range(0, len(places), self._arrays.batch):
-            features, changes = self._features(places[start : start + self._arrays.batch], True)
+            inputs, changes = self._inputs(places[start : start + self._arrays.batch], True)
             slope = self._layers[-1][0]
-            # Backwards through the layers; on a ReLU's kink the derivative is that of its flat side.
-            for (weight, _), hidden in zip(
-                self._layers[-2::-1], self._hidden(features)[-2::-1], strict=True
+            # Backwards through the layers; on a ReLU's kink the slope is that of the flat side.
+            for (weight, _), output in zip(
+                self._layers[-2::-1], self._outputs(inputs)[-2::-1], strict=True
             ):
-                slope = (slope * self._arrays.single(hidden > 0)) @ weight
+                slope = (slope * self._arrays.to_float32(output > 0)) @ weight
             for axis, change in enumerate(changes):
-                result[start : start + len(features), axis] = xp.sum(slope * change, axis=1)
+                result[start : start + len(inputs), axis] = xp.sum(slope * change, axis=1)
         return result
 
-    def _hidden(self, features: Array) -> list[Array]:
-        """What each layer puts out (n, width), the last one the values (n, 1)."""
-        outputs = [features]
+    def _outputs(self, inputs: Array) -> list[Array]:
+        """Outputs (n, width) of the layers for inputs (n, k); the last are the values (n, 1)."""
+        outputs = [inputs]
         for number, (weight, bias) in enumerate(self._layers):
-            found = outputs[-1] @ weight.T + bias
-            outputs.append(
-                found if number == len(self._layers) - 1 else self._arrays.xp.clip(found, 0.0, None)
-            )
+            output = outputs[-1] @ weight.T + bias
+            last = number == len(self._layers) - 1
+            outputs.append(output if last else self._arrays.xp.clip(output, 0.0, None))
         return outputs[1:]
 
-    def _features(self, places: Array, gradient: bool) -> tuple[Array, list[Array]]:
-        """All levels' embeddings (n, features) at places and, if asked for, their derivatives by x, y and z."""
-        arrays, xp = self._arrays, self._arrays.xp
-        found, changes = [], []
-        for table, shape, pace, last in zip(
-            self._tables, self._shapes, self._paces, self._lasts, strict=True
-        ):
-            at = places * pace
-            before = xp.minimum(xp.floor(at), last)
-            after = arrays.single(at - before)
-            x, y, z = arrays.whole(before).T
-            first = (z * shape[1] + y) * shape[2] + x
-            # An axis of one vertex has no corner after it: both are the same.
-            jumps = [
-                jump if length > 1 else 0
-                for jump, length in zip((shape[1] * shape[2], shape[2], 1), shape, strict=True)
-            ]
-            offsets = [
-                k * jumps[0] + j * jumps[1] + i * jumps[2] for k, j, i in np.ndindex(2, 2, 2)
-            ]
-            corners = xp.stack([table[first + offset] for offset in offsets]).reshape(
-                2, 2, 2, *first.shape, -1
-            )
-            # Along z, y and x in turn.
-            embeddings, steps = interpolate(
-                corners, [after[:, axis, None] for axis in (2, 1, 0)], gradient
-            )
-            found.append(embeddings)
-            changes.append(
-                [
-                    step * arrays.single(pace)[axis]
-                    for step, axis in zip(steps[::-1], range(3), strict=False)
-                ]
-            )
-        return xp.concatenate(found, axis=1), [
-            xp.concatenate(parts, axis=1) for parts in zip(*changes, strict=True)
+    def _inputs(self, places: Array, gradient: bool) -> tuple[Array, list[Array]]:
+        """The inputs (n, k) of the layers at places: all levels' embeddings.
+
+        With `gradient` also their derivatives (n, k) by x, y and z.
+        """
+        xp = self._arrays.xp
+        embeddings, changes = [], []
+        for level in self._levels:
+            embedding, change = level.embeddings(places, gradient)
+            embeddings.append(embedding)
+            changes.append(change)
+        return xp.concatenate(embeddings, axis=1), [
+            xp.concatenate(levels, axis=1) for levels in zip(*changes, strict=True)
         ]
 
 
+class _Level:
+    """The table of a level at one key index, on a device."""
+
+    def __init__(self, network: Network, level: int, key: float, arrays: Arrays) -> None:
+        self._arrays = arrays
+        shape = network.levels[level][1:]
+        nodes = _nodes(network, level, key)
+        table = arrays.array(
+            network.read(level, (nodes, *(slice(0, length) for length in shape))), "float32"
+        )
+        share = float(_position(network, level, key) - nodes.start)
+        self._table = (table[0] * (1 - share) + table[-1] * share).reshape(
+            -1, network.embedding_size
+        )
+        self._shape = shape
+        spans = [max(size - 1, 1) for size in network.box_size]
+        pace = [(length - 1) / span for length, span in zip(shape, spans, strict=True)]
+        # x, y, z as places are.
+        self._pace = arrays.array(pace[::-1])
+        self._last = arrays.array([max(length - 2.0, 0.0) for length in shape[::-1]])
+
+    def embeddings(self, places: Array, gradient: bool) -> tuple[Array, list[Array]]:
+        """Embeddings (n, E) at places and, if asked for, their derivatives by x, y and z."""
+        arrays, xp, shape = self._arrays, self._arrays.xp, self._shape
+        at = places * self._pace
+        before = xp.minimum(xp.floor(at), self._last)
+        after = arrays.to_float32(at - before)
+        x, y, z = arrays.to_int64(before).T
+        first = (z * shape[1] + y) * shape[2] + x
+        # An axis of one vertex has no corner after it: both are the same.
+        jumps = [
+            jump if length > 1 else 0
+            for jump, length in zip((shape[1] * shape[2], shape[2], 1), shape, strict=True)
+        ]
+        offsets = [k * jumps[0] + j * jumps[1] + i * jumps[2] for k, j, i in np.ndindex(2, 2, 2)]
+        corners = xp.stack([self._table[first + offset] for offset in offsets]).reshape(
+            2, 2, 2, *first.shape, -1
+        )
+        # Along z, y and x in turn.
+        embeddings, across = interpolate(
+            corners, [after[:, axis, None] for axis in (2, 1, 0)], gradient
+        )
+        pace = arrays.to_float32(self._pace)
+        return embeddings, [change * pace[axis] for axis, change in enumerate(across[::-1])]
+
+
 class _Nodes:
-    """The time nodes of a table between which one key index lies, in memory, so that a pass of samples does not read them again."""
+    """The time nodes of a table around one key index, in memory.
+
+    So a pass of samples does not read them again.
+    """
 
     def __init__(self, table: TableSource, nodes: slice) -> None:
         self.shape = tuple(table.shape)
@@ -166,7 +172,7 @@ class _Nodes:
         self._values = table.read((nodes, *(slice(0, length) for length in self.shape[1:])))
 
     def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """Values of a region (t, z, y, x) whose times are among the nodes."""
+        """Values of a region (t, z, y, x, embedding) whose times are among the nodes."""
         time = region[0]
         return self._values[(slice(time.start - self._first, time.stop - self._first), *region[1:])]
 
@@ -177,6 +183,7 @@ def _position(network: Network, level: int, key: float) -> float:
 
 
 def _nodes(network: Network, level: int, key: float) -> slice:
+    """The one or two time nodes of a level around a key index."""
     count = network.levels[level][0]
     first = min(int(_position(network, level, key)), max(count - 2, 0))
     return slice(first, min(first + 2, count))

@@ -1,4 +1,4 @@
-"""Leaping over bricks of a field in which nothing can be seen, for rays that are marched together."""
+"""Leaping over invisible bricks of a field, for rays that are marched together."""
 
 from __future__ import annotations
 
@@ -16,9 +16,14 @@ __all__ = ["Leaping"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Leaping:
-    """Which bricks matter: `distance` (z, y, x) is that in bricks to the nearest that does, diagonals counted as one.
+    """The bricks that matter, and how far away they are.
 
-    last: number (x, y, z) of the last brick. first: place where the first one begins. side: of a brick, in vertices of the domain.
+    Attributes:
+        distance: int64 (z, y, x), of each brick to the nearest that matters, in bricks, a diagonal
+            step counted as one.
+        last: (3,), number (x, y, z) of the last brick.
+        first: (3,), place (x, y, z) at which the first brick begins.
+        side: side of a brick, in vertices of the domain.
     """
 
     arrays: Arrays
@@ -29,7 +34,10 @@ class Leaping:
 
     @classmethod
     def of(cls, bricks: Bricks, task: Task, first: Array, stride: float, arrays: Arrays) -> Leaping:
-        """Of the bricks that can hold a visible value or a surface; of those with any value, for the largest along a ray."""
+        """Leaping for a task: over bricks without a visible value and without a surface.
+
+        For the largest value along a ray every brick with a value matters.
+        """
         table = task.table
         if task.maximum and table is not None:
             task = replace(task, table=replace(table, extinctions=np.ones_like(table.extinctions)))
@@ -48,9 +56,11 @@ class Leaping:
         return self.distance[self._bricks(places)[1]] == 0
 
     def leap(self, origin: Array, pace: Array, sample: Array, end: Array) -> tuple[Array, int]:
-        """The first sample (n,) of each ray, not before `sample`, in a brick that matters, or `end`; and how many leaps that took.
+        """The next sample (n,) of each ray, from `sample` on, in a brick that matters, or `end`.
 
-        origin: places (n, 3) of the samples 0. pace: from one sample to the next.
+        Also returns the number of leaps that it took.
+
+        origin: places (n, 3) of the samples 0. pace: (n, 3), from one sample to the next.
         """
         xp = self.arrays.xp
         sample = self.arrays.copy(sample)
@@ -59,12 +69,14 @@ class Leaping:
         while len(pending):
             brick, index = self._bricks(origin[pending] + sample[pending][:, None] * pace[pending])
             away = self.distance[index]
-            inside = away > 0
-            pending, brick, away = pending[inside], brick[inside], away[inside][:, None]
+            invisible = away > 0
+            pending, brick, away = pending[invisible], brick[invisible], away[invisible][:, None]
             start, step = origin[pending], pace[pending]
-            # The cube of bricks around this one in which none matters, on the side that the ray goes to.
+            # The faces towards which the ray goes of the cube of bricks around this one in which
+            # none matters.
             face = (
-                self.arrays.real(xp.where(step > 0, brick + away, brick - away + 1)) * self.side
+                self.arrays.to_float64(xp.where(step > 0, brick + away, brick - away + 1))
+                * self.side
                 + self.first
             )
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -73,14 +85,14 @@ class Leaping:
                     None,
                     ENDLESS,
                 )
-            onward = xp.maximum(self.arrays.whole(xp.floor(reach)) + 1, sample[pending] + 1)
+            onward = xp.maximum(self.arrays.to_int64(xp.floor(reach)) + 1, sample[pending] + 1)
             sample[pending] = xp.minimum(onward, end[pending])
             leaps += len(pending)
             pending = pending[sample[pending] < end[pending]]
         return sample, leaps
 
     def _bricks(self, places: Array) -> tuple[Array, tuple[Array, Array, Array]]:
-        """Numbers (..., 3), x, y, z, of the bricks that places lie in, and the same as an index."""
+        """Numbers (..., 3), x, y, z, of the bricks at places, and their index (z, y, x)."""
         at = self.arrays.xp.floor((places - self.first) / self.side)
-        brick = self.arrays.whole(self.arrays.xp.clip(at, 0 * self.last, self.last))
+        brick = self.arrays.to_int64(self.arrays.xp.clip(at, 0 * self.last, self.last))
         return brick, (brick[..., 2], brick[..., 1], brick[..., 0])

@@ -1,4 +1,4 @@
-"""The light on a sample: Phong's model by the gradient, and what a light grid leaves of it."""
+"""The light on a sample: Phong's model by the gradient, and the shares that a light grid leaves."""
 
 from __future__ import annotations
 
@@ -17,8 +17,12 @@ __all__ = ["LightAt", "Phong"]
 class Phong:
     """Phong's model, two-sided, with the vector halfway between light and eye (Blinn).
 
-    lamp: (3,), towards the light, or None. scale: from derivatives by x, y, z per vertex to gradients, of the table's range per vertex
-    spacing. floor: the length of one at which the light from a direction is half gone, so that noise of rounding has none.
+    Attributes:
+        lamp: (3,), unit vector towards the light, or None for a light at the eye.
+        scale: (3,), factors from derivatives by x, y, z per vertex to gradients, which are shares
+            of the table's range per vertex spacing.
+        floor: gradient at which the light from a direction has faded by half, so that the noise of
+            rounding is not lit.
     """
 
     arrays: Arrays
@@ -29,7 +33,7 @@ class Phong:
 
     @classmethod
     def of(cls, task: Task, field: Field) -> Phong | None:
-        """As every way to march has it (setting.py); None for a task without light."""
+        """The model of a task, with the same scales as the native marcher's; None without light."""
         lighting, arrays = task.lighting, field.arrays
         if lighting is None:
             return None
@@ -49,8 +53,11 @@ class Phong:
     ) -> Array:
         """Lit colours (n, 3): ambient and scattered light in the colour, mirrored light in white.
 
-        slopes: derivatives (n, 3) by x, y, z per vertex. along: unit vectors (n, 3) of the rays. lamp, around: shares (n,) of the light
-        that arrive. Where the gradient vanishes only the ambient light is left.
+        Where the gradient vanishes, only the ambient light is left.
+
+        slopes: derivatives (n, 3) by x, y, z per vertex.
+        along: unit vectors (n, 3) of the rays.
+        lamp, around: shares (n,) of the light that arrive from the lamp and from around.
         """
         xp, lighting = self.arrays.xp, self.lighting
         gradient = slopes * self.scale
@@ -69,24 +76,25 @@ class Phong:
 
 
 class LightAt:
-    """A `LightGrid` in arrays of `arrays`."""
+    """A `LightGrid` in arrays of `arrays`, as a function of places."""
 
     def __init__(self, grid: LightGrid, arrays: Arrays) -> None:
         self._arrays, self._cell = arrays, float(grid.cell)
-        self._shares, self._first = (
-            arrays.array(grid.shares, "float64"),
-            arrays.array(grid.first, "float64"),
-        )
+        self._shares = arrays.array(grid.shares, "float64")
+        self._first = arrays.array(grid.first, "float64")
         self._last = arrays.array([count - 1.0 for count in grid.shares.shape[2::-1]])
 
     def __call__(self, places: Array) -> tuple[Array, Array]:
-        """Shares (n,) of the light from the lamp and from around that reach places (n, 3), x, y, z in vertices; trilinear, clamped."""
+        """Shares (n,) of the light from the lamp and from around that reach places (n, 3).
+
+        places: x, y, z in vertices of the domain. Shares are trilinear, clamped beyond the grid.
+        """
         arrays, xp, last = self._arrays, self._arrays.xp, self._last
         at = xp.clip((places - self._first) / self._cell, 0 * last, last)
         before = xp.minimum(xp.floor(at), xp.clip(last - 1, 0.0, None))
         x, y, z = (at - before).T
-        low, high = arrays.whole(before), arrays.whole(xp.minimum(before + 1, last))
-        found = arrays.full((len(places), 2), 0.0)
+        low, high = arrays.to_int64(before), arrays.to_int64(xp.minimum(before + 1, last))
+        shares = arrays.full((len(places), 2), 0.0)
         for corner in product((0, 1), repeat=3):
             k, j, i = (
                 (high if up else low)[:, axis] for up, axis in zip(corner, (2, 1, 0), strict=True)
@@ -96,5 +104,5 @@ class LightAt:
                 * (y if corner[1] else 1 - y)
                 * (x if corner[2] else 1 - x)
             )
-            found += weight[:, None] * self._shares[k, j, i]
-        return found[:, 0], found[:, 1]
+            shares += weight[:, None] * self._shares[k, j, i]
+        return shares[:, 0], shares[:, 1]

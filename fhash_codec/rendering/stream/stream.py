@@ -34,9 +34,9 @@ from fhash_codec.rendering.task.task import Marched, Task
 __all__ = ["MAX_SAMPLES", "stream"]
 
 MAX_SAMPLES = 64
-"""Samples of one ray in a pass at most, as in the paper."""
+"""Samples of a ray in a pass, at most, as in the paper."""
 BAND = 1 << 20
-"""Rays that are alive at a time; a larger picture is made in bands of rows."""
+"""Rays that are marched at a time; a larger picture is made in bands of rows."""
 
 
 def stream(
@@ -47,14 +47,15 @@ def stream(
     budget: int | None = None,
     progress: Progress = silent,
 ) -> Marched:
-    """March a task's rays through a field, where the field has its arrays.
+    """March a task's rays through a field, in the field's arrays.
 
-    adaptive: adaptive ray marching with N_r = `budget` samples in a pass, the number of rays if None; else one sample of each ray.
+    adaptive: whether to march adaptively; else a pass takes one sample of each ray.
+    budget: N_r, samples of a pass of adaptive marching; None for the number of rays.
     Raises InputError where the memory of a device is not enough.
     """
     width, height = task.rays.size
-    arrays, fine = field.arrays, task.antialiasing**2
-    rows = max(1, BAND // (width * fine))
+    arrays, rays_of_pixel = field.arrays, task.antialiasing**2
+    rows = max(1, BAND // (width * rays_of_pixel))
     rgba = np.zeros((height, width, 4), dtype=np.float32)
     depth = np.full((height, width), np.inf, dtype=np.float32)
     normal = np.zeros((height, width, 3), dtype=np.float32)
@@ -68,7 +69,7 @@ def stream(
             marcher.march(adaptive, budget, partial(_report, progress, first, height))
             counters = complete(counters, marcher.counters, {"gradients": marcher.canvas.gradients})
             rgba[band], depth[band], normal[band] = _pixels(
-                marcher.canvas, (band.stop - band.start, width, fine)
+                marcher.canvas, (band.stop - band.start, width, rays_of_pixel)
             )
     return Marched(
         rgba=rgba,
@@ -79,12 +80,15 @@ def stream(
 
 
 def _report(progress: Progress, first: int, height: int, done: int, total: int) -> None:
-    """A part of a band's rays as a part of all."""
+    """Report the rays of a band that are done, as a share of the whole picture."""
     progress("marching", first * total + (height - first) * done, height * total, "")
 
 
 def _pixels(canvas: Canvas, shape: tuple[int, int, int]) -> tuple[Array, Array, Array]:
-    """rgba, depth and normal of rays (rows, width, rays of a pixel) on the host: the mean colour, and what is nearest."""
+    """Colour, depth and normal of pixels, on the host, from rays (rows, width, rays of a pixel).
+
+    The colour is the mean of a pixel's rays; depth and normal are those of the nearest ray.
+    """
     arrays, xp = canvas.arrays, canvas.arrays.xp
     rgba = (
         xp.concatenate([canvas.colour, 1 - canvas.clear[:, None]], axis=1)
@@ -102,7 +106,16 @@ def _pixels(canvas: Canvas, shape: tuple[int, int, int]) -> tuple[Array, Array, 
 
 
 class _Marcher:
-    """The state of a band's rays."""
+    """The state of a band's rays.
+
+    Attributes:
+        next: int64 (n,), the next sample of each ray.
+        end: int64 (n,), where each ray ends; with surfaces one place behind the last sample, which
+            is the end of the path.
+        from_: (n,), the last place that was looked at, in samples.
+        before: (n,), the value there. Both are NaN before a ray begins and after it leapt.
+        peak, peak_at: (n,), the largest value so far and its place, in samples.
+    """
 
     def __init__(self, field: Field, task: Task, beams: Beams) -> None:
         arrays, count = field.arrays, len(beams.end)
@@ -110,24 +123,24 @@ class _Marcher:
         self.palette = None if task.table is None else Palette.of(task.table, arrays)
         self.canvas = Canvas(field, task, beams, self.palette)
         self.leaping = Leaping.of(field.bricks, task, field.first, field.stride, arrays)
-        # A long step could pass a brick in which a surface lies, from one in which nothing does to another.
+        # A step longer than a brick could pass through one in which a surface lies, on its way from
+        # one in which nothing is visible to another.
         short = task.step <= SIDE * field.stride * float(np.min(np.abs(task.rays.grid.spacing)))
         self.skipping = task.skipping and (short or not task.surfaces)
-        # Between two samples in cells without a surface there may be one with it: then all of a brick is looked at.
+        # Between two samples in cells without a surface there may be a cell with one: pictures with
+        # surfaces look at whole bricks.
         by_cells = self.skipping and not task.surfaces and not task.maximum
         self.cells = field.visible(self.palette) if by_cells and self.palette is not None else None
-        # With surfaces, one more place after the last sample: the end of the path.
-        behind = (beams.leaving > arrays.real(beams.end) - 1) & (beams.end > beams.begin)
-        self.end = beams.end + arrays.whole(behind) if task.surfaces else beams.end
+        behind = (beams.leaving > arrays.to_float64(beams.end) - 1) & (beams.end > beams.begin)
+        self.end = beams.end + arrays.to_int64(behind) if task.surfaces else beams.end
         self.next = arrays.copy(beams.begin)
-        # The last place that was looked at, in samples, and the value there; NaN where a ray leapt since, or has not yet begun.
         self.from_, self.before = arrays.copy(beams.entered), arrays.full(count, np.nan)
         self.peak, self.peak_at = arrays.full(count, -np.inf), arrays.full(count, 0.0)
         self.counters = complete({"rays": int(arrays.xp.count_nonzero(beams.end > beams.begin))})
 
     def march(self, adaptive: bool, budget: int | None, report: Callable[[int, int], None]) -> None:
-        """Passes until no ray is alive."""
-        # Of N_r are all rays that the camera sends, also those that miss.
+        """Take passes until no ray is alive. report: function of the rays done and their number."""
+        # N_r counts all rays that the camera sends, also those that miss.
         budget = len(self.next) if budget is None else budget
         (alive,) = self.arrays.nonzero(self.next < self.end)
         total = max(len(alive), 1)
@@ -148,12 +161,12 @@ class _Marcher:
             self.canvas.show_peaks(self.peak, self.peak_at)
 
     def _leapt(self, alive: Array) -> Array:
-        """Move rays on to their next sample in a brick that matters; those that have one."""
+        """Move rays on to their next sample in a brick that matters; the rays that have one."""
         if not self.skipping:
             return alive
         leapers = alive
         if self.task.surfaces:
-            # There may be one between the last place in a brick and the next one, which is no longer in it.
+            # A surface may lie between the last sample inside a brick and the first one outside it.
             near = ~self.arrays.xp.isnan(self.from_[alive])
             near[self.arrays.nonzero(near)] = self.leaping.matters(
                 self.beams.places(alive[near], self.from_[alive[near]])
@@ -164,69 +177,84 @@ class _Marcher:
             self.beams.origin[leapers], self.beams.pace[leapers], before, self.end[leapers]
         )
         self.counters["skipped_bricks"] += leaps
-        gone = leapers[reached > before]
-        self.before[gone], self.from_[gone] = np.nan, np.nan
+        moved = leapers[reached > before]
+        self.before[moved], self.from_[moved] = np.nan, np.nan
         self.next[leapers] = reached
         return alive[self.next[alive] < self.end[alive]]
 
     def _pass(self, alive: Array, pace: int) -> None:
         """Take `pace` samples of each ray."""
-        task, beams, arrays, xp = self.task, self.beams, self.arrays, self.arrays.xp
+        arrays = self.arrays
         sample = self.next[alive][:, None] + arrays.range(pace)
-        wanted = sample < beams.end[alive][:, None]
-        places = beams.places(alive, sample)
-        if self.cells is not None:
-            wanted[arrays.nonzero(wanted)] = self._visible(places[wanted])
-        elif self.skipping and pace > 1:
-            worth = self.leaping.matters(places)
-            if task.surfaces:  # one may lie between a sample in a brick and the one before or after it, which is not
-                within, worth[:, 0] = arrays.copy(worth), True
-                worth[:, :-1] = worth[:, :-1] | within[:, 1:]
-                worth[:, 1:] = worth[:, 1:] | within[:, :-1]
-            wanted = wanted & worth
+        places = self.beams.places(alive, sample)
+        requested = self._requested(sample < self.beams.end[alive][:, None], places)
         values = arrays.full(sample.shape, np.nan)
-        values[wanted] = self._looked_up(places[wanted])
+        values[requested] = self._looked_up(places[requested])
         self.counters["passes"] += 1
         self.next[alive] += pace
-        if task.maximum:
-            best = xp.argmax(xp.where(xp.isnan(values), -np.inf, values), axis=1)[:, None]
-            value, at = (
-                arrays.take_along(part, best, 1)[:, 0] for part in (values, arrays.real(sample))
-            )
-            larger = value > self.peak[alive]
-            self.peak[alive[larger]], self.peak_at[alive[larger]] = value[larger], at[larger]
-        if task.surfaces or not task.maximum:
+        if self.task.maximum:
+            self._keep_peaks(alive, sample, values)
+        if self.task.surfaces or not self.task.maximum:
             self.canvas.add(alive, self._events(alive, sample, values))
 
+    def _requested(self, within: Array, places: Array) -> Array:
+        """The samples (rays, samples) of a pass whose values are needed.
+
+        within: the samples that lie on their rays' paths. places: (rays, samples, 3).
+        """
+        if self.cells is not None:
+            within[self.arrays.nonzero(within)] = self._visible(places[within])
+            return within
+        if not self.skipping or within.shape[1] == 1:
+            return within
+        needed = self.leaping.matters(places)
+        if self.task.surfaces:
+            # A surface may lie between a sample in a brick that matters and the sample before or
+            # after it, which is in none.
+            matters, needed[:, 0] = self.arrays.copy(needed), True
+            needed[:, :-1] = needed[:, :-1] | matters[:, 1:]
+            needed[:, 1:] = needed[:, 1:] | matters[:, :-1]
+        return within & needed
+
+    def _keep_peaks(self, alive: Array, sample: Array, values: Array) -> None:
+        """Keep the largest value of each ray, and its place, over a pass."""
+        arrays, xp = self.arrays, self.arrays.xp
+        best = xp.argmax(xp.where(xp.isnan(values), -np.inf, values), axis=1)[:, None]
+        value, at = (
+            arrays.take_along(array, best, 1)[:, 0] for array in (values, arrays.to_float64(sample))
+        )
+        larger = value > self.peak[alive]
+        self.peak[alive[larger]], self.peak_at[alive[larger]] = value[larger], at[larger]
+
     def _visible(self, places: Array) -> Array:
-        """Whether places (n, 3) lie in cells in which anything can be seen."""
+        """Whether places (n, 3) lie in visible cells."""
         assert self.cells is not None
         z, y, x = self.cells.shape
-        at = self.arrays.whole((places - self.field.first) / self.field.stride)
+        at = self.arrays.to_int64((places - self.field.first) / self.field.stride)
         i, j, k = (
             self.arrays.xp.clip(at[:, axis], 0, size - 1) for axis, size in enumerate((x, y, z))
         )
         return self.arrays.xp.take(self.cells, (k * y + j) * x + i)
 
     def _looked_up(self, places: Array) -> Array:
+        """Values (n,) at places (n, 3), counted."""
         values = self.field.values(places)
         self.counters["samples"] += len(places)
         self.counters["evaluations"] += self.arrays.xp.count_nonzero(~self.arrays.xp.isnan(values))
         return values
 
     def _events(self, alive: Array, sample: Array, values: Array) -> Events:
+        """The events of a pass. sample: int64 (rays, samples). values: (rays, samples)."""
         task, arrays, xp = self.task, self.arrays, self.arrays.xp
         surfaces, rows = len(task.surfaces), len(alive)
         shape = (*sample.shape, surfaces + 1)
         opacity = arrays.full(shape, 0.0)
-        at, which = (
-            arrays.real(xp.broadcast_to(sample[..., None], shape)),
-            xp.broadcast_to(arrays.range(surfaces + 1), shape),
-        )
+        at = arrays.to_float64(xp.broadcast_to(sample[..., None], shape))
+        which = xp.broadcast_to(arrays.range(surfaces + 1), shape)
         if task.surfaces:
-            found = self._crossings(alive, sample, values)
-            opacity[..., :-1], at[..., :-1] = found.opacity, found.at
-            which = xp.concatenate([found.which, which[..., -1:]], axis=2)
+            crossed = self._crossings(alive, sample, values)
+            opacity[..., :-1], at[..., :-1] = crossed.opacity, crossed.at
+            which = xp.concatenate([crossed.which, which[..., -1:]], axis=2)
         if self.palette is not None and not task.maximum:
             opacity[..., -1] = self._opacity(self.palette, alive, sample, values)
         return Events(
@@ -237,19 +265,23 @@ class _Marcher:
         )
 
     def _crossings(self, alive: Array, sample: Array, values: Array) -> Crossings:
-        """The surfaces before each sample; before the first of a ray from where it enters, behind the last to where it leaves."""
+        """The surfaces before each sample.
+
+        Before the first sample of a ray they are looked for from where it enters the field, behind
+        the last one to where it leaves.
+        """
         beams, arrays, xp = self.beams, self.arrays, self.arrays.xp
-        leaving, places = beams.leaving[alive][:, None], arrays.real(sample)
+        leaving, places = beams.leaving[alive][:, None], arrays.to_float64(sample)
         to = xp.minimum(places, leaving)
         values = arrays.copy(values)
         beyond = (places >= leaving) & (sample < self.end[alive][:, None])
         values[beyond] = self._looked_up(beams.borders(alive, to)[beyond])
         rays = alive[xp.isnan(self.before[alive])]
         self.from_[rays] = xp.maximum(
-            arrays.real(self.next[rays] - sample.shape[1] - 1), beams.entered[rays]
+            arrays.to_float64(self.next[rays] - sample.shape[1] - 1), beams.entered[rays]
         )
         self.before[rays] = self._looked_up(beams.borders(rays, self.from_[rays]))
-        found = crossings(
+        result = crossings(
             lambda row, at: self._looked_up(beams.places(alive[row], at)),
             xp.concatenate([self.from_[alive][:, None], to], axis=1),
             xp.concatenate([self.before[alive][:, None], values], axis=1),
@@ -257,13 +289,12 @@ class _Marcher:
             arrays,
         )
         self.before[alive], self.from_[alive] = values[:, -1], to[:, -1]
-        return found
+        return result
 
     def _opacity(self, palette: Palette, alive: Array, sample: Array, values: Array) -> Array:
-        """Of samples (rays, samples), 0 where there is no value; the last step of a path is shorter."""
+        """Opacities (rays, samples), 0 where there is no value. The last step may be shorter."""
         arrays, xp = self.arrays, self.arrays.xp
-        known = ~xp.isnan(values)
-        row, column = arrays.nonzero(known)
+        row, column = arrays.nonzero(~xp.isnan(values))
         length = (
             xp.where(
                 sample[row, column] == self.beams.last[alive][row], self.beams.rest[alive][row], 1.0

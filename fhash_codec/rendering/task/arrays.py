@@ -1,7 +1,9 @@
-"""The arrays that rays are marched with: numpy's on the host, or torch's on a device (torch_arrays.py), by one set of operations.
+"""The arrays that rays are marched with: numpy's on the host, or torch's on a device.
 
-Marching calls functions that both libraries have under one name and with one meaning through `Arrays.xp`; what differs is a method here.
-Integers and floats are never mixed in one operation with a Python number: torch would make float32 of them.
+Marching calls functions that both libraries have under one name and with one meaning through
+`Arrays.xp`. Where the libraries differ, `Arrays` has a method, which `TorchArrays` replaces. An
+operation never mixes an array with a Python number of the other kind, integer or float: torch would
+make float32 of them.
 """
 
 from __future__ import annotations
@@ -20,59 +22,64 @@ Array = Any
 
 
 class Arrays:
-    """numpy on the host. xp: the library. batch: elements that are worked on at a time; what they take stays in a processor's cache."""
+    """The operations of numpy on the host.
+
+    Attributes:
+        xp: the library.
+        batch: elements to work on at a time, so few that they stay in a processor's cache.
+    """
 
     xp: Any = np
     batch = 1 << 15
 
-    def array(self, values: npt.ArrayLike, kind: str | None = None) -> Array:
-        """Numbers of the host here, of their own kind or of another, as 'float64' or 'int64'."""
-        return np.asarray(values, dtype=kind)
+    def array(self, values: npt.ArrayLike, dtype: str | None = None) -> Array:
+        """An array of numbers from the host, of their own type or of another, as 'float64'."""
+        return np.asarray(values, dtype=dtype)
 
     def host(self, array: Array) -> npt.NDArray[Any]:
-        """An array from here on the host."""
+        """An array on the host with the numbers of an array of this library."""
         return np.asarray(array)
 
-    def empty(self, shape: Sequence[int], kind: str = "float64") -> Array:
-        """Numbers of no meaning yet."""
-        return np.empty(shape, dtype=kind)
+    def empty(self, shape: Sequence[int], dtype: str = "float64") -> Array:
+        """An uninitialised array."""
+        return np.empty(shape, dtype=dtype)
 
-    def full(self, shape: Sequence[int] | int, value: float, kind: str = "float64") -> Array:
-        """One number everywhere."""
-        return np.full(shape, value, dtype=kind)
+    def full(self, shape: Sequence[int] | int, value: float, dtype: str = "float64") -> Array:
+        """An array of one number."""
+        return np.full(shape, value, dtype=dtype)
 
     def range(self, count: int) -> Array:
-        """0 .. count - 1, int64."""
+        """The integers 0 .. count - 1, int64."""
         return np.arange(count)
 
-    def whole(self, array: Array) -> Array:
-        """As int64, towards 0."""
+    def to_int64(self, array: Array) -> Array:
+        """Round an array towards 0 to int64."""
         return array.astype(np.int64)
 
-    def real(self, array: Array) -> Array:
-        """As float64."""
+    def to_float64(self, array: Array) -> Array:
+        """Convert an array to float64."""
         return array.astype(np.float64)
 
-    def single(self, array: Array) -> Array:
-        """As float32."""
+    def to_float32(self, array: Array) -> Array:
+        """Round an array to float32."""
         return array.astype(np.float32)
 
     def copy(self, array: Array) -> Array:
-        """The same numbers in memory of their own."""
+        """Copy an array."""
         return array.copy()
 
     def nonzero(self, array: Array) -> tuple[Array, ...]:
-        """Where an array is not 0, in rows: an index for each of its axes."""
+        """Indices of the elements that are not 0, one array for each axis, in C order."""
         return array.nonzero()  # type: ignore[no-any-return]
 
     def take_along(self, array: Array, index: Array, axis: int) -> Array:
-        """Of each line along an axis the elements that `index` names."""
+        """Pick the elements that `index` names from each line along an axis."""
         return np.take_along_axis(array, index, axis=axis)
 
     def add_rows(self, array: Array, rows: Array, values: Array) -> None:
-        """Add values (m, k) to rows (m,) of an array (n, k), one after the other where a row is named more than once."""
+        """Add values (m, k) to rows (m,) of an array (n, k), in order where a row is repeated."""
         width = array.shape[1]
-        # Along one axis numpy is some times faster.
+        # Along one axis numpy is several times faster.
         np.add.at(
             array.reshape(-1),
             (rows[:, None] * width + np.arange(width)).reshape(-1),
@@ -81,8 +88,9 @@ class Arrays:
 
     @contextmanager
     def guarded(self) -> Iterator[None]:
-        """Within it a device that has not enough memory raises InputError."""
+        """A context that raises InputError where the memory of a device is not enough."""
         yield
 
 
 NUMPY = Arrays()
+"""The arrays of the host."""

@@ -1,6 +1,7 @@
-"""What small bricks of a frame hold, so that a ray passes over those of which nothing can be seen.
+"""Value ranges of small bricks of a frame, by which rays leap over the bricks that are invisible.
 
-A brick is SIDE cells along each axis, with the vertices on all its faces: neighbours share those between them.
+A brick is SIDE cells along each axis, with the vertices on all its faces. Neighbouring bricks share
+the vertices between them.
 """
 
 from __future__ import annotations
@@ -11,30 +12,36 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.rendering.task.palette import Palette
 from fhash_codec.rendering.task.task import Frame, Task
-from fhash_formats import native
 from fhash_formats.support.threads import in_threads
 
 __all__ = ["SIDE", "Bricks"]
 
 Single = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 SIDE = 4
-"""Cells: with twice as many a narrow interval takes up to twice the samples."""
+"""Cells along a brick's side. With twice as many, a narrow interval takes twice the samples."""
 FARTHEST = 255
-"""Bricks that a ray passes over at once, at most."""
+"""Largest distance of bricks, in bricks, and so the largest leap of a ray."""
 ROUNDING = 2.0**-22
-"""Of the largest magnitude: how far an interpolated float32 may lie beyond the values it is from."""
+"""How far an interpolated float32 may lie beyond the values it is interpolated from, as a share of
+the largest magnitude.
+"""
+SMALL = 2**18
+"""Vertices of a frame below which threads take longer to start than the work takes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bricks:
-    """The smallest and largest values of a frame's bricks, for every picture of that frame.
+    """The extreme values of a frame's bricks. One object serves every picture of the frame.
 
     Attributes:
-        values: float32 (z, y, x), contiguous, those of the frame with NaN for what is infinite.
-        low, high: float32 (z, y, x) of bricks; infinity and minus infinity where a brick has no value.
+        values: float32 (z, y, x), contiguous, the values of the frame with NaN for infinite ones.
+        low, high: float32 (z, y, x) of bricks, the smallest and the largest value; infinity and
+            minus infinity where a brick has no value.
     """
 
     values: Single
@@ -43,7 +50,7 @@ class Bricks:
 
     @classmethod
     def of(cls, frame: Frame) -> Bricks:
-        """From a frame's values, in a time that is short beside that of a picture."""
+        """The bricks of a frame, found in a time that is short beside that of a picture."""
         values = np.ascontiguousarray(frame.values, dtype=np.float32)
         low, high = _extremes(values)
         if np.isneginf(low).any() or np.isposinf(high).any():
@@ -57,21 +64,24 @@ class Bricks:
         low, high = float(self.low.min()), float(self.high.max())
         return (low, high) if low <= high else (0.0, 0.0)
 
-    def matters(self, task: Task) -> npt.NDArray[np.bool_]:
-        """Whether anything of a brick (z, y, x) can be seen: a value with extinction, or one of a surface."""
+    def matters(self, task: Task) -> Mask:
+        """Whether a brick (z, y, x) has anything visible: a value with extinction, or a surface."""
         low, high = self.low.astype(np.float64), self.high.astype(np.float64)
-        known = low <= high
-        low, high = np.where(known, low, 0.0), np.where(known, high, 0.0)
+        has_value = low <= high
+        low, high = np.where(has_value, low, 0.0), np.where(has_value, high, 0.0)
         slack = ROUNDING * max(float(np.abs(low).max()), float(np.abs(high).max()))
-        found = np.zeros(low.shape, dtype=bool)
+        visible = np.zeros(low.shape, dtype=bool)
         if task.table is not None:
-            found |= np.asarray(Palette.of(task.table).visible(low, high))
+            visible |= np.asarray(Palette.of(task.table).visible(low, high))
         for surface in task.surfaces:
-            found |= (low - slack <= surface.value) & (surface.value <= high + slack)
-        return found & known
+            visible |= (low - slack <= surface.value) & (surface.value <= high + slack)
+        return visible & has_value
 
     def distance(self, task: Task) -> npt.NDArray[np.int32]:
-        """How many bricks away, diagonals counted as one, the nearest is that matters: int32 (z, y, x), 0..FARTHEST."""
+        """Distance of each brick from the nearest that matters: int32 (z, y, x), 0..FARTHEST.
+
+        It is counted in bricks, a diagonal step as one.
+        """
         matters = self.matters(task)
         distance = np.where(matters, 0, FARTHEST).astype(np.int32)
         if not matters.any():
@@ -79,17 +89,18 @@ class Bricks:
         library = native.library()
         if library is not None:
             library.fhash_march_distance(
-                (ctypes.c_int64 * 3)(*distance.shape), ctypes.c_void_p(distance.ctypes.data)
+                (ctypes.c_int64 * 3)(*distance.shape), distance.ctypes.data
             )
             return distance
         near = matters
-        for step in range(1, min(max(distance.shape), FARTHEST)):
+        for away in range(1, min(max(distance.shape), FARTHEST)):
             near = _spread(near)
-            distance[near & (distance == FARTHEST)] = step
+            distance[near & (distance == FARTHEST)] = away
         return distance
 
 
 def _extremes(values: Single) -> tuple[Single, Single]:
+    """The smallest and the largest value of each brick, as the attributes of `Bricks` have them."""
     bricks = [max(-(-(size - 1) // SIDE), 1) for size in values.shape]
     low, high = np.empty(bricks, dtype=np.float32), np.empty(bricks, dtype=np.float32)
     library = native.library()
@@ -102,18 +113,18 @@ def _extremes(values: Single) -> tuple[Single, Single]:
     def layer(number: int) -> None:
         scratch = np.empty(2 * values.shape[2], dtype=np.float32)
         library.fhash_march_bricks(
-            ctypes.c_void_p(values.ctypes.data),
+            values.ctypes.data,
             shape,
             counts,
-            ctypes.c_int64(SIDE),
-            ctypes.c_int64(number),
-            ctypes.c_int64(number + 1),
-            ctypes.c_void_p(low.ctypes.data),
-            ctypes.c_void_p(high.ctypes.data),
-            ctypes.c_void_p(scratch.ctypes.data),
+            SIDE,
+            number,
+            number + 1,
+            low.ctypes.data,
+            high.ctypes.data,
+            scratch.ctypes.data,
         )
 
-    if values.size < 2**18:
+    if values.size < SMALL:
         for number in range(bricks[0]):
             layer(number)
     else:
@@ -122,7 +133,7 @@ def _extremes(values: Single) -> tuple[Single, Single]:
 
 
 def _reduced(values: Single, ufunc: np.ufunc) -> Single:
-    """The ufunc over each brick, axis by axis."""
+    """Reduce the vertices of each brick by a ufunc, axis by axis."""
     for axis, size in enumerate(values.shape):
         starts = np.arange(0, max(size - 1, 1), SIDE)
         within = ufunc.reduceat(values, starts, axis=axis)
@@ -131,13 +142,13 @@ def _reduced(values: Single, ufunc: np.ufunc) -> Single:
     return values
 
 
-def _spread(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """A mask, and the neighbours of what it has, diagonals too."""
+def _spread(mask: Mask) -> Mask:
+    """A mask grown by one element in every direction, diagonals included."""
     for axis in range(mask.ndim):
-        wide = mask.copy()
+        grown = mask.copy()
         head, tail = [slice(None)] * mask.ndim, [slice(None)] * mask.ndim
         head[axis], tail[axis] = slice(None, -1), slice(1, None)
-        wide[tuple(head)] |= mask[tuple(tail)]
-        wide[tuple(tail)] |= mask[tuple(head)]
-        mask = wide
+        grown[tuple(head)] |= mask[tuple(tail)]
+        grown[tuple(tail)] |= mask[tuple(head)]
+        mask = grown
     return mask

@@ -1,4 +1,4 @@
-"""What a picture took: the counters that every way to march gives, with all their names and as text."""
+"""Counters of the work for a picture, the same for every marcher, by name and as text."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ COUNTERS: Mapping[str, str] = MappingProxyType(
         "skipped_bricks": "places where rays leapt over what cannot be seen",
     }
 )
-"""Each counter and what it counts."""
+"""Names of the counters and what they count."""
 
 
 def complete(*parts: Mapping[str, int]) -> dict[str, int]:
-    """The sums of counters in the order of COUNTERS, 0 where none is given; raises KeyError for a name that is not among them."""
+    """Sums of counters in the order of COUNTERS, 0 where none is given.
+
+    Raises KeyError for a name that is not among COUNTERS.
+    """
     total = dict.fromkeys(COUNTERS, 0)
     for part in parts:
         for name, count in part.items():
@@ -31,7 +34,7 @@ def complete(*parts: Mapping[str, int]) -> dict[str, int]:
 
 
 def rows(counters: Mapping[str, int]) -> list[tuple[str, str, str]]:
-    """Rows (name, count, what it counts) for people."""
+    """Rows (name, count, what it counts) for people to read."""
     return [
         (name.replace("_", " "), f"{counters.get(name, 0):,}", text)
         for name, text in COUNTERS.items()

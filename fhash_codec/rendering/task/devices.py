@@ -1,27 +1,30 @@
-"""The arrays of a device: numpy, or torch on CUDA."""
+"""The arrays of a device: numpy on the host, torch on CUDA."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
 
+from fhash_codec.rendering.scene.scene import DEVICES
 from fhash_codec.rendering.task.arrays import NUMPY, Arrays
 from fhash_formats.errors import InputError
 
-DEVICES = ("auto", "cpu", "cuda")
-
+__all__ = ["arrays_on"]
 
 DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+"""File name of the driver of CUDA."""
 
 
 def arrays_on(device: str) -> Arrays:
-    """The arrays of a device: 'cpu' is numpy, 'cuda' torch's, 'auto' those of CUDA where it is to be had and numpy's elsewhere.
+    """The arrays of a device.
 
-    Raises InputError for another name, and for 'cuda' where there is none. torch is imported only where there is a driver of CUDA.
+    device: 'cpu' for numpy, 'cuda' for torch on CUDA, 'auto' for CUDA where there is one and else
+    numpy. torch is imported only where the driver of CUDA is installed.
+    Raises InputError for another name, and for 'cuda' where there is none.
     """
     if device not in DEVICES:
         raise InputError(f"device is '{device}'; allowed: {', '.join(DEVICES)}")
-    if device == "cpu" or (device == "auto" and not _driver()):
+    if device == "cpu" or (device == "auto" and not _driver_exists()):
         return NUMPY
     from fhash_codec.rendering.task.torch_arrays import TorchArrays
     from fhash_codec.training.devices import choose_device
@@ -30,8 +33,8 @@ def arrays_on(device: str) -> Arrays:
     return NUMPY if chosen.type == "cpu" else TorchArrays(chosen)
 
 
-def _driver() -> bool:
-    """Whether the driver of CUDA is there: importing torch to ask it takes seconds."""
+def _driver_exists() -> bool:
+    """Whether the driver of CUDA can be loaded. Importing torch to ask it would take seconds."""
     try:
         ctypes.CDLL(DRIVER)
     except OSError:

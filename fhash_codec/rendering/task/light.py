@@ -1,8 +1,9 @@
-"""Light that the volume itself takes away: shadows of a lamp, and of the surroundings, on a grid of points.
+"""The light that the volume takes away: shadows of a lamp, and occlusion of the surroundings.
 
-The extinction is averaged onto the grid; from each of its points the way to the lamp, and ways to all sides as far as the surroundings
-reach, are summed up in steps of a cell. All points take the same steps, so that a step is a shift of the whole grid. Surfaces throw no
-shadow.
+Both are computed on a grid of points. The extinction is averaged onto the grid. From each point the
+extinction is summed up along the way to the lamp, and along ways to all sides as far as the
+surroundings reach, in steps of a cell. All points take the same steps, so that a step is a shift of
+the whole grid. Surfaces throw no shadow.
 """
 
 from __future__ import annotations
@@ -10,15 +11,15 @@ from __future__ import annotations
 import ctypes
 import itertools
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Shadows
 from fhash_codec.rendering.task.task import Frame, LightGrid, Table, extinctions_in
-from fhash_formats import native
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import in_threads
 
@@ -28,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
 
 MAX_STEPS = 16
-"""From a point to the end of its surroundings."""
+"""Steps from a point to the end of its surroundings, at most."""
 SIDES = np.array(
     [
         side
@@ -36,7 +37,7 @@ SIDES = np.array(
         if sum(map(abs, side)) in (1, 3)
     ]
 )
-"""Directions of the surroundings: the 6 faces and the 8 corners of a cube."""
+"""Unit vectors towards the surroundings: the 6 faces and the 8 corners of a cube."""
 SIDES /= np.linalg.norm(SIDES, axis=1, keepdims=True)
 
 
@@ -51,8 +52,11 @@ def light_grid(
 ) -> LightGrid:
     """Shares of the light that reach places of a frame, the strengths of both effects included.
 
-    lamp: unit vector (x, y, z) of the coordinates towards the light, for shadows. Points lie a whole number of the frame's vertices apart,
-    that nearest to the resolution. Raises InputError for shadows without a lamp.
+    The points of the grid lie a whole number of the frame's vertices apart, as near to the
+    resolution of the shadows as that allows.
+
+    lamp: unit vector (x, y, z) of the coordinates towards the light, for shadows.
+    Raises InputError for shadows without a lamp.
     """
     if shadows is not None and lamp is None:
         raise InputError("shadows need the direction towards a lamp")
@@ -64,107 +68,126 @@ def light_grid(
     # In lengths of a vertex: float32 has no room for those of all coordinates.
     unit = grid.vertex_spacing
     table = replace(table, extinctions=extinctions_in(table.extinctions, unit))
-    extinction = _extinction(np.ascontiguousarray(frame.values, dtype=np.float32), table, across)
     cell = float(across * frame.stride)
-    shares = np.ones((*extinction.shape, 2), dtype=np.float32)
+    points = _Points(
+        extinction=_extinction(np.ascontiguousarray(frame.values, dtype=np.float32), table, across),
+        spacing=grid.spacing,
+        cell=cell,
+        unit=unit,
+    )
+    shares = np.ones((*points.extinction.shape, 2), dtype=np.float32)
     rays = 0
     if shadows is not None and lamp is not None:
-        step = np.asarray(lamp, dtype=np.float64) / (grid.spacing * cell)
-        step /= np.abs(step).max()
-        passed = _passed(
-            extinction,
-            step,
-            _steps_out(step, extinction.shape),
-            float(np.linalg.norm(step * grid.spacing * cell)) / unit,
-        )
-        shares[..., 0] = 1 - np.float32(shadows.strength) * (1 - passed)
-        rays += extinction.size
+        shares[..., 0] = 1 - np.float32(shadows.strength) * (1 - points.from_lamp(lamp))
+        rays += points.extinction.size
     if ambient_occlusion is not None:
-        count = min(max(2, round(ambient_occlusion.radius / cell)), MAX_STEPS)
-        around = np.zeros(extinction.shape, dtype=np.float32)
-        for side in SIDES:
-            step = side * ambient_occlusion.radius / (count * cell)
-            around += _passed(
-                extinction, step, count, float(np.linalg.norm(step * grid.spacing * cell)) / unit
-            )
-        shares[..., 1] = 1 - np.float32(ambient_occlusion.strength) * (
-            1 - around / np.float32(len(SIDES))
-        )
-        rays += extinction.size * len(SIDES)
+        around = points.from_around(ambient_occlusion.radius)
+        shares[..., 1] = 1 - np.float32(ambient_occlusion.strength) * (1 - around)
+        rays += points.extinction.size * len(SIDES)
     return LightGrid(shares=np.clip(shares, 0, 1), first=first, cell=cell, secondary_rays=rays)
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Points:
+    """The points of a light grid.
+
+    Attributes:
+        extinction: float32 (z, y, x), per `unit`.
+        spacing: (3,), x, y, z, distance of two vertices of the domain, in the coordinates.
+        cell: vertices of the domain from one point to the next.
+        unit: length in the coordinates.
+    """
+
+    extinction: Single
+    spacing: Floats
+    cell: float
+    unit: float
+
+    def from_lamp(self, lamp: Floats) -> Single:
+        """Shares of a lamp's light that reach the points; lamp: unit vector towards it."""
+        step = np.asarray(lamp, dtype=np.float64) / (self.spacing * self.cell)
+        step /= np.abs(step).max()
+        return self._passed(step, _steps_out(step, self.extinction.shape))
+
+    def from_around(self, radius: float) -> Single:
+        """Shares of the light that reaches the points from as far as `radius`, in vertices."""
+        count = min(max(2, round(radius / self.cell)), MAX_STEPS)
+        around = np.zeros(self.extinction.shape, dtype=np.float32)
+        for side in SIDES:
+            around += self._passed(side * radius / (count * self.cell), count)
+        return around / np.float32(len(SIDES))
+
+    def _passed(self, step: Floats, count: int) -> Single:
+        """Share of the light that passes `count` steps (x, y, z, in cells) from each point."""
+        sums = _sums(self.extinction, step, count)
+        return _left(sums, float(np.linalg.norm(step * self.spacing * self.cell)) / self.unit)
+
+
 def _steps_out(step: Floats, shape: tuple[int, ...]) -> int:
-    """Steps after which the last point is out of the grid; step x, y, z in its cells."""
+    """Steps after which every point has left the grid; step: x, y, z in its cells."""
     with np.errstate(divide="ignore", over="ignore"):
         return int(np.min(np.ceil(np.array(shape[::-1]) / np.abs(step)))) + 1
 
 
-def _passed(extinction: Single, step: Floats, count: int, length: float) -> Single:
-    """The share of the light that passes `count` steps from each point: float32 of the grid's shape."""
+def _sums(extinction: Single, step: Floats, count: int) -> Single:
+    """Sums of the extinction in the middle of `count` steps from each point."""
     library = native.library()
     sums = np.zeros(extinction.shape, dtype=np.float32)
     if library is None:
         for number in range(count):
             _add_shifted(extinction, step * (number + 0.5), sums)
-        return _left(sums, length)
+        return sums
     shape, along = (ctypes.c_int64 * 3)(*extinction.shape), (ctypes.c_double * 3)(*step)
     _in_layers(
         extinction.shape[0],
         lambda z: library.fhash_march_sum(
-            _address(extinction),
-            shape,
-            along,
-            ctypes.c_int64(count),
-            ctypes.c_int64(z),
-            ctypes.c_int64(z + 1),
-            _address(sums),
+            extinction.ctypes.data, shape, along, count, z, z + 1, sums.ctypes.data
         ),
     )
-    return _left(sums, length)
+    return sums
 
 
 def _left(sums: Single, length: float) -> Single:
-    """exp(-length * sums), float32; in float64 where the length is beyond float32, in which infinity times 0 would be no number."""
+    """Shares of the light that are left, exp(-length * sums), float32.
+
+    A length beyond float32 is multiplied in float64, since infinity times 0 would be NaN.
+    """
     factor = length if length < 1e30 else np.float64(length)
     with np.errstate(over="ignore"):  # then nothing is left, as it should be
         return np.asarray(np.exp(-factor * sums), dtype=np.float32)
 
 
 def _add_shifted(extinction: Single, offset: Floats, sums: Single) -> None:
-    """Add what lies `offset` (x, y, z, in cells) from each point, trilinear, 0 beyond the grid."""
-    whole = np.floor(offset).astype(int)[::-1]
-    part = (offset - np.floor(offset))[::-1]
+    """Add the extinction at an offset (x, y, z, in cells) from each point, 0 beyond the grid.
+
+    The extinction is trilinear between the points.
+    """
+    cells = np.floor(offset).astype(int)[::-1]
+    fraction = (offset - np.floor(offset))[::-1]
     shape = np.array(extinction.shape)
-    begin, end = np.maximum(0, -whole), np.minimum(shape, shape - whole - (part > 0))
+    begin, end = np.maximum(0, -cells), np.minimum(shape, shape - cells - (fraction > 0))
     if np.any(begin >= end):
         return
     to = tuple(slice(low, high) for low, high in zip(begin, end, strict=True))
     for corner in itertools.product((0, 1), repeat=3):
-        weight = np.prod(np.where(corner, part, 1 - part))
+        weight = np.prod(np.where(corner, fraction, 1 - fraction))
         if weight > 0:
-            moved = zip(begin + whole + corner, end + whole + corner, strict=True)
+            moved = zip(begin + cells + corner, end + cells + corner, strict=True)
             sums[to] += (
                 np.float32(weight) * extinction[tuple(slice(low, high) for low, high in moved)]
             )
 
 
 def _extinction(values: Single, table: Table, across: int) -> Single:
-    """Extinctions on a grid with a point every `across` vertices, the mean of those around it weighed by a tent."""
+    """Extinctions on a grid with a point every `across` vertices.
+
+    Each is the mean of the vertices around the point, weighed by a tent.
+    """
     points = tuple(-(-(size - 1) // across) + 1 for size in values.shape)
     library = native.library()
     last = len(table.extinctions) - 1
     if library is None:
-        found = np.interp(
-            np.nan_to_num(values), np.linspace(table.low, table.high, last + 1), table.extinctions
-        )
-        extinction = np.where(np.isnan(values), 0, found)
-        for axis, count in enumerate(points):
-            places = np.arange(count)[:, None] * across + np.arange(1 - across, across)
-            weights = (across - np.abs(np.arange(1 - across, across))) / across**2
-            parts = np.take(extinction, np.clip(places, 0, values.shape[axis] - 1), axis=axis)
-            extinction = np.tensordot(parts, weights, axes=([axis + 1], [0]))
-        return extinction.astype(np.float32)
+        return _extinction_portable(values, table, across, points)
     out = np.empty(points, dtype=np.float32)
     entries = np.append(table.extinctions, table.extinctions[-1]).astype(np.float32)
     shape, sizes = (ctypes.c_int64 * 3)(*values.shape), (ctypes.c_int64 * 3)(*points)
@@ -172,27 +195,42 @@ def _extinction(values: Single, table: Table, across: int) -> Single:
     def layer(z: int) -> None:
         scratch = np.empty(values.shape[2], dtype=np.float32)
         library.fhash_march_extinction(
-            _address(values),
+            values.ctypes.data,
             shape,
-            _address(entries),
-            ctypes.c_int64(last + 1),
-            ctypes.c_double(table.low),
-            ctypes.c_double(last / (table.high - table.low)),
-            ctypes.c_int64(across),
+            entries.ctypes.data,
+            last + 1,
+            table.low,
+            last / (table.high - table.low),
+            across,
             sizes,
-            ctypes.c_int64(z),
-            ctypes.c_int64(z + 1),
-            _address(out),
-            _address(scratch),
+            z,
+            z + 1,
+            out.ctypes.data,
+            scratch.ctypes.data,
         )
 
     _in_layers(points[0], layer)
     return out
 
 
+def _extinction_portable(
+    values: Single, table: Table, across: int, points: tuple[int, ...]
+) -> Single:
+    """The extinctions of `_extinction` in numpy, within rounding; points: (z, y, x)."""
+    entries = np.linspace(table.low, table.high, len(table.extinctions))
+    extinction = np.interp(np.nan_to_num(values), entries, table.extinctions)
+    extinction = np.where(np.isnan(values), 0, extinction)
+    offsets = np.arange(1 - across, across)
+    weights = (across - np.abs(offsets)) / across**2
+    for axis, count in enumerate(points):
+        vertices = np.arange(count)[:, None] * across + offsets
+        within = np.clip(vertices, 0, values.shape[axis] - 1)
+        extinction = np.tensordot(
+            np.take(extinction, within, axis=axis), weights, axes=([axis + 1], [0])
+        )
+    return extinction.astype(np.float32)
+
+
 def _in_layers(count: int, function: Callable[[int], object]) -> None:
+    """Call a function of the layers 0 .. count - 1 in several threads."""
     list(in_threads(function, range(count)))
-
-
-def _address(array: Single) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)

@@ -1,4 +1,4 @@
-"""Scales of gradients."""
+"""Scales of the gradients that surfaces and volumes are shaded by."""
 
 from __future__ import annotations
 
@@ -7,20 +7,24 @@ import numpy.typing as npt
 
 from fhash_codec.rendering.camera.camera import Grid
 
+__all__ = ["flatness", "slope_scale"]
+
 Floats = npt.NDArray[np.float64]
 
 FLATTEST = 1e-6
-"""Of the value range per vertex: a gradient that counts as half of one. Rounding of the values raises it."""
-
-
+"""Gradient, as a share of the value range per vertex, at which shading has faded by half. The
+rounding of the values raises it.
+"""
 STEEPEST = 1e18
-"""The largest gradient whose square float32 can compute with."""
+"""Largest gradient. The squares of larger ones overflow float32."""
 
 
 def flatness(low: float, high: float, least: float, most: float) -> tuple[float, float]:
-    """The range that gradients are shares of, and the one per vertex at which light from a direction is half gone.
+    """The range that gradients are shares of, and the gradient at which shading has faded by half.
 
-    low, high: ends of the table. least, most: values of the frame, whose rounding to float32 must not be lit.
+    low, high: ends of the table, whose range it is.
+    least, most: extreme values of the frame. Their rounding to float32 makes gradients of noise,
+    which must not be lit.
     """
     span = max(high - low, (most - least) * 1e-15) or 1.0
     noise = 4 * 2.0**-23 * max(abs(least), abs(most)) / span
@@ -28,10 +32,12 @@ def flatness(low: float, high: float, least: float, most: float) -> tuple[float,
 
 
 def slope_scale(grid: Grid, span: float, least: float, most: float) -> Floats:
-    """Factors (3,), x, y, z, from differences between vertices to gradients: shares of `span` in the distance of vertices.
+    """Factors (3,), x, y, z, from differences between vertices to gradients.
 
-    No more than what makes STEEPEST of the difference between least and most, the values of the frame: with axes of lengths that differ
-    that much the direction is the same, and float32 has no room for the squares of more.
+    A gradient is a share of `span` in the distance of two vertices. The factors are clipped so that
+    the largest possible difference, from `least` to `most`, gives at most STEEPEST. That changes
+    factors only where the vertex spacings of the axes differ so much that the direction of the
+    gradient stays the same.
     """
     with np.errstate(over="ignore", divide="ignore"):
         limit = STEEPEST / np.float64(most - least)

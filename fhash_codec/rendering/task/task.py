@@ -1,9 +1,12 @@
-"""What a marcher is asked for, and what it gives: one task for every way to march, so that all make one picture.
+"""What a marcher is given and what it returns. All marchers take one task and make one picture.
 
-Sample k of a ray lies `(k + 0.5) * step` behind the place where the ray enters the drawn box of the whole domain (`Grid.bounds`), or
-`(k + its share) * step` with jitter; the last step is as long as what is left, so that the path through the box is exactly its length.
-What a sample sees is the trilinear (between steps quadrilinear) value there; a sample whose cell has a vertex of weight without a value
-sees nothing. Colour and extinction come from the table, linear between its entries; alpha = 1 - exp(-extinction * length).
+Sample k of a ray lies `(k + 0.5) * step` behind the place where the ray enters the drawn box of the
+whole domain (`Grid.bounds`); with jitter `(k + a share of the ray's own) * step`. The last step is
+as long as the rest of the path, so that the steps fill the path through the box exactly.
+
+A sample sees the trilinear value at its place, quadrilinear between time steps. A sample whose cell
+has a vertex of weight without a value sees nothing. Colour and extinction come from the table,
+linear between its entries; alpha = 1 - exp(-extinction * length).
 """
 
 from __future__ import annotations
@@ -33,9 +36,12 @@ Single = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Table:
-    """A transfer function at n values spread evenly from `low` to `high`; beyond the ends those of the ends.
+    """A transfer function at n values; beyond the ends the colour and extinction of the ends hold.
 
-    colours: float32 (n, 3), 0..1. extinctions: float64 (n,), per unit of the coordinates.
+    Attributes:
+        low, high: values of the first and the last entry; the others lie evenly between them.
+        colours: float32 (n, 3), 0..1.
+        extinctions: float64 (n,), per unit of the coordinates.
     """
 
     low: float
@@ -46,9 +52,15 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lighting:
-    """Phong, two-sided. lamp: unit vector (x, y, z) of the coordinates towards the light; None: from the camera along each ray.
+    """Phong's model, two-sided.
 
-    central: by differences between the places one vertex of the frame before and behind along each axis, not by the gradient of the cell.
+    Attributes:
+        ambient, diffuse, specular: strengths of the three kinds of light.
+        specular_power: exponent of the highlights.
+        lamp: unit vector (x, y, z) of the coordinates towards the light; None for a light at the
+            camera, along each ray.
+        central: whether the gradient is that of central differences, over one vertex of the frame
+            to both sides, and not that of the cell.
     """
 
     ambient: float
@@ -61,7 +73,7 @@ class Lighting:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surface:
-    """An isosurface: value in data units, colour (3,) and opacity 0..1."""
+    """An isosurface: value in marched units, colour (3,), 0..1, and opacity 0..1."""
 
     value: float
     colour: Floats
@@ -69,20 +81,26 @@ class Surface:
 
 
 DENSEST = 1e30
-"""An extinction of which the smallest part is opaque."""
+"""Largest extinction per length: its smallest part is opaque already."""
 
 
 def extinctions_in(extinctions: Floats, length: float) -> Floats:
-    """Extinctions in a length of the coordinates, DENSEST at most: infinite ones would give NaN between the entries of a table."""
+    """Extinctions per `length` from those per unit of the coordinates, DENSEST at most.
+
+    Infinite extinctions would give NaN between the entries of a table.
+    """
     with np.errstate(over="ignore"):
         return np.minimum(extinctions * length, DENSEST)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """Values float32 (z, y, x) of a step, NaN where there is none.
+    """The values of one time step in a region.
 
-    first: vertex (z, y, x) of the domain that the first value is of. stride: vertices from one value to the next (level of detail).
+    Attributes:
+        values: float32 (z, y, x), NaN where there is none.
+        first: vertex (z, y, x) of the domain at which the first value lies.
+        stride: vertices of the domain from one value to the next (level of detail).
     """
 
     values: Single
@@ -90,9 +108,9 @@ class Frame:
     stride: int = 1
 
     def bounds(self, grid: Grid) -> Floats:
-        """The box (3, 2), x, y, z, in vertices of the domain, that there are values of.
+        """The box (3, 2), x, y, z, in vertices of the domain, in which the frame has values.
 
-        It reaches to the end of the domain where no more vertices of the frame would fit.
+        It reaches to the end of the domain where no further vertex of the frame would fit.
         """
         first, counts = (
             np.array(self.first[::-1], dtype=np.float64),
@@ -106,10 +124,13 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LightGrid:
-    """Shares 0..1 of the light that reach a place, float32 (z, y, x, 2): from the lamp, and from around; trilinear, clamped.
+    """Shares of the light that reach the points of a grid; trilinear between them, clamped beyond.
 
-    first: vertex (x, y, z) of the domain that the first point lies at. cell: vertices from one point to the next.
-    secondary_rays: that it took.
+    Attributes:
+        shares: float32 (z, y, x, 2), 0..1, of the light from the lamp and of that from around.
+        first: vertex (x, y, z) of the domain at which the first point lies.
+        cell: vertices of the domain from one point to the next.
+        secondary_rays: number of rays that the grid took.
     """
 
     shares: Single
@@ -120,15 +141,23 @@ class LightGrid:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Task:
-    """All that decides a picture once the scene met the file.
+    """Everything that decides a picture of a given frame or model.
 
     Attributes:
-        rays: in vertices of the domain. step: length in units of the coordinates. threshold: share of the light behind at which a ray ends.
-        table: None where no volume is drawn, for surfaces alone.
-        lighting: of the surfaces, and of the volume if `shaded`. light: what shadows and surroundings leave of it.
-        maximum: the largest value along each ray, with the colour of the table and opaque, instead of the volume.
-        depth, normal: buffers to fill. antialiasing: rays along a pixel's side. jitter: a share of its own for each ray's first sample.
-        skipping: whether what cannot be seen is passed over.
+        rays: the rays of the pixels, in vertices of the domain.
+        step: length from one sample to the next, in units of the coordinates.
+        threshold: a ray ends where less than this share of the light behind comes through.
+        table: transfer function; None where no volume is drawn, for surfaces alone.
+        lighting: lighting of the surfaces, and of the volume if `shaded`.
+        shaded: whether the volume is lit.
+        light: shares of the light that shadows and surroundings leave.
+        surfaces: isosurfaces.
+        maximum: whether to draw the largest value along each ray, opaque in the colour of the
+            table, instead of the volume.
+        depth, normal: whether to fill these buffers.
+        antialiasing: rays along a pixel's side.
+        jitter: whether the first sample of each ray is shifted by a share of the ray's own.
+        skipping: whether rays leap over invisible bricks.
     """
 
     rays: Rays
@@ -149,10 +178,13 @@ class Task:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Marched:
-    """A picture: rgba float32 (H, W, 4), multiplied by the opacity; depth (H, W), normal (H, W, 3) as `Image` has them, or None.
+    """A finished picture.
 
-    counters: rays, passes (of all rays that are alive; for packets, of each packet), samples (values looked up), evaluations (of a network
-    or lattice beyond the cache), gradients, secondary_rays, skipped_bricks.
+    Attributes:
+        rgba: float32 (H, W, 4), the colour multiplied by the opacity.
+        depth: float32 (H, W), as `Image` has it, or None.
+        normal: float32 (H, W, 3), as `Image` has it, or None.
+        counters: amounts of work by the names of COUNTERS (counters.py).
     """
 
     rgba: Single

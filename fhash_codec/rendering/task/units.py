@@ -1,4 +1,4 @@
-"""The unit of the values that are drawn."""
+"""The unit of the values that are marched through."""
 
 from __future__ import annotations
 
@@ -11,24 +11,32 @@ import numpy.typing as npt
 from fhash_codec.rendering.colour.opacity import about
 from fhash_codec.volume import Volume
 
+__all__ = ["Units"]
+
 Floats = npt.NDArray[np.float64]
 
 LARGE_OFFSET = 2.0**9
-"""Half ranges that float32 values may be large: 15 bits are left for the range then."""
+"""Largest magnitude of float32 values that are marched as they are, in halves of the value range.
+The range then has 15 bits of the significand left.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Units:
-    """Values as they are marched: (value - shift) * factor, so that float32 holds data whose range is small beside their offset."""
+    """Marched values, (value - shift) * factor.
+
+    They let float32 hold data whose range is small beside their offset.
+    """
 
     shift: float = 0.0
     factor: float = 1.0
 
     @classmethod
     def of(cls, volume: Volume) -> Units:
-        """Of float64 volumes the middle and the size of the value range, a power of two.
+        """The units of a volume: the middle of its value range, and a power of two near its size.
 
-        float32 values stay what they are unless they are so much larger than their range that what lies between them would be coarse.
+        float32 values are marched as they are, unless they are so much larger than their range that
+        the values between them would be coarse.
         """
         low, high = volume.value_range.low, volume.value_range.high
         if low == high:
@@ -42,7 +50,7 @@ class Units:
         )
 
     def to(self, values: npt.ArrayLike) -> Floats:
-        """Data units to marched units, float64."""
+        """Convert data units to marched units, float64."""
         return np.asarray(
             (np.asarray(values, dtype=np.float64) - self.shift) * self.factor, dtype=np.float64
         )

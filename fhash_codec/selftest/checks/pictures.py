@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.selftest.case import Finding, Run
 from fhash_codec.selftest.environment import environment
-from fhash_formats import native
 
 __all__ = ["CHECKS"]
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.picture.planning import plan_picture
@@ -19,7 +20,6 @@ from fhash_codec.rendering.task.task import Frame
 from fhash_codec.selftest.case import Check, Finding, Run
 from fhash_codec.selftest.checks.ray_oracle import reference_picture
 from fhash_codec.selftest.environment import environment
-from fhash_formats import native
 
 __all__ = ["MODES", "blocks", "closed_form", "key_times", "scene", "scenes"]
 

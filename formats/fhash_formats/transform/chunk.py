@@ -237,14 +237,9 @@ def _task(tile: Values, quality: Quality) -> _Task | None:
     low, high = values.min().item(), values.max().item()
     with_bound = quality.step is None
     error, reach = _bound(quality, low, high, tile.dtype) if with_bound else (None, 0.0)
+    mask = None if all_finite else finite
     return _Task(
-        tile=tile,
-        finite=None if all_finite else finite,
-        low=low,
-        high=high,
-        quality=quality,
-        error=error,
-        reach=reach,
+        tile=tile, finite=mask, low=low, high=high, quality=quality, error=error, reach=reach
     )
 
 
@@ -253,14 +248,12 @@ def _bound(quality: Quality, low: Any, high: Any, dtype: np.dtype[Any]) -> tuple
     error = 0.0 if quality.max_error is None else float(quality.max_error)
     if quality.max_error_rel is not None:
         fraction, span = float(quality.max_error_rel), float(high) - float(low)
-        error = (
-            fraction * span
-            if math.isfinite(span)
-            else fraction * float(high) - fraction * float(low)
-        )
+        error = fraction * span
+        if not math.isfinite(span):
+            error = fraction * float(high) - fraction * float(low)
     if dtype.kind != "f":
-        whole = math.floor(error) if math.isfinite(error) else 1 << 64
-        return error, whole + 0.5
+        largest = math.floor(error) if math.isfinite(error) else 1 << 64
+        return error, largest + 0.5
     return error, error - max(abs(low), abs(high)) * float(np.finfo(dtype).eps)
 
 

@@ -98,10 +98,10 @@ class TransformCodec(ArrayBytesCodec):
             return cls(settings=TileSettings.from_dict(configuration))
         if not configuration:
             return cls(reading=True)
-        known = ("max_error", "max_error_rel", "step", "transform")
-        unknown = [key for key in configuration if key not in known]
+        keys = ("max_error", "max_error_rel", "step", "transform")
+        unknown = [key for key in configuration if key not in keys]
         if unknown:
-            raise InputError(f"{NAME}: unknown key {unknown[0]!r:.40}; known: {', '.join(known)}")
+            raise InputError(f"{NAME}: unknown key {unknown[0]!r:.40}; known: {', '.join(keys)}")
         values: dict[str, Any] = dict(configuration)
         return cls(**values)
 

@@ -12,9 +12,9 @@ from click.testing import Result
 from PIL import Image as Pictures
 
 import fhash_codec
+from fhash_codec import native
 from fhash_codec.rendering.scene.scene import scene_in_png
 from fhash_codec.rendering.task.counters import COUNTERS
-from fhash_formats import native
 
 Fhash = Callable[..., Result]
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from skimage import metrics
 
+from fhash_codec import native
 from fhash_codec.measure.ssim import ssim, ssim_steps
-from fhash_formats import native
 from fhash_formats.errors import InputError
 
 SHAPES = [

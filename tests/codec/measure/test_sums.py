@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fhash_codec import native
 from fhash_codec.compact.choices.estimate import magnitudes
 from fhash_codec.measure.sums import range_and_sum, squared_errors
-from fhash_formats import native
 
 needs_native = pytest.mark.skipif(
     native.library() is None, reason="the native library was not built here"

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, FhashWarning, Renderer, Scene, Volume
+from fhash_codec import EncodeConfig, FhashWarning, Renderer, Scene, Volume, native
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.task.arrays import Arrays
-from fhash_formats import native
 
 SHAPE = (3, 20, 24, 28)
 
@@ -36,21 +35,34 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     return str(request.param)
 
 
+CONFIGS = {
+    "compact": EncodeConfig(effort=1),
+    "feature": EncodeConfig(effort=1, features=("interval:3:99",), dilation=0),
+    "paper": EncodeConfig(profile="paper", features=("interval:3:99",), epochs=15, width=16),
+}
+
+
+class Files(dict[str, Path]):
+    """Paths by kind of CONFIGS; a file is encoded when it is first asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder = folder
+
+    def __missing__(self, kind: str) -> Path:
+        path = self.folder / f"{kind}.fhz"
+        with warnings.catch_warnings():
+            # Coding without the native core gives a warning, since it is slow; this is little.
+            warnings.simplefilter("ignore", FhashWarning)
+            fhash_codec.encode(blobs(), path, CONFIGS[kind])
+        self[kind] = path
+        return path
+
+
 @pytest.fixture(scope="session")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Paths by kind: compact, feature, paper."""
-    folder = tmp_path_factory.mktemp("pictures")
-    configs = {
-        "compact": EncodeConfig(effort=1),
-        "feature": EncodeConfig(effort=1, features=("interval:3:99",), dilation=0),
-        "paper": EncodeConfig(profile="paper", features=("interval:3:99",), epochs=15, width=16),
-    }
-    with warnings.catch_warnings():
-        # Coding without the native core gives a warning, since it is slow; this is little.
-        warnings.simplefilter("ignore", FhashWarning)
-        for name, config in configs.items():
-            fhash_codec.encode(blobs(), folder / f"{name}.fhz", config)
-    return {name: folder / f"{name}.fhz" for name in configs}
+    return Files(tmp_path_factory.mktemp("pictures"))
 
 
 @pytest.fixture

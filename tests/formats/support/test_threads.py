@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import pytest
 
@@ -15,7 +15,9 @@ from fhash_formats.support.threads import (
     ITEMS_PER_THREAD,
     SHARES_PER_THREAD,
     in_threads,
+    map_ahead,
     share_out,
+    thread_pool,
     usable_threads,
 )
 
@@ -141,3 +143,35 @@ def test_another_number_of_threads_is_refused(monkeypatch: pytest.MonkeyPatch, g
     monkeypatch.setenv("FHASH_THREADS", given)
     with pytest.raises(InputError, match=r"FHASH_THREADS is '.*'; allowed: 1 to 1024"):
         usable_threads()
+
+
+def test_few_items_are_read_ahead_and_results_come_in_order() -> None:
+    read: list[int] = []
+    yielded = 0
+
+    def items() -> Iterator[int]:
+        for item in range(50):
+            assert item - yielded < 4
+            read.append(item)
+            yield item
+
+    with thread_pool() as pool:
+        for number, result in enumerate(map_ahead(pool, lambda item: item * item, items(), 4)):
+            assert result == number * number
+            yielded += 1
+    assert read == list(range(50))
+
+
+def test_what_was_not_begun_is_left_out_after_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FHASH_THREADS", "1")
+    begun: list[int] = []
+
+    def work(item: int) -> int:
+        begun.append(item)
+        if item == 2:
+            raise ValueError("two")
+        return item
+
+    with thread_pool() as pool, pytest.raises(ValueError, match="two"):
+        list(map_ahead(pool, work, range(100), 8))
+    assert len(begun) < 100

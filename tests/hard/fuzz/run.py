@@ -27,10 +27,16 @@ from typing import Any
 
 HERE = Path(__file__).parent
 NATIVE = HERE.parents[2] / "formats" / "fhash_formats" / "native"
+"""Sources of the file format's library."""
+CODEC = HERE.parents[2] / "fhash_codec" / "native"
+"""Sources of the codec's library, which include headers of the other one."""
 TARGETS = tuple(HERE / f"{name}.cpp" for name in ("targets", "target_encode", "target_light"))
-SOURCES = ("coder", "mask", "predict", "lifting", "head", "quantise", "values", "march_light")
+SOURCES = ("coder", "mask", "predict", "lifting", "head", "quantise", "values")
+"""Files of NATIVE that are always fuzzed."""
+CODEC_SOURCES = ("march_light",)
+"""Files of CODEC that are always fuzzed."""
 MARCH = ("march", "march_bricks")
-"""Sources of the marcher, compiled on request only and without optimisation.
+"""Files of CODEC that are fuzzed on request, without optimisation.
 
 The compiler takes one minute for them; with optimisation it takes ten.
 """
@@ -82,19 +88,20 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
     if shutil.which(compiler.split()[0]) is None:
         raise CannotBuild(f"no compiler {compiler}")
     folder.mkdir(parents=True, exist_ok=True)
-    tracing = ("-fsanitize-coverage=trace-pc",)
+    tracing, headers = ("-fsanitize-coverage=trace-pc",), f"-I{NATIVE}"
     jobs: list[tuple[Path, tuple[str, ...]]] = [(HERE / "driver.cpp", ("-fsanitize=address", "-g"))]
     if march:
         # Unused lanes of vectors may hold NaN, so float-cast-overflow would report them.
         jobs += [
             (
-                NATIVE / f"{name}.cpp",
-                (*SANITIZE, *tracing, "-fno-sanitize=float-cast-overflow", "-O0"),
+                CODEC / f"{name}.cpp",
+                (*SANITIZE, *tracing, headers, "-fno-sanitize=float-cast-overflow", "-O0"),
             )
             for name in MARCH
         ]
-        jobs += [(HERE / "target_march.cpp", (*SANITIZE, f"-I{NATIVE}"))]
+        jobs += [(HERE / "target_march.cpp", (*SANITIZE, headers, f"-I{CODEC}"))]
     jobs += [(NATIVE / f"{name}.cpp", (*SANITIZE, *tracing)) for name in SOURCES]
+    jobs += [(CODEC / f"{name}.cpp", (*SANITIZE, *tracing, headers)) for name in CODEC_SOURCES]
     jobs += [
         (target, (*SANITIZE, *(["-DFHASH_FUZZ_MARCH"] if march else []))) for target in TARGETS
     ]

@@ -60,6 +60,7 @@ def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     )
     monkeypatch.setattr(run, "NATIVE", tmp_path)
     monkeypatch.setattr(run, "SOURCES", ("quantise",))
+    monkeypatch.setattr(run, "CODEC_SOURCES", ())
     monkeypatch.setattr(run, "TARGETS", (run.HERE / "overrun.cpp",))
     try:
         figures = run.fuzz(

@@ -17,7 +17,7 @@ import numpy as np
 from fhash_formats.errors import InputError
 from fhash_formats.transform.axes.spec import AXES, AxisTransform, TransformSpec
 from fhash_formats.transform.axes.weights import band_lengths
-from fhash_formats.transform.entropy.table import COLUMNS, Table
+from fhash_formats.transform.entropy.table import COLUMNS, NO_REFERENCE, Table
 
 __all__ = ["band_table"]
 
@@ -25,8 +25,6 @@ _KLT_PLANE = 13
 """Kind of a plane that is spanned by a basis of the data."""
 _LEVELS_APART = 4
 """Finest levels that have kinds of their own; coarser levels share the last one's."""
-_NO_REFERENCE = [-1, 0, 0, 0, 0]
-"""Columns of a reference to no band."""
 
 
 class Span(NamedTuple):
@@ -119,7 +117,7 @@ def _table(
                         ),
                         *_before_along_t(rows_of, key),
                         *_before_along_z(rows_of, key),
-                        *(_sibling(rows_of, key) if coupled else _NO_REFERENCE),
+                        *(_sibling(rows_of, key) if coupled else NO_REFERENCE),
                     ]
                 )
                 rows_of[key] = len(rows) - 1
@@ -178,7 +176,7 @@ def _reference(rows_of: Rows, key: _Key, halvings: tuple[int, int, int, int]) ->
 
     halvings: along (t, z, y, x), how often an index is halved on the way to that band.
     """
-    return [rows_of[key], *halvings] if key in rows_of else _NO_REFERENCE
+    return [rows_of[key], *halvings] if key in rows_of else NO_REFERENCE
 
 
 def _before_along_t(rows_of: Rows, key: _Key) -> list[int]:
@@ -195,7 +193,7 @@ def _coupled_parent(rows_of: Rows, key: _Key) -> list[int]:
     """The band of the same orientation one level up, or the low-low band where there is none."""
     level = max(key.y, key.x)
     if level <= 0:
-        return _NO_REFERENCE
+        return NO_REFERENCE
     coarser = key._replace(
         y=level + 1 if key.y > 0 else -(level + 1), x=level + 1 if key.x > 0 else -(level + 1)
     )
@@ -214,7 +212,7 @@ def _parent(rows_of: Rows, key: _Key, y: tuple[Span, ...], x: tuple[Span, ...]) 
     if x_number:
         coarser = key._replace(x=levels_x[x_number - 1])
         return _reference(rows_of, coarser, (0, 0, 0, int(x_number > 1)))
-    return _NO_REFERENCE
+    return NO_REFERENCE
 
 
 def _sibling(rows_of: Rows, key: _Key) -> list[int]:
@@ -223,6 +221,6 @@ def _sibling(rows_of: Rows, key: _Key) -> list[int]:
     High-low refers to low-high, and high-high to high-low.
     """
     if max(key.y, key.x) <= 0 or key.y < 0:
-        return _NO_REFERENCE
+        return NO_REFERENCE
     sibling = key._replace(x=-key.y) if key.x > 0 else key._replace(y=key.x, x=-key.x)
     return _reference(rows_of, sibling, (0, 0, 0, 0))

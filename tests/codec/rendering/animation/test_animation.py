@@ -66,9 +66,11 @@ def test_time_and_orbit_together(volume: Volume) -> None:
 
 
 def test_a_file_says_what_the_words_say(volume: Volume, tmp_path: Path) -> None:
-    toml = tmp_path / "way.toml"
+    toml = tmp_path / "animation.toml"
     toml.write_text(
-        'steps = [0, 4]\norbit = 90\nframes = 3\n[[keys]]\ncamera = {view = "xy"}\n[[keys]]\ncamera = {view = "xy", zoom = 4}\n'
+        "steps = [0, 4]\norbit = 90\nframes = 3\n"
+        '[[keys]]\ncamera = {view = "xy"}\n'
+        '[[keys]]\ncamera = {view = "xy", zoom = 4}\n'
     )
     animation = Animation.parse(str(toml), volume)
     scenes = animation.scenes(SMALL, volume)
@@ -77,8 +79,8 @@ def test_a_file_says_what_the_words_say(volume: Volume, tmp_path: Path) -> None:
     assert Animation.from_dict(animation.to_dict()) == animation
     other = tmp_path / "scene.json"
     other.write_text('{"camera": {"view": "yz"}, "background": "#102030", "size": [999, 9]}')
-    found = Key(scene=str(other), step=1.0).over(SMALL)
-    assert (found.camera.view, found.background, found.size, found.step) == (
+    keyed = Key(scene=str(other), step=1.0).over(SMALL)
+    assert (keyed.camera.view, keyed.background, keyed.size, keyed.step) == (
         "yz",
         "#102030",
         SMALL.size,

@@ -26,15 +26,15 @@ SMALL = Scene(size=(20, 14))
 
 
 def test_features_get_colours_and_thresholds(volume: Volume) -> None:
-    found = parse_tracked(["interval:0.2:0.4", "isosurface:0.7=#ff0000", "segmentation"], volume)
-    assert [str(each.feature).split(":")[0] for each in found] == [
+    tracked = parse_tracked(["interval:0.2:0.4", "isosurface:0.7=#ff0000", "segmentation"], volume)
+    assert [str(item.feature).split(":")[0] for item in tracked] == [
         "interval",
         "isosurface",
         "segmentation",
     ]
-    assert [each.colour for each in found] == [COLOURS[0], "#ff0000", COLOURS[2]]
-    assert 0.1 < found[2].feature.threshold < 0.9  # type: ignore[attr-defined]
-    assert [str(each.feature) for each in parse_tracked([], volume)] == ["interval:-1:9"]
+    assert [item.colour for item in tracked] == [COLOURS[0], "#ff0000", COLOURS[2]]
+    assert 0.1 < tracked[2].feature.threshold < 0.9  # type: ignore[attr-defined]
+    assert [str(item.feature) for item in parse_tracked([], volume)] == ["interval:-1:9"]
 
 
 @pytest.mark.parametrize(
@@ -73,8 +73,8 @@ def test_isosurfaces_alone_leave_the_volume_out(volume: Volume) -> None:
 
 
 def test_a_feature_is_followed(volume: Volume) -> None:
-    (found,) = follow(volume, parse_tracked(["segmentation:0.5"], volume), [0.0, 3.0])
-    first, last = found["steps"]
+    (followed,) = follow(volume, parse_tracked(["segmentation:0.5"], volume), [0.0, 3.0])
+    first, last = followed["steps"]
     assert (first["time"], last["time"]) == (0, 4)
     np.testing.assert_allclose(first["centroid"], [8, 4, 1.5], atol=0.3)  # x descends from 10
     np.testing.assert_allclose(last["centroid"], [5, 4, 1.5], atol=0.3)

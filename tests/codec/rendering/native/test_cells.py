@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
+from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.native.cells import cells_of, limits_of
 from fhash_codec.rendering.scene.scene import Camera
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.task import Frame, Surface, Table, Task
-from fhash_formats import native
 
 
 def task_of(shape, extinctions, surfaces=(), low=0.0, high=1.0):

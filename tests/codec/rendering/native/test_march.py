@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.native.march import march_native
 from fhash_codec.rendering.scene.scene import Camera, Shadows
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.light import light_grid
 from fhash_codec.rendering.task.task import Frame, Lighting, Surface, Table, Task
-from fhash_formats import native
 
 CENTRAL = Lighting(
     ambient=0.2, diffuse=0.8, specular=0.3, specular_power=8.0, lamp=None, central=True

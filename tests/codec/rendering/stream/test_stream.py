@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import Renderer, Scene, Volume
+from fhash_codec import Renderer, Scene, Volume, native
 from fhash_codec.paper.network import Network
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.picture.image import Image
@@ -29,7 +29,6 @@ from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.devices import arrays_on
 from fhash_codec.rendering.task.light import light_grid
 from fhash_codec.rendering.task.task import Frame, Lighting, Marched, Surface, Table, Task
-from fhash_formats import native
 from fhash_formats.errors import InputError
 from fhash_formats.series import Coordinate
 
@@ -557,7 +556,7 @@ def test_a_device_is_named_and_never_replaced(monkeypatch: pytest.MonkeyPatch) -
 def test_marching_on_the_processor_loads_no_torch() -> None:
     code = (
         "import sys; from fhash_codec.rendering.task import devices; "
-        "import fhash_codec.rendering.stream.stream; devices._driver = lambda: False; "
+        "import fhash_codec.rendering.stream.stream; devices._driver_exists = lambda: False; "
         "devices.arrays_on('auto'); devices.arrays_on('cpu'); print('torch' in sys.modules)"
     )
     assert (

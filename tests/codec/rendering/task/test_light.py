@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Shadows
 from fhash_codec.rendering.task.light import light_grid
 from fhash_codec.rendering.task.task import Frame, Table
-from fhash_formats import native
 from fhash_formats.errors import InputError
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -50,13 +50,13 @@ def test_any_mix_comes_back(
 def test_a_coupled_plane_splits_only_the_low_low_quadrant() -> None:
     shape = (1, 1, 16, 16)
     values = noise(shape, np.float64)
-    one, two = (
+    shallow, deep = (
         Transform(
             spec_of(("none", "none", "9/7", "9/7"), (0, 0, depth, depth), shape), shape, np.float64
         )
         for depth in (1, 2)
     )
-    first, second = one.forward(values), two.forward(values)
+    first, second = shallow.forward(values), deep.forward(values)
     assert np.array_equal(first[:, :, 8:, :], second[:, :, 8:, :])
     assert np.array_equal(first[:, :, :, 8:], second[:, :, :, 8:])
     packet = Transform(
@@ -155,7 +155,7 @@ def test_long_axes_come_back(shape: tuple[int, ...]) -> None:
     assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-11
 
 
-def test_the_input_is_left_alone_and_may_lie_anyhow() -> None:
+def test_the_input_is_unchanged_and_may_have_any_strides() -> None:
     shape = (3, 4, 6, 8)
     transform = Transform(spec_of(("haar", "klt", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
     values = noise(shape, np.float32)
@@ -177,8 +177,8 @@ def test_threads_share_a_transform() -> None:
         together = list(pool.map(lambda tile: transform.inverse(transform.forward(tile), 1), tiles))
     fresh = Transform(transform.spec, shape)
     assert all(
-        np.array_equal(one, fresh.inverse(fresh.forward(tile), 1))
-        for one, tile in zip(together, tiles, strict=True)
+        np.array_equal(result, fresh.inverse(fresh.forward(tile), 1))
+        for result, tile in zip(together, tiles, strict=True)
     )
 
 

@@ -14,7 +14,7 @@ import pytest
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.entropy import coder_portable
+from fhash_formats.transform.entropy import mixing_portable
 from fhash_formats.transform.entropy.mask import (
     decode_mask,
     encode_mask,
@@ -47,8 +47,8 @@ def form(request: pytest.FixtureRequest) -> Iterator[str]:
         elif native.library() is None:
             pytest.skip("the native library was not built here")
         if request.param == "plain":
-            patch.setattr(coder_portable, "_RUN", [None])
-        elif request.param == "compiled" and coder_portable._compiled() is None:
+            patch.setattr(mixing_portable, "_numba", lambda: None)
+        elif request.param == "compiled" and mixing_portable._numba() is None:
             pytest.skip("numba cannot be imported here")
         yield request.param
 

@@ -28,7 +28,7 @@ def _settings(values: Values, error: float, **more: Any) -> TileSettings:
     rounding = 0.0 if integers else float(np.finfo(values.dtype).eps) / 2 * np.abs(finite).max()
     step = 2.0 * int(error) + 1.0 if integers else 2 * float(error * (1 - 1e-6) - rounding)
     levels, order = (1, 2, 2, 2), (0, 3, 2, 1)
-    count = sum(len(part.taps) for part in passes_of(levels, order, 1))
+    count = sum(len(step.taps) for step in passes_of(levels, order, 1))
     weights = tuple(np.random.default_rng(0).integers(-200, 200, count).tolist())
     predictor = Predictor(
         step=step,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ def values(dtype: npt.DTypeLike, seed: int = 0, special: bool = True) -> Values:
 
 
 def both(function: Callable[[], Any], patch: pytest.MonkeyPatch) -> Any:
-    """The result of the native pass, asserted to equal that of the portable one bit by bit."""
+    """The result of the native pass, asserted to equal that of the portable given bit by bit."""
     if native.library() is None:
         pytest.skip("the native library is not built or not wanted")
     native_result = function()
@@ -83,18 +84,18 @@ def mask(seed: int = 3) -> npt.NDArray[np.bool_]:
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
 @pytest.mark.parametrize("counted", [None, mask()])
 def test_bounds(dtype: str, counted: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = values(dtype, special=False)
+    given = values(dtype, special=False)
     step = np.dtype(dtype).type(0.25)
-    other = one + step
-    error = float(np.abs(one.astype("f8") - other.astype("f8")).max())
-    assert both(lambda: within(one, other, np.nextafter(error, 1), counted), monkeypatch)
-    assert not both(lambda: within(one, other, 0.24, counted), monkeypatch)
+    other = given + step
+    error = float(np.abs(given.astype("f8") - other.astype("f8")).max())
+    assert both(lambda: within(given, other, np.nextafter(error, 1), counted), monkeypatch)
+    assert not both(lambda: within(given, other, 0.24, counted), monkeypatch)
     at = (1, 4, 6, 310)
     for bad in (np.nan, np.inf):
-        other = one.copy()
+        other = given.copy()
         other[at] = bad
         expected = counted is not None and not counted[at]
-        assert both(lambda other=other: within(one, other, 1.0, counted), monkeypatch) == expected  # type: ignore[misc]
+        assert both(partial(within, given, other, 1.0, counted), monkeypatch) == expected
     special = values(dtype)
     assert not both(lambda: within(special, special, 0.0), monkeypatch)  # NaN is near nothing
     plain = np.where(np.isnan(special), 0, special).astype(dtype)
@@ -119,26 +120,26 @@ def test_within_is_strict_to_the_last_bit() -> None:
 def test_residuals(
     dtype: str, base: str, quantum: float, counted: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one, other = values(dtype, 1, special=False), values(base, 2, special=False)
+    given, other = values(dtype, 1, special=False), values(base, 2, special=False)
     # Halves are rounded to even, and an error of half a quantum is none.
-    one[0, 0, 0, :40] = np.arange(40) * np.dtype(dtype).type(quantum / 2)
+    given[0, 0, 0, :40] = np.arange(40) * np.dtype(dtype).type(quantum / 2)
     other[0, 0, 0, :40] = 0
-    result = both(lambda: residual_of(one, other, counted, quantum, LARGEST), monkeypatch)
+    result = both(lambda: residual_of(given, other, counted, quantum, LARGEST), monkeypatch)
     assert result is not None
     assert result[1] == np.count_nonzero(result[0]) > 0
     for out in ("f4", "f8", "f2", "i2"):
-        both(lambda out=out: corrected(other, result[0], quantum, np.dtype(out)), monkeypatch)  # type: ignore[misc]
-    rest = one.astype("f8") - corrected(other, result[0], quantum, np.dtype("f8"))
+        both(partial(corrected, other, result[0], quantum, np.dtype(out)), monkeypatch)
+    rest = given.astype("f8") - corrected(other, result[0], quantum, np.dtype("f8"))
     assert np.abs(rest if counted is None else rest[counted]).max() <= quantum / 2 * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
 def test_residuals_beyond_the_largest_integer(dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    one, zeros = values(dtype), np.zeros(SHAPE, dtype)
-    assert both(lambda: residual_of(one, zeros, None, 0.5, LARGEST), monkeypatch) is None
-    counted = np.isfinite(one) & (np.abs(one) < 1e3)
-    assert both(lambda: residual_of(one, zeros, counted, 0.5, LARGEST), monkeypatch)[1] > 0
-    assert both(lambda: residual_of(one, zeros, counted, 0.0, LARGEST), monkeypatch) is None
+    given, zeros = values(dtype), np.zeros(SHAPE, dtype)
+    assert both(lambda: residual_of(given, zeros, None, 0.5, LARGEST), monkeypatch) is None
+    counted = np.isfinite(given) & (np.abs(given) < 1e3)
+    assert both(lambda: residual_of(given, zeros, counted, 0.5, LARGEST), monkeypatch)[1] > 0
+    assert both(lambda: residual_of(given, zeros, counted, 0.0, LARGEST), monkeypatch) is None
     last = np.zeros(SHAPE, dtype)
     last[-1, -1, -1, -1] = 1000
     assert both(lambda: residual_of(last, zeros, None, 1.0, 999), monkeypatch) is None
@@ -147,15 +148,15 @@ def test_residuals_beyond_the_largest_integer(dtype: str, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("dtype", TYPES)
 def test_every_type_has_residuals_and_bounds(dtype: str) -> None:
-    one = values(dtype, special=False)
-    base = one.astype("f8") * (1 - 1e-3) + 0.3
-    result = residual_of(one, base, None, 2.0 ** (np.dtype(dtype).itemsize * 4), LARGEST)
+    given = values(dtype, special=False)
+    base = given.astype("f8") * (1 - 1e-3) + 0.3
+    result = residual_of(given, base, None, 2.0 ** (np.dtype(dtype).itemsize * 4), LARGEST)
     assert result is not None
     decoded = corrected(base, result[0], 2.0 ** (np.dtype(dtype).itemsize * 4), np.dtype(dtype))
     assert decoded.dtype == dtype
-    assert within(one, decoded, 2.0**64)
-    assert within(one, one, 0.0)
-    assert not within(one, one[::-1].copy(), 0.0)
+    assert within(given, decoded, 2.0**64)
+    assert within(given, given, 0.0)
+    assert not within(given, given[::-1].copy(), 0.0)
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
@@ -169,9 +170,9 @@ def test_clipping(
 ) -> None:
     with np.errstate(over="ignore"):
         clipped = both(lambda: clip_shifted(values(dtype), center, low, high), monkeypatch)
-        known = clipped[~np.isnan(clipped)]
-        assert known.min() >= np.dtype(dtype).type(low)
-        assert known.max() <= np.dtype(dtype).type(high)
+        numbers = clipped[~np.isnan(clipped)]
+        assert numbers.min() >= np.dtype(dtype).type(low)
+        assert numbers.max() <= np.dtype(dtype).type(high)
     assert np.isnan(clipped).sum() == np.isnan(values(dtype)).sum()
 
 
@@ -212,10 +213,10 @@ def test_empty_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_finite() -> None:
     assert all_finite(np.arange(5))
     for bad in (np.nan, np.inf, -np.inf):
-        one = np.zeros(3 * elementwise.PIECE + 5, np.float32)
-        assert all_finite(one)
-        one[-1] = bad
-        assert not all_finite(one)
+        given = np.zeros(3 * elementwise.PIECE + 5, np.float32)
+        assert all_finite(given)
+        given[-1] = bad
+        assert not all_finite(given)
 
 
 def test_casts_stay_in_the_type() -> None:
@@ -226,9 +227,9 @@ def test_casts_stay_in_the_type() -> None:
 
 
 def test_arrays_that_are_not_in_order() -> None:
-    one = values("f4", special=False)
-    turned = np.asfortranarray(one)
-    assert within(turned, one, 0.0)
-    result = residual_of(turned, one + np.float32(1), None, 0.5, LARGEST)
+    given = values("f4", special=False)
+    turned = np.asfortranarray(given)
+    assert within(turned, given, 0.0)
+    result = residual_of(turned, given + np.float32(1), None, 0.5, LARGEST)
     assert result is not None
     assert (result[0] == -2).all()

@@ -1,4 +1,4 @@
-"""The plan: what a scene asks of a volume, and that it asks for no more."""
+"""Plans: what a scene asks of a volume, and that it asks for no more."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ import pytest
 
 import fhash_codec
 from fhash_codec import Scene, Volume
-from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.camera.view import part_in_view, pixel_vertices
+from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.picture.planning import MAX_RAYS, plan_picture
-from fhash_codec.rendering.scene.scene import Camera
 from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import FhashWarning, InputError, RegionError
 
@@ -25,15 +23,15 @@ def plan(volume: Volume, **scene: Any) -> Plan:
 
 
 def test_what_no_effect_asks_for_is_not_in_the_task(volume: Volume) -> None:
-    found = plan(volume)
-    task = found.task
+    planned = plan(volume)
+    task = planned.task
     assert task.lighting is None
     assert task.light is None
-    assert not found.lights
+    assert not planned.lights
     on = [task.shaded, task.surfaces, task.maximum, task.depth, task.normal, task.jitter]
     assert not any(on)
-    assert found.to_dict()["gradient"] == "none: no effect asks for it"
-    assert found.to_dict()["secondary rays"] == "none: no effect asks for them"
+    assert planned.to_dict()["gradient"] == "none: no effect asks for it"
+    assert planned.to_dict()["secondary rays"] == "none: no effect asks for them"
 
 
 def test_each_effect_changes_its_own_part_of_the_task(volume: Volume) -> None:
@@ -56,13 +54,13 @@ def test_each_effect_changes_its_own_part_of_the_task(volume: Volume) -> None:
 
 
 def test_shadows_light_the_volume_from_over_the_shoulder(volume: Volume) -> None:
-    found = plan(volume, effects={"shading": True, "shadows": True})
-    rays, spacing = found.task.rays, found.task.rays.grid.spacing
-    assert found.lamp is not None
-    assert found.lamp @ (rays.forward * spacing) < 0
-    assert found.lamp @ (rays.up * spacing) > 0
-    assert found.lamp @ (rays.right * spacing) < 0
-    assert found.task.lighting.lamp is found.lamp  # type: ignore[union-attr]
+    planned = plan(volume, effects={"shading": True, "shadows": True})
+    rays, spacing = planned.task.rays, planned.task.rays.grid.spacing
+    assert planned.lamp is not None
+    assert planned.lamp @ (rays.forward * spacing) < 0
+    assert planned.lamp @ (rays.up * spacing) > 0
+    assert planned.lamp @ (rays.right * spacing) < 0
+    assert planned.task.lighting.lamp is planned.lamp  # type: ignore[union-attr]
 
 
 def test_the_step_is_in_spacings_of_what_is_marched(volume: Volume) -> None:
@@ -86,57 +84,6 @@ def test_a_network_has_no_levels_of_detail(files: dict[str, Path]) -> None:
         assert plan(network, size=[4, 4]).lod == 0
         with pytest.raises(InputError, match="no levels of detail"):
             plan(network, march={"lod": 1})
-
-
-def test_only_what_is_in_the_picture_is_decoded(volume: Volume) -> None:
-    volume.chunks = (1, 4, 4, 4)
-    everything = tuple((0, length) for length in volume.shape[1:])
-    assert plan(volume).region == everything
-    rays = Rays.of(
-        Camera(view="xy", projection="parallel", zoom=12), Grid.of(volume.coords), (64, 64)
-    )
-    middle = part_in_view(rays, volume)
-    origins, _ = rays.pixels()
-    for axis, (low, high) in zip((1, 0), middle[1:], strict=True):
-        assert low <= origins[..., axis].min()
-        assert origins[..., axis].max() <= high - 1 or high == volume.shape[3 - axis]
-    assert middle[0] == everything[0]
-    assert middle[1] != everything[1]
-    assert middle[2] != everything[2]
-
-
-@pytest.mark.parametrize("zoom", [1.0, 3.0, 40.0])
-@pytest.mark.parametrize("projection", ["parallel", "perspective"])
-def test_no_ray_meets_the_volume_outside_the_part_in_view(
-    volume: Volume, projection: str, zoom: float
-) -> None:
-    volume.chunks = (1, 4, 4, 4)
-    rays = Rays.of(
-        Camera(projection=projection, zoom=zoom, azimuth=20), Grid.of(volume.coords), (24, 24)
-    )
-    part = part_in_view(rays, volume)
-    origin, direction = rays.pixels()
-    along = np.linspace(0, 3 * float(np.linalg.norm(rays.eye)), 4000)[:, None, None, None]
-    places = origin + along * direction / np.linalg.norm(
-        direction * rays.grid.spacing, axis=-1, keepdims=True
-    )
-    inside = np.all(
-        (places >= rays.grid.bounds[:, 0]) & (places <= rays.grid.bounds[:, 1]), axis=-1
-    )
-    assert inside.any()
-    for axis, (low, high) in zip((2, 1, 0), part, strict=True):
-        assert low <= places[inside][:, axis].min()
-        assert places[inside][:, axis].max() <= high - 1
-
-
-def test_a_pixel_is_nothing_from_inside(volume: Volume) -> None:
-    grid = Grid.of(volume.coords)
-    assert (
-        pixel_vertices(Rays.of(Camera(position=(5, 5, 5), focal_point=(9, 9, 9)), grid, (8, 8)))
-        == 0
-    )
-    parallel = Rays.of(Camera(projection="parallel", parallel_scale=10), grid, (40, 40))
-    assert pixel_vertices(parallel) == pytest.approx(0.5)
 
 
 def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]) -> None:

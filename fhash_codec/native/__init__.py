@@ -1,0 +1,54 @@
+"""Loader of the codec's native library: the C++ of the ray marcher and of the quality figures.
+
+It is a library beside that of `fhash_formats.native`, loaded in the same way and switched off by
+the same `FHASH_NATIVE=0`. Each of the two may be missing without the other: whoever calls a
+function of a library also has a way without it. The figures then have the same bits; pictures agree
+within rounding.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+
+from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
+
+__all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
+
+ABI_VERSION = 1
+"""Number that `fhash_codec_abi_version()` must return; it equals `FHASH_CODEC_ABI` in codec.cpp."""
+
+_KINDS = ("f32", "f64")
+_SCAN = (ARRAY, INTEGER, REAL, ARRAY)
+_ERRORS = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, ARRAY)
+_SSIM = (ARRAY,) * 7
+
+PROTOTYPES: Prototypes = {
+    # march.cpp
+    "fhash_march": (ARRAY, INTEGER, INTEGER, INTEGER, ARRAY),
+    # march_bricks.cpp
+    "fhash_march_bricks": (*(ARRAY,) * 3, *(INTEGER,) * 3, *(ARRAY,) * 3),
+    "fhash_march_distance": (ARRAY, ARRAY),
+    "fhash_march_cells": (*(ARRAY,) * 4, INTEGER, ARRAY, INTEGER, INTEGER, ARRAY),
+    # march_light.cpp
+    "fhash_march_extinction": (
+        *(*(ARRAY,) * 3, INTEGER, REAL, REAL, INTEGER, ARRAY),
+        *(INTEGER, INTEGER, ARRAY, ARRAY),
+    ),
+    "fhash_march_sum": (*(ARRAY,) * 3, *(INTEGER,) * 3, ARRAY),
+    # quality.cpp
+    **{f"fhash_scan_{kind}": _SCAN for kind in _KINDS},
+    **{f"fhash_errors_{kind}": _ERRORS for kind in _KINDS},
+    **{f"fhash_ssim_{kind}": _SSIM for kind in _KINDS},
+    "fhash_magnitudes": (ARRAY, INTEGER, INTEGER, ARRAY, ARRAY),
+}
+"""Functions of this package's library that Python calls."""
+
+_FOLDER = Path(__file__).parent
+
+
+def library() -> ctypes.CDLL | None:
+    """The native library of this package, or None; see `fhash_formats.native.load_library`."""
+    return load_library(
+        _FOLDER, "_codec", ABI_VERSION, PROTOTYPES, version_symbol="fhash_codec_abi_version"
+    )
