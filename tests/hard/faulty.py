@@ -109,15 +109,15 @@ class Bench:
 
     def _known_of(self, name: str) -> tuple[Listing, Listing, int]:
         if name not in self._known:
-            found = []
+            outputs = []
             self.empty()
             for number in (1, 0):
                 counted = self.folder / "operations"
                 self._succeed(self.words(name, number), ("at_operation", self.out, 0, 0, counted))
-                found.append(self.now())
-            assert found[0].keys() == found[1].keys()
-            assert found[0] != found[1]
-            self._known[name] = found[0], found[1], int(counted.read_text())
+                outputs.append(self.now())
+            assert outputs[0].keys() == outputs[1].keys()
+            assert outputs[0] != outputs[1]
+            self._known[name] = outputs[0], outputs[1], int(counted.read_text())
         return self._known[name]
 
     def _succeed(self, words: Sequence[object], *inject: Injection) -> None:

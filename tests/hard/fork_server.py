@@ -47,7 +47,10 @@ LIBRARIES = (
 
 
 def run(words: list[str], log: str, inject: list[list[Any]]) -> None:
-    """The child: the command line with its streams in a file, as the console script runs it; never returns."""
+    """Run a command line in the child as the console script does; never return.
+
+    Its streams go to the file `log`.
+    """
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)

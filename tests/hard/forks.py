@@ -100,7 +100,10 @@ class Server:
             {
                 "words": [str(word) for word in words],
                 "log": str(log),
-                "inject": [[str(v) if isinstance(v, Path) else v for v in each] for each in inject],
+                "inject": [
+                    [str(v) if isinstance(v, Path) else v for v in injection]
+                    for injection in inject
+                ],
             }
         )
         return Running(self, pid, log)

@@ -77,7 +77,7 @@ def trials(numbers: Iterable[int], processes: int, folder: Path) -> Report:
     report = Report()
     with ThreadPoolExecutor(processes) as pool:
         for answers in pool.map(
-            lambda at: list(_answers(waiting, folder / str(at))), range(processes)
+            lambda worker: list(_answers(waiting, folder / str(worker))), range(processes)
         ):
             for answer in answers:
                 report.add(answer)
@@ -90,7 +90,7 @@ def _answers(waiting: SimpleQueue[int], folder: Path) -> Iterator[dict[str, Any]
     while not waiting.empty():
         try:
             number = waiting.get_nowait()
-        except Empty:  # another worker took the last
+        except Empty:  # another worker took the last one
             break
         process = process or _started(folder)
         line = _asked(process, number)
@@ -98,7 +98,7 @@ def _answers(waiting: SimpleQueue[int], folder: Path) -> Iterator[dict[str, Any]
             yield json.loads(line)
             continue
         process.kill()
-        code = _left(process)
+        code = _ended(process)
         process = None
         how = (
             f"the process ended by {signal.Signals(-code).name}"
@@ -107,14 +107,14 @@ def _answers(waiting: SimpleQueue[int], folder: Path) -> Iterator[dict[str, Any]
         )
         yield _crashed(number, how)
     if process is not None:
-        _left(process)
+        _ended(process)
 
 
-def _left(process: subprocess.Popen[str]) -> int:
+def _ended(process: subprocess.Popen[str]) -> int:
     """Let a worker end and return its exit code."""
     assert process.stdin is not None
     assert process.stdout is not None
-    with contextlib.suppress(OSError):  # what could not be written to one that has crashed
+    with contextlib.suppress(OSError):  # text that a crashed worker did not read
         process.stdin.close()
     code = process.wait()
     process.stdout.close()
@@ -122,7 +122,8 @@ def _left(process: subprocess.Popen[str]) -> int:
 
 
 def _started(folder: Path) -> subprocess.Popen[str]:
-    # Where glibc has it, a heap that checks itself: what is written behind the end of an array ends the process when that is freed.
+    # A heap of glibc that checks itself: the process ends if it frees an array behind whose end
+    # something was written.
     checks = {"LD_PRELOAD": "libc_malloc_debug.so.0", "MALLOC_CHECK_": "3"}
     environment = {**os.environ, **checks, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(Path(__file__).with_name("hostile_trial.py")), str(folder)]

@@ -63,7 +63,7 @@ class Trial:
             return tuple(
                 mutations.header_of(mutations.goldens()[self.mutation.golden][1])["domain"]["shape"]
             )
-        except Exception:  # which the first command will report
+        except Exception:  # the first command reports it
             return (5, 6, 7, 9)
 
     def run(self) -> dict[str, Any]:
@@ -71,7 +71,7 @@ class Trial:
         run, region = str(self.path), self._region()
         roi = ",".join(f"{low}:{high}" for low, high in region[1:])
         steps = f"{region[0][0]}:{region[0][1]}"
-        whole, part, picture = (
+        all_values, values, picture = (
             str(self.folder / name) for name in ("whole.npy", "part.npy", "picture.png")
         )
         self._command("info", ["info", run])
@@ -80,14 +80,14 @@ class Trial:
         if self._small():
             self._command(
                 "decode",
-                ["decode", run, "-o", whole, "--force", "-q"],
-                lambda: self._values(whole, self.shape, "whole"),
+                ["decode", run, "-o", all_values, "--force", "-q"],
+                lambda: self._values(all_values, self.shape, "whole"),
             )
         sizes = [high - low for low, high in region]
-        check = lambda: self._values(part, sizes, "part", region)  # noqa: E731
+        check = lambda: self._values(values, sizes, "part", region)  # noqa: E731
         self._command(
             "decode region",
-            ["decode", run, "--roi", roi, "--t", steps, "-o", part, "--force", "-q"],
+            ["decode", run, "--roi", roi, "--t", steps, "-o", values, "--force", "-q"],
             check,
         )
         self._end("sample", self._sample)
@@ -108,11 +108,7 @@ class Trial:
 
     def _region(self) -> list[tuple[int, int]]:
         """Return a small region in the middle, (low, high) for t, z, y, x."""
-        found = []
-        for length in self.shape:
-            low = length // 3
-            found.append((low, min(length, low + 3)))
-        return found
+        return [(length // 3, min(length, length // 3 + 3)) for length in self.shape]
 
     def _command(
         self, name: str, arguments: list[str], check: Callable[[], str | None] | None = None
@@ -175,14 +171,14 @@ class Trial:
             return None
         if len(lines) != 1 or not lines[0].startswith("fhash: error: "):
             return f"exit code {code} and {len(lines)} lines: {said[:300]!r}"
-        # A sound file may hold more than there is memory for.
+        # A sound file may need more memory than there is.
         if (
             code == 1
             and self.mutation.sealed
             and lines[0].startswith("fhash: error: out of memory")
         ):
             return None
-        # Of a sound file with strange values, the usual scene may have nothing to show.
+        # The usual scene may show nothing of a sound file with strange values.
         if code == 2 and self.mutation.sealed and name == "render":
             return None
         return None if code == 4 else f"exit code {code}: {lines[0][:300]}"
@@ -219,7 +215,8 @@ class Trial:
     def _sample(self) -> str | None:
         """Sample points between vertices with the API; an error ends as on the command line."""
         chance = np.random.default_rng(self.mutation.number)
-        # Within a few vertices: a sample decodes what lies between its points, too.
+        # Points lie within a few vertices, since a sample decodes the vertices between its points,
+        # too.
         points = [chance.uniform(low, high - 1, 9) for low, high in self._region()]
         try:
             with fhash_codec.open(self.path) as volume:
@@ -229,7 +226,7 @@ class Trial:
             line, code = describe_error(error)
             say(f"error: {line}")
             raise SystemExit(code) from error
-        # A derivative may well be larger than its type holds.
+        # A derivative may overflow its type.
         return (
             "infinities" if np.isinf(values).any() or slopes.shape != (*values.shape, 4) else None
         )
@@ -244,9 +241,8 @@ class Trial:
 
 def _warned(message: Warning | str, category: type[Warning], *_: Any) -> None:
     """Print a warning as the command line does; warnings of libraries with their own category."""
-    say(
-        f"{'warning' if issubclass(category, FhashWarning) else category.__name__}: {' '.join(str(message).split())}"
-    )
+    kind = "warning" if issubclass(category, FhashWarning) else category.__name__
+    say(f"{kind}: {' '.join(str(message).split())}")
 
 
 @cache
@@ -294,7 +290,7 @@ def worker(folder: Path) -> None:
     limit = _resident("VmData") + MEMORY
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     for line in sys.stdin:
-        if os.environ.get("FHASH_HOSTILE_CRASH") == line.strip():  # a test of this
+        if os.environ.get("FHASH_HOSTILE_CRASH") == line.strip():  # for a test of the crash
             os.kill(os.getpid(), signal.SIGSEGV)
         answers.write(json.dumps(Trial(int(line), folder).run()) + "\n")
 

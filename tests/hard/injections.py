@@ -101,8 +101,8 @@ def no_memory_in(module: str, name: str) -> None:
 
     owner: Any = importlib.import_module(module)
     *path, last = name.split(".")
-    for part in path:
-        owner = getattr(owner, part)
+    for attribute in path:
+        owner = getattr(owner, attribute)
 
     def act(*_: Any, **__: Any) -> Any:
         raise MemoryError

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from containers import Parts, with_crc
-from mutated_json import DOCUMENT
+from documents import DOCUMENT
 from numcodecs.zstd import compress, decompress
 
 from fhash_formats.container.array import ArrayMetadata
@@ -42,10 +42,10 @@ Change = Callable[[random.Random, bytes], bytes]
 
 def documents_of(parts: Parts) -> dict[str, Any]:
     """Return the metadata of the arrays by name."""
-    found = {
+    documents = {
         name.rpartition("/")[0]: json.loads(data) for name, data in parts if name.endswith(DOCUMENT)
     }
-    return {name: values for name, values in found.items() if values["node_type"] == "array"}
+    return {name: values for name, values in documents.items() if values["node_type"] == "array"}
 
 
 def chosen(
@@ -189,8 +189,10 @@ def values_changed(chance: random.Random, parts: Parts) -> Parts:
 
 
 def configuration_of(document: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = document["codecs"][0]["configuration"]["codecs"][0]["configuration"]
-    return found
+    configuration: dict[str, Any] = document["codecs"][0]["configuration"]["codecs"][0][
+        "configuration"
+    ]
+    return configuration
 
 
 def _stream(chance: random.Random, parts: Parts) -> Parts:
@@ -214,7 +216,7 @@ def _restreamed(
     parts = parse_stream(stream)
     flags, sections = parts.flags, parts.sections()
     if not parts.coded:
-        return stream[:1] + b"".join(section(damaged(chance, part)) for part in sections)
+        return stream[:1] + b"".join(section(damaged(chance, data)) for data in sections)
     first = bool(flags & OWN) + bool(flags & MISSING)
     at = chance.randrange(first, len(sections))
     sections[at] = damaged(chance, sections[at])

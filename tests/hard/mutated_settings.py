@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from containers import Parts, with_crc
-from mutated_json import DOCUMENT, dumped, hostile, places
+from documents import DOCUMENT, dumped, hostile, places
 from mutated_payload import (
     bytes_changed,
     chosen,
@@ -181,7 +181,7 @@ def _predictor(chance: random.Random) -> dict[str, Any]:
     reach = chance.randrange(3)
     l0, l1, l2, l3 = levels
     o0, o1, o2, o3 = order
-    count = sum(len(part.taps) for part in passes_of((l0, l1, l2, l3), (o0, o1, o2, o3), reach))
+    count = sum(len(a_pass.taps) for a_pass in passes_of((l0, l1, l2, l3), (o0, o1, o2, o3), reach))
     weights = np.array([chance.choice((-32767, 32767, 0, 4096)) for _ in range(count)], np.int32)
     packed = encode_block(weights.reshape(1, 1, 1, -1))
     packed = damaged(chance, packed) if chance.random() < 0.3 else packed

@@ -86,11 +86,11 @@ END_FIELDS = ((0, "I"), (4, "H"), (6, "H"), (8, "H"), (10, "H"), (12, "I"), (16,
 
 def _entries(data: bytes) -> list[int]:
     """Return the offset of each entry of the directory."""
-    at, found = directory_of(data), []
+    at, offsets = directory_of(data), []
     while data[at : at + 4] == b"PK\x01\x02":
-        found.append(at)
+        offsets.append(at)
         at += ENTRY.size + struct.unpack_from("<H", data, at + 28)[0]
-    return found
+    return offsets
 
 
 def _number(chance: random.Random, form: str, old: int) -> int:
@@ -165,16 +165,16 @@ def _named(chance: random.Random, parts: Parts) -> bytes:
 def _dropped(chance: random.Random, parts: Parts) -> bytes:
     """Remove some members."""
     gone = set(chance.sample(range(len(parts)), chance.choice((1, 1, 2, len(parts) // 2))))
-    return pack([part for number, part in enumerate(parts) if number not in gone])
+    return pack([member for number, member in enumerate(parts) if number not in gone])
 
 
 def _exchanged(chance: random.Random, parts: Parts) -> bytes:
     """Replace the data of one member by another's."""
-    one, other = chance.randrange(len(parts)), chance.randrange(len(parts))
+    first, second = chance.randrange(len(parts)), chance.randrange(len(parts))
     changed = list(parts)
-    changed[one] = (parts[one][0], parts[other][1])
+    changed[first] = (parts[first][0], parts[second][1])
     if chance.random() < 0.5:
-        changed[other] = (parts[other][0], parts[one][1])
+        changed[second] = (parts[second][0], parts[first][1])
     return pack(changed)
 
 

@@ -26,7 +26,8 @@ def looking(few: int, many: int = 2000) -> settings:
         deadline=None,
         database=None,
         print_blob=True,
-        # What fails in the quick set fails again; looking for the smallest example takes minutes and is for the long set.
+        # A failure of the quick set is reproducible. Shrinking it takes minutes and is left to the
+        # long set.
         phases=list(Phase) if LONG else [Phase.explicit, Phase.generate],
         suppress_health_check=[
             HealthCheck.too_slow,

@@ -37,12 +37,12 @@ def leftovers(now: Listing) -> set[str]:
 
 
 def check_killed(bench: Bench, name: str, before: Listing) -> None:
-    """Check the folder after a kill: every output is old or new, and the rest are temporary files."""
+    """Check the folder after a kill: each output is old or new, all else is temporary files."""
     now, after = bench.now(), bench.new(name)
     extra = leftovers(now)
     kept = {place: data for place, data in now.items() if place.split("/")[0] not in extra}
     if kept.keys() != before.keys():
-        # A folder cannot be replaced at one stroke: between two renames it is there under its temporary name.
+        # A folder is replaced by two renames. Between them it has its temporary name.
         aside = [place for place in extra if place.endswith(".old")]
         assert name == "decode zarr"
         assert not kept
@@ -55,7 +55,7 @@ def check_killed(bench: Bench, name: str, before: Listing) -> None:
     elif name in ("decode vti", "decode vtr", "decode pvd", "decode raw", "render pictures"):
         assert all(
             data in (before[place], after[place]) for place, data in kept.items()
-        )  # several outputs, each whole
+        )  # several outputs, each of them complete
     else:
         assert kept in (before, after)
 
@@ -124,7 +124,7 @@ def test_a_kill_at_a_random_moment_loses_nothing(bench: Bench, profile: str) -> 
             place == "a.fhz" or place.endswith((".partial", ".old", ".checkpoint")) for place in now
         )
         checkpoints += any(place.endswith(".checkpoint") for place in now)
-        ended = bench.run(name, *eager)  # goes on from the checkpoint, if there is one
+        ended = bench.run(name, *eager)  # resumes from the checkpoint, if there is one
         assert ended.code == 0, ended.output
         assert bench.now() == bench.new(name)
     assert kills >= 4
@@ -143,7 +143,7 @@ def test_a_kill_while_a_checkpoint_is_written_loses_neither_it_nor_the_output(be
     for number in moments(int(counted.read_text()), 12):
         bench.old(name)
         ended = bench.run(name, eager, ("at_operation", bench.out, number, -signal.SIGKILL))
-        if ended.code == 0:  # how often it saves depends on the time that saving takes
+        if ended.code == 0:  # the number of checkpoints depends on how long saving takes
             continue
         killed += 1
         assert ended.code == -signal.SIGKILL, ended.output
@@ -172,8 +172,8 @@ def test_a_living_writer_is_not_disturbed_by_another(bench: Bench, name: str) ->
         if ended.code == 0:
             assert bench.now() in (bench.new(name), bench.old(name)), (
                 number
-            )  # whichever took the name last
-        else:  # a folder cannot take a name that another took since it moved the older one aside
+            )  # the writer that took the name last
+        else:  # another folder took the name after this writer moved the older one aside
             assert (ended.code, name) == (1, "decode zarr"), ended.output
             assert "another process wrote it meanwhile" in ended.line
             assert bench.now() == bench.old(name), number

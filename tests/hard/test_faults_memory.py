@@ -73,7 +73,8 @@ def test_any_limit_gives_a_result_or_one_line(bench: Bench, larger: Path, name: 
             done += 1
             continue
         if LONG and ended.code in (-signal.SIGSEGV, -signal.SIGKILL):
-            # CPython 3.11 itself: a thread that has no memory to begin with dies, and sometimes `Thread.start` waits for it for ever.
+            # CPython 3.11: a thread without memory to start dies, and `Thread.start` sometimes
+            # waits for it forever.
             died += 1
             continue
         assert ended.code == 1, (limit, ended.output)
@@ -150,7 +151,8 @@ sys.argv = ["fhash", *sys.argv[2:]]
 try:
     main()
 finally:
-    lines = open("/proc/self/status").read().splitlines()  # not getrusage, which begins with the parent's peak
+    # not getrusage, which begins with the parent's peak
+    lines = open("/proc/self/status").read().splitlines()
     open(PEAK, "w").write(next(line.split()[1] for line in lines if line.startswith("VmHWM")))
 """
 
@@ -181,7 +183,7 @@ def test_a_large_file_is_decoded_within_one_gibibyte(
     )
     if (
         suffix == "zarr" and done.returncode
-    ):  # its threads reserve much more than they use, and the limit is on what is reserved
+    ):  # its threads reserve much more than they use; the limit is on reserved memory
         assert done.returncode in (1, 4)
         assert len(done.stderr.splitlines()) == 1
         assert "memory" in done.stderr

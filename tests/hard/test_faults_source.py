@@ -39,7 +39,7 @@ def test_a_source_that_changes_is_refused(bench: Bench, tmp_path: Path, form: st
                 if not LONG and (profile, stage, how) not in QUICK:
                     continue
                 if form == "a mask" and stage != "selecting":
-                    continue  # it is not read before, nor after
+                    continue  # it is read in this stage only
                 check(bench, tmp_path / "source", form, profile, stage, how)
                 tried += 1
     assert tried > 0

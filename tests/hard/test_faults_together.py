@@ -43,7 +43,7 @@ def test_two_at_once_leave_the_whole_output_of_one(bench: Bench, name: str, forc
                 assert one.line.startswith("fhash: error: ")
                 assert "meanwhile" in one.line or "exists; use --force" in one.line, one.line
         now = bench.now()
-        if name == "decode pvd":  # several outputs: each is whole, and they are of one shape
+        if name == "decode pvd":  # several outputs, each complete, with the same names
             assert now.keys() == first.keys()
             assert all(data in (first[place], second[place]) for place, data in now.items())
         else:
@@ -132,7 +132,7 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_line(
             "20x20",
         ),
     }
-    inject = [("user", NOBODY)] if os.geteuid() == 0 else []  # permissions do not stop root
+    inject = [("user", NOBODY)] if os.geteuid() == 0 else []  # root ignores permissions
     before = listing(locked)
     ended = bench.server.run(*words[command], "--force", inject=inject)
     assert ended.code == 2, ended.output  # before any work

@@ -69,6 +69,7 @@ def test_what_injections_replace_exists() -> None:
 
 
 def test_sources_of_the_fuzzer_exist() -> None:
-    for name in (*run.SOURCES, *run.MARCH):
-        assert (run.NATIVE / f"{name}.cpp").is_file(), name
-    assert all(path.is_file() for path in run.TARGETS)
+    sources = [run.NATIVE / f"{name}.cpp" for name in run.SOURCES]
+    sources += [run.CODEC / f"{name}.cpp" for name in (*run.CODEC_SOURCES, *run.MARCH)]
+    for path in (*sources, *run.TARGETS):
+        assert path.is_file(), path

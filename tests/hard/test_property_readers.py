@@ -107,7 +107,7 @@ def test_zarr(values: np.ndarray, order: list[str], form: int, data: Draw) -> No
     chunk = data.draw(chunks(stored.shape))
     names = {} if form == 2 else {"dimension_names": order}
     with folder() as place, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of float16 and the like
+        warnings.simplefilter("ignore")  # on float16 and similar types
         array = zarr.create_array(
             place / "a.zarr",
             shape=stored.shape,
@@ -176,10 +176,10 @@ def test_netcdf_with_fill_values(values: np.ndarray, order: list[str], data: Dra
                 "v", dimensions, stored.dtype, data=stored, fillvalue=fill, chunks=chunk
             )
             assert variable.shape == stored.shape
-        found = read(place / "a.nc")
-        np.testing.assert_array_equal(found.astype(expected.dtype), expected)
+        values_read = read(place / "a.nc")
+        np.testing.assert_array_equal(values_read.astype(expected.dtype), expected)
         if fill is not None:
-            assert found.dtype == expected.dtype
+            assert values_read.dtype == expected.dtype
 
 
 @looking(15)
@@ -208,9 +208,9 @@ def test_what_a_writer_wrote_a_reader_reads(values: np.ndarray, suffix: str, dat
         with open_series(
             path, raw=layout, axes=None if suffix in ("h5", "nc", "zarr") else "t,z,y,x"
         ) as series:
-            found = np.stack(list(series.frames()))
+            values_read = np.stack(list(series.frames()))
             exact = values.astype(series.dtype)
-            assert same(found, exact)
+            assert same(values_read, exact)
             assert same(exact.astype(values.dtype), values)
             if suffix in ("h5", "nc", "zarr"):
                 assert series.units == units

@@ -139,16 +139,15 @@ def test_any_integers_in_any_bands_come_back(integers: np.ndarray, data: Draw) -
 
 
 @NATIVE
-@looking(25, 300)
+@looking(12, 300)
 @given(integers=INTEGERS.filter(lambda integers: integers.size <= 60), data=st.data())
 def test_both_engines_write_the_same_bytes(integers: np.ndarray, data: Draw) -> None:
     table = band_table(data.draw(specs(integers.shape)), integers.shape)
     fast = encode_integers(integers, table)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FHASH_NATIVE", "0")
-        patch.setattr(
-            mixing_portable, "_numba", lambda: None
-        )  # plain Python: compiling takes longer than all examples
+        # Plain Python, since compiling takes longer than all examples.
+        patch.setattr(mixing_portable, "_numba", lambda: None)
         slow = encode_integers(integers, table)
         assert slow.data == fast.data
         crossed = decode_integers(fast.data, integers.shape, table)
@@ -190,27 +189,27 @@ def gap(one: np.ndarray, other: np.ndarray) -> Fraction:
 @example(values=np.array([5e-324, -5e-324, 0.0]), bound=0.0)
 @example(values=np.array([-0.0, 0.0]), bound=0.0)
 def test_any_chunk_keeps_its_bound_strictly(values: np.ndarray, bound: float) -> None:
-    found = decode_chunk(encode_chunk(values, max_error=bound), values.shape, values.dtype)
-    assert found.dtype == values.dtype
-    assert found.shape == values.shape
+    decoded = decode_chunk(encode_chunk(values, max_error=bound), values.shape, values.dtype)
+    assert decoded.dtype == values.dtype
+    assert decoded.shape == values.shape
     if bound == 0:
-        assert same(found, values)
+        assert same(decoded, values)
         return
     finite = np.isfinite(values) if values.dtype.kind == "f" else np.ones(values.shape, bool)
-    assert same(found[~finite], values[~finite])
-    assert gap(found[finite], values[finite]) <= Fraction(bound)
+    assert same(decoded[~finite], values[~finite])
+    assert gap(decoded[finite], values[finite]) <= Fraction(bound)
 
 
 @looking(80)
 @given(values=arrays(FLOATS, dims=(1, 4), side=6), share=st.floats(1e-7, 1))
 def test_any_chunk_keeps_its_relative_bound(values: np.ndarray, share: float) -> None:
-    found = decode_chunk(encode_chunk(values, max_error_rel=share), values.shape, values.dtype)
+    decoded = decode_chunk(encode_chunk(values, max_error_rel=share), values.shape, values.dtype)
     finite = np.isfinite(values)
-    assert same(found[~finite], values[~finite])
+    assert same(decoded[~finite], values[~finite])
     exact = [Fraction(value) for value in values[finite].tolist()]
     if exact:
         span = max(exact) - min(exact)
-        assert gap(found[finite], values[finite]) <= Fraction(share) * span * Fraction(1 + 1e-9)
+        assert gap(decoded[finite], values[finite]) <= Fraction(share) * span * Fraction(1 + 1e-9)
 
 
 @looking(60)

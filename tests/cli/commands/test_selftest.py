@@ -27,7 +27,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
         cases: list[Case], *, everything: bool, processes: int | None, progress: object
     ) -> Summary:
         asked.update(cases=len(cases), everything=everything, processes=processes or 0)
-        found = Finding(name="bound", worst=asked["worst"], limit=1.0, unit="of it", under="psnr")
+        finding = Finding(name="bound", worst=asked["worst"], limit=1.0, unit="of it", under="psnr")
         return Summary(
             results=[
                 CaseResult(
@@ -35,7 +35,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
                     group=case.group,
                     about=case.about,
                     under=("psnr",),
-                    findings=(found,),
+                    findings=(finding,),
                 )
                 for case in cases
             ]
@@ -62,11 +62,11 @@ def test_a_failure_is_listed_and_exits_with_1(fhash: Fhash, measured: dict[str, 
 
 def test_json_holds_every_figure(fhash: Fhash, measured: dict[str, float]) -> None:
     result = fhash("selftest", "--case", "spike", "--case", "twos", "--json")
-    found = json.loads(result.stdout)
+    printed = json.loads(result.stdout)
     assert result.exit_code == 0
-    assert found["holds"] is True
-    assert [case["name"] for case in found["cases"]] == ["twos", "spike"]
-    assert found["cases"][0]["findings"][0] == {
+    assert printed["holds"] is True
+    assert [case["name"] for case in printed["cases"]] == ["twos", "spike"]
+    assert printed["cases"][0]["findings"][0] == {
         "name": "bound",
         "worst": 0.5,
         "limit": 1.0,
