@@ -5,12 +5,12 @@
 // portable coder (transform/entropy/coder_portable.py) follows this file step by step and gives the
 // same bytes.
 //
-// A coefficient is coded as a zero flag, its sign, and its magnitude: in unary up to 13, beyond that
-// by an Exp-Golomb code. Each binary decision k (0 is the zero flag, any other asks "more than k")
-// is predicted by CONTEXTS adaptive estimates, each with a slow and a fast rate. They are mixed in
-// the logistic domain by weights that learn as well, as in the PAQ family of compressors. Contexts
-// come from magnitudes that are already known: to the left, above, one step and one layer before,
-// and in the bands that come before.
+// A coefficient is coded as a zero flag, its sign, and its magnitude: in unary up to 13, beyond
+// that by an Exp-Golomb code. Each binary decision k (0 is the zero flag, any other asks "more than
+// k") is predicted by CONTEXTS adaptive estimates, each with a slow and a fast rate. They are mixed
+// in the logistic domain by weights that learn as well, as in the PAQ family of compressors.
+// Contexts come from magnitudes that are already known: to the left, above, one step and one layer
+// before, and in the bands that come before.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -89,8 +89,8 @@ struct Sums {
     int32_t *share, *level;           // by vertex of a reference: share in `expected`, class
     explicit Sums(size_t width) : room(11 * width) {
         int32_t* at = room.data();
-        for (int32_t** array : {&expected, &plane, &before, &below, &both, &nearest, &sides, &others,
-                                &parent, &share, &level}) {
+        for (int32_t** array : {&expected, &plane, &before, &below, &both, &nearest, &sides,
+                                &others, &parent, &share, &level}) {
             *array = at;
             at += width;
         }
@@ -155,7 +155,8 @@ FHASH_INLINE int find_references(const std::vector<Band>& bands, const Band& ban
         row.reference_y[k] = y;
         row.references[k] = other.magnitudes.data() + t * other.stride[0] + z * other.stride[1] +
                             y * other.stride[2] + PADDING;
-        if (k == 0) parent_filled = other.filled[((int64_t)t * other.size[1] + z) * other.size[2] + y];
+        if (k == 0)
+            parent_filled = other.filled[((int64_t)t * other.size[1] + z) * other.size[2] + y];
     }
     return parent_filled;
 }
@@ -170,7 +171,8 @@ FHASH_INLINE int sum_neighbours(const Band& band, const Row& row, int lanes, Sum
     const uint8_t* const F = row.filled;
     const int64_t M0 = band.stride[0], M1 = band.stride[1], M2 = band.stride[2];
     const int64_t R1 = n2, R0 = (int64_t)n1 * n2;
-    int32_t *FHASH_RESTRICT const expected = sums.expected, *FHASH_RESTRICT const plane = sums.plane;
+    int32_t* FHASH_RESTRICT const expected = sums.expected;
+    int32_t* FHASH_RESTRICT const plane = sums.plane;
     for (int32_t* array : {sums.expected, sums.plane, sums.before, sums.below})
         std::memset(array, 0, 4 * (size_t)lanes);
     int weight = LEFT + LEFT2;
@@ -206,7 +208,8 @@ FHASH_INLINE int sum_neighbours(const Band& band, const Row& row, int lanes, Sum
         }
     };
     // Add a row beside that one, if it exists.
-    auto neighbour = [&](int32_t* FHASH_RESTRICT sum, bool exists, int64_t r, const uint16_t* p) FHASH_LAMBDA {
+    auto neighbour = [&](int32_t* FHASH_RESTRICT sum, bool exists, int64_t r,
+                         const uint16_t* p) FHASH_LAMBDA {
         if (!exists || !F[r]) return;
         FHASH_INDEPENDENT
         for (int x = 0; x < lanes; x++) {
@@ -256,8 +259,11 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
         const int scale = k == 0 ? 343 : k == 1 ? 49 : k == 2 ? 7 : 1;
         const uint16_t* const p = row.references[k];
         const uint16_t* const up = row.reference_y[k] > 0 ? p - other.stride[2] : nothing;
-        const uint16_t* const down = row.reference_y[k] + 1 < other.size[2] ? p + other.stride[2] : nothing;
-        auto around = [&](int i) FHASH_LAMBDA { return 2 * p[i] + p[i - 1] + p[i + 1] + up[i] + down[i]; };
+        const bool has_down = row.reference_y[k] + 1 < other.size[2];
+        const uint16_t* const down = has_down ? p + other.stride[2] : nothing;
+        auto around = [&](int i) FHASH_LAMBDA {
+            return 2 * p[i] + p[i - 1] + p[i + 1] + up[i] + down[i];
+        };
         if (shift == 0 && last >= n3 - 1) {
             FHASH_INDEPENDENT
             for (int x = 0; x < lanes; x++) {
@@ -338,7 +344,8 @@ template <Mode MODE> struct Coder {
         const int before = predict(other, nearest - 1), stop = predict(other, nearest);
         const double same = (s - nearest) * (s - nearest) +
                             lambda * (tables.cost[before] + tables.cost[65536 - stop]);
-        const double less = (s - nearest + 1) * (s - nearest + 1) + lambda * tables.cost[65536 - before];
+        const double less = (s - nearest + 1) * (s - nearest + 1) +
+                            lambda * tables.cost[65536 - before];
         if (nearest == 2 && zero < min(same, less) + other_than_zero) return 0;
         return less < same ? nearest - 1 : nearest;
     }
@@ -359,7 +366,8 @@ template <Mode MODE> struct Coder {
         return (int)min<uint32_t>(v + (UNARY - 1), 0x7fffffff);
     }
 
-    FHASH_INLINE int64_t run(int32_t* q, const float* scaled, const int64_t* shape, const int32_t* table, int64_t count);
+    FHASH_INLINE int64_t run(int32_t* q, const float* scaled, const int64_t* shape,
+                             const int32_t* table, int64_t count);
 };
 
 // Code all bands. q, scaled, shape, table, count: as for fhash_encode and fhash_decode below.
@@ -434,9 +442,12 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                                sum_references(bands, band, row, lanes, nothing, sums);
             const int offset = 160 - log16(weight);
             prepare_contexts(band, row, lanes, nothing, sums);
-            const int32_t *FHASH_RESTRICT const expected = sums.expected, *FHASH_RESTRICT const plane = sums.plane;
-            const int32_t *FHASH_RESTRICT const both = sums.both, *FHASH_RESTRICT const nearest = sums.nearest;
-            const int32_t *FHASH_RESTRICT const sides = sums.sides, *FHASH_RESTRICT const others = sums.others;
+            const int32_t* FHASH_RESTRICT const expected = sums.expected;
+            const int32_t* FHASH_RESTRICT const plane = sums.plane;
+            const int32_t* FHASH_RESTRICT const both = sums.both;
+            const int32_t* FHASH_RESTRICT const nearest = sums.nearest;
+            const int32_t* FHASH_RESTRICT const sides = sums.sides;
+            const int32_t* FHASH_RESTRICT const others = sums.others;
             const int32_t* FHASH_RESTRICT const parent = sums.parent;
             int filled = 0, left = 0, left2 = 0;
 
@@ -454,7 +465,8 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                     small((near + both[x]) / 2) * (12 * KINDS) + parent[x],
                 };
                 Slot* places[CONTEXTS];
-                for (int i = 0; i < CONTEXTS; i++) places[i] = slots[i] + (int64_t)context[i] * DECISIONS;
+                for (int i = 0; i < CONTEXTS; i++)
+                    places[i] = slots[i] + (int64_t)context[i] * DECISIONS;
                 auto predict = [&](Prediction& to, int k) FHASH_LAMBDA {
                     for (int i = 0; i < CONTEXTS; i++) to.slots[i] = places[i] + k;
                     to.first = weights + ((int64_t)k * KINDS + kind) * SET;
@@ -479,12 +491,16 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                 filled = 1;
 
                 // The sign.
-                const int left_sign = x > 0 ? sign_of(out[x - 1]) : 1, left2_sign = x > 1 ? sign_of(out[x - 2]) : 1;
-                const int y_sign = has_y ? sign_of(out[x - S2]) : 1, y2_sign = y > 1 ? sign_of(out[x - 2 * S2]) : 1;
-                const int z_sign = has_z ? sign_of(out[x - S1]) : 1, t_sign = has_t ? sign_of(out[x - S0]) : 1;
+                const int left_sign = x > 0 ? sign_of(out[x - 1]) : 1;
+                const int left2_sign = x > 1 ? sign_of(out[x - 2]) : 1;
+                const int y_sign = has_y ? sign_of(out[x - S2]) : 1;
+                const int y2_sign = y > 1 ? sign_of(out[x - 2 * S2]) : 1;
+                const int z_sign = has_z ? sign_of(out[x - S1]) : 1;
+                const int t_sign = has_t ? sign_of(out[x - S0]) : 1;
                 Prediction sign;
                 sign.slots[0] = signs[0] + kind * 27 + (left_sign * 3 + y_sign) * 3 + t_sign;
-                sign.slots[1] = signs[1] + kind * 81 + ((left_sign * 3 + left2_sign) * 3 + y_sign) * 3 + y2_sign;
+                sign.slots[1] = signs[1] + kind * 81 +
+                                ((left_sign * 3 + left2_sign) * 3 + y_sign) * 3 + y2_sign;
                 sign.slots[2] = signs[2] + kind * 27 + (t_sign * 3 + z_sign) * 3 + left_sign;
                 sign.first = sign.second = weights + SIGNS + kind * SET;
                 const int negative = range.code(value < 0, mix<SIGN_CONTEXTS, false>(sign));
@@ -556,10 +572,13 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
                                   int64_t weight_count, uint16_t* simples, int64_t simple_count,
                                   int64_t keep, uint8_t* data, int64_t capacity) {
     return guarded([&]() -> int64_t {
-        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
+                                 LANES);
         std::vector<uint8_t> out;
-        const int64_t code = scaled ? encode_chosen({{&out}, &state, lambda / 2048}, q, scaled, shape, table, count)
-                                    : encode({{&out}, &state, 0}, q, shape, table, count);
+        const Encoder range = {&out};
+        const int64_t code =
+            scaled ? encode_chosen({range, &state, lambda / 2048}, q, scaled, shape, table, count)
+                   : encode({range, &state, 0}, q, shape, table, count);
         if (code < 0) return code;
         const int64_t size = put(out, data, capacity);
         if (keep && size <= capacity) keep_state(state, slots, weights, simples, LANES);
@@ -576,7 +595,8 @@ FHASH_EXPORT int64_t fhash_decode(int32_t* q, const int64_t* shape, const int32_
                                   const uint16_t* simples, int64_t simple_count,
                                   const uint8_t* data, int64_t size) {
     return guarded([&] {
-        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
+                                 LANES);
         return decode({{data, size}, &state, 0}, q, shape, table, count);
     });
 }

@@ -72,7 +72,7 @@ STARTS = tuple(sum(SIZES[:i]) for i in range(CONTEXTS))
 class Rows(NamedTuple):
     """Places where the rows around a row begin.
 
-    Rows of bits (in `Work.seen`) are `row` itself, `north` and `north2` before it along y, `below`
+    Rows of bits (in `Work.marks`) are `row` itself, `north` and `north2` before it along y, `below`
     and `below2` along z, `back` and `back2` along t. A suffix moves on: `_n` and `_s` by -1 and +1
     along y, `_b` and `_f` by -1 and +1 along z. Rows of levels are `at` for the row itself, and the
     next ones along y (`south`), z (`front`) and t (`later`).
@@ -104,7 +104,7 @@ class Work(NamedTuple):
         bits: the mask, which is written in decoding.
         level: first level of each vertex, 0 to 31.
         other: second level of each vertex, 0 to 15.
-        seen: what `_mark` returns for each vertex, with PADDING zeros at both ends of each row,
+        marks: what `_mark` returns for each vertex, with PADDING zeros at both ends of each row,
             after a row of zeros that stands for rows that do not exist.
         states: state of each segment; one that does not exist is at the start of each row.
         where, inputs: of a decision, for `mix` and `learn`.
@@ -113,7 +113,7 @@ class Work(NamedTuple):
     bits: Sequence
     level: Sequence
     other: Sequence
-    seen: Sequence
+    marks: Sequence
     states: Sequence
     where: Sequence
     inputs: Sequence
@@ -154,10 +154,10 @@ def _start(
     n0, n1, n2, n3 = shape = levels[0].shape
     rows, segments = n0 * n1 * n2, -(-n3 // SEGMENT)
     first, second = (level.astype(np.int64).ravel() for level in levels)
-    seen = np.zeros((rows + 1) * (n3 + 2 * PADDING), np.int64)
+    marks = np.zeros((rows + 1) * (n3 + 2 * PADDING), np.int64)
     states = np.full(rows * (segments + 1), NOTHING, np.int64)
     where, inputs = np.zeros(CONTEXTS, np.int64), np.zeros(LANES, np.int64)
-    work = Work(bits, first, second, seen, states, where, inputs)
+    work = Work(bits, first, second, marks, states, where, inputs)
     if engine is None:
         work = Work(*(sequence.tolist() for sequence in work))
         return work.bits, _run(decoding, shape, memory, LISTS, work, [0] * 4, data)
@@ -273,7 +273,7 @@ def _code_flag(
         return NOTHING
     for x in range(x0, x1):
         bits[at + x] = same
-        work.seen[row + x] = _mark(same, level[at + x])
+        work.marks[row + x] = _mark(same, level[at + x])
     return same
 
 
@@ -292,7 +292,7 @@ def _code_segment(
     Bits are named as in native/mask.cpp: w, n, p and b are before the vertex along x, y, z and t; a
     second letter moves on along y (n, s), x (w, e) or z (p, f); the 2 is for two vertices before.
     """
-    bits, level, seen = work.bits, work.level, work.seen
+    bits, level, marks = work.bits, work.level, work.marks
     where, inputs = work.where, work.inputs
     row, north, below, back, at = rows.row, rows.north, rows.below, rows.back, rows.at
     ones = 0
@@ -301,23 +301,23 @@ def _code_segment(
         ahead = level[at + x + 1] if x + 1 < n3 else a
         half = a >> 1
         w, n, p, b = (
-            seen[row + x - 1] & 1,
-            seen[north + x] & 1,
-            seen[below + x] & 1,
-            seen[back + x] & 1,
+            marks[row + x - 1] & 1,
+            marks[north + x] & 1,
+            marks[below + x] & 1,
+            marks[back + x] & 1,
         )
-        nw, ne = seen[north + x - 1] & 1, seen[north + x + 1] & 1
-        pw, pe = seen[below + x - 1] & 1, seen[below + x + 1] & 1
-        pn, ps = seen[rows.below_n + x] & 1, seen[rows.below_s + x] & 1
-        bw, be = seen[back + x - 1] & 1, seen[back + x + 1] & 1
-        bn, bs = seen[rows.back_n + x] & 1, seen[rows.back_s + x] & 1
-        bp, bf = seen[rows.back_b + x] & 1, seen[rows.back_f + x] & 1
-        w2, n2 = seen[row + x - 2] & 1, seen[rows.north2 + x] & 1
-        p2, b2 = seen[rows.below2 + x] & 1, seen[rows.back2 + x] & 1
+        nw, ne = marks[north + x - 1] & 1, marks[north + x + 1] & 1
+        pw, pe = marks[below + x - 1] & 1, marks[below + x + 1] & 1
+        pn, ps = marks[rows.below_n + x] & 1, marks[rows.below_s + x] & 1
+        bw, be = marks[back + x - 1] & 1, marks[back + x + 1] & 1
+        bn, bs = marks[rows.back_n + x] & 1, marks[rows.back_s + x] & 1
+        bp, bf = marks[rows.back_b + x] & 1, marks[rows.back_f + x] & 1
+        w2, n2 = marks[row + x - 2] & 1, marks[rows.north2 + x] & 1
+        p2, b2 = marks[rows.below2 + x] & 1, marks[rows.back2 + x] & 1
         nearest = w | n << 1 | p << 2 | b << 3
         before = b | be << 1 | bw << 2 | bs << 3 | bn << 4 | bf << 5 | bp << 6
         sums = ((w + n + nw + ne) * 6 + p + pw + pe + ps + pn) * 8 + b + bw + be + bs + bn + bf + bp
-        against = (a * 3 + (seen[row + x - 1] >> 1)) * 3 + (seen[north + x] >> 1)
+        against = (a * 3 + (marks[row + x - 1] >> 1)) * 3 + (marks[north + x] >> 1)
         south, front, later = (
             level[rows.south + x] >> 2,
             level[rows.front + x] >> 2,
@@ -331,7 +331,7 @@ def _code_segment(
         where[3] = STARTS[3] + ((half * 8 + (ahead >> 2)) * 8 + south) * 2 + w
         where[4] = STARTS[4] + ((half * 8 + front) * 8 + later) * 2 + p
         where[5] = STARTS[5] + sums * 8 + (a >> 2)
-        where[6] = STARTS[6] + (against * 3 + (seen[below + x] >> 1)) * 3 + (seen[back + x] >> 1)
+        where[6] = STARTS[6] + (against * 3 + (marks[below + x] >> 1)) * 3 + (marks[back + x] >> 1)
         where[7] = STARTS[7] + ((a >> 3) << 10 | before | w << 7 | n << 8 | p << 9)
         where[8] = STARTS[8] + (nearest | second)
         where[9] = STARTS[9] + (half << 7 | before)
@@ -352,7 +352,7 @@ def _code_segment(
             tables.rate,
         )
         bits[at + x] = bit
-        seen[row + x] = _mark(bit, a)
+        marks[row + x] = _mark(bit, a)
         ones += bit
     return ZEROS if ones == 0 else ONES if ones == x1 - x0 else MIXED
 
