@@ -11,7 +11,7 @@ from specs import mixes_and_depths, spec_of
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.entropy.prior import KINDS
-from fhash_formats.transform.entropy.table import COLUMNS, Table, single_band
+from fhash_formats.transform.entropy.table import COLUMNS, Table
 
 SHAPES = [
     (1, 1, 1, 1),
@@ -135,10 +135,3 @@ def test_a_table_is_made_once_and_read_only() -> None:
     assert table.flags.c_contiguous
     with pytest.raises(ValueError, match="read-only"):
         table[0, 0] = 1
-
-
-def test_integers_that_were_not_transformed_are_one_band() -> None:
-    table = single_band((2, 3, 4, 5))
-    assert table.shape == (1, COLUMNS)
-    assert list(table[0, :9]) == [0, 0, 0, 0, 2, 3, 4, 5, 0]
-    assert list(table[0, 9::5]) == [-1] * 4
