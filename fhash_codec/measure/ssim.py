@@ -130,7 +130,6 @@ class _Frames:
         function = (
             library.fhash_ssim_f32 if self.original.dtype == np.float32 else library.fhash_ssim_f64
         )
-        function.restype = ctypes.c_int64
         total = ctypes.c_double()
         numbers = (self.scale, self.mean, self.c1, self.c2, *_weights()[RADIUS:])
         count = function(

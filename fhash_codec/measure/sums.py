@@ -90,7 +90,6 @@ def _call(
     library: ctypes.CDLL, name: str, values: Values, *arguments: Any, results: int
 ) -> tuple[Any, ...]:
     function = getattr(library, f"fhash_{name}_f{values.dtype.itemsize * 8}")
-    function.restype = ctypes.c_int64
     found = (ctypes.c_double * results)()
     given = (ctypes.c_double(value) if isinstance(value, float) else value for value in arguments)
     return function(_pointer(values), *given, found), *found
