@@ -1,14 +1,18 @@
-// Ray marching on a CPU: packets of 4 x 4 rays through a dense lattice of values.
+// Ray marching on a processor: packets of 4 x 4 rays through a frame of values.
 //
-// Sample k of a ray lies (k + 0.5) steps, or k steps and a share of its own, behind the place where the ray enters the drawn box; the last
-// step is as long as what is left, so that the path through the box is exactly its length. Values are trilinear in a cell, the gradient is
-// that of the cell, exact and nearly free, or by central differences. A cell with a vertex without a value (NaN) is not seen.
+// Sample k of a ray lies (k + 0.5) steps behind the place where the ray enters the drawn box, or k
+// steps and a share of the ray's own. The last step is as long as the rest of the path, so that the
+// steps fill the path through the box exactly. Values are trilinear in a cell. The gradient is that
+// of the cell, exact and nearly free, or by central differences. A cell with a vertex without a
+// value (NaN) is not seen.
 //
-// Compositing is front to back. Within BLOCK samples opacity (not transparency: 1 - 1e-9 is 1 in float32) is summed in float32; blocks
-// are joined in float64, so that thin fog does not vanish in rounding. Built for speed, not for the same bits everywhere: pictures agree
-// with those of fhash_codec/render/stream.py within rounding.
+// Compositing is front to back. Within BLOCK samples the opacity is summed in float32, and not the
+// transparency: 1 - 1e-9 is 1 in float32. Blocks are joined in float64, so that thin fog does not
+// vanish in rounding. The code is built for speed, not for the same bits everywhere: pictures agree
+// with those of fhash_codec/rendering/stream/stream.py within rounding.
 #if defined(__GNUC__) && !defined(__clang__)
-#pragma GCC optimize("no-tree-pre")  // which makes branches of the loops below, and those are not vectorised
+// It makes branches of the loops below, and loops with branches are not vectorised.
+#pragma GCC optimize("no-tree-pre")
 #endif
 #include "march.hpp"
 #include "march_packet.hpp"
@@ -20,13 +24,14 @@
 
 namespace {
 
-template <int WANTED> FHASH_INLINE void Packet<WANTED>::composite(Counters& counted) {
+// Add the samples of a pass to the colours.
+template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::composite(Counters& counted) {
     const float* const table = m.table;
     int gradients = 0;
     #pragma omp simd reduction(+ : gradients)
     for (int l = 0; l < N; l++) {
         float red, green, blue;
-        if (WANTED & WIDE) {
+        if (FLAGS & WIDE) {
             red = cr[l]; green = cg[l]; blue = cb[l];
         } else {
             const int t = 4 * (int)at[l];
@@ -36,14 +41,21 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::composite(Counters& coun
             blue = table[t + 2] + share * (table[t + 6] - table[t + 2]);
         }
         float lamp = 1, around = 1;
-        if (WANTED & LIT) lamp = light_at(m, 0, px[l], py[l], pz[l]), around = light_at(m, 1, px[l], py[l], pz[l]);
-        if (WANTED & SHADED) {
-            const float x = gx[l], y = gy[l], z = gz[l], one = size_of(phong, x, y, z);
-            const float factor = phong.ambient * around + lamp * scattered(phong, x * tox[l] + y * toy[l] + z * toz[l], one);
-            const float shine = lamp * mirrored(phong, x * hx[l] + y * hy[l] + z * hz[l], one);
-            red = red * factor + shine; green = green * factor + shine; blue = blue * factor + shine;
+        if (FLAGS & LIT) {
+            lamp = light_at(m, 0, px[l], py[l], pz[l]);
+            around = light_at(m, 1, px[l], py[l], pz[l]);
+        }
+        if (FLAGS & SHADED) {
+            const float x = gx[l], y = gy[l], z = gz[l], inverse = inverse_length(phong, x, y, z);
+            const float towards = x * tox[l] + y * toy[l] + z * toz[l];
+            const float halfway = x * hx[l] + y * hy[l] + z * hz[l];
+            const float factor = phong.ambient * around + lamp * scattered(phong, towards, inverse);
+            const float shine = lamp * mirrored(phong, halfway, inverse);
+            red = red * factor + shine;
+            green = green * factor + shine;
+            blue = blue * factor + shine;
             gradients += alpha[l] > 0;
-        } else if (WANTED & LIT) {
+        } else if (FLAGS & LIT) {
             const float factor = lamp * around;
             red *= factor; green *= factor; blue *= factor;
         }
@@ -56,72 +68,28 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::composite(Counters& coun
     counted.gradients += gradients;
 }
 
-template <int WANTED> FHASH_INLINE void Packet<WANTED>::march(Counters& counted) {
-    const bool skipping = WANTED & MAXIMUM ? m.highest != nullptr : m.distance != nullptr;
-    const float stop = max((float)m.threshold, 1e-37f);
-    if (skipping && m.surfaces > 0) meet(counted);
-    for (int since = 0;;) {
-        int here = 0;
-        if (skipping) {
-            const int state = skip(counted);
-            if (!(state & 1)) {
-                if (!state) break;
-                continue;
-            }
-        } else {
-            #pragma omp simd reduction(| : here)
-            for (int l = 0; l < N; l++) {
-                on[l] = k[l] < count[l];
-                here |= on[l];
-            }
-            if (!here) break;
-        }
-        counted.passes++;
-        int seen = 0, ending = 0, lost = 0;
-#if defined(FHASH_AVX512)
-        if constexpr (WANTED & WIDE) sample_wide(*this, counted, seen, ending, lost);
-        else
-#endif
-            sample(counted, seen, ending, lost);
-        if (WANTED & MAXIMUM) {
-            if (lost)
-                for (int l = 0; l < N; l++) {
-                    const float found = on[l] && !(value[l] == value[l]) ? (float)fhash_cell_at(m, px[l], py[l], pz[l]).value : NONE;
-                    if (found > best[l]) best[l] = found, where[l] = k[l];
-                }
-            #pragma omp simd
-            for (int l = 0; l < N; l++) k[l] += on[l];
-            continue;
-        }
-        if (lost) {
-            mend();
-            seen = 1;
-        }
-        if (ending && seen) shorten();
-        if (m.surfaces > 0) surfaces(counted);
-        if (seen && (WANTED & CENTRAL)) slopes();
-        if (seen) composite(counted);
-        if (m.surfaces > 0) finish(counted);
-        if (m.depth && (seen || m.surfaces > 0))
-            for (int l = 0; l < N; l++)
-                if (on[l] && clear[l] * (1 - (double)a[l]) < 0.5) see(l, k[l], nullptr, counted);
-        #pragma omp simd
-        for (int l = 0; l < N; l++) k[l] += on[l];
-        if (++since == BLOCK) {
-            since = 0;
-            flush();
-        }
-        // Branches, so that processors begin the next pass before this one's opacity is known.
-        int ended = 0;
-        #pragma omp simd reduction(| : ended)
-        for (int l = 0; l < N; l++) ended |= (left[l] * (1 - a[l]) < stop) & (k[l] < count[l]);
-        if (ended) {
-            #pragma omp simd
-            for (int l = 0; l < N; l++) k[l] = left[l] * (1 - a[l]) < stop ? count[l] : k[l];
-        }
+// Let every ray that is not at its end take part in the pass. Returns 3 if there is one, else 0.
+template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::alive() {
+    int here = 0;
+    #pragma omp simd reduction(| : here)
+    for (int l = 0; l < N; l++) {
+        on[l] = k[l] < count[l];
+        here |= on[l];
     }
-    flush();
-    if (!(WANTED & MAXIMUM)) return;
+    return here ? 3 : 0;
+}
+
+// Look again at samples without a value, which may lie on faces of cells.
+template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::keep_lost_maximum() {
+    for (int l = 0; l < N; l++) {
+        if (!on[l] || value[l] == value[l]) continue;
+        const float here = (float)fhash_cell_at(m, px[l], py[l], pz[l]).value;
+        if (here > best[l]) best[l] = here, where[l] = k[l];
+    }
+}
+
+// Draw the largest values, opaque.
+template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::show_maximum(Counters& counted) {
     for (int l = 0; l < N; l++) {
         if (!(best[l] > -FAR)) continue;
         const double e = clamp((best[l] - m.low) * m.scale, 0.0, (double)(m.entries - 1));
@@ -135,8 +103,70 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::march(Counters& counted)
     }
 }
 
-// Add to the pictures, from this pixel on.
-template <int WANTED> FHASH_INLINE void Packet<WANTED>::write(int64_t x, int64_t y) {
+// Draw the samples of a pass, and the surfaces before them.
+template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::show(Seen seen, Counters& counted) {
+    if (seen.lost) {
+        mend();
+        seen.any = 1;
+    }
+    if (seen.ending && seen.any) shorten();
+    if (m.surfaces > 0) surfaces(counted);
+    if (seen.any && (FLAGS & CENTRAL)) slopes();
+    if (seen.any) composite(counted);
+    if (m.surfaces > 0) finish(counted);
+    if (m.depth && (seen.any || m.surfaces > 0))
+        for (int l = 0; l < N; l++)
+            if (on[l] && clear[l] * (1 - (double)a[l]) < 0.5) see(l, k[l], nullptr, counted);
+}
+
+// End the rays behind which less than a share of the light is left. In two steps with a branch, so
+// that processors begin the next pass before this one's opacity is known.
+template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::end_rays(float stop) {
+    int ended = 0;
+    #pragma omp simd reduction(| : ended)
+    for (int l = 0; l < N; l++) ended |= (left[l] * (1 - a[l]) < stop) & (k[l] < count[l]);
+    if (ended) {
+        #pragma omp simd
+        for (int l = 0; l < N; l++) k[l] = left[l] * (1 - a[l]) < stop ? count[l] : k[l];
+    }
+}
+
+// March the rays of the packet to their ends, pass by pass.
+template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::march(Counters& counted) {
+    const bool skipping = FLAGS & MAXIMUM ? m.highest != nullptr : m.distance != nullptr;
+    const float stop = max((float)m.threshold, 1e-37f);
+    if (skipping && m.surfaces > 0) meet(counted);
+    for (int since = 0;;) {
+        const int state = skipping ? skip(counted) : alive();
+        if (!state) break;
+        if (!(state & 1)) continue;
+        counted.passes++;
+        Seen seen;
+#if defined(FHASH_AVX512)
+        if constexpr (FLAGS & WIDE) sample_wide(*this, counted, seen);
+        else
+#endif
+            sample(counted, seen);
+        if (FLAGS & MAXIMUM) {
+            if (seen.lost) keep_lost_maximum();
+        } else {
+            show(seen, counted);
+        }
+        #pragma omp simd
+        for (int l = 0; l < N; l++) k[l] += on[l];
+        if (FLAGS & MAXIMUM) continue;
+        if (++since == BLOCK) {
+            since = 0;
+            flush();
+        }
+        end_rays(stop);
+    }
+    flush();
+    if (FLAGS & MAXIMUM) show_maximum(counted);
+}
+
+// Add the rays to the pictures, from this pixel on.
+template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::write(int64_t x, int64_t y) {
     const double share = 1.0 / (double)(m.rays * m.rays);
     alignas(64) float shares[N][4];
     #pragma omp simd
@@ -146,55 +176,68 @@ template <int WANTED> FHASH_INLINE void Packet<WANTED>::write(int64_t x, int64_t
         shares[l][2] = (float)(blue[l] * share);
         shares[l][3] = (float)((1 - clear[l]) * share);
     }
-    const int64_t columns = min(m.width - x, (int64_t)SIDE), lines = min(m.height - y, (int64_t)SIDE);
-    for (int64_t j = 0; j < lines; j++) {
+    const int64_t columns = min(m.width - x, (int64_t)SIDE);
+    const int64_t rows = min(m.height - y, (int64_t)SIDE);
+    for (int64_t j = 0; j < rows; j++) {
         float* const out = m.out + 4 * ((y + j) * m.width + x);
         const float* const row = shares[j * SIDE];
         for (int64_t n = 0; n < 4 * columns; n++) out[n] += row[n];
     }
     if (!m.depth) return;
     for (int l = 0; l < N; l++) {
-        const int64_t at = (y + l / SIDE) * m.width + x + l % SIDE;
-        if (l % SIDE >= columns || l / SIDE >= lines || !(depth[l] < m.depth[at])) continue;
-        m.depth[at] = depth[l];  // of several rays the nearest
+        const int64_t pixel = (y + l / SIDE) * m.width + x + l % SIDE;
+        if (l % SIDE >= columns || l / SIDE >= rows || !(depth[l] < m.depth[pixel])) continue;
+        m.depth[pixel] = depth[l];  // that of the nearest ray
         if (!m.normal) continue;
-        for (int c = 0; c < 3; c++) m.normal[3 * at + c] = (float)normal[c][l];
+        for (int c = 0; c < 3; c++) m.normal[3 * pixel + c] = (float)normal[c][l];
     }
 }
 
-// Tiles of TILE x TILE pixels from first to stop, in rows.
-template <int WANTED> FHASH_INLINE void tiles(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) {
-    const int64_t across = (m.width + TILE - 1) / TILE, rays = m.rays;
-    Packet<WANTED> packet(m);
-    for (int64_t tile = first; tile < stop; tile++)
-        for (int64_t y = tile / across * TILE; y < min(tile / across * TILE + TILE, m.height); y += SIDE)
-            for (int64_t x = tile % across * TILE; x < min(tile % across * TILE + TILE, m.width); x += SIDE)
-                for (int64_t ray = 0; ray < rays * rays; ray++) {
-                    const int met = packet.aim(x, y, ray);
-                    if (!met) continue;
-                    counted.rays += met;
-                    packet.march(counted);
-                    packet.write(x, y);
-                }
+// March the packets of a tile.
+template <int FLAGS>
+FHASH_INLINE void march_tile(Packet<FLAGS>& packet, int64_t left, int64_t top, Counters& counted) {
+    const FhashMarch& m = packet.m;
+    for (int64_t y = top; y < min(top + TILE, m.height); y += SIDE)
+        for (int64_t x = left; x < min(left + TILE, m.width); x += SIDE)
+            for (int64_t ray = 0; ray < m.rays * m.rays; ray++) {
+                const int met = packet.aim(x, y, ray);
+                if (!met) continue;
+                counted.rays += met;
+                packet.march(counted);
+                packet.write(x, y);
+            }
 }
 
-// Not FHASH_CLONES: clones cannot be told that gathering from memory is quick on a machine that has all of AVX-512.
+// March the tiles from first to stop, in rows of the picture.
+template <int FLAGS>
+FHASH_INLINE void tiles(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) {
+    const int64_t across = (m.width + TILE - 1) / TILE;
+    Packet<FLAGS> packet(m);
+    for (int64_t tile = first; tile < stop; tile++)
+        march_tile(packet, tile % across * TILE, tile / across * TILE, counted);
+}
+
+// A function for each set of flags, compiled for several machines; m.path says which of them.
+// FHASH_CLONES cannot be used: clones cannot be told that gathering from memory is quick on a
+// machine that has all of AVX-512.
+#define FHASH_PARAMETERS const FhashMarch &m, int64_t first, int64_t stop, Counters &counted
 #if defined(FHASH_AVX512)
-#define FHASH_KERNEL(NAME, WANTED)                                                                                                       \
-    FHASH_AVX512 void NAME##_v4(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) {                                   \
-        tiles<(WANTED) | WIDE>(m, first, stop, counted);                                                                                 \
-    }                                                                                                                                    \
-    __attribute__((target("arch=x86-64-v3,tune=haswell"))) void NAME##_v3(                                                               \
-        const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }                \
-    void NAME##_v1(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }      \
-    void NAME(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) {                                                    \
-        (m.path < 1 && __builtin_cpu_supports("x86-64-v4") && m.shape[2] > 1 ? NAME##_v4                                                 \
-         : m.path < 2 && __builtin_cpu_supports("x86-64-v3")                 ? NAME##_v3                                                 \
-                                                                             : NAME##_v1)(m, first, stop, counted);                      \
+#define FHASH_KERNEL(NAME, FLAGS)                                                                  \
+    FHASH_AVX512 void NAME##_v4(FHASH_PARAMETERS) {                                                \
+        tiles<(FLAGS) | WIDE>(m, first, stop, counted);                                            \
+    }                                                                                              \
+    __attribute__((target("arch=x86-64-v3,tune=haswell"))) void NAME##_v3(FHASH_PARAMETERS) {      \
+        tiles<FLAGS>(m, first, stop, counted);                                                     \
+    }                                                                                              \
+    void NAME##_v1(FHASH_PARAMETERS) { tiles<FLAGS>(m, first, stop, counted); }                    \
+    void NAME(FHASH_PARAMETERS) {                                                                  \
+        const bool v4 = m.path < 1 && __builtin_cpu_supports("x86-64-v4") && m.shape[2] > 1;       \
+        const bool v3 = m.path < 2 && __builtin_cpu_supports("x86-64-v3");                         \
+        (v4 ? NAME##_v4 : v3 ? NAME##_v3 : NAME##_v1)(m, first, stop, counted);                    \
     }
 #else
-#define FHASH_KERNEL(NAME, WANTED) \
-    FHASH_CLONES void NAME(const FhashMarch& m, int64_t first, int64_t stop, Counters& counted) { tiles<WANTED>(m, first, stop, counted); }
+#define FHASH_KERNEL(NAME, FLAGS) \
+    FHASH_CLONES void NAME(FHASH_PARAMETERS) { tiles<FLAGS>(m, first, stop, counted); }
 #endif
 FHASH_KERNEL(plain, 0)
 FHASH_KERNEL(shaded, SHADED)
@@ -204,22 +247,26 @@ FHASH_KERNEL(central, SHADED | CENTRAL)
 FHASH_KERNEL(central_lit, SHADED | CENTRAL | LIT)
 FHASH_KERNEL(maximum, MAXIMUM)
 #undef FHASH_KERNEL
+#undef FHASH_PARAMETERS
 
 }  // namespace
 
-// Add the rays of tiles first to stop (of 16 x 16 pixels, in rows) to the pictures of `march`, which begin as zeros (depth: infinity).
-// wanted: 1 shading of the volume, 2 its light grid, 4 the maximum instead of it. counters: rays, passes, samples, gradients, skips, added to.
-FHASH_EXPORT int64_t fhash_march(const FhashMarch* march, int64_t wanted, int64_t first, int64_t stop, int64_t* counters) {
+// Add the rays of tiles first to stop (of 16 x 16 pixels, in rows) to the pictures of `march`,
+// which begin as zeros (depth: infinity). flags: SHADED, LIT, MAXIMUM. counters, added to: rays,
+// passes, samples, gradients, skips. Returns -1 for an input that cannot be.
+FHASH_EXPORT int64_t fhash_march(const FhashMarch* march, int64_t flags, int64_t first,
+                                 int64_t stop, int64_t* counters) {
     const FhashMarch& m = *march;
-    if (m.surfaces < 0 || m.surfaces > FHASH_SURFACES || m.entries < 2 || m.rays < 1 || !(m.step > 0)) return -1;
+    if (m.surfaces < 0 || m.surfaces > FHASH_SURFACES) return -1;
+    if (m.entries < 2 || m.rays < 1 || !(m.step > 0)) return -1;
     if (m.cells && !m.distance) return -1;
     Counters counted;
-    if (wanted & MAXIMUM) maximum(m, first, stop, counted);
-    else if ((wanted & SHADED) && m.central && (wanted & LIT)) central_lit(m, first, stop, counted);
-    else if ((wanted & SHADED) && m.central) central(m, first, stop, counted);
-    else if ((wanted & SHADED) && (wanted & LIT)) shaded_lit(m, first, stop, counted);
-    else if (wanted & LIT) lit(m, first, stop, counted);
-    else if (wanted & SHADED) shaded(m, first, stop, counted);
+    if (flags & MAXIMUM) maximum(m, first, stop, counted);
+    else if ((flags & SHADED) && m.central && (flags & LIT)) central_lit(m, first, stop, counted);
+    else if ((flags & SHADED) && m.central) central(m, first, stop, counted);
+    else if ((flags & SHADED) && (flags & LIT)) shaded_lit(m, first, stop, counted);
+    else if (flags & LIT) lit(m, first, stop, counted);
+    else if (flags & SHADED) shaded(m, first, stop, counted);
     else plain(m, first, stop, counted);
     counters[0] += counted.rays;
     counters[1] += counted.passes;

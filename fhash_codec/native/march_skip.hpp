@@ -1,4 +1,4 @@
-// Over bricks and cells of which nothing can be seen.
+// Leaping over invisible bricks and cells.
 #pragma once
 
 #include "march_packet.hpp"
@@ -6,50 +6,76 @@
 
 namespace {
 
-// Which rays have a sample to take here (1), and whether any is alive at all (2).
-template <int WANTED> FHASH_INLINE int Packet<WANTED>::skip(Counters& counted) {
+// Move rays on over what is invisible, and let those take part in the pass that have a sample to
+// take. Returns 1 if there is one, plus 2 if any ray is not at its end.
+template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::skip(Counters& counted) {
+    const bool by_cells = m.cells && !(FLAGS & MAXIMUM);
 #if defined(FHASH_AVX512)
-    if constexpr (WANTED & WIDE)
-        return m.cells && !(WANTED & MAXIMUM) ? leap_wide<WANTED, true>(*this, counted) : leap_wide<WANTED, false>(*this, counted);
+    if constexpr (FLAGS & WIDE)
+        return by_cells ? leap_wide<FLAGS, true>(*this, counted)
+                        : leap_wide<FLAGS, false>(*this, counted);
 #endif
-    return m.cells && !(WANTED & MAXIMUM) ? leap<true>(counted) : leap<false>(counted);
+    return by_cells ? leap<true>(counted) : leap<false>(counted);
 }
 
-// The cell that a ray's next sample lies in, its brick, and that one's number.
+// The cell of a ray's next sample, the cell's brick, and the number of that brick.
 struct Spot {
     int i, j, h, jx, jy, jz, brick;
 };
 
-template <int WANTED> FHASH_INLINE Spot spot_of(const Packet<WANTED>& p, int l, int lx, int ly, int lz, int bx, int by) {
-    const float f = (float)p.k[l], part = 1.f / FHASH_BRICK;
+template <int FLAGS>
+FHASH_INLINE Spot spot_of(const Packet<FLAGS>& p, int l, int lx, int ly, int lz, int bx, int by) {
+    const float f = (float)p.k[l], bricks = 1.f / FHASH_BRICK;
     const int i = min((int)clamp(p.ox[l] + f * p.dx[l], 0.f, (float)(lx - 1)), max(lx - 2, 0));
     const int j = min((int)clamp(p.oy[l] + f * p.dy[l], 0.f, (float)(ly - 1)), max(ly - 2, 0));
     const int h = min((int)clamp(p.oz[l] + f * p.dz[l], 0.f, (float)(lz - 1)), max(lz - 2, 0));
-    const int jx = (int)((float)i * part), jy = (int)((float)j * part), jz = (int)((float)h * part);
+    const int jx = (int)((float)i * bricks), jy = (int)((float)j * bricks);
+    const int jz = (int)((float)h * bricks);
     return {i, j, h, jx, jy, jz, (jz * by + jy) * bx + jx};
 }
 
-// Whether nothing can be seen in a cell.
+// Whether a cell is invisible.
 FHASH_INLINE int empty(const uint32_t* cells, int i, int j, int h, int brick) {
-    return ~cells[2 * brick + (h >> 1 & 1)] >> ((h & 1) << 4 | (j & 3) << 2 | (i & 3)) & 1;
+    const int bit = (h & 1) << 4 | (j & 3) << 2 | (i & 3);
+    return ~cells[2 * brick + (h >> 1 & 1)] >> bit & 1;
 }
 
-// CELLS: by cell within the bricks that matter.
-template <int WANTED> template <bool CELLS> FHASH_INLINE int Packet<WANTED>::leap(Counters& counted) {
-    const int bx = (int)m.bricks[2], by = (int)m.bricks[1], lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
-    const float side = (float)FHASH_BRICK;
+// The place, in samples, at which a ray leaves what it leaps over: one cell, if `cell` is 1, or the
+// bricks up to w around the one at its sample. Rather a sample short of the end than one beyond it.
+template <int FLAGS>
+FHASH_INLINE float reach(const Packet<FLAGS>& p, int l, const Spot& at, int w, int cell) {
+    const float side = (float)FHASH_BRICK, near = (float)w * side, lone = (float)cell;
+    const float across = side * (float)(1 + 2 * w) - lone * (side - 1);
+    const float west = (float)at.jx * side, south = (float)at.jy * side;
+    const float bottom = (float)at.jz * side;
+    const float fromx = west + lone * ((float)at.i - west) - near;
+    const float fromy = south + lone * ((float)at.j - south) - near;
+    const float fromz = bottom + lone * ((float)at.h - bottom) - near;
+    const float tx = (fromx + (float)p.upx[l] * across - p.ox[l]) * p.ix[l] + p.farx[l];
+    const float ty = (fromy + (float)p.upy[l] * across - p.oy[l]) * p.iy[l] + p.fary[l];
+    const float tz = (fromz + (float)p.upz[l] * across - p.oz[l]) * p.iz[l] + p.farz[l];
+    return min(min(min(tx, ty), tz), 1e9f) * (1 - 2e-6f);
+}
+
+// `skip` in plain loops. CELLS: cell by cell within the bricks that matter.
+template <int FLAGS>
+template <bool CELLS>
+FHASH_INLINE int Packet<FLAGS>::leap(Counters& counted) {
+    const int bx = (int)m.bricks[2], by = (int)m.bricks[1];
+    const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
     const int keeping = m.surfaces > 0;
     const int32_t* const distance = m.distance;
     const uint32_t* const cells = m.cells;
     const float* const highest = m.highest;
     int here = 0, alive = 0, skipped = 0, any = 0;
-    // Most passes skip nothing: then no more is worked out, and what follows does not wait for the bricks.
+    // Most passes skip nothing. Then no more is computed, and the sampling does not wait for
+    // bricks.
     #pragma omp simd reduction(| : any, here)
     for (int l = 0; l < N; l++) {
         const int going = k[l] < count[l];
         const Spot at = spot_of(*this, l, lx, ly, lz, bx, by);
         int away;
-        if (WANTED & MAXIMUM) away = !(highest[at.brick] > best[l]);
+        if (FLAGS & MAXIMUM) away = !(highest[at.brick] > best[l]);
         else if (CELLS) away = empty(cells, at.i, at.j, at.h, at.brick);
         else away = distance[at.brick] > 0;
         any |= going & away;
@@ -65,27 +91,19 @@ template <int WANTED> template <bool CELLS> FHASH_INLINE int Packet<WANTED>::lea
         const int going = k[l] < count[l];
         const Spot at = spot_of(*this, l, lx, ly, lz, bx, by);
         int away, w = 0, cell = 0;
-        if (WANTED & MAXIMUM) away = highest[at.brick] > best[l] ? 0 : 1;
+        if (FLAGS & MAXIMUM) away = highest[at.brick] > best[l] ? 0 : 1;
         else away = distance[at.brick], w = away - 1;
-        if (CELLS) {  // within a brick that matters, over one cell
+        if (CELLS) {  // a brick that matters: over one cell of it
             cell = away == 0;
             w += cell;
             away = empty(cells, at.i, at.j, at.h, at.brick);
         }
-        // The ends of what is passed over: the cell, or the bricks up to w around this one.
-        const float near = (float)w * side, lone = (float)cell, across = side * (float)(1 + 2 * w) - lone * (side - 1);
-        const float westmost = (float)at.jx * side, southmost = (float)at.jy * side, lowest = (float)at.jz * side;
-        const float fromx = westmost + lone * ((float)at.i - westmost) - near, fromy = southmost + lone * ((float)at.j - southmost) - near;
-        const float fromz = lowest + lone * ((float)at.h - lowest) - near;
-        const float tx = (fromx + (float)upx[l] * across - ox[l]) * ix[l] + farx[l];
-        const float ty = (fromy + (float)upy[l] * across - oy[l]) * iy[l] + fary[l];
-        const float tz = (fromz + (float)upz[l] * across - oz[l]) * iz[l] + farz[l];
-        // Rather a sample short of the brick's end than one beyond it.
-        const float leave = min(min(min(tx, ty), tz), 1e9f) * (1 - 2e-6f);
+        const float leave = reach(*this, l, at, w, cell);
         const int next = min(max((int)leave + 1, k[l] + 1), count[l]);
-        // The first sample beyond a brick that matters is taken: a surface may lie between it and the one before.
-        const int last_of_all = keeping & (previous[l] == previous[l]), over = going & (away > 0) & !last_of_all;
-        quitting[l] = going & (away > 0) & last_of_all;
+        // The first sample behind a brick that matters is taken: a surface may lie before it.
+        const int first_behind = keeping & (previous[l] == previous[l]);
+        const int over = going & (away > 0) & !first_behind;
+        quitting[l] = going & (away > 0) & first_behind;
         leapt[l] = over;
         k[l] = over ? next : k[l];
         on[l] = going & !over;
@@ -103,20 +121,23 @@ template <int WANTED> template <bool CELLS> FHASH_INLINE int Packet<WANTED>::lea
     return (here ? 1 : 0) | (alive ? 2 : 0);
 }
 
-// Whether something can be seen in the cell that a place of a ray lies in.
-template <int WANTED> bool Packet<WANTED>::visible(int l, double sample) const {
+// Whether the cell at a place of a ray is visible.
+template <int FLAGS> bool Packet<FLAGS>::visible(int l, double sample) const {
     int at[3];
     for (int c = 0; c < 3; c++) {
-        const double most = (double)m.shape[2 - c] - 1, place = clamp(o[c][l] + sample * d[c][l], 0.0, most);
+        const double most = (double)m.shape[2 - c] - 1;
+        const double place = clamp(o[c][l] + sample * d[c][l], 0.0, most);
         at[c] = min((int)place, max((int)most - 1, 0));
     }
-    const int64_t side = FHASH_BRICK, q = (at[2] / side * m.bricks[1] + at[1] / side) * m.bricks[2] + at[0] / side;
+    const int64_t side = FHASH_BRICK, row = at[2] / side * m.bricks[1] + at[1] / side;
+    const int64_t q = row * m.bricks[2] + at[0] / side;
     if (m.distance[q] > 0) return false;
     return !m.cells || !empty(m.cells, at[0], at[1], at[2], (int)q);
 }
 
-// Where rays enter a cell that matters but have their first sample beyond it: a surface may lie between.
-template <int WANTED> void Packet<WANTED>::meet(Counters& counted) {
+// Look at where rays enter, if that is in a visible cell: a surface may lie before the first
+// sample.
+template <int FLAGS> void Packet<FLAGS>::meet(Counters& counted) {
     for (int l = 0; l < N; l++) {
         if (k[l] >= count[l] || !visible(l, entered[l])) continue;
         previous[l] = (float)border(l, entered[l]).value;
@@ -124,8 +145,9 @@ template <int WANTED> void Packet<WANTED>::meet(Counters& counted) {
     }
 }
 
-// Where rays leave the box by a cell that matters but have their last sample, short of it: they take that, if one.
-template <int WANTED> void Packet<WANTED>::part_ways(const int* leapt, Counters& counted) {
+// Let rays that leapt to their ends take their last sample, if they leave the box by a visible
+// cell: a surface may lie behind it. leapt: whether each ray leapt in this pass.
+template <int FLAGS> void Packet<FLAGS>::part_ways(const int* leapt, Counters& counted) {
     for (int l = 0; l < N; l++) {
         if (!leapt[l] || k[l] < count[l] || !visible(l, leaving[l])) continue;
         from[l] = max(count[l] - 2.0, entered[l]);

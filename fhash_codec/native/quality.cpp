@@ -1,7 +1,9 @@
-// How far decoded values are from the original: sums of squared errors, and structural similarity (Wang et al. 2004).
+// Figures of how far decoded values are from the original: sums of squared errors, and structural
+// similarity (Wang et al. 2004).
 //
-// fhash_scan and fhash_errors add in a stated order, so that their numpy twins give the same bits: value i goes to lane i % LANES of
-// its piece of PIECE values, lanes are added up in order, then pieces. The similarity agrees with its numpy twin to rounding only.
+// fhash_scan and fhash_errors add in a stated order, so that their numpy twins give the same bits:
+// value i of a piece of PIECE values goes to lane i % LANES; the lanes are added up in order, then
+// the pieces. The similarity agrees with its numpy twin within rounding.
 #include <algorithm>
 #include <cfloat>
 #include <cmath>
@@ -19,7 +21,9 @@ using std::uint8_t;
 
 const int LANES = 256;
 const int64_t PIECE = 1 << 14;
-const int RADIUS = 5, TAPS = 2 * RADIUS + 1, FIELDS = 4;
+const int RADIUS = 5;  // of the window, in vertices
+const int TAPS = 2 * RADIUS + 1;
+const int FIELDS = 4;  // of a filtered plane
 
 FHASH_INLINE double lane_sum(const double* lanes) {
     double sum = 0;
@@ -27,8 +31,10 @@ FHASH_INLINE double lane_sum(const double* lanes) {
     return sum;
 }
 
-// result: least, greatest and sum of value * factor; only of what is finite. The number of those.
-template <class T> FHASH_INLINE int64_t scan(const T* values, int64_t n, double factor, double* result) {
+// The number of the finite values. result: their least, their greatest, and the sum of
+// value * factor.
+template <class T>
+FHASH_INLINE int64_t scan(const T* values, int64_t n, double factor, double* result) {
     const T largest = sizeof(T) == 4 ? (T)FLT_MAX : (T)DBL_MAX;
     int64_t count = 0;
     double total = 0;
@@ -64,10 +70,12 @@ template <class T> FHASH_INLINE int64_t scan(const T* values, int64_t n, double 
     return count;
 }
 
-// result: sum of the squares, and the largest, of (original - decoded) * scale where the original is finite and `mask`, if any, is set.
-// The number of those, or -1 where a difference is not finite.
+// The number of the values that count: those with a finite original where `mask`, if any, is set;
+// -1 where a difference is not finite. result: the sum of the squares of (original - decoded) *
+// scale, and its largest magnitude.
 template <class T, bool MASKED>
-FHASH_INLINE int64_t errors(const T* original, const T* decoded, const uint8_t* mask, int64_t n, double scale, double* result) {
+FHASH_INLINE int64_t errors(const T* original, const T* decoded, const uint8_t* mask, int64_t n,
+                            double scale, double* result) {
     const T limit = sizeof(T) == 4 ? (T)FLT_MAX : (T)DBL_MAX;
     int64_t count = 0;
     double total = 0, largest = 0;
@@ -81,9 +89,11 @@ FHASH_INLINE int64_t errors(const T* original, const T* decoded, const uint8_t* 
             int counted_here = 0;
             for (int lane = 0; lane < width; lane++) {
                 const T one = ones[lane];
-                const bool counted = ((one < 0 ? -one : one) <= limit) & (!MASKED || chosen[lane] != 0);
+                const bool finite = (one < 0 ? -one : one) <= limit;
+                const bool counted = finite & (!MASKED || chosen[lane] != 0);
                 const T first = counted ? one : (T)0, second = counted ? others[lane] : (T)0;
-                const double difference = (double)first * scale - (double)second * scale, size = std::fabs(difference);
+                const double difference = (double)first * scale - (double)second * scale;
+                const double size = std::fabs(difference);
                 sums[lane] += difference * difference;
                 most[lane] = size > most[lane] ? size : most[lane];
                 wrong[lane] += difference - difference;  // 0, or NaN for good
@@ -108,10 +118,12 @@ FHASH_INLINE int64_t mirrored(int64_t i, int64_t size) {
     return i < size ? i : 2 * size - 1 - i;
 }
 
+// Two frames to compare: how their values are scaled, and the constants of the measure.
 struct Frame {
     int64_t shape[3];
     const uint8_t* mask;
-    double scale, mean, c1, c2, weights[RADIUS + 1];  // of the window, from its middle outwards
+    double scale, mean, c1, c2;
+    double weights[RADIUS + 1];  // of the window, from its middle outwards
 };
 
 Frame make_frame(const uint8_t* mask, const int64_t* shape, const double* numbers) {
@@ -126,143 +138,256 @@ Frame make_frame(const uint8_t* mask, const int64_t* shape, const double* number
     return frame;
 }
 
-// Sum over a tile of the local similarity of the vertices that count, whose number is returned, or -1 where a decoded value is not finite.
-template <class T> FHASH_INLINE int64_t similarity(const T* original, const T* decoded, const Frame& frame, const int64_t* tile, double* result) {
-    const int64_t Y = frame.shape[1], X = frame.shape[2];
-    const int64_t ny = tile[3] - tile[2], nx = tile[5] - tile[4], wy = ny + 2 * RADIUS, wx = nx + 2 * RADIUS, plane = ny * nx;
-    const T limit = sizeof(T) == 4 ? (T)FLT_MAX : (T)DBL_MAX;
-    std::vector<double> ring((size_t)(TAPS * FIELDS * plane)), rows((size_t)(FIELDS * wy * nx)), line((size_t)(FIELDS * wx)), sums((size_t)(FIELDS * nx));
-    std::vector<int64_t> columns((size_t)wx);
-    for (int64_t x = 0; x < wx; x++) columns[x] = mirrored(tile[4] - RADIUS + x, X);
-    const bool inner = columns[0] == tile[4] - RADIUS && columns[wx - 1] == tile[5] + RADIUS - 1;
-    const double* const w = frame.weights;
+// The weights of the window, in a local copy, so that no loop has to read them again after a store.
+struct Weights {
+    double w[RADIUS + 1];
+    explicit FHASH_INLINE Weights(const Frame& frame) {
+        for (int k = 0; k <= RADIUS; k++) w[k] = frame.weights[k];
+    }
+    FHASH_INLINE double operator[](int k) const { return w[k]; }
+};
+
+// The window's weighted sum of the values `stride` apart, of which `q` is the first.
+FHASH_INLINE double windowed(const Weights& w, const double* q, int64_t stride) {
+    return w[0] * q[5 * stride] + w[1] * (q[4 * stride] + q[6 * stride]) +
+           w[2] * (q[3 * stride] + q[7 * stride]) + w[3] * (q[2 * stride] + q[8 * stride]) +
+           w[4] * (q[stride] + q[9 * stride]) + w[5] * (q[0] + q[10 * stride]);
+}
+
+// The comparison of a tile of two frames. Planes of the tile and the window around it are filtered
+// along x and y, one after the other; a ring of the last TAPS of them is filtered along z. A plane
+// has FIELDS fields: both values, the sum of their squares, and their product.
+template <class T> struct Comparison {
+    const T *const original, *const decoded;
+    const Frame& frame;
+    const int64_t* const tile;  // first and stop along z, y and x
+    const int64_t ny, nx;       // vertices of the tile
+    const int64_t wy, wx;       // vertices of the tile and the window around it
+    const int64_t plane;        // numbers of a field of a filtered plane
+    std::vector<double> ring, rows, line, sums;
+    std::vector<int64_t> columns;  // of the frame, mirrored at its borders
+    bool inner;                    // whether no column is mirrored
+
+    Comparison(const T* one, const T* other, const Frame& both, const int64_t* ends)
+        : original(one), decoded(other), frame(both), tile(ends), ny(tile[3] - tile[2]),
+          nx(tile[5] - tile[4]), wy(ny + 2 * RADIUS), wx(nx + 2 * RADIUS), plane(ny * nx),
+          ring((size_t)(TAPS * FIELDS * plane)), rows((size_t)(FIELDS * wy * nx)),
+          line((size_t)(FIELDS * wx)), sums((size_t)(FIELDS * nx)), columns((size_t)wx) {
+        for (int64_t x = 0; x < wx; x++)
+            columns[x] = mirrored(tile[4] - RADIUS + x, frame.shape[2]);
+        inner = columns[0] == tile[4] - RADIUS && columns[wx - 1] == tile[5] + RADIUS - 1;
+    }
+
+    static FHASH_INLINE bool finite(T value) {
+        return (value < 0 ? -value : value) <= (sizeof(T) == 4 ? (T)FLT_MAX : (T)DBL_MAX);
+    }
+
+    // Load the fields of a row of the frame that begins at `row`. False where a decoded value that
+    // is compared is not finite.
+    FHASH_INLINE bool load(int64_t row) {
+        // Local copies, so that no loop has to read them again after a store.
+        const T *const ones = original, *const others = decoded;
+        const uint8_t* const mask = frame.mask;
+        const double scale = frame.scale, mean = frame.mean;
+        double *const a = line.data(), *const b = a + wx, *const squares = b + wx;
+        double* const products = squares + wx;
+        int wrong = 0;
+        const auto fill = [&](int64_t x, int64_t at) FHASH_LAMBDA {
+            const T one = ones[at];
+            const bool known = finite(one);
+            const double first = known ? (double)one * scale - mean : 0.0;
+            const bool other = known && (!mask || mask[at]);
+            const double second = other ? (double)others[at] * scale - mean : first;
+            wrong |= !(std::fabs(second) <= DBL_MAX);
+            a[x] = first;
+            b[x] = second;
+            squares[x] = first * first + second * second;
+            products[x] = first * second;
+        };
+        const int64_t first = row + tile[4] - RADIUS, count = wx;
+        const int64_t* const mirror = columns.data();
+        if (inner) for (int64_t x = 0; x < count; x++) fill(x, first + x);
+        else for (int64_t x = 0; x < count; x++) fill(x, row + mirror[x]);
+        return !wrong;
+    }
+
+    double* filtered_plane(int64_t number) { return ring.data() + number % TAPS * FIELDS * plane; }
+
+    // Filter plane z of the frame along x and y, into the ring. False as `load`.
+    FHASH_INLINE bool filter_plane(int64_t z) {
+        const Weights w(frame);
+        const int64_t source_z = mirrored(z, frame.shape[0]);
+        const int64_t Y = frame.shape[1], X = frame.shape[2];
+        const int64_t width = nx, stride = wx;
+        for (int64_t y = 0; y < wy; y++) {
+            if (!load((source_z * Y + mirrored(tile[2] - RADIUS + y, Y)) * X)) return false;
+            for (int f = 0; f < FIELDS; f++) {
+                const double* const p = line.data() + f * stride;
+                double* const out = rows.data() + (f * wy + y) * width;
+                FHASH_INDEPENDENT
+                for (int64_t x = 0; x < width; x++) out[x] = windowed(w, p + x, 1);
+            }
+        }
+        double* const into = filtered_plane(z - tile[0] + RADIUS);
+        for (int f = 0; f < FIELDS; f++)
+            for (int64_t y = 0; y < ny; y++) {
+                const double* const p = rows.data() + (f * wy + y) * width;
+                double* const out = into + f * plane + y * width;
+                FHASH_INDEPENDENT
+                for (int64_t x = 0; x < width; x++) out[x] = windowed(w, p + x, width);
+            }
+        return true;
+    }
+
+    // Filter row y of plane z of the tile along z, into `sums`.
+    FHASH_INLINE void filter_row(int64_t z, int64_t y) {
+        const Weights w(frame);
+        const int64_t width = nx;
+        const double* planes[TAPS];
+        for (int k = 0; k < TAPS; k++) planes[k] = filtered_plane(z - tile[0] + k);
+        for (int f = 0; f < FIELDS; f++) {
+            const int64_t at = f * plane + y * width;
+            const double *const p0 = planes[0] + at, *const p1 = planes[1] + at;
+            const double *const p2 = planes[2] + at, *const p3 = planes[3] + at;
+            const double *const p4 = planes[4] + at, *const p5 = planes[5] + at;
+            const double *const p6 = planes[6] + at, *const p7 = planes[7] + at;
+            const double *const p8 = planes[8] + at, *const p9 = planes[9] + at;
+            const double* const p10 = planes[10] + at;
+            double* const out = sums.data() + f * width;
+            FHASH_INDEPENDENT
+            for (int64_t x = 0; x < width; x++)
+                out[x] = w[0] * p5[x] + w[1] * (p4[x] + p6[x]) + w[2] * (p3[x] + p7[x]) +
+                         w[3] * (p2[x] + p8[x]) + w[4] * (p1[x] + p9[x]) + w[5] * (p0[x] + p10[x]);
+        }
+    }
+
+    // Add the local similarity of the vertices of a row that count. row: of its first vertex.
+    FHASH_INLINE void add_row(int64_t row, double& total, int64_t& count) {
+        const int64_t width = nx;
+        const double *const a = sums.data(), *const b = a + width, *const squares = b + width;
+        const double* const products = squares + width;
+        double* const local = line.data();
+        const double mean = frame.mean, c1 = frame.c1, c2 = frame.c2;
+        FHASH_INDEPENDENT
+        for (int64_t x = 0; x < width; x++) {
+            const double covariance = products[x] - a[x] * b[x];
+            const double variances = squares[x] - a[x] * a[x] - b[x] * b[x];
+            const double one = a[x] + mean, other = b[x] + mean;
+            const double above = (2 * one * other + c1) * (2 * covariance + c2);
+            local[x] = above / ((one * one + other * other + c1) * (variances + c2));
+        }
+        for (int64_t x = 0; x < width; x++) {
+            if (!finite(original[row + x]) || (frame.mask && !frame.mask[row + x])) continue;
+            total += local[x];
+            count++;
+        }
+    }
+};
+
+// The sum over a tile of the local similarity of the vertices that count, whose number is returned,
+// or -1 where a decoded value is not finite.
+template <class T>
+FHASH_INLINE int64_t similarity(const T* original, const T* decoded, const Frame& frame,
+                                const int64_t* tile, double* result) {
+    Comparison<T> comparison(original, decoded, frame, tile);
     int64_t count = 0;
     double total = 0;
     for (int64_t z = tile[0] - RADIUS; z < tile[1] + RADIUS; z++) {
-        const int64_t source_z = mirrored(z, frame.shape[0]);
-        double* const into = ring.data() + (z - tile[0] + RADIUS) % TAPS * FIELDS * plane;
-        for (int64_t y = 0; y < wy; y++) {
-            const int64_t row = (source_z * Y + mirrored(tile[2] - RADIUS + y, Y)) * X;
-            double *const a = line.data(), *const b = a + wx, *const squares = b + wx, *const products = squares + wx;
-            int wrong = 0;
-            const auto load = [&](int64_t x, int64_t at) FHASH_LAMBDA {
-                const T one = original[at];
-                const bool finite = (one < 0 ? -one : one) <= limit;
-                const double first = finite ? (double)one * frame.scale - frame.mean : 0.0;
-                const bool other = finite && (!frame.mask || frame.mask[at]);
-                const double second = other ? (double)decoded[at] * frame.scale - frame.mean : first;
-                wrong |= !(std::fabs(second) <= DBL_MAX);
-                a[x] = first;
-                b[x] = second;
-                squares[x] = first * first + second * second;
-                products[x] = first * second;
-            };
-            if (inner) for (int64_t x = 0; x < wx; x++) load(x, row + tile[4] - RADIUS + x);
-            else for (int64_t x = 0; x < wx; x++) load(x, row + columns[x]);
-            if (wrong) return -1;
-            for (int f = 0; f < FIELDS; f++) {
-                const double* const p = line.data() + f * wx;
-                double* const out = rows.data() + (f * wy + y) * nx;
-                for (int64_t x = 0; x < nx; x++) {
-                    const double* const q = p + x;
-                    out[x] = w[0] * q[5] + w[1] * (q[4] + q[6]) + w[2] * (q[3] + q[7]) + w[3] * (q[2] + q[8]) + w[4] * (q[1] + q[9]) + w[5] * (q[0] + q[10]);
-                }
-            }
-        }
-        for (int f = 0; f < FIELDS; f++)
-            for (int64_t y = 0; y < ny; y++) {
-                const double* const p = rows.data() + (f * wy + y) * nx;
-                double* const out = into + f * plane + y * nx;
-                for (int64_t x = 0; x < nx; x++) {
-                    const double* const q = p + x;
-                    out[x] = w[0] * q[5 * nx] + w[1] * (q[4 * nx] + q[6 * nx]) + w[2] * (q[3 * nx] + q[7 * nx]) + w[3] * (q[2 * nx] + q[8 * nx]) +
-                             w[4] * (q[nx] + q[9 * nx]) + w[5] * (q[0] + q[10 * nx]);
-                }
-            }
+        if (!comparison.filter_plane(z)) return -1;
         const int64_t out_z = z - RADIUS;
         if (out_z < tile[0]) continue;
-        const double* planes[TAPS];
-        for (int k = 0; k < TAPS; k++) planes[k] = ring.data() + (out_z - tile[0] + k) % TAPS * FIELDS * plane;
-        for (int64_t y = 0; y < ny; y++) {
-            for (int f = 0; f < FIELDS; f++) {
-                const int64_t at = f * plane + y * nx;
-                const double *const p0 = planes[0] + at, *const p1 = planes[1] + at, *const p2 = planes[2] + at, *const p3 = planes[3] + at,
-                             *const p4 = planes[4] + at, *const p5 = planes[5] + at, *const p6 = planes[6] + at, *const p7 = planes[7] + at,
-                             *const p8 = planes[8] + at, *const p9 = planes[9] + at, *const p10 = planes[10] + at;
-                double* const out = sums.data() + f * nx;
-                for (int64_t x = 0; x < nx; x++)
-                    out[x] = w[0] * p5[x] + w[1] * (p4[x] + p6[x]) + w[2] * (p3[x] + p7[x]) + w[3] * (p2[x] + p8[x]) + w[4] * (p1[x] + p9[x]) + w[5] * (p0[x] + p10[x]);
-            }
-            const int64_t row = (out_z * Y + tile[2] + y) * X + tile[4];
-            const double *const a = sums.data(), *const b = a + nx, *const squares = b + nx, *const products = squares + nx;
-            double* const local = line.data();
-            for (int64_t x = 0; x < nx; x++) {
-                const double covariance = products[x] - a[x] * b[x], variances = squares[x] - a[x] * a[x] - b[x] * b[x];
-                const double one = a[x] + frame.mean, other = b[x] + frame.mean;
-                const double above = (2 * one * other + frame.c1) * (2 * covariance + frame.c2);
-                local[x] = above / ((one * one + other * other + frame.c1) * (variances + frame.c2));
-            }
-            for (int64_t x = 0; x < nx; x++) {
-                const T one = original[row + x];
-                if (!((one < 0 ? -one : one) <= limit) || (frame.mask && !frame.mask[row + x])) continue;
-                total += local[x];
-                count++;
-            }
+        for (int64_t y = tile[2]; y < tile[3]; y++) {
+            comparison.filter_row(out_z, y - tile[2]);
+            const int64_t row = (out_z * frame.shape[1] + y) * frame.shape[2] + tile[4];
+            comparison.add_row(row, total, count);
         }
     }
     *result = total;
     return count;
 }
 
-FHASH_CLONES int64_t scan_float(const float* values, int64_t n, double factor, double* result) { return scan<float>(values, n, factor, result); }
-FHASH_CLONES int64_t scan_double(const double* values, int64_t n, double factor, double* result) { return scan<double>(values, n, factor, result); }
-FHASH_CLONES int64_t errors_float(const float* one, const float* other, int64_t n, double scale, double* result) {
+FHASH_CLONES int64_t scan_float(const float* values, int64_t n, double factor, double* result) {
+    return scan<float>(values, n, factor, result);
+}
+FHASH_CLONES int64_t scan_double(const double* values, int64_t n, double factor, double* result) {
+    return scan<double>(values, n, factor, result);
+}
+FHASH_CLONES int64_t errors_float(const float* one, const float* other, int64_t n, double scale,
+                                  double* result) {
     return errors<float, false>(one, other, nullptr, n, scale, result);
 }
-FHASH_CLONES int64_t errors_double(const double* one, const double* other, int64_t n, double scale, double* result) {
+FHASH_CLONES int64_t errors_double(const double* one, const double* other, int64_t n, double scale,
+                                   double* result) {
     return errors<double, false>(one, other, nullptr, n, scale, result);
 }
-FHASH_CLONES int64_t masked_errors_float(const float* one, const float* other, const uint8_t* mask, int64_t n, double scale, double* result) {
+FHASH_CLONES int64_t masked_errors_float(const float* one, const float* other, const uint8_t* mask,
+                                         int64_t n, double scale, double* result) {
     return errors<float, true>(one, other, mask, n, scale, result);
 }
-FHASH_CLONES int64_t masked_errors_double(const double* one, const double* other, const uint8_t* mask, int64_t n, double scale, double* result) {
+FHASH_CLONES int64_t masked_errors_double(const double* one, const double* other,
+                                          const uint8_t* mask, int64_t n, double scale,
+                                          double* result) {
     return errors<double, true>(one, other, mask, n, scale, result);
 }
-FHASH_CLONES int64_t similarity_float(const float* one, const float* other, const Frame& frame, const int64_t* tile, double* result) {
-    return guarded([&]() FHASH_LAMBDA { return similarity<float>(one, other, frame, tile, result); });
+FHASH_CLONES int64_t similarity_float(const float* one, const float* other, const Frame& frame,
+                                      const int64_t* tile, double* result) {
+    return guarded(
+        [&]() FHASH_LAMBDA { return similarity<float>(one, other, frame, tile, result); });
 }
-FHASH_CLONES int64_t similarity_double(const double* one, const double* other, const Frame& frame, const int64_t* tile, double* result) {
-    return guarded([&]() FHASH_LAMBDA { return similarity<double>(one, other, frame, tile, result); });
+FHASH_CLONES int64_t similarity_double(const double* one, const double* other, const Frame& frame,
+                                       const int64_t* tile, double* result) {
+    return guarded(
+        [&]() FHASH_LAMBDA { return similarity<double>(one, other, frame, tile, result); });
 }
 
 }  // namespace
 
-// What is finite among n values: their number; result gets the least, the greatest and the sum of value * factor.
-FHASH_EXPORT int64_t fhash_scan_f32(const float* values, int64_t n, double factor, double* result) { return scan_float(values, n, factor, result); }
-FHASH_EXPORT int64_t fhash_scan_f64(const double* values, int64_t n, double factor, double* result) { return scan_double(values, n, factor, result); }
-
-// Errors of n decoded values, times scale, where the original is finite and the mask (nullptr: everywhere) is not 0: their number; result
-// gets the sum of their squares and the largest. -1 where one is not finite.
-FHASH_EXPORT int64_t fhash_errors_f32(const float* original, const float* decoded, const uint8_t* mask, int64_t n, double scale, double* result) {
-    return mask ? masked_errors_float(original, decoded, mask, n, scale, result) : errors_float(original, decoded, n, scale, result);
+// The number of the finite ones of n values. result gets the least, the greatest and the sum of
+// value * factor.
+FHASH_EXPORT int64_t fhash_scan_f32(const float* values, int64_t n, double factor, double* result) {
+    return scan_float(values, n, factor, result);
 }
-FHASH_EXPORT int64_t fhash_errors_f64(const double* original, const double* decoded, const uint8_t* mask, int64_t n, double scale, double* result) {
-    return mask ? masked_errors_double(original, decoded, mask, n, scale, result) : errors_double(original, decoded, n, scale, result);
+FHASH_EXPORT int64_t fhash_scan_f64(const double* values, int64_t n, double factor,
+                                    double* result) {
+    return scan_double(values, n, factor, result);
 }
 
-// Structural similarity over a tile of two frames (codec: ssim.py). shape: (z, y, x) of the frames; tile: start and stop along each axis;
-// numbers: scale, mean after scaling, c1, c2, and the window's six weights from its middle outwards. result gets the sum of the local
-// similarity of the vertices that count (finite in the original, and set in the mask, nullptr being all); their number is returned, -1
-// where a decoded value that is compared is not finite, NO_MEMORY.
-FHASH_EXPORT int64_t fhash_ssim_f32(const float* original, const float* decoded, const uint8_t* mask, const int64_t* shape, const int64_t* tile, const double* numbers, double* result) {
+// Errors of n decoded values, times scale: the number of the values that count, those with a finite
+// original where the mask (nullptr: everywhere) is not 0; -1 where one of them has no finite error.
+// result gets the sum of the squared errors and the largest.
+FHASH_EXPORT int64_t fhash_errors_f32(const float* original, const float* decoded,
+                                      const uint8_t* mask, int64_t n, double scale,
+                                      double* result) {
+    return mask ? masked_errors_float(original, decoded, mask, n, scale, result)
+                : errors_float(original, decoded, n, scale, result);
+}
+FHASH_EXPORT int64_t fhash_errors_f64(const double* original, const double* decoded,
+                                      const uint8_t* mask, int64_t n, double scale,
+                                      double* result) {
+    return mask ? masked_errors_double(original, decoded, mask, n, scale, result)
+                : errors_double(original, decoded, n, scale, result);
+}
+
+// The structural similarity over a tile of two frames (fhash_codec/measure/ssim.py). shape: (z, y,
+// x) of the frames. tile: first and stop along each axis. numbers: scale, mean after scaling, c1,
+// c2, and the window's six weights from its middle outwards. Returns the number of the vertices
+// that count (finite in the original, and set in the mask, nullptr being all); -1 where a decoded
+// value that is compared is not finite; NO_MEMORY. result gets the sum of their local similarity.
+FHASH_EXPORT int64_t fhash_ssim_f32(const float* original, const float* decoded,
+                                    const uint8_t* mask, const int64_t* shape, const int64_t* tile,
+                                    const double* numbers, double* result) {
     return similarity_float(original, decoded, make_frame(mask, shape, numbers), tile, result);
 }
-FHASH_EXPORT int64_t fhash_ssim_f64(const double* original, const double* decoded, const uint8_t* mask, const int64_t* shape, const int64_t* tile, const double* numbers, double* result) {
+FHASH_EXPORT int64_t fhash_ssim_f64(const double* original, const double* decoded,
+                                    const uint8_t* mask, const int64_t* shape, const int64_t* tile,
+                                    const double* numbers, double* result) {
     return similarity_double(original, decoded, make_frame(mask, shape, numbers), tile, result);
 }
 
-// How large n coefficients are: counts and squares by the upper bits of their magnitude, bits >> shift, of which there are 2^(31 - shift).
-FHASH_EXPORT int64_t fhash_magnitudes(const float* values, int64_t n, int64_t shift, int64_t* counts, double* squares) {
+// Counts and sums of squares of n coefficients by the upper bits of their magnitude: bits >> shift,
+// of which there are 2^(31 - shift).
+FHASH_EXPORT int64_t fhash_magnitudes(const float* values, int64_t n, int64_t shift,
+                                      int64_t* counts, double* squares) {
     for (int64_t i = 0; i < n; i++) {
         std::uint32_t bits;
         std::memcpy(&bits, values + i, sizeof bits);
