@@ -1,4 +1,4 @@
-"""In which cells something can be seen."""
+"""Cells of a frame in which something can be seen."""
 
 import numpy as np
 import pytest

@@ -109,7 +109,7 @@ def lit(colour, slope, along, lighting):
 
 
 def places_of(task, shape):
-    """Of each sample of each ray: pixel, number, place and length; directions of the rays."""
+    """Pixel, number, place and length of each sample of each ray; directions of the rays."""
     origin, along = (
         np.array(np.broadcast_to(part.reshape(-1, 3), (np.prod(task.rays.size), 3)))
         for part in task.rays.pixels()

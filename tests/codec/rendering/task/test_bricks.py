@@ -1,4 +1,4 @@
-"""What bricks of a frame hold, and which of them matter."""
+"""Bricks of a frame: the values that they hold, and which of them matter."""
 
 from dataclasses import replace
 
