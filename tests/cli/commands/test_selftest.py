@@ -15,12 +15,13 @@ from fhash_codec.selftest import workers
 from fhash_codec.selftest.case import Case, Finding
 from fhash_codec.selftest.results import CaseResult, Summary
 
-Fhash = Callable[..., Result]
-
 
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
-    """Replaces every case by a figure, {"worst": figure}; the request is added to the dict."""
+    """Replaces the run of cases: each has the figure {"worst": figure}.
+
+    The arguments of the call are added under their names.
+    """
     asked: dict[str, float] = {"worst": 0.5}
 
     def run(
@@ -45,14 +46,16 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     return asked
 
 
-def test_one_case_runs_and_holds(fhash: Fhash) -> None:
+def test_one_case_runs_and_holds(fhash: Callable[..., Result]) -> None:
     result = fhash("selftest", "--case", "nothing-finite", "--processes", "1", "--quiet")
     assert result.exit_code == 0, result.output
     assert "values      1        3" in result.stdout
     assert result.stdout.endswith("everything holds\n")
 
 
-def test_a_failure_is_listed_and_exits_with_1(fhash: Fhash, measured: dict[str, float]) -> None:
+def test_a_failure_is_listed_and_exits_with_1(
+    fhash: Callable[..., Result], measured: dict[str, float]
+) -> None:
     measured["worst"] = 1.25
     result = fhash("selftest", "--group", "times", "--quiet")
     assert result.exit_code == 1
@@ -60,7 +63,7 @@ def test_a_failure_is_listed_and_exits_with_1(fhash: Fhash, measured: dict[str, 
     assert result.stderr == ""
 
 
-def test_json_holds_every_figure(fhash: Fhash, measured: dict[str, float]) -> None:
+def test_json_holds_every_figure(fhash: Callable[..., Result], measured: dict[str, float]) -> None:
     result = fhash("selftest", "--case", "spike", "--case", "twos", "--json")
     printed = json.loads(result.stdout)
     assert result.exit_code == 0
@@ -76,7 +79,7 @@ def test_json_holds_every_figure(fhash: Fhash, measured: dict[str, float]) -> No
     }
 
 
-def test_all_runs_more(fhash: Fhash, measured: dict[str, float]) -> None:
+def test_all_runs_more(fhash: Callable[..., Result], measured: dict[str, float]) -> None:
     assert fhash("selftest", "--quiet").exit_code == 0
     few = measured["cases"]
     assert not measured["everything"]
@@ -87,7 +90,7 @@ def test_all_runs_more(fhash: Fhash, measured: dict[str, float]) -> None:
 
 
 def test_the_report_is_written_once(
-    fhash: Fhash, measured: dict[str, float], tmp_path: Path
+    fhash: Callable[..., Result], measured: dict[str, float], tmp_path: Path
 ) -> None:
     path = tmp_path / "stability.md"
     assert fhash("selftest", "--case", "spike", "--report", path, "--quiet").exit_code == 0
