@@ -125,7 +125,7 @@ class Summary:
         return [f"{result.name}: {line}" for result in self.results for line in result.failures]
 
     def worst(self) -> dict[str, tuple[CaseResult, Finding]]:
-        """For each property, by name, the finding nearest to its limit, with its case."""
+        """The finding nearest to its limit for each property, by name, with its case."""
         worst: dict[str, tuple[CaseResult, Finding]] = {}
         for result in self.results:
             for finding in result.findings:

@@ -105,7 +105,7 @@ def constants(run: Run) -> Iterator[Finding]:
 
 
 def within_range(run: Run) -> Iterator[Finding]:
-    """No decoded value is outside the range of the series by more than the bound."""
+    """Decoded values exceed the range of the series by no more than the bound."""
     finite = run.values[np.isfinite(run.values)]
     low, high = Fraction(finite.min().item()), Fraction(finite.max().item())
     decoded = run.decoded[np.isfinite(run.decoded)]

@@ -60,7 +60,7 @@ class CannotBuild(Exception):
 
 @dataclass
 class Figures:
-    """What all processes of the fuzzer did.
+    """The work of all processes of the fuzzer.
 
     Attributes:
         executions: inputs that were run.

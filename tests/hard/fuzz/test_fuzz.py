@@ -16,7 +16,7 @@ import run
 from reporting import LONG
 
 SECONDS = 5.0
-"""How long the fuzzer mutates inputs, after it has run all seeds."""
+"""Seconds for which the fuzzer mutates inputs, after it has run all seeds."""
 EVERY = 1 if LONG else 5
 """Every so many of the seeds of each target are run. 5 has no factor in common with the numbers of
 seeds of one setup (2 and 3), so that all kinds of seeds take turns."""

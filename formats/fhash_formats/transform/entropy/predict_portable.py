@@ -114,7 +114,7 @@ class Prediction(NamedTuple):
 
 
 class Conditions(NamedTuple):
-    """What the decisions about one difference depend on.
+    """The numbers that the decisions about one difference depend on.
 
     Attributes:
         context: of each estimate.

@@ -45,7 +45,7 @@ def test_a_step_has_its_middle_on_a_vertex_or_between_two(name: str, levels: set
     ("name", "share"), [("creeping-front", 1e-3), ("slow-front", 0.15), ("fast-front", 1.0)]
 )
 def test_a_front_moves_as_fast_as_its_name_says(name: str, share: float) -> None:
-    """Of the vertices, at most this share changes its side from one step to the next."""
+    """A share of the vertices, at most, changes its side from one step to the next."""
     ahead = values_of(name) > 0
     changed = (ahead[1:] != ahead[:-1]).mean()
     assert changed <= share

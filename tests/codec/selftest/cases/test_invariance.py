@@ -52,7 +52,7 @@ def test_a_guise_with_other_errors_or_another_size_is_seen(
     growth: float,
     properties: set[str],
 ) -> None:
-    """As if every guise had the errors of the run, and a share of the range more."""
+    """Gives every guise the errors of the run, and a share of the range more."""
     own = compact_run.decoded - compact_run.values.astype(np.float64)
 
     def encoded(run: Run, values: np.ndarray, factor: float, **_: object) -> tuple:
