@@ -11,7 +11,6 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, FhashWarning, Renderer, Volume, native
-from fhash_codec.rendering.task.arrays import Arrays
 
 SHAPE = (3, 20, 24, 28)
 
@@ -61,13 +60,3 @@ def volume(files: dict[str, Path]) -> Iterator[Volume]:
 @pytest.fixture
 def renderer(volume: Volume) -> Renderer:
     return Renderer(volume)
-
-
-@pytest.fixture
-def tensors() -> Arrays:
-    """torch's arrays on the processor: what marches on CUDA marches here too."""
-    import torch
-
-    from fhash_codec.rendering.task.torch_arrays import TorchArrays
-
-    return TorchArrays(torch.device("cpu"))
