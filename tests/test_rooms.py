@@ -85,7 +85,6 @@ WITHOUT_MIRROR: dict[str, str] = {
     "fhash_codec.rendering.native.frame_task": "through the marcher: native/test_march.py",
     "fhash_codec.rendering.native.structure": "layout of a C++ structure: native/test_march.py",
     "fhash_codec.rendering.picture.plan": "a record: picture/test_planning.py, test_explain.py",
-    "fhash_codec.rendering.stream.canvas": "closed forms of whole rays: stream/test_stream.py",
     "fhash_codec.rendering.task.task": "records that every marcher takes: rendering/test_march.py",
     "fhash_codec.selftest.checks.properties": "a list of checks: selftest/test_runner.py",
     "fhash_formats.transform.entropy.coder_portable": "held against the C++: test_coder.py",

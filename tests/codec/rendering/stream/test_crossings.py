@@ -1,4 +1,4 @@
-"""Crossings of rays with isosurfaces: exact roots, in order, and none where a value is missing."""
+"""Where streamed rays cross isosurfaces."""
 
 from __future__ import annotations
 
@@ -24,14 +24,12 @@ def test_roots_are_exact() -> None:
     assert found.which[0, 1:3, 0].tolist() == [1, 0]
 
 
-def test_a_sample_without_a_value_hides_the_crossings_beside_it() -> None:
-    sample = np.arange(4.0)[None]
-    steps = np.array([[-1.0, 1.0, np.nan, -1.0]])
-    found = crossings(
-        lambda row, at: 2 * at - 1,
-        sample,
-        steps,
-        (Surface(value=0.0, colour=np.ones(3), opacity=1.0),),
-    )
-    assert found.opacity[0, :, 0].tolist() == [1.0, 0.0, 0.0]
-    np.testing.assert_allclose(found.at[0, 0, 0], 0.5)
+def test_nothing_is_crossed_where_a_value_is_missing() -> None:
+    """Neither between samples of which one has no value, nor where the search meets none."""
+    surface = Surface(value=0.5, colour=np.ones(3), opacity=1.0)
+    sample, values = np.arange(4.0)[None], np.array([[0.0, np.nan, 0.0, 1.0]])
+    missing = crossings(lambda row, at: np.full(len(at), np.nan), sample, values, (surface,))
+    assert not missing.opacity.any()
+    there = crossings(lambda row, at: at - 2, sample, values, (surface,))
+    assert there.opacity[0, :, 0].tolist() == [0, 0, 1]
+    assert there.at[0, 2, 0] == 2.5

@@ -1,23 +1,37 @@
-"""Devices: numpy on the processor, and torch only where CUDA's driver is."""
+"""The arrays of a device."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
-from fhash_codec.rendering.task import devices
 from fhash_codec.rendering.task.arrays import NUMPY
+from fhash_codec.rendering.task.devices import arrays_on
 from fhash_formats.errors import InputError
 
 
-def test_the_processor_marches_with_numpy() -> None:
-    assert devices.arrays_on("cpu") is NUMPY
+def test_a_device_is_named_and_never_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert arrays_on("cpu") is arrays_on("auto") is NUMPY
+    with pytest.raises(InputError, match="no CUDA device"):
+        arrays_on("cuda")
+    with pytest.raises(InputError, match="'gpu'; allowed: auto, cpu, cuda"):
+        arrays_on("gpu")
 
 
-def test_auto_without_a_driver_is_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(devices, "DRIVER", "no-such-library")
-    assert devices.arrays_on("auto") is NUMPY
-
-
-def test_unknown_devices_are_refused_with_those_that_are_known() -> None:
-    with pytest.raises(InputError, match="device is 'gpu'; allowed: auto, cpu, cuda"):
-        devices.arrays_on("gpu")
+def test_marching_on_the_processor_loads_no_torch() -> None:
+    code = (
+        "import sys; from fhash_codec.rendering.task import devices; "
+        "import fhash_codec.rendering.stream.stream; devices._driver_exists = lambda: False; "
+        "devices.arrays_on('auto'); devices.arrays_on('cpu'); print('torch' in sys.modules)"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True
+        ).stdout
+        == "False\n"
+    )
