@@ -13,7 +13,7 @@ from fhash_formats.transform.entropy.table import HIGH, KIND, LOW, REFERENCES, s
 
 
 def test_the_columns_are_those_of_the_native_coder() -> None:
-    source = (Path(native.__file__).parent / "coder.cpp").read_text(encoding="utf-8")
+    source = (Path(native.__file__).parent / "coder_contexts.hpp").read_text(encoding="utf-8")
     found = re.search(r"enum Column \{([^}]*)\}", source)
     assert found is not None
     columns = dict(re.findall(r"(\w+) = (\d+)", found[1]))
