@@ -1,0 +1,34 @@
+"""Scales of gradients for shading."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fhash_codec.rendering.camera.camera import Grid
+from fhash_codec.rendering.task.slopes import FLATTEST, STEEPEST, flatness, slope_scale
+
+
+def grid(*spacing: float) -> Grid:
+    return Grid(counts=(9, 9, 9), origin=np.zeros(3), spacing=np.array(spacing))
+
+
+def test_gradients_are_shares_of_the_range_in_the_distance_of_vertices() -> None:
+    np.testing.assert_allclose(slope_scale(grid(1, 1, 1), 4.0, 0.0, 4.0), [0.25] * 3)
+    factors = slope_scale(grid(1, 2, -4), 4.0, 0.0, 4.0)
+    np.testing.assert_allclose(factors / factors[0], [1, 0.5, -0.25])
+
+
+def test_no_gradient_is_too_steep_to_be_squared_in_float32() -> None:
+    factors = slope_scale(grid(1e-14, 1, 1), 1e-30, 0.0, 10.0)
+    assert np.abs(factors).max() * 10.0 <= STEEPEST
+    assert np.isfinite(np.float32(STEEPEST) ** 2)
+
+
+def test_noise_of_rounding_is_not_lit() -> None:
+    assert flatness(0.0, 1.0, 0.0, 1.0) == (1.0, FLATTEST)
+    span, floor = flatness(1000.0, 1001.0, 1000.0, 1001.0)
+    assert span == 1.0
+    # Half of a unit in the last place of 1001 in float32, in both of two values.
+    assert floor >= float(np.spacing(np.float32(1001)))
+    assert flatness(5.0, 5.0, 5.0, 5.0)[0] == pytest.approx(1.0)
