@@ -1,4 +1,5 @@
-// What the volume leaves of light, with hostile values: the numbers of a table are finite, and steps as fhash_codec/render/light.py makes them.
+// The light that the volume takes away, with hostile values. The numbers of a table are finite, and
+// steps are as fhash_codec/rendering/task/light.py makes them.
 #include <algorithm>
 #include <cmath>
 
