@@ -99,12 +99,16 @@ class March(ctypes.Structure):
 
     def __init__(self, **fields: Any) -> None:
         arrays = {name: field for name, field in fields.items() if isinstance(field, np.ndarray)}
+        kinds: dict[str, Any] = dict(self._fields_)
+        for name, array in arrays.items():
+            assert array.flags.c_contiguous, f"{name} is not contiguous"
+            assert np.ctypeslib.as_ctypes_type(array.dtype) is kinds[name]._type_, (
+                f"{name} is {array.dtype}"
+            )
+            fields[name] = array.ctypes.data_as(kinds[name])
         # A pointer in a structure does not refer to its array.
         self._arrays = tuple(arrays.values())
-        kinds: dict[str, Any] = dict(self._fields_)
-        super().__init__(
-            **fields | {name: array.ctypes.data_as(kinds[name]) for name, array in arrays.items()}
-        )
+        super().__init__(**fields)
 
 
 def numbers(values: npt.ArrayLike) -> ctypes.Array[c_double]:

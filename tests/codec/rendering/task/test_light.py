@@ -32,7 +32,7 @@ def table_of(extinctions):
 
 @pytest.mark.parametrize("resolution", [1.0, 2.0])
 @pytest.mark.parametrize("spacing", [1.0, -0.5])
-def test_the_shadow_within_a_slab_is_its_closed_form(way, resolution, spacing):
+def test_the_shadow_within_a_slab_is_its_closed_form(way, resolution, spacing) -> None:
     shape = (41, 9, 9)
     settings = Shadows(strength=0.75, resolution=resolution)
     lamp = UP * np.sign(spacing)
@@ -52,7 +52,7 @@ def test_the_shadow_within_a_slab_is_its_closed_form(way, resolution, spacing):
     assert light.secondary_rays == light.shares[..., 0].size
 
 
-def test_a_block_throws_its_shadow_away_from_the_lamp(way):
+def test_a_block_throws_its_shadow_away_from_the_lamp(way) -> None:
     values = np.zeros((40, 40, 40))
     values[18:22, 18:22, 18:22] = 1.0
     lamp = np.array([1.0, 0.0, 1.0]) / np.sqrt(2)
@@ -70,7 +70,7 @@ def test_a_block_throws_its_shadow_away_from_the_lamp(way):
     assert lamp_share[10, 30, 10] > 0.99
 
 
-def test_surroundings_take_light_only_where_there_are_any(way):
+def test_surroundings_take_light_only_where_there_are_any(way) -> None:
     values = np.zeros((40, 40, 40))
     values[:20] = 1.0
     settings = AmbientOcclusion(strength=0.5, radius=6.0)
@@ -84,7 +84,7 @@ def test_surroundings_take_light_only_where_there_are_any(way):
     assert np.all(np.diff(around[2:-2]) >= -1e-6)
 
 
-def test_native_and_numpy_agree(monkeypatch):
+def test_native_and_numpy_agree(monkeypatch) -> None:
     if native.library() is None:
         pytest.skip("no native library")
     values = np.random.default_rng(4).uniform(size=(23, 30, 17)).astype(np.float32)
@@ -112,7 +112,7 @@ def test_native_and_numpy_agree(monkeypatch):
         assert one.shares.max() <= 1
 
 
-def test_nothing_that_takes_light_leaves_all_of_it(way):
+def test_nothing_that_takes_light_leaves_all_of_it(way) -> None:
     for table in (None, table_of([0.0, 0.0])):
         light = light_grid(
             frame_of(np.ones((5, 5, 5))), grid_of((5, 5, 5)), table, shadows=Shadows(), lamp=UP
@@ -121,7 +121,7 @@ def test_nothing_that_takes_light_leaves_all_of_it(way):
         assert light.secondary_rays == 0
 
 
-def test_shadows_need_a_lamp():
+def test_shadows_need_a_lamp() -> None:
     with pytest.raises(InputError, match="lamp"):
         light_grid(
             frame_of(np.ones((5, 5, 5))),
