@@ -1,4 +1,4 @@
-"""What a marcher is given."""
+"""The task of a marcher."""
 
 from __future__ import annotations
 

@@ -287,7 +287,7 @@ def tries(data: bytes, count: int) -> list[bytes]:
 
 
 def survives(count: int, shape: Shape, table: Table) -> int:
-    """How many streams are refused; all others give integers."""
+    """Number of streams that are refused; all others give integers."""
     data, refused = encode_integers(make("mixed", shape), table).data, 0
     for damaged in tries(data, count):
         try:
