@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import threading
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +10,6 @@ from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.training.train import Diverged, TrainingProgress, plan_training, train
 from fhash_formats.errors import TrainingError
-from fhash_formats.support.interrupts import deferred_interrupts
 
 
 def test_every_epoch_visits_every_brick_once_in_an_order_of_its_own(setup, coreset) -> None:
@@ -111,29 +106,3 @@ def test_a_budget_ends_the_training(setup, coreset) -> None:
     reached = TrainingProgress()
     assert not train(engine, plan, coreset, reached, budget_seconds=0.0)
     assert (reached.epoch, reached.batch, engine.step) == (0, 1, 1)
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_the_first_signal_asks_and_the_second_interrupts(number):
-    before = signal.getsignal(number)
-    with deferred_interrupts() as stop:
-        os.kill(os.getpid(), number)
-        assert stop.asked
-        os.kill(os.getpid(), number)  # the same request, delivered twice
-        stop.since -= 2
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), number)
-    assert signal.getsignal(number) is before
-
-
-def test_other_threads_are_left_alone():
-    seen = []
-
-    def work():
-        with deferred_interrupts() as stop:
-            seen.append(stop.asked)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert seen == [False]
