@@ -1,13 +1,14 @@
-"""fhash: a codec for time-varying volumes by feature-based tesseract grids (F-Hash).
+"""fhash: a codec for time-varying volumes (t, z, y, x).
 
     import fhash_codec
 
     fhash_codec.encode("run.h5", "run.fhz", fhash_codec.EncodeConfig(features=("interval:0.5:1",)))
     with fhash_codec.open("run.fhz") as volume:
         frame = volume[42]
-        fhash_codec.rendering(volume).save("view.png")
+        fhash_codec.render(volume).save("view.png")
 
-Names load on first use, so that importing the package is cheap; torch loads only when a model is trained.
+Names load on first use, so that importing the package is cheap. torch loads only where a network
+is trained, or drawn on a GPU.
 """
 
 from __future__ import annotations
@@ -36,13 +37,14 @@ if TYPE_CHECKING:
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
     from fhash_codec.encoding import encode
-    from fhash_codec.rendering.renderer import Renderer, render
+    from fhash_codec.rendering import render
+    from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.rendering.scene.scene import Scene
     from fhash_codec.volume import Volume, open
 
 __version__ = version("fhash")
 
-_HOMES = {
+_MODULES = {
     "EncodeConfig": "config",
     "Renderer": "rendering.renderer",
     "Scene": "rendering.scene.scene",
@@ -50,7 +52,9 @@ _HOMES = {
     "diff": "comparison",
     "encode": "encoding",
     "open": "volume",
+    "render": "rendering",
 }
+"""Public names that load on first use, with their modules in this package."""
 
 __all__ = [
     "DamagedFileError",
@@ -78,12 +82,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name == "render":
-        # The package is the function: importing a part of it would put the package in the function's place anyway.
-        return importlib.import_module("fhash_codec.rendering")
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'fhash_codec' has no attribute '{name}'")
-    value = getattr(importlib.import_module(f"fhash_codec.{_HOMES[name]}"), name)
+    value = getattr(importlib.import_module(f"fhash_codec.{_MODULES[name]}"), name)
     globals()[name] = value
     return value
 

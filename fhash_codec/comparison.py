@@ -1,4 +1,4 @@
-"""Comparing a container with the series it stands for."""
+"""Comparison of a container with the series it was encoded from."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from fhash_formats.series import Series
 
 
 def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> dict[str, Any]:
-    """Decode every step of the container `path` and measure it against the data; the figures of `report`.
+    """Decode every step of the container `path` and measure it against the data.
 
-    Raises InputError if the shapes differ, DamagedFileError for a damaged container.
+    Returns the figures of `report`. Raises InputError if the shapes differ, DamagedFileError for a
+    damaged container.
     """
     begun = time.perf_counter()
     with open_source(source) as series, open_volume(path) as volume:
         if series.shape != volume.shape:
             raise InputError(
-                f"{series.source} has shape {series.shape}, {path} has {volume.shape} in (t, z, y, x); give the same --var, --axes, --t"
+                f"{series.source} has shape {series.shape}, {path} has {volume.shape} "
+                "in (t, z, y, x); give the same --var, --axes, --t"
             )
-        return report(
-            volume, measure(series, volume, progress), seconds=time.perf_counter() - begun
-        )
+        quality = measure(series, volume, progress)
+        return report(volume, quality, seconds=time.perf_counter() - begun)
 
 
 def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any]:
-    """The quality of a volume as it decodes against its series, every step of it: `metrics.Quality` as JSON values.
+    """Measure every decoded step of a volume against its series: `metrics.Quality` as JSON values.
 
     Raises InputError if the series changed since it was opened.
     """

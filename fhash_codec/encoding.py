@@ -1,4 +1,4 @@
-"""Encoding: series -> coreset -> trained model -> container."""
+"""Encoding: a series in, a container out, whose quality is measured on the file as it decodes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,11 @@ from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter
 from fhash_formats.errors import InputError, QualityError
 from fhash_formats.support.atomic import check_output
-from fhash_formats.writers.registry import WRITERS
+
+DATA_SUFFIXES = frozenset(
+    (".npy", ".h5", ".hdf5", ".nc", ".nc4", ".zarr", ".raw", ".vti", ".vtr", ".pvd", ".vtkhdf")
+)
+"""Suffixes of the data files that `fhash decode` writes. No container may have one of them."""
 
 
 def encode(
@@ -36,28 +40,33 @@ def encode(
     force: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Encode a series into the container `path`, complete or not at all; the figures of what was written (see `report`).
+    """Encode a series into the container `path`, complete or not at all.
 
-    source: a file (opened by `fhash_formats.open_series`), a Series, or an array (t, z, y, x) or (z, y, x), labelled or not.
-    mask: booleans (t, z, y, x) or (z, y, x), one more feature, and the only one where the settings name no other.
-    Ctrl-C during the training saves a checkpoint beside `path` and raises InterruptedEncodingError; the same call goes on from it to
-    the same result. Raises QualityError, with the file written and its figures in the error, if `config.psnr` was not reached, and
-    InputError for what cannot be encoded.
+    source: a file (opened by `fhash_formats.open_series`), a Series, or an array (t, z, y, x) or
+        (z, y, x), labelled or not.
+    config: the settings; the defaults if None.
+    mask: booleans (t, z, y, x) or (z, y, x), one more feature. It is the only feature if the
+        settings name none.
+    force: replace a file that exists.
+
+    Returns the figures of the written file (see `report`). Ctrl-C during the training saves a
+    checkpoint beside `path` and raises InterruptedEncodingError; the same call then continues from
+    the checkpoint to the same result. Raises InputError for a source or settings that cannot be
+    encoded. Raises QualityError, with the file written and its figures in the error, if the file
+    misses what the settings promise.
     """
     config, path = config or EncodeConfig(), Path(os.path.normpath(path))
     begun = time.perf_counter()
     check_name(path)
     check_output(path, force)
     with open_source(source) as series:
-        masks = [
-            feature.removeprefix("mask:")
-            for feature in config.features
-            if feature.startswith("mask:")
-        ]
-        check_output(path, force, sources=[*series.files, *masks])
+        check_output(path, force, sources=[*series.files, *_mask_files(config)])
         with ContainerWriter(path, force=force) as writer:
-            fill = encode_compact if config.profile == "compact" else encode_paper
-            header, checkpoint = fill(writer, series, config, mask, path, progress)
+            checkpoint = None
+            if config.profile == "compact":
+                header = encode_compact(writer, series, config, mask, progress)
+            else:
+                header, checkpoint = encode_paper(writer, series, config, mask, path, progress)
             with Volume(writer.preview(header)) as volume:
                 quality = measure(series, volume, progress)
             header["quality"] = brief_quality(quality)
@@ -70,37 +79,49 @@ def encode(
     return figures
 
 
-def _check_promise(path: Path, config: EncodeConfig, figures: dict[str, Any]) -> None:
-    """Raise QualityError where the written file does not keep what was promised."""
-    psnr, largest = figures["psnr"], figures["max_abs_error"]
-    asked, found = "", ""
-    wanted = (
-        promise(config)
-        if config.profile == "compact"
-        else {}
-        if config.psnr is None
-        else {"psnr": config.psnr}
-    )
-    if "psnr" in wanted and figures["rmse"] != 0 and (psnr is None or psnr < wanted["psnr"]):
-        asked, found = (
-            f"{wanted['psnr']:g} dB were",
-            "an unknown PSNR" if psnr is None else f"{psnr:.2f} dB over the coreset",
-        )
-    bound = wanted.get("max_error", math.inf)
-    if "max_error_rel" in wanted:
-        bound = wanted["max_error_rel"] * figures["data_range"]
-    if largest is not None and largest > bound:
-        asked, found = f"at most {bound:g} was", f"a largest error of {largest:g}"
-    if asked:
-        more = "" if config.profile == "compact" else ". More --epochs may help"
-        raise QualityError(
-            f"{path}: {found}, {asked} asked for; the file is written{more}", figures
-        )
-
-
 def check_name(path: Path) -> None:
-    """Refuse to give a container the name of another kind of file (InputError): most often it is that of the data."""
-    if path.suffix.lower() in (suffix for writer in WRITERS for suffix in writer.suffixes):
+    """Raise InputError for a container named like a data file: most often the source itself."""
+    if path.suffix.lower() in DATA_SUFFIXES:
         raise InputError(
             f"{path}: a container is not a {path.suffix} file; give it a name that ends in .fhz"
         )
+
+
+def _mask_files(config: EncodeConfig) -> list[str]:
+    """Paths of the masks among the features."""
+    prefix = "mask:"
+    return [text.removeprefix(prefix) for text in config.features if text.startswith(prefix)]
+
+
+def _check_promise(path: Path, config: EncodeConfig, figures: dict[str, Any]) -> None:
+    """Raise QualityError if the written file misses what the settings promise."""
+    missed = _missed_bound(config, figures) or _missed_psnr(config, figures)
+    if missed is not None:
+        advice = "" if config.profile == "compact" else ". More --epochs may help"
+        raise QualityError(f"{path}: {missed}; the file is written{advice}", figures)
+
+
+def _missed_psnr(config: EncodeConfig, figures: dict[str, Any]) -> str | None:
+    """Text on a PSNR below the promised one; None if there is no such promise or it holds."""
+    promised = promise(config).get("psnr") if config.profile == "compact" else config.psnr
+    if promised is None or figures["rmse"] == 0:
+        return None
+    psnr = figures["psnr"]
+    if psnr is None:
+        return f"an unknown PSNR, {promised:g} dB were asked for"
+    if psnr < promised:
+        return f"{psnr:.2f} dB over the coreset, {promised:g} dB were asked for"
+    return None
+
+
+def _missed_bound(config: EncodeConfig, figures: dict[str, Any]) -> str | None:
+    """Text on an error beyond the promised bound; None if there is no such promise or it holds."""
+    bound = math.inf
+    if config.max_error is not None:
+        bound = config.max_error
+    elif config.max_error_rel is not None:
+        bound = config.max_error_rel * figures["data_range"]
+    largest = figures["max_abs_error"]
+    if largest is not None and largest > bound:
+        return f"a largest error of {largest:g}, at most {bound:g} was asked for"
+    return None

@@ -1,4 +1,7 @@
-"""What a container's header holds, for both profiles."""
+"""A container's header and the arrays of a series beside it (FORMAT.md), the same in both profiles.
+
+Each profile adds what it alone knows, such as its model.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +12,31 @@ from math import prod
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.container import ContainerWriter, describe_coordinates
+from fhash_formats.container import Container, ContainerWriter, describe_coordinates
 from fhash_formats.series import AXIS_NAMES, Series
+
+MISSING_CHUNK_BYTES = 1 << 20
+"""Bytes of one chunk of the missing-value masks. A member for each step would cost 130 bytes."""
+
+MAX_POINTS = 24
+"""Points of a training history that a file keeps at most."""
+
+DIGITS = 6
+"""Significant digits of a figure over all steps."""
+
+STEP_DIGITS = 5
+"""Significant digits of a figure of one step."""
 
 
 def describe_source(
     series: Series, value_range: ValueRange, config: EncodeConfig
 ) -> dict[str, Any]:
-    """What the headers of both profiles say of the series."""
+    """Header entries of a series: variable, shape and range, and a quality to be filled in."""
     return {
         "encoder": {"version": version("fhash"), "seed": config.seed},
         "variable": {
@@ -36,9 +52,6 @@ def describe_source(
     }
 
 
-MISSING_CHUNK_BYTES = 1 << 20  # a member of its own for each step would cost 130 bytes a step
-
-
 def write_series(
     writer: ContainerWriter,
     series: Series,
@@ -47,11 +60,11 @@ def write_series(
     *,
     brief: bool = False,
 ) -> dict[str, Any]:
-    """Coordinates, key frames, and where the source has no finite value; what the header has to say of them.
+    """Write coordinates, key frames, and masks of the values that are not finite.
 
-    brief: only what the header cannot say in fewer bytes, as the profile compact allows.
+    brief: leave out each array that the header can say in fewer bytes, as the profile compact
+    allows. Returns the header entries that then stand for the arrays.
     """
-    steps = series.shape[0]
     described = describe_coordinates(series.coords) if brief else {}
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
@@ -61,39 +74,54 @@ def write_series(
                 coordinate.values,
                 attributes={**coordinate.attributes, "name": coordinate.name},
             )
-    if not brief or len(key_frames) < steps:
+    if not brief or len(key_frames) < series.shape[0]:
         writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
     if scanned.missing:
-        empty = np.zeros(-(-prod(series.shape[1:]) // 8), dtype=np.uint8)
-        rows = max(1, min(steps, MISSING_CHUNK_BYTES // empty.size))
-        writer.add_array(
-            "missing/bits",
-            shape=(steps, empty.size),
-            dtype=empty.dtype,
-            chunk_shape=(rows, empty.size),
-            chunks=(
-                np.stack(
-                    [
-                        scanned.missing.get(step, empty)
-                        for step in range(start, min(start + rows, steps))
-                    ]
-                )
-                for start in range(0, steps, rows)
-            ),
-        )
+        _write_missing(writer, series.shape, scanned)
     return {"coordinates": described} if brief else {}
 
 
-MAX_POINTS = 24
-"""Of a training's history in a file."""
+def _write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Scan) -> None:
+    """Write one row of bits per step, 1 = not finite, several rows to a chunk."""
+    steps = shape[0]
+    empty = np.zeros(-(-prod(shape[1:]) // 8), dtype=np.uint8)
+    rows = max(1, min(steps, MISSING_CHUNK_BYTES // empty.size))
+    writer.add_array(
+        "missing/bits",
+        shape=(steps, empty.size),
+        dtype=empty.dtype,
+        chunk_shape=(rows, empty.size),
+        chunks=(
+            np.stack(
+                [
+                    scanned.missing.get(step, empty)
+                    for step in range(start, min(start + rows, steps))
+                ]
+            )
+            for start in range(0, steps, rows)
+        ),
+    )
 
 
-DIGITS, STEP_DIGITS = 6, 5
-"""Significant digits of figures in a file: over all steps, of one step."""
+def read_missing(container: Container, first: int, last: int) -> npt.NDArray[np.bool_] | None:
+    """Mask (z, y, x) of the values that are not finite at any step from `first` to `last`.
+
+    None if every value of the source is finite.
+    """
+    stored = container.arrays.get("missing/bits")
+    if stored is None:
+        return None
+    shape = container.header["domain"]["shape"][1:]
+    rows = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
+    bits = np.unpackbits(np.bitwise_or.reduce(rows, axis=0), count=prod(shape))
+    return bits.view(np.bool_).reshape(shape)
 
 
 def brief_quality(quality: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures (`metrics.Quality` as JSON values) as a header has them: rounded to the worse side, those of the steps as lists."""
+    """Figures as a header has them: rounded to the worse side, figures of single steps as lists.
+
+    quality: `metrics.Quality` as JSON values.
+    """
     brief = {
         name: _figure(name, value, DIGITS) if isinstance(value, float) else value
         for name, value in quality.items()
@@ -109,9 +137,12 @@ def brief_quality(quality: Mapping[str, Any]) -> dict[str, Any]:
 def brief_history(
     history: Sequence[Mapping[str, float | None]], *, timings: bool
 ) -> list[dict[str, float]]:
-    """The history of a training as a header has it: at most 24 points, the last among them; milliseconds and hundredths of a dB."""
-    kept = min(len(history), MAX_POINTS)
-    chosen = [history[(number + 1) * len(history) // kept - 1] for number in range(kept)]
+    """A training history as a header has it: at most MAX_POINTS points, the last point included.
+
+    Seconds are rounded to milliseconds, PSNR to hundredths of a dB. timings: keep the seconds.
+    """
+    count = min(len(history), MAX_POINTS)
+    chosen = [history[(number + 1) * len(history) // count - 1] for number in range(count)]
     points = [
         {
             "seconds": _rounded(point["seconds"], 3) if timings else None,
@@ -123,14 +154,26 @@ def brief_history(
     return [{name: value for name, value in point.items() if value is not None} for point in points]
 
 
+def history_points(
+    history: Sequence[Mapping[str, Any]] | Mapping[str, Sequence[Any]],
+) -> list[dict[str, Any]]:
+    """The points of a header's training history, each with seconds, epoch and psnr.
+
+    history: a list of points (profile paper), or a list of values by name (profile compact).
+    """
+    if isinstance(history, Mapping):
+        history = [
+            dict(zip(history, point, strict=True)) for point in zip(*history.values(), strict=True)
+        ]
+    return [{"seconds": None, "psnr": None, **point} for point in history]
+
+
 def _figure(name: str, value: float | None, digits: int) -> float | None:
-    """A figure with so many significant digits, never better than it was."""
+    """A figure rounded to significant digits, never to a better value."""
+    if value is None:
+        return None
     rounding = ROUND_FLOOR if name.startswith(("psnr", "ssim")) else ROUND_CEILING
-    return (
-        None
-        if value is None
-        else float(Context(prec=digits, rounding=rounding).create_decimal_from_float(value))
-    )
+    return float(Context(prec=digits, rounding=rounding).create_decimal_from_float(value))
 
 
 def _rounded(value: float | None, digits: int) -> float | None:

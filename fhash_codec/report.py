@@ -1,21 +1,30 @@
-"""The figures of a container, the same from `encode` and from `diff`."""
+"""Figures of a container as JSON values, the same from `encode` and from `diff`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
+from fhash_codec.header import history_points
 from fhash_codec.volume import Volume
+
+FIGURES = ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain")
+"""Figures of a quality that a report has at its top level, beside all of them in `quality`."""
 
 
 def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[str, Any]:
-    """JSON values: sizes in bytes, quality in dB and data units (None where the error or the range is 0), how it was trained.
+    """Sizes, quality and training of a container, as JSON values.
 
-    ratio: raw bytes / bytes of the whole file. psnr, rmse, max_abs_error, ssim: over the coreset of all steps, also those between key
-    frames; *_domain: over every finite vertex, the background standing outside the coreset. curve: the training history.
-    restarts: how often the training diverged and began again at a quarter of the learning rate.
-    tables_loss_db: what coded tables cost at the key frames, None for others.
-    seconds: of the whole job that was reported on.
+    quality: `metrics.Quality` as JSON values. seconds: duration of the whole job.
+
+    Of the values returned:
+        bytes, raw_bytes: of the whole file, and of the series in its own number type.
+        ratio: raw_bytes / bytes.
+        psnr, rmse, max_abs_error, ssim: over the coreset of all steps, those between key frames
+            included; in dB and data units. None if the error or the range is 0.
+        psnr_domain: over every finite vertex, with the background outside the coreset.
+        curve: the training history.
+        restarts: how often the training diverged and began again at a quarter of the learning rate.
+        tables_loss_db: dB that coded tables lose at the key frames; None for other tables.
     """
     info = volume.info
     return {
@@ -23,12 +32,10 @@ def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[s
         "bytes": info["bytes"],
         "raw_bytes": info["raw_bytes"],
         "ratio": info["ratio"],
-        **{
-            name: quality[name] for name in ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain")
-        },
+        **{name: quality[name] for name in FIGURES},
         "seconds": seconds,
         "epochs": info["training"]["epochs"],
-        "curve": curve(info["history"]),
+        "curve": history_points(info["history"]),
         "shape": info["domain"]["shape"],
         "key_frames": info["key_frames"],
         "feature_bounding_box": info["feature_bounding_box"],
@@ -42,14 +49,3 @@ def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[s
         "gains": info["model"].get("gains", []),
         "quality": quality,
     }
-
-
-def curve(
-    history: Sequence[Mapping[str, Any]] | Mapping[str, Sequence[Any]],
-) -> list[dict[str, Any]]:
-    """The points of a header's history, in either of its forms, each with seconds, epoch and psnr."""
-    if isinstance(history, Mapping):
-        history = [
-            dict(zip(history, point, strict=True)) for point in zip(*history.values(), strict=True)
-        ]
-    return [{"seconds": None, "psnr": None, **point} for point in history]

@@ -6,24 +6,29 @@ from collections.abc import Mapping
 from functools import cached_property
 from math import prod
 from pathlib import Path
-from types import EllipsisType, TracebackType
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box, crop
+from fhash_codec.coreset.boxes import Box, Spans
 from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
+from fhash_codec.header import read_missing
+from fhash_codec.indexing import Index, expand_index, index_ranges
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
+from fhash_codec.sampling import interpolable
 from fhash_codec.volume_model import open_model
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 
-Index = int | slice | EllipsisType
 OUTSIDE = ("nan", "background")
+"""Choices of what `read` gives outside the coreset."""
+
 MAX_LOD = 10
+"""Coarsest level of detail: every 1024th vertex."""
 
 
 def open(path: str | Path) -> Volume:
@@ -35,22 +40,28 @@ def open(path: str | Path) -> Volume:
 
 
 class Volume:
-    """A time-varying volume in a container: reads like a numpy array (t, z, y, x), decoding just what is asked for.
+    """A time-varying volume in a container, read like a numpy array (t, z, y, x).
 
-    Values are in data units; vertices outside the coreset, and where the source had no finite value, are NaN.
+    Only the tiles that a request needs are decoded. Values are in data units. They are NaN outside
+    the coreset, and where the source had no finite value.
 
     Attributes:
-        shape: (t, z, y, x). dims: its names. chunks: what one read decodes at least.
+        shape: vertices (t, z, y, x).
+        dims: names of the axes.
+        chunks: vertices (t, z, y, x) that are decoded together.
         dtype: float64 for sources of float64 or of integers above 16 bits, else float32.
-        name, units, attrs: of the variable. coords: a Coordinate for each of "t", "z", "y", "x".
-        path: of the file. info: everything the file says of itself, as JSON values.
+        name, units, attrs: of the variable.
+        coords: a Coordinate for each of "t", "z", "y", "x".
+        box: the feature bounding box, in vertices of the domain.
+        path: of the file.
+        info: everything the file says of itself, as JSON values.
     """
 
     dims = AXES
     ndim = 4
 
     def __init__(self, container: Container) -> None:
-        """Over an open container, which it closes; `fhash_codec.open` is for files."""
+        """Read from an open container, which `close` closes; `fhash_codec.open` opens files."""
         header = container.header
         self.container = container
         self.path = Path(container.path)
@@ -59,18 +70,18 @@ class Volume:
         self.name: str = header["variable"]["name"]
         self.units: str = header["variable"]["units"]
         self.attrs: Mapping[str, Any] = header["variable"]["attributes"]
-        self.box: Box = tuple((low, high) for low, high in header["feature_bounding_box"])  # type: ignore[assignment]
+        self.box = Box.of(header["feature_bounding_box"])
         self.profile: str = header["model"]["profile"]
         self.value_range = ValueRange(*header["value_range"])
         self.background = float(header["background"])
         self._model = open_model(container)
         self.chunks = self._model.chunks
 
-    # -- what the file says ------------------------------------------------------------------------------------------------
+    # -- contents of the file --
 
     @property
     def size(self) -> int:
-        """Number of vertices."""
+        """Number of vertices over all steps."""
         return prod(self.shape)
 
     @cached_property
@@ -80,7 +91,7 @@ class Volume:
 
     @cached_property
     def key_times(self) -> KeyTimes:
-        """How steps and times map to the model's time axis."""
+        """The map from steps and times to the model's time axis."""
         stored = self.container.arrays.get("key_frames")
         key_frames = tuple(
             range(self.shape[0]) if stored is None else (int(step) for step in stored.read())
@@ -89,7 +100,10 @@ class Volume:
 
     @property
     def info(self) -> dict[str, Any]:
-        """The container's header with the figures that follow from it: bytes, raw bytes, ratio, key frames, arrays."""
+        """The container's header, and what follows from it.
+
+        Added are the path, bytes, raw bytes, ratio, key frames and arrays.
+        """
         header = self.container.header
         raw = self.size * np.dtype(header["variable"]["dtype"]).itemsize
         arrays = {
@@ -112,66 +126,74 @@ class Volume:
         }
 
     def verify(self, progress: Progress = silent) -> int:
-        """Read and check every array; their number. Raises DamagedFileError."""
+        """Read and check every array; return their number. Raises DamagedFileError."""
         return self.container.verify(lambda done, total: progress("verifying", done, total, ""))
 
-    # -- reading -----------------------------------------------------------------------------------------------------------
+    # -- reading --
 
     def read(
-        self, t: float, region: Box | None = None, *, outside: str = "nan"
+        self, t: float, region: Spans | None = None, *, outside: str = "nan"
     ) -> npt.NDArray[Any]:
-        """Values (z, y, x) of `self.dtype` of a region (all if None) at step `t`, which may lie between steps.
+        """Values (z, y, x) of a region at step `t`, of `self.dtype`.
 
-        Between steps time runs evenly from one to the next. Outside the coreset stands NaN, or with outside='background' the
-        mean of what was left out; where the source had no finite value stands NaN in any case.
-        Raises RegionError for a step or region outside the domain, InputError for another `outside`.
+        t: a step; a fraction lies between two steps, and time runs evenly from one to the next.
+        region: in vertices of the domain; the whole domain if None.
+        outside: "nan", or "background" for the mean of the values outside the coreset. Where the
+            source had no finite value, NaN stands in any case.
+        Raises RegionError for a step or region outside the domain, InputError for another
+        `outside`.
         """
         if outside not in OUTSIDE:
             raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
         key = self._key_index(t)
         region = self._checked(region)
-        result = np.full([high - low for low, high in region], np.nan, dtype=self.dtype)
-        found = self._within_box(region)
-        if found is not None:
-            target, local = found
-            wanted = self._occupied(key, local)
+        result = np.full(region.shape, np.nan, dtype=self.dtype)
+        common = self._within_box(region)
+        if common is not None:
+            in_region, in_box = common
+            requested = self._occupied(key, in_box)
             np.copyto(
-                result[target],
-                self._model.region(key, local, wanted).astype(self.dtype, copy=False),
-                where=wanted,
+                result[in_region.slices()],
+                self._model.read(key, in_box, requested).astype(self.dtype, copy=False),
+                where=requested,
             )
         if outside == "background":
             result[np.isnan(result)] = self.background
         missing = self._missing_at(t)
         if missing is not None:
-            result[crop(missing, region)] = np.nan
+            result[missing[region.slices()]] = np.nan
         return result
 
-    def read_lod(self, t: float, lod: int, region: Box | None = None) -> npt.NDArray[Any]:
-        """Every 2^lod-th vertex (z, y, x) of the feature bounding box at step `t`, low-passed, of `self.dtype`; compact files only.
+    def read_lod(self, t: float, lod: int, region: Spans | None = None) -> npt.NDArray[Any]:
+        """Low-passed values (z, y, x) at every 2^lod-th vertex of the feature bounding box.
 
-        lod: 0 to 10; 0 is the box as `read` gives it. region: those that lie in it, in vertices of the domain (all if None); see
-        `lod_vertices`. Finer detail, and what lies in other tiles, is not decoded. NaN outside the coreset of these vertices.
-        Raises RegionError for a step outside the series and a region without such a vertex, InputError for a file of another profile or
-        another lod.
+        t: a whole step.
+        lod: level of detail, 0 to 10; level 0 is the box as `read` gives it.
+        region: in vertices of the domain (all if None); see `lod_vertices` for the vertices in it.
+
+        Neither finer detail nor other tiles are decoded. Vertices outside the coreset are NaN. Only
+        compact files have levels of detail. Raises RegionError for a step outside the series and
+        for a region without such a vertex, InputError for another profile or another lod.
         """
         vertices = self.lod_vertices(lod, region)
         if not float(t).is_integer():
             raise InputError(f"step {t:g} lies between two; levels of detail are of whole steps")
         step = int(self._key_index(t))
-        part: Box = tuple(
-            ((v[0] - low) >> lod, ((v[-1] - low) >> lod) + 1)
-            for v, (low, _) in zip(vertices, self.box, strict=True)
-        )  # type: ignore[assignment]
-        values = self._model.coarse(step, int(lod), part).astype(self.dtype)
-        surrounding: Box = tuple((v[0], v[-1] + 1) for v in vertices)  # type: ignore[assignment]
+        coarse = Box.of(
+            ((along[0] - first) >> lod, ((along[-1] - first) >> lod) + 1)
+            for along, first in zip(vertices, self.box.first, strict=True)
+        )
+        values = self._model.read_lod(step, int(lod), coarse).astype(self.dtype)
+        surrounding = Box.of((along[0], along[-1] + 1) for along in vertices)
         values[~self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]] = np.nan
         return values
 
-    def lod_vertices(self, lod: int, region: Box | None = None) -> tuple[range, range, range]:
-        """The vertices (z, y, x) of the domain that `read_lod` gives: every 2^lod-th of the feature bounding box, within a region.
+    def lod_vertices(self, lod: int, region: Spans | None = None) -> tuple[range, range, range]:
+        """The vertices (z, y, x) of the domain whose values `read_lod` gives.
 
-        Raises InputError for another lod than 0 to 10, RegionError for a region outside the domain or without such a vertex.
+        They are every 2^lod-th vertex of the feature bounding box that lies in the region. Raises
+        InputError for another lod than 0 to 10, RegionError for a region outside the domain or
+        without such a vertex.
         """
         if (
             isinstance(lod, bool)
@@ -180,42 +202,42 @@ class Volume:
         ):
             raise InputError(f"lod is {lod}; allowed: 0 to {MAX_LOD}")
         every = 1 << int(lod)
-        found = []
+        vertices = []
         for axis, (first, end), (low, high) in zip(
             AXES[1:], self.box, self._checked(region), strict=True
         ):
-            inside = range(first + -(-max(low - first, 0) // every) * every, min(high, end), every)
-            if not inside:
+            start = first + -(-max(low - first, 0) // every) * every
+            along = range(start, min(high, end), every)
+            if not along:
                 raise RegionError(
-                    f"{self.path}: region {low}:{high} of axis {axis} holds no vertex of level of detail {lod}, "
-                    f"every {every}. from {first} to {end - 1}"
+                    f"{self.path}: region {low}:{high} of axis {axis} holds no vertex of level of "
+                    f"detail {lod}, every {every}. from {first} to {end - 1}"
                 )
-            found.append(inside)
-        z, y, x = found
+            vertices.append(along)
+        z, y, x = vertices
         return z, y, x
 
     def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
-        """Values by numpy's basic indexing: integers, slices and `...`, negative as usual; RegionError (an IndexError) outside."""
-        parts = _expanded(index)
-        picked = [
-            _positions(part, length, axis)
-            for part, length, axis in zip(parts, self.shape, AXES, strict=True)
-        ]
-        steps, *space = picked
-        result = np.empty([len(p) for p in picked], dtype=self.dtype)
+        """Values by numpy's basic indexing: integers, slices and `...`, negative ones as usual.
+
+        Raises RegionError (an IndexError) for an index outside the shape and for other indices.
+        """
+        parts = expand_index(index)
+        ranges = index_ranges(parts, self.shape)
+        steps, *space = ranges
+        result = np.empty([len(positions) for positions in ranges], dtype=self.dtype)
         if result.size:
-            region: Box = tuple((min(p), max(p) + 1) for p in space)  # type: ignore[assignment]
-            local = np.ix_(*(np.array(p) - low for p, (low, _) in zip(space, region, strict=True)))
+            region = Box.of((min(positions), max(positions) + 1) for positions in space)
+            offsets = zip(space, region.first, strict=True)
+            local = np.ix_(*(np.array(positions) - first for positions, first in offsets))
             for number, step in enumerate(steps):
                 result[number] = self.read(step, region)[local]
-        return result[
-            tuple(0 if isinstance(part, int | np.integer) else slice(None) for part in parts)
-        ]
+        return result[tuple(slice(None) if isinstance(part, slice) else 0 for part in parts)]
 
     def __array__(
         self, dtype: npt.DTypeLike | None = None, copy: bool | None = None
     ) -> npt.NDArray[Any]:
-        """The whole volume."""
+        """All values, decoded."""
         if copy is False:
             raise ValueError(
                 "a volume cannot become an array without a copy: its values are decoded"
@@ -236,13 +258,19 @@ class Volume:
         time: npt.ArrayLike | None = None,
         gradient: bool = False,
     ) -> npt.NDArray[Any] | tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-        """Values at points between vertices, in data units; the arguments broadcast against each other.
+        """Values at points between vertices, in data units.
 
-        z, y, x: positions in vertices (0 is the first). t: position in steps; or time: in the units of the series' times.
-        gradient: also return derivatives (..., 4) of the value by t, z, y and x, in data units per step and per vertex: analytic,
-        through interpolation and network; on the border of two cells those of the cell after it.
-        A point is NaN where a vertex of its cell that counts is outside the coreset, and outside the domain.
-        Raises InputError unless just one of t and time is given, RegionError for a step or time outside the series.
+        The positions broadcast against each other.
+
+        z, y, x: positions in vertices of the domain; 0 is the first vertex.
+        t: positions in steps. time: positions in the units of the series' times. One of the two.
+        gradient: also return derivatives (..., 4) of the value by t, z, y and x, in data units per
+            step and per vertex. They are analytic, through interpolation and network. On the border
+            of two cells they are those of the cell after the border.
+
+        A point is NaN outside the domain, and where a vertex of its cell is outside the coreset;
+        vertices of weight 0 do not matter. Raises InputError unless one of t and time is given,
+        RegionError for a step or time outside the series.
         """
         if (t is None) == (time is None):
             raise InputError("give either t (in steps) or time (in the units of the series)")
@@ -250,55 +278,57 @@ class Volume:
             t = self._checked_times().steps_of_times(np.asarray(time, dtype=np.float64))
         points = np.broadcast_arrays(*(np.asarray(p, dtype=np.float64) for p in (t, z, y, x)))
         shape = points[0].shape
-        steps, *space = (p.ravel() for p in points)
+        steps, *space = (position.ravel() for position in points)
         keys = self.key_times.key_indices(steps)
-        local = [p - low for p, (low, _) in zip(space, self.box, strict=True)]
-        inside = self._interpolable(steps, keys, space)
+        inside = interpolable(self.box, steps, keys, space, self.occupancy)
         values: npt.NDArray[Any] = np.full(inside.shape, np.nan)
         slopes = np.full((*inside.shape, 4), np.nan)
         if inside.any():
-            chosen = [p[inside] for p in (keys, *local)]
+            local = [
+                (position - first)[inside]
+                for position, first in zip(space, self.box.first, strict=True)
+            ]
             if gradient:
-                values[inside], slopes[inside] = self._model.slopes(chosen[0], chosen[1:])
-                # From per key frame to per step: between two steps the key index runs evenly.
-                first = np.minimum(np.floor(steps[inside]), max(self.shape[0] - 2, 0))
-                after = np.minimum(first + 1, self.shape[0] - 1)
-                slopes[inside, 0] *= self.key_times.key_indices(after) - self.key_times.key_indices(
-                    first
-                )
+                sampled = self._model.sample_with_gradient(keys[inside], local)
+                values[inside], slopes[inside] = sampled
+                slopes[inside, 0] *= self.key_times.keys_per_step(steps[inside])
             else:
-                values[inside] = self._model.points(chosen[0], chosen[1:])
+                values[inside] = self._model.sample(keys[inside], local)
         values = values.reshape(shape).astype(self.dtype)
         return (values, slopes.reshape(*shape, 4).astype(self.dtype)) if gradient else values
 
-    def occupancy(self, t: float, region: Box | None = None) -> npt.NDArray[np.bool_]:
-        """Which vertices (z, y, x) of a region (all if None) are in the coreset at step `t`.
+    def occupancy(self, t: float, region: Spans | None = None) -> npt.NDArray[np.bool_]:
+        """Mask (z, y, x) of the vertices of a region that are in the coreset at step `t`.
 
-        Between key frames those that are at either of them, in the profile compact at both. Raises RegionError.
+        region: in vertices of the domain; the whole domain if None. Between key frames a vertex
+        must be in the coreset at either of the two; in the profile compact, at both. Raises
+        RegionError for a step or region outside the domain.
         """
         key = self._key_index(t)
         region = self._checked(region)
-        result = np.zeros([high - low for low, high in region], dtype=bool)
-        found = self._within_box(region)
-        if found is not None:
-            target, local = found
-            result[target] = self._occupied(key, local)
+        result = np.zeros(region.shape, dtype=bool)
+        common = self._within_box(region)
+        if common is not None:
+            in_region, in_box = common
+            result[in_region.slices()] = self._occupied(key, in_box)
         missing = self._missing_at(t)
-        return result if missing is None else result & ~crop(missing, region)
+        return result if missing is None else result & ~missing[region.slices()]
 
     def step_of_time(self, time: float) -> float:
-        """The step, fractional between steps, at a time in the units of the series; RegionError outside its times.
+        """The step at a time in the units of the series; a fraction lies between two steps.
 
-        Raises InputError if the series' times do not strictly ascend or descend.
+        Raises RegionError for a time outside the series, InputError if the series' times do not
+        strictly ascend or descend.
         """
         return self._checked_times().step_of_time(float(time))
 
-    # -- pieces ------------------------------------------------------------------------------------------------------------
+    # -- steps, regions and masks --
 
     def _checked_times(self) -> KeyTimes:
         if not strictly_monotonic(self.coords["t"].values):
             raise InputError(
-                f"{self.path}: the times of the series do not strictly ascend or descend; ask for a step instead"
+                f"{self.path}: the times of the series do not strictly ascend or descend; "
+                "ask for a step instead"
             )
         return self.key_times
 
@@ -308,80 +338,37 @@ class Volume:
             raise RegionError(f"{self.path}: step {t:g} is outside 0..{last}")
         return self.key_times.key_index(float(t))
 
-    def _checked(self, region: Box | None) -> Box:
+    def _checked(self, region: Spans | None) -> Box:
         if region is None:
-            return tuple((0, length) for length in self.shape[1:])  # type: ignore[return-value]
+            return Box.of_shape(self.shape[1:])
         for axis, (low, high), length in zip(AXES[1:], region, self.shape[1:], strict=True):
             if not 0 <= low < high <= length:
                 raise RegionError(
-                    f"{self.path}: region {low}:{high} of axis {axis} is empty or outside 0:{length}"
+                    f"{self.path}: region {low}:{high} of axis {axis} is empty "
+                    f"or outside 0:{length}"
                 )
-        return region
+        return Box.of(region)
 
-    def _within_box(self, region: Box) -> tuple[tuple[slice, ...], Box] | None:
-        """Where a region of the domain and the box meet: as slices of the region, and in vertices of the box; None where they do not."""
-        inner = [
-            (max(low, b0), min(high, b1))
-            for (low, high), (b0, b1) in zip(region, self.box, strict=True)
-        ]
-        if not all(low < high for low, high in inner):
+    def _within_box(self, region: Box) -> tuple[Box, Box] | None:
+        """The vertices that a region shares with the feature bounding box; None if there are none.
+
+        They are returned twice: in vertices of the region, and in vertices of the box.
+        """
+        common = self.box.intersect(region)
+        if common is None:
             return None
-        target = tuple(
-            slice(low - r0, high - r0) for (low, high), (r0, _) in zip(inner, region, strict=True)
-        )
-        return target, tuple(
-            (low - b0, high - b0) for (low, high), (b0, _) in zip(inner, self.box, strict=True)
-        )  # type: ignore[return-value]
+        in_region = common.shift(-first for first in region.first)
+        return in_region, common.shift(-first for first in self.box.first)
 
-    def _occupied(self, key: float, local: Box) -> npt.NDArray[np.bool_]:
-        """Which vertices of a part of the box count at a key index."""
-        return self._model.occupied(int(np.floor(key)), int(np.ceil(key)), local)
+    def _occupied(self, key: float, region: Box) -> npt.NDArray[np.bool_]:
+        """Mask (z, y, x) of the coreset at a key index; the region is in vertices of the box."""
+        return self._model.occupied(int(np.floor(key)), int(np.ceil(key)), region)
 
     def _missing_at(self, t: float) -> npt.NDArray[np.bool_] | None:
-        """Where the source had no finite value at a step, or at either step around; None where the file has no such vertices."""
-        stored = self.container.arrays.get("missing/bits")
-        if stored is None:
-            return None
-        steps = range(int(np.floor(t)), int(np.ceil(t)) + 1)
-        bits = stored.read((slice(steps[0], steps[-1] + 1), slice(0, stored.shape[1])))
-        masks = np.unpackbits(
-            np.bitwise_or.reduce(bits, axis=0), count=prod(self.shape[1:])
-        ).reshape(self.shape[1:])
-        return np.asarray(masks, dtype=bool)
+        """Mask (z, y, x) of the values that are not finite at step `t`, or at a step beside it."""
+        return read_missing(self.container, int(np.floor(t)), int(np.ceil(t)))
 
-    def _interpolable(
-        self,
-        steps: npt.NDArray[np.float64],
-        keys: npt.NDArray[np.float64],
-        space: list[npt.NDArray[np.float64]],
-    ) -> npt.NDArray[np.bool_]:
-        """Points whose every cell vertex of weight above 0 is in the coreset."""
-        inside: npt.NDArray[np.bool_] = np.all(
-            [(p >= low) & (p <= high - 1) for p, (low, high) in zip(space, self.box, strict=True)],
-            axis=0,
-        )
-        # Points between the same steps and key frames share one occupancy.
-        between = np.stack([np.floor(steps), np.ceil(steps), np.floor(keys), np.ceil(keys)])
-        _, first, group = np.unique(between, axis=1, return_index=True, return_inverse=True)
-        for number, representative in enumerate(first):
-            chosen = np.flatnonzero(inside & (group == number))
-            if not chosen.size:
-                continue
-            low = [np.floor(p[chosen]).astype(np.int64) for p in space]
-            high = [np.ceil(p[chosen]).astype(np.int64) for p in space]
-            around: Box = tuple(
-                (int(b.min()), int(h.max()) + 1) for b, h in zip(low, high, strict=True)
-            )  # type: ignore[assignment]
-            occupied = self.occupancy(steps[representative], around)
-            for corner in np.ndindex(2, 2, 2):
-                at = (
-                    (h if up else b) - start
-                    for up, b, h, (start, _) in zip(corner, low, high, around, strict=True)
-                )
-                inside[chosen] &= occupied[tuple(at)]
-        return inside
-
-    # -- life --------------------------------------------------------------------------------------------------------------
+    # -- life --
 
     def close(self) -> None:
         """Release the file."""
@@ -410,29 +397,3 @@ def decoded_type(source: np.dtype[Any]) -> np.dtype[Any]:
     """The type of decoded values: a float wide enough for the source's own precision."""
     narrow = source.itemsize <= 2 or source == np.float32
     return np.dtype(np.float32 if narrow else np.float64)
-
-
-def _expanded(index: Index | tuple[Index, ...]) -> list[int | slice]:
-    """One part per axis, `...` and missing axes filled with full slices."""
-    parts = list(index) if isinstance(index, tuple) else [index]
-    for part in parts:
-        if part is not Ellipsis and (
-            isinstance(part, bool) or not isinstance(part, int | np.integer | slice)
-        ):
-            raise RegionError(
-                f"a volume is indexed by integers, slices and '...', not by {type(part).__name__}; take np.asarray of it for more"
-            )
-    dots = [number for number, part in enumerate(parts) if part is Ellipsis]
-    if len(dots) > 1 or len(parts) - len(dots) > 4:
-        raise RegionError(f"a volume has 4 axes (t, z, y, x); the index has {len(parts)} parts")
-    at = dots[0] if dots else len(parts)
-    fill = [slice(None)] * (4 - len(parts) + len(dots))
-    return [part for part in [*parts[:at], *fill, *parts[at + len(dots) :]] if part is not Ellipsis]
-
-
-def _positions(part: int | slice, length: int, axis: str) -> range:
-    if isinstance(part, slice):
-        return range(length)[part]
-    if not -length <= part < length:
-        raise RegionError(f"index {part} is outside axis {axis} of {length}")
-    return range(part % length, part % length + 1)

@@ -1,4 +1,4 @@
-"""What `Volume` asks of the model in a container, the same for every profile."""
+"""The model behind a `Volume`: one interface, the same for every profile."""
 
 from __future__ import annotations
 
@@ -8,53 +8,67 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.model import CompactModel
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.paper.model import PaperModel
-from fhash_codec.paper.regions import Box
 from fhash_formats.container import Container
 
 Positions = npt.NDArray[np.float64]
+"""Positions (n,) of points along one axis."""
 
 
 class VolumeModel(Protocol):
-    """Values in data units on the feature bounding box. Regions and positions are in vertices of the box, times are key indices:
+    """Values of a series, in data units, inside the feature bounding box.
+
+    Regions and positions count vertices of the feature bounding box. Times are key indices:
     0 to key frames - 1, fractional between key frames.
     """
 
     @property
     def chunks(self) -> tuple[int, ...]:
-        """Vertices (t, z, y, x) that one read decodes at least."""
+        """Vertices (t, z, y, x) that are decoded together: a read decodes at least so many."""
         ...
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
-        """Which vertices (z, y, x) of a region are in the coreset between two neighbouring key frames, or at one given twice."""
-        ...
+        """Mask (z, y, x) of a region: the vertices in the coreset between two key frames.
 
-    def region(self, key: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
-        """Values (z, y, x) of a region, of any number type; what stands where `wanted` is False is open."""
-        ...
-
-    def coarse(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
-        """Every 2^lod-th vertex (z, y, x), low-passed. region: which of them, counted in coarse vertices.
-
-        Raises InputError where the profile has no levels of detail.
+        first, last: neighbouring key frames, or the same key frame twice.
         """
         ...
 
-    def points(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
-        """Values (n,) at points: key indices and (z, y, x), all inside."""
+    def read(self, key: float, region: Box, requested: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+        """Values (z, y, x) of a region, of any number type.
+
+        requested: mask (z, y, x) of the region; where it is False, the values are undefined.
+        """
         ...
 
-    def slopes(
+    def read_lod(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
+        """Low-passed values (z, y, x) at every 2^lod-th vertex of the box, within a region.
+
+        region: in coarse vertices, so that vertex 1 of it is vertex 2^lod of the box.
+        Raises InputError if the profile has no levels of detail.
+        """
+        ...
+
+    def sample(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+        """Values (n,) at points.
+
+        keys: key indices of the points. space: their positions z, y and x. All lie in the box.
+        """
+        ...
+
+    def sample_with_gradient(
         self, keys: Positions, space: list[Positions]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Values (n,) and derivatives (n, 4) by key index, z, y and x; on the border of two cells those of the cell after it."""
+        """Values (n,) at points, and derivatives (n, 4) by key index, z, y and x.
+
+        On the border of two cells, the derivatives are those of the cell after the border.
+        """
         ...
 
 
 def open_model(container: Container) -> VolumeModel:
     """The model of a container; nothing is read yet."""
-    return (
-        CompactModel(container.arrays)
-        if container.header["model"]["profile"] == "compact"
-        else PaperModel(container)
-    )
+    if container.header["model"]["profile"] == "compact":
+        return CompactModel(container.arrays)
+    return PaperModel(container)

@@ -1,4 +1,5 @@
-"""The house rules that no single module can hold: who may import whom, what loads what, and that the documents name what exists."""
+"""House rules that no module can hold alone: packages, what loads what, and documents that name
+what exists. `test_rooms.py` holds the order of the rooms."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ TORCH_FILES = re.compile(
     r"paper/(fhash|tesseract)\.py|paper/(training|engines)/.+\.py|training/.+\.py|bench/.+\.py"
     r"|compact/choices/head_training\.py|rendering/task/torch_arrays\.py"
 )
-"""Modules of fhash_codec in which tensors are trained or evaluated, or marched through, or that start a training."""
+"""Modules of fhash_codec that train or evaluate tensors, march through them, or start training."""
 SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy")
 
 
@@ -104,12 +105,16 @@ def test_version_is_the_same_everywhere() -> None:
         "from fhash_cli.main import program; program(['--help'])",
         "from fhash_cli.main import program; program(['encode', '--help'])",
         "from fhash_cli.main import program; program(['render', 'x'])",
-        "import os; os.environ.update(_FHASH_COMPLETE='bash_complete', COMP_WORDS='fhash enc', COMP_CWORD='1');"
+        "import os; os.environ.update("
+        "_FHASH_COMPLETE='bash_complete', COMP_WORDS='fhash enc', COMP_CWORD='1');"
         "from fhash_cli.main import program; program(prog_name='fhash')",
     ],
 )
 def test_nothing_slow_is_loaded_before_it_is_needed(statement: str) -> None:
-    code = f"import sys\ntry:\n    {statement}\nexcept SystemExit:\n    pass\nprint([m for m in {SLOW} if m in sys.modules])"
+    code = (
+        f"import sys\ntry:\n    {statement}\nexcept SystemExit:\n    pass\n"
+        f"print([m for m in {SLOW} if m in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
 
@@ -133,6 +138,19 @@ def test_constraints_pin_every_requirement_and_name_no_place() -> None:
         re.sub(r"[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", line)[0].lower()) for line in required
     } - {"fhash"}  # type: ignore[index]
     assert names <= pinned
+
+
+@pytest.mark.parametrize("document", ["docs/architecture.md", "CONTRIBUTING.md", "README.md"])
+def test_documents_name_paths_that_exist(document: str) -> None:
+    text = (ROOT / document).read_text(encoding="utf-8")
+    text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    places = [ROOT, *PACKAGES.values(), PACKAGES["fhash_formats"] / "transform"]
+    places += [PACKAGES["fhash_codec"] / "rendering", ROOT / "formats", ROOT / "cli"]
+    paths = re.findall(
+        r"`((?:[a-z_]+/)+(?:[a-z_]+\.[a-z]+)?|(?:[a-z_]+/)*[a-z_]+\.(?:py|cpp))`", text
+    )
+    missing = [path for path in paths if not any((place / path).exists() for place in places)]
+    assert not missing
 
 
 def readme_commands() -> list[str]:

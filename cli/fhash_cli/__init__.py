@@ -1,1 +1,1 @@
-"""The command line: click commands, one file each; nothing else."""
+"""The command line: click commands and the options, tables and progress that they share."""

@@ -1,4 +1,4 @@
-"""The options of `fhash render` that make several pictures: animations, evolution, and features in colours of their own."""
+"""Options of `fhash render` for several pictures: animations, evolutions, tracked features."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 __all__ = ["AnimationOptions", "add_animation_options", "run_animation", "tracking"]
 
 OWN = "own"
-"""What `--track` takes for the features of the file."""
+"""Value of `--track` that stands for the features of the file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AnimationOptions:
-    """What the options of `add_animation_options` came to."""
+    """Values of the options that `add_animation_options` adds."""
 
     animate: str | None
     frames: int | None
@@ -51,7 +51,7 @@ class AnimationOptions:
             raise click.UsageError("--columns is of an evolution: give --evolution too")
 
     def several(self, scene: Scene) -> bool:
-        """Whether there is more than one picture to make, which `run_animation` does."""
+        """Whether there is more than one picture to draw; `run_animation` then draws them."""
         return self.animate is not None or scene.evolution is not None
 
     def over(self, scene: Scene, volume: Volume) -> Scene:
@@ -66,7 +66,7 @@ class AnimationOptions:
         )
 
     def tracked(self, volume: Volume, progress: Progress) -> list[Tracked]:
-        """The features of `--track`, none without it."""
+        """The features of `--track`; none without the option."""
         from fhash_codec.rendering.animation.tracking import parse_tracked
 
         if not self.track:
@@ -84,7 +84,8 @@ def add_animation_options(command: Command) -> Command:
     @click.option(
         "--animate",
         metavar="SPEC",
-        help="steps[=A:B], time[=A:B], orbit[=DEGREES], separated by commas, or a file (TOML, JSON).",
+        help="steps[=A:B], time[=A:B], orbit[=DEGREES], separated by commas,"
+        " or a file (TOML, JSON).",
     )
     @click.option(
         "--frames", type=click.IntRange(1, 100_000), metavar="N", help="Pictures of an animation."
@@ -96,7 +97,7 @@ def add_animation_options(command: Command) -> Command:
         "--pictures",
         metavar="NAME.png",
         type=click.Path(),
-        help="Of a film, keep the pictures too: NAME.0000.png and so on.",
+        help="Keep the pictures of a film too: NAME.0000.png and so on.",
     )
     @click.option(
         "--evolution",
@@ -114,7 +115,8 @@ def add_animation_options(command: Command) -> Command:
         "--track",
         metavar="FEATURE[=#RRGGBB]",
         multiple=True,
-        help=f"Draw interval:LO:HI, isosurface:V or segmentation[:T] in a colour of its own; repeat. '{OWN}': those of the file.",
+        help="Draw interval:LO:HI, isosurface:V or segmentation[:T] in a colour of its own; repeat."
+        f" '{OWN}': those of the file.",
     )
     @functools.wraps(command)
     def collected(**values: Any) -> None:
@@ -125,7 +127,10 @@ def add_animation_options(command: Command) -> Command:
 
 
 def tracking(volume: Volume, scene: Scene, options: AnimationOptions, progress: Progress) -> Scene:
-    """The scene with the features of `--track` instead of its transfer function; itself without the option."""
+    """The scene with the features of `--track` in place of its transfer function.
+
+    Without the option it is the scene itself.
+    """
     from fhash_codec.rendering.animation.tracking import tracking_scene
 
     tracked = options.tracked(volume, progress)
@@ -141,62 +146,93 @@ def run_animation(
     force: bool,
     progress: Progress,
 ) -> tuple[dict[str, Any], str]:
-    """Make the pictures of `--animate`, or of a scene that is an evolution, at `output`; the result as JSON values and as text.
+    """Draw the pictures of `--animate` or of an evolution; the result as JSON values and as text.
 
-    Only for options and a scene that are `several`; applies `--track` itself. Raises InputError before any work for outputs that cannot
-    be written.
+    Only for options and a scene that are `several`; applies `--track` itself. Raises InputError
+    before any work for outputs that cannot be written.
     """
+    if options.animate is not None:
+        return _animate(volume, scene, options, output, force=force, progress=progress)
+    return _draw_evolution(volume, scene, options, output, force=force, progress=progress)
+
+
+def _animate(
+    volume: Volume,
+    scene: Scene,
+    options: AnimationOptions,
+    output: str,
+    *,
+    force: bool,
+    progress: Progress,
+) -> tuple[dict[str, Any], str]:
+    """Draw the pictures or the film of `--animate`."""
+    from fhash_codec.rendering.animation.animate import animate
+    from fhash_codec.rendering.animation.animation import Animation
+    from fhash_formats.errors import OutputExistsError
+
+    assert options.animate is not None
+    shown = tracking(volume, scene, options, progress)
+    animation = Animation.parse(options.animate, volume)
+    if options.frames is not None:
+        animation = dataclasses.replace(animation, frames=options.frames)
+    if options.fps is not None:
+        animation = dataclasses.replace(animation, fps=options.fps)
+    _check_pictures(volume, output, options.pictures, force)
+    try:
+        done = animate(
+            volume,
+            shown,
+            animation,
+            output,
+            pictures=options.pictures,
+            force=force,
+            progress=progress,
+        )
+    except OutputExistsError as error:
+        # Only the command line is wrong so far: exit code 2.
+        raise InputError(str(error)) from error
+    result = done.to_dict()
+    first, last = result["paths"][0], result["paths"][-1]
+    rows = [
+        ("written", first if len(result["paths"]) == 1 else f"{first} to {last}"),
+        ("pictures", f"{done.rendered} rendered, {done.kept} kept"),
+        ("seconds", number(done.seconds, digits=3)),
+    ]
+    return result, table(rows)
+
+
+def _check_pictures(volume: Volume, output: str, pictures: str | None, force: bool) -> None:
+    """Refuse outputs of an animation before any work."""
     from pathlib import Path
 
-    from fhash_codec.rendering.animation.animate import animate, numbered
-    from fhash_codec.rendering.animation.animation import Animation
-    from fhash_codec.rendering.animation.evolution import evolution
+    from fhash_codec.rendering.animation.animate import numbered
+
+    for path in (output, pictures):
+        if path is not None:
+            # Numbered pictures that exist may be kept; only their scenes will tell which may not
+            # be replaced.
+            counted = Path(path).suffix.lower() == ".png"
+            first = numbered(Path(path), 1)[0] if counted else path
+            check_writable(first, force or counted, sources=[volume.path])
+
+
+def _draw_evolution(
+    volume: Volume,
+    scene: Scene,
+    options: AnimationOptions,
+    output: str,
+    *,
+    force: bool,
+    progress: Progress,
+) -> tuple[dict[str, Any], str]:
+    """Draw an evolution as one picture, and follow the features of `--track`."""
+    from pathlib import Path
+
+    from fhash_codec.rendering import render
     from fhash_codec.rendering.animation.tracking import follow, tracking_scene
-    from fhash_formats.errors import OutputExistsError
 
     tracked = options.tracked(volume, progress)
     shown = tracking_scene(scene, tracked, volume) if tracked else scene
-    if options.animate is not None:
-        changes = {
-            name: value
-            for name, value in (("frames", options.frames), ("fps", options.fps))
-            if value is not None
-        }
-        animation = dataclasses.replace(Animation.parse(options.animate, volume), **changes)  # type: ignore[arg-type]
-        for path in (output, options.pictures):
-            if path is not None:
-                # Numbered pictures that are there may be kept: which must not be replaced is seen when their scenes are known.
-                counted = Path(path).suffix.lower() == ".png"
-                check_writable(
-                    numbered(Path(path), 1)[0] if counted else path,
-                    force or counted,
-                    sources=[volume.path],
-                )
-        try:
-            done = animate(
-                volume,
-                shown,
-                animation,
-                output,
-                pictures=options.pictures,
-                force=force,
-                progress=progress,
-            )
-        except OutputExistsError as error:
-            # Nothing has failed yet but the command as it was written.
-            raise InputError(str(error)) from error
-        result = done.to_dict()
-        rows = [
-            (
-                "written",
-                result["paths"][0]
-                if len(result["paths"]) == 1
-                else f"{result['paths'][0]} to {result['paths'][-1]}",
-            ),
-            ("pictures", f"{done.rendered} rendered, {done.kept} kept"),
-            ("seconds", number(done.seconds, digits=3)),
-        ]
-        return result, table(rows)
     if Path(output).suffix.lower() != ".png":
         raise InputError(
             f"{output}: an evolution is one picture and is written as .png; use such a name"
@@ -204,7 +240,7 @@ def run_animation(
     check_writable(output, force, sources=[volume.path])
     assert shown.evolution is not None
     steps = list(shown.evolution.steps)
-    image = evolution(volume, shown, progress=progress)
+    image = render(volume, shown, progress=progress)
     paths = [str(path) for path in image.save(output, force=force)]
     followed = follow(volume, tracked, steps) if tracked else []
     result = {
@@ -215,31 +251,23 @@ def run_animation(
         "seconds": image.seconds,
         "tracked": followed,
     }
-    text = table(
-        [
-            ("written", paths[0]),
-            ("steps", str(len(steps))),
-            ("seconds", number(image.seconds, digits=3)),
-        ]
-    )
-    if followed:
-        text += "\n\n" + _places(followed)
-    return result, text
+    rows = [
+        ("written", paths[0]),
+        ("steps", str(len(steps))),
+        ("seconds", number(image.seconds, digits=3)),
+    ]
+    return result, table(rows) + ("\n\n" + _places(followed) if followed else "")
 
 
 def _places(followed: list[dict[str, Any]]) -> str:
-    """How large each feature is at each step, and where its middle is."""
+    """Size and centroid of each feature at each step."""
     header = ("step", *(entry["feature"] for entry in followed))
     rows = []
-    for number_, place in enumerate(followed[0]["steps"]):
+    for places in zip(*(entry["steps"] for entry in followed), strict=True):
         cells = []
-        for entry in followed:
-            here = entry["steps"][number_]
-            middle = (
-                ""
-                if here["centroid"] is None
-                else " at " + ", ".join(f"{part:.4g}" for part in here["centroid"])
-            )
-            cells.append(f"{here['vertices']:,}{middle}")
-        rows.append((f"{place['step']:g}", *cells))
+        for place in places:
+            centroid = place["centroid"]
+            middle = "" if centroid is None else " at " + ", ".join(f"{x:.4g}" for x in centroid)
+            cells.append(f"{place['vertices']:,}{middle}")
+        rows.append((f"{places[0]['step']:g}", *cells))
     return table([header, *rows])

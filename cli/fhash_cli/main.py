@@ -1,6 +1,7 @@
-"""`fhash`: finds the command, runs it, and turns whatever goes wrong into one line on stderr and an exit code.
+"""`fhash`: finds and runs a command; turns an error into one line on stderr and an exit code.
 
-0 success; 1 failure; 2 usage or unsuitable input; 3 a quality gate missed; 4 damaged or unsupported file; 130 interrupted.
+Exit codes: 0 success; 1 failure; 2 usage or unsuitable input; 3 a quality gate missed; 4 damaged or
+unsupported file; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -30,11 +31,14 @@ COMMANDS = {
     "bench": "measure speed on this machine",
     "selftest": "check hard cases on this machine",
 }
-"""Each command's line of help. Its module `fhash_cli.NAME` is imported when it is used, so that `--help` is quick."""
+"""Help line of each command; its module `fhash_cli.commands.NAME` is imported only on use."""
 
 
 class Program(click.Group):
-    """The commands of COMMANDS, imported when used; `main` ends the process with the exit codes above and never with a traceback."""
+    """The commands of COMMANDS, imported on use.
+
+    `main` ends the process with one of the exit codes above, never with a traceback.
+    """
 
     def list_commands(self, context: click.Context) -> list[str]:
         """Names in the order of COMMANDS."""
@@ -44,7 +48,7 @@ class Program(click.Group):
         """The click command of a name; None for a name that is unknown."""
         if name not in COMMANDS:
             return None
-        return cast(click.Command, importlib.import_module(f"fhash_cli.{name}").command)
+        return cast(click.Command, importlib.import_module(f"fhash_cli.commands.{name}").command)
 
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """The list of commands for `--help`, without importing them."""
@@ -52,7 +56,10 @@ class Program(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
     def invoke(self, context: click.Context) -> Any:
-        """Run the command; warnings go to stderr as one line, Ctrl-C becomes an error before click prints lines of its own about it."""
+        """Run the command; each warning is one line on stderr.
+
+        Ctrl-C becomes an error here, before click prints lines of its own about it.
+        """
         with warnings.catch_warnings():
             warnings.showwarning = warn
             try:
@@ -72,7 +79,7 @@ class Program(click.Group):
             line, code = describe_error(error)
             say(f"error: {line}")
             sys.exit(code)
-        # Of a command that ends early (--help, --version) click returns the exit code; the commands themselves return None.
+        # click returns the exit code of commands that end early (--help, --version), else None.
         sys.exit(result if isinstance(result, int) else 0)
 
 
@@ -84,10 +91,11 @@ class Program(click.Group):
 @click.version_option(package_name="fhash", message="%(prog)s %(version)s")
 @click.pass_context
 def program(context: click.Context) -> None:
-    """A codec for time-varying volumes: keeps the features you name, reads back any region at any time.
+    """A codec for time-varying volumes: keeps the features you name, reads any region at any time.
 
     Results go to stdout (one JSON object with --json), log and progress to stderr.
-    Exit codes: 0 success, 1 failure, 2 usage or unsuitable input, 3 quality gate missed, 4 damaged or unsupported file, 130 interrupted.
+    Exit codes: 0 success, 1 failure, 2 usage or unsuitable input, 3 quality gate missed,
+    4 damaged or unsupported file, 130 interrupted.
     """
     if context.invoked_subcommand is None:
         click.echo(context.get_help(), err=True)
@@ -108,7 +116,11 @@ def main() -> None:
 
 
 def _occupy_streams() -> None:
-    """Open the null device in place of closed standard streams, or an output would take the number of one and what is printed there."""
+    """Open the null device in place of closed standard streams.
+
+    Otherwise an output file would get the number of a closed stream, and with it whatever is
+    printed there.
+    """
     for number in range(3):
         try:
             os.fstat(number)
@@ -117,7 +129,10 @@ def _occupy_streams() -> None:
 
 
 def _heed_signals() -> None:
-    """What ends a job or its terminal does it as Ctrl-C does, and nothing half written stays; an ignored signal (nohup) stays ignored."""
+    """Treat SIGTERM and SIGHUP like Ctrl-C, so that no partial output remains.
+
+    A signal that is ignored (nohup) stays ignored.
+    """
     for name in ("SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
@@ -129,7 +144,10 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _settle_stdout() -> None:
-    """Flush stdout; where it is full or closed, drop what is left, or the interpreter prints a traceback of its own while it ends."""
+    """Flush stdout, and drop the rest where it is full or closed.
+
+    Otherwise the interpreter prints a traceback of its own at exit.
+    """
     if sys.stdout is None:
         return
     try:

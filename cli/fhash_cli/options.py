@@ -1,4 +1,4 @@
-"""Options that several commands share, and the values they are written in: slices, regions, and every setting of an encoding."""
+"""Options that several commands share, and their types: slices, regions, encoding settings."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ run_argument = click.argument("run", metavar="RUN.fhz", type=click.Path())
 def check_writable(
     path: str | Path, force: bool, *, region: bool = False, sources: Sequence[str | Path] = ()
 ) -> None:
-    """Refuse an output (of `save_region` with `region`) before any work: it exists, cannot be replaced, or is one of the `sources`.
+    """Refuse an output before any work: it exists, cannot be replaced, or is one of the `sources`.
 
-    Raises InputError throughout (exit code 2), since nothing has failed yet but the command as it was written.
+    region: the output is written by `save_region`, whose checks differ.
+    Raises InputError in every case (exit code 2): only the command line is wrong so far.
     """
     from fhash_formats import save_check
     from fhash_formats.support.atomic import check_output
@@ -40,12 +41,12 @@ def check_writable(
 
 
 class RealRange(click.FloatRange):
-    """A number within limits; click's own lets NaN through, which is neither below nor above anything."""
+    """A number within limits, and no NaN, which click's own range lets through."""
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """The number; refuses NaN and whatever is outside the limits."""
+        """The number; fails for NaN and for a number outside the limits."""
         number = float(super().convert(value, param, ctx))
         if math.isnan(number):
             self.fail(f"'{value}' is not a number", param, ctx)
@@ -67,14 +68,18 @@ class SliceType(click.ParamType[slice]):
             return parse_slice(str(value))
         except ValueError:
             self.fail(
-                f"'{value}' is not an index or a half-open range A:B or A:B:S of indices, such as 4, 40:50, 10: or ::2",
+                f"'{value}' is not an index or a half-open range A:B or A:B:S of indices,"
+                " such as 4, 40:50, 10: or ::2",
                 param,
                 ctx,
             )
 
 
 class IntervalsType(click.ParamType[tuple[Any, ...]]):
-    """Three intervals `z0:z1,y0:y1,x0:x1`; an end left out is the end of the domain. Of indices, or of positions (`number=float`)."""
+    """Three intervals `z0:z1,y0:y1,x0:x1`, of indices or (`number=float`) of positions.
+
+    An end that is left out stands for the end of the domain.
+    """
 
     def __init__(self, number: type[int] | type[float]) -> None:
         self.number = number
@@ -96,7 +101,8 @@ class IntervalsType(click.ParamType[tuple[Any, ...]]):
         if [len(interval) for interval in intervals] != [2, 2, 2]:
             example = "0:16,:,8:24" if self.number is int else "0:0.5,:,1.5:2"
             self.fail(
-                f"'{value}' is not z0:z1,y0:y1,x0:x1, where an end may be left out, such as {example}",
+                f"'{value}' is not z0:z1,y0:y1,x0:x1, where an end may be left out,"
+                f" such as {example}",
                 param,
                 ctx,
             )
@@ -116,7 +122,7 @@ def parse_slice(text: str) -> slice:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
-    """How to read the data: the options that `series_options` adds."""
+    """Options that `series_options` adds: they say how to read the data."""
 
     var: str | None
     axes: str | None
@@ -169,9 +175,12 @@ def series_options(command: Command) -> Command:
 
 
 def config_options(*names: str, profile: str | None = None) -> Callable[[Command], Command]:
-    """Add an option for every field of EncodeConfig, or for those named, from the field's own help, choices and range.
+    """Add an option for each field of EncodeConfig, or for each of `names`.
 
-    The command gets an EncodeConfig as `config`. profile: that of a command which has no option for it.
+    Help, choices and range of an option are those of the field. The command gets an EncodeConfig as
+    `config`.
+
+    profile: the profile of a command that has no option for it.
     """
     from fhash_codec.config import EncodeConfig
 
@@ -188,7 +197,10 @@ def config_options(*names: str, profile: str | None = None) -> Callable[[Command
 
 
 def setting_options(*names: str) -> Callable[[Command], Command]:
-    """As `config_options`, for settings of several profiles: the command gets a dict of them as `settings`."""
+    """Add options as `config_options` does; the command gets a dict of them as `settings`.
+
+    It serves commands whose settings are for several profiles.
+    """
     from fhash_codec.config import EncodeConfig
 
     fields = [

@@ -1,4 +1,4 @@
-"""What the command line prints: results on stdout (a table, or one JSON object), log, progress and errors on stderr."""
+"""Output of the command line: results on stdout (a table or JSON), everything else on stderr."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from fhash_formats.errors import FhashError, OutputError
 from fhash_formats.support.attributes import plain_text
 
 NO_MEMORY = ("can't allocate memory", "memory allocation failed")
+"""Words of the RuntimeErrors by which torch and HDF5 report that memory ran out."""
 QUIET_SECONDS = 2.0
 """Stages shorter than this show no progress."""
 
@@ -38,7 +39,10 @@ def warn(
 
 
 def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
-    """The result on stdout: one JSON object in one line, or the text for people; raises OutputError where stdout is closed."""
+    """Print a result on stdout: as one line of JSON, or as text.
+
+    Raises OutputError where stdout is closed.
+    """
     if sys.stdout is None:
         raise OutputError(
             "the result cannot be printed, stdout is closed; files named as outputs are written"
@@ -47,7 +51,10 @@ def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of equal length as aligned columns: the first to the left; others to the right where there are more than two."""
+    """Rows of equal length as aligned columns.
+
+    The first column is aligned to the left; where there are more than two, the others to the right.
+    """
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
 
     def line(row: Sequence[str]) -> str:
@@ -83,12 +90,12 @@ def compared(report: Mapping[str, Any]) -> str:
 
 
 def number(value: float | None, unit: str = "", *, digits: int = 4) -> str:
-    """A measured value with its unit, where it has one ("1" stands for none); None (not defined) as a dash."""
+    """A measured value with its unit ("1" stands for none); a dash for None (not defined)."""
     return "-" if value is None else f"{value:.{digits}g} {'' if unit == '1' else unit}".rstrip()
 
 
 def apart(*values: float) -> list[str]:
-    """Numbers with 6 digits, or as many more, up to 12, as it takes to tell those that differ apart."""
+    """Numbers with 6 digits, or with up to 12 where different numbers would look equal."""
     for digits in range(6, 13):
         texts = [f"{value:.{digits}g}" for value in values]
         if len(set(texts)) == len(set(values)):
@@ -109,12 +116,15 @@ def spans(region: Sequence[Sequence[int]]) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names in a row, those in the middle left out where there are many."""
+    """Names separated by commas; of more than 8 those in the middle are left out."""
     return ", ".join(names if len(names) <= 8 else [*names[:6], "...", names[-1]])
 
 
 def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, str]]:
-    """Rows of the quality that `encode`, `diff` and `demo` share; a container of another writer may leave figures out."""
+    """Rows of the quality, for `encode`, `diff`, `demo` and `info`.
+
+    A container of another writer may lack some figures.
+    """
     exact = report.get("rmse") == 0
     return [
         ("PSNR, coreset", "exact" if exact else number(report.get("psnr"), "dB")),
@@ -123,6 +133,12 @@ def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, 
         ("largest error", number(report.get("max_abs_error"), units)),
         ("SSIM", number(report.get("ssim"), digits=5)),
     ]
+
+
+def loss_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The row of the PSNR that coded tables cost; none for other tables."""
+    loss = model.get("tables_loss_db")
+    return [] if loss is None else [("tables", f"coded, for {loss:.2f} dB of the PSNR")]
 
 
 def describe_error(error: Exception) -> tuple[str, int]:
@@ -140,21 +156,23 @@ def describe_error(error: Exception) -> tuple[str, int]:
         )
     elif isinstance(error, RuntimeError) and str(error) == "can't start new thread":
         line, code = (
-            "no thread can be started: no memory is left, or no process (ulimit -u); FHASH_THREADS=1 takes fewer",
+            "no thread can be started: no memory is left, or no process (ulimit -u);"
+            " FHASH_THREADS=1 takes fewer",
             1,
         )
     elif isinstance(error, OSError) and error.strerror:
         line, code = f"{error.strerror}: {error.filename}" if error.filename else error.strerror, 1
     else:
         line, code = (
-            f"unexpected {type(error).__name__}: {error}; please report this (FHASH_DEBUG=1 shows where it came from)",
+            f"unexpected {type(error).__name__}: {error}; please report this"
+            " (FHASH_DEBUG=1 shows where it came from)",
             1,
         )
     return " ".join(line.split()), code
 
 
 def _is_no_memory(error: Exception) -> bool:
-    """Whether there was no memory: torch (CUDA, CPU) and HDF5 say so in errors of their own."""
+    """Whether an error means that memory ran out, also in the words of torch and HDF5."""
     if isinstance(error, RuntimeError):
         return type(error).__name__ == "OutOfMemoryError" or any(
             words in str(error) for words in NO_MEMORY
@@ -163,9 +181,10 @@ def _is_no_memory(error: Exception) -> bool:
 
 
 class Progress:
-    """The progress callback (stage, done, total, note) of the codec: a bar on a terminal, else one line every 10 %.
+    """The codec's progress callback (stage, done, total, note), as a context manager.
 
-    Nothing is shown of the first QUIET_SECONDS of a stage, nor at all with `quiet`. A context manager: leaving it removes the bar.
+    It draws a bar on a terminal, and prints a line every 10 % elsewhere. The first QUIET_SECONDS of
+    a stage show nothing; `quiet` shows nothing at all. Leaving the context removes the bar.
     """
 
     def __init__(self, *, quiet: bool) -> None:
@@ -189,12 +208,15 @@ class Progress:
         self._erase()
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Take note of `done` parts of `total` of a stage, with a remark such as "41.2 dB"."""
+        """Report that `done` of `total` parts of a stage are done.
+
+        note: a remark such as "41.2 dB".
+        """
         if self.quiet:
             return
         now = time.monotonic()
         if stage != self.stage:
-            # The first report of a stage comes when its first part is done: it began with the end of the stage before.
+            # The first report follows the first part: the stage began at the end of the last.
             self._erase()
             self.stage, self.start, self.tenth = stage, self.last, 0
         self.last = now
@@ -208,7 +230,8 @@ class Progress:
         if self.terminal and (now - self.shown > 0.1 or share == 1):
             filled = round(24 * share)
             click.echo(
-                f"\r{stage:10} {'#' * filled}{'-' * (24 - filled)} {share:4.0%}{remark}{left}\x1b[K",
+                f"\r{stage:10} {'#' * filled}{'-' * (24 - filled)} {share:4.0%}"
+                f"{remark}{left}\x1b[K",
                 err=True,
                 nl=False,
             )

@@ -1,4 +1,4 @@
-"""The options of `fhash render` that make a scene: a file of one, and what each option puts in place of its parts."""
+"""Options of `fhash render` that describe a scene: a file, and options that replace parts of it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import functools
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +22,39 @@ if TYPE_CHECKING:
 __all__ = ["SceneOptions", "scene_options"]
 
 NUMBERS = {2: "A,B", 3: "X,Y,Z"}
+"""Placeholders of options that take so many numbers."""
+
+PLACES = {
+    "time": "time",
+    "t": "step",
+    "size": "size",
+    "view": "camera.view",
+    "azimuth": "camera.azimuth",
+    "elevation": "camera.elevation",
+    "zoom": "camera.zoom",
+    "projection": "camera.projection",
+    "position": "camera.position",
+    "focal_point": "camera.focal_point",
+    "view_up": "camera.view_up",
+    "cmap": "transfer_function.colours",
+    "opacity": "transfer_function.opacity",
+    "range": "transfer_function.range",
+    "density": "transfer_function.density",
+    "scale": "scale",
+    "background": "background",
+    "step": "march.step",
+    "threshold": "march.threshold",
+    "lod": "march.lod",
+    "march": "march.mode",
+    "device": "march.device",
+    "samples_per_pass": "march.samples_per_pass",
+    "antialiasing": "effects.antialiasing",
+}
+"""Places of a scene that an option sets, by the name of the option's parameter."""
 
 
 class NumbersType(click.ParamType[tuple[float, ...]]):
-    """So many numbers with commas between them."""
+    """A fixed count of numbers with commas between them."""
 
     def __init__(self, count: int) -> None:
         self.count, self.name = count, NUMBERS[count]
@@ -32,14 +62,15 @@ class NumbersType(click.ParamType[tuple[float, ...]]):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
-        """The numbers; whether they are allowed is for the scene to say."""
+        """The numbers; the scene checks later whether their values are allowed."""
         try:
             numbers = tuple(float(part) for part in str(value).split(","))
         except ValueError:
             numbers = ()
         if len(numbers) != self.count:
             self.fail(
-                f"'{value}' is not {self.count} numbers with commas between them, such as {','.join('123'[: self.count])}",
+                f"'{value}' is not {self.count} numbers with commas between them,"
+                f" such as {','.join('123'[: self.count])}",
                 param,
                 ctx,
             )
@@ -83,7 +114,15 @@ class OpacityType(click.ParamType[Any]):
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions:
-    """What the options of `scene_options` came to: a file, places of the scene with their values, and lists that are added to."""
+    """Values of the options that `scene_options` adds.
+
+    Attributes:
+        file: path of a scene to begin from, or None.
+        places: places of the scene, such as `camera.view`, with their values.
+        effects: names of effects to switch on.
+        isosurfaces: texts VALUE[,COLOUR][,OPACITY].
+        settings: texts PLACE=VALUE.
+    """
 
     file: str | None
     places: dict[str, Any]
@@ -97,8 +136,7 @@ class SceneOptions:
 
         base = Scene() if self.file is None else Scene.load(self.file)
         values = base.to_dict()
-        moment = {name for name in ("step", "time") if name in self.places}
-        if moment:
+        if "step" in self.places or "time" in self.places:
             for name in ("step", "time", "evolution"):
                 values.pop(name, None)
         for place, value in self.places.items():
@@ -119,130 +157,110 @@ class SceneOptions:
         return Scene.from_dict(values)
 
 
-def scene_options(command: Command) -> Command:
-    """Add the options of SceneOptions; the command gets them as `options`."""
-    places = {
-        "time": "time",
-        "t": "step",
-        "size": "size",
-        "view": "camera.view",
-        "azimuth": "camera.azimuth",
-        "elevation": "camera.elevation",
-        "zoom": "camera.zoom",
-        "projection": "camera.projection",
-        "position": "camera.position",
-        "focal_point": "camera.focal_point",
-        "view_up": "camera.view_up",
-        "cmap": "transfer_function.colours",
-        "opacity": "transfer_function.opacity",
-        "range": "transfer_function.range",
-        "density": "transfer_function.density",
-        "scale": "scale",
-        "background": "background",
-        "step": "march.step",
-        "threshold": "march.threshold",
-        "lod": "march.lod",
-        "march": "march.mode",
-        "device": "march.device",
-        "samples_per_pass": "march.samples_per_pass",
-        "antialiasing": "effects.antialiasing",
-    }
-
-    @click.option(
+OPTIONS: tuple[Callable[[Command], Command], ...] = (
+    click.option(
         "--scene",
         "file",
         metavar="FILE",
         type=click.Path(),
         help="A scene to begin from: JSON, TOML, or a PNG of fhash render.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--t",
         type=float,
         metavar="N",
         help="Step, between two of them too; -1 is the last. Default: the first.",
-    )
-    @click.option("--time", type=float, metavar="T", help="A physical time instead of a step.")
-    @click.option("--size", type=SizeType(), help="Pixels across and down.  [default: 512x512]")
-    @click.option(
+    ),
+    click.option("--time", type=float, metavar="T", help="A physical time instead of a step."),
+    click.option("--size", type=SizeType(), help="Pixels across and down.  [default: 512x512]"),
+    click.option(
         "--view", metavar="NAME", help="Direction to look from: iso, xy, xz, yz, yx, zx or zy."
-    )
-    @click.option(
+    ),
+    click.option(
         "--azimuth",
         type=float,
         metavar="DEGREES",
         help="Turn the camera about the upward direction.",
-    )
-    @click.option("--elevation", type=float, metavar="DEGREES", help="Raise the camera.")
-    @click.option("--zoom", type=float, metavar="X", help="Magnification.")
-    @click.option("--projection", metavar="NAME", help="perspective or parallel.")
-    @click.option(
+    ),
+    click.option("--elevation", type=float, metavar="DEGREES", help="Raise the camera."),
+    click.option("--zoom", type=float, metavar="X", help="Magnification."),
+    click.option("--projection", metavar="NAME", help="perspective or parallel."),
+    click.option(
         "--position",
         type=NumbersType(3),
         help="Where the camera stands, in the coordinates of the series.",
-    )
-    @click.option("--focal-point", type=NumbersType(3), help="What the camera looks at.")
-    @click.option("--view-up", type=NumbersType(3), help="What is upwards in the picture.")
-    @click.option(
+    ),
+    click.option("--focal-point", type=NumbersType(3), help="What the camera looks at."),
+    click.option("--view-up", type=NumbersType(3), help="What is upwards in the picture."),
+    click.option(
         "--scale",
         type=NumbersType(3),
         help="Stretch the axes.  [default: one in other units is as long as the rest]",
-    )
-    @click.option("--cmap", metavar="NAME", help="Colour map, or a ParaView preset (JSON).")
-    @click.option(
+    ),
+    click.option("--cmap", metavar="NAME", help="Colour map, or a ParaView preset (JSON)."),
+    click.option(
         "--opacity",
         type=OpacityType(),
         help="auto, feature, linear, geom, sigmoid, foreground, opaque, or points.",
-    )
-    @click.option("--range", type=NumbersType(2), help="Values that the colours reach from and to.")
-    @click.option("--density", type=float, metavar="X", help="Factor of the extinction.")
-    @click.option(
+    ),
+    click.option("--range", type=NumbersType(2), help="Values that the colours reach from and to."),
+    click.option("--density", type=float, metavar="X", help="Factor of the extinction."),
+    click.option(
         "--effect",
         "effects",
         metavar="NAME",
         multiple=True,
-        help="shading, shadows, ambient-occlusion, maximum-intensity, jitter, box, axes, colour-bar or time-label; may be repeated.",
-    )
-    @click.option(
+        help="shading, shadows, ambient-occlusion, maximum-intensity, jitter, box, axes, colour-bar"
+        " or time-label; may be repeated.",
+    ),
+    click.option(
         "--isosurface",
         "isosurfaces",
         metavar="V[,COLOUR][,OPACITY]",
         multiple=True,
         help="A surface; may be repeated.",
-    )
-    @click.option("--no-volume", is_flag=True, help="Surfaces alone.")
-    @click.option("--background", metavar="COLOUR", help="'#rrggbb', a name, or transparent.")
-    @click.option("--antialiasing", type=int, metavar="N", help="Rays along a pixel's side.")
-    @click.option("--depth", is_flag=True, help="Write the depth too, as NAME.depth.npy.")
-    @click.option("--normal", is_flag=True, help="Write normals too, as NAME.normal.npy.")
-    @click.option("--march", metavar="NAME", help="Way to march: auto, cache, arm or stream.")
-    @click.option(
+    ),
+    click.option("--no-volume", is_flag=True, help="Surfaces alone."),
+    click.option("--background", metavar="COLOUR", help="'#rrggbb', a name, or transparent."),
+    click.option("--antialiasing", type=int, metavar="N", help="Rays along a pixel's side."),
+    click.option("--depth", is_flag=True, help="Write the depth too, as NAME.depth.npy."),
+    click.option("--normal", is_flag=True, help="Write normals too, as NAME.normal.npy."),
+    click.option("--march", metavar="NAME", help="Way to march: auto, cache, arm or stream."),
+    click.option(
         "--device", metavar="NAME", help="Where arm and stream compute: auto, cpu or cuda."
-    )
-    @click.option("--step", type=float, metavar="X", help="Length of a step in vertex spacings.")
-    @click.option(
+    ),
+    click.option("--step", type=float, metavar="X", help="Length of a step in vertex spacings."),
+    click.option(
         "--threshold", type=float, metavar="X", help="Share of the light at which a ray ends."
-    )
-    @click.option(
+    ),
+    click.option(
         "--lod", type=int, metavar="N", help="Level of detail; by the size of a pixel if left out."
-    )
-    @click.option("--samples-per-pass", type=int, metavar="N", help="N_r of adaptive ray marching.")
-    @click.option(
+    ),
+    click.option("--samples-per-pass", type=int, metavar="N", help="N_r of adaptive ray marching."),
+    click.option(
         "--skipping/--no-skipping",
         default=None,
         help="Pass over bricks of which nothing can be seen.",
-    )
-    @click.option(
+    ),
+    click.option(
         "--set",
         "settings",
         metavar="PLACE=VALUE",
         multiple=True,
         help="Any part of a scene, such as effects.shading.ambient=0.3.",
-    )
+    ),
+)
+"""Every option of a scene, in the order of `--help`."""
+
+
+def scene_options(command: Command) -> Command:
+    """Add the options of SceneOptions; the command gets them as `options`."""
+
     @functools.wraps(command)
     def collected(**values: Any) -> None:
         given = {
             place: value
-            for name, place in places.items()
+            for name, place in PLACES.items()
             if (value := values.pop(name)) is not None
         }
         buffers = [name for name in ("depth", "normal") if values.pop(name)]
@@ -260,11 +278,17 @@ def scene_options(command: Command) -> Command:
             **values,
         )
 
-    return collected
+    decorated: Command = collected
+    for option in reversed(OPTIONS):
+        decorated = option(decorated)
+    return decorated
 
 
 def _put(values: dict[str, Any], place: str, value: Any) -> None:
-    """Set a place such as `effects.shading.ambient` in nested tables; a part that is `true` or left out becomes a table."""
+    """Set a place such as `effects.shading.ambient` in nested tables.
+
+    A table on the way that is `true`, `false` or absent is made.
+    """
     *above, last = place.split(".")
     for part in above:
         inner = values.get(part)
@@ -279,26 +303,27 @@ def _put(values: dict[str, Any], place: str, value: Any) -> None:
 
 
 def _effect(name: str) -> str:
-    """The field of Effects that a word stands for."""
+    """The field of Effects that a name stands for; raises InputError for an unknown name."""
     from fhash_codec.rendering.scene.scene import Effects
 
-    known = [
+    names = [
         field.name
         for field in dataclasses.fields(Effects)
         if field.name not in ("isosurfaces", "buffers", "antialiasing")
     ]
     plain = name.replace("-", "_").replace("color", "colour")
-    if plain not in known:
-        near = difflib.get_close_matches(plain, known, n=1, cutoff=0.0)[0]
-        names = ", ".join(each.replace("_", "-") for each in known)
+    if plain not in names:
+        near = difflib.get_close_matches(plain, names, n=1, cutoff=0.0)[0]
+        allowed = ", ".join(effect.replace("_", "-") for effect in names)
         raise InputError(
-            f"effect '{name[:60]}' is not known; did you mean '{near.replace('_', '-')}'? Known: {names}"
+            f"effect '{name[:60]}' is not known; did you mean '{near.replace('_', '-')}'?"
+            f" Known: {allowed}"
         )
     return plain
 
 
 def _isosurface(text: str) -> dict[str, Any]:
-    """VALUE[,COLOUR][,OPACITY]."""
+    """The record of a surface from VALUE[,COLOUR][,OPACITY]."""
     first, *rest = text.split(",")
     try:
         surface: dict[str, Any] = {"value": float(first)}
@@ -309,7 +334,8 @@ def _isosurface(text: str) -> dict[str, Any]:
                 surface["colour"] = part.strip()
     except ValueError as error:
         raise InputError(
-            f"--isosurface {text}: write a value, then a colour and an opacity if need be, such as 1.5,orange,0.5"
+            f"--isosurface {text}: write a value, then a colour and an opacity if need be,"
+            " such as 1.5,orange,0.5"
         ) from error
     return surface
 

@@ -1,4 +1,4 @@
-"""What `--t`, `--time`, `--roi` and `--box` mean for one open container: steps, vertices, and the coordinates cut to them."""
+"""Steps and vertices that `--t`, `--time`, `--roi` and `--box` select of an open container."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ Span = tuple[int, int]
 
 
 def steps_of(volume: Volume, chosen: slice | None, option: str = "--t") -> list[float]:
-    """Indices of the steps of a slice, all of them for None; raises RegionError for a slice that leaves the series or holds nothing."""
+    """Indices of the steps of a slice; all steps for None.
+
+    Raises RegionError for a slice that leaves the series or is empty.
+    """
     count = volume.shape[0]
     chosen = chosen if chosen is not None else slice(None)
     low, high = _span(
@@ -27,7 +30,10 @@ def steps_of(volume: Volume, chosen: slice | None, option: str = "--t") -> list[
 def region_of(
     volume: Volume, roi: Sequence[Sequence[int | None]] | None
 ) -> tuple[Span, Span, Span]:
-    """Vertices ((z0, z1), (y0, y1), (x0, x1)) of `--roi`, all of them for None; raises RegionError where it leaves the domain."""
+    """Vertices ((z0, z1), (y0, y1), (x0, x1)) of `--roi`; the whole domain for None.
+
+    Raises RegionError for a region that leaves the domain.
+    """
     roi = roi if roi is not None else ((None, None),) * 3
     z, y, x = (
         _span(
@@ -39,7 +45,10 @@ def region_of(
 
 
 def region_of_box(volume: Volume, box: Sequence[Sequence[float | None]]) -> tuple[Span, Span, Span]:
-    """The vertices whose positions lie in `--box`, ends included; raises RegionError where it leaves the domain or holds no vertex."""
+    """Vertices whose positions lie in `--box`, ends included.
+
+    Raises RegionError for a box that leaves the domain or holds no vertex.
+    """
     z, y, x = (_vertices(volume, axis, *ends) for axis, ends in zip("zyx", box, strict=True))
     return z, y, x
 
@@ -52,18 +61,21 @@ def _vertices(volume: Volume, axis: str, low: float | None, high: float | None) 
     start, end = first if low is None else low, last if high is None else high
     if not first <= start <= last or not first <= end <= last:
         raise RegionError(
-            f"--box along {axis} is {start:.12g}:{end:.12g}; the domain has positions {first:.12g} to {last:.12g}"
+            f"--box along {axis} is {start:.12g}:{end:.12g};"
+            f" the domain has positions {first:.12g} to {last:.12g}"
         )
     inside = np.flatnonzero((positions >= start) & (positions <= end))
     if not inside.size:
         raise RegionError(
-            f"--box along {axis} is {start:.12g}:{end:.12g}, which holds no vertex; the {positions.size} vertices lie further apart"
+            f"--box along {axis} is {start:.12g}:{end:.12g}, which holds no vertex;"
+            f" the {positions.size} vertices lie further apart"
         )
     low_index, high_index = int(inside[0]), int(inside[-1]) + 1
     if high_index - low_index != inside.size:
         raise RegionError(
-            f"--box along {axis} is {start:.12g}:{end:.12g}; the positions along {axis} neither ascend nor descend, and between vertices "
-            f"{low_index} and {high_index - 1} some lie outside it; give vertices with --roi"
+            f"--box along {axis} is {start:.12g}:{end:.12g}; the positions along {axis} neither"
+            f" ascend nor descend, and between vertices {low_index} and {high_index - 1} some lie"
+            " outside it; give vertices with --roi"
         )
     return low_index, high_index
 
@@ -71,24 +83,25 @@ def _vertices(volume: Volume, axis: str, low: float | None, high: float | None) 
 def coordinates(
     volume: Volume, steps: Sequence[float], vertices: Sequence[range]
 ) -> dict[str, Coordinate]:
-    """The Coordinate of each axis cut to some (fractional) steps and the vertices along z, y and x."""
+    """Coordinates of the (fractional) steps and of the vertices along z, y and x."""
     import numpy as np
 
     from fhash_formats.series import Coordinate
 
-    whole = volume.coords
-    times = np.interp(steps, np.arange(volume.shape[0]), whole["t"].values)
+    coords = volume.coords
+    times = np.interp(steps, np.arange(volume.shape[0]), coords["t"].values)
     values = {"t": times} | {
-        axis: whole[axis].values[list(part)] for axis, part in zip("zyx", vertices, strict=True)
+        axis: coords[axis].values[list(indices)]
+        for axis, indices in zip("zyx", vertices, strict=True)
     }
     return {
-        axis: Coordinate(name=whole[axis].name, values=cut, attributes=whole[axis].attributes)
+        axis: Coordinate(name=coords[axis].name, values=cut, attributes=coords[axis].attributes)
         for axis, cut in values.items()
     }
 
 
 def _span(what: str, low: int | None, high: int | None, count: int, allowed: str) -> Span:
-    """Python's meaning of low:high among `count`, without its clipping."""
+    """Ends of low:high among `count` as Python means them, but without its clipping."""
     first = 0 if low is None else low + count if low < 0 else low
     last = count if high is None else high + count if high < 0 else high
     if not 0 <= first < last <= count:

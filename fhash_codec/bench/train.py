@@ -1,4 +1,4 @@
-"""`fhash bench train`: the engines side by side on one series, in turns, so that a busy machine treats them alike."""
+"""`fhash bench train`: the engines on one series, in turns: a busy machine treats them alike."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.selection import select
-from fhash_codec.paper.training.train import Plan, plan_training, probe_psnr
+from fhash_codec.paper.training.train import TrainingPlan, plan_training, probe_psnr
 from fhash_codec.progress import Progress, silent
 from fhash_codec.training.devices import choose_device
 from fhash_codec.training.threads import threads_for
 from fhash_formats.errors import InputError
 
 TURNS = 3
+"""Turns over which each engine's time is spread."""
 INFER_SECONDS = 1.0
+"""Seconds of evaluation in each turn."""
 
 
 def bench_train(
@@ -36,19 +38,27 @@ def bench_train(
     seconds: float = 12.0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Measure engines on the coreset of a series; each trains for `seconds` in three turns, then evaluates lattice vertices.
+    """Measure engines on the coreset of a series.
 
-    Returns {"engines": [{engine, train_msamples_s, infer_msamples_s, fraction_of_peak, train_ratio, infer_ratio, psnr, epochs,
-    seconds}], "machine": {...}, "series", "samples", "batch_samples"}. Samples are coreset vertices; speeds are medians over the turns,
-    in 10^6 a second; ratios are to the naive engine of the same run. psnr: on the coreset after those seconds (dB, normalised values;
-    the learning rate falls to zero over each engine's own seconds). fraction_of_peak: arithmetic of the MLP alone over the rate of a
-    large float32 matrix product measured here.
+    Each engine trains for `seconds` in three turns, and evaluates bricks in each. The result has
+    the keys `engines`, `machine`, `series`, `samples` and `batch_samples`. An entry of `engines`:
+
+    - `train_msamples_s`, `infer_msamples_s`: coreset vertices, in 10^6 a second, medians over the
+      turns.
+    - `train_ratio`, `infer_ratio`: speeds over those of the naive engine in the same run.
+    - `fraction_of_peak`: arithmetic of the MLP alone over the rate of a large float32 matrix
+      product.
+    - `psnr`: dB on the coreset after those seconds, of normalised values. The learning rate falls
+      to zero over each engine's own seconds.
+    - `epochs`, `seconds`: of training.
+
     Raises InputError for an unknown engine or seconds that are not positive.
     """
     config = config or EncodeConfig(profile="paper")
     if seconds <= 0 or not engines:
         raise InputError(
-            f"seconds is {seconds:g} for {len(engines)} engines; a positive time and at least one engine are needed"
+            f"seconds is {seconds:g} for {len(engines)} engines;"
+            " a positive time and at least one engine are needed"
         )
     device = choose_device(config.device)
     with open_source(source) as series:
@@ -97,13 +107,13 @@ class _Run:
         name: str,
         architecture: Architecture,
         coreset: Coreset,
-        plan: Plan,
+        plan: TrainingPlan,
         seconds: float,
         device: torch.device,
     ) -> None:
         self.name, self.coreset, self.plan, self.device = name, coreset, plan, device
         self.counts = np.diff(coreset.offsets)
-        # A first step, not counted, says how many fit in the seconds; the cosine over them is set then.
+        # A first step, not counted, tells how many steps fit in the time; the schedule needs that.
         rate = float(plan.rates[-1])
         engine = make_engine(
             name, architecture, coreset, np.full(3, rate), seed=plan.seed, device=device

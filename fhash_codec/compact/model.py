@@ -1,4 +1,4 @@
-"""The compact profile's model: lattice values in a table, linear between vertices and between steps. numpy only."""
+"""The model of a compact file: values at vertices in a table, linear between them. numpy only."""
 
 from __future__ import annotations
 
@@ -10,15 +10,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
-from fhash_codec.paper.regions import Box
 from fhash_formats.container import StoredArray
 
 Positions = npt.NDArray[np.float64]
+"""Coordinates of some points along one axis."""
 
 
 class CompactModel:
-    """A `VolumeModel` (volume_model.py) of a compact file: values (t, z, y, x) at the vertices of the feature bounding box."""
+    """A `VolumeModel` (volume_model.py) of a compact file.
+
+    Its table holds values (t, z, y, x) at the vertices of the feature bounding box.
+    """
 
     def __init__(self, arrays: Mapping[str, StoredArray]) -> None:
         self._arrays = arrays
@@ -26,7 +30,7 @@ class CompactModel:
         self.chunks = self._array.chunk_shape
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
-        """Which vertices (z, y, x) of a region of the box are in the coreset at step `first` and at step `last`."""
+        """Return which vertices (z, y, x) of a region are in the coreset at both of two steps."""
         # Between steps both count: a value is no better than the two it lies between.
         space = tuple(slice(low, high) for low, high in region)
         if "occupancy/mask" in self._arrays:
@@ -40,8 +44,12 @@ class CompactModel:
         z, y, x = self._array.shape[1:]
         return unpack(bits[0] & bits[-1], (z, y, x))[space]
 
-    def region(self, step: float, region: Box, wanted: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
-        """Values (z, y, x) of a region of the box at a step, as they are stored; between steps, linear in the step, float64."""
+    def read(self, step: float, region: Box, requested: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+        """Return the values (z, y, x) of a region of the box at a step.
+
+        At a stored step they have the type of the source; between steps they are interpolated
+        linearly, in float64.
+        """
         first = int(np.floor(step))
         weight = step - first
         space = tuple(slice(low, high) for low, high in region)
@@ -51,8 +59,13 @@ class CompactModel:
             values = values.astype(np.float64) * (1 - weight) + steps[1].astype(np.float64) * weight
         return values
 
-    def coarse(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
-        """Every 2^lod-th vertex (z, y, x) of the box at a step, low-passed by each tile on its own; a region of them in coarse vertices."""
+    def read_lod(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
+        """Return every 2^lod-th vertex (z, y, x) of a region of the box at a step.
+
+        Each tile is low-passed on its own.
+
+        region: counted in coarse vertices.
+        """
         tile, stride = self._array.chunk_shape, 1 << lod
         result = np.empty([high - low for low, high in region], dtype=self._array.dtype)
         grid = [
@@ -60,35 +73,37 @@ class CompactModel:
             for (low, high), n in zip(region, tile[1:], strict=True)
         ]
         for index in product(*grid):
-            # A tile that begins between two coarse vertices gives its own lattice; the nearest of its vertices stand for those.
+            # Coarse vertices of the region that lie in the tile.
             ends = [
                 (max(-(-i * n // stride), a), min(-(-(i + 1) * n // stride), b))
                 for i, n, (a, b) in zip(index, tile[1:], region, strict=True)
             ]
             if any(first >= stop for first, stop in ends):
                 continue
-            part = self._array.decode_chunk((step // tile[0], *index), lod)[step % tile[0]]
+            chunk = self._array.decode_chunk((step // tile[0], *index), lod)[step % tile[0]]
             target, source = [], []
             for i, n, (first, stop), (low, _), size in zip(
-                index, tile[1:], ends, region, part.shape, strict=True
+                index, tile[1:], ends, region, chunk.shape, strict=True
             ):
                 target.append(slice(first - low, stop - low))
-                source.append(
-                    np.minimum(
-                        (np.arange(first, stop) * stride - i * n + stride // 2) // stride, size - 1
-                    )
-                )
-            result[tuple(target)] = part[np.ix_(*source)]
+                source.append(_nearest(first, stop, stride, i * n, size))
+            result[tuple(target)] = chunk[np.ix_(*source)]
         return result
 
-    def points(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
-        """Values at points, quadrilinear: steps and (z, y, x) in vertices of the box, all inside."""
+    def sample(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+        """Return the values at points, quadrilinear.
+
+        steps, space: steps and (z, y, x) of the points, in vertices of the box, all inside.
+        """
         return self._interpolated(steps, space)[0]
 
-    def slopes(
+    def sample_with_gradient(
         self, steps: Positions, space: list[Positions]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Values, and derivatives (points, 4) by step, z, y and x; on the border of two cells those of the cell after it."""
+        """Return the values at points, and their derivatives (points, 4) by step, z, y and x.
+
+        On the border of two cells the derivatives are those of the cell after it.
+        """
         values, corners, weights = self._interpolated(steps, space)
         slopes = np.empty((values.size, 4))
         for axis in range(4):
@@ -110,7 +125,11 @@ class CompactModel:
     def _interpolated(
         self, steps: Positions, space: list[Positions]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], list[Positions]]:
-        """Values, the 16 corners (2, 2, 2, 2, points) around each point, and the weights of the upper corner along each axis."""
+        """Return the values at points, and what they are interpolated from.
+
+        That is the 16 corners (2, 2, 2, 2, points) around each point, and the weights of the
+        upper corners along each axis.
+        """
         shape = self._array.shape
         low = [
             np.clip(np.floor(p).astype(np.int64), 0, max(n - 2, 0))
@@ -122,7 +141,7 @@ class CompactModel:
         box = tuple(
             (int(i.min()), int(h.max()) + 1) for i, h in zip(low[1:], high[1:], strict=True)
         )
-        space_slices = tuple(slice(*part) for part in box)
+        space_slices = tuple(slice(*span) for span in box)
         for step in np.unique(np.concatenate([low[0], high[0]])):
             frame = self._array.read((slice(int(step), int(step) + 1), *space_slices))[0]
             for corner in product((0, 1), repeat=4):
@@ -133,8 +152,21 @@ class CompactModel:
                     corners[(*corner, chosen)] = frame[where]
         values = np.zeros(steps.size)
         for corner in product((0, 1), repeat=4):
-            parts = [weights[axis] if up else 1 - weights[axis] for axis, up in enumerate(corner)]
+            factors = [weights[axis] if up else 1 - weights[axis] for axis, up in enumerate(corner)]
             # A corner without weight counts for nothing, also where it is not finite.
-            weight = np.asarray(prod(parts))
+            weight = np.asarray(prod(factors))
             values += np.where(weight == 0, 0.0, weight * corners[corner])
         return values, corners, weights
+
+
+def _nearest(first: int, stop: int, stride: int, start: int, size: int) -> npt.NDArray[np.int64]:
+    """Return the vertex of a tile's own coarse lattice that is nearest to each coarse vertex.
+
+    A tile that begins between two coarse vertices has a lattice of its own.
+
+    first, stop: range of the coarse vertices, counted from the beginning of the box.
+    start: first vertex of the tile along the axis.
+    size: vertices of the tile's own coarse lattice.
+    """
+    vertices = np.arange(first, stop) * stride - start
+    return np.minimum((vertices + stride // 2) // stride, size - 1)

@@ -1,245 +1,209 @@
-"""The compact profile: series -> coreset -> plan on a sample -> tiles coded in parallel -> container."""
+"""Coding of all tiles of a series, so that the promise is kept on the whole and not just a sample.
+
+The tiles are coded once for a bound or a size. For a PSNR they are coded again, with other steps,
+until they reach it.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from math import prod
-from typing import Any
 
-from fhash_codec.compact.choices.step import SLOPE, nearer
+from fhash_codec.compact.choices.search import SLOPE
+from fhash_codec.compact.choices.step import psnr_search
 from fhash_codec.compact.choices.transform import refit, usual_transform
+from fhash_codec.compact.coded_table import CodedTable
 from fhash_codec.compact.goal import goal_of
-from fhash_codec.compact.plan import Planned, plan
-from fhash_codec.compact.tiles.blocks import Blocks, Care, Index, Values
+from fhash_codec.compact.plan import CodingPlan, plan
+from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile
 from fhash_codec.compact.tiles.coding import Outcome, code, total
-from fhash_codec.compact.tiles.sample import pool
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
 from fhash_codec.progress import Progress
-from fhash_formats.container import ContainerWriter
 from fhash_formats.series import Series
-from fhash_formats.support.threads import usable_threads
+from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
+
+__all__ = ["code_series"]
 
 OVERHEAD_BYTES = 3000
-"""Of a container without its tiles, roughly; only the search for a ratio needs it."""
-MAX_TILES = 4096
-"""In one shard; a larger table has a shard for each layer of tiles in time."""
+"""Approximate bytes of a container without its tiles; only the search for a ratio needs it."""
 PASSES = 4
-"""Most times that the whole is coded to keep a promise that the sample did not foretell."""
-SAFE, EXCEEDED = 1e-3, 0.05
-"""dB above what was promised: the least to be aimed at, since a promise may not be missed by a rounding; what is worth another pass."""
-QUICK_AIM, QUICK_ROOM = 0.12, 0.35
-"""The same at effort 1, where one pass should do: the foresight is about so precise."""
+"""Times that all tiles are coded at most for a promise that the sample did not foretell."""
+SAFE = 1e-3
+"""dB always added to the PSNR promised, so that rounding cannot break the promise."""
+EXCESS = 0.05
+"""Excess in dB that is worth another pass."""
+QUICK_AIM = 0.12
+"""dB added to the PSNR at effort 1, where one pass should do: the precision of the estimate."""
+QUICK_EXCESS = 0.35
+"""Excess in dB that is worth another pass at effort 1."""
+MARGIN = 0.005
+"""dB added to the PSNR in the second pass; doubled in each further one."""
 UNLIKE = 0.3
-"""dB by which all tiles may be worse than the sample before what was trained on it is dropped."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """The coded table: streams in C order of the tiles, how they were made, what they give."""
-
-    planned: Planned
-    streams: list[bytes]
-    outcome: Outcome
+"""dB by which all tiles may be worse than the sample before the head is dropped."""
+REFIT_RATIO = 1.5
+"""Ratio by which the step must fall before the data's own bases are made anew."""
 
 
 def code_series(
-    series: Series, found: FeatureSelection, config: EncodeConfig, progress: Progress
-) -> Table:
+    series: Series, selection: FeatureSelection, config: EncodeConfig, progress: Progress
+) -> CodedTable:
     """Plan and code all tiles so that the promise of the settings is kept, if it can be."""
-    value_range, extent = found.scanned.value_range, found.extent
+    value_range = selection.scanned.value_range
     raw_bytes = prod(series.shape) * series.dtype.itemsize
     goal = goal_of(config, value_range, raw_bytes, OVERHEAD_BYTES)
-    blocks = Blocks(series, extent, series.shape)
+    blocks = Blocks(series, selection.extent, series.shape)
     begun = time.perf_counter()
-    with pool() as workers:
-        planned = plan(
-            blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress, found.features
+    with thread_pool() as workers:
+        coding_plan = plan(
+            blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress, selection.features
         )
         if goal.psnr is None or goal.data_range == 0:
-            streams, outcome = _code_all(planned, workers, progress)
-            best = Table(planned=planned, streams=streams, outcome=outcome)
+            table = _code_all(coding_plan, workers, progress)
         else:
-            best = _to_psnr(
-                planned, goal.psnr, quick=config.effort == 1, workers=workers, progress=progress
-            )
-    gains = best.planned.gains
-    gains.append(
-        {
-            "what": "all tiles",
-            "bytes": best.outcome.size + OVERHEAD_BYTES,
-            "seconds": round(time.perf_counter() - begun, 3),
-        }
-    )
-    return best
+            aim = _Aim(psnr=goal.psnr, data_range=goal.data_range, quick=config.effort == 1)
+            table = _code_to_psnr(coding_plan, aim, workers, progress)
+    gain = {
+        "what": "all tiles",
+        "bytes": table.outcome.size + OVERHEAD_BYTES,
+        "seconds": round(time.perf_counter() - begun, 3),
+    }
+    return replace(table, plan=replace(table.plan, gains=[*table.plan.gains, gain]))
 
 
-def _to_psnr(
-    planned: Planned, psnr: float, *, quick: bool, workers: ThreadPoolExecutor, progress: Progress
-) -> Table:
+@dataclass(frozen=True, kw_only=True)
+class _Aim:
+    """The PSNR promised, and how near to it all tiles should come."""
+
+    psnr: float
+    """PSNR in dB."""
+    data_range: float
+    """Range of the values, in data units."""
+    quick: bool
+    """Whether one pass should do."""
+
+    @property
+    def min_psnr(self) -> float:
+        """PSNR in dB that must be reached."""
+        return self.psnr + SAFE
+
+    def psnr_of(self, outcome: Outcome) -> float:
+        """Return the PSNR of an outcome in dB."""
+        return outcome.psnr(self.data_range)
+
+    def is_met(self, psnr: float, attempt: int) -> bool:
+        """Whether a PSNR keeps the promise, and in the first attempt does not exceed it by much."""
+        if psnr < self.min_psnr:
+            return False
+        excess = QUICK_EXCESS if self.quick else EXCESS
+        return attempt > 0 or psnr < self.psnr + excess or math.isinf(psnr)
+
+    def next_target(self, psnr: float, attempt: int) -> float:
+        """Return the PSNR to search for after an attempt that reached `psnr`."""
+        if self.quick:
+            return self.min_psnr + (EXCESS + abs(psnr - self.psnr) / 8)
+        return self.min_psnr + MARGIN * float(2**attempt)
+
+    def prefers(self, outcome: Outcome, other: Outcome) -> bool:
+        """Whether an outcome keeps the promise in fewer bytes, or misses it by less."""
+        psnr, other_psnr = self.psnr_of(outcome), self.psnr_of(other)
+        if min(psnr, other_psnr) < self.min_psnr:
+            return psnr > other_psnr
+        return outcome.size < other.size
+
+
+def _code_to_psnr(
+    coding_plan: CodingPlan, aim: _Aim, workers: ThreadPoolExecutor, progress: Progress
+) -> CodedTable:
     """Code all tiles until they reach a PSNR.
 
-    Where the tiles turn out to be much worse than the sample said, what was learnt from it is dropped, one after the other: the head, then
-    the data's own bases.
+    Where they turn out much worse than the sample, what was learned from it is dropped, one after
+    the other: the head, then the data's own bases.
     """
-    data_range = planned.goal.data_range
-    least = psnr + SAFE
-    if quick:
-        planned = replace(
-            planned,
-            settings=replace(
-                planned.settings, step=planned.settings.step * (1 - QUICK_AIM / SLOPE)
-            ),
-        )
-    best: Table | None = None
-    for part in _simpler(planned):
-        points: list[tuple[float, float]] = []
-        now = part
-        for attempt in range(PASSES):
-            streams, outcome = _code_all(now, workers, progress)
-            reached = outcome.psnr(data_range)
-            if best is None or _better(outcome, best.outcome, data_range, least):
-                best = Table(planned=now, streams=streams, outcome=outcome)
-            missed = reached < least
-            if not missed and (
-                attempt > 0
-                or reached < psnr + (QUICK_ROOM if quick else EXCEEDED)
-                or math.isinf(reached)
-            ):
-                break
-            if reached < least - UNLIKE and attempt == 0 and now.settings.head is not None:
-                break  # the head does not hold for all tiles
-            points.append((math.log(now.settings.step), reached))
-            margin = 0.005 * 2**attempt if not quick else EXCEEDED + abs(reached - psnr) / 8
-            before = now.settings.step
-            now = replace(now, settings=nearer(now.settings, points, least + margin))
-            if now.sample is not None and now.settings.step < before / 1.5:
-                now = replace(now, settings=refit(now.sample, now.settings))
-        if best is not None and best.outcome.psnr(data_range) >= least:
+    if aim.quick:
+        step = coding_plan.settings.step * (1 - QUICK_AIM / SLOPE)
+        coding_plan = replace(coding_plan, settings=replace(coding_plan.settings, step=step))
+    best: CodedTable | None = None
+    for simpler_plan in _simpler_plans(coding_plan):
+        best = _search_psnr(simpler_plan, aim, best, workers, progress)
+        if aim.psnr_of(best.outcome) >= aim.min_psnr:
             break
     assert best is not None
     return best
 
 
-def _simpler(planned: Planned) -> Iterator[Planned]:
-    """What was planned, then without its head, then with wavelets alone."""
-    settings = planned.settings
-    yield planned
+def _search_psnr(
+    coding_plan: CodingPlan,
+    aim: _Aim,
+    best: CodedTable | None,
+    workers: ThreadPoolExecutor,
+    progress: Progress,
+) -> CodedTable:
+    """Code all tiles with step after step; the best table of these and of the one given."""
+    search = psnr_search(coding_plan.settings)
+    for attempt in range(PASSES):
+        table = _code_all(coding_plan, workers, progress)
+        psnr = aim.psnr_of(table.outcome)
+        if best is None or aim.prefers(table.outcome, best.outcome):
+            best = table
+        if aim.is_met(psnr, attempt):
+            break
+        settings = coding_plan.settings
+        if psnr < aim.min_psnr - UNLIKE and attempt == 0 and settings.head is not None:
+            break  # the head does not hold for all tiles
+        search.add(settings.step, psnr)
+        step = search.step_for(aim.next_target(psnr, attempt))
+        coding_plan = replace(coding_plan, settings=replace(settings, step=step))
+        if coding_plan.sample is not None and step < settings.step / REFIT_RATIO:
+            refitted = refit(coding_plan.sample, coding_plan.settings)
+            coding_plan = replace(coding_plan, settings=refitted)
+    assert best is not None
+    return best
+
+
+def _simpler_plans(coding_plan: CodingPlan) -> Iterator[CodingPlan]:
+    """Yield the plan itself, then without its head, then with wavelets instead of own bases."""
+    settings = coding_plan.settings
+    yield coding_plan
     if settings.head is not None:
         settings = replace(settings, head=None)
-        yield replace(planned, settings=settings)
+        yield replace(coding_plan, settings=settings)
     if any(axis.basis is not None for axis in settings.transform.axes):
-        yield replace(
-            planned, settings=replace(settings, transform=usual_transform(planned.blocks.tile))
-        )
-
-
-def _better(one: Outcome, other: Outcome, data_range: float, least: float) -> bool:
-    """Whether an outcome is to be taken instead of another: it keeps the promise in fewer bytes, or misses it by less."""
-    reached, before = one.psnr(data_range), other.psnr(data_range)
-    if min(reached, before) < least:
-        return reached > before
-    return one.size < other.size
-
-
-def write_table(writer: ContainerWriter, table: Table) -> None:
-    """Write the table; where the coreset is not the whole box, its tiles say what is in it."""
-    blocks, settings = table.planned.blocks, table.planned.settings
-    writer.add_sharded(
-        "tables/level_1",
-        shape=blocks.shape,
-        dtype=blocks.dtype,
-        chunk_shape=blocks.tile,
-        shard_shape=_shard(blocks.tile, blocks.grid),
-        chunks=iter(table.streams),
-        dimension_names=("t", "z", "y", "x"),
-        codecs=[
-            {"name": "fhash.transform", "configuration": settings.to_dict()},
-            {"name": "crc32c"},
-        ],
-    )
-
-
-def compact_header(table: Table, config: EncodeConfig) -> dict[str, Any]:
-    """What a compact file's header says of its model."""
-    blocks, settings, outcome = table.planned.blocks, table.planned.settings, table.outcome
-    weights = (
-        0
-        if settings.head is None
-        else sum(layer.weights.size + layer.biases.size for layer in settings.head.layers)
-    )
-    head = (
-        None
-        if settings.head is None
-        else {"hidden": list(settings.head.hidden), "cross": settings.head.cross}
-    )
-    return {
-        "profile": "compact",
-        "levels": [list(blocks.shape)],
-        "embedding_size": 1,
-        "tables": blocks.dtype.name,
-        "parameters": outcome.nonzero + weights,
-        "head": head,
-        "gains": [
-            {name: value for name, value in gain.items() if config.timings or name != "seconds"}
-            for gain in table.planned.gains
-        ],
-    }
-
-
-def required_features(table: Table) -> list[str]:
-    """What a reader of the file must know."""
-    return ["transform", *table.planned.settings.features]
+        transform = usual_transform(coding_plan.blocks.tile)
+        yield replace(coding_plan, settings=replace(settings, transform=transform))
 
 
 def _code_all(
-    planned: Planned, workers: ThreadPoolExecutor, progress: Progress
-) -> tuple[list[bytes], Outcome]:
-    """Code every tile; a few are on their way at a time, so that memory stays bounded."""
-    blocks, settings, coding = planned.blocks, planned.settings, planned.coding
-    everything = prod(blocks.grid)
-    streams: list[bytes] = []
-    outcomes: list[Outcome] = []
-    waiting: deque[Future[tuple[bytes, Outcome]]] = deque()
+    coding_plan: CodingPlan, workers: ThreadPoolExecutor, progress: Progress
+) -> CodedTable:
+    """Code every tile; few tiles are worked on at a time, so that memory stays bounded."""
+    blocks = coding_plan.blocks
+    filled_tiles: dict[Index, Tile] = {}
+    if coding_plan.sample is not None and coding_plan.coding.filled:
+        # Reuse the tiles that the search has already filled.
+        sample = coding_plan.sample
+        filled_tiles = dict(zip(sample.indices, sample.tiles, strict=True))
 
-    # Of what the search filled already, nothing else is looked for.
-    known = (
-        {}
-        if planned.sample is None or not coding.filled
-        else dict(zip(planned.sample.indices, planned.sample.tiles, strict=True))
-    )
+    def source(index: Index) -> Index | Tile:
+        """Return a tile, or its index where the workers may read it themselves."""
+        if index in filled_tiles:
+            return filled_tiles[index]
+        return index if blocks.in_memory else blocks.read(index)
 
-    def work(tile: Index | tuple[Values, Care]) -> tuple[bytes, Outcome]:
-        values, care = blocks.read(tile) if len(tile) == 4 else tile
-        coded, outcome = code(values, care, settings, coding)
+    def work(source: Index | Tile) -> tuple[bytes, Outcome]:
+        tile = source if isinstance(source, Tile) else blocks.read(source)
+        coded, outcome = code(tile, coding_plan.settings, coding_plan.coding)
         return coded.data, outcome
 
-    def collect() -> None:
-        data, outcome = waiting.popleft().result()
+    streams: list[bytes] = []
+    outcomes: list[Outcome] = []
+    sources = (source(index) for index in blocks.indices())
+    for data, outcome in map_ahead(workers, work, sources, 2 * usable_threads()):
         streams.append(data)
         outcomes.append(outcome)
-        progress("coding", len(streams), everything, "")
-
-    for index in blocks.indices():
-        waiting.append(
-            workers.submit(
-                work,
-                known[index] if index in known else index if blocks.held else blocks.read(index),
-            )
-        )
-        if len(waiting) > 2 * usable_threads():
-            collect()
-    while waiting:
-        collect()
-    return streams, total(outcomes)
-
-
-def _shard(tile: Index, grid: Index) -> tuple[int, ...]:
-    """One shard for everything, or for one layer of tiles in time where there are many."""
-    layers = grid[0] if prod(grid) <= MAX_TILES else 1
-    return (layers * tile[0], *(n * count for n, count in zip(tile[1:], grid[1:], strict=True)))
+        progress("coding", len(streams), prod(blocks.grid), "")
+    return CodedTable(plan=coding_plan, streams=streams, outcome=total(outcomes))

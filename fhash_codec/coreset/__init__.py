@@ -1,1 +1,1 @@
-"""What of a series counts, before any model: key frames, features, occupancy and the box around them."""
+"""The part of a series that a model is made of: key frames, features, masks and their box."""

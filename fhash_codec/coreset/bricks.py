@@ -1,7 +1,9 @@
-"""The training samples: the vertices of the dilated features, gathered in bricks of the feature bounding box (paper, Coreset Selection).
+"""The training samples: the vertices of the dilated features, gathered in bricks of their box.
 
-Two passes over the key frames, one frame at a time. The first keeps one bit per vertex of the domain and finds the box; the second
-crops, normalises and gathers the values of the selected vertices brick by brick.
+It takes two passes over the key frames, one frame at a time. The first pass finds the feature
+bounding box and keeps one bit per vertex of the domain (extent.py). The second pass crops,
+normalises and gathers the values of the selected vertices, brick by brick. Source: the paper,
+Coreset Selection.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset import occupancy
-from fhash_codec.coreset.boxes import Box, Sizes, box_size, crop
+from fhash_codec.coreset.boxes import Box, Sizes
 from fhash_codec.coreset.extent import find_extent
 from fhash_codec.coreset.features import Feature
 from fhash_codec.coreset.scan import Scan
@@ -22,8 +24,9 @@ from fhash_codec.progress import Progress
 from fhash_formats.series import Series
 
 Scalar = TypeVar("Scalar", bound=np.generic)
+
 BRICK_BITS = (3, 3, 4)
-"""The usual brick, 8 x 8 x 16 vertices (z, y, x), as exponents of two."""
+"""Exponents of two of the usual brick: 8 x 8 x 16 vertices (z, y, x)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,15 +36,19 @@ class Coreset:
     Attributes:
         box: the feature bounding box, fused over the key frames.
         key_frames: steps that the samples are from.
-        brick_shape: vertices of a brick (z, y, x), 1024 or fewer in all by default.
-        brick_grid: bricks along each axis of the box (z, y, x); the last of an axis may reach beyond the box.
-        bricks: int32 (n, 4), (key index, z, y, x) in the brick grid, of the bricks that hold a sample, ascending.
-        mask_bits: uint8 (n, ceil(vertices of a brick / 8)), np.packbits of each brick in C order, 1 = sample.
-        values: float32 (samples,) in [0, 1], brick by brick, in C order within a brick, samples only.
-        offsets: int64 (n + 1,), where each brick begins in `values`.
-        occupancy: one grid per key frame, ragged Morton over the box; its voxels are the samples.
+        brick_shape: vertices of a brick (z, y, x), at most 1024 in all by default.
+        brick_grid: bricks along each axis of the box (z, y, x). The last brick of an axis may reach
+            beyond the box.
+        bricks: int32 (n, 4), one row (key index, z, y, x) in the brick grid for each brick that
+            holds a sample, ascending.
+        mask_bits: uint8 (n, ceil(vertices of a brick / 8)), np.packbits of each brick in C order,
+            1 = sample.
+        values: float32 (samples,) in [0, 1], samples only: brick by brick, in C order in a brick.
+        offsets: int64 (n + 1,), the place in `values` where each brick begins, and their end.
+        occupancy: one grid per key frame, in ragged Morton order over the box, 1 = sample.
         fraction: samples / (key frames * vertices of the domain).
-        background: mean of the finite values outside the coreset over the key frames, in data units; of all values if none is outside.
+        background: mean of the finite values outside the coreset over the key frames, in data
+            units; the mean of all values if none is outside.
     """
 
     box: Box
@@ -69,41 +76,43 @@ def build_coreset(
 ) -> Coreset:
     """The coreset of a series: finite vertices of the merged features, dilated, at every key frame.
 
-    `features` are resolved, `dilation` is in vertices, `brick` replaces the default brick shape. Raises InputError if the features
-    select nothing at all; single key frames may be empty. Warns of a feature
-    that selects nothing while others do. Progress stages: "selecting", "gathering".
+    features: resolved, see `resolve_features`.
+    dilation: in vertices.
+    brick: the shape of a brick (z, y, x); `brick_shape` of the box if None.
+
+    Raises InputError if the features select nothing at all; single key frames may be empty. Warns
+    of a feature that selects nothing while others do. Progress stages: "selecting", "gathering".
     """
     extent = find_extent(series, scan, key_frames, features, dilation, progress)
     box, samples = extent.box, extent.samples
-    size = box_size(box)
+    size = box.shape
     shape = brick or brick_shape(size)
     grid = (-(-size[0] // shape[0]), -(-size[1] // shape[1]), -(-size[2] // shape[2]))
     values = np.empty(samples, dtype=np.float32)
-    grids, layers, filled = [], [], 0
+    grids, layers, end = [], [], 0
     for key, step in enumerate(key_frames):
         mask = extent.mask(key)
         grids.append(occupancy.pack(mask))
-        frame = crop(series.read(step), box)
+        frame = series.read(step)[box.slices()]
         for layer in range(grid[0]):
             rows = slice(layer * shape[0], (layer + 1) * shape[0])
-            tiles = tile(mask[rows], shape)
+            in_coreset = tile(mask[rows], shape)
             # Boolean indexing walks brick by brick, in C order within a brick.
-            found = scan.value_range.to_unit(tile(frame[rows], shape)[tiles])
-            values[filled : filled + found.size] = found
-            filled += found.size
-            layers.append(_layer_bricks(tiles, key, layer))
+            samples_of_layer = scan.value_range.to_unit(tile(frame[rows], shape)[in_coreset])
+            start, end = end, end + samples_of_layer.size
+            values[start:end] = samples_of_layer
+            layers.append(_layer_bricks(in_coreset, key, layer))
         progress("gathering", key + 1, len(key_frames), "")
+    bricks, mask_bits, counts = (np.concatenate(arrays) for arrays in zip(*layers, strict=True))
     return Coreset(
         box=box,
         key_frames=tuple(key_frames),
         brick_shape=shape,
         brick_grid=grid,
-        bricks=np.concatenate([coordinates for coordinates, _, _ in layers]),
-        mask_bits=np.concatenate([bits for _, bits, _ in layers]),
+        bricks=bricks,
+        mask_bits=mask_bits,
         values=values,
-        offsets=np.cumsum(
-            np.concatenate([np.zeros(1, dtype=np.int64), *(counts for _, _, counts in layers)])
-        ),
+        offsets=np.cumsum(np.concatenate([np.zeros(1, dtype=np.int64), counts])),
         occupancy=tuple(grids),
         fraction=extent.fraction,
         background=extent.background,
@@ -111,39 +120,43 @@ def build_coreset(
 
 
 def brick_shape(size: Sizes) -> Sizes:
-    """Vertices of a brick (z, y, x) for a box of that size: 8 x 8 x 16, and where an axis is shorter the factors of two go to the others.
+    """Vertices of a brick (z, y, x) for a box of some size: 8 x 8 x 16 for a box that is not thin.
 
-    No axis gets more than the power of two that covers it; the product is 1024, or less where the whole box is smaller. Then the
-    bricks of an axis are made as short as their number allows, so that few of their vertices lie beyond the box.
+    A shorter axis passes its factors of two on to the other axes. No axis gets more than the power
+    of two that covers it. The product is 1024, or less if the box is smaller. In the end the bricks
+    of an axis are made as short as their number allows, so that few vertices lie beyond the box.
     """
-    room = [(axis - 1).bit_length() for axis in size]
-    bits = [min(usual, most) for usual, most in zip(BRICK_BITS, room, strict=True)]
-    while sum(bits) < sum(BRICK_BITS) and bits != room:
-        # The thinnest axis that has room; x before y before z where equal, since x is contiguous.
-        axis = min(
-            (axis for axis in (2, 1, 0) if bits[axis] < room[axis]), key=lambda axis: bits[axis]
-        )
-        bits[axis] += 1
-    counts = [-(-axis // 2**bit) for axis, bit in zip(size, bits, strict=True)]
-    z, y, x = (-(-axis // count) for axis, count in zip(size, counts, strict=True))
+    max_bits = [(length - 1).bit_length() for length in size]
+    bits = [min(usual, limit) for usual, limit in zip(BRICK_BITS, max_bits, strict=True)]
+    while sum(bits) < sum(BRICK_BITS) and bits != max_bits:
+        # The thinnest axis that may grow; x before y before z if equal, since x is contiguous.
+        growing = [axis for axis in (2, 1, 0) if bits[axis] < max_bits[axis]]
+        bits[min(growing, key=lambda axis: bits[axis])] += 1
+    counts = [-(-length // 2**bit) for length, bit in zip(size, bits, strict=True)]
+    z, y, x = (-(-length // count) for length, count in zip(size, counts, strict=True))
     return z, y, x
 
 
 def tile(layer: npt.NDArray[Scalar], shape: Sizes) -> npt.NDArray[Scalar]:
-    """One layer of bricks of a box, (up to brick z, y, x), as (grid y, grid x, brick z, y, x); zeros fill the bricks beyond the box."""
+    """One layer of a box, cut into bricks: (grid y, grid x, brick z, brick y, brick x).
+
+    layer: (z, y, x) of the box, with z at most the height of a brick.
+    shape: vertices of a brick (z, y, x). Zeros fill the bricks that reach beyond the box.
+    """
     _, y, x = layer.shape
     rows, columns = -(-y // shape[1]), -(-x // shape[2])
-    whole = np.zeros((shape[0], rows * shape[1], columns * shape[2]), dtype=layer.dtype)
-    whole[: layer.shape[0], :y, :x] = layer
-    return whole.reshape(shape[0], rows, shape[1], columns, shape[2]).transpose(1, 3, 0, 2, 4)
+    padded = np.zeros((shape[0], rows * shape[1], columns * shape[2]), dtype=layer.dtype)
+    padded[: layer.shape[0], :y, :x] = layer
+    return padded.reshape(shape[0], rows, shape[1], columns, shape[2]).transpose(1, 3, 0, 2, 4)
 
 
 def _layer_bricks(
-    tiles: npt.NDArray[np.bool_], key: int, layer: int
+    in_coreset: npt.NDArray[np.bool_], key: int, layer: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.uint8], npt.NDArray[np.int64]]:
-    """Coordinates (n, 4), packed masks and numbers of samples of the bricks of one layer that hold a sample."""
-    flat = tiles.reshape(*tiles.shape[:2], -1)
+    """Coordinates (n, 4), packed masks and sample counts of the bricks of a layer with a sample."""
+    flat = in_coreset.reshape(*in_coreset.shape[:2], -1)
     y, x = np.nonzero(flat.any(axis=2))
-    kept = flat[y, x]
+    masks = flat[y, x]
     coordinates = np.stack([np.full_like(y, key), np.full_like(y, layer), y, x], axis=1)
-    return coordinates.astype(np.int32), np.packbits(kept, axis=1), kept.sum(axis=1, dtype=np.int64)
+    counts = masks.sum(axis=1, dtype=np.int64)
+    return coordinates.astype(np.int32), np.packbits(masks, axis=1), counts

@@ -1,4 +1,4 @@
-"""The extent of the coreset: one bit per vertex of the domain."""
+"""The extent of the coreset: its box, and one bit per vertex of the domain and key frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box, Sizes, bounding_box, crop, fuse
+from fhash_codec.coreset.boxes import Box, Sizes, bounding_box, fuse
 from fhash_codec.coreset.features import Everything, Feature, dilate
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import Mean
@@ -22,15 +22,16 @@ from fhash_formats.series import Series
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Extent:
-    """Where the coreset lies, one bit per vertex of the domain.
+    """The vertices of the coreset at every key frame.
 
     Attributes:
         box: the feature bounding box, fused over the key frames.
         key_frames: steps at which the features were found.
         packed: np.packbits of the mask (z, y, x) of the domain at each key frame.
-        domain: its shape (z, y, x).
+        domain: shape (z, y, x) of the domain.
         samples: vertices of the coreset over all key frames.
-        background: mean of the finite values outside the coreset over the key frames, in data units; of all values if none is outside.
+        background: mean of the finite values outside the coreset over the key frames, in data
+            units; the mean of all values if none is outside.
     """
 
     box: Box
@@ -46,13 +47,12 @@ class Extent:
         return self.samples / (len(self.key_frames) * prod(self.domain))
 
     def mask(self, key: int) -> npt.NDArray[np.bool_]:
-        """Which vertices (z, y, x) of the box are in the coreset at a key frame."""
-        whole = (
-            np.unpackbits(self.packed[key], count=prod(self.domain))
-            .view(np.bool_)
-            .reshape(self.domain)
-        )
-        return crop(whole, self.box)
+        """Mask (z, y, x) of the vertices of the box that are in the coreset.
+
+        key: index of a key frame.
+        """
+        bits = np.unpackbits(self.packed[key], count=prod(self.domain))
+        return bits.view(np.bool_).reshape(self.domain)[self.box.slices()]
 
 
 def find_extent(
@@ -63,43 +63,36 @@ def find_extent(
     dilation: int,
     progress: Progress,
 ) -> Extent:
-    """Where the coreset lies: finite vertices of the merged features, dilated, at every key frame; raises and warns as `build_coreset`."""
-    packed: list[npt.NDArray[np.uint8]] = []
-    bounds, outside, samples = [], Mean(), 0
+    """The extent of the finite vertices of the merged features, dilated, at every key frame.
+
+    Parameters, errors, warnings and the progress stage "selecting" as in `build_coreset`.
+    """
     z, y, x = series.shape[1:]
     if not scan.missing and any(isinstance(feature, Everything) for feature in features):
-        # Nothing to look at: one mask of ones for all.
-        whole = np.packbits(np.ones((z, y, x), dtype=bool))
-        for done in range(len(key_frames)):
-            progress("selecting", done + 1, len(key_frames), "")
-        return Extent(
-            box=((0, z), (0, y), (0, x)),
-            key_frames=tuple(key_frames),
-            packed=[whole] * len(key_frames),
-            domain=(z, y, x),
-            samples=len(key_frames) * z * y * x,
-            background=scan.mean,
-        )
-    idle = set(features)
+        return _everywhere(scan, key_frames, (z, y, x), progress)
+    packed: list[npt.NDArray[np.uint8]] = []
+    boxes, outside, samples = [], Mean(), 0
+    without_vertices = set(features)
     for done, step in enumerate(key_frames):
         frame = series.read(step)
-        selected = [feature.select(frame, step) for feature in features]
-        idle -= {feature for feature, found in zip(features, selected, strict=True) if found.any()}
-        mask, finite = _dilated(np.logical_or.reduce(selected), step, scan, dilation)
+        masks = [feature.select(frame, step) for feature in features]
+        without_vertices -= {
+            feature for feature, mask in zip(features, masks, strict=True) if mask.any()
+        }
+        mask, finite = _dilated(np.logical_or.reduce(masks), step, scan, dilation)
         packed.append(np.packbits(mask))
-        bounds.append(bounding_box(mask))
+        boxes.append(bounding_box(mask))
         samples += int(np.count_nonzero(mask))
         _add_outside(outside, frame, mask, finite)
         progress("selecting", done + 1, len(key_frames), "")
-    box = fuse(bounds)
+    box = fuse(boxes)
     if box is None:
         low, high = scan.value_range.low, scan.value_range.high
         names = ", ".join(str(feature) for feature in features)
         raise InputError(
             f"feature {names} selects nothing; values range from {low:.9g} to {high:.9g}"
         )
-
-    for feature in sorted(map(str, idle)):
+    for feature in sorted(map(str, without_vertices)):
         warnings.warn(
             f"feature {feature} selects nothing; the others do", FhashWarning, stacklevel=2
         )
@@ -113,10 +106,28 @@ def find_extent(
     )
 
 
+def _everywhere(scan: Scan, key_frames: Sequence[int], domain: Sizes, progress: Progress) -> Extent:
+    """The extent of a coreset that holds every vertex; no frame is read for it."""
+    all_ones = np.packbits(np.ones(domain, dtype=bool))
+    for done in range(len(key_frames)):
+        progress("selecting", done + 1, len(key_frames), "")
+    return Extent(
+        box=Box.of_shape(domain),
+        key_frames=tuple(key_frames),
+        packed=[all_ones] * len(key_frames),
+        domain=domain,
+        samples=len(key_frames) * prod(domain),
+        background=scan.mean,
+    )
+
+
 def _dilated(
     mask: npt.NDArray[np.bool_], step: int, scan: Scan, dilation: int
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_] | None]:
-    """The finite vertices of a feature once it has grown, and which vertices are finite at all (None: all)."""
+    """Masks (z, y, x) of the finite vertices of the dilated mask, and of all finite vertices.
+
+    The second mask is None if every vertex is finite.
+    """
     mask = dilate(mask, dilation)
     z, y, x = mask.shape
     finite = scan.finite(step, (z, y, x))
@@ -131,7 +142,10 @@ def _add_outside(
     mask: npt.NDArray[np.bool_],
     finite: npt.NDArray[np.bool_] | None,
 ) -> None:
-    """Take the finite values outside the coreset into a mean, plane by plane so that their float64 copy stays small."""
+    """Add the finite values outside the coreset to a mean.
+
+    Planes are added one by one, so that their float64 copies stay small.
+    """
     for z, plane in enumerate(frame):
         outside = ~mask[z] if finite is None else finite[z] & ~mask[z]
         mean.add(plane[outside])

@@ -1,4 +1,7 @@
-"""Which vertices of a frame a user cares about (paper, Feature Extraction and Feature Dilation)."""
+"""Features: the regions of interest of a frame, and their dilation.
+
+Source: the paper, Feature Extraction and Feature Dilation.
+"""
 
 from __future__ import annotations
 
@@ -19,31 +22,39 @@ from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 
 Frame = npt.NDArray[Any]
-Selection = npt.NDArray[np.bool_]
-OpenMask = Callable[[str, tuple[int, int, int, int]], Callable[[int], Selection]]
-"""(path, shape of the series) -> (step -> bool (z, y, x)), as fhash_formats.readers.open_mask."""
+"""Values (z, y, x) of one step."""
+
+FrameMask = npt.NDArray[np.bool_]
+"""Booleans (z, y, x) of one step."""
+
+OpenMask = Callable[[str, tuple[int, int, int, int]], Callable[[int], FrameMask]]
+"""(path, shape of the series) -> (step -> FrameMask), as fhash_formats.readers.open_mask."""
 
 KINDS = "interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE, all"
+"""Forms of a feature, for error messages."""
+
 BINS = 1024
+"""Bins of the histogram for Otsu's threshold."""
 
 
 class Feature(ABC):
-    """A region of interest; `str` of it is the text that `parse_feature` reads.
+    """A region of interest; `str(feature)` is the text that `parse_feature` reads.
 
-    Thresholds are rounded to the number type of a floating frame before they are compared, as numpy does: in a float32 frame
-    `interval:0.1:0.3` includes the value 0.3. Integers are compared as float64. NaN and infinite vertices are never selected.
+    Thresholds are rounded to the number type of a floating-point frame before the comparison, as
+    numpy does: in a float32 frame `interval:0.1:0.3` includes the value 0.3. Integers are compared
+    as float64. NaN and infinite vertices are never selected.
     """
 
     @abstractmethod
-    def select(self, frame: Frame, step: int) -> Selection:
-        """The vertices of the feature in a frame (z, y, x) of data values: bool of the same shape."""
+    def select(self, frame: Frame, step: int) -> FrameMask:
+        """Mask (z, y, x) of the vertices of the feature in a frame of data values."""
 
 
 @dataclass(frozen=True)
 class Everything(Feature):
     """Every finite vertex."""
 
-    def select(self, frame: Frame, step: int) -> Selection:
+    def select(self, frame: Frame, step: int) -> FrameMask:
         return np.isfinite(frame)
 
     def __str__(self) -> str:
@@ -52,7 +63,7 @@ class Everything(Feature):
 
 @dataclass(frozen=True)
 class Interval(Feature):
-    """Vertices with low <= value <= high; an end may be infinite."""
+    """Vertices with low <= value <= high; both ends may be infinite."""
 
     low: float
     high: float
@@ -61,10 +72,10 @@ class Interval(Feature):
         if not self.low <= self.high:
             raise InputError(f"feature '{self}' is empty; write interval:LO:HI with LO <= HI")
 
-    def select(self, frame: Frame, step: int) -> Selection:
-        selected: Selection = np.isfinite(frame)
-        selected &= frame >= _alike(self.low, frame)
-        selected &= frame <= _alike(self.high, frame)
+    def select(self, frame: Frame, step: int) -> FrameMask:
+        selected: FrameMask = np.isfinite(frame)
+        selected &= frame >= _as_frame_type(self.low, frame)
+        selected &= frame <= _as_frame_type(self.high, frame)
         return selected
 
     def __str__(self) -> str:
@@ -73,16 +84,20 @@ class Interval(Feature):
 
 @dataclass(frozen=True)
 class Isosurface(Feature):
-    """Both ends of every lattice edge (along z, y or x) whose ends lie strictly on either side of the value, and vertices exactly on it."""
+    """Vertices beside an isosurface.
+
+    They are both ends of every grid edge (along z, y or x) whose ends lie strictly on either side
+    of the value, and the vertices that have the value itself.
+    """
 
     value: float
 
-    def select(self, frame: Frame, step: int) -> Selection:
-        value, finite = _alike(self.value, frame), np.isfinite(frame)
-        selected: Selection = frame == value
+    def select(self, frame: Frame, step: int) -> FrameMask:
+        value, finite = _as_frame_type(self.value, frame), np.isfinite(frame)
+        selected: FrameMask = frame == value
         selected &= finite
-        above: Selection = (frame > value) & finite
-        below: Selection = (frame < value) & finite
+        above: FrameMask = (frame > value) & finite
+        below: FrameMask = (frame < value) & finite
         for axis in range(3):
             high, low, ends = (np.moveaxis(mask, axis, 0) for mask in (above, below, selected))
             crossed = (high[:-1] & low[1:]) | (low[:-1] & high[1:])
@@ -96,17 +111,21 @@ class Isosurface(Feature):
 
 @dataclass(frozen=True)
 class Segmentation(Feature):
-    """The foreground: vertices strictly above the threshold. None stands for Otsu's, which `resolve_features` fills in."""
+    """The foreground: vertices strictly above a threshold.
+
+    The threshold None stands for Otsu's threshold, which `resolve_features` fills in.
+    """
 
     threshold: float | None = None
 
-    def select(self, frame: Frame, step: int) -> Selection:
+    def select(self, frame: Frame, step: int) -> FrameMask:
         if self.threshold is None:
             raise InputError(
-                "feature 'segmentation' has no threshold yet; resolve_features finds Otsu's from the data"
+                "feature 'segmentation' has no threshold yet; "
+                "resolve_features finds Otsu's from the data"
             )
-        selected: Selection = np.isfinite(frame)
-        selected &= frame > _alike(self.threshold, frame)
+        selected: FrameMask = np.isfinite(frame)
+        selected &= frame > _as_frame_type(self.threshold, frame)
         return selected
 
     def __str__(self) -> str:
@@ -115,27 +134,36 @@ class Segmentation(Feature):
 
 @dataclass(frozen=True)
 class Mask(Feature):
-    """Vertices that a file of booleans marks, so that any detector fits; `read` gives its mask (z, y, x) of a step once it is open."""
+    """Vertices that a file of booleans marks; any detector can write such a file.
+
+    Attributes:
+        path: of the file.
+        read: step -> mask (z, y, x) of the open file; None until `resolve_features` opens it.
+    """
 
     path: str
-    read: Callable[[int], Selection] | None = field(default=None, compare=False, repr=False)
+    read: Callable[[int], FrameMask] | None = field(default=None, compare=False, repr=False)
 
-    def select(self, frame: Frame, step: int) -> Selection:
+    def select(self, frame: Frame, step: int) -> FrameMask:
         if self.read is None:
             raise InputError(f"feature '{self}' is not open yet; resolve_features opens it")
-        marked = self.read(step)
-        if marked.shape != frame.shape:
+        mask = self.read(step)
+        if mask.shape != frame.shape:
             raise InputError(
-                f"feature '{self}': the mask of step {step} has shape {marked.shape}; the frame has {frame.shape} (z, y, x)"
+                f"feature '{self}': the mask of step {step} has shape {mask.shape}; "
+                f"the frame has {frame.shape} (z, y, x)"
             )
-        return np.isfinite(frame) & marked
+        return np.isfinite(frame) & mask
 
     def __str__(self) -> str:
         return f"mask:{self.path}"
 
 
 def parse_feature(text: str) -> Feature:
-    """The feature that a text names, such as "interval:0.2:1"; raises InputError with the forms that are allowed."""
+    """The feature that a text such as "interval:0.2:1" names.
+
+    Raises InputError, with the forms that are allowed.
+    """
     kind, *rest = text.split(":", 1)
     values = rest[0] if rest else None
     if kind == "all" and values is None:
@@ -148,12 +176,10 @@ def parse_feature(text: str) -> Feature:
             *_numbers(text, values, 1, "isosurface:V with a finite number V", finite=True)
         )
     if kind == "segmentation":
+        if values is None:
+            return Segmentation()
         form = "segmentation or segmentation:T with a finite number T"
-        return (
-            Segmentation()
-            if values is None
-            else Segmentation(*_numbers(text, values, 1, form, finite=True))
-        )
+        return Segmentation(*_numbers(text, values, 1, form, finite=True))
     if kind == "mask" and values:
         return Mask(values)
     raise InputError(f"feature '{text}' is not known; allowed: {KINDS}")
@@ -167,18 +193,21 @@ def resolve_features(
     progress: Progress,
     open_mask: OpenMask | None = None,
 ) -> tuple[Feature, ...]:
-    """Parsed features that are ready to select: Otsu's threshold filled in, masks open.
+    """Features that are ready to select: parsed, with Otsu's threshold filled in and masks open.
 
-    Otsu's threshold comes from one histogram (BINS bins over the global range) of the finite values of all key frames; they are read
-    only if a feature needs it. `open_mask` defaults to fhash_formats.readers.open_mask. Progress stage: "thresholding".
+    texts: what `parse_feature` reads.
+    value_range: of the whole series; the histogram for Otsu's threshold spans it.
+    open_mask: opens a mask file; fhash_formats.readers.open_mask if None.
+
+    Otsu's threshold comes from one histogram of the finite values of all key frames. They are read
+    only if a feature needs the threshold. Progress stage: "thresholding".
     """
     features = [parse_feature(text) for text in texts]
     if Segmentation() in features:
         edges = value_range.from_unit(np.linspace(0.0, 1.0, BINS + 1))
-        filled = Segmentation(
-            otsu_threshold(_histogram(series, key_frames, value_range, progress), edges)
-        )
-        features = [filled if feature == Segmentation() else feature for feature in features]
+        histogram = _histogram(series, key_frames, value_range, progress)
+        by_otsu = Segmentation(otsu_threshold(histogram, edges))
+        features = [by_otsu if feature == Segmentation() else feature for feature in features]
     if any(isinstance(feature, Mask) for feature in features) and open_mask is None:
         from fhash_formats.readers import open_mask as open_mask_file
 
@@ -192,9 +221,10 @@ def resolve_features(
 
 
 def otsu_threshold(counts: npt.ArrayLike, edges: npt.ArrayLike) -> float:
-    """Otsu's threshold of a histogram: the inner edge with the largest variance between the two classes (Otsu 1979, equation 18).
+    """Otsu's threshold: the inner edge with the largest variance between its two sides.
 
-    counts (n,), edges (n + 1,) equally spaced. Where an empty gap makes several edges equal, the middle one.
+    counts: of a histogram (n,). edges: of its bins (n + 1,), equally spaced. If empty bins make
+    several edges equally good, the middle edge is taken. Source: Otsu 1979, equation 18.
     """
     weights, bounds = np.asarray(counts, dtype=np.float64), np.asarray(edges, dtype=np.float64)
     moments = weights * np.arange(weights.size)
@@ -208,10 +238,11 @@ def otsu_threshold(counts: npt.ArrayLike, edges: npt.ArrayLike) -> float:
     return float(bounds[best[best.size // 2] + 1])
 
 
-def dilate(mask: Selection, vertices: int) -> Selection:
-    """A mask (z, y, x) grown by that many vertices in the 26-neighbourhood (paper, Feature Dilation); nothing wraps around an edge.
+def dilate(mask: FrameMask, vertices: int) -> FrameMask:
+    """A mask (z, y, x) grown by some vertices in the 26-neighbourhood (paper, Feature Dilation).
 
-    The cube is grown one axis after another, and along an axis by shifts that double, since a reach r may be shifted by r + 1.
+    The growth does not wrap around the ends of an axis. It takes one axis after another. Along an
+    axis the shifts double: a mask that has grown by r may be shifted by r + 1 without a gap.
     """
     for axis in range(3):
         reach = 0
@@ -225,8 +256,11 @@ def dilate(mask: Selection, vertices: int) -> Selection:
     return mask
 
 
-def _alike(value: float, frame: Frame) -> np.generic:
-    """The value as a scalar that compares with a frame without converting it: of its own floating type, float64 for integers."""
+def _as_frame_type(value: float, frame: Frame) -> np.generic:
+    """A threshold as a scalar of the frame's floating-point type, or of float64 for integers.
+
+    numpy then compares without converting the frame.
+    """
     with np.errstate(over="ignore"):
         return np.float64(value).astype(frame.dtype if frame.dtype.kind == "f" else np.float64)
 
@@ -234,10 +268,11 @@ def _alike(value: float, frame: Frame) -> np.generic:
 def _histogram(
     series: Series, key_frames: Sequence[int], value_range: ValueRange, progress: Progress
 ) -> npt.NDArray[np.int64]:
+    """Counts (BINS,) of the finite values of all key frames, over the range of the series."""
     counts = np.zeros(BINS, dtype=np.int64)
     for done, step in enumerate(key_frames):
-        for part in pieces(series.read(step)):
-            unit = value_range.to_unit(finite_values(part))
+        for piece in pieces(series.read(step)):
+            unit = value_range.to_unit(finite_values(piece))
             counts += np.bincount(
                 np.minimum((unit * BINS).astype(np.int64), BINS - 1), minlength=BINS
             )
@@ -248,6 +283,7 @@ def _histogram(
 def _numbers(
     text: str, values: str | None, count: int, form: str, *, finite: bool = False
 ) -> list[float]:
+    """The numbers of a feature's text; raises InputError, with the form that is allowed."""
     parts = [] if values is None else values.split(":")
     try:
         numbers = [float(part) for part in parts]

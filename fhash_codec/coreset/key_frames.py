@@ -1,4 +1,7 @@
-"""Which steps are trained on, and where a time between them lies (paper, Coreset Selection: key frames in chronological order)."""
+"""Key frames: the steps that a model is trained on, and the model's time axis through them.
+
+Source: the paper, Coreset Selection (key frames in chronological order).
+"""
 
 from __future__ import annotations
 
@@ -17,27 +20,38 @@ from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Series
 
 FORMS = "all, every:K, auto:N or a list such as 0,4,9"
-MAX_VOXELS = 2**16
+"""Forms of the setting `key_frames`, for error messages."""
+
+MAX_VERTICES = 2**16
+"""Vertices of a frame that `auto:N` looks at, at most."""
+
 MAX_SAMPLES = 2**26
-"""Bounds of `auto:N`: voxels looked at in a frame, and values held over all frames."""
+"""Values over all frames that `auto:N` holds in memory, at most."""
 
 
 def strictly_monotonic(times: npt.NDArray[np.float64]) -> bool:
-    """Whether times (T,) are finite and strictly ascending or strictly descending; a single finite time is."""
+    """Whether all times (T,) are finite, and strictly ascend or strictly descend.
+
+    A single finite time does.
+    """
     before, after = times[:-1], times[1:]
     return bool(np.isfinite(times).all() and ((after > before).all() or (after < before).all()))
 
 
 def time_axis(times: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """What the model's time runs along: the times (T,) where they are strictly monotonic, else the step numbers."""
+    """The model's time axis (T,): the times if they are strictly monotonic, else step numbers."""
     return times if strictly_monotonic(times) else np.arange(times.size, dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KeyTimes:
-    """Physical times of all steps, float64 (T,), strictly monotonic, and the ascending steps that are key frames.
+    """The map between steps, physical times and key indices of a series.
 
-    Raises InputError for times that are not strictly monotonic; step numbers will do in their place.
+    Attributes:
+        times: physical times of all steps, float64 (T,), strictly monotonic.
+        key_frames: the steps that are key frames, ascending.
+
+    Raises InputError for times that are not strictly monotonic; step numbers can replace them.
     """
 
     times: npt.NDArray[np.float64]
@@ -46,21 +60,24 @@ class KeyTimes:
     def __post_init__(self) -> None:
         if not strictly_monotonic(self.times):
             raise InputError(
-                "times are not finite and strictly ascending or descending; use step numbers in their place"
+                "times are not finite and strictly ascending or descending; "
+                "use step numbers in their place"
             )
 
     def key_index(self, step: float) -> float:
-        """The fractional key index of a fractional step, in [0, key frames - 1]; a whole number exactly at each key frame.
+        """The fractional key index of a fractional step, in [0, key frames - 1].
 
-        Step -> physical time (piecewise linear between steps) -> key index (piecewise linear between the key times). Both together are
-        linear from one step to the next, since key frames are steps: so it is computed, because times between steps may be too close for
-        float64 to tell apart. Steps before the first or after the last key frame clamp to it; a step outside the series raises
-        RegionError; a single key frame gives 0.
+        It is a whole number exactly at each key frame. The map goes from the step to its physical
+        time (piecewise linear between steps), and from the time to the key index (piecewise linear
+        between key times). Key frames are steps, so both together are linear from one step to the
+        next. The key index is computed in this way, because float64 may not tell apart the times
+        between two steps. Steps before the first key frame or after the last one take its index; a
+        single key frame gives 0. Raises RegionError for a step outside the series.
         """
         return float(self.key_indices(step))
 
     def key_indices(self, steps: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """`key_index` of many steps at once, of any shape."""
+        """`key_index` of an array of steps of any shape."""
         steps = np.asarray(steps, dtype=np.float64)
         last = self.times.size - 1
         outside = ~((steps >= 0) & (steps <= last))
@@ -74,56 +91,77 @@ class KeyTimes:
             )
         )
 
+    def keys_per_step(self, steps: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """The derivative of the key index by the step, at steps of any shape.
+
+        Between two steps the key index runs evenly; at a step, the derivative is that behind it.
+        """
+        last = self.times.size - 1
+        before = np.minimum(np.floor(steps), max(last - 1, 0))
+        after = np.minimum(before + 1, last)
+        return self.key_indices(after) - self.key_indices(before)
+
     @cached_property
     def _key_indices_of_steps(self) -> npt.NDArray[np.float64]:
         """The key index of every step (T,)."""
         ascending = self._ascending() * self._scale
         keys = ascending[list(self.key_frames)]
         indices = np.interp(ascending, keys, np.arange(keys.size))
-        # Times that scaling made equal are different steps all the same.
+        # Scaling may make two times equal; their steps still differ.
         indices[list(self.key_frames)] = np.arange(keys.size)
         return np.asarray(indices)
 
     def step_of_time(self, time: float) -> float:
-        """The fractional step at a physical time, piecewise linear between steps; raises RegionError outside the times of the series."""
+        """The fractional step at a physical time, piecewise linear between steps.
+
+        Raises RegionError for a time outside the series.
+        """
         return float(self.steps_of_times(time))
 
     def steps_of_times(self, times: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """`step_of_time` of many times at once, of any shape."""
+        """`step_of_time` of an array of times of any shape."""
         times = np.asarray(times, dtype=np.float64)
-        ascending, turned = self._ascending(), self._sign() * times
-        outside = ~((turned >= ascending[0]) & (turned <= ascending[-1]))
+        ascending, targets = self._ascending(), self._sign() * times
+        outside = ~((targets >= ascending[0]) & (targets <= ascending[-1]))
         if outside.any():
             raise RegionError(
-                f"time {times[outside].flat[0]:g} is outside {self.times.min():g}..{self.times.max():g}"
+                f"time {times[outside].flat[0]:g} is outside "
+                f"{self.times.min():g}..{self.times.max():g}"
             )
-        found = np.asarray(
-            np.interp(turned * self._scale, ascending * self._scale, np.arange(ascending.size))
+        steps = np.asarray(
+            np.interp(targets * self._scale, ascending * self._scale, np.arange(ascending.size))
         )
-        # A time of the series is its step, also where scaling made it equal to another.
-        at = np.searchsorted(ascending, turned)
-        return np.where(ascending[at] == turned, at, found)
+        # A time of the series gives its own step, even if scaling made it equal to another time.
+        at = np.searchsorted(ascending, targets)
+        return np.where(ascending[at] == targets, at, steps)
 
     @property
     def _scale(self) -> float:
-        """A power of two, which is exact: differences of the largest times would overflow, slopes between the smallest as well."""
+        """A power of two that brings the times near 1.
+
+        Without it, differences of the largest times and slopes between the smallest would overflow.
+        The multiplication is exact.
+        """
         return power_of_two(float(np.abs(self.times).max()))
 
     def _sign(self) -> float:
         return -1.0 if self.times[-1] < self.times[0] else 1.0
 
     def _ascending(self) -> npt.NDArray[np.float64]:
-        """The times, negated where they descend: exact, and what np.interp needs."""
+        """The times in ascending order for np.interp: negated, which is exact, if they descend."""
         return self._sign() * self.times
 
 
 def select_key_frames(
     spec: str, series: Series, times: npt.NDArray[np.float64], progress: Progress
 ) -> tuple[int, ...]:
-    """The ascending steps that `spec` names: all | every:K (the last step always included) | auto:N | a list such as 0,4,9.
+    """The steps that the setting `key_frames` names, ascending.
 
-    `auto:N` reads every frame once (progress stage "key frames") and needs strictly monotonic times (T,).
-    Raises InputError for a spec that is malformed or does not fit the series.
+    spec: all | every:K (the last step is always included) | auto:N | a list such as 0,4,9.
+    times: the model's time axis (T,); for auto:N it must be strictly monotonic.
+
+    auto:N reads every frame once (progress stage "key frames"). Raises InputError for a spec that
+    is malformed or does not fit the series.
     """
     steps = series.shape[0]
     kind, _, value = spec.partition(":")
@@ -136,19 +174,22 @@ def select_key_frames(
         count = _count(spec, value, "auto:N with N >= 2")
         if count == 1 and steps > 1:
             raise InputError(
-                f"key-frames is '{spec}' for {steps} steps; allowed: auto:N with N at least 2, since both ends are kept"
+                f"key-frames is '{spec}' for {steps} steps; allowed: auto:N with N at least 2, "
+                "since both ends are kept"
             )
         return tuple(range(steps)) if count >= steps else _auto(series, times, count, progress)
     return _listed(spec, steps)
 
 
 def _count(spec: str, value: str, form: str) -> int:
+    """The number in a spec; raises InputError, with the form that is allowed, if it has none."""
     if not (value.isascii() and value.isdigit()) or int(value) < 1:
         raise InputError(f"key-frames is '{spec}'; write {form}")
     return int(value)
 
 
 def _listed(spec: str, steps: int) -> tuple[int, ...]:
+    """The steps of a list such as 0,4,9."""
     parts = [part.strip() for part in spec.split(",")]
     if not all(part.isascii() and part.isdigit() for part in parts):
         raise InputError(f"key-frames is '{spec}'; allowed: {FORMS}")
@@ -163,12 +204,14 @@ def _listed(spec: str, steps: int) -> tuple[int, ...]:
 def _auto(
     series: Series, times: npt.NDArray[np.float64], count: int, progress: Progress
 ) -> tuple[int, ...]:
+    """The `count` steps from which the other frames interpolate best, on a sample of vertices."""
     if not strictly_monotonic(times):
         raise InputError(
-            "key-frames auto:N needs times that strictly ascend or descend; use step numbers in their place"
+            "key-frames auto:N needs times that strictly ascend or descend; "
+            "use step numbers in their place"
         )
     steps = series.shape[0]
-    stride = lattice_stride(series.shape[1:], max(1, min(MAX_VOXELS, MAX_SAMPLES // steps)))
+    stride = vertex_stride(series.shape[1:], max(1, min(MAX_VERTICES, MAX_SAMPLES // steps)))
     samples: list[npt.NDArray[Any]] = []
     for step, frame in enumerate(series.frames()):
         samples.append(frame[::stride, ::stride, ::stride].flatten())
@@ -176,8 +219,11 @@ def _auto(
     return optimal_steps(segment_costs(gram_matrix(samples), times), count)
 
 
-def lattice_stride(shape: Sequence[int], limit: int) -> int:
-    """The smallest stride, the same on every axis, at which a frame (z, y, x) keeps at most `limit` vertices; 1 where it fits whole."""
+def vertex_stride(shape: Sequence[int], limit: int) -> int:
+    """The smallest stride at which a frame (z, y, x) keeps at most `limit` vertices.
+
+    The stride is the same on every axis; 1 if all vertices fit.
+    """
     stride = 1
     while np.prod([-(-size // stride) for size in shape]) > limit:
         stride += 1
@@ -185,10 +231,11 @@ def lattice_stride(shape: Sequence[int], limit: int) -> int:
 
 
 def gram_matrix(samples: Sequence[npt.NDArray[Any]]) -> npt.NDArray[np.float64]:
-    """Inner products (T, T) of frames, T arrays (voxels,), scaled to order 1 and shifted by the mean over time of each voxel.
+    """Inner products (T, T) of frames, given as T arrays (vertices,).
 
-    The shift changes no interpolation error, since the weights of an interpolation add up to one, and spares the digits of it.
-    NaN and infinite values are set to the mean of all finite ones.
+    Values are scaled to order 1, and each vertex is shifted by its mean over time. The shift does
+    not change an interpolation error, since the weights of an interpolation add up to one, but it
+    avoids cancellation. NaN and infinite values are set to the mean of all finite values.
     """
     peak = max(
         float(np.abs(frame[np.isfinite(frame)].astype(np.float64)).max(initial=0.0))
@@ -209,7 +256,7 @@ def gram_matrix(samples: Sequence[npt.NDArray[Any]]) -> npt.NDArray[np.float64]:
 
 
 def _columns(samples: Sequence[npt.NDArray[Any]]) -> Iterator[npt.NDArray[np.float64]]:
-    """Blocks (T, some voxels) of the samples in float64, at most 32 MiB each."""
+    """Blocks (T, some vertices) of the samples in float64, at most 32 MiB each."""
     width = max(1, 2**22 // len(samples))
     for start in range(0, samples[0].size, width):
         yield np.stack([frame[start : start + width].astype(np.float64) for frame in samples])
@@ -218,10 +265,11 @@ def _columns(samples: Sequence[npt.NDArray[Any]]) -> Iterator[npt.NDArray[np.flo
 def segment_costs(
     gram: npt.NDArray[np.float64], times: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """cost[a, b], (T, T): summed squared error of the frames strictly between a and b if they are interpolated in time from a and b.
+    """Interpolation errors (T, T): entry [a, b] is the summed squared error between a and b.
 
-    With y_k = x_k - x_a and s_k = t_k - t_a, the error of frame k is |y_k - s_k / s_b y_b|^2, whose sum over k needs only the inner
-    products. Infinite where b <= a.
+    Frames strictly between steps a and b are interpolated in time from the frames of a and b. With
+    y_k = x_k - x_a and s_k = t_k - t_a, the error of frame k is |y_k - s_k / s_b y_b|^2; its sum
+    over k needs only the inner products. Infinite if b <= a.
     """
     steps = times.size
     scaled = times * power_of_two(float(np.abs(times).max()))
@@ -231,29 +279,32 @@ def segment_costs(
         later = slice(a + 1, steps)
         s = np.abs(scaled[later] - scaled[a])
         s = s / s[-1]
-        to_a, own = gram[later, a], gram[a, a]
-        squares = np.diagonal(gram)[later] - 2 * to_a + own  # |y_k|^2
+        to_a, square_a = gram[later, a], gram[a, a]
+        squares = np.diagonal(gram)[later] - 2 * to_a + square_a  # |y_k|^2
         # Sums over a < k < b, for every b at once.
         before_squares, before_s2, before_s = (np.cumsum(v) - v for v in (squares, s * s, s))
         before_to_a = np.cumsum(s * to_a) - s * to_a
-        mixed = (
-            upper[later, later].T @ s - before_to_a - (to_a - own) * before_s
-        )  # sum of s_k (y_k . y_b)
+        # Sum of s_k (y_k . y_b).
+        mixed = upper[later, later].T @ s - before_to_a - (to_a - square_a) * before_s
         costs[a, later] = before_squares - 2 * mixed / s + squares * before_s2 / (s * s)
-    np.maximum(costs, 0.0, out=costs)  # rounding may leave a tiny negative sum
+    np.maximum(costs, 0.0, out=costs)  # Rounding may leave a tiny negative sum.
     return costs
 
 
 def optimal_steps(costs: npt.NDArray[np.float64], count: int) -> tuple[int, ...]:
-    """The `count` >= 2 steps, both ends included, with the least total cost of the segments between them; exact dynamic programming."""
+    """The `count` steps, ends included, with the least total cost of the segments between them.
+
+    costs: of the segments (T, T), from `segment_costs`. count: at least 2. Exact, by dynamic
+    programming.
+    """
     steps = costs.shape[0]
-    best, parents = costs[0], []
+    best, predecessors = costs[0], []
     for _ in range(count - 2):
         total = best[:, None] + costs
-        parent = total.argmin(axis=0)
-        best = total[parent, np.arange(steps)]
-        parents.append(parent)
+        predecessor = total.argmin(axis=0)
+        best = total[predecessor, np.arange(steps)]
+        predecessors.append(predecessor)
     path = [steps - 1]
-    for parent in reversed(parents):
-        path.append(int(parent[path[-1]]))
+    for predecessor in reversed(predecessors):
+        path.append(int(predecessor[path[-1]]))
     return (0, *reversed(path))

@@ -1,8 +1,10 @@
-"""One bit per voxel, in ragged Morton order (paper, Feature Dilation and Rendering; findings: cubic Morton pads 5x more).
+"""Occupancy: one bit per voxel, in ragged Morton order.
 
-Each axis is padded to a power of two. The Morton index interleaves the bits of x, y and z from the lowest up (x first, then y, then z)
-and passes over an axis that has no bits left, so that a thin box costs no more than its own padding. Bit i of the grid is bit
-7 - i % 8 of byte i // 8 (the order of np.packbits). Bits in the padding are 0.
+Each axis is padded to a power of two. The Morton index interleaves the bits of x, y and z from the
+lowest up (x first, then y, then z). It skips an axis that has no bits left, so that a thin box
+costs no more than its own padding; a cubic Morton order was measured to pad 5 times more. Bit i of
+the grid is bit 7 - i % 8 of byte i // 8 (the order of np.packbits). Bits in the padding are 0.
+Source: the paper, Feature Dilation and Rendering.
 """
 
 from __future__ import annotations
@@ -12,12 +14,16 @@ import numpy.typing as npt
 
 Shape = tuple[int, int, int]
 """Vertices per axis, (z, y, x)."""
+
 Bits = npt.NDArray[np.uint8]
-"""A packed grid of one key frame."""
+"""The packed grid of one key frame, uint8 (packed_bytes,)."""
 
 
 def bit_order(shape: Shape) -> list[tuple[int, int]]:
-    """(axis, bit of that axis) for each bit of the Morton index, lowest first; axis 0 is z, 2 is x."""
+    """Pairs (axis, bit of that axis) for the bits of the Morton index, lowest first.
+
+    Axis 0 is z, axis 2 is x.
+    """
     widths = [(size - 1).bit_length() for size in shape]
     return [(axis, bit) for bit in range(max(widths)) for axis in (2, 1, 0) if bit < widths[axis]]
 
@@ -25,7 +31,10 @@ def bit_order(shape: Shape) -> list[tuple[int, int]]:
 def morton_index(
     z: npt.ArrayLike, y: npt.ArrayLike, x: npt.ArrayLike, shape: Shape
 ) -> npt.NDArray[np.int64]:
-    """The definition: bit number of the vertices (z, y, x), broadcast, in the grid of a box of `shape`."""
+    """Bit numbers of vertices in the grid of a box: the definition of the order.
+
+    z, y, x: indices of the vertices; they broadcast. shape: of the box.
+    """
     vertex = [np.asarray(axis, dtype=np.int64) for axis in (z, y, x)]
     index = np.zeros(np.broadcast_shapes(*(axis.shape for axis in vertex)), dtype=np.int64)
     for place, (axis, bit) in enumerate(bit_order(shape)):
@@ -39,20 +48,23 @@ def packed_bytes(shape: Shape) -> int:
 
 
 def between(a: Bits, b: Bits) -> Bits:
-    """The grid at a time between two key frames: a voxel is occupied if it is in either of them."""
+    """The grid between two key frames: a voxel is occupied if it is at either of them."""
     return a | b
 
 
 def pack(mask: npt.NDArray[np.bool_]) -> Bits:
-    """The grid of a mask (z, y, x): uint8 (packed_bytes,). Every small block of 8 vertices is one byte; bytes go to their Morton places."""
+    """The packed grid of a mask (z, y, x).
+
+    A block of 8 vertices fills one byte, and the bytes go to their Morton places.
+    """
     shape = _shape(mask)
     steps, offsets = _byte_block(shape)
     blocks = np.zeros(
         [-(-size // step) for size, step in zip(shape, steps, strict=True)], dtype=np.uint8
     )
     for place, (z, y, x) in enumerate(offsets):
-        part = mask[z :: steps[0], y :: steps[1], x :: steps[2]].view(np.uint8)
-        blocks[: part.shape[0], : part.shape[1], : part.shape[2]] |= part << (7 - place)
+        vertices = mask[z :: steps[0], y :: steps[1], x :: steps[2]].view(np.uint8)
+        blocks[_corner(vertices)] |= vertices << (7 - place)
     bits = np.zeros(packed_bytes(shape), dtype=np.uint8)
     for z, plane in enumerate(blocks):
         bits[_byte_index(z, plane.shape, steps, shape)] = plane
@@ -69,8 +81,8 @@ def unpack(bits: Bits, shape: Shape) -> npt.NDArray[np.bool_]:
         plane[...] = bits[_byte_index(z, plane.shape, steps, shape)]
     mask = np.empty(shape, dtype=np.uint8)
     for place, (z, y, x) in enumerate(offsets):
-        part = mask[z :: steps[0], y :: steps[1], x :: steps[2]]
-        part[...] = (blocks[: part.shape[0], : part.shape[1], : part.shape[2]] >> (7 - place)) & 1
+        vertices = mask[z :: steps[0], y :: steps[1], x :: steps[2]]
+        vertices[...] = (blocks[_corner(vertices)] >> (7 - place)) & 1
     return mask.view(np.bool_)
 
 
@@ -79,16 +91,24 @@ def _shape(mask: npt.NDArray[np.bool_]) -> Shape:
     return z, y, x
 
 
+def _corner(vertices: Bits) -> tuple[slice, ...]:
+    """The index of the first blocks along each axis, as many as an array has vertices."""
+    return tuple(slice(length) for length in vertices.shape)
+
+
 def _byte_block(shape: Shape) -> tuple[list[int], list[tuple[int, int, int]]]:
-    """The block of vertices that shares a byte: its size per axis, and the place (z, y, x) in it of each bit, lowest bit first."""
-    low = bit_order(shape)[:3]
-    steps = [2 ** sum(axis == of for axis, _ in low) for of in range(3)]
+    """The block of vertices that shares a byte: its size (z, y, x), and its vertices.
+
+    The vertices are offsets (z, y, x) in the block, in the order of the bits, lowest bit first.
+    """
+    lowest = bit_order(shape)[:3]
+    steps = [2 ** sum(bit_axis == axis for bit_axis, _ in lowest) for axis in range(3)]
     offsets = []
-    for number in range(2 ** len(low)):
-        place = [0, 0, 0]
-        for bit, (axis, axis_bit) in enumerate(low):
-            place[axis] |= ((number >> bit) & 1) << axis_bit
-        offsets.append((place[0], place[1], place[2]))
+    for number in range(2 ** len(lowest)):
+        offset = [0, 0, 0]
+        for bit, (axis, axis_bit) in enumerate(lowest):
+            offset[axis] |= ((number >> bit) & 1) << axis_bit
+        offsets.append((offset[0], offset[1], offset[2]))
     return steps, offsets
 
 
@@ -98,10 +118,10 @@ def _byte_index(
     """Byte numbers (blocks y, blocks x) of one plane of byte blocks."""
     y = np.arange(blocks[0])[:, None] * steps[1]
     x = np.arange(blocks[1])[None, :] * steps[2]
-    # z, y and x own different bits: interleave each axis alone and join.
-    alone = (
+    # z, y and x have different bits of the index: interleave each axis by itself, then join them.
+    index = (
         morton_index(z * steps[0], 0, 0, shape)
         | morton_index(0, y, 0, shape)
         | morton_index(0, 0, x, shape)
     )
-    return alone >> 3
+    return index >> 3

@@ -1,4 +1,4 @@
-"""The first pass over a series: its range, its mean, and where values are missing."""
+"""The first pass over a series: its range, its mean, and its missing values."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from fhash_formats.series import Series
 
 @dataclass(frozen=True, kw_only=True)
 class Scan:
-    """What one pass over all steps of a series tells.
+    """Figures of the finite values of all steps of a series.
 
     Attributes:
-        value_range: of all finite values, in data units.
-        mean: of all finite values, in data units, within the range.
+        value_range: of the finite values, in data units.
+        mean: of the finite values, in data units, within the range.
         finite_count: number of finite values.
-        missing: for each step that has NaN or infinite values, one bit per vertex, 1 = missing: np.packbits of the frame in C order.
+        missing: masks of the steps that have NaN or infinite values: one bit per vertex,
+            1 = missing, np.packbits of the frame in C order.
     """
 
     value_range: ValueRange
@@ -34,7 +35,10 @@ class Scan:
     missing: Mapping[int, npt.NDArray[np.uint8]]
 
     def finite(self, step: int, shape: tuple[int, int, int]) -> npt.NDArray[np.bool_] | None:
-        """Which vertices of a step are finite, bool of the frame's shape (z, y, x); None where all are."""
+        """Mask (z, y, x) of the finite vertices of a step; None if all are finite.
+
+        shape: of a frame.
+        """
         if step not in self.missing:
             return None
         missing = np.unpackbits(self.missing[step], count=prod(shape)).view(np.bool_)
@@ -42,26 +46,32 @@ class Scan:
 
 
 def scan(series: Series, progress: Progress) -> Scan:
-    """Read every frame once; raises InputError if no value at all is finite, or if the series changed. Progress stage: "scanning"."""
+    """Scan every frame once.
+
+    Raises InputError if no value at all is finite, or if the series changed. Progress stage:
+    "scanning".
+    """
     low, high, mean = np.inf, -np.inf, Mean()
     missing: dict[int, npt.NDArray[np.uint8]] = {}
-    last: npt.NDArray[np.uint8] | None = None
+    last_bits: npt.NDArray[np.uint8] | None = None
     steps = series.shape[0]
     for step, frame in enumerate(series.frames()):
         count = 0
-        for part in pieces(frame):
-            found = _part(part, mean)
-            count, low, high = count + found[0], min(low, found[1]), max(high, found[2])
+        for piece in pieces(frame):
+            piece_count, piece_low, piece_high = _scan_piece(piece, mean)
+            count, low, high = count + piece_count, min(low, piece_low), max(high, piece_high)
         if count < frame.size:
             bits = np.packbits(~np.isfinite(frame))
             # A land mask is the same at every step: keep one copy of it.
-            last = last if last is not None and np.array_equal(bits, last) else bits
-            missing[step] = last
+            if last_bits is None or not np.array_equal(bits, last_bits):
+                last_bits = bits
+            missing[step] = last_bits
         progress("scanning", step + 1, steps, "")
     series.check()
     if mean.count == 0:
         raise InputError(
-            f"{series.source}: '{series.name}' has no finite value in any of its {steps} steps; there is nothing to encode"
+            f"{series.source}: '{series.name}' has no finite value in any of its {steps} steps; "
+            "there is nothing to encode"
         )
     value_range = ValueRange(low, high)
     return Scan(
@@ -72,13 +82,13 @@ def scan(series: Series, progress: Progress) -> Scan:
     )
 
 
-def _part(part: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:
-    """Number, least and greatest of the finite values of a piece, which the mean takes in."""
-    if part.dtype.kind != "f":
-        mean.add(part)
-        return part.size, float(part.min()), float(part.max())
-    wide = part.astype(np.float32 if part.dtype.itemsize <= 4 else np.float64, copy=False)
-    # A sum of float32 values does not overflow, one of float64 values is taken after scaling.
+def _scan_piece(piece: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:
+    """Number, minimum and maximum of the finite values of a piece; they are added to the mean."""
+    if piece.dtype.kind != "f":
+        mean.add(piece)
+        return piece.size, float(piece.min()), float(piece.max())
+    wide = piece.astype(np.float32 if piece.dtype.itemsize <= 4 else np.float64, copy=False)
+    # A sum of float32 values does not overflow; float64 values are scaled before they are summed.
     count, low, high, total = range_and_sum(wide)
     scale = 1.0
     if count and wide.dtype == np.float64:
@@ -89,7 +99,7 @@ def _part(part: npt.NDArray[Any], mean: Mean) -> tuple[int, float, float]:
 
 
 def finite_values(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The finite ones of the values, one-dimensional; the array itself where all are."""
+    """The finite values, one-dimensional; the array itself if all of its values are finite."""
     if values.dtype.kind != "f":
         return values
     finite = np.isfinite(values)

@@ -1,4 +1,4 @@
-"""From a source to its coreset: open, scan, choose key frames, find features, gather."""
+"""The selection of a coreset: open a source, scan it, choose key frames and find features."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,11 +24,16 @@ from fhash_formats.series import AXES, ArraySeries, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 
 Source = str | Path | Series | npt.ArrayLike
+"""Data to encode: a file, a Series, or an array (t, z, y, x) or (z, y, x), labelled or not."""
 
 
 @contextmanager
 def open_source(source: Source) -> Iterator[Series]:
-    """A file opened by `fhash_formats.open_series` for as long as it is used, a Series as it is, or an array as a series."""
+    """The series of a source.
+
+    A file is opened by `fhash_formats.open_series`, and closed at the end of the context. A Series
+    is taken as it is.
+    """
     if isinstance(source, str | Path):
         with open_series(source) as series:
             yield series
@@ -36,23 +42,18 @@ def open_source(source: Source) -> Iterator[Series]:
 
 
 def _array_series(source: npt.ArrayLike) -> Series:
-    """An array as a series; of a labelled one (xarray.DataArray) also the name, units and coordinates, its axes being (t, z, y, x)."""
+    """The series of an array; a labelled array (xarray.DataArray) keeps its labels.
+
+    Labels are the name, units, attributes and coordinates. The axes of the array are (t, z, y, x).
+    """
     dims, labels = getattr(source, "dims", None), getattr(source, "coords", None)
     if dims is None or labels is None:
         return ArraySeries(source)
-    coords = {}
-    for axis, dim in zip(AXES[-len(dims) :], dims, strict=True):
-        if dim in labels and labels[dim].dtype.kind in "iufM":
-            values, attributes = np.asarray(labels[dim]), json_attributes(labels[dim].attrs)
-            if values.dtype.kind == "M":
-                values = (values - np.datetime64(0, "s")) / np.timedelta64(1, "s")
-                attributes = {
-                    "units": "seconds since 1970-01-01",
-                    "calendar": "proleptic_gregorian",
-                }
-            coords[axis] = Coordinate(
-                name=str(dim), values=values.astype(np.float64), attributes=attributes
-            )
+    coords = {
+        axis: _coordinate(str(dim), labels[dim])
+        for axis, dim in zip(AXES[-len(dims) :], dims, strict=True)
+        if dim in labels and labels[dim].dtype.kind in "iufM"
+    }
     attributes = json_attributes(source.attrs)  # type: ignore[union-attr]
     name = str(getattr(source, "name", None) or "values")
     return ArraySeries(
@@ -60,18 +61,34 @@ def _array_series(source: npt.ArrayLike) -> Series:
     )
 
 
+def _coordinate(name: str, label: Any) -> Coordinate:
+    """The coordinate of a labelled axis; dates become seconds since 1970."""
+    values, attributes = np.asarray(label), json_attributes(label.attrs)
+    if values.dtype.kind == "M":
+        values = (values - np.datetime64(0, "s")) / np.timedelta64(1, "s")
+        attributes = {"units": "seconds since 1970-01-01", "calendar": "proleptic_gregorian"}
+    return Coordinate(name=name, values=values.astype(np.float64), attributes=attributes)
+
+
 def _array_mask(mask: npt.ArrayLike, series: Series) -> Feature:
-    marked = np.asarray(mask, dtype=bool)
-    if marked.shape not in (series.shape, series.shape[1:]):
+    """The feature of a mask in memory; raises InputError for a shape other than the series'."""
+    values = np.asarray(mask, dtype=bool)
+    if values.shape not in (series.shape, series.shape[1:]):
         raise InputError(
-            f"mask has shape {marked.shape}; the series has {series.shape} in (t, z, y, x)"
+            f"mask has shape {values.shape}; the series has {series.shape} in (t, z, y, x)"
         )
-    return Mask("array", read=lambda step: marked if marked.ndim == 3 else marked[step])
+    return Mask("array", read=lambda step: values if values.ndim == 3 else values[step])
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSelection:
-    """What the settings select of a series: its range, the key frames, the features, where they lie."""
+    """The part of a series that the settings select.
+
+    Attributes:
+        scanned: range, mean and missing values of the series.
+        features: resolved, see `resolve_features`.
+        extent: the key frames, and the vertices of the coreset at each of them.
+    """
 
     scanned: Scan
     features: tuple[Feature, ...]
@@ -81,10 +98,13 @@ class FeatureSelection:
 def select_features(
     series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None
 ) -> FeatureSelection:
-    """Scan a series, choose its key frames and find its features, a frame at a time.
+    """Scan a series, choose its key frames and find its features, one frame at a time.
 
-    mask: booleans (t, z, y, x) or (z, y, x), one more feature; it stands for 'all' where the settings name nothing else.
-    Raises InputError for settings that do not fit the series, or that select nothing. Warns of times that cannot serve as an axis.
+    mask: booleans (t, z, y, x) or (z, y, x), one more feature. It replaces the feature 'all' if the
+        settings name no other.
+
+    Raises InputError for settings that do not fit the series, or that select nothing. Warns of
+    times that cannot serve as an axis.
     """
     scanned, key_frames, features = resolve_selection(series, config, progress, mask)
     return FeatureSelection(
@@ -97,10 +117,12 @@ def select_features(
 def resolve_selection(
     series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None
 ) -> tuple[Scan, tuple[int, ...], tuple[Feature, ...]]:
+    """The scan, the key frames and the resolved features of a series; see `select_features`."""
     times = time_axis(series.coords["t"].values)
     if times is not series.coords["t"].values:
         warnings.warn(
-            f"{series.source}: its times do not strictly ascend or descend; step numbers stand for them",
+            f"{series.source}: its times do not strictly ascend or descend; "
+            "step numbers stand for them",
             FhashWarning,
             stacklevel=3,
         )
@@ -108,8 +130,6 @@ def resolve_selection(
     key_frames = select_key_frames(config.key_frames, series, times, progress)
     features = resolve_features(config.features, series, key_frames, scanned.value_range, progress)
     if mask is not None:
-        features = (
-            _array_mask(mask, series),
-            *(feature for feature in features if config.features != ("all",)),
-        )
+        named = () if config.features == ("all",) else features
+        features = (_array_mask(mask, series), *named)
     return scanned, tuple(key_frames), features

@@ -1,4 +1,4 @@
-"""A picture that compares an original with what was decoded, drawn with pillow alone: original, decoded, error, with colour bars."""
+"""A picture of original values, decoded values and their error, with colour bars, by pillow."""
 
 from __future__ import annotations
 
@@ -14,18 +14,34 @@ from fhash_codec.rendering.colour.colour_maps import COLOUR_MAPS
 Slice = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]
 
-VIRIDIS, BALANCE = COLOUR_MAPS["viridis"], COLOUR_MAPS["balance"]
-"""What values are drawn in, and errors: blue, near white, red, so that an error of nothing is the middle."""
+VIRIDIS = COLOUR_MAPS["viridis"]
+"""Colours of values."""
+BALANCE = COLOUR_MAPS["balance"]
+"""Colours of errors: blue, near white for no error, red."""
 OUTSIDE = (208, 209, 212)
-"""The grey of vertices that are not in the coreset (NaN)."""
+"""Grey of vertices outside the coreset (NaN)."""
 
-_PAPER, _INK, _FAINT = (255, 255, 255), (28, 30, 36), (112, 116, 126)
-_LEFT, _RIGHT, _TOP, _FOOT, _GAP, _WIDTH = 112, 132, 106, 52, 10, 1240
+_PAPER = (255, 255, 255)
+_INK = (28, 30, 36)
+_FAINT = (112, 116, 126)
+# Lengths in pixels: margins, gap between slices, and the width aimed at.
+_LEFT = 112
+_RIGHT = 132
+_TOP = 106
+_FOOT = 52
+_GAP = 10
+_WIDTH = 1240
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pair:
-    """One step: a label such as "t = 0.25 s", the original (y, x) and the decoded slice (y, x) with NaN outside the coreset."""
+    """One step of the comparison.
+
+    Attributes:
+        label: text such as "t = 0.25 s".
+        original: values (y, x).
+        decoded: values (y, x), NaN outside the coreset.
+    """
 
     label: str
     original: Slice
@@ -33,7 +49,10 @@ class Pair:
 
 
 def colours(values: npt.ArrayLike, low: float, high: float, points: Sequence[str]) -> Pixels:
-    """Values of any shape as colours (..., 3) uint8, from `low` to `high` along the hexadecimal colours `points`; NaN becomes OUTSIDE."""
+    """Colour values of any shape; result (..., 3) uint8.
+
+    Colours run from `low` to `high` along the hexadecimal colours `points`; NaN becomes OUTSIDE.
+    """
     table = np.array(
         [[int(point[i : i + 2], 16) for i in (0, 2, 4)] for point in points], dtype=np.float64
     )
@@ -51,10 +70,11 @@ def colours(values: npt.ArrayLike, low: float, high: float, points: Sequence[str
 def compare(
     pairs: Sequence[Pair], *, title: str, subtitle: str, quantity: str, footer: str = ""
 ) -> Image.Image:
-    """Three rows (original, decoded, error = decoded - original) with a column for each pair, about 1240 pixels wide.
+    """Draw three rows (original, decoded, error = decoded - original) with a column for each pair.
 
-    Slices are drawn with x to the right and y upwards; a vertex is a square of whole pixels, nothing is smoothed.
-    The first two rows share the colour bar of `quantity`; the error has its own, even about 0.
+    The picture is about 1240 pixels wide. x points to the right and y upwards. A vertex is a square
+    of whole pixels; nothing is smoothed. The first two rows share the colour bar of `quantity`; the
+    error has its own, symmetric about 0.
     """
     rows, columns = pairs[0].original.shape
     errors = [pair.decoded - pair.original for pair in pairs]
@@ -103,7 +123,8 @@ def _bar(
     ticks: Sequence[float],
     name: str,
 ) -> None:
-    """A vertical colour bar at (left, top, height) with evenly spaced labels from the bottom up, and its name above it."""
+    """Draw a vertical colour bar at (left, top, height), with labels from the bottom up and its
+    name."""
     left, top, height = place
     ramp = colours(np.linspace(1.0, 0.0, height)[:, None].repeat(18, axis=1), 0.0, 1.0, points)
     image.paste(Image.fromarray(ramp), (left, top))

@@ -1,7 +1,9 @@
-"""Small simulated series for the demo and for trying things out: numpy only, the same values on every run.
+"""Small simulated series for the demo: numpy only, the same values on every run.
 
-- `vortex`: two blobs of a tracer carried and mixed by a swirl, a pseudo-spectral solution of the advection-diffusion equation;
-- `front`: an expanding shell whose radius follows the Sedov-Taylor law of a blast and whose surface grows fingers.
+- `vortex`: two blobs of a tracer, carried and mixed by a swirl; a pseudo-spectral solution of the
+  advection-diffusion equation.
+- `front`: an expanding shell whose radius follows the Sedov-Taylor law of a blast and whose surface
+  grows fingers.
 """
 
 from __future__ import annotations
@@ -20,9 +22,17 @@ Frame = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """A simulation: its frames for a shape (t, z, y, x) and a seed, the variable, its units, a feature worth keeping, and one line of help.
+    """A simulation.
 
-    The domain is the unit cube in metres, stretched to the shape, and lasts one second; the values lie in about 0..1.
+    The domain is the unit cube in metres, stretched to the shape, and lasts one second. Values lie
+    in about 0..1.
+
+    Attributes:
+        help: one line.
+        frames: generates the frames for a shape (t, z, y, x) and a seed.
+        name: name of the variable.
+        units: units of the variable.
+        feature: a feature worth keeping.
     """
 
     help: str
@@ -43,7 +53,8 @@ def simulate(
         raise InputError(f"scene is '{name}'; allowed: {', '.join(SCENES)}")
     if shape[0] < 2 or min(shape[1:]) < 8:
         raise InputError(
-            f"scene shape is {shape} in (t, z, y, x); at least 2 steps and 8 vertices along every axis are needed"
+            f"scene shape is {shape} in (t, z, y, x);"
+            " at least 2 steps and 8 vertices along every axis are needed"
         )
     scene = SCENES[name]
     positions = {"t": np.linspace(0.0, 1.0, shape[0])} | {
@@ -71,9 +82,11 @@ def _positions(shape: tuple[int, ...]) -> tuple[npt.NDArray[np.float64], ...]:
 
 
 def _vortex(shape: tuple[int, int, int, int], seed: int) -> Iterator[Frame]:
-    """dc/dt = -div(u c) + D lap(c) in a periodic box; derivatives by Fourier transform, classical Runge-Kutta of order 4 in time.
+    """Solve dc/dt = -div(u c) + D lap(c) in a periodic box.
 
-    u is LeVeque's vortex in a box (sin^2, so that it vanishes on the walls) with an upward flow in its core: divergence-free.
+    Derivatives are taken by Fourier transform, time steps by the classical Runge-Kutta method of
+    order 4. u is LeVeque's vortex in a box (sin^2, so that it vanishes on the walls) with an upward
+    flow in its core; it is divergence-free.
     """
     steps, *box = shape
     z, y, x = _positions(tuple(box))
@@ -89,7 +102,7 @@ def _vortex(shape: tuple[int, int, int, int], seed: int) -> Iterator[Frame]:
         np.fft.rfftfreq(box[2], 1 / box[2]),
     ]
     waves = np.meshgrid(*(2 * np.pi * count for count in counts), indexing="ij", sparse=True)
-    # The product u c makes waves that the lattice mistakes for longer ones: the usual two-thirds rule removes them.
+    # The product u c has waves too short for the lattice: the two-thirds rule removes aliases.
     kept = np.meshgrid(
         *(np.abs(count) < n / 3 for count, n in zip(counts, box, strict=True)),
         indexing="ij",
@@ -129,7 +142,10 @@ def _vortex(shape: tuple[int, int, int, int], seed: int) -> Iterator[Frame]:
 
 
 def _front(shape: tuple[int, int, int, int], seed: int) -> Iterator[Frame]:
-    """Density of an expanding shell: radius ~ t^(2/5) (Sedov-Taylor), with fingers of fixed direction that grow with time."""
+    """Density of an expanding shell with radius ~ t^(2/5) (Sedov-Taylor).
+
+    Its fingers have fixed directions and grow with time.
+    """
     steps, *box = shape
     z, y, x = (position - 0.5 for position in _positions(tuple(box)))
     radius = np.sqrt(z**2 + y**2 + x**2)

@@ -1,1 +1,1 @@
-"""Figures of arrays: ranges, sums, PSNR and SSIM. It knows no series, file or model."""
+"""Figures of arrays: ranges, sums, PSNR and SSIM. This package knows no series, file or model."""

@@ -1,6 +1,7 @@
-"""How well decoded frames match the original: PSNR, RMSE, largest error and SSIM, frame by frame in float64. numpy only.
+"""Quality of decoded frames: PSNR, RMSE, largest error and SSIM, frame by frame in float64.
 
-Vertices whose original value is not finite count nowhere. PSNR = 20 log10(range / RMSE) with the global range of the original series.
+Vertices whose original value is not finite are left out of every figure.
+PSNR = 20 log10(range / RMSE), with the range of the whole original series. numpy only.
 """
 
 from __future__ import annotations
@@ -25,13 +26,22 @@ from fhash_formats.support.threads import usable_threads
 
 __all__ = ["Errors", "Quality", "StepQuality", "measure_quality", "psnr", "ssim", "ssim_steps"]
 
-FRAMES_HELD, VERTICES_HELD = 8, 1 << 24
-"""Frames of each series that may be held while they are compared: at most so many, of at most so many vertices together, at least one."""
+FRAMES_HELD = 8
+"""Frames of each series in memory at a time while they are compared, at most."""
+
+VERTICES_HELD = 1 << 24
+"""Vertices of these frames together, at most; a single larger frame is allowed."""
+
+Scaled = tuple[int, float, float]
+"""Number of vertices, sum of squares and largest magnitude of scaled differences."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepQuality:
-    """Figures of one step: dB, data units, data units; None where nothing counts, and PSNR also where the error or the range is 0."""
+    """Figures of one step: PSNR in dB, errors in data units.
+
+    None if no vertex is counted; the PSNR is None as well if the error or the range is 0.
+    """
 
     step: int
     psnr: float | None
@@ -41,13 +51,15 @@ class StepQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """Figures of a whole series; None where nothing counts or a figure has no finite value.
+    """Figures of a series; None if no vertex is counted or a figure has no finite value.
 
     Attributes:
         psnr, rmse, max_abs_error: over the coreset of all steps, in dB and data units.
-        ssim: mean over the coreset of the measured steps. ssim_window: its sigma and window in vertices, the data range and those steps.
-        psnr_domain, rmse_domain, max_abs_error_domain: over all vertices, the background standing outside the coreset.
-        per_step: over the coreset of each step.
+        ssim: mean over the coreset of the measured steps.
+        ssim_window: sigma and window of the SSIM in vertices, the data range and measured steps.
+        psnr_domain, rmse_domain, max_abs_error_domain: over all vertices, with the background as
+            the decoded value outside the coreset.
+        per_step: figures over the coreset of each step.
     """
 
     psnr: float | None
@@ -68,14 +80,17 @@ class Quality:
 class Errors:
     """Squared and largest differences over frames.
 
-    Differences are taken after scaling by an exact power of two near the range, so that neither huge nor tiny ranges over- or underflow.
+    Differences are computed after scaling by an exact power of two near the range, so that neither
+    huge nor tiny ranges overflow or underflow.
 
     Attributes:
-        count: vertices compared so far. steps: a StepQuality per frame.
+        data_range: of the original series, in data units; inf is allowed and makes PSNR None.
+        count: vertices compared so far.
+        steps: a StepQuality per frame.
     """
 
     def __init__(self, data_range: float) -> None:
-        """data_range: of the original series, in data units; one that overflows (inf) is allowed and leaves PSNR None."""
+        """Begin without frames; raises InputError for a range below 0 or NaN."""
         if not data_range >= 0:
             raise InputError(f"data range is {data_range}; 0 or more is needed")
         self.data_range = data_range
@@ -92,9 +107,11 @@ class Errors:
         decoded: Values,
         mask: npt.NDArray[np.bool_] | None = None,
     ) -> StepQuality:
-        """Compare a frame where `mask` is set, everywhere if None; all of one shape. The step's figures.
+        """Compare a frame, and return the figures of its step.
 
-        Raises InputError for other shapes and where a decoded value that counts is not finite.
+        mask: vertices to be compared, all if None. The three arrays have one shape. Raises
+        InputError for different shapes, and for a decoded value that is not finite at a vertex that
+        is compared.
         """
         return self.take(step, self.compare(step, original, decoded, mask))
 
@@ -104,28 +121,28 @@ class Errors:
         original: Values,
         decoded: Values,
         mask: npt.NDArray[np.bool_] | None = None,
-    ) -> tuple[int, float, float]:
-        """Count, sum of squares and largest of the scaled differences of a frame, which `take` takes in; raises as `add`."""
+    ) -> Scaled:
+        """The scaled differences of a frame, for `take`; parameters and errors as in `add`."""
         if original.shape != decoded.shape or (mask is not None and mask.shape != original.shape):
             raise InputError(
-                f"step {step}: the original is {original.shape}, the decoded {decoded.shape}; they must be of one shape"
+                f"step {step}: the original is {original.shape}, the decoded {decoded.shape}; "
+                "they must be of one shape"
             )
-        found = squared_errors(original, decoded, mask, self._scale)
-        if found[0] < 0:
+        errors = squared_errors(original, decoded, mask, self._scale)
+        if errors[0] < 0:
             raise InputError(f"step {step}: decoded values are not finite where they are compared")
-        return found
+        return errors
 
-    def take(self, step: int, compared: tuple[int, float, float]) -> StepQuality:
-        """Count what `compare` found; the step's figures."""
-        count, squares, largest = compared
+    def take(self, step: int, errors: Scaled) -> StepQuality:
+        """Add the differences of a step, and return its figures."""
+        count, squares, largest = errors
         self.count += count
         self._squares += squares
         self._largest = max(self._largest, largest)
-        rmse = self._rmse(squares, count)
         figures = StepQuality(
             step=step,
             psnr=self._psnr(squares, count),
-            rmse=rmse,
+            rmse=self._rmse(squares, count),
             max_abs_error=self._unscaled(largest, count),
         )
         self.steps.append(figures)
@@ -138,7 +155,7 @@ class Errors:
 
     @property
     def psnr(self) -> float | None:
-        """In dB, over all frames."""
+        """PSNR over all frames, in dB."""
         return self._psnr(self._squares, self.count)
 
     @property
@@ -147,7 +164,7 @@ class Errors:
         return self._unscaled(self._largest, self.count)
 
     def _psnr(self, squares: float, count: int) -> float | None:
-        # In scaled units: a mean of denormals is rounded to one.
+        # In scaled units: in data units, a mean of denormals would be rounded to a denormal.
         return psnr(self.data_range * self._scale, math.sqrt(squares / count) if count else None)
 
     def _rmse(self, squares: float, count: int) -> float | None:
@@ -160,20 +177,86 @@ class Errors:
 
 
 def psnr(data_range: float, rmse: float | None) -> float | None:
-    """20 log10(data_range / rmse) in dB; None where either is 0, unknown or not finite."""
+    """20 log10(data_range / rmse) in dB; None if either is 0, None or not finite."""
     if rmse is None or not (0 < rmse < math.inf and 0 < data_range < math.inf):
         return None
     return 20 * (math.log10(data_range) - math.log10(rmse))
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Compared:
-    """A step's errors over the coreset and over everything, as `Errors.compare` gives them, and what `ssim` gives."""
+class _Comparison:
+    """Comparison of one step.
+
+    Attributes:
+        coreset, domain: scaled differences over the coreset, and over all vertices.
+        similarity: what `ssim` returns; (0.0, 0) for a step whose SSIM is not measured.
+    """
 
     step: int
-    inside: tuple[int, float, float]
-    everywhere: tuple[int, float, float]
+    coreset: Scaled
+    domain: Scaled
     similarity: tuple[float, int]
+
+
+class _Comparer:
+    """Comparison of decoded steps with the original, a few steps at a time in threads.
+
+    The figures are added up in the order of the steps, whatever the number of threads.
+    """
+
+    def __init__(self, data_range: float, background: float) -> None:
+        self.coreset, self.domain = Errors(data_range), Errors(data_range)
+        self.similarity, self.similar_vertices = 0.0, 0
+        self._background = background
+
+    def compare(
+        self, step: int, original: Values, decoded: Values, *, with_ssim: bool, threads: int
+    ) -> _Comparison:
+        """Compare one step; safe in any thread.
+
+        threads: of the SSIM.
+        """
+        in_coreset = np.isfinite(decoded)
+        mask = None if in_coreset.all() else in_coreset
+        coreset = domain = self.coreset.compare(step, original, decoded, mask)
+        if mask is not None:
+            filled = np.where(mask, decoded, decoded.dtype.type(self._background))
+            domain = self.domain.compare(step, original, filled)
+        similarity = 0.0, 0
+        if with_ssim:
+            data_range = self.coreset.data_range
+            similarity = ssim(original, decoded, data_range, mask, threads=threads)
+        return _Comparison(step=step, coreset=coreset, domain=domain, similarity=similarity)
+
+    def add(self, comparison: _Comparison) -> StepQuality:
+        """Add a step to the figures of the series; the steps come in order."""
+        figures = self.coreset.take(comparison.step, comparison.coreset)
+        self.domain.take(comparison.step, comparison.domain)
+        total, vertices = comparison.similarity
+        self.similarity += total
+        self.similar_vertices += vertices
+        return figures
+
+    def quality(self, measured: list[int]) -> Quality:
+        """The figures of all steps added; `measured` are the steps whose SSIM is."""
+        coreset, domain = self.coreset, self.domain
+        data_range = coreset.data_range
+        return Quality(
+            psnr=coreset.psnr,
+            rmse=coreset.rmse,
+            max_abs_error=coreset.max_abs_error,
+            ssim=self.similarity / self.similar_vertices if self.similar_vertices else None,
+            ssim_window={
+                "sigma": SIGMA,
+                "window": WINDOW,
+                "data_range": data_range if math.isfinite(data_range) else None,
+                "steps": measured,
+            },
+            psnr_domain=domain.psnr,
+            rmse_domain=domain.rmse,
+            max_abs_error_domain=domain.max_abs_error,
+            per_step=tuple(coreset.steps),
+        )
 
 
 def measure_quality(
@@ -184,49 +267,26 @@ def measure_quality(
     background: float,
     progress: Progress = silent,
 ) -> Quality:
-    """Compare all steps of a decoded series with the original, some frames (z, y, x) of each at a time (FRAMES_HELD).
+    """Compare all steps of a decoded series with the original.
 
-    The coreset is where `decode(step)` is finite; elsewhere it stands for `background` (data units). SSIM is measured over the coreset of
-    evenly spaced steps (`ssim_steps`). Raises InputError for frames of different shapes.
+    original_frames, decode: step -> frame (z, y, x) of the original, and of the decoded series. A
+        vertex is in the coreset if its decoded value is finite.
+    data_range: of the original series, in data units.
+    background: decoded value outside the coreset for the figures over the domain, in data units.
+
+    At most FRAMES_HELD frames of each series are in memory. The SSIM is measured over the coreset
+    of evenly spaced steps (`ssim_steps`). Raises InputError for frames of different shapes.
+    Progress stage: "measuring".
     """
-    coreset, domain = Errors(data_range), Errors(data_range)
-    similarity, vertices, measured = 0.0, 0, [-1]
-    threads, waiting = usable_threads(), deque[Future[_Compared]]()
-
-    def work(step: int, original: Values, decoded: Values, similar: bool, share: int) -> _Compared:
-        known = np.isfinite(decoded)
-        whole = bool(known.all())
-        inside = coreset.compare(step, original, decoded, None if whole else known)
-        # Where everything is decoded, both are the same.
-        outside = (
-            inside
-            if whole
-            else domain.compare(
-                step, original, np.where(known, decoded, decoded.dtype.type(background))
-            )
-        )
-        found = (
-            ssim(original, decoded, data_range, None if whole else known, threads=share)
-            if similar
-            else (0.0, 0)
-        )
-        return _Compared(step=step, inside=inside, everywhere=outside, similarity=found)
+    comparer = _Comparer(data_range, background)
+    measured = [-1]
+    threads, waiting = usable_threads(), deque[Future[_Comparison]]()
 
     def collect() -> None:
-        nonlocal similarity, vertices
-        compared = waiting.popleft().result()
-        figures = coreset.take(compared.step, compared.inside)
-        domain.take(compared.step, compared.everywhere)
-        similarity, vertices = (
-            similarity + compared.similarity[0],
-            vertices + compared.similarity[1],
-        )
-        progress(
-            "measuring",
-            compared.step + 1,
-            steps,
-            "" if figures.psnr is None else f"{figures.psnr:.1f} dB",
-        )
+        """Wait for the first step under way, and add it."""
+        figures = comparer.add(waiting.popleft().result())
+        note = "" if figures.psnr is None else f"{figures.psnr:.1f} dB"
+        progress("measuring", figures.step + 1, steps, note)
 
     with ThreadPoolExecutor(threads, thread_name_prefix="fhash-measure") as workers:
         for step in range(steps):
@@ -238,24 +298,14 @@ def measure_quality(
                 collect()
             waiting.append(
                 workers.submit(
-                    work, step, original, decoded, step in measured, -(-threads // at_once)
+                    comparer.compare,
+                    step,
+                    original,
+                    decoded,
+                    with_ssim=step in measured,
+                    threads=-(-threads // at_once),
                 )
             )
         while waiting:
             collect()
-    return Quality(
-        psnr=coreset.psnr,
-        rmse=coreset.rmse,
-        max_abs_error=coreset.max_abs_error,
-        ssim=similarity / vertices if vertices else None,
-        ssim_window={
-            "sigma": SIGMA,
-            "window": WINDOW,
-            "data_range": data_range if math.isfinite(data_range) else None,
-            "steps": measured,
-        },
-        psnr_domain=domain.psnr,
-        rmse_domain=domain.rmse,
-        max_abs_error_domain=domain.max_abs_error,
-        per_step=tuple(coreset.steps),
-    )
+    return comparer.quality(measured)

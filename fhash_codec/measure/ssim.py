@@ -1,8 +1,9 @@
-"""Structural similarity of volumes (Wang et al. 2004): Gaussian window, population covariance, as scikit-image with
-`gaussian_weights=True, sigma=1.5, use_sample_covariance=False`. Native where it is there (fhash_codec/native/quality.cpp).
+"""Structural similarity (SSIM) of volumes, with a Gaussian window and population covariance.
 
-In numpy filtering a tile is three products with small banded matrices, as the window is separable and short: ten times faster than adding
-shifted arrays.
+It is that of scikit-image with `gaussian_weights=True, sigma=1.5, use_sample_covariance=False`.
+Native code computes it where it is installed (fhash_codec/native/quality.cpp), else numpy. In
+numpy a tile is filtered by three products with small banded matrices, since the window is separable
+and short: ten times faster than adding shifted arrays. Source: Wang et al. 2004.
 """
 
 from __future__ import annotations
@@ -23,18 +24,36 @@ from fhash_codec.measure.value_range import pieces, power_of_two
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import share_out, usable_threads
 
-SIGMA, RADIUS = 1.5, 5
+SIGMA = 1.5
+"""Standard deviation of the Gaussian window, in vertices."""
+
+RADIUS = 5
+"""Vertices of the window on either side of its middle."""
+
 WINDOW = 2 * RADIUS + 1
-K1, K2 = 0.01, 0.03
-TILE, NATIVE_TILE = (32, 32, 32), (64, 32, 64)
-"""Vertices (z, y, x) that are compared at once; together with the window's radius around them they stay in the cache."""
+"""Vertices of the window along each axis."""
+
+K1 = 0.01
+"""Constant of the mean, as a fraction of the range (Wang et al. 2004)."""
+
+K2 = 0.03
+"""Constant of the variance, as a fraction of the range (Wang et al. 2004)."""
+
+TILE = (32, 32, 32)
+"""Vertices (z, y, x) that numpy compares at once: with the window around, they fit the cache."""
+
+NATIVE_TILE = (64, 32, 64)
+"""Vertices (z, y, x) that native code compares at once."""
+
 BUDGET = 2**25
+"""Vertices of all steps that are measured together, by default."""
 
 _NOT_FINITE = "SSIM: decoded values are not finite where they are compared"
 
 Doubles = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 Tile = tuple[tuple[int, int], ...]
+"""Half-open spans of vertices along z, y and x."""
 
 
 def ssim(
@@ -45,13 +64,22 @@ def ssim(
     *,
     threads: int | None = None,
 ) -> tuple[float, int]:
-    """Sum of the local similarity of two frames (z, y, x) and the number of vertices it is over; their quotient is the mean SSIM.
+    """Sum of the local similarity of two frames, and the number of vertices in the sum.
 
-    Without a mask the outer 5 vertices of every axis of at least 11 are left out, as scikit-image does, and a shorter axis counts whole;
-    an axis of one vertex then gives the SSIM of the plane. With a mask that leaves something out just its vertices count, and outside it
-    both frames take the original's value. Borders are mirrored (scipy's 'reflect'). Where the original is not finite both frames take the
-    mean of its finite values, and the vertex does not count. A range that is 0 or not finite has no SSIM: (0.0, 0).
-    Raises InputError for frames of different shapes and for decoded values that are not finite where the frames are compared.
+    Their quotient is the mean SSIM.
+
+    original, decoded: frames (z, y, x) of one shape.
+    data_range: of the series, in data units; 0 or an infinite one has no SSIM and gives (0.0, 0).
+    mask: vertices (z, y, x) to be measured. A mask of all True is no mask.
+    threads: `usable_threads()` if None.
+
+    Without a mask, the outer 5 vertices of every axis of at least 11 are left out, as scikit-image
+    does; a shorter axis is measured whole, and an axis of one vertex gives the SSIM of the plane.
+    With a mask, only its vertices are counted, and both frames take the original's value outside
+    it. Borders are mirrored (scipy's
+    'reflect'). Vertices whose original is not finite are not counted, and both frames take the mean
+    of the original there. Raises InputError for frames of different shapes, and for decoded values
+    that are not finite at a vertex that is compared.
     """
     if (
         original.ndim != 3
@@ -59,31 +87,34 @@ def ssim(
         or (mask is not None and mask.shape != original.shape)
     ):
         raise InputError(
-            f"SSIM: the original is {original.shape}, the decoded {decoded.shape}; frames (z, y, x) of one shape are needed"
+            f"SSIM: the original is {original.shape}, the decoded {decoded.shape}; "
+            "frames (z, y, x) of one shape are needed"
         )
     if not 0 < data_range < math.inf:
         return 0.0, 0
-    whole = mask is None or bool(mask.all())
-    margins = [RADIUS if whole and size >= WINDOW else 0 for size in original.shape]
-    frame = _Frames(original, decoded, data_range, None if whole else mask)
-    spans = zip(
-        margins, original.shape, TILE if native.library() is None else NATIVE_TILE, strict=True
-    )
-    tiles = list(product(*(_cuts(margin, size - margin, most) for margin, size, most in spans)))
+    if mask is not None and mask.all():
+        mask = None
+    margins = [RADIUS if mask is None and size >= WINDOW else 0 for size in original.shape]
+    frames = _Frames(original, decoded, data_range, mask)
+    tile_shape = TILE if native.library() is None else NATIVE_TILE
+    spans = zip(margins, original.shape, tile_shape, strict=True)
+    tiles = list(product(*(_cuts(margin, size - margin, limit) for margin, size, limit in spans)))
     results: dict[Tile, tuple[float, int]] = {}
 
     def work(share: Sequence[Tile]) -> None:
         for tile in share:
-            results[tile] = frame.similarity(tile)
+            results[tile] = frames.similarity(tile)
 
     share_out(work, tiles, usable_threads(threads))
-    return math.fsum(total for total, _ in results.values()), sum(
-        count for _, count in results.values()
-    )
+    totals, counts = zip(*results.values(), strict=True)
+    return math.fsum(totals), sum(counts)
 
 
 def ssim_steps(steps: int, vertices_per_step: int, budget: int = BUDGET) -> list[int]:
-    """Evenly spaced steps, ends included, that hold at most `budget` vertices together; one step, the middle one, is always measured."""
+    """Evenly spaced steps, ends included, with at most `budget` vertices together.
+
+    At least one step is measured: the middle one.
+    """
     count = max(1, min(steps, budget // max(vertices_per_step, 1)))
     if count == 1:
         return [steps // 2]
@@ -91,7 +122,10 @@ def ssim_steps(steps: int, vertices_per_step: int, budget: int = BUDGET) -> list
 
 
 class _Frames:
-    """Two frames to compare, scaled by a power of two near the range and shifted to the original's mean: squares stay small and exact."""
+    """Two frames to compare, scaled by a power of two near the range and shifted by the mean.
+
+    Their squares then stay small and exact.
+    """
 
     def __init__(
         self,
@@ -114,16 +148,15 @@ class _Frames:
             )
             self.mask = None if mask is None else np.ascontiguousarray(mask)
         count, total = 0, 0.0
-        for part in pieces(self.original):
-            found = range_and_sum(
-                part if part.dtype in (np.float32, np.float64) else part.astype(np.float64),
-                float(self.scale),
-            )
-            count, total = count + found[0], total + found[3]
+        for piece in pieces(self.original):
+            if piece.dtype not in (np.float32, np.float64):
+                piece = piece.astype(np.float64)
+            piece_count, _, _, piece_total = range_and_sum(piece, float(self.scale))
+            count, total = count + piece_count, total + piece_total
         self.mean = np.float64(total / count if count else 0.0)
 
     def similarity(self, tile: Tile) -> tuple[float, int]:
-        """Sum and count over a tile."""
+        """Sum of the similarity over a tile, and the number of vertices in the sum."""
         return self._portable(tile) if self._library is None else self._native(self._library, tile)
 
     def _native(self, library: ctypes.CDLL, tile: Tile) -> tuple[float, int]:
@@ -150,10 +183,10 @@ class _Frames:
 
     def _portable(self, tile: Tile) -> tuple[float, int]:
         inner = tuple(slice(start, stop) for start, stop in tile)
-        counts = np.isfinite(self.original[inner])
+        counted = np.isfinite(self.original[inner])
         if self.mask is not None:
-            counts &= self.mask[inner]
-        if not counts.any():
+            counted &= self.mask[inner]
+        if not counted.any():
             return 0.0, 0
         a, b = self._read(tile)
         mean_a, mean_b, squares, products = _filtered(np.stack([a, b, a * a + b * b, a * b]))
@@ -163,10 +196,10 @@ class _Frames:
         mean_b += self.mean
         above = (2 * mean_a * mean_b + self.c1) * (2 * covariance + self.c2)
         below = (mean_a * mean_a + mean_b * mean_b + self.c1) * (variances + self.c2)
-        return float((above / below)[counts].sum()), int(counts.sum())
+        return float((above / below)[counted].sum()), int(counted.sum())
 
     def _read(self, tile: Tile) -> tuple[Doubles, Doubles]:
-        """Both frames of a tile and the window's radius around it."""
+        """Both frames in a tile and RADIUS vertices around it, scaled and shifted."""
         a = _around(self.original, tile) * self.scale - self.mean
         b = _around(self.decoded, tile) * self.scale - self.mean
         missing = ~np.isfinite(a)
@@ -179,27 +212,30 @@ class _Frames:
         return a, b
 
 
-def _cuts(start: int, stop: int, most: int) -> list[tuple[int, int]]:
-    """Split an axis evenly into tiles of at most so many vertices."""
-    count = -(-(stop - start) // most)
+def _cuts(start: int, stop: int, limit: int) -> list[tuple[int, int]]:
+    """Spans of at most `limit` vertices that split an axis evenly."""
+    count = -(-(stop - start) // limit)
     ends = [start + (stop - start) * number // count for number in range(count + 1)]
     return list(pairwise(ends))
 
 
 def _around(values: npt.NDArray[Any], tile: Tile) -> npt.NDArray[Any]:
-    """A tile with RADIUS more on every side; beyond the frame mirrored, the end vertices repeated (d c b a | a b c d | d c b a)."""
+    """The values of a tile and of RADIUS vertices more on every side.
+
+    They are mirrored beyond the frame, with the end vertices repeated: d c b a | a b c d | d c b a.
+    """
     ends = [
         (max(start - RADIUS, 0), min(stop + RADIUS, size))
         for (start, stop), size in zip(tile, values.shape, strict=True)
     ]
-    part = values[tuple(slice(*end) for end in ends)]
+    around = values[tuple(slice(*end) for end in ends)]
     for axis, ((start, stop), (first, _), size) in enumerate(
         zip(tile, ends, values.shape, strict=True)
     ):
-        if part.shape[axis] < stop - start + 2 * RADIUS:
+        if around.shape[axis] < stop - start + 2 * RADIUS:
             index = np.arange(start - RADIUS, stop + RADIUS) % (2 * size)
-            part = part.take(np.minimum(index, 2 * size - 1 - index) - first, axis=axis)
-    return part
+            around = around.take(np.minimum(index, 2 * size - 1 - index) - first, axis=axis)
+    return around
 
 
 @lru_cache(maxsize=64)
@@ -213,9 +249,10 @@ def _window(length: int) -> Doubles:
 
 @lru_cache(maxsize=1)
 def _weights() -> Doubles:
+    """The Gaussian window along one axis (WINDOW,); its sum is 1."""
     weights = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
-    normal: Doubles = weights / weights.sum()
-    return normal
+    normalised: Doubles = weights / weights.sum()
+    return normalised
 
 
 def _filtered(fields: Doubles) -> Doubles:

@@ -1,7 +1,9 @@
-"""Range, sum and squared errors of many values, native (fhash_codec/native/quality.cpp) or in numpy with the same bits.
+"""Range, sum and squared errors of many values.
 
-Both add in one stated order, because what is measured steers the encoder, whose bytes must not depend on the machine: value i of a piece
-of PIECE values goes to lane i % LANES; each lane is added up in order, then the lanes, then the pieces.
+They are computed by native code (fhash_codec/native/quality.cpp), or by numpy with the same bits.
+Both add in one fixed order: value i of a piece of PIECE values goes to lane i % LANES, and each
+lane is summed in order, then the lanes, then the pieces. The order is fixed because these figures
+steer the encoder, and its bytes must not depend on the machine.
 """
 
 from __future__ import annotations
@@ -21,13 +23,19 @@ Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 Doubles = npt.NDArray[np.float64]
 
-LANES, PIECE = 256, 1 << 14
+LANES = 256
+"""Sums that run side by side."""
+
+PIECE = 1 << 14
+"""Values that are summed in lanes before the lanes are added up."""
 
 
 def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, float, float]:
-    """Number, least, greatest (inf and -inf if there is none) and sum times a factor of the finite ones of float32 or float64 values.
+    """Number, minimum, maximum and sum of the finite values of a float32 or float64 array.
 
-    Zeros come without a sign, since which of two zeros is the least is nobody's order. A sum beyond float64 is infinite.
+    Without a finite value, the minimum is inf and the maximum -inf. Zeros are returned without a
+    sign, since no order decides between 0.0 and -0.0. Each value is multiplied by `factor` before
+    it is added to the sum. A sum beyond float64 is infinite.
     """
     flat = np.ascontiguousarray(values).reshape(-1)
     library = native.library()
@@ -38,14 +46,14 @@ def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, floa
         return count, low + 0.0, high + 0.0, total
     count, low, high, total = 0, np.inf, -np.inf, 0.0
     for start in range(0, flat.size, PIECE):
-        part = flat[start : start + PIECE]
-        finite = np.isfinite(part)
-        chosen = part[finite]
-        if chosen.size:
-            count += chosen.size
-            low, high = min(low, float(chosen.min())), max(high, float(chosen.max()))
+        piece = flat[start : start + PIECE]
+        is_finite = np.isfinite(piece)
+        finite = piece[is_finite]
+        if finite.size:
+            count += finite.size
+            low, high = min(low, float(finite.min())), max(high, float(finite.max()))
         with np.errstate(over="ignore"):
-            total += _lane_sum(np.where(finite, part, 0).astype(np.float64) * factor)
+            total += _lane_sum(np.where(is_finite, piece, 0).astype(np.float64) * factor)
     return count, low + 0.0, high + 0.0, total
 
 
@@ -54,8 +62,13 @@ def squared_errors(
 ) -> tuple[int, float, float]:
     """Number, sum of squares and largest magnitude of (original - decoded) * scale, in float64.
 
-    Arrays of one shape and any real type; counted are those with a finite original where the mask is set (None: everywhere). The number is
-    -1 where a decoded value that counts is not finite. 64-bit integers are compared exactly, where float64 would round differences to 0.
+    original, decoded: arrays of one shape and any real type.
+    mask: of the same shape; all True if None. A vertex is counted if the mask is True and its
+        original value is finite.
+    scale: a power of two.
+
+    The number is -1 if a decoded value is not finite at a counted vertex. 64-bit integers are
+    compared exactly; float64 would round their differences to 0.
     """
     library = native.library()
     if (
@@ -63,36 +76,41 @@ def squared_errors(
         and original.dtype == decoded.dtype
         and original.dtype in (np.float32, np.float64)
     ):
-        one, other = np.ascontiguousarray(original), np.ascontiguousarray(decoded)
-        counted = None if mask is None else np.ascontiguousarray(mask, dtype=np.bool_)
-        pointers = _pointer(other), _pointer(counted)
-        return _call(library, "errors", one, *pointers, ctypes.c_int64(one.size), scale, results=2)
+        original, decoded = np.ascontiguousarray(original), np.ascontiguousarray(decoded)
+        mask = None if mask is None else np.ascontiguousarray(mask, dtype=np.bool_)
+        pointers = _pointer(decoded), _pointer(mask)
+        size = ctypes.c_int64(original.size)
+        return _call(library, "errors", original, *pointers, size, scale, results=2)
     exact = original.dtype.kind in "iu" and original.dtype.itemsize == 8
     count, squares, largest = 0, 0.0, 0.0
     masks = pieces(np.broadcast_to(np.True_, original.shape) if mask is None else mask)
-    for one, other, counts in zip(pieces(original), pieces(decoded), masks, strict=True):
+    for source, result, counted in zip(pieces(original), pieces(decoded), masks, strict=True):
         if library is not None and not exact:
-            found = squared_errors(
-                one.astype(np.float64),
-                other.astype(np.float64),
-                None if mask is None else counts,
+            errors = squared_errors(
+                source.astype(np.float64),
+                result.astype(np.float64),
+                None if mask is None else counted,
                 scale,
             )
         else:
-            found = _squared_errors(one, other, counts, np.float64(scale))
-        if found[0] < 0:
+            errors = _squared_errors(source, result, counted, np.float64(scale))
+        if errors[0] < 0:
             return -1, 0.0, 0.0
-        count, squares, largest = count + found[0], squares + found[1], max(largest, found[2])
+        count, squares, largest = count + errors[0], squares + errors[1], max(largest, errors[2])
     return count, squares, largest
 
 
 def _call(
     library: ctypes.CDLL, name: str, values: Values, *arguments: Any, results: int
 ) -> tuple[Any, ...]:
+    """The count that a native function returns, and the `results` numbers that it writes.
+
+    name: `scan` or `errors`; the function of the type of the values is called.
+    """
     function = getattr(library, f"fhash_{name}_f{values.dtype.itemsize * 8}")
-    found = (ctypes.c_double * results)()
-    given = (ctypes.c_double(value) if isinstance(value, float) else value for value in arguments)
-    return function(_pointer(values), *given, found), *found
+    output = (ctypes.c_double * results)()
+    numbers = (ctypes.c_double(value) if isinstance(value, float) else value for value in arguments)
+    return function(_pointer(values), *numbers, output), *output
 
 
 def _pointer(array: Values | None) -> ctypes.c_void_p:
@@ -100,7 +118,10 @@ def _pointer(array: Values | None) -> ctypes.c_void_p:
 
 
 def _lane_sum(values: Doubles) -> float:
-    """The sum of at most PIECE values in the stated order; a running sum has one order on every machine, `sum` has not."""
+    """The sum of at most PIECE values in the fixed order.
+
+    A running sum adds in one order on every machine; `np.sum` does not.
+    """
     rows = np.zeros((-(-values.size // LANES), LANES))
     rows.reshape(-1)[: values.size] = values
     total = 0.0
@@ -112,14 +133,16 @@ def _lane_sum(values: Doubles) -> float:
 def _squared_errors(
     original: Values, decoded: Values, mask: Mask, scale: np.float64
 ) -> tuple[int, float, float]:
+    """`squared_errors` of one-dimensional arrays by numpy."""
     count, squares, largest = 0, 0.0, 0.0
     for start in range(0, original.size, PIECE):
-        part = slice(start, start + PIECE)
-        counts = np.isfinite(original[part]) & mask[part]
-        difference = np.where(counts, _scaled_difference(original[part], decoded[part], scale), 0.0)
+        piece = slice(start, start + PIECE)
+        counted = np.isfinite(original[piece]) & mask[piece]
+        errors = _scaled_difference(original[piece], decoded[piece], scale)
+        difference = np.where(counted, errors, 0.0)
         if not np.isfinite(difference).all():
             return -1, 0.0, 0.0
-        count += int(np.count_nonzero(counts))
+        count += int(np.count_nonzero(counted))
         largest = max(largest, float(difference.max()), -float(difference.min()))
         with np.errstate(over="ignore"):
             squares += _lane_sum(np.square(difference))
@@ -127,18 +150,19 @@ def _squared_errors(
 
 
 def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> Doubles:
+    """(original - decoded) * scale; exact for 64-bit integers."""
     with np.errstate(over="ignore", invalid="ignore"):
         difference = np.asarray(original * scale - decoded * scale, dtype=np.float64)
     if original.dtype.kind in "iu" and original.dtype.itemsize == 8:
         limits = np.iinfo(original.dtype)
-        whole = np.clip(
+        nearest = np.clip(
             np.rint(decoded.astype(np.float64)),
             float(limits.min),
             np.nextafter(float(limits.max), 0.0),
         )
-        # Differences wrap at 2^64; those beyond 2^62 do not need the exactness.
-        exact = (original - whole.astype(original.dtype)).view(np.int64) - (
-            decoded.astype(np.float64) - whole
+        # Integer differences wrap at 2^64; differences beyond 2^62 do not need to be exact.
+        exact = (original - nearest.astype(original.dtype)).view(np.int64) - (
+            decoded.astype(np.float64) - nearest
         )
         difference = np.where(np.abs(difference) < 2.0**62 * scale, exact * scale, difference)
     return difference

@@ -1,4 +1,4 @@
-"""The size of a model: which tables and layers it has; no numbers, no torch."""
+"""The size of a model: its tables and its layers, without their numbers and without torch."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from fhash_codec.paper.levels import Resolution, level_resolutions, parameter_co
 
 @dataclass(frozen=True, kw_only=True)
 class Architecture:
-    """Tables per level (finest first) and an MLP from all embeddings of a point to one value in [0, 1].
+    """Sizes of the tables of all levels, and of the MLP that turns their embeddings into a value.
 
     Attributes:
-        levels: vertices (t, z, y, x) of each table.
-        embedding_size: numbers at each vertex.
-        hidden_layers, width: of the MLP with ReLU; no hidden layer is a linear readout.
+        levels: vertices (t, z, y, x) of each table, finest first.
+        embedding_size: numbers at each vertex of a table.
+        hidden_layers: hidden layers of the MLP, with ReLU; 0 makes it a linear readout.
+        width: neurons of each hidden layer.
         box_size: vertices (z, y, x) of the feature bounding box.
         key_frames: number of key frames.
     """
@@ -39,7 +40,11 @@ class Architecture:
         hidden_layers: int = 1,
         width: int = 64,
     ) -> Architecture:
-        """The paper's model of a feature bounding box and a number of key frames."""
+        """Return the paper's model of a feature bounding box and a number of key frames.
+
+        The defaults are the paper's (section 4.2): fold 2, embeddings of 2 numbers, and an MLP of 2
+        layers (one of them hidden) with 64 neurons.
+        """
         levels = level_resolutions(box_size, key_frames, fold)
         return cls(
             levels=levels,
@@ -52,12 +57,15 @@ class Architecture:
 
     @property
     def sizes(self) -> Resolution:
-        """Vertices (t, z, y, x) on which the coreset lies: key frames and box; equal to the finest level."""
+        """Vertices (t, z, y, x) of the lattice of samples: key frames and box.
+
+        They equal the resolution of the finest level (paper, equation 4).
+        """
         return (self.key_frames, *self.box_size)
 
     @property
     def inputs(self) -> int:
-        """Numbers that reach the MLP for one point."""
+        """Inputs of the MLP for one point: the embeddings of all levels, concatenated."""
         return len(self.levels) * self.embedding_size
 
     @property
@@ -68,7 +76,7 @@ class Architecture:
 
     @property
     def parameters(self) -> int:
-        """All trained numbers, tables and MLP."""
+        """Number of all trained numbers, in the tables and the MLP."""
         return parameter_count(self.levels, self.embedding_size) + sum(
-            o * (i + 1) for o, i in self.layer_shapes
+            outputs * (inputs + 1) for outputs, inputs in self.layer_shapes
         )

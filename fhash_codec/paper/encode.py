@@ -1,4 +1,4 @@
-"""Encoding by the paper profile."""
+"""Encoding by the profile paper: select the coreset, train the model, write both."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.header import brief_history, describe_source, write_series
 from fhash_codec.paper.selection import Selection, select
 from fhash_codec.paper.storage import write_model, write_tables
-from fhash_codec.paper.training.fit import Trained, train_model
+from fhash_codec.paper.training.fit import TrainedModel, train_model
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
 from fhash_formats.series import Series
@@ -25,52 +25,79 @@ def encode_paper(
     path: Path,
     progress: Progress,
 ) -> tuple[dict[str, Any], Path | None]:
-    """Train the published model and write it; the header without its quality, and the checkpoint to be removed."""
-    selected = select(series, config, progress, mask)
-    trained = train_model(selected.coreset, selected.architecture, config, path, progress)
-    architecture, coreset = selected.architecture, selected.coreset
-    loss = None
-    write_series(writer, series, selected.scanned, coreset.key_frames)
-    if config.tables == "transform":
-        from fhash_codec.paper.tables.step import write_coded
+    """Train the published model on a series and write it.
 
-        # A promise counts every step; what is between key frames this search does not see.
-        psnr = config.psnr if len(coreset.key_frames) == series.shape[0] else None
-        loss = write_coded(
-            writer,
-            architecture,
-            coreset,
-            trained.fine,
-            trained.tables,
-            trained.layers,
-            psnr,
-            progress,
-        )
+    Args:
+        writer: the container that is being written.
+        series: the series.
+        config: the settings.
+        mask: one more feature, as in `select`.
+        path: the output file, beside which the checkpoint of the training lies.
+        progress: called with each step of the work.
+
+    Returns:
+        The header without its quality, and the checkpoint to remove once the file is complete.
+    """
+    selection = select(series, config, progress, mask)
+    coreset, architecture = selection.coreset, selection.architecture
+    trained = train_model(coreset, architecture, config, path, progress)
+    write_series(writer, series, selection.scanned, coreset.key_frames)
+    loss = None
+    if config.tables == "transform":
+        loss = _write_coded_tables(writer, series, selection, trained, config, progress)
     else:
         write_tables(writer, architecture, coreset, trained.fine, trained.tables, config.tables)
-    write_model(writer, architecture, coreset, trained.layers)
-    header = _header(series, selected, trained, config)
+    write_model(writer, coreset, trained.layers)
+    header = _header(series, selection, trained, config)
     if loss is not None:
         header["required_features"] = ["transform"]
         header["model"]["tables_loss_db"] = round(loss, 4)
     return header, trained.checkpoint
 
 
-def _header(
-    series: Series, selected: Selection, trained: Trained, config: EncodeConfig
-) -> dict[str, Any]:
-    """The container's header (FORMAT.md), its quality still to be measured."""
-    architecture, coreset, value_range = (
-        selected.architecture,
-        selected.coreset,
-        selected.scanned.value_range,
+def _write_coded_tables(
+    writer: ContainerWriter,
+    series: Series,
+    selection: Selection,
+    trained: TrainedModel,
+    config: EncodeConfig,
+    progress: Progress,
+) -> float:
+    """Write the tables through the coder of the profile compact; return the PSNR lost, in dB."""
+    # Only `--tables transform` needs these modules.
+    from fhash_codec.paper.tables.step import write_coded
+
+    # A promised PSNR covers every time step, but the search for the quantiser step sees key frames
+    # only. It can keep the promise only where every time step is a key frame.
+    every_step = len(selection.coreset.key_frames) == series.shape[0]
+    return write_coded(
+        writer,
+        selection.architecture,
+        selection.coreset,
+        trained.fine,
+        trained.tables,
+        trained.layers,
+        config.psnr if every_step else None,
+        progress,
     )
+
+
+def _header(
+    series: Series, selection: Selection, trained: TrainedModel, config: EncodeConfig
+) -> dict[str, Any]:
+    """Return the container's header (FORMAT.md, Header), without its quality."""
+    architecture, coreset = selection.architecture, selection.coreset
     seconds = trained.history[-1]["seconds"] if trained.history else 0.0
+    restarts = (
+        {"restarts": trained.restarts, "learning_rate": trained.learning_rate}
+        if trained.restarts
+        else {}
+    )
     return {
-        **describe_source(series, value_range, config),
+        **describe_source(series, selection.scanned.value_range, config),
         "background": coreset.background,
         "feature_bounding_box": [list(span) for span in coreset.box],
-        "features": [str(feature) for feature in selected.features],
+        "features": [str(feature) for feature in selection.features],
         "coreset_fraction": coreset.fraction,
         "model": {
             "profile": config.profile,
@@ -87,11 +114,7 @@ def _header(
             "seconds": seconds if config.timings else None,
             "epochs": trained.epochs,
             "device": trained.device,
-            **(
-                {"restarts": trained.restarts, "learning_rate": trained.learning_rate}
-                if trained.restarts
-                else {}
-            ),
+            **restarts,
         },
         "history": brief_history(trained.history, timings=config.timings),
     }

@@ -1,4 +1,7 @@
-"""The paper profile's model as `Volume` reads it: the trained network in data units, and its occupancy. numpy only."""
+"""The paper profile's model as `Volume` reads it: the network, in data units, and its occupancy.
+
+This module needs numpy only.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import box_size, crop
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import between, unpack
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.paper.network import Network
-from fhash_codec.paper.regions import Box, decode_region, sample_points
+from fhash_codec.paper.points import sample_points
+from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.storage import load_network
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError
@@ -21,51 +25,59 @@ Positions = npt.NDArray[np.float64]
 
 
 class PaperModel:
-    """A `VolumeModel` (volume_model.py) of the network in a container; a fractional key index interpolates embeddings, not values."""
+    """A `VolumeModel` (volume_model.py) of the network in a container.
+
+    At a fractional key index the embeddings are interpolated in time, not the values.
+    """
 
     def __init__(self, container: Container) -> None:
         header = container.header
         self._container = container
         self._range = ValueRange(*header["value_range"])
-        self._box: Box = tuple((low, high) for low, high in header["feature_bounding_box"])  # type: ignore[assignment]
+        self._box = Box.of(header["feature_bounding_box"])
         self.chunks: tuple[int, ...] = (1, *header["domain"]["shape"][1:])
         self._unpacked = lru_cache(maxsize=4)(self._unpack)
 
     @cached_property
     def network(self) -> Network:
-        """The tables, read on demand, and the layers."""
+        """The network. Its tables are read on demand."""
         return load_network(self._container)
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
-        """Which vertices (z, y, x) of a region are in the coreset at either of two key frames."""
-        return crop(self._unpacked(first, last), region)
+        """Return which vertices (z, y, x) of a region are in the coreset at either key frame."""
+        return self._unpacked(first, last)[region.slices()]
 
-    def region(
-        self, key: float, region: Box, wanted: npt.NDArray[np.bool_]
+    def read(
+        self, key: float, region: Box, requested: npt.NDArray[np.bool_]
     ) -> npt.NDArray[np.float64]:
-        """Values (z, y, x) of a region; blocks without a wanted vertex are NaN and cost nothing."""
-        return self._range.from_unit(decode_region(self.network, key, region, wanted=wanted))
+        """Return the values (z, y, x) of a region.
 
-    def coarse(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
-        """Raises InputError: the embeddings of a coarser level alone give no values."""
+        Blocks of the decoder without a requested vertex are NaN and cost nothing.
+        """
+        return self._range.from_unit(decode_region(self.network, key, region, requested=requested))
+
+    def read_lod(self, key: int, lod: int, region: Box) -> npt.NDArray[Any]:
+        """Raise InputError: the embeddings of a coarser level alone give no values."""
         raise InputError(
-            f"{self._container.path}: a file of the profile paper has no levels of detail; decode it whole"
+            f"{self._container.path}: a file of the profile paper has no levels of detail; "
+            "decode it whole"
         )
 
-    def points(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
-        """Values (n,) at points, all inside the box."""
+    def sample(self, keys: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
+        """Return the values (n,) at points inside the box."""
         return self._range.from_unit(sample_points(self.network, keys, *space))
 
-    def slopes(
+    def sample_with_gradient(
         self, keys: Positions, space: list[Positions]
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Values (n,) and analytic derivatives (n, 4) by key index, z, y and x."""
+        """Return the values (n,) and analytic derivatives (n, 4) by key index, z, y and x."""
         unit, slopes = sample_points(self.network, keys, *space, gradient=True)
         return self._range.from_unit(unit), slopes.astype(np.float64) * (
             self._range.high - self._range.low
         )
 
     def _unpack(self, first: int, last: int) -> npt.NDArray[np.bool_]:
+        """Return the occupancy (z, y, x) of the box at either of two key frames."""
         stored = self._container.arrays["occupancy/bits"]
         bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
-        return unpack(between(bits[0], bits[-1]), box_size(self._box))
+        return unpack(between(bits[0], bits[-1]), self._box.shape)

@@ -1,9 +1,26 @@
-"""A trained model as plain numbers: the tables of every level and the dense layers of its head. numpy only.
+"""A trained network as plain numbers: the tables of all levels and the dense layers. numpy only.
 
-A level's table is an array (t, z, y, x, embedding) whose corners align with the box: vertex i of an axis of S vertices lies at
-i (R - 1) / (S - 1) among the R vertices of the level (0 where S is 1); time likewise from the key index, which is fractional between
-key frames. The value at a point is the head of all levels' quadrilinearly interpolated embeddings, level-major: number
-level * embedding_size + e, finest level first.
+A level's table is an array (t, z, y, x, embedding). Its first and last vertices coincide with those
+of the box: vertex i of an axis with S vertices lies at i (R - 1) / (S - 1) among the R vertices of
+the level, at 0 where S is 1. Time follows the same rule, from the key index, which is fractional
+between key frames. The inputs of the dense layers at a point are the embeddings of all levels,
+interpolated linearly along the four axes. Input level * embedding_size + e is embedding e of a
+level; the finest level comes first.
+
+The promise of repeatable values
+--------------------------------
+A sample gets the same bits whatever other samples are evaluated with it. A matrix product of BLAS
+alone does not promise that: BLAS picks its kernel, and with it the order of the sums, by the shape
+of the matrices, and some kernels add in another order at another column. Two classes keep the
+promise, both by construction and on every machine:
+
+* `DenseLayers`, for the vertices of a region (`regions.py`). Regions are decoded in whole blocks at
+  fixed places, and a block in products of exactly `COLUMNS` columns. So a vertex always lies in the
+  same column of a product of the same shape.
+* `PointwiseLayers` (`pointwise.py`), for samples at free positions (`points.py`, rendering), which
+  may come in any column. It adds without BLAS.
+
+The bits may differ between machines, because their BLAS libraries do.
 """
 
 from __future__ import annotations
@@ -24,47 +41,57 @@ Layer = tuple[Floats, Floats]
 """Weight (out, in) and bias (out,)."""
 
 COLUMNS = 64
-"""Samples per matrix product. BLAS picks its kernel by the shape; products of this size run in one thread and in the first-level cache."""
+"""Samples per matrix product: such a product runs in one thread and in the first-level cache."""
 PRODUCTS = 64
-"""Products per layer before the next layer: what they put out stays in the second-level cache."""
+"""Products per layer before the next layer: their outputs stay in the second-level cache."""
+MAX_GRADIENT_SAMPLES = PRODUCTS * COLUMNS
+"""Largest number of samples for which `DenseLayers.gradient` can follow a run."""
 
 
 class TableSource(Protocol):
-    """A level's table, wherever it lies: `shape` is (t, z, y, x, embedding)."""
+    """A level's table, in memory or elsewhere."""
 
     @property
-    def shape(self) -> tuple[int, ...]: ...
+    def shape(self) -> tuple[int, ...]:
+        """Lengths of the axes (t, z, y, x, embedding)."""
+        ...
 
     def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """The embeddings of a region given as 5 slices of step 1 with explicit ends; float32 or float16."""
+        """Return the embeddings of a region, float32 or float16.
+
+        The region is 5 slices of step 1 with explicit ends.
+        """
         ...
 
 
 class ArrayTable:
-    """An array in memory (t, z, y, x, embedding) as a TableSource."""
+    """A `TableSource` of an array in memory, (t, z, y, x, embedding)."""
 
     def __init__(self, values: npt.NDArray[Any]) -> None:
         self.values = values
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """Lengths of the axes of the array."""
         return self.values.shape
 
     def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """Return a region as a view."""
         return self.values[region]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """All that decoding needs; raises InputError where the parts do not fit together.
+    """Everything that decoding needs. Raises InputError where the parts do not fit together.
 
     Attributes:
         levels: resolution (t, z, y, x) of each level, finest first.
         embedding_size: numbers at each vertex of a table.
         tables: one TableSource per level.
-        layers: (weight, bias) from the features to one output; ReLU between them; one layer alone is a linear readout.
+        layers: (weight, bias) of each layer, from the inputs to one output. ReLU stands between
+            layers; a single layer is a linear readout.
         box_size: vertices of the feature bounding box (z, y, x).
-        key_frames: how many.
+        key_frames: number of key frames.
     """
 
     levels: tuple[Resolution, ...]
@@ -75,39 +102,21 @@ class Network:
     key_frames: int
 
     def __post_init__(self) -> None:
-        if not self.levels or len(self.tables) != len(self.levels):
-            raise InputError(
-                f"network: {len(self.tables)} tables for {len(self.levels)} levels; each level needs one"
-            )
-        if min(*self.box_size, self.key_frames) < 1:
-            raise InputError(
-                f"network: box {self.box_size} with {self.key_frames} key frames; every length must be at least 1"
-            )
-        for level, (resolution, table) in enumerate(zip(self.levels, self.tables, strict=True)):
-            if tuple(table.shape) != (*resolution, self.embedding_size) or min(table.shape) < 1:
-                raise InputError(
-                    f"network: the table of level {level} has shape {tuple(table.shape)}, not {(*resolution, self.embedding_size)}"
-                )
-        width = self.features
-        for index, (weight, bias) in enumerate(self.layers):
-            if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
-                raise InputError(
-                    f"network: layer {index} has weight {weight.shape} and bias {bias.shape}; it gets {width} numbers"
-                )
-            if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
-                raise InputError(f"network: layer {index} holds numbers that are not finite")
-            width = weight.shape[0]
-        if not self.layers or width != 1:
-            raise InputError(f"network: the last of {len(self.layers)} layers must have one output")
+        self._check_tables()
+        self._check_layers()
 
     @property
-    def features(self) -> int:
-        """Inputs of the head."""
+    def inputs(self) -> int:
+        """Number of inputs of the first layer."""
         return len(self.levels) * self.embedding_size
 
     @cached_property
     def matrices(self) -> tuple[Floats, ...]:
-        """The layers as matrices (out + 1, in + 1) on vectors with a 1 at the end: the bias is the last column and the 1 is handed on."""
+        """Layers as matrices (out + 1, in + 1) that include the biases.
+
+        They act on vectors whose last number is 1: the bias is the last column, and the last row
+        hands the 1 on to the next layer.
+        """
         matrices = []
         for weight, bias in self.layers:
             matrix = np.zeros((weight.shape[0] + 1, weight.shape[1] + 1), np.float32)
@@ -116,26 +125,75 @@ class Network:
         return tuple(matrices)
 
     def read(self, level: int, region: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """A region (t, z, y, x) of a level's table, with all embeddings; raises DamagedFileError for numbers that are not finite."""
+        """Return all embeddings in a region of a level's table.
+
+        Args:
+            level: index of the level, 0 for the finest.
+            region: slices (t, z, y, x).
+
+        Raises:
+            DamagedFileError: numbers in the table are not finite.
+        """
         values = self.tables[level].read((*region, slice(0, self.embedding_size)))
         if not np.isfinite(values).all():
+            # Messages count levels from 1, as the arrays of the file do.
             raise DamagedFileError(
-                f"the table of level {level} holds numbers that are not finite; the training diverged or the file is damaged"
+                f"the table of level {level + 1} holds numbers that are not finite; "
+                "the training diverged or the file is damaged"
             )
         return values
 
+    def _check_tables(self) -> None:
+        if not self.levels or len(self.tables) != len(self.levels):
+            raise InputError(
+                f"network: {len(self.tables)} tables for {len(self.levels)} levels; "
+                "each level needs one"
+            )
+        if min(*self.box_size, self.key_frames) < 1:
+            raise InputError(
+                f"network: box {self.box_size} with {self.key_frames} key frames; "
+                "every length must be at least 1"
+            )
+        for number, (resolution, table) in enumerate(
+            zip(self.levels, self.tables, strict=True), start=1
+        ):
+            shape, needed = tuple(table.shape), (*resolution, self.embedding_size)
+            if shape != needed or min(shape) < 1:
+                raise InputError(
+                    f"network: the table of level {number} has shape {shape}, not {needed}"
+                )
+
+    def _check_layers(self) -> None:
+        width = self.inputs
+        for number, (weight, bias) in enumerate(self.layers, start=1):
+            if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
+                raise InputError(
+                    f"network: layer {number} has weight {weight.shape} and bias {bias.shape}; "
+                    f"it gets {width} numbers"
+                )
+            if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+                raise InputError(f"network: layer {number} holds numbers that are not finite")
+            width = weight.shape[0]
+        if not self.layers or width != 1:
+            raise InputError(f"network: the last of {len(self.layers)} layers must have one output")
+
 
 class DenseLayers:
-    """The dense layers of a network with room for a fixed number of samples; one per thread.
+    """Dense layers of a network, evaluated by matrix products of fixed shape.
+
+    The module's docstring says what that promises. An object has room for a fixed number of samples
+    and belongs to one thread. Write the inputs of n samples into `inputs[:-1, :n]`, call `run`, and
+    take the first n outputs; what the spare columns hold does not matter.
 
     Attributes:
-        inputs: (features + 1, samples) float32, to be filled by the caller; the last row is 1. `samples` is rounded up to whole products.
+        inputs: (network.inputs + 1, samples) float32, filled by the caller. The last row is 1 and
+            must stay so. The number of samples is rounded up to whole products.
     """
 
     def __init__(self, network: Network, samples: int) -> None:
         self.matrices = network.matrices
         products = -(-samples // COLUMNS)
-        self.inputs = np.zeros((network.features + 1, products * COLUMNS), np.float32)
+        self.inputs = np.zeros((network.inputs + 1, products * COLUMNS), np.float32)
         self.inputs[-1] = 1.0
         self.outputs = np.empty((products, COLUMNS), np.float32)
         self.hidden = [
@@ -144,15 +202,14 @@ class DenseLayers:
         ]
 
     def run(self) -> Floats:
-        """The outputs (samples,) for `inputs`; the next run overwrites them."""
+        """Return the outputs (samples,) for `inputs`. The next run overwrites them."""
         inputs = self.inputs.reshape(len(self.inputs), -1, COLUMNS).transpose(1, 0, 2)
         for start in range(0, len(inputs), PRODUCTS):
             current = inputs[start : start + PRODUCTS]
             for matrix, hidden in zip(self.matrices, self.hidden, strict=True):
                 out = hidden[: len(current)]
-                with np.errstate(
-                    over="ignore", invalid="ignore"
-                ):  # of hostile weights; values are clipped to their range
+                # Hostile weights overflow; values are clipped to their range later.
+                with np.errstate(over="ignore", invalid="ignore"):
                     np.matmul(matrix, current, out=out)
                 if hidden is not self.hidden[-1]:
                     np.maximum(out, 0.0, out=out)
@@ -161,14 +218,17 @@ class DenseLayers:
         return self.outputs.reshape(-1)
 
     def gradient(self) -> Floats:
-        """Derivatives (features, samples) of the last run's outputs by its inputs; for at most PRODUCTS * COLUMNS samples.
+        """Return the derivatives (network.inputs, samples) of the last run's outputs by its inputs.
 
-        Backwards through the layers; on a ReLU's kink the derivative is that of its flat side.
+        The chain rule goes backwards through the layers. On a ReLU's kink the derivative is that of
+        its flat side. The run must have had at most MAX_GRADIENT_SAMPLES samples, since hidden
+        layers of earlier products are overwritten.
         """
         assert len(self.outputs) <= PRODUCTS, "only the last products' hidden layers are kept"
         slope = np.broadcast_to(
             self.matrices[-1][0, :, None], (len(self.outputs), self.matrices[-1].shape[1], COLUMNS)
         )
+        # Hostile weights overflow here, too.
         with np.errstate(over="ignore", invalid="ignore"):
             for matrix, hidden in zip(self.matrices[-2::-1], self.hidden[-2::-1], strict=True):
                 slope = np.matmul(matrix.T, slope * (hidden > 0))

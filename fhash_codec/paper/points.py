@@ -10,20 +10,31 @@ from typing import Any, Literal, overload
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.paper.network import COLUMNS, PRODUCTS, DenseLayers, Floats, Network
+from fhash_codec.paper.network import MAX_GRADIENT_SAMPLES, DenseLayers, Floats, Network
 from fhash_codec.paper.pointwise import PointwiseLayers
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.support.threads import share_out, usable_threads
 
 AXES = ("key_index", "z", "y", "x")
-CHUNK_POINTS = PRODUCTS * COLUMNS
-SMALL_READ, LARGE_READ, READ_PER_POINT = 2**20, 2**25, 16
-"""Vertices of the finest table: so many are always read at once, never more than so many, and between them so many per point."""
+"""Names of the coordinates of a point, in order."""
+CHUNK_POINTS = MAX_GRADIENT_SAMPLES
+"""Points that one thread evaluates at a time."""
+SMALL_READ = 2**20
+"""Vertices of the finest table that a group of points may always span."""
+LARGE_READ = 2**25
+"""Vertices of the finest table that a group of points may never exceed."""
+READ_PER_POINT = 16
+"""Vertices of the finest table per point that a group may span between those two limits."""
 
 
 @dataclass(frozen=True)
 class Patch:
-    """A part of one level's table in memory, (t, z, y, x, E), and the vertex at which it begins."""
+    """A part of one level's table in memory.
+
+    Attributes:
+        values: embeddings (t, z, y, x, E).
+        first: vertex (t, z, y, x) of the level at which the part begins.
+    """
 
     values: npt.NDArray[Any]
     first: tuple[int, ...]
@@ -65,14 +76,30 @@ def sample_points(
     gradient: bool = False,
     threads: int | None = None,
 ) -> Floats | tuple[Floats, Floats]:
-    """Normalised values float32 (n,) at n points; with `gradient` also float32 (n, 4), the derivatives by key index, z, y and x.
+    """Return the normalised values float32 (n,) at n points.
 
-    key_index: (n,) in [0, key_frames - 1]; z, y, x: (n,) in vertices of the box, in [0, size - 1]; a single number stands for all.
-    The derivatives are those of the model itself, through interpolation and network, per key frame and per vertex. On the border
-    of two cells they are those of the cell after it, at the end of an axis those of the last cell, along an axis of one vertex 0;
-    on a ReLU's kink those of its flat side. Points that lie close together are read together: a part of each table at a time.
-    A point has the same bits whatever other points are given with it, in whatever order (pointwise.py).
-    Raises RegionError for a point outside the box, InputError for arrays that do not fit together.
+    With `gradient`, also return the derivatives float32 (n, 4) by key index, z, y and x, per key
+    frame and per vertex. They are those of the model itself, through interpolation and layers:
+
+    * On the border of two cells they are those of the cell after it; at the end of an axis, those
+      of the last cell.
+    * Along an axis of one vertex they are 0.
+    * On a ReLU's kink they are those of its flat side.
+
+    Points that lie close together share one read of a part of each table. A point has the same
+    bits whatever other points are given with it, in whatever order (pointwise.py).
+
+    Args:
+        network: the trained network.
+        key_index: times (n,) in [0, key_frames - 1].
+        z, y, x: positions (n,) in vertices of the box, in [0, size - 1]. A single number stands for
+            all points.
+        gradient: whether to return the derivatives.
+        threads: number of threads; None for one per processor.
+
+    Raises:
+        RegionError: a point is outside the box.
+        InputError: the lengths of the arrays do not fit together.
     """
     threads = usable_threads(threads)
     points = _points(network, (key_index, z, y, x))
@@ -81,68 +108,118 @@ def sample_points(
     slopes = np.empty((count, 4) if gradient else (0, 4), np.float32)
 
     for group in _groups(network, points, np.arange(count)):
-        span = np.stack([points[:, group].min(axis=1), points[:, group].max(axis=1)], axis=1)
-        patches = [_patch(network, level, span) for level in range(len(network.levels))]
+        patches = _patches(network, points[:, group])
 
-        def work(
+        def evaluate(
             chunks: Sequence[npt.NDArray[np.intp]], patches: Sequence[Patch] = patches
         ) -> None:
             for chunk in chunks:
-                values[chunk], slope = _evaluate(network, patches, points[:, chunk], gradient)
-                if slope is not None:
-                    slopes[chunk] = slope.T
+                values[chunk], chunk_slopes = _evaluate(
+                    network, patches, points[:, chunk], gradient
+                )
+                if chunk_slopes is not None:
+                    slopes[chunk] = chunk_slopes.T
 
         share_out(
-            work,
+            evaluate,
             [group[start : start + CHUNK_POINTS] for start in range(0, len(group), CHUNK_POINTS)],
             threads,
         )
     return (values, slopes) if gradient else values
 
 
-def feature_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
-    """Derivatives float32 (features, n) of the normalised value by each interpolated embedding at points (4, n) of the box, in order.
+def input_slopes(network: Network, points: npt.NDArray[np.float64]) -> Floats:
+    """Return the derivatives float32 (inputs, n) of the value by each input of the network.
 
-    Points that lie close together are read together: those of one call should.
+    The inputs are the interpolated embeddings, in the order of `Network`. The value is normalised.
+    A part of each table that surrounds all points is read at once, so points of one call should lie
+    close together.
+
+    Args:
+        network: the trained network.
+        points: positions (4, n), key index, z, y and x, inside the box.
     """
-    span = np.stack([points.min(axis=1), points.max(axis=1)], axis=1)
-    patches = [_patch(network, level, span) for level in range(len(network.levels))]
-    slopes = np.empty((network.features, points.shape[1]), np.float32)
+    patches = _patches(network, points)
+    slopes = np.empty((network.inputs, points.shape[1]), np.float32)
     for start in range(0, points.shape[1], CHUNK_POINTS):
         chunk = points[:, start : start + CHUNK_POINTS]
-        count = chunk.shape[1]
-        head = DenseLayers(network, count)
-        for level, patch in enumerate(patches):
-            before, after, _ = _locate(network, level, chunk)
-            rows = slice(level * network.embedding_size, (level + 1) * network.embedding_size)
-            head.inputs[rows, :count] = interpolate(
-                _corners(patch, before, network.levels[level]), after, False
-            )[0]
-        head.run()
-        slopes[:, start : start + count] = head.gradient()[:, :count]
+        layers = DenseLayers(network, chunk.shape[1])
+        _encode(network, patches, chunk, layers.inputs)
+        layers.run()
+        slopes[:, start : start + chunk.shape[1]] = layers.gradient()[:, : chunk.shape[1]]
     return slopes
+
+
+def interpolate(
+    corners: Floats, after_weights: Iterable[Floats], gradient: bool
+) -> tuple[Floats, list[Floats]]:
+    """Interpolate corners (2, 2, ..., E, n) to (E, n), linearly along the leading axes in turn.
+
+    The arrays may also be tensors of torch.
+
+    Args:
+        corners: embeddings of the corners of a cell, with one leading axis of length 2 for each
+            weight.
+        after_weights: for each leading axis, the weight of the corner after the point.
+        gradient: whether to return the changes.
+
+    Returns:
+        The embeddings and, with `gradient`, their changes across the cell along each of these axes.
+    """
+    changes: list[Floats] = []
+    for weight in after_weights:
+        changes = [_between(change, weight) for change in changes]
+        if gradient:
+            changes.append(corners[1] - corners[0])
+        corners = _between(corners, weight)
+    return corners, changes
+
+
+def _between(pair: Floats, after_weight: Floats) -> Floats:
+    """Interpolate linearly between the two items of a pair."""
+    result: Floats = pair[0] * (1 - after_weight) + pair[1] * after_weight
+    return result
 
 
 def _evaluate(
     network: Network, patches: Sequence[Patch], points: npt.NDArray[np.float64], gradient: bool
 ) -> tuple[Floats, Floats | None]:
-    """Values (n,) at points (4, n) within the patches and, if asked for, derivatives (4, n)."""
-    size, count = network.embedding_size, points.shape[1]
+    """Return values (n,) and, with `gradient`, derivatives (4, n) at points (4, n) in patches."""
+    count = points.shape[1]
     layers = PointwiseLayers(network, count)
-    changes = np.zeros((4 if gradient else 0, len(layers.inputs) - 1, layers.inputs.shape[1]), "f4")
+    slopes = _encode(network, patches, points, layers.inputs, gradient=gradient)
+    values = layers.run()[:count]
+    if not gradient:
+        return values, None
+    return values, layers.slopes(slopes)[:, :count]
+
+
+def _encode(
+    network: Network,
+    patches: Sequence[Patch],
+    points: npt.NDArray[np.float64],
+    inputs: Floats,
+    *,
+    gradient: bool = False,
+) -> Floats:
+    """Write the interpolated embeddings at points (4, n) into the first n columns of `inputs`.
+
+    Return their derivatives (4, inputs, columns) by the position; with `gradient` unset, none.
+    """
+    size, count = network.embedding_size, points.shape[1]
+    slopes = np.zeros((4 if gradient else 0, network.inputs, inputs.shape[1]), np.float32)
     for level, patch in enumerate(patches):
         rows = slice(level * size, (level + 1) * size)
-        before, after, pace = _locate(network, level, points)
+        before, after_weights, pace = _locate(network, level, points)
         corners = _corners(patch, before, network.levels[level])
-        layers.inputs[rows, :count], across = interpolate(corners, after, gradient)
-        for axis, change in enumerate(across):
-            np.multiply(change, np.float32(pace[axis]), out=changes[axis, rows, :count])
-    values = layers.run()[:count]
-    return values, layers.slopes(changes)[:, :count] if gradient else None
+        inputs[rows, :count], changes = interpolate(corners, after_weights, gradient)
+        for axis, change in enumerate(changes):
+            np.multiply(change, np.float32(pace[axis]), out=slopes[axis, rows, :count])
+    return slopes
 
 
 def _points(network: Network, arrays: Sequence[npt.ArrayLike]) -> npt.NDArray[np.float64]:
-    """The points as one array (4, n), checked."""
+    """Return the points as one array (4, n) after checking them."""
     columns = [np.asarray(array, dtype=np.float64) for array in arrays]
     try:
         points = np.stack(np.broadcast_arrays(*(np.atleast_1d(column) for column in columns)))
@@ -150,7 +227,8 @@ def _points(network: Network, arrays: Sequence[npt.ArrayLike]) -> npt.NDArray[np
         points = np.empty(0)
     if points.ndim != 2:
         raise InputError(
-            f"points have shapes {', '.join(str(c.shape) for c in columns)}; one length (n,) is needed for key_index, z, y and x"
+            f"points have shapes {', '.join(str(column.shape) for column in columns)}; "
+            "one length (n,) is needed for key_index, z, y and x"
         )
     for axis, column, size in zip(
         AXES, points, (network.key_frames, *network.box_size), strict=True
@@ -166,7 +244,12 @@ def _points(network: Network, arrays: Sequence[npt.ArrayLike]) -> npt.NDArray[np
 def _locate(
     network: Network, level: int, points: npt.NDArray[np.float64]
 ) -> tuple[npt.NDArray[np.int64], Floats, npt.NDArray[np.float64]]:
-    """The corner before each point (4, n), the weight in [0, 1] of the corner after it (4, n), and corners per vertex (4,)."""
+    """Find the cells of a level around points (4, n).
+
+    Returns:
+        The corner before each point (4, n), the weight in [0, 1] of the corner after it (4, n), and
+        the corners per vertex of the box along each axis (4,).
+    """
     corners = np.array(network.levels[level])[:, None]
     span = np.array([max(size - 1, 1) for size in (network.key_frames, *network.box_size)])[:, None]
     position = points * (corners - 1) / span
@@ -177,7 +260,10 @@ def _locate(
 def _groups(
     network: Network, points: npt.NDArray[np.float64], chosen: npt.NDArray[np.intp]
 ) -> Iterator[npt.NDArray[np.intp]]:
-    """Split points until the part of the finest table that a group spans is small, or well filled and not too large to be read at once."""
+    """Split chosen points into groups that each span a part of the finest table fit to be read.
+
+    A part is fit if it is small, or if it holds many points and is not too large.
+    """
     if not len(chosen):
         return
     low, high = points[:, chosen].min(axis=1), points[:, chosen].max(axis=1)
@@ -189,6 +275,12 @@ def _groups(
     below = points[axis, chosen] < np.floor((low[axis] + high[axis] + 1) / 2)
     yield from _groups(network, points, chosen[below])
     yield from _groups(network, points, chosen[~below])
+
+
+def _patches(network: Network, points: npt.NDArray[np.float64]) -> list[Patch]:
+    """Read the part of each level that surrounds all of some points (4, n)."""
+    span = np.stack([points.min(axis=1), points.max(axis=1)], axis=1)
+    return [_patch(network, level, span) for level in range(len(network.levels))]
 
 
 def _patch(network: Network, level: int, span: npt.NDArray[np.float64]) -> Patch:
@@ -204,41 +296,22 @@ def _patch(network: Network, level: int, span: npt.NDArray[np.float64]) -> Patch
 
 
 def _corners(patch: Patch, before: npt.NDArray[np.int64], resolution: Sequence[int]) -> Floats:
-    """The 16 corners around each point: float32 (t 2, z 2, y 2, x 2, E, n)."""
+    """Return the 16 corners around each point, float32 (t 2, z 2, y 2, x 2, E, n)."""
     shape = patch.values.shape
     strides = (math.prod(shape[1:4]), math.prod(shape[2:4]), shape[3], 1)
     index: npt.NDArray[np.int64] = np.zeros(before.shape[1], np.int64)
     for corner, first, stride in zip(before, patch.first, strides, strict=True):
         index += (corner - first) * stride
-    # An axis of one vertex has no corner after it: both are the same.
-    steps = [
+    # An axis of one vertex has no corner after it: both corners are the same.
+    t_offsets, z_offsets, y_offsets, x_offsets = [
         (0, stride if length > 1 else 0) for stride, length in zip(strides, resolution, strict=True)
     ]
     offsets = np.array(
-        [t + z + y + x for t in steps[0] for z in steps[1] for y in steps[2] for x in steps[3]]
+        [t + z + y + x for t in t_offsets for z in z_offsets for y in y_offsets for x in x_offsets]
     )
-    found = patch.values.reshape(-1, shape[4]).take(offsets[:, None] + index, axis=0, mode="clip")
-    return np.ascontiguousarray(np.moveaxis(found, -1, 1), dtype=np.float32).reshape(
+    embeddings = patch.values.reshape(-1, shape[4]).take(
+        offsets[:, None] + index, axis=0, mode="clip"
+    )
+    return np.ascontiguousarray(np.moveaxis(embeddings, -1, 1), dtype=np.float32).reshape(
         2, 2, 2, 2, shape[4], -1
     )
-
-
-def interpolate(
-    corners: Floats, after: Iterable[Floats], gradient: bool
-) -> tuple[Floats, list[Floats]]:
-    """Corners, as (2, 2, 2, 2, E, n), to (E, n), linearly along the first axes in turn, one for each weight of the corner after it.
-
-    With `gradient` also the change across the cell along each of these axes, in their order. Also for tensors of torch.
-    """
-    changes: list[Floats] = []
-    for weight in after:
-        changes = [_between(change, weight) for change in changes]
-        if gradient:
-            changes.append(corners[1] - corners[0])
-        corners = _between(corners, weight)
-    return corners, changes
-
-
-def _between(pair: Floats, weight: Floats) -> Floats:
-    result: Floats = pair[0] * (1 - weight) + pair[1] * weight
-    return result

@@ -1,10 +1,11 @@
-"""Decoding a region of lattice vertices, with numpy alone.
+"""Decoding of a region of lattice vertices, with numpy alone.
 
-The law: a region holds the same bits as that slice of the whole frame, whatever the number of threads. It holds by construction:
-vertices are computed in blocks at fixed places in the box, always whole blocks by the same products of the same shapes, then cropped.
+A region holds the same bits as that slice of the whole frame, whatever the number of threads. This
+law holds by construction: vertices are computed in blocks at fixed places in the box, always as
+whole blocks, by the same products of the same shapes (`network.DenseLayers`), and then cropped.
 
-On the lattice a level is a separable upsampling of a small part of its table, so that a block costs a few small matrix products per level
-instead of 16 gathers per vertex.
+On the lattice a level is a separable upsampling of a small part of its table. A block therefore
+costs a few small matrix products per level instead of 16 table look-ups per vertex.
 """
 
 from __future__ import annotations
@@ -17,41 +18,46 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.paper.network import ArrayTable, DenseLayers, Floats, Network, TableSource
-from fhash_codec.paper.points import sample_points
+from fhash_codec.coreset.boxes import Spans
+from fhash_codec.paper.network import DenseLayers, Floats, Network
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.support.threads import share_out, usable_threads
 
-__all__ = [
-    "ArrayTable",
-    "Box",
-    "Network",
-    "TableSource",
-    "block_shape",
-    "decode_region",
-    "sample_points",
-]
-
-Box = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
-"""((z0, z1), (y0, y1), (x0, x1)), half-open, in vertices of the feature bounding box."""
-
 BLOCK_VERTICES = 8192
+"""Largest number of vertices in a block."""
 READ_NUMBERS = 2**24
 """Numbers of a table that are read at once for one time node."""
 
+BlockIndex = tuple[int, int, int]
+"""Place (z, y, x) of a block in the grid of blocks."""
+
 
 @dataclass(frozen=True)
-class AxisPart:
-    """What a block needs of one axis of one level: vertices [first, stop) of the table and their weights, float32 (block, stop - first)."""
+class AxisWeights:
+    """Weights that interpolate the vertices of a block along one axis of one level.
+
+    Attributes:
+        first, stop: vertices [first, stop) of the level between which the block lies.
+        weights: float32 (vertices of the block, stop - first).
+    """
 
     first: int
     stop: int
     weights: Floats
 
 
+LevelWeights = tuple[dict[int, AxisWeights], ...]
+"""Weights of one level for each axis (z, y, x), by the block's place along that axis."""
+
+
 @dataclass(frozen=True)
-class Piece:
-    """The part of one level that a region needs, interpolated in time: float32 (E, z, y, x), and where it begins in the table."""
+class LevelWindow:
+    """The part of one level that a region needs, at one time.
+
+    Attributes:
+        values: embeddings interpolated in time, float32 (E, z, y, x).
+        first: vertex (z, y, x) of the level at which the window begins.
+    """
 
     values: Floats
     first: tuple[int, int, int]
@@ -60,50 +66,59 @@ class Piece:
 def decode_region(
     network: Network,
     key_index: float,
-    region: Box,
+    region: Spans,
     *,
-    wanted: npt.NDArray[np.bool_] | None = None,
+    requested: npt.NDArray[np.bool_] | None = None,
     threads: int | None = None,
 ) -> Floats:
-    """Normalised values float32 (z, y, x) of the vertices of a region at a key index in [0, key_frames - 1], fractional between key frames.
+    """Return the normalised values float32 (z, y, x) at the vertices of a region.
 
-    `wanted` (z, y, x), bool: blocks without a wanted vertex are left NaN and cost nothing; other vertices that are not wanted may
-    hold a value or NaN. Threads: None is one per processor. Holds one frame of the region (rounded to blocks) per level.
-    Raises RegionError for a region or key index outside the box, InputError for `wanted` of another shape.
+    The memory for one frame of the region, rounded to blocks, is needed per level.
+
+    Args:
+        network: the trained network.
+        key_index: time in 0 .. key_frames - 1, fractional between key frames.
+        region: spans (z, y, x) in vertices of the feature bounding box.
+        requested: bool (z, y, x), the vertices whose values are needed; all if left out. A block
+            without a requested vertex is NaN and costs nothing. Other vertices that were not
+            requested hold either a value or NaN.
+        threads: number of threads; None for one per processor.
+
+    Raises:
+        RegionError: the region or the key index is outside the box.
+        InputError: `requested` has another shape or type.
     """
-    _check(network, key_index, region, wanted)
+    _check(network, key_index, region, requested)
     threads = usable_threads(threads)
     shape = block_shape(network.box_size)
     result = np.full([stop - start for start, stop in region], np.nan, np.float32)
-    blocks = _blocks(shape, region, wanted)
+    blocks = _blocks(shape, region, requested)
     if not blocks:
         return result
-    numbers = [sorted({block[axis] for block in blocks}) for axis in range(3)]
-    parts = [
-        [
-            _axis_parts(network.box_size[axis], level[axis + 1], shape[axis], numbers[axis])
-            for axis in range(3)
-        ]
-        for level in network.levels
+    weights = [_level_weights(network, level[1:], shape, blocks) for level in network.levels]
+    windows = [
+        _level_window(network, level, key_index, level_weights)
+        for level, level_weights in enumerate(weights)
     ]
-    pieces = [_piece(network, level, key_index, axes) for level, axes in enumerate(parts)]
 
-    def work(share: Sequence[tuple[int, int, int]]) -> None:
-        head = DenseLayers(network, math.prod(shape))
+    def decode(share: Sequence[BlockIndex]) -> None:
+        layers = DenseLayers(network, math.prod(shape))
         for block in share:
-            _encode(network, block, shape, pieces, parts, head)
-            values = head.run()[: math.prod(shape)].reshape(shape)
-            inside, outside = _crop(block, shape, region)
-            result[outside] = values[inside]
+            _encode(network, block, shape, windows, weights, layers)
+            values = layers.run()[: math.prod(shape)].reshape(shape)
+            inside_block, inside_region = _overlap(block, shape, region)
+            result[inside_region] = values[inside_block]
 
-    share_out(work, blocks, threads)
+    share_out(decode, blocks, threads)
     return result
 
 
 def block_shape(box_size: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Vertices (z, y, x) of the blocks of a box: 8 x 16 x 32, doubled along the shortest axes that can grow up to BLOCK_VERTICES together.
+    """Return the vertices (z, y, x) of the blocks of a box. They depend on the box alone.
 
-    Each axis is split evenly, so that little of the last block hangs over the end. It depends on the box alone.
+    A block has 8 x 16 x 32 vertices. Its shortest axes that can still grow are doubled, as long as
+    the block has at most BLOCK_VERTICES. Each axis is then split evenly, so that little of the last
+    block lies beyond the end of the box.
     """
     shape = [min(size, limit) for size, limit in zip(box_size, (8, 16, 32), strict=True)]
     while (
@@ -116,7 +131,7 @@ def block_shape(box_size: tuple[int, int, int]) -> tuple[int, int, int]:
 
 
 def _check(
-    network: Network, key_index: float, region: Box, wanted: npt.NDArray[np.bool_] | None
+    network: Network, key_index: float, region: Spans, requested: npt.NDArray[np.bool_] | None
 ) -> None:
     if not 0 <= key_index <= network.key_frames - 1:
         raise RegionError(f"key index {key_index} is outside 0..{network.key_frames - 1}")
@@ -124,112 +139,142 @@ def _check(
         if not 0 <= start < stop <= size:
             raise RegionError(f"region {axis} {start}:{stop} is empty or outside the box, 0:{size}")
     shape = tuple(stop - start for start, stop in region)
-    if wanted is not None and (wanted.shape != shape or wanted.dtype != np.bool_):
+    if requested is not None and (requested.shape != shape or requested.dtype != np.bool_):
         raise InputError(
-            f"wanted is {wanted.dtype} {wanted.shape}; a bool array {shape} is needed, as large as the region"
+            f"requested is {requested.dtype} {requested.shape}; "
+            f"a bool array {shape} is needed, as large as the region"
         )
 
 
 def _blocks(
-    shape: Sequence[int], region: Box, wanted: npt.NDArray[np.bool_] | None
-) -> list[tuple[int, int, int]]:
-    """Numbers (z, y, x) of the blocks that touch the region and hold a wanted vertex."""
+    shape: Sequence[int], region: Spans, requested: npt.NDArray[np.bool_] | None
+) -> list[BlockIndex]:
+    """Return the places of the blocks that touch the region and hold a requested vertex."""
     z, y, x = (
         range(start // length, (stop - 1) // length + 1)
         for (start, stop), length in zip(region, shape, strict=True)
     )
     blocks = list(product(z, y, x))
-    if wanted is None:
+    if requested is None:
         return blocks
-    return [block for block in blocks if wanted[_crop(block, shape, region)[1]].any()]
+    return [block for block in blocks if requested[_overlap(block, shape, region)[1]].any()]
 
 
-def _crop(
-    block: Sequence[int], shape: Sequence[int], region: Box
+def _overlap(
+    block: BlockIndex, shape: Sequence[int], region: Spans
 ) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Where a block and a region meet: slices of the block and slices of the region."""
-    inside, outside = [], []
-    for number, length, (start, stop) in zip(block, shape, region, strict=True):
-        first, last = max(number * length, start), min((number + 1) * length, stop)
-        inside.append(slice(first - number * length, last - number * length))
-        outside.append(slice(first - start, last - start))
-    return tuple(inside), tuple(outside)
+    """Return the overlap of a block and a region: as slices of the block, and of the region."""
+    inside_block, inside_region = [], []
+    for place, length, (start, stop) in zip(block, shape, region, strict=True):
+        first, last = max(place * length, start), min((place + 1) * length, stop)
+        inside_block.append(slice(first - place * length, last - place * length))
+        inside_region.append(slice(first - start, last - start))
+    return tuple(inside_block), tuple(inside_region)
 
 
-def _axis_parts(
-    size: int, resolution: int, length: int, numbers: Iterable[int]
-) -> dict[int, AxisPart]:
-    """The parts that blocks of a length need of one axis, by number of the block.
+def _level_weights(
+    network: Network,
+    resolution: Sequence[int],
+    shape: Sequence[int],
+    blocks: Sequence[BlockIndex],
+) -> LevelWeights:
+    """Return the weights that interpolate a level of resolution (z, y, x) at some blocks."""
+    return tuple(
+        _axis_weights(size, vertices, length, sorted(set(places)))
+        for size, vertices, length, places in zip(
+            network.box_size, resolution, shape, zip(*blocks, strict=True), strict=True
+        )
+    )
 
-    Vertex i lies at i (R - 1) / (S - 1), in whole numbers, so that a vertex on a corner has exactly its embedding.
-    Weights are computed in float64.
+
+def _axis_weights(
+    size: int, resolution: int, length: int, places: Iterable[int]
+) -> dict[int, AxisWeights]:
+    """Return the weights of blocks along one axis, by the place of the block.
+
+    Vertex i of the box lies at i (R - 1) / (S - 1) of the level. The whole part of that is computed
+    in integers, so that a vertex on a corner gets exactly that corner's embedding. The weights are
+    computed in float64 and rounded to float32.
+
+    Args:
+        size: vertices S of the box along the axis.
+        resolution: vertices R of the level along the axis.
+        length: vertices of a block along the axis.
+        places: places of the blocks along the axis.
     """
     span = max(size - 1, 1)
     corner, rest = np.divmod(np.arange(size) * (resolution - 1), span)
-    parts = {}
-    for number in numbers:
-        vertices = slice(number * length, min((number + 1) * length, size))
-        before, after = corner[vertices], rest[vertices] / span
+    weights_of = {}
+    for place in places:
+        vertices = slice(place * length, min((place + 1) * length, size))
+        before, after_weight = corner[vertices], rest[vertices] / span
         first = int(before[0])
-        stop = int(before[-1]) + (2 if after[-1] > 0 else 1)
-        # A column to spare, for the corner after the last, which may not be needed. Rows past the end of the box stay zero and are cropped.
+        stop = int(before[-1]) + (2 if after_weight[-1] > 0 else 1)
+        # The spare last column takes the weight of a corner after the last one, which may be 0 and
+        # then has no column. Rows beyond the end of the box stay 0 and are cropped.
         weights = np.zeros((length, stop - first + 1))
         row = np.arange(len(before))
-        weights[row, before - first] = 1 - after
-        weights[row, before - first + 1] = after
-        parts[number] = AxisPart(first, stop, weights[:, :-1].astype(np.float32))
-    return parts
+        weights[row, before - first] = 1 - after_weight
+        weights[row, before - first + 1] = after_weight
+        weights_of[place] = AxisWeights(first, stop, weights[:, :-1].astype(np.float32))
+    return weights_of
 
 
-def _piece(
-    network: Network, level: int, key_index: float, axes: Sequence[dict[int, AxisPart]]
-) -> Piece:
-    """Read what all blocks need of a level, a few large reads at the one or two time nodes, and interpolate it in time."""
+def _level_window(
+    network: Network, level: int, key_index: float, weights: LevelWeights
+) -> LevelWindow:
+    """Read the part of a level that all blocks need, and interpolate it in time.
+
+    The part is read at the one or two time nodes around the key index, in a few large reads.
+    """
     nodes = network.levels[level][0]
     position = key_index * (nodes - 1) / max(network.key_frames - 1, 1)
     node = min(int(position), nodes - 1)
-    weight = np.float32(position - node)
-    time = slice(node, node + 1 if weight == 0 else node + 2)
+    after_weight = np.float32(position - node)
+    time = slice(node, node + 1 if after_weight == 0 else node + 2)
     (z0, z1), (y0, y1), (x0, x1) = (
-        (min(p.first for p in parts.values()), max(p.stop for p in parts.values()))
-        for parts in axes
+        (min(w.first for w in axis.values()), max(w.stop for w in axis.values()))
+        for axis in weights
     )
     values = np.empty((network.embedding_size, z1 - z0, y1 - y0, x1 - x0), np.float32)
     planes = max(1, READ_NUMBERS // values[:, 0].size)
     for start in range(z0, z1, planes):
         stop = min(start + planes, z1)
-        nodes_read = network.read(level, (time, slice(start, stop), slice(y0, y1), slice(x0, x1)))
-        frame = nodes_read[0].astype(np.float32, copy=False)
-        if weight != 0:
-            frame = frame * (1 - weight) + nodes_read[1] * weight
+        frames = network.read(level, (time, slice(start, stop), slice(y0, y1), slice(x0, x1)))
+        frame = frames[0].astype(np.float32, copy=False)
+        if after_weight != 0:
+            frame = frame * (1 - after_weight) + frames[1] * after_weight
         values[:, start - z0 : stop - z0] = np.moveaxis(frame, -1, 0)
-    return Piece(values, (z0, y0, x0))
+    return LevelWindow(values, (z0, y0, x0))
 
 
 def _encode(
     network: Network,
-    block: tuple[int, int, int],
+    block: BlockIndex,
     shape: tuple[int, int, int],
-    pieces: Sequence[Piece],
-    parts: Sequence[Sequence[dict[int, AxisPart]]],
-    head: DenseLayers,
+    windows: Sequence[LevelWindow],
+    weights: Sequence[LevelWeights],
+    layers: DenseLayers,
 ) -> None:
-    """Fill the head's inputs with the interpolated embeddings of a block: x first, while the part is smallest, then y, then z."""
+    """Fill the inputs of the layers with the interpolated embeddings of a block.
+
+    Each level is interpolated along x first, while it is smallest, then along y, then along z.
+    """
     size, (bz, by, bx) = network.embedding_size, shape
-    for level, (piece, axes) in enumerate(zip(pieces, parts, strict=True)):
-        z, y, x = (axes[axis][block[axis]] for axis in range(3))
+    for level, (window, level_weights) in enumerate(zip(windows, weights, strict=True)):
+        z, y, x = (level_weights[axis][block[axis]] for axis in range(3))
         slices = (
-            slice(part.first - first, part.stop - first)
-            for part, first in zip((z, y, x), piece.first, strict=True)
+            slice(axis.first - first, axis.stop - first)
+            for axis, first in zip((z, y, x), window.first, strict=True)
         )
-        values = piece.values[(slice(None), *slices)]
-        rows = head.inputs[level * size : (level + 1) * size, : bz * by * bx]
+        values = window.values[(slice(None), *slices)]
+        rows = layers.inputs[level * size : (level + 1) * size, : bz * by * bx]
         if network.levels[level][1:] == network.box_size:
-            # The table's vertices are the box's: nothing to interpolate, only the end of the box to pad.
-            whole = rows.reshape(size, bz, by, bx)
-            if values.shape != whole.shape:
-                whole[...] = 0.0
-            whole[tuple(slice(length) for length in values.shape)] = values
+            # The vertices of the level are those of the box: only the end of the box needs padding.
+            padded = rows.reshape(size, bz, by, bx)
+            if values.shape != padded.shape:
+                padded[...] = 0.0
+            padded[tuple(slice(length) for length in values.shape)] = values
         else:
             upsampled = y.weights @ (values @ x.weights.T)
             np.matmul(

@@ -1,4 +1,4 @@
-"""The coreset and the architecture that the paper profile trains."""
+"""The coreset that the paper profile trains on, and the architecture it trains."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.boxes import box_size
 from fhash_codec.coreset.bricks import Coreset, build_coreset
 from fhash_codec.coreset.features import Feature
 from fhash_codec.coreset.scan import Scan
@@ -19,7 +18,14 @@ from fhash_formats.series import Series
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """What the settings select of a series, and the model that is to be fitted to it."""
+    """Training samples that the settings select from a series, and the model to fit to them.
+
+    Attributes:
+        scanned: value range and missing values of the series.
+        features: the features of interest.
+        coreset: the samples at the key frames.
+        architecture: the sizes of the model.
+    """
 
     scanned: Scan
     features: tuple[Feature, ...]
@@ -30,11 +36,22 @@ class Selection:
 def select(
     series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None
 ) -> Selection:
-    """As `find`, and gather the coreset for training."""
+    """Find the features of a series at its key frames and gather the coreset for training.
+
+    Args:
+        series: the series.
+        config: the settings.
+        progress: called with each step of the work.
+        mask: booleans (t, z, y, x) or (z, y, x), one more feature. It replaces 'all' where the
+            settings name no other feature.
+
+    Raises:
+        InputError: the settings do not fit the series, or they select nothing.
+    """
     scanned, key_frames, features = resolve_selection(series, config, progress, mask)
     coreset = build_coreset(series, scanned, key_frames, features, config.dilation, progress)
     architecture = Architecture.for_box(
-        box_size(coreset.box),
+        coreset.box.shape,
         len(key_frames),
         fold=config.fold,
         embedding_size=config.embedding_size,

@@ -1,12 +1,13 @@
-"""A trained model and its coreset as arrays of a container, and back. numpy only.
+"""A trained model and its coreset as arrays of a container, written and read. numpy only.
 
-Tables are arrays of numbers, or with `--tables transform` coded: then each level has an array per component, and an embedding is a mixture
-of the components (`mixed`).
+Tables are stored as arrays of numbers. With `--tables transform` they are coded instead: each level
+then has one array per component, and an embedding is a mixture of the components
+(`mix_components`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import isfinite, prod
 from typing import Any
@@ -14,25 +15,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats, Network, TableSource
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.errors import DamagedFileError, InputError
 
-CHUNK_BYTES = (
-    2 << 20
-)  # a time node in one chunk up to this size, in bricks above: each chunk has a fixed cost, each read a whole chunk
+CHUNK_BYTES = 2 << 20
+"""Bytes of the largest chunk of a table. Each chunk has a fixed cost; reads decode whole chunks."""
 TABLE_AXES = ("t", "z", "y", "x", "embedding")
+"""Names of the axes of a table."""
 
 
 def write_model(
-    writer: ContainerWriter,
-    architecture: Architecture,
-    coreset: Coreset,
-    layers: list[tuple[Floats, Floats]],
+    writer: ContainerWriter, coreset: Coreset, layers: list[tuple[Floats, Floats]]
 ) -> None:
-    """Write MLP and occupancy. layers: (weight (out, in), bias (out,))."""
+    """Write the occupancy of a coreset, and the (weight, bias) of each layer of the MLP."""
     for number, (weight, bias) in enumerate(layers, start=1):
         writer.add_whole(f"mlp/weight_{number}", weight)
         writer.add_whole(f"mlp/bias_{number}", bias)
@@ -48,28 +47,30 @@ def write_tables(
     tables: list[Floats],
     kind: str,
 ) -> None:
-    """Write the tables as numbers of the type `kind`.
+    """Write the tables of all levels as plain numbers.
 
-    fine: the finest embeddings (bricks, E, vertices of a brick); tables: the coarser ones (buckets, E).
-    Raises InputError where the numbers do not fit in `kind`.
+    Args:
+        writer: the container that is being written.
+        architecture: the sizes of the tables.
+        coreset: the coreset, whose bricks the finest embeddings belong to.
+        fine: embeddings of the finest level (bricks, E, vertices of a brick).
+        tables: embeddings of the coarser levels, each (buckets, E).
+        kind: name of the number type in the file, as `EncodeConfig.tables`.
+
+    Raises:
+        InputError: the numbers do not fit in `kind`.
     """
     size = architecture.embedding_size
-    _write_table(
-        writer,
-        1,
-        (*architecture.levels[0], size),
-        fine,
-        (finest_frame(coreset, fine, k) for k in range(architecture.key_frames)),
-        kind,
-    )
+    finest_frames = (finest_frame(coreset, fine, key) for key in range(architecture.key_frames))
+    _write_table(writer, 1, (*architecture.levels[0], size), fine, finest_frames, kind)
     for number, (level, table) in enumerate(
         zip(architecture.levels[1:], tables, strict=True), start=2
     ):
-        _write_table(writer, number, (*level, size), table, iter(table.reshape(*level, size)), kind)
+        _write_table(writer, number, (*level, size), table, table.reshape(*level, size), kind)
 
 
 def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
-    """The finest table (z, y, x, E) of one key frame from its bricks; 0 where no brick lies."""
+    """Return the finest table (z, y, x, E) of one key frame from its bricks; 0 outside of them."""
     size = fine.shape[1]
     grid, shape = coreset.brick_grid, coreset.brick_shape
     blocks = np.zeros((*grid, *shape, size), dtype=np.float32)
@@ -79,13 +80,17 @@ def finest_frame(coreset: Coreset, fine: Floats, key: int) -> Floats:
     padded = blocks.transpose(0, 3, 1, 4, 2, 5, 6).reshape(
         *(g * s for g, s in zip(grid, shape, strict=True)), size
     )
-    return np.ascontiguousarray(padded[tuple(slice(high - low) for low, high in coreset.box)])
+    return np.ascontiguousarray(padded[tuple(slice(length) for length in coreset.box.shape)])
 
 
 def load_network(container: Container) -> Network:
-    """The model in a container, its tables read on demand; DamagedFileError if its parts do not fit together."""
+    """Return the network in a container; its tables are read on demand.
+
+    Raises DamagedFileError where the arrays do not fit together.
+    """
     header = container.header
     model = header["model"]
+    size = model["embedding_size"]
     levels = tuple(tuple(level) for level in model["levels"])
     layers = tuple(
         (container.arrays[f"mlp/weight_{n}"].read(), container.arrays[f"mlp/bias_{n}"].read())
@@ -94,65 +99,61 @@ def load_network(container: Container) -> Network:
     try:
         return Network(
             levels=levels,
-            embedding_size=model["embedding_size"],
-            tables=[
-                _table(container, n, model["embedding_size"]) for n in range(1, len(levels) + 1)
-            ],
+            embedding_size=size,
+            tables=[_table(container, number, size) for number in range(1, len(levels) + 1)],
             layers=layers,
-            box_size=tuple(high - low for low, high in header["feature_bounding_box"]),
+            box_size=Box.of(header["feature_bounding_box"]).shape,
             key_frames=levels[0][0],
         )
     except InputError as error:
         raise DamagedFileError(f"{container.path}: {error}") from error
 
 
-def _table(container: Container, level: int, size: int) -> TableSource:
-    """The table of a level, in whichever way it is stored."""
-    if container.header["model"]["tables"] == "transform":
-        return CodedTable(
-            [container.arrays[component_name(level, number)] for number in range(1, size + 1)]
-        )
-    return StoredTable(container.arrays[f"tables/level_{level}"])
+def component_name(level: int, component: int) -> str:
+    """Return the name of the array of one component of a coded level; both count from 1."""
+    return f"tables/level_{level}/component_{component}"
 
 
-def component_name(level: int, number: int) -> str:
-    """The array of one component of a coded level, both counted from 1."""
-    return f"tables/level_{level}/component_{number}"
+def mix_components(components: Sequence[Floats], mixing: Floats) -> Floats:
+    """Return embeddings float32 (..., E) from E components (...) (FORMAT.md, Coded tables).
 
+    Embedding e is the sum of component j times mixing[j, e]. Each product and each sum is rounded
+    to float32, from the first component on, so the bits are the same on every machine.
 
-def mixed(components: Sequence[Floats], mixing: Floats) -> Floats:
-    """Embeddings float32 (..., E) from E components (...): embedding e is the sum of component j times mixing[j, e].
-
-    In float32, each product and each sum rounded, from the first component on: the same bits on every machine.
+    Args:
+        components: E arrays of one shape.
+        mixing: (E, E), component by embedding.
     """
-    result = np.empty((*components[0].shape, mixing.shape[1]), np.float32)
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # of hostile numbers; the network refuses what is not finite
+    embeddings = np.empty((*components[0].shape, mixing.shape[1]), np.float32)
+    # Hostile numbers overflow; the network refuses what is not finite.
+    with np.errstate(over="ignore", invalid="ignore"):
         for number in range(mixing.shape[1]):
             total = components[0] * mixing[0, number]
             for component, weights in zip(components[1:], mixing[1:], strict=True):
                 total = total + component * weights[number]
-            result[..., number] = total
-    return result
+            embeddings[..., number] = total
+    return embeddings
 
 
 class CodedTable:
-    """A level's table whose components are coded, as the decoder reads it."""
+    """A `TableSource` of a level whose components are coded."""
 
     def __init__(self, arrays: Sequence[StoredArray]) -> None:
+        """Read a level from the arrays (t, z, y, x) of its components."""
         self.arrays = arrays
         self.shape = (*arrays[0].shape, len(arrays))
+        # A mixing beyond float32 becomes infinite, which the network refuses.
         with np.errstate(over="ignore"):
             self.mixing = np.array([array.attributes["mixing"] for array in arrays], np.float32)
 
     def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """Embeddings of a region, float32."""
-        return mixed([array.read(region[:4]) for array in self.arrays], self.mixing)[..., region[4]]
+        """Return the embeddings of a region, float32."""
+        components = [array.read(region[:4]) for array in self.arrays]
+        return mix_components(components, self.mixing)[..., region[4]]
 
 
 class StoredTable:
-    """A level's table in a container, as the decoder reads it."""
+    """A `TableSource` of a level that is stored as plain numbers."""
 
     def __init__(self, array: StoredArray) -> None:
         self.array = array
@@ -161,13 +162,19 @@ class StoredTable:
         self.offset = np.float32(array.attributes.get("offset", 0.0))
 
     def read(self, region: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """Embeddings of a region: quantised ones as offset + scale * number, float32; others as they are stored."""
+        """Return the embeddings of a region.
+
+        Integers become offset + scale * number, float32; other numbers come as they are stored.
+        """
         values = self.array.read(region)
         return values if self.array.dtype.kind == "f" else values * self.scale + self.offset
 
 
 def table_chunk(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
-    """Chunk of a table (t, z, y, x, E): one time node, halved along its longest axis until it takes at most 2 MiB."""
+    """Return the chunk shape of a table (t, z, y, x, E) with numbers of `itemsize` bytes.
+
+    A chunk is one time node, halved along its longest axis until it takes at most CHUNK_BYTES.
+    """
     chunk = [1, *shape[1:]]
     while prod(chunk) * itemsize > CHUNK_BYTES and max(chunk[1:4]) > 1:
         axis = 1 + int(np.argmax(chunk[1:4]))
@@ -177,7 +184,12 @@ def table_chunk(shape: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class NumberType:
-    """How embeddings stand in a file: as `dtype`, of 8 bits as offset + scale * number."""
+    """The numbers of a file that embeddings are stored as.
+
+    Attributes:
+        dtype: type of the numbers, floating or unsigned.
+        scale, offset: an embedding stored as an unsigned number is offset + scale * number.
+    """
 
     dtype: np.dtype[Any]
     scale: float = 1.0
@@ -185,7 +197,10 @@ class NumberType:
 
     @classmethod
     def of(cls, values: Floats, kind: str) -> NumberType:
-        """That of embeddings to be stored as `kind`; raises InputError where they do not fit in it or are not finite."""
+        """Return the number type named `kind` with the scale and offset that fit some embeddings.
+
+        Raises InputError where the embeddings are not finite or do not fit in the type.
+        """
         dtype = np.dtype(kind)
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 0.0)
         if not (isfinite(low) and isfinite(high)):
@@ -193,7 +208,7 @@ class NumberType:
                 "embeddings are not finite: the training diverged; set a lower --learning-rate"
             )
         if dtype.kind == "u":
-            # Zero, which stands wherever nothing was trained, is within the range, so that it costs little.
+            # The range includes 0, so that the 0 of untrained vertices costs little.
             low, high = min(low, 0.0), max(high, 0.0)
         reached = high - low if dtype.kind == "u" else max(-low, high)
         if reached > float(np.finfo(np.float32 if dtype.kind == "u" else dtype).max):
@@ -202,7 +217,8 @@ class NumberType:
             )
         if dtype.kind == "f":
             return cls(dtype=dtype)
-        # A step that float32 does not hold to all its digits would not give back what it was made from.
+        # float32 holds numbers below its `tiny` with fewer digits. A scale that small would not
+        # give back the embeddings.
         scale = (
             max((high - low) / np.iinfo(dtype).max, float(np.finfo(np.float32).tiny))
             if high > low
@@ -211,7 +227,7 @@ class NumberType:
         return cls(dtype=dtype, scale=scale, offset=low)
 
     def stored(self, embeddings: Floats) -> npt.NDArray[Any]:
-        """Embeddings as numbers of the type, of the same shape."""
+        """Return embeddings as numbers of the type, of the same shape."""
         if self.dtype.kind == "f":
             return embeddings.astype(self.dtype)
         return np.asarray(
@@ -219,31 +235,50 @@ class NumberType:
         )
 
 
+def _table(container: Container, level: int, size: int) -> TableSource:
+    """Return the table of a level, counted from 1, however it is stored."""
+    if container.header["model"]["tables"] == "transform":
+        return CodedTable(
+            [container.arrays[component_name(level, number)] for number in range(1, size + 1)]
+        )
+    return StoredTable(container.arrays[f"tables/level_{level}"])
+
+
 def _write_table(
     writer: ContainerWriter,
-    number: int,
+    level: int,
     shape: tuple[int, ...],
-    values: Floats,
-    frames: Iterator[Floats],
+    embeddings: Floats,
+    frames: Iterable[Floats],
     kind: str,
 ) -> None:
-    """Write one level from its frames (z, y, x, E), one time node at a time."""
-    numbers = NumberType.of(values, kind)
-    dtype = numbers.dtype
-    attributes = {"offset": numbers.offset, "scale": numbers.scale} if dtype.kind == "u" else None
+    """Write the table of one level.
 
+    Args:
+        writer: the container that is being written.
+        level: number of the level, counted from 1.
+        shape: lengths of the axes (t, z, y, x, E).
+        embeddings: all embeddings in any order, for the range of the numbers.
+        frames: the embeddings of each time node, (z, y, x, E).
+        kind: name of the number type in the file.
+    """
+    number_type = NumberType.of(embeddings, kind)
+    dtype = number_type.dtype
+    attributes = (
+        {"offset": number_type.offset, "scale": number_type.scale} if dtype.kind == "u" else None
+    )
     chunk = table_chunk(shape, dtype.itemsize)
 
     def chunks() -> Iterator[npt.NDArray[Any]]:
         for frame in frames:
-            node = numbers.stored(frame)[None]
+            node = number_type.stored(frame)[None]
             for start in np.ndindex(*(-(-n // c) for n, c in zip(node.shape, chunk, strict=True))):
                 yield node[
                     tuple(slice(i * c, (i + 1) * c) for i, c in zip(start, chunk, strict=True))
                 ]
 
     writer.add_array(
-        f"tables/level_{number}",
+        f"tables/level_{level}",
         shape=shape,
         dtype=dtype,
         chunk_shape=chunk,

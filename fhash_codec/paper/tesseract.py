@@ -1,8 +1,9 @@
-"""The tesseract encoding of one level: F-Hash bucket index and quadrilinear interpolation (paper, Multi-Resolution Tesseract Encoding)."""
+"""The tesseract encoding of one level: bucket index and interpolation (paper, section 3.2)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -11,76 +12,73 @@ from fhash_codec.paper.levels import Resolution
 
 
 def bucket_index(corner: Tensor, resolution: Resolution) -> Tensor:
-    """F-Hash: the bucket of grid corners (..., 4) in (t, z, y, x), int64 (...).
+    """Return the F-Hash bucket int64 (...) of grid corners (..., 4) in (t, z, y, x).
 
-    The paper's linearisation ((t Rz + z) Ry + y) Rx + x: a bijection from the corners of a level to 0 .. Rt Rz Ry Rx - 1.
+    The index is ((t Rz + z) Ry + y) Rx + x, the linearisation of equation 9 of the paper. It maps
+    the corners of a level one to one to 0 .. Rt Rz Ry Rx - 1: no collision, no empty bucket.
     """
     t, z, y, x = corner.unbind(-1)
     _, rz, ry, rx = resolution
     return ((t * rz + z) * ry + y) * rx + x
 
 
-def locate(
-    points: Tensor, sizes: Sequence[int], resolution: Resolution
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The tesseract around each point (n, 4), given in vertices (t, z, y, x) of a lattice of `sizes`.
+def locate(points: Tensor, sizes: Sequence[int], resolution: Resolution) -> tuple[Tensor, Tensor]:
+    """Find the tesseract around each point (paper, section 3.2.4, steps 1 and 2).
 
-    Returns the corner before it, int64 (n, 4); the weight of the corner after it, in [0, 1], (n, 4); and the derivative of that
-    weight by the point's position, (4,). Corners align: the first and last vertex of an axis are the first and last corner at every
-    level. Positions outside the lattice are clamped to it. A position on a corner lies in the tesseract that begins there.
+    The first and the last vertex of an axis are the first and the last corner at every level.
+    Positions outside the lattice are clamped to it. A position on a corner lies in the tesseract
+    that begins there.
+
+    Args:
+        points: positions (n, 4), (t, z, y, x) in vertices of the lattice of samples.
+        sizes: vertices (t, z, y, x) of that lattice.
+        resolution: vertices (t, z, y, x) of the level.
+
+    Returns:
+        The corner before each point, int64 (n, 4), and the weight in [0, 1] of the corner after it
+        along each axis, (n, 4).
     """
-    count = torch.tensor(resolution, device=points.device)
+    corners = torch.tensor(resolution, device=points.device)
     span = torch.tensor(
         [max(size - 1, 1) for size in sizes], dtype=points.dtype, device=points.device
     )
     # Multiply before dividing: a vertex that falls on a corner then gives a whole number exactly.
-    position = torch.minimum(points.clamp_min(0), span) * (count - 1) / span
-    before = torch.minimum(position.floor().long(), (count - 2).clamp_min(0))
-    return before, position - before, (count - 1) / span
+    position = torch.minimum(points.clamp_min(0), span) * (corners - 1) / span
+    before = torch.minimum(position.floor().long(), (corners - 2).clamp_min(0))
+    return before, position - before
 
 
 def interpolate(
     table: Tensor, points: Tensor, sizes: Sequence[int], resolution: Resolution
 ) -> Tensor:
-    """Embeddings (n, E) at points (n, 4) from a table (buckets, E): the 16 corners weighted linearly in x, y, z, then t."""
-    before, weight, _ = locate(points, sizes, resolution)
-    result = torch.zeros(len(points), table.shape[1], dtype=table.dtype, device=table.device)
-    for corner, share in _corners(before, weight, resolution):
-        result = result + share.prod(-1, keepdim=True) * table[corner]
-    return result
+    """Return the embeddings (n, E) at points, by quadrilinear interpolation between 16 corners.
 
+    This is the sum of equations 10 to 12 of the paper, written as one product of four weights per
+    corner (section 3.2.4, steps 3 and 4).
 
-def interpolate_with_jacobian(
-    table: Tensor, points: Tensor, sizes: Sequence[int], resolution: Resolution
-) -> tuple[Tensor, Tensor]:
-    """Embeddings (n, E) and their derivatives (n, E, 4) by the position in vertices (t, z, y, x).
-
-    On the border of two cells the derivative is that of the cell after it; at the end of an axis, of the last cell.
+    Args:
+        table: embeddings (buckets, E) of the level.
+        points: positions (n, 4), as in `locate`.
+        sizes: vertices (t, z, y, x) of the lattice of samples.
+        resolution: vertices (t, z, y, x) of the level.
     """
-    before, weight, slope = locate(points, sizes, resolution)
-    value = torch.zeros(len(points), table.shape[1], dtype=table.dtype, device=table.device)
-    jacobian = torch.zeros(*value.shape, 4, dtype=table.dtype, device=table.device)
-    for number, (corner, share) in enumerate(_corners(before, weight, resolution)):
-        embedding = table[corner]
-        value += share.prod(-1, keepdim=True) * embedding
-        for axis in range(4):
-            others = torch.cat([share[:, :axis], share[:, axis + 1 :]], dim=1).prod(
-                -1, keepdim=True
-            )
-            sign = 1.0 if number >> (3 - axis) & 1 else -1.0
-            jacobian[:, :, axis] += sign * slope[axis] * others * embedding
-    return value, jacobian
+    before, after_weight = locate(points, sizes, resolution)
+    embeddings = torch.zeros(len(points), table.shape[1], dtype=table.dtype, device=table.device)
+    for buckets, weights in _corners(before, after_weight, resolution):
+        embeddings = embeddings + weights.prod(-1, keepdim=True) * table[buckets]
+    return embeddings
 
 
-def _corners(before: Tensor, weight: Tensor, resolution: Resolution) -> list[tuple[Tensor, Tensor]]:
-    """For each of the 16 corners (bits t, z, y, x from high to low): its bucket (n,) and its weight per axis (n, 4)."""
+def _corners(
+    before: Tensor, after_weight: Tensor, resolution: Resolution
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Yield for each of the 16 corners its bucket (n,) and its weight along each axis (n, 4).
+
+    The corners come with the offset along x changing fastest, along t slowest.
+    """
     last = torch.tensor(resolution, device=before.device) - 1
-    corners = []
-    for number in range(16):
-        step = torch.tensor(
-            [number >> 3 & 1, number >> 2 & 1, number >> 1 & 1, number & 1], device=before.device
-        )
-        # An axis of one corner has no corner after it; its weight there is 0, so that any bucket of the table will do.
-        bucket = bucket_index(torch.minimum(before + step, last), resolution)
-        corners.append((bucket, torch.where(step.bool(), weight, 1 - weight)))
-    return corners
+    for offsets in product((0, 1), repeat=4):
+        offset = torch.tensor(offsets, device=before.device)
+        # An axis of one corner has no corner after it. Its weight is 0, so any bucket will do.
+        buckets = bucket_index(torch.minimum(before + offset, last), resolution)
+        yield buckets, torch.where(offset.bool(), after_weight, 1 - after_weight)

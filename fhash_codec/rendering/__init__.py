@@ -1,30 +1,32 @@
-"""Pictures of a volume. The package is the function too: `fhash_codec.rendering(volume, scene)` is that of `render.py`."""
+"""Pictures of a volume: the function `render`, and one folder for each stage of rendering."""
 
 from __future__ import annotations
 
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING
 
+from fhash_codec.progress import Progress, silent
+
 if TYPE_CHECKING:
-    from fhash_codec.progress import Progress
     from fhash_codec.rendering.picture.image import Image
     from fhash_codec.rendering.scene.scene import Scene
     from fhash_codec.volume import Volume
 
-
-class _Package(ModuleType):
-    """A package that is called as a function, which its name is better known as."""
-
-    def __call__(
-        self, volume: Volume, scene: Scene | None = None, *, progress: Progress | None = None
-    ) -> Image:
-        """A picture of a volume, as `fhash_codec.rendering.renderer.render` makes it."""
-        from fhash_codec.progress import silent
-        from fhash_codec.rendering.renderer import render
-
-        return render(volume, scene, progress=progress or silent)
+__all__ = ["render"]
 
 
-# How a module gets methods of its own: Python's data model, "Customizing module attribute access".
-sys.modules[__name__].__class__ = _Package
+def render(volume: Volume, scene: Scene | None = None, *, progress: Progress = silent) -> Image:
+    """Render one picture of a volume.
+
+    Args:
+        volume: an open container.
+        scene: what to show. The default scene suits the feature of the file. A scene with
+            `evolution` gives several steps side by side.
+        progress: is told about each stage.
+
+    Raises InputError for a scene that cannot be drawn, RegionError for a step or time outside
+    the series.
+    """
+    # Imported here, so that `import fhash_codec.rendering` stays cheap.
+    from fhash_codec.rendering.renderer import Renderer
+
+    return Renderer(volume).render(scene, progress=progress)

@@ -1,4 +1,8 @@
-"""Marching rays through a frame of values: natively in packets, or slower streamed in numpy where the native library is not there."""
+"""Marching rays through a frame of values.
+
+Rays are marched natively in packets, or, more slowly, streamed in numpy where there is no native
+library.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +24,24 @@ __all__ = ["march"]
 def march(
     frame: Frame, task: Task, *, bricks: Bricks | None = None, threads: int | None = None
 ) -> Marched:
-    """The picture of a task.
+    """March the rays of a task.
 
-    A sample of a last, shorter step that lies beyond the box is taken at the nearest place in it. Outside a frame smaller than the
-    domain nothing is seen. Surfaces are looked for between the entry, the samples and the exit of a ray, and lie in front of the sample
-    behind them. Beside a maximum they are drawn over it. The depth is where less than half of the light is left, or where the maximum
-    is; of several rays of a pixel the nearest.
+    The last step of a ray is shorter; if its sample lies beyond the box, the nearest place in the
+    box is sampled. Outside a frame that is smaller than the domain nothing is seen.
 
-    bricks: of the frame, for further pictures of it. threads: at most so many; as many as there are processors by default.
-    Raises InputError for more than MAX_SURFACES surfaces and a step that is not above 0.
+    Surfaces are searched between the entry, the samples and the exit of a ray, and lie in front of
+    the next sample. They are drawn over a maximum.
+
+    The depth is where less than half of the light is left, or where the maximum is; the nearest
+    one of several rays of a pixel.
+
+    Args:
+        frame: the values.
+        task: what to march.
+        bricks: of the frame; made if None.
+        threads: most threads; None for all processors.
+
+    Raises InputError for more than MAX_SURFACES surfaces and for a step that is not above 0.
     """
     if not task.step > 0:
         raise InputError(f"a step has the length {task.step:g}; it must be above 0")
@@ -37,29 +50,26 @@ def march(
     if bricks is None:
         bricks = Bricks.of(frame)
     if task.maximum and task.surfaces:
+        surfaces = dataclasses.replace(task, maximum=False, table=None, shaded=False)
+        maximum = dataclasses.replace(task, surfaces=())
         return _over(
-            _march(
-                frame,
-                dataclasses.replace(task, maximum=False, table=None, shaded=False),
-                bricks,
-                threads,
-            ),
-            _march(frame, dataclasses.replace(task, surfaces=()), bricks, threads),
+            _march(frame, surfaces, bricks, threads), _march(frame, maximum, bricks, threads)
         )
     return _march(frame, task, bricks, threads)
 
 
 def _march(frame: Frame, task: Task, bricks: Bricks, threads: int | None) -> Marched:
+    """March natively if possible, else streamed."""
     library = native.library()
     if library is None or bricks.values.size > MAX_VALUES:
         streamed = stream(FrameField(frame, task.rays.grid, bricks), task, adaptive=True)
-        # A decoded frame is no model that is evaluated.
+        # Looking up a decoded frame is not an evaluation of the model.
         return dataclasses.replace(streamed, counters={**streamed.counters, "evaluations": 0})
     return march_native(library, frame, task, bricks, threads)
 
 
 def _over(front: Marched, back: Marched) -> Marched:
-    """Two pictures of the same rays, one behind the other."""
+    """Put one picture over another of the same rays, and add their counters."""
     depth, normal = front.depth, front.normal
     hidden = front.rgba[..., 3] > 0.5
     if depth is not None and back.depth is not None:

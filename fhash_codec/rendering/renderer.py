@@ -1,4 +1,4 @@
-"""Pictures of a volume: plan, decode, light, march, draw around."""
+"""Rendering a volume: plan the picture, decode a frame, light it, march rays, draw around it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.animation.evolution import evolution
 from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.march import march
+from fhash_codec.rendering.picture.evolution import evolution
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.picture.overlay import overlay, time_text
 from fhash_codec.rendering.picture.plan import Plan
+from fhash_codec.rendering.picture.planning import plan_at, plan_picture
 from fhash_codec.rendering.scene.scene import Scene
 from fhash_codec.rendering.stream.fields import Field, FrameField, NetworkField
 from fhash_codec.rendering.stream.stream import stream
@@ -25,63 +26,77 @@ from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.counters import complete
 from fhash_codec.rendering.task.devices import arrays_on
 from fhash_codec.rendering.task.light import light_grid
-from fhash_codec.rendering.task.task import Frame, Marched
+from fhash_codec.rendering.task.task import Frame, Marched, Task
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashError
 
-__all__ = ["Renderer", "render"]
+__all__ = ["Renderer", "decoded_frame"]
 
 Key = tuple[float, int]
 """Step and level of detail of a decoded frame."""
 
 MEMORY = 2 << 30
-"""Bytes of decoded frames that a renderer keeps."""
+"""Bytes of decoded frames that a renderer keeps by default."""
 BINS = 512
+"""Bins of the histogram of a series."""
 COARSE = 2**18
-"""Vertices of a level of detail that is enough for a histogram."""
-
-
-def render(volume: Volume, scene: Scene | None = None, *, progress: Progress = silent) -> Image:
-    """A picture of a volume; the scene's defaults suit the feature of the file.
-
-    Raises InputError for a scene that cannot be drawn, RegionError for a step or time outside the series.
-    """
-    return Renderer(volume).render(Scene() if scene is None else scene, progress=progress)
+"""Most vertices of a frame that is read for the histogram, where levels of detail allow it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Decoded:
+class _DecodedFrame:
+    """A decoded frame, the region (z, y, x) that was asked for, and the frame's bricks."""
+
     frame: Frame
     region: Box
     bricks: Bricks
 
     @property
     def nbytes(self) -> int:
+        """Bytes of the values."""
         return self.frame.values.nbytes
+
+    def covers(self, region: Box) -> bool:
+        """Whether the frame was decoded for this region or a larger one."""
+        return all(
+            low <= first and last <= high
+            for (low, high), (first, last) in zip(self.region, region, strict=True)
+        )
 
 
 class Renderer:
-    """Makes pictures of one volume, and keeps what it decoded for the next ones, up to `memory` bytes.
+    """Renders pictures of one volume and keeps decoded frames for the next pictures.
 
-    Not for several threads at once. After a picture with an `upcoming` one the volume is read in the background until the next.
+    Not safe for several threads at once. After a picture with `upcoming`, a background thread reads
+    the volume until the next picture begins.
     """
 
     def __init__(self, volume: Volume, *, memory: int = MEMORY, threads: int | None = None) -> None:
+        """Prepare to render a volume.
+
+        Args:
+            volume: an open container.
+            memory: bytes of decoded frames to keep.
+            threads: most threads for marching; None for all processors.
+        """
         self.volume, self.memory, self.threads = volume, memory, threads
-        self._decoded: OrderedDict[Key, _Decoded] = OrderedDict()
+        self._frames: OrderedDict[Key, _DecodedFrame] = OrderedDict()
         self._histogram: Histogram | None = None
-        self._planned: tuple[Scene, Plan] | None = None
-        self._reader: ThreadPoolExecutor | None = None
-        self._coming: tuple[Key, Future[_Decoded]] | None = None
+        self._last_plan: tuple[Scene, Plan] | None = None
+        self._background: ThreadPoolExecutor | None = None
+        self._prefetch: tuple[Key, Future[_DecodedFrame]] | None = None
 
     def plan(self, scene: Scene) -> Plan:
-        """What a picture of a scene would take; raises InputError or RegionError as `render` does."""
+        """Plan a picture without rendering it; raises InputError or RegionError as `render` does.
+
+        A scene that differs from the last one only in its time takes over the rest of that plan.
+        """
         timeless = replace(scene, step=None, time=None)
-        if self._planned is not None and self._planned[0] == timeless:
-            return self._planned[1].at(self.volume, scene)
-        plan = Plan.of(self.volume, scene, histogram=self.histogram)
-        self._planned = timeless, plan
+        if self._last_plan is not None and self._last_plan[0] == timeless:
+            return plan_at(self._last_plan[1], self.volume, scene)
+        plan = plan_picture(self.volume, scene, histogram=self.histogram)
+        self._last_plan = timeless, plan
         return plan
 
     def render(
@@ -92,144 +107,71 @@ class Renderer:
         upcoming: Scene | None = None,
         progress: Progress = silent,
     ) -> Image:
-        """A picture of a scene, or of a plan that was made for it.
+        """Render a scene, or a plan that was made for it.
 
-        upcoming: the scene of the next picture. What that needs is decoded while this one is marched.
+        Args:
+            scene: what to show; the default scene if None. A scene with `evolution` gives several
+                steps side by side.
+            plan: a plan of `plan`, in place of a scene.
+            upcoming: the scene of the next picture; its frame is decoded while this one is marched.
+            progress: is told about each stage.
+
+        Raises InputError for a scene that cannot be drawn, RegionError for a step or time outside
+        the series.
         """
         if plan is None and scene is not None and scene.evolution is not None:
             return evolution(self.volume, scene, progress=progress, draw=self.render)
         begin = time.perf_counter()
-        plan = plan if plan is not None else self.plan(Scene() if scene is None else scene)
-        task = plan.task
-        lit: dict[str, int] = {}
-        frame = (
-            self._frame(plan, progress)
-            if plan.mode == "cache" or plan.lights or self.volume.profile == "compact"
-            else None
-        )
+        if plan is None:
+            plan = self.plan(Scene() if scene is None else scene)
+        # Networks are evaluated where rays sample them; light needs a frame all the same.
+        frame_needed = plan.mode == "cache" or plan.lights or self.volume.profile == "compact"
+        decoded = self._frame(plan, progress) if frame_needed else None
         if upcoming is not None:
-            self._prepare(upcoming)
-        if plan.lights:
-            assert frame is not None
-            progress("lighting", 0, 1, "")
-            light = light_grid(
-                frame.frame,
-                task.rays.grid,
-                task.table,
-                shadows=plan.shadows,
-                lamp=plan.lamp,
-                ambient_occlusion=plan.occlusion,
-            )
-            task, lit = replace(task, light=light), {"secondary_rays": light.secondary_rays}
-            progress("lighting", 1, 1, "")
-        if plan.mode == "cache":
-            assert frame is not None
-            progress("marching", 0, 1, "")
-            marched = march(frame.frame, task, bricks=frame.bricks, threads=self.threads)
-            progress("marching", 1, 1, "")
-        else:
-            arrays = arrays_on(plan.scene.march.device)
-            field: Field = (
-                FrameField(frame.frame, task.rays.grid, frame.bricks, arrays)
-                if frame is not None and self.volume.profile == "compact"
-                else NetworkField(self.volume, plan.step, plan.units, arrays)
-            )
-            marched = stream(
-                field,
-                task,
-                adaptive=plan.mode == "arm",
-                budget=plan.scene.march.samples_per_pass,
-                progress=progress,
-            )
-        return self._finished(plan, marched, lit, begin)
+            self._start_prefetch(upcoming)
+        task, secondary_rays = _lit(plan, decoded, progress)
+        marched = self._march(plan, task, decoded, progress)
+        return self._finish(plan, marched, secondary_rays, begin)
 
     def histogram(self) -> Histogram:
-        """How frequent values are in the series: of its first, middle and last step, coarse where the file has levels of detail."""
+        """Count the values of the series: its first, middle and last step, coarse if possible."""
         if self._histogram is None:
-            self._settle()
-            volume = self.volume
-            last = volume.shape[0] - 1
-            # By a power of two, 1 for every ordinary range, so that edges of denormals are apart and no width overflows.
-            scale = volume.value_range.scale
-            edges = np.linspace(
-                volume.value_range.low * scale, volume.value_range.high * scale, BINS + 1
-            )
-            counts = np.zeros(BINS, dtype=np.int64)
-            if volume.profile == "compact":
-                size = float(np.prod([high - low for low, high in volume.box]))
-                lod = 0
-                while size / 8**lod > COARSE:
-                    lod += 1
-                frames = [volume.read_lod(step, lod) for step in sorted({0, last // 2, last})]
-            else:
-                frames = [volume.read(last // 2)]
-            for frame in frames:
-                known = frame[np.isfinite(frame)]
-                counts += np.histogram(
-                    np.clip(known if scale == 1 else known * scale, edges[0], edges[-1]), edges
-                )[0]
-            self._histogram = edges / scale, counts
+            self._finish_prefetch()
+            self._histogram = _histogram_of(self.volume)
         return self._histogram
 
-    def _frame(self, plan: Plan, progress: Progress) -> _Decoded:
-        """The decoded frame of a plan, from those that are kept if one of them holds its region."""
-        kept = self._kept(plan)
-        if kept is not None:
-            return kept
-        key = plan.step, plan.lod
-        progress("decoding", 0, 1, "")
-        made = self._settle(key)
-        if made is None or not _holds(made, plan):
-            made = _decode(self.volume, plan)
-        progress("decoding", 1, 1, "")
-        self._decoded.pop(key, None)
-        while (
-            self._decoded
-            and sum(each.nbytes for each in self._decoded.values()) + made.nbytes > self.memory
-        ):
-            self._decoded.popitem(last=False)
-        if made.nbytes <= self.memory:
-            self._decoded[key] = made
-        return made
+    def _march(
+        self, plan: Plan, task: Task, decoded: _DecodedFrame | None, progress: Progress
+    ) -> Marched:
+        """March the rays of a task in the mode of the plan."""
+        if plan.mode == "cache":
+            assert decoded is not None
+            progress("marching", 0, 1, "")
+            marched = march(decoded.frame, task, bricks=decoded.bricks, threads=self.threads)
+            progress("marching", 1, 1, "")
+            return marched
+        arrays = arrays_on(plan.scene.march.device)
+        field: Field
+        if decoded is not None and self.volume.profile == "compact":
+            field = FrameField(decoded.frame, task.rays.grid, decoded.bricks, arrays)
+        else:
+            field = NetworkField(self.volume, plan.step, plan.units, arrays)
+        return stream(
+            field,
+            task,
+            adaptive=plan.mode == "arm",
+            budget=plan.scene.march.samples_per_pass,
+            progress=progress,
+        )
 
-    def _prepare(self, scene: Scene) -> None:
-        """Begin to decode what a picture of this scene needs; what is wrong with it is raised when that picture is made."""
-        try:
-            plan = self.plan(scene)
-        except (FhashError, OSError):
-            return
-        if plan.mode != "cache" or self._kept(plan) is not None:
-            return
-        self._settle()
-        if self._reader is None:
-            self._reader = ThreadPoolExecutor(1, thread_name_prefix="fhash-render")
-        self._coming = (plan.step, plan.lod), self._reader.submit(_decode, self.volume, plan)
-
-    def _kept(self, plan: Plan) -> _Decoded | None:
-        """What is kept of a plan's frame, if that holds its region."""
-        kept = self._decoded.get((plan.step, plan.lod))
-        if kept is None or not _holds(kept, plan):
-            return None
-        self._decoded.move_to_end((plan.step, plan.lod))
-        return kept
-
-    def _settle(self, key: Key | None = None) -> _Decoded | None:
-        """Wait for what is decoded in the background, since a volume is read by one thread at a time; that frame, if it is of this key."""
-        if self._coming is None:
-            return None
-        (of, future), self._coming = self._coming, None
-        if of == key:
-            return future.result()
-        future.exception()  # waits; a failure of a frame that nobody wants is no one's
-        return None
-
-    def _finished(self, plan: Plan, marched: Marched, lit: dict[str, int], begin: float) -> Image:
+    def _finish(self, plan: Plan, marched: Marched, secondary_rays: int, begin: float) -> Image:
+        """Make a picture of what was marched, with its overlay; `begin` is when rendering began."""
         volume = self.volume
         image = Image(
             rgba=marched.rgba,
             depth=marched.depth,
             normal=marched.normal,
-            counters=complete(marched.counters, lit),
+            counters=complete(marched.counters, {"secondary_rays": secondary_rays}),
             scene=plan.scene.to_dict(),
             source=volume.path.name,
             digest=volume.container.digest,
@@ -247,25 +189,129 @@ class Renderer:
         )
         return replace(drawn, seconds=time.perf_counter() - begin)
 
+    def _frame(self, plan: Plan, progress: Progress) -> _DecodedFrame:
+        """The decoded frame of a plan: a kept one, the prefetched one, or a new one."""
+        kept = self._kept(plan)
+        if kept is not None:
+            return kept
+        key = plan.step, plan.lod
+        progress("decoding", 0, 1, "")
+        decoded = self._finish_prefetch(key)
+        if decoded is None or not decoded.covers(plan.region):
+            decoded = _decode(self.volume, plan)
+        progress("decoding", 1, 1, "")
+        self._keep(key, decoded)
+        return decoded
 
-def _holds(kept: _Decoded, plan: Plan) -> bool:
-    """Whether a frame reaches as far as a plan looks."""
-    return all(a <= c and d <= b for (a, b), (c, d) in zip(kept.region, plan.region, strict=True))
+    def _kept(self, plan: Plan) -> _DecodedFrame | None:
+        """The kept frame of a plan, if it covers the plan's region."""
+        key = plan.step, plan.lod
+        kept = self._frames.get(key)
+        if kept is None or not kept.covers(plan.region):
+            return None
+        self._frames.move_to_end(key)
+        return kept
+
+    def _keep(self, key: Key, decoded: _DecodedFrame) -> None:
+        """Keep a frame, and drop the least recently used ones beyond the memory."""
+        self._frames.pop(key, None)
+        while (
+            self._frames
+            and sum(kept.nbytes for kept in self._frames.values()) + decoded.nbytes > self.memory
+        ):
+            self._frames.popitem(last=False)
+        if decoded.nbytes <= self.memory:
+            self._frames[key] = decoded
+
+    def _start_prefetch(self, scene: Scene) -> None:
+        """Begin to decode the frame of a scene; an error is raised when the scene is rendered."""
+        try:
+            plan = self.plan(scene)
+        except (FhashError, OSError):
+            return
+        if plan.mode != "cache" or self._kept(plan) is not None:
+            return
+        self._finish_prefetch()
+        if self._background is None:
+            self._background = ThreadPoolExecutor(1, thread_name_prefix="fhash-render")
+        future = self._background.submit(_decode, self.volume, plan)
+        self._prefetch = (plan.step, plan.lod), future
+
+    def _finish_prefetch(self, key: Key | None = None) -> _DecodedFrame | None:
+        """Wait for the prefetched frame; return it if it has this key.
+
+        The wait is needed in any case: only one thread at a time may read a volume.
+        """
+        if self._prefetch is None:
+            return None
+        (prefetched, future), self._prefetch = self._prefetch, None
+        if prefetched == key:
+            return future.result()
+        future.exception()  # wait; the error of a prefetched frame that nobody needs is dropped
+        return None
 
 
-def _decode(volume: Volume, plan: Plan) -> _Decoded:
+def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple[Task, int]:
+    """The task of a plan with its light, and the number of secondary rays that the light took."""
+    if not plan.lights:
+        return plan.task, 0
+    assert decoded is not None
+    progress("lighting", 0, 1, "")
+    light = light_grid(
+        decoded.frame,
+        plan.task.rays.grid,
+        plan.task.table,
+        shadows=plan.shadows,
+        lamp=plan.lamp,
+        ambient_occlusion=plan.occlusion,
+    )
+    progress("lighting", 1, 1, "")
+    return replace(plan.task, light=light), light.secondary_rays
+
+
+def _histogram_of(volume: Volume) -> Histogram:
+    """Count the finite values of a few steps in BINS bins over the value range."""
+    last = volume.shape[0] - 1
+    # A power of two, 1 for every ordinary range, keeps edges of denormals apart and widths finite.
+    scale = volume.value_range.scale
+    edges = np.linspace(volume.value_range.low * scale, volume.value_range.high * scale, BINS + 1)
+    counts = np.zeros(BINS, dtype=np.int64)
+    if volume.profile == "compact":
+        vertices = float(np.prod([high - low for low, high in volume.box]))
+        lod = 0
+        while vertices / 8**lod > COARSE:
+            lod += 1
+        frames = [volume.read_lod(step, lod) for step in sorted({0, last // 2, last})]
+    else:
+        frames = [volume.read(last // 2)]
+    for frame in frames:
+        finite = frame[np.isfinite(frame)]
+        scaled = finite if scale == 1 else finite * scale
+        counts += np.histogram(np.clip(scaled, edges[0], edges[-1]), edges)[0]
+    return edges / scale, counts
+
+
+def _decode(volume: Volume, plan: Plan) -> _DecodedFrame:
     frame = decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units)
-    return _Decoded(frame=frame, region=plan.region, bricks=Bricks.of(frame))
+    return _DecodedFrame(frame=frame, region=plan.region, bricks=Bricks.of(frame))
 
 
 def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Units) -> Frame:
-    """The values of a region of the feature bounding box at a step, of every 2^lod-th vertex, as a marcher takes them."""
+    """Decode a region of the feature bounding box as a marcher takes it.
+
+    Args:
+        volume: an open container.
+        step: of the series; fractional between two steps.
+        lod: level of detail; every 2^lod-th vertex along each axis is decoded.
+        region: (z, y, x) of the domain; only its part within the feature bounding box is decoded.
+        units: of the values of the frame.
+    """
     inner: Box = tuple(  # type: ignore[assignment]
         (max(low, first), min(high, last))
         for (low, high), (first, last) in zip(region, volume.box, strict=True)
     )
     if any(low >= high for low, high in inner):
-        # Nothing of the feature is in the picture.
+        # Nothing of the feature is in the picture: one vertex without a value stands for it.
         low, _ = zip(*volume.box, strict=True)
         return Frame(
             values=np.full((1, 1, 1), np.nan, dtype=np.float32),
@@ -275,8 +321,7 @@ def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Uni
     if lod == 0:
         values, first = volume.read(step, inner), [low for low, _ in inner]
     else:
-        vertices = volume.lod_vertices(lod, inner)
-        first = [part.start for part in vertices]
+        first = [vertices.start for vertices in volume.lod_vertices(lod, inner)]
         before, after = int(np.floor(step)), int(np.ceil(step))
         values = volume.read_lod(before, lod, inner)
         if after != before:
@@ -288,5 +333,6 @@ def decoded_frame(volume: Volume, step: float, lod: int, region: Box, units: Uni
 
 
 def _single(values: npt.NDArray[np.floating], units: Units) -> npt.NDArray[np.float32]:
-    plain = values if units == Units() else units.to(values)
-    return np.ascontiguousarray(plain, dtype=np.float32)
+    """Values in the units of the march, float32 and contiguous."""
+    converted = values if units == Units() else units.to(values)
+    return np.ascontiguousarray(converted, dtype=np.float32)

@@ -1,1 +1,2 @@
-"""Hard cases: data, settings and scenes on which codecs and renderers break, each with the properties that must hold."""
+"""Hard cases: data, settings and scenes on which codecs and renderers break, each with the
+properties that must hold."""

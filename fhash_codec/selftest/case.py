@@ -1,4 +1,7 @@
-"""What a hard case is, and what is found of it: the interface between the catalogue, the properties and the runner."""
+"""The records of the self-test: a hard case, a run of it under one of its settings, and a finding.
+
+The catalogue makes cases, the runner makes runs of them, and checks turn runs into findings.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,20 @@ from fhash_formats.series import Series
 __all__ = ["RUN_THREADS", "Case", "Check", "Finding", "Run"]
 
 RUN_THREADS = 4
-"""Threads by which every case is encoded; other numbers of them are compared with it."""
+"""Threads with which every case is encoded. A check repeats the encoding with other numbers of
+threads."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """A property of a case, measured: it holds where `worst` is at most `limit`; what is not a number does not.
+    """A property of a case, measured. It holds if `worst` is at most `limit`; NaN does not hold.
 
-    name: of the property. unit: of both figures, such as 'values', 'of the bound', 'of the range', 'dB'. under: settings or engine.
+    Attributes:
+        name: name of the property.
+        worst: the largest figure that was measured.
+        limit: the largest figure that is allowed.
+        unit: unit of both figures, such as 'values', 'of the bound', 'of the range' or 'dB'.
+        under: the settings or engine that gave the figure.
     """
 
     name: str
@@ -36,16 +45,24 @@ class Finding:
 
     @property
     def holds(self) -> bool:
-        """Whether the figure keeps to its limit."""
+        """Whether the figure is within its limit."""
         return bool(self.worst <= self.limit)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Run:
-    """A case encoded with one of its settings.
+    """A case that was encoded with one of its settings.
 
-    values: of the source (t, z, y, x), as they were given. under: name of the settings. path: of the container; `folder` is for more
-    files. volume: the container, open. thorough: in the long set, where a check may take its time.
+    Attributes:
+        case: the case.
+        series: the source.
+        values: values of the source (t, z, y, x), in the source's dtype.
+        under: name of the settings.
+        config: the settings.
+        folder: a temporary folder in which checks may write files.
+        path: the container.
+        volume: the container, opened.
+        thorough: whether the run belongs to the long set, where a check may take more time.
     """
 
     case: Case
@@ -60,12 +77,13 @@ class Run:
 
     @cached_property
     def decoded(self) -> npt.NDArray[Any]:
-        """The whole volume (t, z, y, x) as it decodes, NaN outside the coreset."""
+        """All decoded values (t, z, y, x), NaN outside the coreset."""
         return self.volume[...]
 
     @property
     def data_range(self) -> float:
-        """Of the finite values, in data units, as the codec has it; infinite where it overflows."""
+        """Range of the finite values in data units, as the codec computes it; infinite if it
+        overflows."""
         return self.volume.value_range.high - self.volume.value_range.low
 
 
@@ -77,13 +95,18 @@ class Case:
     """One hard case.
 
     Attributes:
-        name: short, in lower case with hyphens, unique. group: values, shapes, fronts, features, times, networks, rays.
-        about: one line, what is hard and what must hold.
-        make: the series, small (some 10,000 values), the same on every call. It may have no NaN-free value at all.
-        settings: by name, each encoded and checked. more: those of the long set.
-        checks: beyond those that every run has to pass.
-        quick: in the quick set, which takes less than three minutes as a whole.
-        refused: where the encoding must be refused with InputError, or end with QualityError, a part of the message.
+        name: short and unique, in lower case with hyphens.
+        group: one of values, shapes, fronts, features, times, networks, rays.
+        about: one line that says what is hard and what must hold.
+        make: returns the series, which is small (some 10,000 values) and the same on every call.
+            The series may have no finite value.
+        settings: settings by name; the case is encoded and checked with each of them.
+        more: additional settings of the long set.
+        checks: checks of this case, in addition to the checks of every run.
+        quick: whether the case belongs to the quick set, which takes less than three minutes in
+            total.
+        refused: a part of the message, if encoding must raise InputError or QualityError; else
+            None.
     """
 
     name: str

@@ -1,4 +1,5 @@
-"""Where the codec runs: what it reads from the environment, set for a while, and what there is of machine and libraries."""
+"""The environment of the codec: variables that are set for a while, and a description of machine
+and libraries."""
 
 from __future__ import annotations
 
@@ -12,14 +13,14 @@ import fhash_codec.native as codec_native
 import fhash_formats.native as formats_native
 from fhash_formats.support.threads import usable_threads
 
-__all__ = ["environment", "surroundings"]
+__all__ = ["describe_machine", "environment"]
 
 
-def surroundings() -> str:
-    """Versions, machine and what is used of it, in a line. Loads torch."""
+def describe_machine() -> str:
+    """Versions, machine and the parts of it that are used, in one line. Loads torch."""
     from fhash_codec.training.devices import choose_device
 
-    parts = [
+    facts = [
         f"fhash {version('fhash')}",
         f"Python {platform.python_version()}",
         f"numpy {version('numpy')}",
@@ -29,7 +30,7 @@ def surroundings() -> str:
         "native core" if native_code() else "without the native core",
         "CUDA" if choose_device("auto").type == "cuda" else "no CUDA",
     ]
-    return ", ".join(parts)
+    return ", ".join(facts)
 
 
 def native_code() -> bool:
@@ -39,13 +40,17 @@ def native_code() -> bool:
 
 @contextmanager
 def environment(**variables: str) -> Iterator[None]:
-    """Within it these variables of the process have these values: FHASH_NATIVE, FHASH_THREADS. Not for several threads at once."""
-    before = {name: os.environ.get(name) for name in variables}
+    """Sets environment variables of this process, such as FHASH_NATIVE and FHASH_THREADS, within a
+    `with` block.
+
+    Not for several threads at once: the environment belongs to the process.
+    """
+    previous = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name, value in previous.items():
             if value is None:
                 os.environ.pop(name, None)
             else:

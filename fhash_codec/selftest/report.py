@@ -1,4 +1,4 @@
-"""The results of the hard cases as Markdown: the same text for the same figures."""
+"""The results of the hard cases as Markdown; the same figures give the same text."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ __all__ = ["markdown"]
 HEAD = """\
 # Numerical stability
 
-Made by `fhash selftest{options} --report`: {cases} hard cases, each encoded under several settings, decoded and drawn. A figure holds where
-it is at most its limit. Of each case the property is shown that came nearest to its limit.{where}
+Made by `fhash selftest{options} --report`: {cases} hard cases. Each case is encoded with several
+settings, decoded and drawn. A property holds if its figure is at most its limit. For each case, the
+tables show the property whose figure came nearest to its limit.{where}
 
 **{verdict}**
 """
 
 
 def markdown(summary: Summary, *, options: str = "", where: str = "") -> str:
-    """The verdict, the worst figure of every property, then of every case, group by group.
+    """The verdict, the worst figure of every property, and a table of cases for every group.
 
-    options: of the command that made it. where: a sentence on machine and time.
+    Args:
+        summary: the results.
+        options: options of the command that made them, for the text.
+        where: a sentence on machine and time.
     """
     failures = summary.failures
     verdict = (
@@ -32,7 +36,7 @@ def markdown(summary: Summary, *, options: str = "", where: str = "") -> str:
         if len(failures) == 1
         else f"{len(failures)} do not hold."
     )
-    parts = [
+    sections = [
         HEAD.format(
             options=options,
             cases=len(summary.results),
@@ -41,25 +45,25 @@ def markdown(summary: Summary, *, options: str = "", where: str = "") -> str:
         )
     ]
     if failures:
-        parts.append(
+        sections.append(
             "## What does not hold\n\n" + "\n".join(f"- {_plain(line)}" for line in failures) + "\n"
         )
     worst = summary.worst()
-    parts.append("## The worst of every property\n")
+    sections.append("## The worst of every property\n")
     rows = [
-        (name, _figure(one), _limit(one), result.name, one.under)
-        for name, (result, one) in sorted(worst.items())
+        (name, _figure(finding), _limit(finding), result.name, finding.under)
+        for name, (result, finding) in sorted(worst.items())
     ]
-    parts.append(_table(("property", "worst", "limit", "case", "settings"), rows))
+    sections.append(_table(("property", "worst", "limit", "case", "settings"), rows))
     for group, results in summary.groups.items():
-        parts.append(f"## {group.capitalize()}\n")
-        parts.append(
+        sections.append(f"## {group.capitalize()}\n")
+        sections.append(
             _table(
                 ("case", "what is hard", "settings", "nearest to its limit", "figure", "limit"),
-                [_row(one) for one in results],
+                [_row(result) for result in results],
             )
         )
-    return "\n".join(parts)
+    return "\n".join(sections)
 
 
 def _row(result: CaseResult) -> tuple[str, ...]:

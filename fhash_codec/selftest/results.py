@@ -1,4 +1,4 @@
-"""What was found of the cases, as records and JSON values."""
+"""The results of cases, as records and JSON values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ __all__ = ["CaseResult", "Summary", "relative"]
 
 
 def relative(finding: Finding) -> float:
-    """The figure in parts of its limit: above 1 where it does not hold, infinite where the limit is 0 and it is more."""
+    """The figure as a multiple of its limit: above 1 if the property does not hold.
+
+    Infinite if the figure is NaN, or positive with a limit of 0.
+    """
     if not finding.holds:
         return (
             math.inf
@@ -25,10 +28,15 @@ def relative(finding: Finding) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class CaseResult:
-    """What was found of one case.
+    """The results of one case.
 
-    under: names of its settings that were tried. findings: of all of them, each with its settings in `under`. errors: one line for each
-    setting under which the case did not come to an end.
+    Attributes:
+        name: name of the case.
+        group: its group.
+        about: one line that says what is hard.
+        under: names of the settings that were tried.
+        findings: the findings under all settings, each with the name of its settings in `under`.
+        errors: one line for each error that kept the case, or a check of it, from finishing.
     """
 
     name: str
@@ -40,7 +48,7 @@ class CaseResult:
 
     @property
     def holds(self) -> bool:
-        """Whether everything was measured and keeps its limit."""
+        """Whether there was no error and all figures are within their limits."""
         return not self.errors and all(finding.holds for finding in self.findings)
 
     @property
@@ -50,18 +58,19 @@ class CaseResult:
 
     @property
     def failures(self) -> list[str]:
-        """A line for each thing that is wrong."""
-        broken = [one for one in self.findings if not one.holds]
+        """One line for each error and for each property that does not hold."""
+        broken = [finding for finding in self.findings if not finding.holds]
         return [
             *self.errors,
             *(
-                f"{one.under}: {one.name} is {one.worst:.6g} {one.unit}, at most {one.limit:.6g}"
-                for one in broken
+                f"{finding.under}: {finding.name} is {finding.worst:.6g} {finding.unit}, "
+                f"at most {finding.limit:.6g}"
+                for finding in broken
             ),
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values; a figure that is not finite is text."""
+        """JSON values; figures that are not finite become text."""
         return {
             "name": self.name,
             "group": self.group,
@@ -74,16 +83,16 @@ class CaseResult:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> CaseResult:
-        """From `to_dict`'s values."""
+        """The result with the values that `to_dict` returned."""
         findings = tuple(
             Finding(
-                name=one["name"],
-                worst=float(one["worst"]),
-                limit=float(one["limit"]),
-                unit=one["unit"],
-                under=one["under"],
+                name=values_of_finding["name"],
+                worst=float(values_of_finding["worst"]),
+                limit=float(values_of_finding["limit"]),
+                unit=values_of_finding["unit"],
+                under=values_of_finding["under"],
             )
-            for one in values["findings"]
+            for values_of_finding in values["findings"]
         )
         plain = {name: values[name] for name in ("name", "group", "about")}
         return cls(
@@ -99,32 +108,31 @@ class Summary:
 
     @property
     def holds(self) -> bool:
-        """Whether every case does."""
+        """Whether every case holds."""
         return all(result.holds for result in self.results)
 
     @property
     def groups(self) -> dict[str, list[CaseResult]]:
         """The results by group."""
-        found: dict[str, list[CaseResult]] = {}
+        groups: dict[str, list[CaseResult]] = {}
         for result in self.results:
-            found.setdefault(result.group, []).append(result)
-        return found
+            groups.setdefault(result.group, []).append(result)
+        return groups
 
     @property
     def failures(self) -> list[str]:
-        """A line for each thing that is wrong, beginning with the case."""
+        """One line for each failure, beginning with the name of the case."""
         return [f"{result.name}: {line}" for result in self.results for line in result.failures]
 
     def worst(self) -> dict[str, tuple[CaseResult, Finding]]:
-        """Of each property, by name, the finding nearest to its limit and its case."""
-        found: dict[str, tuple[CaseResult, Finding]] = {}
+        """The finding nearest to its limit for each property, by name, with its case."""
+        worst: dict[str, tuple[CaseResult, Finding]] = {}
         for result in self.results:
             for finding in result.findings:
-                if finding.name not in found or relative(finding) > relative(
-                    found[finding.name][1]
-                ):
-                    found[finding.name] = result, finding
-        return found
+                previous = worst.get(finding.name)
+                if previous is None or relative(finding) > relative(previous[1]):
+                    worst[finding.name] = result, finding
+        return worst
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values."""

@@ -1,4 +1,7 @@
-"""Running cases: each in a folder of its own, encode -> container -> decode -> picture, and whatever goes wrong is a line of its result."""
+"""The run of a case: encode, open, decode, draw and check it in a temporary folder.
+
+Whatever goes wrong becomes a line of the result.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ import numpy as np
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
 from fhash_codec.selftest.case import RUN_THREADS, Case, Check, Finding, Run
-from fhash_codec.selftest.checks.properties import EVERY
+from fhash_codec.selftest.checks.properties import COMMON_CHECKS
 from fhash_codec.selftest.environment import environment
 from fhash_codec.selftest.results import CaseResult
 from fhash_codec.volume import open as open_volume
@@ -24,12 +27,16 @@ __all__ = ["run_case"]
 
 
 def run_case(
-    case: Case, *, everything: bool = False, checks: Sequence[Check] = EVERY
+    case: Case, *, everything: bool = False, checks: Sequence[Check] = COMMON_CHECKS
 ) -> CaseResult:
-    """What is found of a case, under the settings of the long set too with `everything`; nothing is raised but KeyboardInterrupt.
+    """The result of a case; raises nothing but KeyboardInterrupt.
 
-    checks: what every run has to keep, besides the checks of the case. A RuntimeWarning of numpy (an overflow, an invalid operation) counts
-    as an error.
+    A RuntimeWarning of numpy (an overflow or an invalid operation) counts as an error.
+
+    Args:
+        case: the case.
+        everything: whether the additional settings of the long set are run, too.
+        checks: the checks of every run, in addition to the checks of the case.
     """
     settings: Mapping[str, EncodeConfig] = {**case.settings, **(case.more if everything else {})}
     findings: list[Finding] = []
@@ -44,7 +51,7 @@ def run_case(
             settings = {}
         for under, config in settings.items():
             with tempfile.TemporaryDirectory(prefix="fhash-selftest-") as folder:
-                found, wrong = _run(
+                run_findings, run_errors = _run(
                     case,
                     series,
                     under,
@@ -54,9 +61,10 @@ def run_case(
                     everything,
                 )
             findings += [
-                replace(one, under=f"{under}, {one.under}" if one.under else under) for one in found
+                replace(finding, under=f"{under}, {finding.under}" if finding.under else under)
+                for finding in run_findings
             ]
-            errors += wrong
+            errors += run_errors
     return CaseResult(
         name=case.name,
         group=case.group,
@@ -102,7 +110,7 @@ def _run(
 
 
 def _checked(run: Run, checks: Sequence[Check]) -> tuple[list[Finding], list[str]]:
-    """A check that ends with an error does not keep the others from being made."""
+    """Findings and errors of all checks; a check that raises does not stop the others."""
     findings: list[Finding] = []
     errors: list[str] = []
     for check in checks:
@@ -114,14 +122,17 @@ def _checked(run: Run, checks: Sequence[Check]) -> tuple[list[Finding], list[str
 
 
 def _refused(
-    wanted: str, series: Series, under: str, config: EncodeConfig, path: Path
+    expected: str, series: Series, under: str, config: EncodeConfig, path: Path
 ) -> tuple[list[Finding], list[str]]:
-    """Whether the encoding is refused as it must be, and leaves nothing; one that misses its promise leaves its file, as it says."""
+    """Whether the encoding is refused with a message that contains `expected`, and leaves no file.
+
+    An encoding that misses its promise raises QualityError and keeps its file.
+    """
     try:
         encode(series, path, config)
     except (InputError, QualityError) as error:
-        if wanted not in str(error):
-            return [], [f"{under}: refused with '{error}', which does not say '{wanted}'"]
+        if expected not in str(error):
+            return [], [f"{under}: refused with '{error}', which does not say '{expected}'"]
         left = {entry.name for entry in path.parent.iterdir()} - (
             {path.name} if isinstance(error, QualityError) else set()
         )
@@ -130,7 +141,7 @@ def _refused(
         ], []
     except Exception as error:
         return [], [_line(under, error)]
-    return [], [f"{under}: was encoded; it should have been refused with '{wanted}'"]
+    return [], [f"{under}: was encoded; it should have been refused with '{expected}'"]
 
 
 def _line(where: str, error: Exception) -> str:

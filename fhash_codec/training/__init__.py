@@ -1,1 +1,1 @@
-"""What every training shares: Adam, threads and devices."""
+"""Adam, threads and devices for every training."""

@@ -1,21 +1,59 @@
-"""Adam's constants, and its steps without a gradient in closed form (Kingma and Ba 2015, algorithm 1)."""
+"""Adam's constants, its step, and its steps without a gradient in closed form.
+
+The source is Kingma and Ba 2015, algorithm 1.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-8
-WINDOW = 200  # (BETA1 / sqrt(BETA2))**200 is 8e-10: later steps without a gradient no longer move a parameter
+BETA1 = 0.9
+"""Decay of the mean of gradients per step."""
+BETA2 = 0.999
+"""Decay of the mean of squared gradients per step."""
+EPSILON = 1e-8
+"""Number added to the root of the mean square before it divides."""
+WINDOW = 200
+"""Steps without a gradient after which a parameter no longer moves.
+
+(BETA1 / sqrt(BETA2))**200 is 8e-10.
+"""
+
+Column = npt.NDArray[np.float32]
+
+
+class CatchUp(NamedTuple):
+    """Effect of steps without a gradient on parameters, each float32 (n,).
+
+    With Adam's mean m and mean square v as they were before these steps, a parameter moves by
+    -factor * m / (sqrt(v) + epsilon). Then m decays by `mean_decay` and v by `square_decay`.
+    """
+
+    factor: Column
+    epsilon: Column
+    mean_decay: Column
+    square_decay: Column
 
 
 def adam_step(
     parameter: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, step: int, rate: float
 ) -> None:
-    """Step number `step` (from 1 on) of Adam, in place; all tensors of one shape.
+    """Do one step of Adam in place, on tensors of one shape.
 
-    torch.optim.Adam does the same, but loads torch's compiler on its first use, which takes as long as torch itself.
+    torch.optim.Adam does the same, but loads torch's compiler on its first use, which takes as long
+    as loading torch itself.
+
+    Args:
+        parameter: the numbers to move.
+        gradient: their gradient.
+        mean: mean of the gradients.
+        square: mean of the squared gradients.
+        step: number of the step, from 1 on.
+        rate: learning rate.
     """
     mean.lerp_(gradient, 1 - BETA1)
     square.mul_(BETA2).addcmul_(gradient, gradient, value=1 - BETA2)
@@ -23,23 +61,21 @@ def adam_step(
     parameter.addcdiv_(mean, root, value=-rate / (1 - BETA1**step))
 
 
-def catch_up(
-    visited: npt.NDArray[np.int64], step: int, rates: npt.NDArray[np.float64]
-) -> tuple[
-    npt.NDArray[np.float32],
-    npt.NDArray[np.float32],
-    npt.NDArray[np.float32],
-    npt.NDArray[np.float32],
-]:
-    """What steps visited+1 .. step with zero gradients do to parameters whose last gradient came at `visited` (0: never), each (n,).
+def catch_up(visited: npt.NDArray[np.int64], step: int, rates: npt.NDArray[np.float64]) -> CatchUp:
+    """Return the effect of the steps visited + 1 .. step, all with a gradient of zero.
 
-    Returns factor, epsilon, mean decay and square decay; with Adam's mean m and square v as they were at `visited`,
-    the parameter moves by -factor * m / (sqrt(v) + epsilon), and m and v decay by the two factors.
+    At step j = visited + i Adam moves a parameter by
+    -rate_j m b1^i / (1 - b1^j) / (sqrt(v b2^i / (1 - b2^j)) + eps). With r = b1 / sqrt(b2) and
+    c_j = sqrt(1 - b2^j) / (1 - b1^j) that is
+    -rate_j r^i c_j m / (sqrt(v) + eps sqrt((1 - b2^j) / b2^i)).
+    All but the last root leave the sum over i. The root varies slowly and is replaced by its
+    harmonic mean under the weights rate_j r^i c_j. That is exact where sqrt(v) is far above eps and
+    where it is far below.
 
-    At step j = visited + i Adam moves by -rate_j m b1^i / (1 - b1^j) / (sqrt(v b2^i / (1 - b2^j)) + eps). With r = b1 / sqrt(b2)
-    that is -rate_j r^i c_j m / (sqrt(v) + eps sqrt((1 - b2^j) / b2^i)), c_j = sqrt(1 - b2^j) / (1 - b1^j): all but the last root
-    leave the sum over i. The root varies slowly; its harmonic mean under the weights rate_j r^i c_j stands for it, which is exact
-    where sqrt(v) is far above eps and where it is far below.
+    Args:
+        visited: number of the last step with a gradient for each parameter, int64 (n,); 0 for none.
+        step: number of the present step.
+        rates: learning rate of every step, counted from 1.
     """
     gap = step - visited
     missed = np.where(visited > 0, gap, 0)
@@ -52,9 +88,9 @@ def catch_up(
     factor = weight.sum(axis=1)
     inverse = (weight / np.sqrt(correction2 / BETA2**i)).sum(axis=1)
     epsilon = EPSILON * np.divide(factor, inverse, out=np.ones_like(factor), where=inverse > 0)
-    return (
-        factor.astype(np.float32),
-        epsilon.astype(np.float32),
-        (BETA1 ** missed.astype(np.float64)).astype(np.float32),
-        (BETA2 ** missed.astype(np.float64)).astype(np.float32),
+    return CatchUp(
+        factor=factor.astype(np.float32),
+        epsilon=epsilon.astype(np.float32),
+        mean_decay=(BETA1 ** missed.astype(np.float64)).astype(np.float32),
+        square_decay=(BETA2 ** missed.astype(np.float64)).astype(np.float32),
     )

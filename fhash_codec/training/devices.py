@@ -1,4 +1,4 @@
-"""The device that a training runs on."""
+"""Choice of the device that torch computes on."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ if TYPE_CHECKING:
 
 
 def choose_device(name: str) -> torch.device:
-    """The device of this name; 'auto' is a CUDA device where there is one. Raises InputError where it is not to be had."""
+    """Return the torch device named cpu, cuda or auto; auto is CUDA where there is a device.
+
+    Raises InputError for cuda where torch finds no CUDA device.
+    """
     import torch
 
     if name == "auto":

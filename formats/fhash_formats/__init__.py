@@ -1,4 +1,7 @@
-"""Bytes on disk: series that are read, regions that are written, and the `.fhz` container. Importing it is cheap."""
+"""File formats: readers of series, writers of regions, and the `.fhz` container.
+
+Importing this package is cheap.
+"""
 
 from fhash_formats.readers import RawLayout, open_mask, open_series, parse_shape
 from fhash_formats.writers import Region, save_check, save_region

@@ -1,7 +1,8 @@
-"""The one error tree of fhash; every package raises from here and the command line turns it into one line.
+"""The error tree of fhash.
 
-The tree has built-in bases, so that `except FileNotFoundError` works as it does anywhere else.
-A message says what is wrong, the value that was given, what is allowed and what to do about it.
+Every package raises these errors, and the command line prints an error in one line.
+The errors also have built-in bases, so that `except FileNotFoundError` works as usual. A message
+says what is wrong, which value was given, what is allowed and what to do.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from typing import Any
 
 
 class FhashError(Exception):
-    """Anything that fhash refuses or fails at. The command line exits with `exit_code`."""
+    """Base of all errors of fhash. The command line exits with `exit_code`."""
 
     exit_code = 1
 
@@ -32,7 +33,7 @@ class RegionError(FhashError, IndexError):
 
 
 class OutputExistsError(InputError, FileExistsError):
-    """An output that is there already and may not be replaced without leave."""
+    """An output that exists and may not be replaced without permission (`force`)."""
 
 
 class OutputError(FhashError, OSError):
@@ -40,7 +41,7 @@ class OutputError(FhashError, OSError):
 
 
 class QualityError(FhashError):
-    """A promised quality that was not reached; `figures` holds what was, as JSON values."""
+    """A promised quality that was missed; `figures` holds the quality reached, as JSON values."""
 
     exit_code = 3
 
@@ -50,13 +51,13 @@ class QualityError(FhashError):
 
 
 class DamagedFileError(FhashError, ValueError):
-    """A `.fhz` file that is damaged, hostile or not a container at all."""
+    """A `.fhz` file that is damaged, hostile or not a container."""
 
     exit_code = 4
 
 
 class UnsupportedFileError(DamagedFileError):
-    """A sound `.fhz` file of a newer format or with features that this version does not know."""
+    """A sound `.fhz` file of a newer format, or with features that this version does not know."""
 
 
 class TrainingError(FhashError, ArithmeticError):
@@ -64,16 +65,16 @@ class TrainingError(FhashError, ArithmeticError):
 
 
 class MissingDependencyError(FhashError, ImportError):
-    """An optional library that a format or command needs; the message names the extra to install."""
+    """A missing optional library of a format or command; the message names the extra to install."""
 
     exit_code = 2
 
 
 class InterruptedEncodingError(FhashError):
-    """Encoding that a user stopped; its checkpoint is saved and the same command goes on from there."""
+    """Encoding that a user stopped; the same command continues from its saved checkpoint."""
 
     exit_code = 130
 
 
 class FhashWarning(UserWarning):
-    """Something that a user should know and that is no error."""
+    """A fact that a user should know and that is no error."""

@@ -1,18 +1,19 @@
-"""What a reader returns: a time-varying volume that is read one frame at a time.
+"""`Series`: a time-varying volume that is read one frame at a time, as every reader returns it.
 
 The contract of every reader:
 
-- axes are always (t, z, y, x), whatever the file's order; a frame is (z, y, x);
-- `read(step)` reads one frame, and keeps of the file at most a slab of bounded size, so that no series is ever held whole;
-- values are physical (packing undone, fill values turned into NaN) in the native byte order;
-- coordinates are float64, one per axis, the plain index where the file has none.
+- Axes are always (t, z, y, x), whatever the file's order; a frame is (z, y, x).
+- `read(step)` reads one frame. A reader keeps at most a slab of bounded size in memory, so that no
+  series is ever held as a whole.
+- Values are physical, in the native byte order: packing is undone, and fill values become NaN.
+- Coordinates are float64, one per axis; they are the plain index where the file has none.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -24,11 +25,18 @@ from fhash_formats.errors import InputError, RegionError
 
 AXES = ("t", "z", "y", "x")
 AXIS_NAMES = {"t": "time", "z": "z", "y": "y", "x": "x"}
+"""Name of each axis in a container, and of a coordinate that the source does not name."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Coordinate:
-    """Positions along one axis: `values` float64 (n,), the file's name for it, and its attributes (JSON values)."""
+    """Positions along one axis.
+
+    Attributes:
+        name: the file's name of the axis.
+        values: float64 (n,).
+        attributes: JSON values.
+    """
 
     name: str
     values: npt.NDArray[np.float64]
@@ -36,7 +44,7 @@ class Coordinate:
 
 
 def index_coordinate(axis: str, length: int) -> Coordinate:
-    """The coordinate of an axis for which the file gives none: 0, 1, 2, ..."""
+    """The coordinate 0, 1, 2, ... of an axis for which the file has none."""
     return Coordinate(name=AXIS_NAMES[axis], values=np.arange(length, dtype=np.float64))
 
 
@@ -45,13 +53,14 @@ class Series(ABC):
 
     Attributes:
         source: path as given by the user, for messages.
-        name: variable name, e.g. "density".
-        units: of the values, "" where unknown.
-        dtype: of the frames, native byte order, integer or float.
+        name: name of the variable, e.g. "density".
+        units: units of the values, "" where unknown.
+        dtype: number type of the frames, integer or float, native byte order.
         shape: (t, z, y, x), every length at least 1.
         coords: a Coordinate for each of "t", "z", "y", "x".
-        attributes: of the variable, JSON values only.
-        files: what it is read from, files and folders; no output may replace them. None where it is in memory.
+        attributes: attributes of the variable, JSON values.
+        files: files and folders that the series is read from, which no output may replace; empty
+            for a series in memory.
     """
 
     source: str
@@ -65,28 +74,30 @@ class Series(ABC):
 
     @abstractmethod
     def read(self, step: int) -> npt.NDArray[Any]:
-        """One frame (z, y, x), C-contiguous, of `self.dtype`, not to be written to.
+        """One frame (z, y, x) of `self.dtype`, C-contiguous; callers must not write to it.
 
-        Raises RegionError for a step outside 0 .. shape[0] - 1, InputError if the file cannot be read.
+        Raises RegionError for a step outside 0 .. shape[0] - 1, and InputError if the file cannot
+        be read.
         """
 
     def require_step(self, step: int) -> None:
-        """Raise RegionError for a step that the series has not; negative ones do not count from the end."""
+        """Raise RegionError for a step outside the series; negative steps are outside, too."""
         if not 0 <= step < self.shape[0]:
             raise RegionError(f"{self.source}: step {step} is outside 0..{self.shape[0] - 1}")
 
     def check(self) -> None:  # noqa: B027 - a series in memory does not change
-        """Raise InputError if what it is read from changed since it was opened: then the frames read are not of one state.
+        """Raise InputError if the files changed since they were opened.
 
-        `read` notices most changes at once. Only this looks at every file, such as the chunks of a Zarr folder; whoever makes something
-        of all frames calls it before that counts.
+        The frames that were read would then not be of one state. `read` notices most changes at
+        once, but only this looks at every file, such as the chunks of a Zarr folder. A caller that
+        makes an output of all frames calls this before the output takes its name.
         """
 
     def close(self) -> None:  # noqa: B027 - a series in memory has nothing to release
-        """Release the file."""
+        """Release the files."""
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:
-        """Every frame in order."""
+        """Yield every frame in order."""
         for step in range(self.shape[0]):
             yield self.read(step)
 
@@ -103,41 +114,45 @@ class Series(ABC):
 
 
 class StepsSeries(Series):
-    """Some steps of another series, in the order given."""
+    """Some steps of another series, in the order given.
 
-    def __init__(self, whole: Series, steps: Sequence[int]) -> None:
+    Raises InputError for no steps, and RegionError for a step outside the other series.
+    """
+
+    def __init__(self, series: Series, steps: Sequence[int]) -> None:
         if not steps:
             raise InputError(
-                f"{whole.source}: the selection of steps is empty; the series has {whole.shape[0]} steps"
+                f"{series.source}: the selection of steps is empty; "
+                f"the series has {series.shape[0]} steps"
             )
         for step in steps:
-            whole.require_step(step)
-        time = whole.coords["t"]
-        self.whole = whole
+            series.require_step(step)
+        self.series = series
         self.steps = tuple(steps)
-        self.source, self.name, self.units = whole.source, whole.name, whole.units
-        self.dtype, self.attributes, self.files = whole.dtype, whole.attributes, whole.files
-        self.shape = (len(self.steps), *whole.shape[1:])
-        chosen = Coordinate(
-            name=time.name, values=time.values[list(self.steps)], attributes=time.attributes
-        )
-        self.coords = {**whole.coords, "t": chosen}
+        self.source, self.name, self.units = series.source, series.name, series.units
+        self.dtype, self.attributes, self.files = series.dtype, series.attributes, series.files
+        self.shape = (len(self.steps), *series.shape[1:])
+        time = series.coords["t"]
+        self.coords = {
+            **series.coords,
+            "t": replace(time, values=time.values[list(self.steps)]),
+        }
 
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)
-        return self.whole.read(self.steps[step])
+        return self.series.read(self.steps[step])
 
     def check(self) -> None:
-        self.whole.check()
+        self.series.check()
 
     def close(self) -> None:
-        self.whole.close()
+        self.series.close()
 
 
 class ArraySeries(Series):
-    """An array in memory (t, z, y, x) or (z, y, x) as a series; masked values of floats are NaN.
+    """An array in memory, (t, z, y, x) or (z, y, x), as a series; masked floats become NaN.
 
-    Raises InputError for an array that cannot be a series, and for coordinates that do not fit it.
+    Raises InputError for an array that cannot be a series, and for coordinates that do not fit.
     """
 
     def __init__(
@@ -168,14 +183,22 @@ class ArraySeries(Series):
 def check_values(
     what: str, shape: Sequence[int], dtype: np.dtype[Any]
 ) -> tuple[int, int, int, int]:
-    """The shape (t, z, y, x) if an array of this shape and type can be a series, or an InputError that says why not."""
+    """The shape (t, z, y, x) of an array that can be a series; raises InputError for others.
+
+    Args:
+        what: name of the array, for messages.
+        shape: of the array.
+        dtype: of the array.
+    """
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise InputError(
-            f"{what}: values of type {dtype} cannot be encoded; integers and floats up to 64 bits can"
+            f"{what}: values of type {dtype} cannot be encoded; "
+            "integers and floats up to 64 bits can"
         )
     if len(shape) != 4:
         raise InputError(
-            f"{what}: {len(shape)} dimensions {tuple(shape)}; a series has 4 (t, z, y, x), or 3 (z, y, x) for one step"
+            f"{what}: {len(shape)} dimensions {tuple(shape)}; "
+            "a series has 4 (t, z, y, x), or 3 (z, y, x) for one step"
         )
     if min(shape) < 1:
         raise InputError(f"{what}: an axis is empty, shape {tuple(shape)} in (t, z, y, x)")
@@ -186,7 +209,7 @@ def check_values(
 def check_coords(
     what: str, coords: Mapping[str, Coordinate], shape: tuple[int, int, int, int]
 ) -> None:
-    """Raise InputError unless there is a coordinate for each of t, z, y, x, float64 and as long as its axis."""
+    """Raise InputError unless each of t, z, y, x has a float64 coordinate as long as the axis."""
     if set(coords) != set(AXES):
         raise InputError(
             f"{what}: coordinates of {sorted(coords)}; exactly those of t, z, y and x are needed"
@@ -195,18 +218,23 @@ def check_coords(
         values = coords[axis].values
         if values.shape != (length,) or values.dtype != np.float64:
             raise InputError(
-                f"{what}: the coordinate of {axis} is {values.dtype} {values.shape}; float64 ({length},) is needed"
+                f"{what}: the coordinate of {axis} is {values.dtype} {values.shape}; "
+                f"float64 ({length},) is needed"
             )
 
 
 def _unmasked(array: npt.ArrayLike) -> npt.NDArray[Any]:
-    """The values; masked ones must not pass for what happens to stand under the mask."""
+    """The values, with NaN for masked ones; the numbers under a mask have no meaning.
+
+    Raises InputError for masked values of a type that has no NaN.
+    """
     if not np.ma.is_masked(array):
         return np.asarray(array)
     masked: np.ma.MaskedArray[Any, Any] = np.ma.asarray(array)
     if masked.dtype.kind != "f":
         raise InputError(
-            f"array: masked values of type {masked.dtype}, which has no NaN; convert it to float32 or float64 first"
+            f"array: masked values of type {masked.dtype}, which has no NaN; "
+            "convert it to float32 or float64 first"
         )
     filled: npt.NDArray[Any] = masked.filled(np.nan)
     return filled

@@ -64,7 +64,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A container of part of the tiny series: there are vertices outside the coreset."""
+    """A container of part of the tiny series, with vertices outside the coreset."""
     path = tmp_path_factory.mktemp("run") / "tiny.fhz"
     result = invoke(
         "encode", data, "-o", path, "--feature", "interval:6:99", "--dilation", "0", *SMALL
@@ -74,7 +74,7 @@ def run(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def listing(folder: Path) -> dict[str, bytes | None]:
-    """Everything below a folder with its bytes (None for a folder), to see whether a command left a trace."""
+    """Paths below a folder with their bytes, None for a folder; shows the traces of a command."""
     return {
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))
@@ -83,7 +83,10 @@ def listing(folder: Path) -> dict[str, bytes | None]:
 
 @pytest.fixture
 def refused(tmp_path: Path) -> Callable[..., str]:
-    """Runs a command line that must fail with an exit code, one line on stderr and no trace; the line without 'fhash: error: '."""
+    """Runs a command line that must fail with an exit code, one line on stderr and no trace.
+
+    The line is returned without 'fhash: error: '.
+    """
 
     def check(code: int, *words: object) -> str:
         before = listing(tmp_path)

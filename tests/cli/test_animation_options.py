@@ -1,4 +1,4 @@
-"""The options that make several pictures: what they come to, which exclude each other, and what is written."""
+"""Options for several pictures: values, options that exclude each other, and outputs."""
 
 from __future__ import annotations
 
@@ -21,15 +21,14 @@ from fhash_cli.animation_options import (
 from fhash_cli.main import Program
 from fhash_cli.options import run_argument
 from fhash_cli.output import Progress
-from fhash_codec.rendering.scene.png_text import scene_in_png
-from fhash_codec.rendering.scene.scene import Scene
+from fhash_codec.rendering.scene.scene import Scene, scene_in_png
 
 SMALL = Scene(size=(24, 18))
 
 
 @click.group(cls=Program)
 def program() -> None:
-    """Stands for fhash."""
+    """A stand-in for fhash."""
 
 
 @click.command("render")
@@ -38,7 +37,7 @@ def program() -> None:
 @click.option("--force", is_flag=True)
 @add_animation_options
 def render(run: str, output: str, force: bool, several: AnimationOptions) -> None:
-    """Stands for `fhash render`."""
+    """A stand-in for `fhash render`."""
     with fhash_codec.open(run) as volume, Progress(quiet=True) as progress:
         scene = several.over(SMALL, volume)
         if several.several(scene):

@@ -1,4 +1,4 @@
-"""How values are written on the command line, and that every setting of an encoding can be written there."""
+"""Values on the command line: their forms, and an option for every setting of an encoding."""
 
 from __future__ import annotations
 

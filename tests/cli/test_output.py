@@ -1,4 +1,4 @@
-"""Tables, numbers for people, and progress that keeps quiet when there is nothing to say."""
+"""Tables, numbers for people, and progress, which is quiet when there is nothing to say."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Terminal:
 def reports(
     monkeypatch: pytest.MonkeyPatch, *, seconds: float, terminal: bool = False, quiet: bool = False
 ) -> str:
-    """What is printed of a stage of 40 parts of `seconds` each, after one that took no time."""
+    """The text printed for a stage of 40 parts of `seconds` each, after one that took no time."""
     screen, now = Terminal(terminal), [0.0]
     monkeypatch.setattr("sys.stderr", screen)
     monkeypatch.setattr(output.time, "monotonic", lambda: now[0])
@@ -150,7 +150,8 @@ class OutOfMemoryError(RuntimeError):
         (OutOfMemoryError("CUDA"), "out of memory; take fewer", 1),
         (
             RuntimeError(
-                "[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: 8 bytes"
+                "[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator:"
+                " can't allocate memory: 8 bytes"
             ),
             "out of memory; take",
             1,

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from fhash_codec.config import EncodeConfig
@@ -19,17 +20,17 @@ from fhash_formats.errors import InputError
     ],
     ids=["default", "changed", "paper"],
 )
-def test_from_dict_of_to_dict_is_the_same_even_through_json(config):
+def test_from_dict_of_to_dict_is_the_same_even_through_json(config) -> None:
     assert EncodeConfig.from_dict(config.to_dict()) == config
     assert EncodeConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
-def test_every_field_has_help():
+def test_every_field_has_help() -> None:
     for name, field in EncodeConfig.__dataclass_fields__.items():
         assert field.metadata["help"], name
 
 
-def test_an_unknown_name_is_refused_and_the_nearest_is_offered():
+def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
     with pytest.raises(InputError, match=r"'learning_rat'.*'learning_rate'"):
         EncodeConfig.from_dict({"learning_rat": 0.1})
 
@@ -77,7 +78,14 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered():
         ({"dilation": -1}, "dilation is -1"),
     ],
 )
-def test_a_value_that_is_not_allowed_is_named_with_what_is(values, message):
+def test_a_value_that_is_not_allowed_is_named_with_what_is(values, message) -> None:
     with pytest.raises(InputError, match=message) as caught:
         EncodeConfig.from_dict(values)
     assert "\n" not in str(caught.value)
+
+
+def test_settings_may_be_given_as_python_values() -> None:
+    assert EncodeConfig(features="all").features == ("all",)
+    assert EncodeConfig(profile="paper", key_frames=[0, 3]).key_frames == "0,3"
+    with pytest.raises(InputError, match="mask="):
+        EncodeConfig(features=(np.ones(3, bool),))

@@ -30,7 +30,7 @@ def distance(axes: dict[str, Coordinate]) -> np.ndarray:
 
 
 def outwards(mesh: Mesh) -> np.ndarray:
-    """For each triangle, whether its vertices run counterclockwise seen from outside a ball about the origin."""
+    """Whether the corners of each triangle run counterclockwise as seen from outside the ball."""
     a, b, c = (mesh.vertices[mesh.triangles[:, corner]] for corner in range(3))
     return (np.cross(b - a, c - a) * (a + b + c)).sum(axis=1) > 0
 

@@ -21,7 +21,7 @@ def volume(encoded):
         yield volume
 
 
-def test_it_looks_like_an_array(encoded, volume):
+def test_it_looks_like_an_array(encoded, volume) -> None:
     field, path = encoded
     assert (volume.shape, volume.dtype, volume.ndim, volume.size, len(volume)) == (
         field.shape,
@@ -56,10 +56,10 @@ INDICES = [
 
 
 @pytest.mark.parametrize("index", INDICES, ids=str)
-def test_any_part_holds_the_same_bits_as_that_slice_of_the_whole(volume, index):
-    part, whole = volume[index], volume[...]
-    np.testing.assert_array_equal(part, whole[index])
-    assert part.dtype == whole.dtype
+def test_any_part_holds_the_same_bits_as_that_slice_of_the_whole(volume, index) -> None:
+    part, values = volume[index], volume[...]
+    np.testing.assert_array_equal(part, values[index])
+    assert part.dtype == values.dtype
 
 
 @pytest.mark.parametrize(
@@ -75,12 +75,12 @@ def test_any_part_holds_the_same_bits_as_that_slice_of_the_whole(volume, index):
         (1.5, "not by float"),
     ],
 )
-def test_other_indices_are_refused(volume, index, message):
+def test_other_indices_are_refused(volume, index, message) -> None:
     with pytest.raises(IndexError, match=message):
         volume[index]
 
 
-def test_outside_the_coreset_stands_nan_or_the_background(encoded, volume):
+def test_outside_the_coreset_stands_nan_or_the_background(encoded, volume) -> None:
     field, _ = encoded
     for step in range(5):
         occupied = volume.occupancy(step)
@@ -95,7 +95,9 @@ def test_outside_the_coreset_stands_nan_or_the_background(encoded, volume):
         volume.read(0, outside="zero")
 
 
-def test_occupancy_is_the_dilated_feature_and_between_key_frames_that_of_either(encoded, volume):
+def test_occupancy_is_the_dilated_feature_and_between_key_frames_that_of_either(
+    encoded, volume
+) -> None:
     field, _ = encoded
     for step in (0, 2, 4):
         feature = (field[step] >= 0.5) & (field[step] <= 2)
@@ -107,7 +109,7 @@ def test_occupancy_is_the_dilated_feature_and_between_key_frames_that_of_either(
 
 @pytest.mark.parametrize("profile", ["paper", "compact"])
 @pytest.mark.parametrize("t", [0, 2.5, 4])
-def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t):
+def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t) -> None:
     field = np.arange(5 * 6 * 7 * 8, dtype=np.float32).reshape(5, 6, 7, 8) % 317
     field[2, 3:, 4] = np.nan
     short = {"epochs": 1, "width": 4} if profile == "paper" else {"effort": 1, "tile": "2x3x4x5"}
@@ -117,8 +119,8 @@ def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t):
         EncodeConfig(profile=profile, features=("interval:100:150",), dilation=0, **short),
     )
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
-        whole = volume.occupancy(t)
-        assert 0 < whole.mean() < 0.5
+        occupied = volume.occupancy(t)
+        assert 0 < occupied.mean() < 0.5
         for region in (
             ((0, 6), (0, 7), (0, 8)),
             ((2, 5), (1, 6), (3, 4)),
@@ -126,7 +128,7 @@ def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t):
             ((0, 1), (0, 1), (0, 1)),
         ):
             np.testing.assert_array_equal(
-                volume.occupancy(t, region), whole[tuple(slice(*part) for part in region)]
+                volume.occupancy(t, region), occupied[tuple(slice(*part) for part in region)]
             )
         with pytest.raises(RegionError, match="axis x"):
             volume.occupancy(t, ((0, 6), (0, 7), (0, 9)))
@@ -142,29 +144,29 @@ def test_occupancy_of_a_region_is_that_part_of_the_whole(tmp_path, profile, t):
         (0, ((0, 1), (3, 3), (0, 1)), "region 3:3 of axis y is empty"),
     ],
 )
-def test_regions_outside_are_refused(volume, t, region, message):
+def test_regions_outside_are_refused(volume, t, region, message) -> None:
     with pytest.raises(RegionError, match=message):
         volume.read(t, region)
 
 
-def test_sampling_at_vertices_gives_the_decoded_values(volume):
+def test_sampling_at_vertices_gives_the_decoded_values(volume) -> None:
     z, y, x = np.meshgrid(range(9), range(12), range(20), indexing="ij")
     for t in (0, 1, 3.25, 4):
         np.testing.assert_allclose(volume.sample(t=t, z=z, y=y, x=x), volume.read(t), atol=1e-6)
 
 
-def test_sampling_between_vertices_needs_its_whole_cell(volume):
+def test_sampling_between_vertices_needs_its_whole_cell(volume) -> None:
     occupied = volume.occupancy(2)
     z, y, x = (p + 0.5 for p in np.meshgrid(range(8), range(11), range(19), indexing="ij"))
     cell = np.lib.stride_tricks.sliding_window_view(occupied, (2, 2, 2)).all(axis=(3, 4, 5))
     np.testing.assert_array_equal(np.isfinite(volume.sample(t=2, z=z, y=y, x=x)), cell)
     # On a face only the face's own vertices count.
     face = occupied[:, :-1, :-1] & occupied[:, 1:, :-1] & occupied[:, :-1, 1:] & occupied[:, 1:, 1:]
-    found = volume.sample(t=2, z=np.arange(9)[:, None, None], y=y[:1], x=x[:1])
-    np.testing.assert_array_equal(np.isfinite(found), face)
+    values = volume.sample(t=2, z=np.arange(9)[:, None, None], y=y[:1], x=x[:1])
+    np.testing.assert_array_equal(np.isfinite(values), face)
 
 
-def test_sampling_outside_the_domain_is_nan_and_broadcasts(volume):
+def test_sampling_outside_the_domain_is_nan_and_broadcasts(volume) -> None:
     values = volume.sample(t=0, z=[[-0.1], [8.1]], y=5, x=np.arange(3))
     assert values.shape == (2, 3)
     assert np.isnan(values).all()
@@ -175,7 +177,7 @@ def test_sampling_outside_the_domain_is_nan_and_broadcasts(volume):
             volume.sample(z=0, y=0, x=0, **both)
 
 
-def test_gradients_are_per_vertex_and_per_step(volume):
+def test_gradients_are_per_vertex_and_per_step(volume) -> None:
     random = np.random.default_rng(0)
     t, z, y, x = (random.random(400) * (n - 1) for n in volume.shape)
     values, gradient = volume.sample(t=t, z=z, y=y, x=x, gradient=True)
@@ -198,7 +200,7 @@ def test_gradients_are_per_vertex_and_per_step(volume):
 
 
 @pytest.mark.parametrize("times", [[2.0, 3.0, 4.0, 30.0, 31.0], [31.0, 30.0, 4.0, 3.0, 2.0]])
-def test_physical_times_may_be_uneven_and_descend(tmp_path, times):
+def test_physical_times_may_be_uneven_and_descend(tmp_path, times) -> None:
     field = np.linspace(0, 1, 5, dtype=np.float32)[:, None, None, None] * np.ones(
         (5, 2, 3, 4), np.float32
     )
@@ -215,7 +217,7 @@ def test_physical_times_may_be_uneven_and_descend(tmp_path, times):
             volume.step_of_time(31.5)
 
 
-def test_times_that_do_not_ascend_are_warned_of_and_steps_stand_for_them(tmp_path):
+def test_times_that_do_not_ascend_are_warned_of_and_steps_stand_for_them(tmp_path) -> None:
     series = ArraySeries(
         np.random.default_rng(0).random((3, 2, 3, 4)),
         coords={"t": Coordinate(name="time", values=np.array([0.0, 0.0, 1.0]))},
@@ -228,13 +230,13 @@ def test_times_that_do_not_ascend_are_warned_of_and_steps_stand_for_them(tmp_pat
             volume.step_of_time(0.5)
 
 
-def test_it_pickles_by_path(encoded, volume):
+def test_it_pickles_by_path(encoded, volume) -> None:
     copy = pickle.loads(pickle.dumps(volume))
     np.testing.assert_array_equal(copy[3], volume[3])
     copy.close()
 
 
-def test_decoding_a_frame_reads_only_its_time_nodes(encoded, monkeypatch):
+def test_decoding_a_frame_reads_only_its_time_nodes(encoded, monkeypatch) -> None:
     with fhash_codec.open(encoded[1]) as volume:
         read = []
         array_type = type(volume.container.arrays["tables/level_1"])
@@ -249,7 +251,7 @@ def test_decoding_a_frame_reads_only_its_time_nodes(encoded, monkeypatch):
         assert {node for name, node in read if name == "occupancy/bits"} == {1}
 
 
-def test_info_is_json_and_says_what_is_in_the_file(encoded, volume):
+def test_info_is_json_and_says_what_is_in_the_file(encoded, volume) -> None:
     import json
 
     info = json.loads(json.dumps(volume.info, allow_nan=False))
@@ -260,7 +262,7 @@ def test_info_is_json_and_says_what_is_in_the_file(encoded, volume):
     assert volume.verify() == len(info["arrays"])
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path) -> None:
     with pytest.raises(MissingInputError, match=r"none\.fhz"):
         fhash_codec.open(tmp_path / "none.fhz")
 
@@ -276,11 +278,11 @@ def test_a_missing_file_is_named(tmp_path):
         ("float64", "float64"),
     ],
 )
-def test_decoded_values_are_floats_as_wide_as_the_source_needs(source, decoded):
+def test_decoded_values_are_floats_as_wide_as_the_source_needs(source, decoded) -> None:
     assert decoded_type(np.dtype(source)) == np.dtype(decoded)
 
 
-def test_decoding_a_frame_takes_no_more_memory_for_more_frames(tmp_path):
+def test_decoding_a_frame_takes_no_more_memory_for_more_frames(tmp_path) -> None:
     import tracemalloc
 
     peaks = []
@@ -300,8 +302,11 @@ def test_decoding_a_frame_takes_no_more_memory_for_more_frames(tmp_path):
 
 
 @pytest.mark.parametrize("stored", [None, "mask", "bits"])
-def test_what_a_compact_file_leaves_out(tmp_path, stored):
-    """Coordinates are in the header, every step is a key frame, and without occupancy the whole box is inside."""
+def test_what_a_compact_file_leaves_out(tmp_path, stored) -> None:
+    """Coordinates are in the header, and every step is a key frame.
+
+    Without occupancy the whole box is in the coreset.
+    """
     shape, box = (2, 3, 4, 5), (2, 4, 3)
     inside = np.random.default_rng(0).random((2, *box)) < 0.5
     header = {
@@ -348,6 +353,6 @@ def test_what_a_compact_file_leaves_out(tmp_path, stored):
         assert volume.step_of_time(2) == 0.25
         # Between steps a value is no better than the two it lies between: both must be inside.
         for t, expected in ((0, inside[0]), (0.5, inside[0] & inside[1])):
-            whole = np.zeros(shape[1:], dtype=bool)
-            whole[1:3, 0:4, 2:5] = True if stored is None else expected
-            np.testing.assert_array_equal(volume.occupancy(t), whole)
+            occupied = np.zeros(shape[1:], dtype=bool)
+            occupied[1:3, 0:4, 2:5] = True if stored is None else expected
+            np.testing.assert_array_equal(volume.occupancy(t), occupied)

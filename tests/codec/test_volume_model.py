@@ -10,11 +10,16 @@ import pytest
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError
 from fhash_codec.compact.model import CompactModel
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.paper.model import PaperModel
 from fhash_codec.volume_model import VolumeModel, open_model
 from fhash_formats.container import Container
 
-REGIONS = [((0, 5), (0, 6), (0, 7)), ((1, 4), (2, 3), (0, 7)), ((4, 5), (5, 6), (6, 7))]
+REGIONS = [
+    Box.of_shape((5, 6, 7)),
+    Box((1, 4), (2, 3), (0, 7)),
+    Box((4, 5), (5, 6), (6, 7)),
+]
 SETTINGS = {
     "compact": {"effort": 1, "tile": "2x3x4x4"},
     "paper": {"profile": "paper", "epochs": 2, "width": 8, "key_frames": "0,1,3"},
@@ -23,7 +28,7 @@ SETTINGS = {
 
 
 @pytest.fixture(scope="module", params=SETTINGS)
-def model(request, tmp_path_factory):
+def named_model(request, tmp_path_factory):
     """A model whose box is 5 x 6 x 7, with vertices outside the coreset."""
     field = np.random.default_rng(0).random((4, 7, 8, 9))
     field[:, [0, -1]], field[:, :, [0, -1]], field[..., [0, -1]] = -1, -1, -1
@@ -37,52 +42,52 @@ def model(request, tmp_path_factory):
         yield request.param, open_model(container)
 
 
-def test_each_profile_has_its_model(model):
-    name, found = model
-    assert isinstance(found, CompactModel if name == "compact" else PaperModel)
-    assert tuple(found.chunks) == ((2, 3, 4, 4) if name == "compact" else (1, 7, 8, 9))
-    for method, wanted in inspect.getmembers(VolumeModel, inspect.isfunction):
+def test_each_profile_has_its_model(named_model) -> None:
+    name, model = named_model
+    assert isinstance(model, CompactModel if name == "compact" else PaperModel)
+    assert tuple(model.chunks) == ((2, 3, 4, 4) if name == "compact" else (1, 7, 8, 9))
+    for method, declared in inspect.getmembers(VolumeModel, inspect.isfunction):
         if not method.startswith("_"):
-            assert len(inspect.signature(getattr(type(found), method)).parameters) == len(
-                inspect.signature(wanted).parameters
+            assert len(inspect.signature(getattr(type(model), method)).parameters) == len(
+                inspect.signature(declared).parameters
             )
 
 
 @pytest.mark.parametrize("region", REGIONS, ids=str)
-def test_regions_are_parts_of_the_whole(model, region):
-    _, found = model
-    inner = tuple(slice(*span) for span in region)
+def test_regions_are_parts_of_the_whole(named_model, region) -> None:
+    _, model = named_model
+    inner = region.slices()
     for first, last in ((0, 0), (1, 2)):
-        occupied = found.occupied(first, last, REGIONS[0])
+        occupied = model.occupied(first, last, REGIONS[0])
         assert 0 < occupied.mean() < 1
-        np.testing.assert_array_equal(found.occupied(first, last, region), occupied[inner])
+        np.testing.assert_array_equal(model.occupied(first, last, region), occupied[inner])
         key = (first + last) / 2
-        whole = found.region(key, REGIONS[0], occupied)
-        assert whole.dtype == np.float64
-        part = found.region(key, region, occupied[inner])
-        np.testing.assert_array_equal(part[occupied[inner]], whole[inner][occupied[inner]])
+        values = model.read(key, REGIONS[0], occupied)
+        assert values.dtype == np.float64
+        part = model.read(key, region, occupied[inner])
+        np.testing.assert_array_equal(part[occupied[inner]], values[inner][occupied[inner]])
 
 
-def test_points_at_vertices_are_the_region_and_slopes_have_the_same_values(model):
-    _, found = model
-    occupied = found.occupied(1, 1, REGIONS[0])
+def test_points_at_vertices_are_the_region_and_slopes_have_the_same_values(named_model) -> None:
+    _, model = named_model
+    occupied = model.occupied(1, 1, REGIONS[0])
     places = np.argwhere(occupied).T.astype(np.float64)
     keys = np.ones(places.shape[1])
-    values = found.points(keys, list(places))
-    np.testing.assert_allclose(values, found.region(1, REGIONS[0], occupied)[occupied], atol=1e-5)
-    again, slopes = found.slopes(keys, list(places))
+    values = model.sample(keys, list(places))
+    np.testing.assert_allclose(values, model.read(1, REGIONS[0], occupied)[occupied], atol=1e-5)
+    again, slopes = model.sample_with_gradient(keys, list(places))
     np.testing.assert_allclose(again, values, atol=1e-6)
     assert slopes.shape == (len(values), 4)
     assert slopes.dtype == np.float64
 
 
-def test_levels_of_detail_are_given_or_refused(model):
-    name, found = model
+def test_levels_of_detail_are_given_or_refused(named_model) -> None:
+    name, model = named_model
     if name == "compact":
-        whole = found.coarse(1, 1, ((0, 3), (0, 3), (0, 4)))
+        values = model.read_lod(1, 1, Box.of_shape((3, 3, 4)))
         np.testing.assert_array_equal(
-            found.coarse(1, 1, ((1, 3), (2, 3), (0, 2))), whole[1:3, 2:3, 0:2]
+            model.read_lod(1, 1, Box((1, 3), (2, 3), (0, 2))), values[1:3, 2:3, 0:2]
         )
     else:
         with pytest.raises(InputError, match="no levels of detail"):
-            found.coarse(1, 1, ((0, 3), (0, 3), (0, 4)))
+            model.read_lod(1, 1, Box.of_shape((3, 3, 4)))

@@ -1,4 +1,4 @@
-"""Series in memory and selections of steps: the contract that every reader keeps too."""
+"""Series in memory and selections of steps: the contract that every reader keeps, too."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ VALUES = np.random.default_rng(0).normal(size=(4, 2, 3, 5)).astype(np.float32)
 
 @pytest.mark.parametrize("step", [-1, 4])
 def test_no_step_counts_from_the_end(step: int) -> None:
-    whole = ArraySeries(VALUES)
-    for series in (whole, StepsSeries(whole, [3, 2, 1, 0])):
+    all_steps = ArraySeries(VALUES)
+    for series in (all_steps, StepsSeries(all_steps, [3, 2, 1, 0])):
         with pytest.raises(RegionError, match=rf"array: step {step} is outside 0\.\.3"):
             series.read(step)
     with pytest.raises(RegionError, match=rf"step {step} is outside"):
-        StepsSeries(whole, [0, step])
+        StepsSeries(all_steps, [0, step])
 
 
 def test_some_steps() -> None:
@@ -46,10 +46,10 @@ def test_masked_values_are_nan_and_never_what_is_under_the_mask() -> None:
     np.testing.assert_array_equal(
         np.stack(list(ArraySeries(masked).frames())), np.where(VALUES > 0, np.nan, VALUES)
     )
-    whole = (VALUES * 9).astype(np.int16)
-    np.testing.assert_array_equal(ArraySeries(np.ma.asarray(whole)).read(1), whole[1])
+    integers = (VALUES * 9).astype(np.int16)
+    np.testing.assert_array_equal(ArraySeries(np.ma.asarray(integers)).read(1), integers[1])
     with pytest.raises(InputError, match="masked values of type int16, which has no NaN"):
-        ArraySeries(np.ma.masked_greater(whole, 0))
+        ArraySeries(np.ma.masked_greater(integers, 0))
 
 
 @pytest.mark.parametrize(
@@ -98,10 +98,10 @@ def test_a_series_knows_its_files(tmp_path: Path) -> None:
         "linked.h5": ["linked.h5", "a.h5"],
         "a.zarr": ["a.zarr"],
     }
-    for name, files in names.items():
+    for opened, files in names.items():
         for steps in (None, slice(0, 1)):
-            with open_series(tmp_path / name, steps=steps) as series:
-                assert series.files == tuple(tmp_path / each for each in files)
+            with open_series(tmp_path / opened, steps=steps) as series:
+                assert series.files == tuple(tmp_path / name for name in files)
     mask = open_mask(tmp_path / "f0.npy", VALUES.shape)
     mask.close()
     assert mask.files == (tmp_path / "f0.npy",)

@@ -1,6 +1,7 @@
-"""Writes the golden containers of the present format version: `python tests/golden/make.py`. Tests only ever read them.
+"""Writes the golden containers of the present format version: `python tests/golden/make.py`.
 
-A golden is made once, when its format version is new, and kept for ever: whatever comes later must decode it to the values beside it.
+A golden is made once, when its format version is new, and kept for ever: every later version must
+decode it to the values beside it. Tests only read goldens.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from fhash_codec import EncodeConfig
 from fhash_formats.series import ArraySeries, Coordinate
 
 HERE = Path(__file__).parent
-TOLERANCE = 1e-5  # of the range: float32 arithmetic in another order
+TOLERANCE = 1e-5
+"""Tolerance of decoded values, as a fraction of the range: float32 sums in another order."""
 
 GOLDENS = {
     "paper-1.0-plain": EncodeConfig(profile="paper", width=8, timings=False, tables="float32"),
@@ -61,7 +63,7 @@ TIME = Coordinate(
 
 
 def series() -> ArraySeries:
-    """A small moving field with a hole that wanders, and uneven times."""
+    """A small moving field with a moving hole, and uneven times."""
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (5, 6, 7, 9)), indexing="ij")
     values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
     for step in range(5):
@@ -70,7 +72,7 @@ def series() -> ArraySeries:
 
 
 def fronts() -> ArraySeries:
-    """Noise beside a flat part, with a sharp edge that moves, and a hole: what is coded by prediction."""
+    """Noise beside a flat region, with a sharp moving edge and a hole; prediction codes it best."""
     t, z, y, x = np.meshgrid(
         np.arange(6), np.arange(16), np.arange(24), np.arange(24), indexing="ij"
     )
@@ -83,14 +85,13 @@ def fronts() -> ArraySeries:
 
 
 SERIES = {"compact-1.1-predictor": fronts}
-"""Of the goldens that are not made from `series`."""
+"""Sources of the goldens that are not made from `series`."""
 
 
 def main() -> None:
     for name, config in GOLDENS.items():
         path = HERE / f"{name}.fhz"
-        if path.exists():
-            # Goldens are never replaced.
+        if path.exists():  # goldens are never replaced
             continue
         fhash_codec.encode(SERIES.get(name, series)(), path, config)
         with fhash_codec.open(path) as volume:

@@ -1,4 +1,4 @@
-"""Containers of every format version, kept for ever, decode to the values beside them."""
+"""Golden containers of every format version decode to the values beside them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAMES = [
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_golden_containers_decode_to_their_values(name):
+def test_golden_containers_decode_to_their_values(name: str) -> None:
     with (
         np.load(HERE / f"{name}.npz") as expected,
         fhash_codec.open(HERE / f"{name}.fhz") as volume,
@@ -40,7 +40,9 @@ def test_golden_containers_decode_to_their_values(name):
 
 @pytest.mark.parametrize("native", ["0", "1"])
 @pytest.mark.parametrize("name", COMPACT)
-def test_compact_goldens_decode_to_the_same_bits_on_every_engine(name, native, monkeypatch):
+def test_compact_goldens_decode_to_the_same_bits_on_every_engine(
+    name: str, native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("FHASH_NATIVE", native)
     with (
         np.load(HERE / f"{name}.npz") as expected,
@@ -49,12 +51,12 @@ def test_compact_goldens_decode_to_the_same_bits_on_every_engine(name, native, m
         np.testing.assert_array_equal(volume[...], expected["whole"])
 
 
-def test_no_golden_is_left_untested():
+def test_no_golden_is_left_untested() -> None:
     assert sorted(path.stem for path in HERE.glob("*.fhz")) == sorted(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_any_zarr_reader_opens_them(name):
+def test_any_zarr_reader_opens_them(name: str) -> None:
     with fhash_codec.open(HERE / f"{name}.fhz") as volume:
         group = zarr.open_group(ZipStore(HERE / f"{name}.fhz", mode="r"), mode="r", zarr_format=3)
         assert group.attrs["fhash"]["format"] == "fhash"

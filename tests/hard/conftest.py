@@ -1,4 +1,7 @@
-"""Lets the tests of this folder import the modules beside them: pytest's importlib mode puts no folder of tests on the path."""
+"""Fixtures of the hard tests, which import modules beside them.
+
+pytest's importlib mode puts no folder of tests on the path, so this file does.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from forks import Server, build_faults
 
 @pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """Runs command lines in forks of a process that has imported everything."""
+    """A process that has imported everything and runs command lines in forks of itself."""
     folder = tmp_path_factory.mktemp("logs")
     server = Server(folder, build_faults(folder))
     yield server
@@ -32,6 +35,7 @@ def _bench(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Bench:
 
 @pytest.fixture
 def bench(_bench: Bench) -> Bench:
-    """Commands whose operations on files can be counted and made to fail, and an empty folder for their outputs."""
+    """Commands whose file operations can be counted and made to fail, and an empty folder for
+    outputs."""
     _bench.empty()
     return _bench

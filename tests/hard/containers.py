@@ -1,4 +1,4 @@
-"""Members of a container to files and back, without any of the checks that a writer makes."""
+"""Containers as lists of members and back, without the checks of a writer."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from fhash_formats.container.layout import END, Member, comment, ending, local_h
 from fhash_formats.container.zip_checked import read_member, read_members
 
 Parts = list[tuple[str, bytes]]
-"""Name and full data of each member, in the order of the file."""
+"""Name and inflated data of each member, in the order of the file."""
 
 
 class BytesSource:
-    """A file in memory."""
+    """A file in memory, as a source of a reader."""
 
     def __init__(self, data: bytes) -> None:
         self.data, self.size = data, len(data)
 
     def read(self, offset: int, size: int) -> bytes:
-        """A part of it."""
+        """Return `size` bytes from `offset` on."""
         return self.data[offset : offset + size]
 
     def close(self) -> None:
-        """Nothing to be done."""
+        """Do nothing: there is no file to close."""
 
 
 def unpack(data: bytes) -> Parts:
-    """The members of a sound container, documents inflated."""
+    """Return the members of a sound container, with documents inflated."""
     source = BytesSource(data)
     return [
         (name, bytes(read_member(source, member))) for name, member in read_members(source).items()
@@ -36,12 +36,15 @@ def unpack(data: bytes) -> Parts:
 
 
 def pack(parts: Iterable[tuple[str, bytes]]) -> bytes:
-    """A file of any members, with sound checksums."""
+    """Return a file of any members, with correct checksums."""
     return pack_members([(name, data, None, zlib.crc32(data)) for name, data in parts])
 
 
 def pack_members(given: Iterable[tuple[str, bytes, int | None, int]]) -> bytes:
-    """The same of (name, data as they lie in the file, declared full size of deflated ones, declared CRC-32)."""
+    """Return a file of members as they are given.
+
+    A member is (name, data as stored, declared full size if deflated, declared CRC-32).
+    """
     members, chunks, position = [], [], 0
     for name, data, full_size, crc in given:
         member = Member(name=name, offset=position, size=len(data), crc=crc, full_size=full_size)
@@ -52,16 +55,16 @@ def pack_members(given: Iterable[tuple[str, bytes, int | None, int]]) -> bytes:
 
 
 def directory_of(data: bytes) -> int:
-    """Where the directory of a sound file begins."""
+    """Return the offset of the directory of a sound file."""
     return int(END.unpack_from(data, len(data) - len(comment(b"")) - END.size)[6])
 
 
 def resealed(data: bytes, start: int) -> bytes:
-    """The file with the digest of its directory, which begins at `start`, made right."""
+    """Return the file with a correct digest of its directory, which begins at `start`."""
     directory = data[start : -len(comment(b""))]
     return data[:start] + directory + comment(directory)
 
 
 def with_crc(data: bytes) -> bytes:
-    """Data of a chunk with their CRC-32C."""
+    """Return the data of a chunk with their CRC-32C."""
     return data + crc32c(data).to_bytes(4, "little")

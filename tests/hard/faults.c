@@ -1,8 +1,10 @@
-/* Preloaded into a process: counts its operations on files below a folder, and at the n-th makes the disk full or kills the process.
+/* Preloaded into a process: counts its operations on files below a folder. At the n-th operation it
+   makes the disk full or sends a signal to the process.
 
-   fhash_faults(folder, n, code): code > 0 is the errno with which the n-th operation and every later one that takes space fails,
-   code < 0 the signal that the process sends itself before the n-th operation; n = 0 only counts. fhash_fault_count() is the number
-   of operations so far. Reading, closing and deleting are no operations: they need no space. */
+   fhash_faults(folder, n, code): code > 0 is the errno with which the n-th operation and all later
+   ones that take space fail; code < 0 is minus the signal that the process sends itself before the
+   n-th operation; n = 0 only counts. fhash_fault_count() is the number of operations so far.
+   Reading and closing are no operations, since they need no space. */
 
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -45,7 +47,7 @@ static int below_fd(int fd) {
     return below(path);
 }
 
-/* 1 where the operation must fail. */
+/* Counts an operation and sends the signal, if any; returns 1 if the operation must fail. */
 static int fault(int ours) {
     if (!ours) return 0;
     long now = __atomic_add_fetch(&count, 1, __ATOMIC_SEQ_CST);
@@ -60,19 +62,29 @@ static int fault(int ours) {
 
 #define REAL(name) ((__typeof__(&name))dlsym(RTLD_NEXT, #name))
 
-ssize_t write(int fd, const void *data, size_t size) { return fault(below_fd(fd)) ? -1 : REAL(write)(fd, data, size); }
-ssize_t writev(int fd, const struct iovec *parts, int n) { return fault(below_fd(fd)) ? -1 : REAL(writev)(fd, parts, n); }
-ssize_t pwrite(int fd, const void *data, size_t size, off_t to) { return fault(below_fd(fd)) ? -1 : REAL(pwrite)(fd, data, size, to); }
+ssize_t write(int fd, const void *data, size_t size) {
+    return fault(below_fd(fd)) ? -1 : REAL(write)(fd, data, size);
+}
+ssize_t writev(int fd, const struct iovec *parts, int n) {
+    return fault(below_fd(fd)) ? -1 : REAL(writev)(fd, parts, n);
+}
+ssize_t pwrite(int fd, const void *data, size_t size, off_t to) {
+    return fault(below_fd(fd)) ? -1 : REAL(pwrite)(fd, data, size, to);
+}
 ssize_t pwrite64(int fd, const void *data, size_t size, off64_t to) {
     return fault(below_fd(fd)) ? -1 : REAL(pwrite64)(fd, data, size, to);
 }
 int ftruncate(int fd, off_t size) { return fault(below_fd(fd)) ? -1 : REAL(ftruncate)(fd, size); }
-int ftruncate64(int fd, off64_t size) { return fault(below_fd(fd)) ? -1 : REAL(ftruncate64)(fd, size); }
+int ftruncate64(int fd, off64_t size) {
+    return fault(below_fd(fd)) ? -1 : REAL(ftruncate64)(fd, size);
+}
 int fsync(int fd) { return fault(below_fd(fd)) ? -1 : REAL(fsync)(fd); }
 int link(const char *from, const char *to) { return fault(below(to)) ? -1 : REAL(link)(from, to); }
-int mkdir(const char *path, mode_t mode) { return fault(below(path)) ? -1 : REAL(mkdir)(path, mode); }
+int mkdir(const char *path, mode_t mode) {
+    return fault(below(path)) ? -1 : REAL(mkdir)(path, mode);
+}
 
-/* A rename takes no space: it is a moment to be killed at, and fails on no full disk. */
+/* A rename takes no space, so it does not fail on a full disk. It is a moment for a signal. */
 int rename(const char *from, const char *to) {
     if (code < 0 || !at) fault(below(to));
     return REAL(rename)(from, to);
@@ -90,7 +102,7 @@ int rename(const char *from, const char *to) {
 OPENING(open)
 OPENING(open64)
 
-/* The beginnings of deletions are moments to be killed at as well. */
+/* A deletion takes no space either, and is a moment for a signal, too. */
 int unlink(const char *path) {
     if (code < 0 || !at) fault(below(path));
     return REAL(unlink)(path);

@@ -1,4 +1,4 @@
-"""What the tests of faults share: a small series, the commands that they disturb, and what must stay."""
+"""A small series, the commands that the tests of faults disturb, and what these must leave."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ SHAPE = (4, 9, 10, 12)
 
 
 def values(seed: int = 0) -> np.ndarray:
-    """A moving blob with noise, (t, z, y, x) float32."""
+    """Return a moving blob with noise, float32 (t, z, y, x)."""
     t, z, y, x = np.meshgrid(*map(np.arange, SHAPE), indexing="ij", sparse=True)
     blob = 1 + 9 * np.exp(-((z - 4) ** 2 + (y - 5) ** 2 + (x - 3 - 2 * t) ** 2) / 6)
     return (blob + 0.01 * np.random.default_rng(seed).standard_normal(SHAPE)).astype(np.float32)
 
 
 def listing(folder: Path) -> Listing:
-    """Everything below a folder with its bytes (None for a folder)."""
+    """Return everything below a folder by path, with its bytes; None for a folder."""
     return {
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))
@@ -35,12 +35,18 @@ def listing(folder: Path) -> Listing:
 
 
 def moments(count: int, most: int = 6) -> list[int]:
-    """Which of `count` operations to disturb: all of them in the long set, else some from the first to the last."""
+    """Return which of `count` operations to disturb.
+
+    All of them in the long set, else at most `most`, evenly spread from the first to the last.
+    """
     return sorted({round(n) for n in np.linspace(1, count, count if LONG else min(count, most))})
 
 
 class Bench:
-    """A folder `out` to which commands write, with an older output of other data in it, and what they are made from beside it."""
+    """A folder `out` into which commands write, with an older output of other data in it.
+
+    The inputs of the commands, two series and their containers, lie beside it.
+    """
 
     def __init__(self, server: Server, folder: Path) -> None:
         self.server, self.folder, self.out = server, folder, folder / "out"
@@ -54,7 +60,7 @@ class Bench:
         self._known: dict[str, tuple[Listing, Listing, int]] = {}
 
     def words(self, name: str, number: int = 0) -> list[str]:
-        """The command line of COMMANDS[name]; number: 1 for that of the older output."""
+        """Return the command line of COMMANDS[name]; number 1 is that of the older output."""
         places = {
             "in": self._place("in", number),
             "run": self._place("run", number),
@@ -63,7 +69,7 @@ class Bench:
         return [word.format_map(places) for word in COMMANDS[name]]
 
     def run(self, name: str, *inject: Injection, force: bool = True) -> Ended:
-        """Run a command; without `force` it is one that replaces nothing."""
+        """Run a command; without `force`, one that replaces nothing."""
         return self.server.run(
             *(word for word in self.words(name) if force or word != "--force"), inject=inject
         )
@@ -73,7 +79,7 @@ class Bench:
         return self.server.start(*self.words(name, number), inject=inject)
 
     def old(self, name: str) -> Listing:
-        """Put the older output into the folder, and nothing else; what is then in it."""
+        """Put only the older output into the folder, and return what is then in it."""
         old = self._known_of(name)[0]
         self.empty()
         for place, data in old.items():
@@ -84,33 +90,34 @@ class Bench:
         return old
 
     def new(self, name: str) -> Listing:
-        """What is in the folder once the command is done."""
+        """Return what is in the folder after the undisturbed command."""
         return self._known_of(name)[1]
 
     def operations(self, name: str) -> int:
-        """How many operations on files in the folder the command makes while it replaces the older output."""
+        """Return the number of file operations in the folder while the command replaces the older
+        output."""
         return self._known_of(name)[2]
 
     def now(self) -> Listing:
-        """What is in the folder."""
+        """Return what is in the folder."""
         return listing(self.out)
 
     def empty(self) -> None:
-        """Leave nothing in the folder."""
+        """Empty the folder."""
         shutil.rmtree(self.out)
         self.out.mkdir()
 
     def _known_of(self, name: str) -> tuple[Listing, Listing, int]:
         if name not in self._known:
-            found = []
+            outputs = []
             self.empty()
             for number in (1, 0):
                 counted = self.folder / "operations"
                 self._succeed(self.words(name, number), ("at_operation", self.out, 0, 0, counted))
-                found.append(self.now())
-            assert found[0].keys() == found[1].keys()
-            assert found[0] != found[1]
-            self._known[name] = found[0], found[1], int(counted.read_text())
+                outputs.append(self.now())
+            assert outputs[0].keys() == outputs[1].keys()
+            assert outputs[0] != outputs[1]
+            self._known[name] = outputs[0], outputs[1], int(counted.read_text())
         return self._known[name]
 
     def _succeed(self, words: Sequence[object], *inject: Injection) -> None:
@@ -170,4 +177,4 @@ COMMANDS = {
         "-q",
     ),
 }
-"""Command lines by name; {in}, {run} and {out} stand for the series, a container and the folder of the outputs."""
+"""Command lines by name; {in} is the series, {run} a container and {out} the folder for outputs."""

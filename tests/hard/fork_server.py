@@ -1,7 +1,9 @@
-"""A process that imports fhash once and runs each command line in a fork of itself; started by `forks.Server`.
+"""A process that imports fhash once and runs each command line in a fork; started by
+`forks.Server`.
 
-It takes one JSON object per line. {"words": [...], "log": path, "inject": [[name, ...], ...]} starts a command line, and its process id is
-the answer; {"wait": pid} is answered by how that process ended: its exit code, or minus the number of the signal.
+It reads one JSON object per line. {"words": [...], "log": path, "inject": [[name, ...], ...]}
+starts a command line; the answer is its process id. {"wait": pid} waits for that process; the
+answer is its exit code, or minus the number of the signal that ended it.
 """
 
 from __future__ import annotations
@@ -20,33 +22,35 @@ import fhash_cli.commands.encode
 import fhash_cli.commands.render  # noqa: F401 - imported for the forks
 from fhash_cli.main import main
 
-MODULES = (
+OWN = (
     "fhash_codec",
     "fhash_codec.encoding",
     "fhash_codec.compact.tiles_to_promise",
     "fhash_codec.isosurface",
+    "fhash_codec.paper.engines.slab",
+    "fhash_codec.paper.training.checkpoint",
+    "fhash_codec.paper.training.train",
     "fhash_codec.rendering.renderer",
+    "fhash_formats.container",
 )
-OTHERS = (
+"""Modules of fhash that are imported before the first fork."""
+LIBRARIES = (
     "h5py",
     "zarr",
     "xarray",
     "h5netcdf",
     "PIL.PngImagePlugin",
     "PIL.GifImagePlugin",
-    "fhash_formats.container",
     "scipy.special",
 )
-TRAINING = (
-    "torch",
-    "fhash_codec.paper.engines.portable",
-    "fhash_codec.paper.training.checkpoint",
-    "fhash_codec.paper.training.train",
-)
+"""Libraries that are imported before the first fork, if they are installed."""
 
 
 def run(words: list[str], log: str, inject: list[list[Any]]) -> None:
-    """The child: the command line with its streams in a file, as the console script runs it; never returns."""
+    """Run a command line in the child as the console script does; never return.
+
+    Its streams go to the file `log`.
+    """
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
@@ -74,7 +78,9 @@ def serve() -> None:
     import importlib
     import importlib.util
 
-    for name in (*MODULES, *OTHERS, *TRAINING):
+    for name in OWN:
+        importlib.import_module(name)
+    for name in LIBRARIES:
         if importlib.util.find_spec(name) is not None:
             importlib.import_module(name)
     print("ready", flush=True)

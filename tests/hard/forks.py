@@ -1,4 +1,7 @@
-"""Command lines in processes of their own that start in milliseconds and can be killed: a process that imports once, and its forks."""
+"""Command lines in processes that start in milliseconds and can be killed.
+
+One process imports fhash once and runs each command line in a fork of itself.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ Injection = tuple[Any, ...]
 
 
 def build_faults(folder: Path) -> Path | None:
-    """The compiled `faults.c`, None where there is no compiler or no preloading."""
+    """Compile `faults.c` and return the library; None without a compiler or without preloading."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None or not sys.platform.startswith("linux"):
         return None
@@ -29,7 +32,7 @@ def build_faults(folder: Path) -> Path | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Ended:
-    """How a command line ended: exit code, or minus the signal; stdout and stderr together."""
+    """The end of a command line: exit code, or minus the signal; stdout and stderr together."""
 
     code: int
     output: str
@@ -43,7 +46,7 @@ class Ended:
 
 
 class Running:
-    """A command line on its way."""
+    """A command line that runs."""
 
     def __init__(self, server: Server, pid: int, log: Path) -> None:
         self.server, self.pid, self.log = server, pid, log
@@ -53,7 +56,7 @@ class Running:
         os.kill(self.pid, number)
 
     def wait(self) -> Ended:
-        """Until it ends."""
+        """Wait for its end."""
         code = self.server.ask({"wait": self.pid})
         # Killed before it had begun, it has none.
         return Ended(
@@ -62,7 +65,10 @@ class Running:
 
 
 class Server:
-    """The process that forks; a context manager. faults: the library of `build_faults`, preloaded."""
+    """The process that forks.
+
+    `faults` is the library of `build_faults`, which is preloaded.
+    """
 
     def __init__(self, folder: Path, faults: Path | None) -> None:
         self.folder, self.faults, self.count = folder, faults, 0
@@ -80,20 +86,24 @@ class Server:
         return self.process.stdout.readline().strip()
 
     def ask(self, request: dict[str, Any]) -> int:
-        """Send a request, and the number that is its answer."""
+        """Send a request and return the number that is the answer."""
         assert self.process.stdin is not None
         print(json.dumps(request), file=self.process.stdin, flush=True)
         return int(self._answer())
 
     def start(self, *words: object, inject: Sequence[Injection] = ()) -> Running:
-        """Start `fhash WORDS`; inject: functions of `injections` by name, each with its arguments."""
+        """Start `fhash WORDS`; `inject` lists functions of `injections` by name, with their
+        arguments."""
         self.count += 1
         log = self.folder / f"{self.count}.log"
         pid = self.ask(
             {
                 "words": [str(word) for word in words],
                 "log": str(log),
-                "inject": [[str(v) if isinstance(v, Path) else v for v in each] for each in inject],
+                "inject": [
+                    [str(v) if isinstance(v, Path) else v for v in injection]
+                    for injection in inject
+                ],
             }
         )
         return Running(self, pid, log)
@@ -103,7 +113,7 @@ class Server:
         return self.start(*words, inject=inject).wait()
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         assert self.process.stdin is not None
         self.process.stdin.close()
         self.process.wait()

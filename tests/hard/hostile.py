@@ -1,6 +1,6 @@
-"""Hostile files through the commands of `fhash`: a pool of worker processes (hostile_trial.py), and what came of all mutations.
+"""Hostile files through the commands of `fhash`, in a pool of worker processes (hostile_trial.py).
 
-Where a worker ends, or says nothing for long, the mutation that it was at counts as a crash, and another is started.
+If a worker ends or hangs, its mutation counts as a crash, and another worker is started.
 """
 
 from __future__ import annotations
@@ -23,12 +23,16 @@ from typing import Any
 import mutations
 
 HANG = 120.0
-"""Seconds until a worker that says nothing is ended."""
+"""Seconds without an answer after which a worker is ended."""
 
 
 @dataclass
 class Report:
-    """Counts of ends by command; what may not be; and the worst figures of all commands, each with the number of its mutation."""
+    """The results of all mutations.
+
+    Ends are counted by command and by kind. The worst figures are kept with the number of their
+    mutation.
+    """
 
     mutations: int = 0
     ends: dict[str, Counter[str]] = field(default_factory=dict)
@@ -38,7 +42,7 @@ class Report:
     worst_bytes: tuple[int, str] = (0, "")
 
     def add(self, answer: dict[str, Any]) -> None:
-        """Take in what a worker said of one mutation."""
+        """Add a worker's answer about one mutation."""
         self.mutations += 1
         name = f"{answer['number']} ({answer['kind']} of {answer['golden']})"
         for end in answer["ends"]:
@@ -52,7 +56,7 @@ class Report:
                 self.wrong.append(f"{name}, {end['command']}: {end['wrong']}")
 
     def figures(self) -> dict[str, Any]:
-        """JSON values."""
+        """Return JSON values."""
         return {
             "mutations": self.mutations,
             "wrong": len(self.wrong),
@@ -73,7 +77,7 @@ def trials(numbers: Iterable[int], processes: int, folder: Path) -> Report:
     report = Report()
     with ThreadPoolExecutor(processes) as pool:
         for answers in pool.map(
-            lambda at: list(_answers(waiting, folder / str(at))), range(processes)
+            lambda worker: list(_answers(waiting, folder / str(worker))), range(processes)
         ):
             for answer in answers:
                 report.add(answer)
@@ -86,7 +90,7 @@ def _answers(waiting: SimpleQueue[int], folder: Path) -> Iterator[dict[str, Any]
     while not waiting.empty():
         try:
             number = waiting.get_nowait()
-        except Empty:  # another worker took the last
+        except Empty:  # another worker took the last one
             break
         process = process or _started(folder)
         line = _asked(process, number)
@@ -94,7 +98,7 @@ def _answers(waiting: SimpleQueue[int], folder: Path) -> Iterator[dict[str, Any]
             yield json.loads(line)
             continue
         process.kill()
-        code = _left(process)
+        code = _ended(process)
         process = None
         how = (
             f"the process ended by {signal.Signals(-code).name}"
@@ -103,14 +107,14 @@ def _answers(waiting: SimpleQueue[int], folder: Path) -> Iterator[dict[str, Any]
         )
         yield _crashed(number, how)
     if process is not None:
-        _left(process)
+        _ended(process)
 
 
-def _left(process: subprocess.Popen[str]) -> int:
-    """Let a worker end; its exit code."""
+def _ended(process: subprocess.Popen[str]) -> int:
+    """Let a worker end and return its exit code."""
     assert process.stdin is not None
     assert process.stdout is not None
-    with contextlib.suppress(OSError):  # what could not be written to one that has crashed
+    with contextlib.suppress(OSError):  # text that a crashed worker did not read
         process.stdin.close()
     code = process.wait()
     process.stdout.close()
@@ -118,7 +122,8 @@ def _left(process: subprocess.Popen[str]) -> int:
 
 
 def _started(folder: Path) -> subprocess.Popen[str]:
-    # Where glibc has it, a heap that checks itself: what is written behind the end of an array ends the process when that is freed.
+    # A heap of glibc that checks itself: the process ends if it frees an array behind whose end
+    # something was written.
     checks = {"LD_PRELOAD": "libc_malloc_debug.so.0", "MALLOC_CHECK_": "3"}
     environment = {**os.environ, **checks, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(Path(__file__).with_name("hostile_trial.py")), str(folder)]
@@ -134,7 +139,7 @@ def _started(folder: Path) -> subprocess.Popen[str]:
 
 
 def _asked(process: subprocess.Popen[str], number: int) -> str:
-    """The worker's answer; nothing where it ended or hangs."""
+    """Return the worker's answer; empty if it ended or hangs."""
     assert process.stdin is not None
     assert process.stdout is not None
     try:

@@ -1,9 +1,9 @@
-"""One hostile file and the commands of `fhash` on it, in a process whose memory and time are bounded.
+"""One hostile file and the commands of `fhash` on it, in a process with bounded memory and time.
 
     python tests/hard/hostile_trial.py FOLDER
 
-reads numbers of mutations from stdin and answers each with one line of JSON; FOLDER is for its files. With --write NUMBER FILE.fhz it
-writes the file of a number.
+The script reads numbers of mutations from stdin and answers each with one line of JSON; its files
+lie in FOLDER. With --write NUMBER FILE.fhz it writes the file of a number.
 """
 
 from __future__ import annotations
@@ -34,11 +34,12 @@ from fhash_formats.container import Container
 from fhash_formats.errors import FhashError, FhashWarning
 
 MEMORY = 512 << 20
-"""Bytes beyond what the process has before: an allocation above that fails."""
+"""Bytes that the process may allocate beyond what it has before; larger allocations fail."""
 SECONDS = 10.0
-"""Of processor time for one command, on a machine that others use as well; on one of its own it takes less than 2."""
+"""Longest processor time of one command in seconds, on a shared machine. An idle machine takes less
+than 2."""
 LARGE = 1 << 22
-"""Vertices of a series that are decoded as a whole; of more only a region, as decoding takes as long as there are vertices."""
+"""Most vertices of a series that is decoded as a whole; of larger ones, a region is decoded."""
 OWN_WARNING = "fhash: warning: "
 
 
@@ -53,7 +54,8 @@ class Trial:
         self.shape = self._declared()
 
     def _declared(self) -> tuple[int, ...]:
-        """Shape of the volume as the file says it; that of the golden where it cannot be opened."""
+        """Return the shape of the volume that the file declares; the golden's if it cannot be
+        opened."""
         try:
             with Container.open(self.path) as container:
                 return tuple(container.header["domain"]["shape"])
@@ -61,15 +63,15 @@ class Trial:
             return tuple(
                 mutations.header_of(mutations.goldens()[self.mutation.golden][1])["domain"]["shape"]
             )
-        except Exception:  # which the first command will report
+        except Exception:  # the first command reports it
             return (5, 6, 7, 9)
 
     def run(self) -> dict[str, Any]:
-        """All commands; what the worker answers."""
+        """Run all commands and return the answer of the worker."""
         run, region = str(self.path), self._region()
         roi = ",".join(f"{low}:{high}" for low, high in region[1:])
         steps = f"{region[0][0]}:{region[0][1]}"
-        whole, part, picture = (
+        all_values, values, picture = (
             str(self.folder / name) for name in ("whole.npy", "part.npy", "picture.png")
         )
         self._command("info", ["info", run])
@@ -78,14 +80,14 @@ class Trial:
         if self._small():
             self._command(
                 "decode",
-                ["decode", run, "-o", whole, "--force", "-q"],
-                lambda: self._values(whole, self.shape, "whole"),
+                ["decode", run, "-o", all_values, "--force", "-q"],
+                lambda: self._values(all_values, self.shape, "whole"),
             )
         sizes = [high - low for low, high in region]
-        check = lambda: self._values(part, sizes, "part", region)  # noqa: E731
+        check = lambda: self._values(values, sizes, "part", region)  # noqa: E731
         self._command(
             "decode region",
-            ["decode", run, "--roi", roi, "--t", steps, "-o", part, "--force", "-q"],
+            ["decode", run, "--roi", roi, "--t", steps, "-o", values, "--force", "-q"],
             check,
         )
         self._end("sample", self._sample)
@@ -105,12 +107,8 @@ class Trial:
         return prod(self.shape) <= LARGE
 
     def _region(self) -> list[tuple[int, int]]:
-        """A small part in the middle."""
-        found = []
-        for length in self.shape:
-            low = length // 3
-            found.append((low, min(length, low + 3)))
-        return found
+        """Return a small region in the middle, (low, high) for t, z, y, x."""
+        return [(length // 3, min(length, length // 3 + 3)) for length in self.shape]
 
     def _command(
         self, name: str, arguments: list[str], check: Callable[[], str | None] | None = None
@@ -126,7 +124,8 @@ class Trial:
         self._end(name, work)
 
     def _end(self, name: str, work: Callable[[], str | None]) -> None:
-        """Do the work and note how it ended; `work` returns what is wrong with its result."""
+        """Do the work and note how it ended; `work` returns what is wrong with its result, or
+        None."""
         out, err, wrong = io.StringIO(), io.StringIO(), None
         _reset_peak()
         before, start = _resident("VmRSS"), time.process_time()
@@ -158,7 +157,7 @@ class Trial:
         )
 
     def _judged(self, name: str, code: int, said: str) -> str | None:
-        """What may not be about an exit code and what was printed with it."""
+        """Return what is wrong with an exit code and the text that was printed with it, or None."""
         lines = [line for line in said.splitlines() if not line.startswith(OWN_WARNING)]
         if code == 0:
             if lines:
@@ -172,14 +171,14 @@ class Trial:
             return None
         if len(lines) != 1 or not lines[0].startswith("fhash: error: "):
             return f"exit code {code} and {len(lines)} lines: {said[:300]!r}"
-        # A sound file may hold more than there is memory for.
+        # A sound file may need more memory than there is.
         if (
             code == 1
             and self.mutation.sealed
             and lines[0].startswith("fhash: error: out of memory")
         ):
             return None
-        # Of a sound file with strange values, the usual scene may have nothing to show.
+        # The usual scene may show nothing of a sound file with strange values.
         if code == 2 and self.mutation.sealed and name == "render":
             return None
         return None if code == 4 else f"exit code {code}: {lines[0][:300]}"
@@ -194,7 +193,11 @@ class Trial:
         what: str,
         region: list[tuple[int, int]] | None = None,
     ) -> str | None:
-        """What is wrong with decoded values: finite and of the declared shape, those of the golden where nothing was sealed."""
+        """Return what is wrong with decoded values, or None.
+
+        They must be finite and have the declared shape; if nothing was sealed, they must be the
+        golden's.
+        """
         values = np.load(path)
         os.unlink(path)
         if values.shape != tuple(shape):
@@ -210,9 +213,10 @@ class Trial:
         return None
 
     def _sample(self) -> str | None:
-        """Points between vertices, by the API: errors as the command line would end with."""
+        """Sample points between vertices with the API; an error ends as on the command line."""
         chance = np.random.default_rng(self.mutation.number)
-        # Within a few vertices: a sample decodes what lies between its points, too.
+        # Points lie within a few vertices, since a sample decodes the vertices between its points,
+        # too.
         points = [chance.uniform(low, high - 1, 9) for low, high in self._region()]
         try:
             with fhash_codec.open(self.path) as volume:
@@ -222,7 +226,7 @@ class Trial:
             line, code = describe_error(error)
             say(f"error: {line}")
             raise SystemExit(code) from error
-        # A derivative may well be larger than its type holds.
+        # A derivative may overflow its type.
         return (
             "infinities" if np.isinf(values).any() or slopes.shape != (*values.shape, 4) else None
         )
@@ -236,21 +240,20 @@ class Trial:
 
 
 def _warned(message: Warning | str, category: type[Warning], *_: Any) -> None:
-    """A warning as the command line shows it, those that are meant for users apart from those of the libraries below."""
-    say(
-        f"{'warning' if issubclass(category, FhashWarning) else category.__name__}: {' '.join(str(message).split())}"
-    )
+    """Print a warning as the command line does; warnings of libraries with their own category."""
+    kind = "warning" if issubclass(category, FhashWarning) else category.__name__
+    say(f"{kind}: {' '.join(str(message).split())}")
 
 
 @cache
 def expected_values(golden: str) -> Any:
-    """All values of a golden."""
+    """Return all values of a golden."""
     with fhash_codec.open(mutations.GOLDENS / f"{golden}.fhz") as volume:
         return volume[...]
 
 
 def _resident(key: str) -> int:
-    """A figure of this process's memory, bytes."""
+    """Return a figure of this process's memory in bytes."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(key + ":"):
             return int(line.split()[1]) * 1024
@@ -262,7 +265,7 @@ def _reset_peak() -> None:
 
 
 def _bound_time() -> None:
-    """End the process where the next command takes more than a few times what it may."""
+    """End the process if the next command takes several times its longest time."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     resource.setrlimit(
         resource.RLIMIT_CPU,
@@ -271,7 +274,7 @@ def _bound_time() -> None:
 
 
 def worker(folder: Path) -> None:
-    """Warm up, bound the memory, then a line of JSON for each number on stdin."""
+    """Warm up, bound the memory, then answer each number on stdin with a line of JSON."""
     fhash_cli.main.warn = _warned  # type: ignore[assignment]
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     for golden in mutations.goldens():
@@ -287,7 +290,7 @@ def worker(folder: Path) -> None:
     limit = _resident("VmData") + MEMORY
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     for line in sys.stdin:
-        if os.environ.get("FHASH_HOSTILE_CRASH") == line.strip():  # a test of this
+        if os.environ.get("FHASH_HOSTILE_CRASH") == line.strip():  # for a test of the crash
             os.kill(os.getpid(), signal.SIGSEGV)
         answers.write(json.dumps(Trial(int(line), folder).run()) + "\n")
 

@@ -1,4 +1,4 @@
-"""What goes wrong in a forked command line; each function is named in a request to the fork server."""
+"""Faults in a forked command line; a request to the fork server names the functions."""
 
 from __future__ import annotations
 
@@ -14,9 +14,15 @@ from typing import Any
 
 
 def at_operation(folder: str, number: int, code: int, counted: str = "") -> None:
-    """At the n-th operation on files below `folder`: code > 0 fails it and all later ones with that errno, < 0 sends the signal -code.
+    """Disturb the n-th operation on files below a folder.
 
-    counted: a file outside the folder to which the number of operations is written at the end.
+    Args:
+        folder: the folder.
+        number: the operation, from 1 on; 0 only counts.
+        code: above 0, the errno with which this and all later operations fail; below 0, minus the
+            signal that the process sends itself.
+        counted: a file outside the folder into which the number of operations is written at the
+            end.
     """
     library = ctypes.CDLL(os.environ["FHASH_FAULTS"])
     library.fhash_fault_count.restype = ctypes.c_long
@@ -34,13 +40,16 @@ def at_operation(folder: str, number: int, code: int, counted: str = "") -> None
 
 
 def file_limit(size: int) -> None:
-    """No file may become longer than this; SIGXFSZ is ignored, as Python does by itself."""
+    """Limit the length of files. SIGXFSZ is ignored, as Python does by default."""
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
 def memory_limit(size: int, report: str = "") -> None:
-    """No more data (heap and private maps) than this; report: a file for the peak of the resident set in KiB."""
+    """Limit the data (heap and private maps) of the process to `size` bytes.
+
+    `report` is a file into which the peak of the resident set is written, in KiB.
+    """
     resource.setrlimit(resource.RLIMIT_DATA, (size, size))
     if report:
         leave = sys.exit
@@ -53,13 +62,13 @@ def memory_limit(size: int, report: str = "") -> None:
 
 
 def user(number: int) -> None:
-    """Become another user, whom permissions stop."""
+    """Become another user, for whom permissions hold."""
     os.setgid(number)
     os.setuid(number)
 
 
 def _at_progress(stage: str, done: int, act: Callable[[], None]) -> None:
-    """Once, when a stage first reports `done` parts."""
+    """Call `act` once, when a stage first reports `done` parts."""
     from fhash_cli.output import Progress
 
     listen, acts = Progress.__call__, [act]
@@ -73,12 +82,12 @@ def _at_progress(stage: str, done: int, act: Callable[[], None]) -> None:
 
 
 def signal_at(stage: str, done: int, number: int) -> None:
-    """A signal to itself when a stage reports `done` parts."""
+    """Send a signal to this process when a stage reports `done` parts."""
     _at_progress(stage, done, lambda: signal.raise_signal(number))
 
 
 def no_memory_at(stage: str, done: int) -> None:
-    """A MemoryError when a stage reports `done` parts."""
+    """Raise MemoryError when a stage reports `done` parts."""
 
     def act() -> None:
         raise MemoryError
@@ -87,13 +96,13 @@ def no_memory_at(stage: str, done: int) -> None:
 
 
 def no_memory_in(module: str, name: str) -> None:
-    """A MemoryError in a function of a module, or a method "Class.name"."""
+    """Raise MemoryError in a function of a module, or in a method "Class.name"."""
     import importlib
 
     owner: Any = importlib.import_module(module)
     *path, last = name.split(".")
-    for part in path:
-        owner = getattr(owner, part)
+    for attribute in path:
+        owner = getattr(owner, attribute)
 
     def act(*_: Any, **__: Any) -> Any:
         raise MemoryError
@@ -116,7 +125,7 @@ def note_stages(path: str) -> None:
 
 
 def eager_checkpoints() -> None:
-    """A training saves its checkpoint as often as it may."""
+    """Let a training save its checkpoint as often as it can."""
     import functools
 
     import fhash_codec.paper.training.train
@@ -127,12 +136,15 @@ def eager_checkpoints() -> None:
 
 
 def change_at(stage: str, done: int, path: str, how: str) -> None:
-    """Change a source when a stage reports `done` parts: 'touch', 'shrink', 'vanish', 'grow', or the path of what replaces it."""
+    """Change a source when a stage reports `done` parts.
+
+    `how` is 'touch', 'shrink', 'vanish', 'grow', or the path of a file or folder that replaces it.
+    """
     _at_progress(stage, done, lambda: change(path, how))
 
 
 def change(path: str, how: str) -> None:
-    """Change a file or folder, as `change_at` says."""
+    """Change a file or folder as `change_at` says."""
     target = Path(path)
     if how == "vanish":
         shutil.rmtree(target) if target.is_dir() else target.unlink()

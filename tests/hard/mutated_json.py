@@ -1,153 +1,24 @@
-"""Mutations of metadata documents, digests redone: hostile numbers, other types, keys that are missing, codecs with strange settings."""
+"""Mutations of metadata documents, with correct checksums.
+
+They put in hostile numbers and other types, remove keys, and give codecs strange settings.
+"""
 
 from __future__ import annotations
 
 import json
-import math
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
 from containers import Parts
-
-DOCUMENT = "zarr.json"
-LARGE = (
-    *(
-        2**16,
-        2**20,
-        2**24,
-        2**28,
-        2**31 - 1,
-        2**31,
-        2**32,
-        2**40,
-        2**53 + 1,
-        2**60,
-        2**62,
-        2**63 - 1,
-        2**63,
-        2**64 - 1,
-        2**64,
-    ),
-    *(10**30, 10**400),
-)
-NUMBERS: tuple[Any, ...] = (0, 1, 2, 3, 5, 7, 10, 11, 64, -1, -(2**60), -(2**63), *LARGE)
-FLOATS = (
-    0.5,
-    -0.5,
-    -0.0,
-    1.5,
-    1e-12,
-    1e308,
-    -1e308,
-    1.7976931348623157e308,
-    2.3e-308,
-    5e-324,
-    3.4e38,
-    -3.4e38,
-    1e-45,
-    1e39,
-    1e16,
-)
-SPECIAL = (math.nan, math.inf, -math.inf)
-OTHERS: tuple[Any, ...] = (
-    *(
-        True,
-        False,
-        None,
-        "",
-        "x",
-        "9/7",
-        "klt",
-        "\x00",
-        "../x",
-        "1",
-        "\ud7ff",
-        "\n",
-        "NaN",
-        "x" * 70_000,
-        [],
-        [0],
-        [[]],
-        {},
-        {"a": 1},
-    ),
-    *([1] * 70_000, [None] * 5, {"must_understand": False}, {str(n): n for n in range(3000)}),
-)
-
-
-def _nest(depth: int) -> Any:
-    value: Any = 1
-    for level in range(depth):
-        value = [value] if level % 2 else {"a": value}
-    return value
-
-
-def hostile(chance: random.Random, old: Any) -> Any:
-    """A value in place of another; mostly one of the same sort, because others are refused at once."""
-    turn = chance.random()
-    if isinstance(old, int) and not isinstance(old, bool) and turn < 0.6:
-        return chance.choice(
-            (
-                *NUMBERS,
-                old + 1,
-                old - 1,
-                -old,
-                2 * old,
-                old * old + 1 if old < 2**80 else 0,
-                float(old) if old < 2**80 else 1e300,
-            )
-        )
-    if isinstance(old, float) and turn < 0.6:
-        return chance.choice(
-            (
-                *FLOATS,
-                *SPECIAL,
-                -old,
-                old * 1e6,
-                old * 1e-6,
-                old * 1e30,
-                int(old) if math.isfinite(old) else 0,
-            )
-        )
-    if isinstance(old, list) and old and turn < 0.6:
-        return chance.choice(
-            (
-                old[:-1],
-                [*old, old[-1]],
-                old[::-1],
-                [*old] * 2,
-                [old],
-                [old[0]] * len(old),
-                [],
-                sorted(old, key=str),
-            )
-        )
-    if isinstance(old, str) and turn < 0.4:
-        return chance.choice((old[:-1], old + "x", old.upper(), old * 2, old[::-1]))
-    return chance.choice(
-        (*OTHERS, *NUMBERS, *FLOATS, *SPECIAL, _nest(chance.choice((10, 60, 70, 400))))
-    )
-
-
-Place = tuple[Any, Any]
-"""A container and a key or index in it."""
-
-
-def places(value: Any) -> Iterator[Place]:
-    """Every value of a document."""
-    for key in (
-        value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
-    ):
-        yield value, key
-        yield from places(value[key])
+from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, hostile, places
 
 
 def _changed(
     chance: random.Random, parts: Parts, change: Callable[[dict[str, Any]], None], name: str = ""
 ) -> Parts:
-    """One document changed; a random one where none is named, the root as often as all others."""
+    """Change one document: the one that is named, else the root or, as often, any other one."""
     documents = [other for other, _ in parts if other.endswith(DOCUMENT)]
     name = name or (DOCUMENT if chance.random() < 0.4 else chance.choice(documents))
     result = []
@@ -160,12 +31,8 @@ def _changed(
     return result
 
 
-def dumped(values: Any) -> bytes:
-    return json.dumps(values).encode()
-
-
 def _value(chance: random.Random, parts: Parts) -> Parts:
-    """A value, or a few, in place of others."""
+    """Replace one value, or a few."""
 
     def change(values: dict[str, Any]) -> None:
         for _ in range(chance.choice((1, 1, 1, 2, 4))):
@@ -176,14 +43,14 @@ def _value(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _key(chance: random.Random, parts: Parts) -> Parts:
-    """A key that is missing, is there besides, or is called otherwise."""
+    """Remove, rename or add a key."""
 
     def change(values: dict[str, Any]) -> None:
         objects = [
             values,
             *(holder[key] for holder, key in places(values) if isinstance(holder[key], dict)),
         ]
-        chosen = chance.choice([one for one in objects if one])
+        chosen = chance.choice([value for value in objects if value])
         key, turn = chance.choice(list(chosen)), chance.random()
         if turn < 0.5:
             del chosen[key]
@@ -200,7 +67,7 @@ def _key(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _length(chance: random.Random, parts: Parts) -> Parts:
-    """One length of the volume called otherwise wherever it stands, so that all documents agree."""
+    """Replace one length of the volume in all documents, so that they agree."""
     header = json.loads(dict(parts)[DOCUMENT])["attributes"]["fhash"]
     old = chance.choice(header["domain"]["shape"])
     new = chance.choice((1, 2, old - 1, old + 1, old + 3, 2 * old, 100, 1000, *LARGE[:10]))
@@ -217,7 +84,7 @@ def _length(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _lengths(chance: random.Random, parts: Parts) -> Parts:
-    """The domain alone: larger than the box, with positions by rule."""
+    """Make the domain larger than the box, with positions by rule."""
 
     def change(values: dict[str, Any]) -> None:
         header = values["attributes"]["fhash"]
@@ -241,7 +108,8 @@ def _rule(chance: random.Random) -> dict[str, Any]:
 
 
 def _coordinates(chance: random.Random, parts: Parts) -> Parts:
-    """Positions by rule or list that are absurd: all equal, beyond their type, descending, with steps that vanish."""
+    """Replace positions by absurd ones: all equal, beyond their type, descending, with vanishing
+    steps."""
 
     def change(values: dict[str, Any]) -> None:
         header = values["attributes"]["fhash"]
@@ -260,7 +128,7 @@ def _coordinates(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _header(chance: random.Random, parts: Parts) -> Parts:
-    """Numbers of the header that decoding depends on, each allowed by itself."""
+    """Replace numbers of the header on which decoding depends; each is allowed by itself."""
 
     def change(values: dict[str, Any]) -> None:
         header = values["attributes"]["fhash"]
@@ -323,7 +191,7 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _array(chance: random.Random, parts: Parts) -> Parts:
-    """Type, shapes and codecs of one array."""
+    """Change the type, shapes or codecs of one array."""
     arrays = [name for name, data in parts if name.endswith(DOCUMENT) and b'"array"' in data]
 
     def change(values: dict[str, Any]) -> None:
@@ -378,7 +246,7 @@ def _array(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _text(chance: random.Random, parts: Parts) -> Parts:
-    """Bytes of a document changed."""
+    """Change bytes of a document."""
     documents = [name for name, _ in parts if name.endswith(DOCUMENT)]
     name = DOCUMENT if chance.random() < 0.4 else chance.choice(documents)
     snippets = (

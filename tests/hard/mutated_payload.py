@@ -1,4 +1,7 @@
-"""Mutations of what chunks hold, all checksums redone, so that the decoders see them: streams of coders, settings, values."""
+"""Mutations of the contents of chunks: streams of coders, indices and values.
+
+All checksums are correct, so the contents reach the decoders.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from containers import Parts, with_crc
-from mutated_json import DOCUMENT
+from documents import DOCUMENT
 from numcodecs.zstd import compress, decompress
 
 from fhash_formats.container.array import ArrayMetadata
@@ -24,24 +27,34 @@ from fhash_formats.transform.entropy.mask import decode_mask
 from fhash_formats.transform.entropy.predict import decode_predicted
 from fhash_formats.transform.entropy.table import single_band
 from fhash_formats.transform.tile.decoding import linear_values, predicted_values, transform_for
-from fhash_formats.transform.tile.sections import MISSING, OWN, RESIDUAL, little, parts_of, section
+from fhash_formats.transform.tile.sections import (
+    MISSING,
+    OWN,
+    RESIDUAL,
+    little_endian,
+    parse_stream,
+    section,
+)
 from fhash_formats.transform.tile.settings import TileSettings
 
 Change = Callable[[random.Random, bytes], bytes]
 
 
 def documents_of(parts: Parts) -> dict[str, Any]:
-    """Metadata of the arrays by name."""
-    found = {
+    """Return the metadata of the arrays by name."""
+    documents = {
         name.rpartition("/")[0]: json.loads(data) for name, data in parts if name.endswith(DOCUMENT)
     }
-    return {name: values for name, values in found.items() if values["node_type"] == "array"}
+    return {name: values for name, values in documents.items() if values["node_type"] == "array"}
 
 
 def chosen(
     chance: random.Random, parts: Parts, coded: bool | None = None
 ) -> tuple[str, dict[str, Any], str, bytes]:
-    """An array, its metadata, and one of its members; coded: by `fhash.transform`, or not, or whichever."""
+    """Choose an array; return its name and metadata, and name and data of one of its members.
+
+    `coded` says whether the array is coded by `fhash.transform`; None allows both.
+    """
     documents = documents_of(parts)
     fitting = [
         (name, data)
@@ -65,7 +78,7 @@ def replaced(parts: Parts, new: dict[str, bytes]) -> Parts:
 
 
 def damaged(chance: random.Random, data: bytes) -> bytes:
-    """Bytes of a stream changed a little or much."""
+    """Return the bytes of a stream changed a little or much."""
     if not data:
         return chance.randbytes(chance.randrange(9))
     changed = bytearray(data)
@@ -88,7 +101,8 @@ def damaged(chance: random.Random, data: bytes) -> bytes:
 def inner_chunks(
     document: dict[str, Any], member: str, data: bytes
 ) -> tuple[Sharding, np.ndarray[Any, Any], list[bytes]]:
-    """The sharding of an array, which inner chunks of a shard are present, and these with their CRC-32C."""
+    """Return the sharding of an array, which inner chunks a shard has, and these with their
+    CRC-32C."""
     metadata = ArrayMetadata.from_dict(document)
     sharding = metadata.sharding
     assert sharding is not None
@@ -103,7 +117,7 @@ def shard_of(sharding: Sharding, present: np.ndarray[Any, Any], chunks: list[byt
 
 
 def bytes_changed(chance: random.Random, parts: Parts) -> Parts:
-    """Bytes of a chunk as they lie in the file, with their CRC-32C redone."""
+    """Change bytes of a chunk as stored, with a correct CRC-32C."""
     _, document, member, data = chosen(chance, parts)
     if not is_coded(document):
         return replaced(parts, {member: with_crc(damaged(chance, data[:-4]))})
@@ -114,7 +128,8 @@ def bytes_changed(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _index(chance: random.Random, parts: Parts) -> Parts:
-    """The index of a shard: entries that overlap, point at themselves, lie outside or are not there."""
+    """Change the index of a shard: entries overlap, point into the index, or lie outside or are
+    missing."""
     coded = [name for name, document in documents_of(parts).items() if is_coded(document)]
     if not coded:
         return bytes_changed(chance, parts)
@@ -146,7 +161,7 @@ SPECIAL = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-45, 1e38, -3.4e38, 1e300, -1e3
 
 
 def values_changed(chance: random.Random, parts: Parts) -> Parts:
-    """Values of an ordinary array: coordinates, weights, tables, occupancy, key frames."""
+    """Change values of an ordinary array: coordinates, weights, tables, occupancy, key frames."""
     _, document, member, data = chosen(chance, parts, False)
     dtype = np.dtype(document["data_type"])
     values = np.frombuffer(decompress(data[:-4]), dtype).copy()
@@ -174,12 +189,17 @@ def values_changed(chance: random.Random, parts: Parts) -> Parts:
 
 
 def configuration_of(document: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = document["codecs"][0]["configuration"]["codecs"][0]["configuration"]
-    return found
+    configuration: dict[str, Any] = document["codecs"][0]["configuration"]["codecs"][0][
+        "configuration"
+    ]
+    return configuration
 
 
 def _stream(chance: random.Random, parts: Parts) -> Parts:
-    """Sections of a coded tile changed, with the digests of what they decode to: another valid tile, unless a decoder refuses it."""
+    """Change sections of a coded tile, with correct digests of what they decode to.
+
+    The result is another valid tile, unless a decoder refuses it.
+    """
     if not any(is_coded(document) for document in documents_of(parts).values()):
         return values_changed(chance, parts)
     _, document, member, data = chosen(chance, parts, True)
@@ -193,10 +213,10 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
 def _restreamed(
     chance: random.Random, stream: bytes, settings: TileSettings, shape: tuple[int, ...]
 ) -> bytes:
-    parts = parts_of(stream)
+    parts = parse_stream(stream)
     flags, sections = parts.flags, parts.sections()
     if not parts.coded:
-        return stream[:1] + b"".join(section(damaged(chance, part)) for part in sections)
+        return stream[:1] + b"".join(section(damaged(chance, data)) for data in sections)
     first = bool(flags & OWN) + bool(flags & MISSING)
     at = chance.randrange(first, len(sections))
     sections[at] = damaged(chance, sections[at])
@@ -212,10 +232,11 @@ def _restreamed(
             integers = decode_integers(
                 sections[first], shape, band_table(settings.transform, shape)
             )
-        digest = zlib.crc32(little(integers))
+        digest = zlib.crc32(little_endian(integers))
         if flags & RESIDUAL:
             digest = zlib.crc32(
-                little(decode_integers(sections[first + 1], shape, single_band(shape))), digest
+                little_endian(decode_integers(sections[first + 1], shape, single_band(shape))),
+                digest,
             )
         if parts.masked and settings.mask is not None and sections[-1]:
             sections[-1] = _mask_section(
@@ -229,7 +250,7 @@ def _restreamed(
 def _mask_section(
     coded: bytes, integers: Any, settings: TileSettings, shape: tuple[int, ...], predicted: bool
 ) -> bytes:
-    """A coded mask behind the digest of what it decodes to."""
+    """Return a coded mask after the digest of the mask to which it decodes."""
     assert settings.mask is not None
     with np.errstate(all="ignore"):
         if predicted and settings.predictor is not None:

@@ -1,4 +1,8 @@
-"""Mutations of what decoders are told: flags of tiles, settings of codecs, heads, bases, predictors, and volumes beyond all measure."""
+"""Mutations of the settings of decoders.
+
+They change flags of tiles, settings of codecs, heads, bases and predictors, and declare giant
+volumes.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from containers import Parts, with_crc
-from mutated_json import DOCUMENT, dumped, hostile, places
+from documents import DOCUMENT, dumped, hostile, places
 from mutated_payload import (
     bytes_changed,
     chosen,
@@ -38,7 +42,7 @@ from fhash_formats.transform.tile.sections import EMPTY, EXACT, FORMAT, MASKED, 
 
 
 def _flags(chance: random.Random, parts: Parts) -> Parts:
-    """The flags of a coded tile, or settings of its own in it."""
+    """Change the flags of a coded tile, or give it settings of its own."""
     if not any(is_coded(document) for document in documents_of(parts).values()):
         return bytes_changed(chance, parts)
     _, document, member, data = chosen(chance, parts, True)
@@ -60,7 +64,10 @@ def _flags(chance: random.Random, parts: Parts) -> Parts:
 
 
 def _settings(chance: random.Random, parts: Parts) -> Parts:
-    """Settings of a codec: steps, ranges, transforms, heads, masks, predictors, with the features that they require."""
+    """Change settings of a codec, with the features that they require.
+
+    The settings are steps, ranges, transforms, heads, masks and predictors.
+    """
     documents = documents_of(parts)
     coded = [name for name, document in documents.items() if is_coded(document)]
     if not coded:
@@ -126,7 +133,7 @@ def _settings_changed(
 
 
 def _basis(chance: random.Random, shape: tuple[int, ...]) -> str:
-    """A packed basis, mostly of a wrong length."""
+    """Return a packed basis, mostly of a wrong length."""
     n = chance.choice((*shape, 1, 2, 512))
     rank = chance.randrange(n + 1) if n < 40 else 3
     integers = np.zeros((rank, n), np.int32)
@@ -141,7 +148,7 @@ def _basis(chance: random.Random, shape: tuple[int, ...]) -> str:
 
 
 def _head(chance: random.Random) -> str:
-    """A packed head with extreme numbers."""
+    """Return a packed head with extreme numbers."""
     cross = chance.random() < 0.4
     hidden = [chance.choice((1, 3, 14)) for _ in range(2 if cross else chance.randrange(1, 4))]
     inputs = layer_inputs(hidden, cross)
@@ -168,13 +175,13 @@ def _head(chance: random.Random) -> str:
 
 
 def _predictor(chance: random.Random) -> dict[str, Any]:
-    """A predictor with extreme weights."""
+    """Return a predictor with extreme weights."""
     levels = [chance.choice((0, 1, 3, 8)) for _ in range(4)]
     order = chance.sample(range(4), 4)
     reach = chance.randrange(3)
     l0, l1, l2, l3 = levels
     o0, o1, o2, o3 = order
-    count = sum(len(part.taps) for part in passes_of((l0, l1, l2, l3), (o0, o1, o2, o3), reach))
+    count = sum(len(a_pass.taps) for a_pass in passes_of((l0, l1, l2, l3), (o0, o1, o2, o3), reach))
     weights = np.array([chance.choice((-32767, 32767, 0, 4096)) for _ in range(count)], np.int32)
     packed = encode_block(weights.reshape(1, 1, 1, -1))
     packed = damaged(chance, packed) if chance.random() < 0.3 else packed
@@ -189,7 +196,11 @@ def _predictor(chance: random.Random) -> dict[str, Any]:
 
 
 def _giant(chance: random.Random, parts: Parts) -> Parts:
-    """A file of a few kilobytes that declares a volume of up to 2^60 vertices in tiles of up to 2^30 bytes, all of them empty."""
+    """Declare, in a file of a few kilobytes, a volume of up to 2^60 vertices in tiles of up to 2^30
+    bytes.
+
+    All tiles are empty.
+    """
     documents = documents_of(parts)
     root = json.loads(dict(parts)[DOCUMENT])
     header = root["attributes"]["fhash"]

@@ -1,4 +1,4 @@
-"""Mutations of the ZIP around a container, its digest redone: names, sizes, offsets, bombs."""
+"""Mutations of the ZIP around a container, with a correct digest: names, sizes, offsets, bombs."""
 
 from __future__ import annotations
 
@@ -85,12 +85,12 @@ END_FIELDS = ((0, "I"), (4, "H"), (6, "H"), (8, "H"), (10, "H"), (12, "I"), (16,
 
 
 def _entries(data: bytes) -> list[int]:
-    """Where each entry of the directory begins."""
-    at, found = directory_of(data), []
+    """Return the offset of each entry of the directory."""
+    at, offsets = directory_of(data), []
     while data[at : at + 4] == b"PK\x01\x02":
-        found.append(at)
+        offsets.append(at)
         at += ENTRY.size + struct.unpack_from("<H", data, at + 28)[0]
-    return found
+    return offsets
 
 
 def _number(chance: random.Random, form: str, old: int) -> int:
@@ -99,7 +99,7 @@ def _number(chance: random.Random, form: str, old: int) -> int:
 
 
 def _field(chance: random.Random, parts: Parts) -> bytes:
-    """One or a few fields of entries, in some the same in the local header, too."""
+    """Change one or a few fields of entries, sometimes in the local header, too."""
     data = bytearray(pack(parts))
     start = directory_of(bytes(data))
     for _ in range(chance.choice((1, 1, 2, 4))):
@@ -115,7 +115,7 @@ def _field(chance: random.Random, parts: Parts) -> bytes:
 
 
 def _end(chance: random.Random, parts: Parts) -> bytes:
-    """Fields of the end record, or bytes put before it."""
+    """Change a field of the end record, or put records before it."""
     data = bytearray(pack(parts))
     start, end = directory_of(bytes(data)), len(data) - len(comment(b"")) - 22
     if chance.random() < 0.3:
@@ -143,7 +143,7 @@ def _end(chance: random.Random, parts: Parts) -> bytes:
 
 
 def _signature(chance: random.Random, parts: Parts) -> bytes:
-    """Another version in the comment, or another text."""
+    """Put another version or another text into the comment."""
     data = pack(parts)
     new = chance.choice(
         (b"fhash 0", b"fhash 1", b"fhash 3", b"fhash 9999", b"fhash -", b"FHASH 2", b"fhash 02")
@@ -154,7 +154,7 @@ def _signature(chance: random.Random, parts: Parts) -> bytes:
 
 
 def _named(chance: random.Random, parts: Parts) -> bytes:
-    """A member under another name, hostile or that of another member."""
+    """Give a member another name: a hostile one, or that of another member."""
     at = chance.randrange(len(parts))
     name = chance.choice(NAMES) if chance.random() < 0.6 else chance.choice(parts)[0]
     if chance.random() < 0.5:
@@ -163,30 +163,31 @@ def _named(chance: random.Random, parts: Parts) -> bytes:
 
 
 def _dropped(chance: random.Random, parts: Parts) -> bytes:
-    """Some members missing."""
+    """Remove some members."""
     gone = set(chance.sample(range(len(parts)), chance.choice((1, 1, 2, len(parts) // 2))))
-    return pack([part for number, part in enumerate(parts) if number not in gone])
+    return pack([member for number, member in enumerate(parts) if number not in gone])
 
 
 def _exchanged(chance: random.Random, parts: Parts) -> bytes:
-    """The data of one member in place of another's."""
-    one, other = chance.randrange(len(parts)), chance.randrange(len(parts))
+    """Replace the data of one member by another's."""
+    first, second = chance.randrange(len(parts)), chance.randrange(len(parts))
     changed = list(parts)
-    changed[one] = (parts[one][0], parts[other][1])
+    changed[first] = (parts[first][0], parts[second][1])
     if chance.random() < 0.5:
-        changed[other] = (parts[other][0], parts[one][1])
+        changed[second] = (parts[second][0], parts[first][1])
     return pack(changed)
 
 
 def _shuffled(chance: random.Random, parts: Parts) -> bytes:
-    """Another order."""
+    """Shuffle the members."""
     changed = list(parts)
     chance.shuffle(changed)
     return pack(changed)
 
 
 def _nested(chance: random.Random, parts: Parts) -> bytes:
-    """Nodes within nodes: an array in an array, groups hundreds deep, a whole hierarchy below one of its own arrays."""
+    """Put nodes into nodes: an array into an array, groups hundreds deep, a hierarchy below its own
+    array."""
     prefix = chance.choice(
         (
             "coords/time",
@@ -207,14 +208,15 @@ def _nested(chance: random.Random, parts: Parts) -> bytes:
 
 
 def _many(chance: random.Random, parts: Parts) -> bytes:
-    """Thousands of members."""
+    """Add thousands of members."""
     count = chance.choice((100, 3000))
     document = chance.choice((b'{"zarr_format":3,"node_type":"group"}', b"{}", b""))
     return pack([*((f"g{number}/zarr.json", document) for number in range(count)), *parts])
 
 
 def _bomb(chance: random.Random, parts: Parts) -> bytes:
-    """A document or chunk that inflates to 2^20 .. 2^31 bytes, declared truly or not."""
+    """Replace a document or chunk by one that inflates to 2^20 to 2^31 bytes, declared truly or
+    not."""
     at = chance.randrange(len(parts))
     name, data = parts[at]
     size = 1 << chance.choice((20, 24, 26, 30, 31))
@@ -238,7 +240,7 @@ def _bomb(chance: random.Random, parts: Parts) -> bytes:
 
 
 def _zeros(size: int, declared: int | None) -> bytes:
-    """A zstd frame of zeros in blocks of one repeated byte: 128 KiB from 4 bytes."""
+    """Return a zstd frame of zeros in blocks of one repeated byte: 128 KiB from 4 bytes."""
     head = (
         struct.pack("<IB", 0xFD2FB528, 0x00) + b"\x88"
         if declared is None
@@ -250,7 +252,7 @@ def _zeros(size: int, declared: int | None) -> bytes:
 
 
 def _deflated(chance: random.Random, parts: Parts) -> bytes:
-    """Members deflated that may be or may not, with sizes that are right or not."""
+    """Deflate members that may or may not be deflated, with sizes that are right or wrong."""
     given = []
     for name, data in parts:
         packed = name.endswith("zarr.json") or chance.random() < 0.1
@@ -260,7 +262,7 @@ def _deflated(chance: random.Random, parts: Parts) -> bytes:
 
 
 def _extra(chance: random.Random, parts: Parts) -> bytes:
-    """Another array, sound or not, that nobody asked for."""
+    """Add another array, sound or not."""
     shape = [chance.choice((1, 2, 2**20, 2**31, 2**60)) for _ in range(chance.choice((1, 2, 4, 8)))]
     chunk = [chance.choice((1, n, min(n, 2**28))) for n in shape]
     document = {

@@ -1,7 +1,8 @@
 """Deterministic mutations of the golden containers: the same number always makes the same file.
 
-Two sorts. A damaged file is what an accident leaves: its checksums tell. A sealed one is what an attacker makes: every checksum and the
-digest are redone, so that the damage reaches what lies behind them; it may even be a sound file of something else.
+There are two sorts. A damaged file is the result of an accident, which its checksums reveal. A
+sealed file is the work of an attacker: all checksums and the digest are correct, so the mutation
+reaches the code behind them. A sealed file may even be sound.
 """
 
 from __future__ import annotations
@@ -25,7 +26,15 @@ GOLDENS = Path(__file__).parents[1] / "golden"
 
 @dataclass(frozen=True, kw_only=True)
 class Mutation:
-    """One file. golden: name of what it was made of; kind: how; sealed: whether all checksums were redone."""
+    """One mutated file.
+
+    Attributes:
+        number: number of the mutation.
+        golden: name of the golden that was mutated.
+        kind: kind of the mutation.
+        sealed: whether all checksums are correct.
+        data: bytes of the file.
+    """
 
     number: int
     golden: str
@@ -36,7 +45,7 @@ class Mutation:
 
 @cache
 def goldens() -> dict[str, tuple[bytes, Parts]]:
-    """Bytes and members of each golden by name."""
+    """Return bytes and members of each golden by name."""
     return {
         path.stem: (data := path.read_bytes(), unpack(data))
         for path in sorted(GOLDENS.glob("*.fhz"))
@@ -44,7 +53,7 @@ def goldens() -> dict[str, tuple[bytes, Parts]]:
 
 
 def mutation(number: int) -> Mutation:
-    """The mutation of a number from 0 on; goldens and kinds take turns."""
+    """Return the mutation of a number from 0 on; goldens and kinds take turns."""
     chance = random.Random(number)
     names, kinds = list(goldens()), list(KINDS)
     golden, kind = names[number % len(names)], kinds[number // len(names) % len(kinds)]
@@ -121,7 +130,7 @@ DAMAGES: dict[str, Callable[[random.Random, bytes], bytes]] = {
 def _packed(
     change: Callable[[random.Random, Parts], Parts],
 ) -> Callable[[random.Random, Parts], bytes]:
-    """A change of members as one of the file."""
+    """Return a change of members as a change of the file."""
     return lambda chance, parts: pack(change(chance, parts))
 
 
@@ -137,5 +146,5 @@ KINDS = (*DAMAGES, *SEALED)
 
 
 def header_of(parts: Parts) -> Any:
-    """The header of a golden, for those who want to know what it declares."""
+    """Return the header of a golden."""
     return json.loads(dict(parts)["zarr.json"])["attributes"]["fhash"]

@@ -1,4 +1,7 @@
-"""How far the property-based tests look: few and always the same examples in `make test`, many and new ones in the long set."""
+"""Settings and strategies of the property-based tests.
+
+`make test` tries few examples, always the same ones; the long set tries many new ones.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +19,15 @@ NUMBERS = (*INTEGERS, *FLOATS)
 
 
 def looking(few: int, many: int = 2000) -> settings:
-    """Settings of a test: `few` examples, or `many` in the long set."""
+    """Return the settings of a test: `few` examples, or `many` in the long set."""
     return settings(
         max_examples=many if LONG else few,
         derandomize=not LONG,
         deadline=None,
         database=None,
         print_blob=True,
-        # What fails in the quick set fails again; looking for the smallest example takes minutes and is for the long set.
+        # A failure of the quick set is reproducible. Shrinking it takes minutes and is left to the
+        # long set.
         phases=list(Phase) if LONG else [Phase.explicit, Phase.generate],
         suppress_health_check=[
             HealthCheck.too_slow,
@@ -36,18 +40,21 @@ def looking(few: int, many: int = 2000) -> settings:
 def arrays(
     dtypes: tuple[str, ...] = NUMBERS, *, dims: tuple[int, int] = (4, 4), side: int = 6
 ) -> st.SearchStrategy[np.ndarray]:
-    """Arrays of any numbers, NaN, infinities, denormals and signed zeros among them."""
+    """Draw arrays of any numbers, with NaN, infinities, denormals and signed zeros."""
     shapes = hnp.array_shapes(min_dims=dims[0], max_dims=dims[1], min_side=1, max_side=side)
     return st.sampled_from(dtypes).flatmap(lambda dtype: hnp.arrays(np.dtype(dtype), shapes))
 
 
 def chunks(shape: tuple[int, ...]) -> st.SearchStrategy[tuple[int, ...]]:
-    """A chunk of an array: along each axis from one vertex to all."""
+    """Draw the shape of a chunk of an array: from one vertex to all, along each axis."""
     return st.tuples(*(st.integers(1, length) for length in shape))
 
 
 def same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two arrays have the same type, shape and values, the sign of zero included; all NaN are alike."""
+    """Return whether two arrays have the same type, shape and values.
+
+    The signs of zeros must be the same; all NaN are alike.
+    """
     if one.dtype != other.dtype or one.shape != other.shape:
         return False
     if one.dtype.kind != "f":
@@ -61,7 +68,7 @@ def same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def one_line(error: Exception) -> None:
-    """Assert that an error is a line for people."""
+    """Assert that the message of an error is one line of reasonable length."""
     text = str(error)
     assert text
     assert "\n" not in text
@@ -69,4 +76,4 @@ def one_line(error: Exception) -> None:
 
 
 Draw = Any
-"""What `st.data()` and `st.composite` give to draw with."""
+"""The type of the argument that `st.data()` and `st.composite` give."""

@@ -1,4 +1,4 @@
-"""What the tests of hard cases share: whether the long set is wanted, and where the figures go."""
+"""The choice between the quick and the long set, and the file for figures."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from collections.abc import Mapping
 from typing import Any
 
 LONG = os.environ.get("FHASH_HARD") == "1"
-"""Whether the long set is wanted."""
+"""Whether the long set runs."""
 
 
 def record(case: str, figures: Mapping[str, Any]) -> None:
-    """Append one line of JSON, {"case": name, figure: value, ...}, to the file that FHASH_HARD_REPORT names, if it names one.
+    """Append a line of JSON, {"case": name, figure: value, ...}, to the file that FHASH_HARD_REPORT
+    names.
 
-    One write for a line, so that several processes may report to one file.
+    A line is one write, so several processes may report to one file. Without the variable, nothing
+    is written.
     """
     path = os.environ.get("FHASH_HARD_REPORT")
     if path:

@@ -1,4 +1,4 @@
-"""One series in every form that can be read, for the tests that change it while it is read."""
+"""One series in every form that can be read, for tests that change it while it is read."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 Written = tuple[Path, list[str]]
-"""Where the series was written, and the words with which `fhash encode` reads it."""
+"""A file or folder that may be changed, and the words with which `fhash encode` reads the series.
+"""
 
 
 def npy(folder: Path, values: np.ndarray) -> Written:
@@ -113,4 +114,5 @@ FORMS: dict[str, Callable[[Path, np.ndarray], Written]] = {
     "a virtual dataset": virtual,
     "a mask": mask,
 }
-"""Each writes the values (t, z, y, x) below a folder, always in the same place, and says what may be changed."""
+"""Functions by form. Each writes the values (t, z, y, x) into a folder, always under the same
+name."""

@@ -11,33 +11,50 @@ from pathlib import Path
 from typing import Any
 
 ABOUT = {
-    "hostile files": "Mutations of the golden containers through the commands: how each of them ended, and at most how many seconds of\n"
-    "processor time and bytes of memory it took. What is refused ends with exit code 4. Too large (1) is a sound file that declares more\n"
-    "than there is memory for here, nothing to show (2) one whose usual picture would be empty or cannot be placed.",
-    "the native code under sanitizers": "Coverage-guided fuzzing of the native library under address and undefined-behaviour\n"
-    "sanitizers: decoders, encoders (what they write has to decode to what was coded), transforms, heads, the marcher and its light.",
-    "kill -9 at an operation": "The process is killed before each of its operations on files: the older output stays whole, and the\n"
-    "next run clears away what was left.",
-    "kill -9 at a random moment": "The process is killed at random: the older output stays, and the same command gives the same file.",
-    "kill -9 while checkpoints are written": "The same, where checkpoints are written all the time.",
-    "a full disk": "Each operation on files fails as it does on a full disk: refused with one line, nothing half-written. What is\n"
-    "not refused did not need the operation.",
-    "a signal at each stage": "Ctrl-C and SIGTERM in each stage: one line, nothing half-written, and the older output stays.",
-    "a signal at an operation": "The same at operations on files.",
-    "a source that changes": "The source grows, shrinks, is written again or vanishes while it is read: refused.",
-    "two at once": "Two writers of one output: the result is one of the two, whole.",
-    "little memory": "Under tighter and tighter limits of memory: done, or one line.",
+    "hostile files": """\
+Mutations of the golden containers, read by every command. The first table shows the largest
+processor time in seconds and the largest memory in bytes of one command; the others show how the
+commands ended. Refused means exit code 4. A sound file that declares more than fits into memory is
+too large (exit code 1). If its usual picture would be empty or has no place in the coordinates,
+there is nothing to show (exit code 2).""",
+    "the native code under sanitizers": """\
+Coverage-guided fuzzing of the native library under address and undefined-behaviour sanitizers:
+decoders, encoders (whose output must decode to the input), transforms, heads, the marcher and its
+light.""",
+    "kill -9 at an operation": """\
+The process is killed before each of its file operations. The older output stays complete, and the
+next run removes temporary files.""",
+    "kill -9 at a random moment": """\
+The process is killed at a random moment. The older output stays, and the same command then gives
+the same file.""",
+    "kill -9 while checkpoints are written": """\
+The same with a process that writes checkpoints all the time.""",
+    "a full disk": """\
+Each file operation fails as on a full disk. The command is refused with one line and leaves nothing
+half-written. A command that is not refused did not need the operation.""",
+    "a signal at each stage": """\
+Ctrl-C, SIGTERM and SIGHUP in each stage: the command prints one line and leaves nothing
+half-written, and the older output stays.""",
+    "a signal at an operation": "The same signals at file operations.",
+    "a source that changes": """\
+The source grows, shrinks, is rewritten or vanishes while it is read: the command is refused.""",
+    "two at once": "Two processes write one output. The result is complete and of one of them.",
+    "little memory": "Commands under ever smaller limits of memory finish, or end with one line.",
     "a large series": "",
-    "a large decode within 1 GiB": "A series larger than the limit of memory, decoded within it.",
+    "a large decode within 1 GiB": "A series larger than the memory limit is decoded within it.",
 }
+"""A text for each case, by its name in the figures."""
 
 
 def text(records: list[dict[str, Any]]) -> str:
-    """A section for each case, a row for each of its records; figures that are tables themselves come after it."""
+    """Return a section for each case, with a row for each of its records.
+
+    Figures that are tables themselves follow the rows.
+    """
     cases: dict[str, list[dict[str, Any]]] = {}
     for record in records:
         cases.setdefault(record.pop("case"), []).append(record)
-    parts = ["## Hostile files and faults\n\nMade by `make hard`.\n"]
+    sections = ["## Hostile files and faults\n\nMade by `make hard`.\n"]
     for case, records_of_case in cases.items():
         about = ABOUT.get(case, "")
         plain = [
@@ -51,11 +68,11 @@ def text(records: list[dict[str, Any]]) -> str:
                 for name, value in record.items()
                 if isinstance(value, dict)
             ]
-        parts.append(
+        sections.append(
             "\n\n".join([f"### {case[0].upper()}{case[1:]}", *([about] if about else []), *tables])
             + "\n"
         )
-    return "\n".join(parts)
+    return "\n".join(sections)
 
 
 def _table(rows: list[dict[str, Any]]) -> str:

@@ -1,4 +1,5 @@
-"""A disk that is full from the n-th operation on, for every n: one line, and everything as it was."""
+"""A disk that is full from the n-th operation on, for every n: the command prints one line and
+changes nothing."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ def test_a_disk_that_fills_up_at_any_operation_changes_nothing(bench: Bench, nam
         before = bench.old(name)
         ended = bench.run(name, ("at_operation", bench.out, number, errno.ENOSPC))
         now = bench.now()
-        if ended.code == 0:  # what failed was not needed, such as a link
+        if ended.code == 0:  # the operation was not needed, such as a link
             assert now == bench.new(name), (number, ended.output)
             continue
         failed += 1
@@ -48,7 +49,7 @@ def test_a_file_that_may_not_become_so_long_changes_nothing(bench: Bench, name: 
         longest - 1,
         longest // 2,
         min(700, longest // 4),
-    }:  # the message itself goes to a file
+    }:  # larger than the message, which goes to a file, too
         ended = bench.run(name, ("file_limit", size))
         assert ended.code == 1, (size, ended.output)
         assert ended.line.startswith("fhash: error: "), size

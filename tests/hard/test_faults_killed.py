@@ -1,4 +1,7 @@
-"""kill -9: the older output stays bit for bit, the next call gives what an undisturbed one gives, and leaves nothing else behind."""
+"""A command that is killed keeps the older output, bit for bit.
+
+The next call gives the result of an undisturbed call and removes what was left.
+"""
 
 from __future__ import annotations
 
@@ -27,19 +30,19 @@ KILLED = (
 
 
 def leftovers(now: Listing) -> set[str]:
-    """The temporaries in a folder, by name."""
+    """Return the names of the temporary files in a folder."""
     return {
         place.split("/")[0] for place in now if place.split("/")[0].endswith((".partial", ".old"))
     }
 
 
 def check_killed(bench: Bench, name: str, before: Listing) -> None:
-    """What is there after a kill: every output old or new, and nothing else but temporaries."""
+    """Check the folder after a kill: each output is old or new, all else is temporary files."""
     now, after = bench.now(), bench.new(name)
     extra = leftovers(now)
     kept = {place: data for place, data in now.items() if place.split("/")[0] not in extra}
     if kept.keys() != before.keys():
-        # A folder cannot be replaced at one stroke: between two renames it is there under its temporary name.
+        # A folder is replaced by two renames. Between them it has its temporary name.
         aside = [place for place in extra if place.endswith(".old")]
         assert name == "decode zarr"
         assert not kept
@@ -52,7 +55,7 @@ def check_killed(bench: Bench, name: str, before: Listing) -> None:
     elif name in ("decode vti", "decode vtr", "decode pvd", "decode raw", "render pictures"):
         assert all(
             data in (before[place], after[place]) for place, data in kept.items()
-        )  # several outputs, each whole
+        )  # several outputs, each of them complete
     else:
         assert kept in (before, after)
 
@@ -79,7 +82,8 @@ def test_a_kill_at_any_operation_loses_nothing_and_the_next_call_clears_up(
 
 
 def test_a_folder_that_was_moved_aside_comes_back_before_anything_else(bench: Bench) -> None:
-    """Whoever does not say --force is told that there is an output, although the killed one had just moved it away."""
+    """Without --force, the user is told that an output exists, even if the killed command had just
+    moved it away."""
     name, seen = "decode zarr", 0
     for number in range(bench.operations(name), 0, -1):
         before = bench.old(name)
@@ -120,7 +124,7 @@ def test_a_kill_at_a_random_moment_loses_nothing(bench: Bench, profile: str) -> 
             place == "a.fhz" or place.endswith((".partial", ".old", ".checkpoint")) for place in now
         )
         checkpoints += any(place.endswith(".checkpoint") for place in now)
-        ended = bench.run(name, *eager)  # goes on from the checkpoint, if there is one
+        ended = bench.run(name, *eager)  # resumes from the checkpoint, if there is one
         assert ended.code == 0, ended.output
         assert bench.now() == bench.new(name)
     assert kills >= 4
@@ -139,7 +143,7 @@ def test_a_kill_while_a_checkpoint_is_written_loses_neither_it_nor_the_output(be
     for number in moments(int(counted.read_text()), 12):
         bench.old(name)
         ended = bench.run(name, eager, ("at_operation", bench.out, number, -signal.SIGKILL))
-        if ended.code == 0:  # how often it saves depends on the time that saving takes
+        if ended.code == 0:  # the number of checkpoints depends on how long saving takes
             continue
         killed += 1
         assert ended.code == -signal.SIGKILL, ended.output
@@ -168,15 +172,15 @@ def test_a_living_writer_is_not_disturbed_by_another(bench: Bench, name: str) ->
         if ended.code == 0:
             assert bench.now() in (bench.new(name), bench.old(name)), (
                 number
-            )  # whichever took the name last
-        else:  # a folder cannot take a name that another took since it moved the older one aside
+            )  # the writer that took the name last
+        else:  # another folder took the name after this writer moved the older one aside
             assert (ended.code, name) == (1, "decode zarr"), ended.output
             assert "another process wrote it meanwhile" in ended.line
             assert bench.now() == bench.old(name), number
 
 
 def wait_stopped(pid: int) -> None:
-    """Until a process has stopped."""
+    """Wait until a process has stopped."""
     for _ in range(2000):
         if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T":
             return

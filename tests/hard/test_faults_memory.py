@@ -1,4 +1,5 @@
-"""Little memory: any limit ends in a result or in one line, and a file of gigabytes is decoded within one."""
+"""Little memory: any limit ends in a result or in one line, and gigabytes are decoded within a
+limit."""
 
 from __future__ import annotations
 
@@ -27,13 +28,13 @@ LIMITS = (
     if LONG
     else (2, 128)
 )
-"""MiB of data that a command may take beside what the interpreter and the libraries have already."""
+"""Data in MiB that a command may use beyond what the interpreter and the libraries use already."""
 SHAPE = (12, 48, 64, 80)
 
 
 @pytest.fixture(scope="module")
 def larger(_bench: Bench) -> Path:
-    """A container for which the memory of the libraries is not everything."""
+    """A container whose decoding needs memory beyond that of the libraries."""
     place = _bench.folder / "larger"
     place.mkdir()
     field = np.random.default_rng(0).standard_normal(SHAPE).astype(np.float32).cumsum(3)
@@ -50,7 +51,8 @@ COMMANDS = {
     "render": ("render", "{run}", "--size", "200x200", "-o", "a.png"),
     "verify": ("verify", "{run}"),
 }
-"""Left out: where HDF5, OpenBLAS or scikit-image end the process themselves when they get no memory."""
+"""Commands by name. HDF5, OpenBLAS and scikit-image end the process without memory and are left
+out."""
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -71,7 +73,8 @@ def test_any_limit_gives_a_result_or_one_line(bench: Bench, larger: Path, name: 
             done += 1
             continue
         if LONG and ended.code in (-signal.SIGSEGV, -signal.SIGKILL):
-            # CPython 3.11 itself: a thread that has no memory to begin with dies, and sometimes `Thread.start` waits for it for ever.
+            # CPython 3.11: a thread without memory to start dies, and `Thread.start` sometimes
+            # waits for it forever.
             died += 1
             continue
         assert ended.code == 1, (limit, ended.output)
@@ -93,13 +96,13 @@ def test_any_limit_gives_a_result_or_one_line(bench: Bench, larger: Path, name: 
 
 
 def data_of(pid: int) -> int:
-    """Bytes of data that a process has taken."""
+    """Return the bytes of data of a process."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData"))
 
 
 class Streamed(Series):
-    """A moving wave that is made frame by frame and never held."""
+    """A moving wave that is made frame by frame and never held in memory."""
 
     def __init__(self, shape: tuple[int, int, int, int]) -> None:
         self.source, self.name, self.units, self.attributes = "streamed", "wave", "", {}
@@ -121,7 +124,7 @@ class Streamed(Series):
 
 @pytest.fixture(scope="module")
 def huge(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, int, float]]:
-    """A container of a series of 3 GiB, that size, and the largest error."""
+    """A container of a series of 3 GiB, the bytes of the series, and the largest error."""
     path = tmp_path_factory.mktemp("huge") / "wave.fhz"
     series = Streamed((48, 256, 256, 256))
     raw = 4 * int(np.prod(series.shape))
@@ -148,7 +151,8 @@ sys.argv = ["fhash", *sys.argv[2:]]
 try:
     main()
 finally:
-    lines = open("/proc/self/status").read().splitlines()  # not getrusage, which begins with the parent's peak
+    # not getrusage, which begins with the parent's peak
+    lines = open("/proc/self/status").read().splitlines()
     open(PEAK, "w").write(next(line.split()[1] for line in lines if line.startswith("VmHWM")))
 """
 
@@ -179,7 +183,7 @@ def test_a_large_file_is_decoded_within_one_gibibyte(
     )
     if (
         suffix == "zarr" and done.returncode
-    ):  # its threads reserve much more than they use, and the limit is on what is reserved
+    ):  # its threads reserve much more than they use; the limit is on reserved memory
         assert done.returncode in (1, 4)
         assert len(done.stderr.splitlines()) == 1
         assert "memory" in done.stderr

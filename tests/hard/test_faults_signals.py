@@ -1,4 +1,5 @@
-"""Ctrl-C, SIGTERM and SIGHUP at each stage and at each operation on files: exit code 130, one line, nothing half written."""
+"""Ctrl-C, SIGTERM and SIGHUP at each stage and file operation: exit code 130, one line, nothing
+half-written."""
 
 from __future__ import annotations
 
@@ -26,17 +27,18 @@ COMMITTED = (
 
 
 def stages(bench: Bench, name: str, noted: Path) -> list[tuple[str, int]]:
-    """The first and the last report of each stage of a command."""
+    """Return the first and the last report of each stage of a command; in the long set, all
+    reports."""
     noted.unlink(missing_ok=True)
     words = [word for word in bench.words(name) if word != "-q"]
     ended = bench.server.run(*words, inject=[("note_stages", noted)])
     assert ended.code == 0, ended.output
-    found = [
+    reports_of_all = [
         (line.rpartition(" ")[0], int(line.rpartition(" ")[2]))
         for line in noted.read_text().splitlines()
     ]
     chosen = []
-    for _, group in itertools.groupby(dict.fromkeys(found), key=lambda report: report[0]):
+    for _, group in itertools.groupby(dict.fromkeys(reports_of_all), key=lambda report: report[0]):
         reports = list(group)
         chosen += reports if LONG else dict.fromkeys([reports[0], reports[-1]])
     return list(dict.fromkeys(chosen))
@@ -47,15 +49,15 @@ def test_a_signal_at_each_stage_leaves_the_older_output(
     bench: Bench, name: str, tmp_path: Path
 ) -> None:
     bench.old(name)
-    found = stages(bench, name, tmp_path / "stages")
-    assert found or name.startswith("decode vtp")
+    moments_of_stages = stages(bench, name, tmp_path / "stages")
+    assert moments_of_stages or name.startswith("decode vtp")
     if name in [f"encode {profile}" for profile in PROFILES]:
-        assert {stage for stage, _ in found} >= {
+        assert {stage for stage, _ in moments_of_stages} >= {
             "scanning",
             "measuring",
             "training" if "paper" in name else "coding",
         }
-    for turn, (stage, done) in enumerate(found):
+    for turn, (stage, done) in enumerate(moments_of_stages):
         number = SIGNALS[turn % len(SIGNALS)]
         before = bench.old(name)
         ended = bench.run(name, ("signal_at", stage, done, number))
@@ -69,12 +71,16 @@ def test_a_signal_at_each_stage_leaves_the_older_output(
             stage,
             done,
         )
-    ended = bench.run(name)  # goes on from the checkpoint, if there is one
+    ended = bench.run(name)  # resumes from the checkpoint, if there is one
     assert ended.code == 0, ended.output
     assert bench.now() == bench.new(name)
     record(
         "a signal at each stage",
-        {"command": name, "stages": len({stage for stage, _ in found}), "signals": len(found)},
+        {
+            "command": name,
+            "stages": len({stage for stage, _ in moments_of_stages}),
+            "signals": len(moments_of_stages),
+        },
     )
 
 
@@ -85,7 +91,7 @@ def test_a_signal_at_any_operation_leaves_one_of_the_two_outputs(bench: Bench, n
         before = bench.old(name)
         ended = bench.run(name, ("at_operation", bench.out, place, -SIGNALS[turn % len(SIGNALS)]))
         now = bench.now()
-        if ended.code == 0:  # it came when everything was done
+        if ended.code == 0:  # the signal came after the end of the work
             assert now == bench.new(name), place
             continue
         assert ended.code == 130, (place, ended.output)

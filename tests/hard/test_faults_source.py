@@ -1,4 +1,7 @@
-"""A source that changes, shrinks, grows or vanishes while it is read: one line and exit code 2, and never a mix of two versions."""
+"""A source that changes, shrinks, grows or vanishes while it is read is refused.
+
+The command ends with one line and exit code 2, and never mixes two versions.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,7 @@ def test_a_source_that_changes_is_refused(bench: Bench, tmp_path: Path, form: st
                 if not LONG and (profile, stage, how) not in QUICK:
                     continue
                 if form == "a mask" and stage != "selecting":
-                    continue  # it is not read before, nor after
+                    continue  # it is read in this stage only
                 check(bench, tmp_path / "source", form, profile, stage, how)
                 tried += 1
     assert tried > 0

@@ -1,4 +1,4 @@
-"""Two writers of one output, folders that cannot be written, and memory that runs out."""
+"""Two writers of one output, folders without permission to write, and memory that runs out."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_two_at_once_leave_the_whole_output_of_one(bench: Bench, name: str, forc
                 assert one.line.startswith("fhash: error: ")
                 assert "meanwhile" in one.line or "exists; use --force" in one.line, one.line
         now = bench.now()
-        if name == "decode pvd":  # several outputs: each is whole, and they are of one shape
+        if name == "decode pvd":  # several outputs, each complete, with the same names
             assert now.keys() == first.keys()
             assert all(data in (first[place], second[place]) for place, data in now.items())
         else:
@@ -63,7 +63,7 @@ def test_two_at_once_leave_the_whole_output_of_one(bench: Bench, name: str, forc
 def test_what_appears_while_it_is_made_is_not_replaced_without_leave(
     bench: Bench, name: str
 ) -> None:
-    """Stopped at each operation, while another writes the same output."""
+    """The command is stopped at each operation while another one writes the same output."""
     bench.old(name)
     kept = bench.now()
     refused = 0
@@ -96,7 +96,10 @@ def test_what_appears_while_it_is_made_is_not_replaced_without_leave(
 
 @pytest.fixture
 def locked(bench: Bench) -> Iterator[Path]:
-    """A folder that may be read and not written, in which an output lies; below the temporary folder, which anyone may enter."""
+    """A folder that may be read but not written, with an output in it.
+
+    It lies in the temporary folder, which any user may enter.
+    """
     place = Path(tempfile.mkdtemp(prefix="fhash-locked-"))
     place.chmod(0o755)
     shutil.copy(bench.folder / "0" / "in.npy", place / "in.npy")
@@ -129,7 +132,7 @@ def test_a_folder_that_cannot_be_written_is_said_in_one_line(
             "20x20",
         ),
     }
-    inject = [("user", NOBODY)] if os.geteuid() == 0 else []  # permissions do not stop root
+    inject = [("user", NOBODY)] if os.geteuid() == 0 else []  # root ignores permissions
     before = listing(locked)
     ended = bench.server.run(*words[command], "--force", inject=inject)
     assert ended.code == 2, ended.output  # before any work
@@ -165,7 +168,7 @@ PLACES = [
     ("encode compact", "fhash_formats.container.writer", "ContainerWriter._tail"),
     ("encode paper", "fhash_codec.paper.training.checkpoint", "load_checkpoint"),
     ("encode paper", "fhash_codec.paper.training.train", "train"),
-    ("encode paper", "fhash_codec.encoding", "write_tables"),
+    ("encode paper", "fhash_codec.paper.encode", "write_tables"),
     ("decode h5", "fhash_codec.volume", "Volume.read"),
     ("decode h5", "fhash_formats.writers.hdf5", "_create"),
     ("decode zarr", "fhash_formats.writers.zarr_store", "_flush"),

@@ -1,4 +1,5 @@
-"""Any arrays and any header that a container can hold come back, and one content has one file."""
+"""Any arrays and any header that a container can hold come back, and the same content gives the
+same file."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ TABLE = {"name": "fhash.transform"}
 
 
 def header(**changes: Any) -> dict[str, Any]:
-    """Of a small compact container; `changes` replace its keys."""
+    """Return the header of a small compact container; `changes` replace its keys."""
     return {
         "encoder": {"version": "0.1.0", "seed": 7},
         "variable": {"name": "density", "units": "kg m-3", "dtype": "float32", "attributes": {}},
@@ -57,13 +58,13 @@ def table() -> np.ndarray:
 
 @contextmanager
 def places() -> Iterator[list[Path]]:
-    """Two names for files in a folder of their own."""
+    """Two file names in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix="fhash-") as folder:
         yield [Path(folder) / name for name in ("a.fhz", "b.fhz")]
 
 
 def write(path: Path, extra: Any, **changes: Any) -> None:
-    """A container with more arrays: `extra` writes them."""
+    """Write a container with additional arrays, which `extra` writes."""
     from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
     from fhash_formats.transform.tile.settings import TileSettings
 

@@ -1,4 +1,7 @@
-"""Any series under any settings: what is promised is kept as an independent look at the values finds it, or is refused in one line."""
+"""Any series under any settings keeps its promise, or is refused in one line.
+
+The promise is checked on the decoded values, independently of the encoder.
+"""
 
 from __future__ import annotations
 
@@ -24,13 +27,13 @@ Shape = tuple[int, int, int, int]
 
 
 def waves(chance: np.random.Generator, shape: Shape) -> np.ndarray:
-    """A few plane waves."""
+    """Return the sum of three plane waves."""
     places = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
     return sum(np.sin(sum(chance.normal(0, 6) * place for place in places)) for _ in range(3))
 
 
 def front(chance: np.random.Generator, shape: Shape) -> np.ndarray:
-    """A step that moves along x by part of a vertex a step."""
+    """Return a step that moves 0.3 vertices along x per time step."""
     t, x = np.arange(shape[0])[:, None, None, None], np.arange(shape[3])
     return np.broadcast_to(
         np.where(x > chance.uniform(0, shape[3]) + 0.3 * t, 1.0, 0.0), shape
@@ -38,7 +41,7 @@ def front(chance: np.random.Generator, shape: Shape) -> np.ndarray:
 
 
 def spikes(chance: np.random.Generator, shape: Shape) -> np.ndarray:
-    """Nothing but a few vertices."""
+    """Return zeros with a few random vertices."""
     return np.where(chance.random(shape) < 0.02, chance.normal(0, 1, shape), 0.0)
 
 
@@ -60,7 +63,8 @@ KINDS = {
 
 @st.composite
 def fields(draw: Draw) -> np.ndarray:
-    """A series (t, z, y, x) of some structure, type, size of values and offset; floats with holes."""
+    """Draw a series (t, z, y, x): its structure, type, magnitude and offset; floats also with
+    holes."""
     shape = tuple(draw(st.integers(1, most)) for most in (6, 9, 12, 17))
     chance = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     values = KINDS[draw(st.sampled_from(sorted(KINDS)))](chance, shape)
@@ -74,7 +78,7 @@ def fields(draw: Draw) -> np.ndarray:
         ).astype(dtype)
     power = draw(st.integers(-4, 3) if dtype.itemsize == 2 else st.integers(-30, 30))
     offset = draw(st.sampled_from([0.0, 0.0, 1.0, -1e3]))
-    with np.errstate(over="ignore"):  # what is beyond float16 is infinite, as in other files
+    with np.errstate(over="ignore"):  # values beyond float16 become infinite
         values = ((values + offset) * 10.0**power).astype(dtype)
     holes = draw(st.sampled_from([0.0, 0.0, 0.01, 0.5]))
     values[chance.random(shape) < holes] = draw(st.sampled_from([np.nan, np.inf, -np.inf]))
@@ -83,7 +87,8 @@ def fields(draw: Draw) -> np.ndarray:
 
 @st.composite
 def settings(draw: Draw, values: np.ndarray) -> EncodeConfig:
-    """Settings that do not contradict themselves; features and bounds about as large as the values."""
+    """Draw settings that do not contradict each other, with features and bounds on the scale of the
+    values."""
     finite = values[np.isfinite(values)].astype(np.float64)
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     common: dict[str, Any] = {
@@ -132,12 +137,12 @@ def settings(draw: Draw, values: np.ndarray) -> EncodeConfig:
 
 @st.composite
 def tasks(draw: Draw) -> tuple[np.ndarray, EncodeConfig]:
-    """A series and settings for it."""
+    """Draw a series and settings for it."""
     values = draw(fields())
     return values, draw(settings(values))
 
 
-@looking(30, 1000)
+@looking(15, 1000)
 @given(task=tasks())
 @example(task=(np.zeros((1, 1, 1, 1)), EncodeConfig(max_error_rel=0.0)))
 def test_any_settings_keep_their_promise_or_are_refused_in_one_line(
@@ -173,22 +178,20 @@ def check(
     figures: dict[str, Any],
     missed: str,
 ) -> None:
-    """What was promised, and what is said of the file, against the values themselves."""
-    given, finite, found = values.astype(np.float64), np.isfinite(values), np.isfinite(decoded)
+    """Compare the promise and the stated figures with the decoded values."""
+    original, finite, kept = values.astype(np.float64), np.isfinite(values), np.isfinite(decoded)
     assert decoded.shape == values.shape
     assert not np.isinf(decoded).any()
-    assert not found[~finite].any()
-    if (
-        config.key_frames != "all"
-    ):  # of other steps the model knows what is between them, where they have values
+    assert not kept[~finite].any()
+    if config.key_frames != "all":  # other steps are finite where the key frames beside them are
         pass
     elif config.features == ("all",):
-        assert (found == finite).all()
+        assert (kept == finite).all()
     elif config.features[0].startswith("interval"):
         ends = [float(end) for end in config.features[0].split(":")[1:]]
-        assert found[finite & (given >= ends[0]) & (given <= ends[1])].all()
-    errors = np.abs(decoded[found] - given[found])
-    span = float(given[finite].max() - given[finite].min())
+        assert kept[finite & (original >= ends[0]) & (original <= ends[1])].all()
+    errors = np.abs(decoded[kept] - original[kept])
+    span = float(original[finite].max() - original[finite].min())
     largest, squares = float(errors.max()), float(np.sqrt(np.mean((errors / (span or 1.0)) ** 2)))
     assert math.isclose(largest, figures["max_abs_error"], rel_tol=1e-9), (
         largest,
@@ -205,5 +208,5 @@ def check(
     assert missed or largest <= bound
     if config.psnr is not None and span > 0:
         assert missed or psnr >= config.psnr - 1e-9
-    if missed:  # and the miss is true
+    if missed:  # the miss is real
         assert largest > bound or psnr < (config.psnr if config.psnr is not None else 50.0)

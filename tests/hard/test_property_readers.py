@@ -1,4 +1,4 @@
-"""Any numbers, in any order of the axes, byte order, chunking and packing, come out of every reader as they are."""
+"""Any numbers, axis order, byte order, chunking and packing come out of every reader unchanged."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ORDERS = st.permutations(AXES)
 
 @contextmanager
 def folder() -> Iterator[Path]:
-    """A new folder for each example, which a fixture would not be."""
+    """A new folder for each example; a fixture would give all examples the same one."""
     with tempfile.TemporaryDirectory(prefix="fhash-") as path:
         yield Path(path)
 
@@ -41,7 +41,7 @@ def read(path: Path, **options: object) -> np.ndarray:
 
 
 def turned(values: np.ndarray, order: list[str]) -> np.ndarray:
-    """The values (t, z, y, x) with their axes in another order."""
+    """Return the values (t, z, y, x) with their axes in another order."""
     return values.transpose([AXES.index(axis) for axis in order])
 
 
@@ -107,7 +107,7 @@ def test_zarr(values: np.ndarray, order: list[str], form: int, data: Draw) -> No
     chunk = data.draw(chunks(stored.shape))
     names = {} if form == 2 else {"dimension_names": order}
     with folder() as place, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of float16 and the like
+        warnings.simplefilter("ignore")  # on float16 and similar types
         array = zarr.create_array(
             place / "a.zarr",
             shape=stored.shape,
@@ -123,7 +123,7 @@ def test_zarr(values: np.ndarray, order: list[str], form: int, data: Draw) -> No
 @looking(15)
 @given(values=arrays(), order=ORDERS, data=st.data())
 def test_zarr_without_some_of_its_chunks(values: np.ndarray, order: list[str], data: Draw) -> None:
-    """Chunks never written are the array's fill value, whatever that is."""
+    """Chunks that were never written hold the fill value of the array, whatever it is."""
     import zarr
 
     stored = turned(values, order)
@@ -150,7 +150,7 @@ def test_zarr_without_some_of_its_chunks(values: np.ndarray, order: list[str], d
 @looking(12)
 @given(values=arrays((*INTEGERS, "float32", "float64")), order=ORDERS, data=st.data())
 def test_netcdf_with_fill_values(values: np.ndarray, order: list[str], data: Draw) -> None:
-    """Where a value is the fill value there is NaN; integers become the float that xarray makes of them."""
+    """The fill value becomes NaN; integers become the float type that xarray gives them."""
     pytest.importorskip("h5netcdf")
     import h5netcdf
 
@@ -176,10 +176,10 @@ def test_netcdf_with_fill_values(values: np.ndarray, order: list[str], data: Dra
                 "v", dimensions, stored.dtype, data=stored, fillvalue=fill, chunks=chunk
             )
             assert variable.shape == stored.shape
-        found = read(place / "a.nc")
-        np.testing.assert_array_equal(found.astype(expected.dtype), expected)
+        values_read = read(place / "a.nc")
+        np.testing.assert_array_equal(values_read.astype(expected.dtype), expected)
         if fill is not None:
-            assert found.dtype == expected.dtype
+            assert values_read.dtype == expected.dtype
 
 
 @looking(15)
@@ -189,7 +189,7 @@ def test_netcdf_with_fill_values(values: np.ndarray, order: list[str], data: Dra
     data=st.data(),
 )
 def test_what_a_writer_wrote_a_reader_reads(values: np.ndarray, suffix: str, data: Draw) -> None:
-    """With ascending coordinates of any spacing, and a name and units of any letters."""
+    """The coordinates ascend with any spacing; name and units consist of any letters."""
     steps = st.floats(1e-6, 1e6)
     coords = {}
     for axis, length in zip(AXES, values.shape, strict=True):
@@ -208,9 +208,9 @@ def test_what_a_writer_wrote_a_reader_reads(values: np.ndarray, suffix: str, dat
         with open_series(
             path, raw=layout, axes=None if suffix in ("h5", "nc", "zarr") else "t,z,y,x"
         ) as series:
-            found = np.stack(list(series.frames()))
+            values_read = np.stack(list(series.frames()))
             exact = values.astype(series.dtype)
-            assert same(found, exact)
+            assert same(values_read, exact)
             assert same(exact.astype(values.dtype), values)
             if suffix in ("h5", "nc", "zarr"):
                 assert series.units == units

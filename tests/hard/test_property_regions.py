@@ -1,4 +1,5 @@
-"""Any part of any volume is that part of the whole: indices as numpy takes them, regions, times, levels of detail."""
+"""Any part of a volume equals that part of all values: numpy's indices, regions, times, levels of
+detail."""
 
 from __future__ import annotations
 
@@ -38,7 +39,7 @@ SETTINGS = {
 
 
 def field(shape: tuple[int, ...] = SHAPE) -> np.ndarray:
-    """Waves with holes, (t, z, y, x) float32."""
+    """Return waves with holes, float32 (t, z, y, x)."""
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
     values = (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z).astype(np.float32)
     values[1:2, 2:3, 3:4, :] = np.nan
@@ -49,7 +50,7 @@ def field(shape: tuple[int, ...] = SHAPE) -> np.ndarray:
 def volume(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Volume, np.ndarray]]:
-    """An open volume and the whole of it."""
+    """An open volume and all its values."""
     path = tmp_path_factory.mktemp("regions") / "a.fhz"
     fhash_codec.encode(field(), path, SETTINGS[request.param])
     with fhash_codec.open(path) as opened:
@@ -57,7 +58,7 @@ def volume(
 
 
 def boxes(shape: tuple[int, ...]) -> st.SearchStrategy[tuple[tuple[int, int], ...]]:
-    """Regions (z, y, x) with at least one vertex."""
+    """Draw regions (z, y, x) with at least one vertex."""
     return st.tuples(
         *(
             st.integers(0, n - 1).flatmap(
@@ -68,16 +69,16 @@ def boxes(shape: tuple[int, ...]) -> st.SearchStrategy[tuple[tuple[int, int], ..
     )
 
 
-@looking(150)
+@looking(60)
 @given(index=hnp.basic_indices(SHAPE, allow_newaxis=False, allow_ellipsis=True))
 @example(index=(slice(-1, -100, -3), Ellipsis, -1))
 @example(index=(slice(10**20, None), slice(None, None, -(10**20))))
 def test_any_index_is_numpys(volume: tuple[Volume, np.ndarray], index: object) -> None:
-    part = volume[0][index]  # type: ignore[index]
-    assert same(np.asarray(part), np.asarray(volume[1][index]))  # type: ignore[index]
+    selected = volume[0][index]  # type: ignore[index]
+    assert same(np.asarray(selected), np.asarray(volume[1][index]))  # type: ignore[index]
 
 
-@looking(100)
+@looking(50)
 @given(
     index=st.lists(
         st.one_of(st.integers(-13, 13), st.slices(12), st.just(Ellipsis)), max_size=6
@@ -96,7 +97,7 @@ def test_what_numpy_refuses_is_an_index_error(
         assert same(np.asarray(volume[0][index]), np.asarray(expected))
 
 
-@looking(80)
+@looking(30)
 @given(
     region=boxes(SHAPE[1:]),
     t=st.floats(0, SHAPE[0] - 1),
@@ -119,7 +120,7 @@ def test_a_region_of_a_level_of_detail_is_that_part_of_it(
 ) -> None:
     opened = volume[0]
     try:
-        whole, all_of_it = opened.read_lod(step, lod), opened.lod_vertices(lod)
+        level, all_of_it = opened.read_lod(step, lod), opened.lod_vertices(lod)
     except InputError:
         assert opened.profile == "paper"
         return
@@ -134,26 +135,26 @@ def test_a_region_of_a_level_of_detail_is_that_part_of_it(
         )
         return
     place = tuple(
-        slice(every.index(part[0]), every.index(part[-1]) + 1)
-        for every, part in zip(all_of_it, vertices, strict=True)
+        slice(every.index(kept[0]), every.index(kept[-1]) + 1)
+        for every, kept in zip(all_of_it, vertices, strict=True)
     )
-    assert same(opened.read_lod(step, lod, region), whole[place])
+    assert same(opened.read_lod(step, lod, region), level[place])
 
 
-@looking(40)
+@looking(30)
 @given(data=st.data())
 def test_points_on_vertices_have_the_values_there(
     volume: tuple[Volume, np.ndarray], data: Draw
 ) -> None:
-    opened, whole = volume
+    opened, all_values = volume
     count = data.draw(st.integers(1, 8))
     t, z, y, x = (
         np.array(data.draw(st.lists(st.integers(0, n - 1), min_size=count, max_size=count)))
         for n in SHAPE
     )
-    found, expected = opened.sample(t=t, z=z, y=y, x=x), whole[t, z, y, x]
-    assert (np.isnan(found) == np.isnan(expected)).all()
-    np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-6)
+    sampled, expected = opened.sample(t=t, z=z, y=y, x=x), all_values[t, z, y, x]
+    assert (np.isnan(sampled) == np.isnan(expected)).all()
+    np.testing.assert_allclose(sampled, expected, rtol=2e-5, atol=2e-6)
 
 
 @contextmanager
@@ -165,7 +166,7 @@ def encoded(values: np.ndarray, config: EncodeConfig) -> Iterator[Volume]:
             yield opened
 
 
-@looking(30, 500)
+@looking(15, 500)
 @given(
     shape=hnp.array_shapes(min_dims=4, max_dims=4, min_side=1, max_side=9),
     dtype=st.sampled_from(["int8", "uint16", "int64", "uint64", "float16", "float32", "float64"]),
@@ -187,7 +188,7 @@ def test_any_series_of_any_tiles_keeps_its_bound_and_its_regions(
         least, most = (
             max(limits.min, -(2**53)),
             min(limits.max, 2**53),
-        )  # a volume decodes integers to floats
+        )  # volumes decode integers to float64
         values = random.integers(least, most, shape, dtype=kind, endpoint=True)
     tile = "x".join(str(data.draw(st.integers(1, 12))) for _ in range(4))
     config = (
@@ -196,14 +197,17 @@ def test_any_series_of_any_tiles_keeps_its_bound_and_its_regions(
         else EncodeConfig(effort=1, tile=tile, max_error=0.0)
     )
     with encoded(values, config) as opened:
-        whole = opened[...]
+        all_values = opened[...]
         index = data.draw(hnp.basic_indices(shape, allow_newaxis=False))
-        assert same(np.asarray(opened[index]), np.asarray(whole[index]))
+        assert same(np.asarray(opened[index]), np.asarray(all_values[index]))
         finite = np.isfinite(values)
-        assert (np.isfinite(whole) == finite).all()
+        assert (np.isfinite(all_values) == finite).all()
         exact = [float(value) for value in values[finite]]
         error = max(
-            (abs(float(found) - value) for found, value in zip(whole[finite], exact, strict=True)),
+            (
+                abs(float(decoded) - value)
+                for decoded, value in zip(all_values[finite], exact, strict=True)
+            ),
             default=0.0,
         )
         rounding = max(map(abs, exact)) * np.finfo(opened.dtype).eps

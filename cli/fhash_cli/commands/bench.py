@@ -1,4 +1,4 @@
-"""`fhash bench`: how fast this machine is and how small files get, with what it was measured on."""
+"""`fhash bench`: measures speed and size on this machine, beside other codecs and engines."""
 
 from __future__ import annotations
 
@@ -50,7 +50,10 @@ class EnginesType(click.ParamType[tuple[str, ...]]):
 
 
 class NamesType(click.ParamType[str]):
-    """One of the names of a bench, or 'none'; they are looked up when one is given, so that --help loads nothing."""
+    """One of the names of a bench, or 'none'.
+
+    Names are looked up only when one is given, so that --help loads nothing.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -113,9 +116,10 @@ def train(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Train the model of DATA with each engine for a while, in turns; speeds in million samples a second.
+    """Train the model of DATA with each engine in turns; speeds in million samples a second.
 
-    "of peak" is the arithmetic of the network over the rate of a large matrix product measured in the same run.
+    "of peak" is the arithmetic of the network over the rate of a large matrix product, which is
+    measured in the same run.
     """
     from fhash_codec.config import ENGINES
 
@@ -129,7 +133,7 @@ def train(
 
 
 def _text(result: dict[str, Any]) -> str:
-    """A row of figures for each engine, and what they were taken on."""
+    """A row of figures for each engine, and the machine."""
     header = (
         "engine",
         "train M/s",
@@ -219,10 +223,11 @@ def rate(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Compare the bytes that fhash and other codecs need for DATA at equal quality, and their speed.
+    """Compare fhash with other codecs: bytes that DATA needs at equal quality, and speed.
 
-    Without --target and --bound: 35, 40, 45, 50 and 60 dB, and bounds of 5, 2, 1, 0.5 and 0.1 % of the range. Quality is that of what is
-    really decoded. DATA is held in memory whole. The other codecs come with pip install 'fhash[bench]'.
+    Without --target and --bound: 35, 40, 45, 50 and 60 dB, and bounds of 5, 2, 1, 0.5 and 0.1 % of
+    the range. Quality is measured on the decoded values. DATA is held in memory. The other codecs
+    come with pip install 'fhash[bench]'.
     """
     if plot is not None:
         check_writable(plot, force, sources=[data])
@@ -255,7 +260,38 @@ def rate(
 
 
 def _rate_text(result: RateBench) -> str:
-    """Tables of bytes, speed and access, and how they were taken."""
+    """Tables of bytes, speed and access, and notes on how they were measured."""
+    lines = [_bytes_table(result)]
+    if any(point.as_asked is False for point in result.points):
+        lines.append(
+            "* its own tolerance of this bound does not keep it;"
+            " a tighter one was taken where one does"
+        )
+    short = {point.codec: point for point in result.points if not point.reached}
+    lines += [
+        f"{codec} does not reach all: {number(point.psnr, 'dB')} in {point.bytes:,} bytes"
+        for codec, point in short.items()
+    ]
+    if result.speeds:
+        lines.append("\n" + _speed_table(result))
+    if result.access:
+        lines.append("\n" + _access_table(result))
+    lines += [
+        "",
+        f"{result.series}, {result.dtype} {extent(result.shape)}, {size(result.raw_bytes)}",
+        *result.notes,
+    ]
+    if result.missing:
+        lines.append(
+            f"{result.missing:,} values are not finite;"
+            " lossy peers were given neighbouring values in their place"
+        )
+    lines += [f"not measured: {reason}" for reason in result.refused.values()]
+    return "\n".join(lines)
+
+
+def _bytes_table(result: RateBench) -> str:
+    """A row for each quality: bytes of each codec, and how many times larger the best peer is."""
     codecs = list(dict.fromkeys(point.codec for point in result.points))
     points = {(point.goal, point.asked, point.codec): point for point in result.points}
     best = result.best_peers()
@@ -270,48 +306,34 @@ def _rate_text(result: RateBench) -> str:
             cells.append(f"{point.bytes:,}{broken}" if point is not None and point.reached else "-")
         name = f"{asked:g} dB" if goal == "psnr" else f"within {100 * asked:g} %"
         rows.append((name, *cells, *(number(row["ratios"][codec], "x", digits=3) for codec in own)))
-    parts = [table(rows)]
-    if any(point.as_asked is False for point in result.points):
-        parts.append(
-            "* its own tolerance of this bound does not keep it; a tighter one was taken where one does"
+    return table(rows)
+
+
+def _speed_table(result: RateBench) -> str:
+    """A row for each codec: PSNR, and speed of encoding and decoding."""
+    rows = [
+        (
+            speed.codec,
+            number(speed.psnr, "dB"),
+            number(speed.encode_mb_s, digits=3),
+            number(speed.decode_mb_s, digits=3),
         )
-    short = {point.codec: point for point in result.points if not point.reached}
-    parts += [
-        f"{codec} does not reach all: {number(point.psnr, 'dB')} in {point.bytes:,} bytes"
-        for codec, point in short.items()
+        for speed in result.speeds
     ]
-    if result.speeds:
-        speeds = [
-            (
-                speed.codec,
-                number(speed.psnr, "dB"),
-                number(speed.encode_mb_s, digits=3),
-                number(speed.decode_mb_s, digits=3),
-            )
-            for speed in result.speeds
-        ]
-        parts.append("\n" + table([("speed", "PSNR", "encode MB/s", "decode MB/s"), *speeds]))
-    if result.access:
-        region = f"{extent(result.access[0].region)} of a step"
-        access = [
-            (
-                entry.setting,
-                number(entry.psnr, "dB"),
-                f"{entry.bytes:,}",
-                number(entry.milliseconds, digits=3),
-                f"{entry.bytes_read:,}",
-            )
-            for entry in result.access
-        ]
-        parts.append("\n" + table([(region, "PSNR", "bytes", "ms", "bytes read"), *access]))
-    parts += [
-        "",
-        f"{result.series}, {result.dtype} {extent(result.shape)}, {size(result.raw_bytes)}",
-        *result.notes,
-    ]
-    if result.missing:
-        parts.append(
-            f"{result.missing:,} values are not finite; lossy peers were given neighbouring values in their place"
+    return table([("speed", "PSNR", "encode MB/s", "decode MB/s"), *rows])
+
+
+def _access_table(result: RateBench) -> str:
+    """A row for each codec and layout: time and bytes that a small region takes."""
+    rows = [
+        (
+            entry.setting,
+            number(entry.psnr, "dB"),
+            f"{entry.bytes:,}",
+            number(entry.milliseconds, digits=3),
+            f"{entry.bytes_read:,}",
         )
-    parts += [f"not measured: {reason}" for reason in result.refused.values()]
-    return "\n".join(parts)
+        for entry in result.access
+    ]
+    region = f"{extent(result.access[0].region)} of a step"
+    return table([(region, "PSNR", "bytes", "ms", "bytes read"), *rows])

@@ -1,7 +1,8 @@
-"""`fhash bench render`: what pictures cost, beside VTK, and their quality against time."""
+"""`fhash bench render`: measures the time and quality of pictures, beside VTK."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,11 @@ from fhash_cli.options import check_writable, force_option, json_option, quiet_o
 from fhash_cli.output import Progress, emit, extent, number, table
 
 if TYPE_CHECKING:
-    from fhash_codec.bench.pictures.results import RenderBench
+    from fhash_codec.bench.pictures.results import RenderBench, Switch
 
 
 class PartType(click.ParamType[str]):
-    """A part of the bench; they are looked up when one is given, so that --help loads nothing."""
+    """Name of a part of the bench, looked up only when one is given: --help loads nothing."""
 
     name = "part"
 
@@ -42,7 +43,8 @@ class PartType(click.ParamType[str]):
     "parts",
     type=PartType(),
     multiple=True,
-    help="effects, accelerations, streams, vtk, exactness, playback or curves; repeat. Default: all.",
+    help="effects, accelerations, streams, vtk, exactness, playback or curves; repeat."
+    " Default: all.",
 )
 @click.option(
     "--size",
@@ -81,9 +83,10 @@ def render(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Measure pictures of RUN.fhz: each effect and acceleration on and off, ways to march, VTK's ray casters, quality against time.
+    """Measure pictures of RUN.fhz: effects, accelerations, marchers, VTK's ray casters, quality.
 
-    VTK comes with pip install 'fhash[vtk]'; without it what it is needed for is left out. Every variant of a comparison runs in turns.
+    Each effect and acceleration is measured on and off; the variants of a comparison run in turns.
+    VTK comes with pip install 'fhash[vtk]'; without it the comparisons with VTK are left out.
     """
     if plot is not None:
         check_writable(plot, force, sources=[run])
@@ -110,125 +113,147 @@ def render(
     emit(result.to_dict(), _render_text(result), as_json)
 
 
+Rows = list[tuple[str, ...]]
+
+
 def _render_text(result: RenderBench) -> str:
-    """A table for each part, and how they were taken."""
-    parts = []
-
-    def add(*rows: tuple[str, ...]) -> None:
-        if len(rows) > 1:
-            parts.append(table(rows) + "\n")
-
-    def ms(value: float) -> str:
-        return number(value, digits=3)
-
-    for title, switches in (("effect", result.effects), ("acceleration", result.accelerations)):
-        add(
-            (
-                title,
-                "off ms",
-                "on ms",
-                "on / off",
-                "samples off",
-                "samples on",
-                *(("PSNR",) if title == "acceleration" else ()),
-            ),
-            *(
-                (
-                    each.name,
-                    ms(each.off_ms),
-                    ms(each.on_ms),
-                    number(each.ratio, "x", digits=3),
-                    f"{each.counters_off['samples']:,}",
-                    f"{each.counters_on['samples']:,}",
-                    *((_decibels(each.psnr),) if title == "acceleration" else ()),
-                )
-                for each in switches
-            ),
-        )
-    add(
-        ("march", "ms", "passes", "samples", "evaluations", "PSNR", "largest"),
-        *(
-            (
-                each.mode if each.budget is None else f"{each.mode}, N_r {each.budget:,}",
-                ms(each.milliseconds),
-                f"{each.passes:,}",
-                f"{each.samples:,}",
-                f"{each.evaluations:,}",
-                _decibels(each.psnr),
-                number(each.largest, digits=2),
-            )
-            for each in result.streams
-        ),
-    )
-    add(
-        ("beside VTK", "size", "ours ms", "whole ms", "VTK ms", "VTK / ours", "PSNR", "SSIM"),
-        *(
-            (
-                _lit(each.scene, each.shaded),
-                str(each.size),
-                ms(each.ours_ms),
-                ms(each.whole_ms),
-                ms(each.vtk_ms),
-                number(each.ratio, "x", digits=3),
-                _decibels(each.psnr),
-                number(each.ssim),
-            )
-            for each in result.against
-        ),
-    )
-    add(
-        ("VTK on software OpenGL", "size", "step", "PSNR", "SSIM", "largest", "by its rules"),
-        *(
-            (
-                _lit(each.scene, bool(each.gradient))
-                + (", central differences" if each.gradient == "central" else ""),
-                str(each.size),
-                f"{each.step:g}",
-                _decibels(each.psnr),
-                number(each.ssim),
-                str(each.largest),
-                _decibels(each.explained),
-            )
-            for each in result.exactness
-        ),
-    )
-    add(
-        ("playback", "size", "steps", "ours ms", "VTK ms", "ours / VTK"),
-        *(
-            (
-                _lit(each.scene, each.shaded),
-                str(each.size),
-                str(each.steps),
-                ms(each.ours_ms),
-                ms(each.vtk_ms),
-                number(each.ratio, "x", digits=3),
-            )
-            for each in result.playback
-        ),
-    )
-    add(
-        ("knob", "value", "ms", "samples", "PSNR"),
-        *(
-            (
-                each.knob,
-                f"{each.value:.4g}",
-                ms(each.milliseconds),
-                f"{each.samples:,}",
-                _decibels(each.psnr),
-            )
-            for each in result.curves
-        ),
-    )
+    """A table for each part that was measured, and notes on how."""
+    lines = [table(rows) + "\n" for rows in _tables(result) if len(rows) > 1]
     facts = ", ".join(f"{name} {fact}" for name, fact in result.machine.items())
-    parts.append(
-        f"{result.series}, {extent(result.shape)}, step {result.step:g}, {result.size} x {result.size}, medians of {result.turns}"
-    )
-    parts += [
+    lines += [
+        f"{result.series}, {extent(result.shape)}, step {result.step:g},"
+        f" {result.size} x {result.size}, medians of {result.turns}",
         *result.notes,
         facts,
         *(f"not measured: {part}: {reason}" for part, reason in result.refused.items()),
     ]
-    return "\n".join(parts)
+    return "\n".join(lines)
+
+
+def _tables(result: RenderBench) -> Iterator[Rows]:
+    """Every table of the bench: a heading, and a row for each measurement."""
+    yield _switches("effect", result.effects)
+    yield _switches("acceleration", result.accelerations, psnr=True)
+    yield _streams(result)
+    yield _beside_vtk(result)
+    yield _exactness(result)
+    yield _playback(result)
+    yield _curves(result)
+
+
+def _switches(title: str, switches: Sequence[Switch], *, psnr: bool = False) -> Rows:
+    """Time and samples of pictures with something off and on; psnr: of one against the other."""
+    heading = (title, "off ms", "on ms", "on / off", "samples off", "samples on")
+    rows: Rows = [(*heading, "PSNR") if psnr else heading]
+    for switch in switches:
+        row = (
+            switch.name,
+            _ms(switch.off_ms),
+            _ms(switch.on_ms),
+            number(switch.ratio, "x", digits=3),
+            f"{switch.counters_off['samples']:,}",
+            f"{switch.counters_on['samples']:,}",
+        )
+        rows.append((*row, _decibels(switch.psnr)) if psnr else row)
+    return rows
+
+
+def _streams(result: RenderBench) -> Rows:
+    """Time, passes and quality of the marchers that evaluate the model itself."""
+    return [
+        ("march", "ms", "passes", "samples", "evaluations", "PSNR", "largest"),
+        *(
+            (
+                run.mode if run.budget is None else f"{run.mode}, N_r {run.budget:,}",
+                _ms(run.milliseconds),
+                f"{run.passes:,}",
+                f"{run.samples:,}",
+                f"{run.evaluations:,}",
+                _decibels(run.psnr),
+                number(run.largest, digits=2),
+            )
+            for run in result.streams
+        ),
+    ]
+
+
+def _beside_vtk(result: RenderBench) -> Rows:
+    """Time and likeness of pictures beside those of VTK's fixed-point ray caster."""
+    return [
+        ("beside VTK", "size", "ours ms", "whole ms", "VTK ms", "VTK / ours", "PSNR", "SSIM"),
+        *(
+            (
+                _lit(pair.scene, pair.shaded),
+                str(pair.size),
+                _ms(pair.ours_ms),
+                _ms(pair.whole_ms),
+                _ms(pair.vtk_ms),
+                number(pair.ratio, "x", digits=3),
+                _decibels(pair.psnr),
+                number(pair.ssim),
+            )
+            for pair in result.against
+        ),
+    ]
+
+
+def _exactness(result: RenderBench) -> Rows:
+    """Likeness of pictures to those of VTK's GPU mapper on software OpenGL."""
+    return [
+        ("VTK on software OpenGL", "size", "step", "PSNR", "SSIM", "largest", "by its rules"),
+        *(
+            (
+                _lit(pair.scene, bool(pair.gradient))
+                + (", central differences" if pair.gradient == "central" else ""),
+                str(pair.size),
+                f"{pair.step:g}",
+                _decibels(pair.psnr),
+                number(pair.ssim),
+                str(pair.largest),
+                _decibels(pair.explained),
+            )
+            for pair in result.exactness
+        ),
+    ]
+
+
+def _playback(result: RenderBench) -> Rows:
+    """Time of playing all steps, beside VTK."""
+    return [
+        ("playback", "size", "steps", "ours ms", "VTK ms", "ours / VTK"),
+        *(
+            (
+                _lit(run.scene, run.shaded),
+                str(run.size),
+                str(run.steps),
+                _ms(run.ours_ms),
+                _ms(run.vtk_ms),
+                number(run.ratio, "x", digits=3),
+            )
+            for run in result.playback
+        ),
+    ]
+
+
+def _curves(result: RenderBench) -> Rows:
+    """Quality against time for each knob: step length, threshold, level of detail."""
+    return [
+        ("knob", "value", "ms", "samples", "PSNR"),
+        *(
+            (
+                point.knob,
+                f"{point.value:.4g}",
+                _ms(point.milliseconds),
+                f"{point.samples:,}",
+                _decibels(point.psnr),
+            )
+            for point in result.curves
+        ),
+    ]
+
+
+def _ms(value: float) -> str:
+    return number(value, digits=3)
 
 
 def _decibels(psnr: float | None) -> str:

@@ -1,8 +1,9 @@
-"""`fhash decode`: a region of a container at any steps or times, as a file or as a short table of statistics."""
+"""`fhash decode`: rebuilds a region of a container as a file, or prints statistics of it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from fhash_codec import Volume
+    from fhash_codec.progress import Progress as Callback
 
 TYPES = (
     "float16",
@@ -119,13 +121,7 @@ def command(
     quiet: bool,
 ) -> None:
     """Rebuild a region of RUN.fhz; without -o, print statistics of it."""
-    import numpy as np
-
     import fhash_codec
-    from fhash_codec.isosurface import isosurface as surface
-    from fhash_codec.isosurface import require_marching_cubes
-    from fhash_formats import Region, save_region
-    from fhash_formats.writers.mesh import check_mesh_output, save_mesh
 
     if steps is not None and times:
         raise click.UsageError("--t and --time exclude each other")
@@ -133,6 +129,37 @@ def command(
         raise click.UsageError("--roi and --box exclude each other")
     if lod is not None and outside != "nan":
         raise click.UsageError("--lod has NaN outside the coreset; leave out --outside")
+    _check_output(output, isosurface, dtype, force, run)
+    with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
+        selection = Selection.of(volume, steps, times, roi, box, lod, outside, dtype)
+        statistics = Statistics()
+        frames = selection.frames(volume, statistics, progress)
+        paths: list[str] = []
+        if output is None:
+            for _ in frames:
+                pass
+        elif isosurface is not None:
+            paths = _save_surface(output, isosurface, volume, selection, frames, force, run)
+        else:
+            paths = _save_region(output, volume, selection, frames, force, run)
+        result = {
+            "paths": paths,
+            "shape": selection.shape,
+            "dtype": selection.kind.name,
+            "steps": selection.steps,
+            "region": [(vertices.start, vertices.stop) for vertices in selection.vertices],
+            **statistics.result(),
+        }
+        emit(result, table(_rows(result, volume.units)), as_json)
+
+
+def _check_output(
+    output: str | None, isosurface: float | None, dtype: str | None, force: bool, run: str
+) -> None:
+    """Refuse an output before any work."""
+    from fhash_codec.isosurface import require_marching_cubes
+    from fhash_formats.writers.mesh import check_mesh_output
+
     if isosurface is not None:
         if output is None or dtype is not None:
             raise click.UsageError(
@@ -142,72 +169,134 @@ def command(
         require_marching_cubes()
     elif output is not None:
         check_writable(output, force, region=True, sources=[run])
-    with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Frames that the options select of an open container, and how their values are given.
+
+    Attributes:
+        steps: step indices, fractional for times between steps.
+        region: vertices ((z0, z1), (y0, y1), (x0, x1)) of the domain.
+        vertices: vertices of the domain along z, y and x that a frame has.
+        lod: level of detail, None for every vertex.
+        outside: `nan` or `background`, the values outside the coreset.
+        kind: number type of the output.
+    """
+
+    steps: list[float]
+    region: tuple[Span, Span, Span]
+    vertices: tuple[range, range, range]
+    lod: int | None
+    outside: Literal["nan", "background"]
+    kind: np.dtype[Any]
+
+    @classmethod
+    def of(
+        cls,
+        volume: Volume,
+        steps: slice | None,
+        times: tuple[float, ...],
+        roi: Sequence[Sequence[int | None]] | None,
+        box: Sequence[Sequence[float | None]] | None,
+        lod: int | None,
+        outside: Literal["nan", "background"],
+        dtype: str | None,
+    ) -> Selection:
+        """Resolve the options; raises RegionError where they leave the series or its domain."""
+        import numpy as np
+
         chosen = [volume.step_of_time(time) for time in times] if times else steps_of(volume, steps)
         region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
-        # A level of detail has its own vertices, those of the feature bounding box that lie in the region.
+        # A level of detail has its own vertices: those of the feature bounding box in the region.
         z, y, x = (
             (range(low, high) for low, high in region)
             if lod is None
             else volume.lod_vertices(lod, region)
         )
-        kind = np.dtype(dtype or volume.dtype)
-        statistics = Statistics()
+        return cls(
+            steps=chosen,
+            region=region,
+            vertices=(z, y, x),
+            lod=lod,
+            outside=outside,
+            kind=np.dtype(dtype or volume.dtype),
+        )
 
-        def frames() -> Iterator[npt.NDArray[Any]]:
-            for done, step in enumerate(chosen):
-                frame = (
-                    volume.read(step, region, outside=outside)
-                    if lod is None
-                    else volume.read_lod(step, lod, region)
-                )
-                statistics.add(frame, _inside(volume, step, region, frame, outside))
-                yield convert(frame, kind, filled=outside == "background")
-                progress("decoding", done + 1, len(chosen))
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Shape (t, z, y, x) of the output."""
+        z, y, x = self.vertices
+        return len(self.steps), len(z), len(y), len(x)
 
-        shape = (len(chosen), len(z), len(y), len(x))
-        paths = []
-        if output is not None and isosurface is not None:
-            if len(chosen) != 1:
-                raise InputError(
-                    f"--isosurface is of one step; {len(chosen)} were chosen: give --t N or --time T"
-                )
-            coords = coordinates(volume, chosen, (z, y, x))
-            (frame,) = frames()
-            mesh = surface(
-                frame, isosurface, coords, name=volume.name, time=float(coords["t"].values[0])
+    def frames(
+        self, volume: Volume, statistics: Statistics, progress: Callback
+    ) -> Iterator[npt.NDArray[Any]]:
+        """Decode the frames (z, y, x) one by one; each is added to the statistics."""
+        for done, step in enumerate(self.steps):
+            frame = (
+                volume.read(step, self.region, outside=self.outside)
+                if self.lod is None
+                else volume.read_lod(step, self.lod, self.region)
             )
-            paths = [str(save_mesh(output, mesh, force=force, sources=[run]))]
-        elif output is None:
-            for _ in frames():
-                pass
-        else:
-            whole = Region(
-                name=volume.name,
-                units=volume.units,
-                dtype=kind,
-                shape=shape,
-                coords=coordinates(volume, chosen, (z, y, x)),
-                attributes=volume.attrs,
-            )
-            paths = [
-                str(path)
-                for path in save_region(output, whole, frames(), force=force, sources=[run])
-            ]
-        within = [(part.start, part.stop) for part in (z, y, x)]
-        result = {
-            "paths": paths,
-            "shape": shape,
-            "dtype": kind.name,
-            "steps": chosen,
-            "region": within,
-            **statistics.result(),
-        }
-        emit(result, table(_rows(result, volume.units)), as_json)
+            statistics.add(frame, _inside(volume, step, self.region, frame, self.outside))
+            yield convert(frame, self.kind, filled=self.outside == "background")
+            progress("decoding", done + 1, len(self.steps), "")
+
+
+def _save_surface(
+    output: str,
+    isosurface: float,
+    volume: Volume,
+    selection: Selection,
+    frames: Iterator[npt.NDArray[Any]],
+    force: bool,
+    run: str,
+) -> list[str]:
+    """Write the isosurface of the one selected step; the paths written."""
+    from fhash_codec.isosurface import isosurface as surface
+    from fhash_formats.writers.mesh import save_mesh
+
+    if len(selection.steps) != 1:
+        raise InputError(
+            f"--isosurface is of one step; {len(selection.steps)} were chosen:"
+            " give --t N or --time T"
+        )
+    coords = coordinates(volume, selection.steps, selection.vertices)
+    (frame,) = frames
+    time = float(coords["t"].values[0])
+    mesh = surface(frame, isosurface, coords, name=volume.name, time=time)
+    return [str(save_mesh(output, mesh, force=force, sources=[run]))]
+
+
+def _save_region(
+    output: str,
+    volume: Volume,
+    selection: Selection,
+    frames: Iterator[npt.NDArray[Any]],
+    force: bool,
+    run: str,
+) -> list[str]:
+    """Write the frames in the format of the output's suffix; the paths written."""
+    from fhash_formats import Region, save_region
+
+    region = Region(
+        name=volume.name,
+        units=volume.units,
+        dtype=selection.kind,
+        shape=selection.shape,
+        coords=coordinates(volume, selection.steps, selection.vertices),
+        attributes=volume.attrs,
+    )
+    paths = save_region(output, region, frames, force=force, sources=[run])
+    return [str(path) for path in paths]
 
 
 class Statistics:
-    """Smallest, largest and mean value, and the share inside the coreset, of frames that are seen one at a time; NaN is left out."""
+    """Smallest, largest and mean value, and share inside the coreset, of frames added one by one.
+
+    NaN is left out.
+    """
 
     def __init__(self) -> None:
         from fhash_codec.measure.value_range import Mean
@@ -216,29 +305,29 @@ class Statistics:
         self.inside = self.all = 0
 
     def add(self, frame: npt.NDArray[Any], inside: int) -> None:
-        """Take in a frame of any shape, `inside` of whose vertices belong to the coreset."""
+        """Add a frame of any shape; inside: number of its vertices in the coreset."""
         import numpy as np
 
         from fhash_codec.measure.value_range import pieces
 
-        known = frame[~np.isnan(frame)]
+        values = frame[~np.isnan(frame)]
         self.all += frame.size
         self.inside += inside
-        if known.size:
+        if values.size:
             self.low, self.high = (
-                min(self.low, float(known.min())),
-                max(self.high, float(known.max())),
+                min(self.low, float(values.min())),
+                max(self.high, float(values.max())),
             )
-        for piece in pieces(known):
+        for piece in pieces(values):
             self.mean.add(piece)
 
     def result(self) -> dict[str, float | None]:
         """JSON values; None where no vertex has a value."""
-        found = self.mean.count > 0
+        defined = self.mean.count > 0
         return {
-            "min": self.low if found else None,
-            "max": self.high if found else None,
-            "mean": self.mean.value() if found else None,
+            "min": self.low if defined else None,
+            "max": self.high if defined else None,
+            "mean": self.mean.value() if defined else None,
             "inside_fraction": self.inside / self.all,
         }
 
@@ -246,9 +335,10 @@ class Statistics:
 def convert(
     frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any], *, filled: bool = False
 ) -> npt.NDArray[Any]:
-    """A decoded frame in another number type: rounded and clipped for integers; raises InputError where the type cannot hold a value.
+    """Convert a decoded frame to another number type; for integers it is rounded and clipped.
 
-    `filled`: vertices outside the coreset have the background's value, so that NaN is what the data had none for.
+    filled: vertices outside the coreset hold the background's value; NaN means a missing value.
+    Raises InputError where the type cannot hold a value.
     """
     import numpy as np
 
@@ -259,24 +349,27 @@ def convert(
             narrow = frame.astype(kind)
         if np.isinf(narrow).any():
             raise InputError(
-                f"a value of {float(np.nanmax(np.abs(frame))):.6g} does not fit {kind}; choose a wider type"
+                f"a value of {float(np.nanmax(np.abs(frame))):.6g} does not fit {kind};"
+                " choose a wider type"
             )
         return narrow
     if np.isnan(frame).any():
         if filled:
             raise InputError(
-                f"the data have no value (NaN) at some vertices of the region, which {kind} cannot hold; take a float type"
+                "the data have no value (NaN) at some vertices of the region, which"
+                f" {kind} cannot hold; take a float type"
             )
         raise InputError(
-            f"the region holds vertices without a value (NaN), which {kind} cannot hold; add --outside background, or take a float type"
+            f"the region holds vertices without a value (NaN), which {kind} cannot hold;"
+            " add --outside background, or take a float type"
         )
     limits = np.iinfo(kind)
     rounded = np.rint(frame.astype(np.float64))
-    # The largest 64-bit integers have no float64 of their own: the float of the limit lies one above it.
-    full = rounded >= float(limits.max)
-    whole = np.where(full, 0.0, np.maximum(rounded, float(limits.min))).astype(kind)
-    whole[full] = limits.max
-    return np.asarray(whole)
+    # No float64 equals the largest 64-bit integer: the float of the limit lies one above it.
+    clipped = rounded >= float(limits.max)
+    integers = np.where(clipped, 0.0, np.maximum(rounded, float(limits.min))).astype(kind)
+    integers[clipped] = limits.max
+    return np.asarray(integers)
 
 
 def _inside(
@@ -286,7 +379,7 @@ def _inside(
     frame: npt.NDArray[Any],
     outside: str,
 ) -> int:
-    """How many vertices of a decoded frame belong to the coreset."""
+    """Number of vertices of a decoded frame that are in the coreset."""
     import numpy as np
 
     if outside == "nan":

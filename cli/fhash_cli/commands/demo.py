@@ -1,4 +1,4 @@
-"""`fhash demo`: the whole way once, on a small simulation: data, container, comparison, picture."""
+"""`fhash demo`: simulates a small series, encodes it, compares and draws it."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from fhash_formats.series import Series
 
 COLUMNS = 4
+"""Steps that the picture shows side by side."""
 
 
 @click.command("demo")
@@ -53,7 +54,7 @@ COLUMNS = 4
 @json_option
 @quiet_option
 def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) -> None:
-    """Simulate a small series, encode it, decode it, compare and draw: DIR/SCENE.h5, .fhz and .png."""
+    """Simulate a small series, encode, decode, compare and draw it: DIR/SCENE.h5, .fhz and .png."""
     from fhash_codec.config import EncodeConfig
     from fhash_formats import Region, open_series, save_region
     from fhash_formats.support.atomic import replacing
@@ -109,7 +110,7 @@ def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) ->
 
 
 def _draw(scene: str, series: Series, volume: Volume, report: dict[str, Any]) -> Image.Image:
-    """The picture: the slice of constant z with the most of the coreset, at steps spread evenly over the series."""
+    """Draw the slice of constant z with the most of the coreset, at evenly spread steps."""
     from fhash_codec.demo.comparison_picture import Pair, compare
 
     steps = [round((index + 0.5) * series.shape[0] / COLUMNS) for index in range(COLUMNS)]
@@ -124,14 +125,18 @@ def _draw(scene: str, series: Series, volume: Volume, report: dict[str, Any]) ->
         )
         for step in steps
     ]
-    saved = f"{size(report['raw_bytes'])} in {size(report['bytes'])} ({number(report['ratio'], digits=3)}x)"
-    quality = f"{number(report['psnr'], 'dB', digits=3)} in the coreset, largest error {number(report['max_abs_error'], digits=2)}"
+    ratio = number(report["ratio"], digits=3)
+    saved = f"{size(report['raw_bytes'])} in {size(report['bytes'])} ({ratio}x)"
+    largest = number(report["max_abs_error"], digits=2)
+    psnr = number(report["psnr"], "dB", digits=3)
+    quality = f"{psnr} in the coreset, largest error {largest}"
     return compare(
         pairs,
         title=f"fhash demo: {scene}",
         subtitle=f"{extent(series.shape)} values, {saved}, {quality}",
         quantity=series.name if series.units == "1" else f"{series.name} ({series.units})",
-        footer=f"outside the coreset, not kept.   Slice z = {heights[layer]:.2g} m; error = decoded - original",
+        footer=f"outside the coreset, not kept.   Slice z = {heights[layer]:.2g} m;"
+        " error = decoded - original",
     )
 
 

@@ -1,4 +1,4 @@
-"""`fhash diff`: the quality of a container, measured on the file against the data, with gates for scripts."""
+"""`fhash diff`: measures a container against its data, with gates for scripts."""
 
 from __future__ import annotations
 
@@ -54,20 +54,22 @@ def command(
         *quality_rows(report, series.units),
     ]
     emit(report, table(rows), as_json)
-    # No PSNR is defined where nothing differs, which meets any gate, and where the data are constant or nothing can be compared, which
-    # meets none.
+    # Where nothing differs no PSNR is defined, and any gate is met. Where the data are constant, or
+    # nothing can be compared, none is defined either, and no gate is met.
     if (
         min_psnr is not None
         and report["rmse"] != 0
         and not (report["psnr"] is not None and report["psnr"] >= min_psnr)
     ):
-        found = (
+        reached = (
             "no PSNR is defined"
             if report["psnr"] is None
             else f"PSNR {number(report['psnr'], 'dB')}"
         )
-        raise QualityError(f"{run}: {found} in the coreset; at least {min_psnr:g} dB was asked for")
+        raise QualityError(
+            f"{run}: {reached} in the coreset; at least {min_psnr:g} dB was asked for"
+        )
     worst = report["max_abs_error"]
     if max_error is not None and not (worst is not None and worst <= max_error):
-        found = "no value can be compared" if worst is None else f"largest error {worst:.6g}"
-        raise QualityError(f"{run}: {found} in the coreset; at most {max_error:g} was asked for")
+        largest = "no value can be compared" if worst is None else f"largest error {worst:.6g}"
+        raise QualityError(f"{run}: {largest} in the coreset; at most {max_error:g} was asked for")

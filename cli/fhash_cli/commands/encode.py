@@ -22,6 +22,7 @@ from fhash_cli.output import (
     compared,
     emit,
     extent,
+    loss_rows,
     number,
     quality_rows,
     size,
@@ -55,19 +56,20 @@ def command(
 ) -> None:
     """Find the features of DATA, encode them and write them as RUN.fhz.
 
-    DATA is a file of HDF5, NetCDF, numpy or raw values, a Zarr folder, or a pattern of such files in quotes ('step_*.raw').
-    With --profile paper Ctrl-C saves a checkpoint beside RUN.fhz; the same command goes on from it.
+    DATA is a file of HDF5, NetCDF, numpy or raw values, a Zarr folder, or a pattern of such files
+    in quotes ('step_*.raw'). With --profile paper Ctrl-C saves a checkpoint beside RUN.fhz; the
+    same command resumes from it.
     """
     import fhash_codec
 
-    # Whether a folder is data at all is for the reader to say; `encode` then keeps it from being replaced.
+    # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
     with source.open(data) as series, Progress(quiet=quiet) as progress:
         missed = None
         try:
             report = fhash_codec.encode(series, output, config, force=force, progress=progress)
         except QualityError as error:
-            # The file is written, and how far it is from the promise is a result all the same.
+            # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
     emit(report, table(report_rows(report, series.units)), as_json)
     if missed is not None:
@@ -90,7 +92,8 @@ def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
         *([("key frames", str(len(report["key_frames"])))] if paper else []),
         (
             "coreset",
-            f"{report['coreset_fraction']:.3%} of the domain, in {spans(report['feature_bounding_box'])}",
+            f"{report['coreset_fraction']:.3%} of the domain,"
+            f" in {spans(report['feature_bounding_box'])}",
         ),
         *quality_rows(report, units),
         ("model", f"{model}, {report['profile']}"),
@@ -99,14 +102,11 @@ def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
     ]
 
 
-def loss_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What coded tables cost, where there are any."""
-    loss = model.get("tables_loss_db")
-    return [] if loss is None else [("tables", f"coded, for {loss:.2f} dB of the PSNR")]
-
-
 def gain_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What each stage of a compact encoding made of the size, and when it was done; on a sample but for the last."""
+    """The size after each stage of a compact encoding, and when the stage was done.
+
+    All but the last are estimated from a sample.
+    """
     last = len(report["gains"]) - 1
     return [
         (

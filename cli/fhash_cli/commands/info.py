@@ -1,4 +1,4 @@
-"""`fhash info`: what a container says of itself."""
+"""`fhash info`: prints what a container holds and how good it is."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.commands.encode import loss_rows
 from fhash_cli.options import json_option, run_argument
 from fhash_cli.output import (
     apart,
@@ -14,6 +13,7 @@ from fhash_cli.output import (
     emit,
     extent,
     listed,
+    loss_rows,
     number,
     quality_rows,
     spans,
@@ -45,7 +45,8 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
     return [
         (
             "file",
-            f"{info['path']}, format {'.'.join(map(str, info['format_version']))}, by fhash {info['encoder']['version']}",
+            f"{info['path']}, format {'.'.join(map(str, info['format_version']))},"
+            f" by fhash {info['encoder']['version']}",
         ),
         ("size", compared(info)),
         (
@@ -58,7 +59,8 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
         ("features", f"{', '.join(info['features'])}; grown by {info['dilation']}"),
         (
             "coreset",
-            f"{info['coreset_fraction']:.3%} of the domain, in {spans(info['feature_bounding_box'])}",
+            f"{info['coreset_fraction']:.3%} of the domain,"
+            f" in {spans(info['feature_bounding_box'])}",
         ),
         (
             "key frames",
@@ -81,11 +83,13 @@ def _network(info: dict[str, Any], seconds: str) -> list[tuple[str, str]]:
         *loss_rows(model),
         (
             "network",
-            f"{model['profile']}, {len(model['levels'])} levels, {model['parameters']:,} parameters in {model['tables']}",
+            f"{model['profile']}, {len(model['levels'])} levels,"
+            f" {model['parameters']:,} parameters in {model['tables']}",
         ),
         (
             "training",
-            f"{training['epochs']} epochs{seconds} on {training['device']}, seed {info['encoder']['seed']}{lowered}",
+            f"{training['epochs']} epochs{seconds} on {training['device']},"
+            f" seed {info['encoder']['seed']}{lowered}",
         ),
     ]
 
@@ -104,7 +108,8 @@ def _compact(volume: Volume, seconds: str) -> list[tuple[str, str]]:
 
 
 def _positions(volume: Volume, axis: str) -> str:
-    """The positions of an axis in a few words: name, first, last, units."""
+    """Name, first and last position, and units of an axis."""
     coordinate = volume.coords[axis]
     units = coordinate.attributes.get("units", "")
-    return f"{coordinate.name} {' to '.join(apart(coordinate.values[0], coordinate.values[-1]))} {units}".rstrip()
+    ends = " to ".join(apart(coordinate.values[0], coordinate.values[-1]))
+    return f"{coordinate.name} {ends} {units}".rstrip()

@@ -57,10 +57,10 @@ def command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Draw RUN.fhz as it is at one time; what is shown follows from the feature in the file unless options say more.
+    """Draw RUN.fhz at one time; unless options say more, the file's features decide what is shown.
 
-    With --animate the output is NAME.png for numbered pictures, which are made anew only where they are not there yet, or a film
-    NAME.mp4 or NAME.gif.
+    With --animate the output is NAME.png for numbered pictures, of which only missing ones are
+    drawn, or a film NAME.mp4 or NAME.gif.
     """
     import fhash_codec
     from fhash_codec.rendering.renderer import Renderer
@@ -71,7 +71,8 @@ def command(
         if several.several(scene):
             if explain or save_scene is not None:
                 raise click.UsageError(
-                    "--explain and --save-scene are of one picture; leave them out of an animation or evolution"
+                    "--explain and --save-scene are for one picture;"
+                    " leave them out of an animation or evolution"
                 )
             result, text = run_animation(
                 volume, scene, several, str(path), force=force, progress=progress
@@ -113,7 +114,7 @@ def _check_outputs(path: Path, save_scene: str | None, scene: Scene, force: bool
 
 
 def _save(image: Image, path: Path, save_scene: str | None, force: bool) -> list[Path]:
-    """Write the picture, and its scene first if it is asked for."""
+    """Write the picture, after its scene where one is asked for; the paths written."""
     from fhash_formats.support.atomic import replacing
 
     if save_scene is None:
@@ -127,15 +128,15 @@ def _save(image: Image, path: Path, save_scene: str | None, force: bool) -> list
 def _text(plan: Plan, image: Image, paths: list[str], explain: bool) -> str:
     from fhash_codec.rendering.task.counters import rows
 
-    found = [("written", path) for path in paths]
+    lines = [("written", path) for path in paths]
     if not explain:
         height, width = image.rgba.shape[:2]
-        found += [
+        lines += [
             ("size", extent((width, height))),
             ("step", f"{plan.step:g}, t = {plan.time:.6g}"),
         ]
-    found.append(("seconds", number(image.seconds, digits=3)))
+    lines.append(("seconds", number(image.seconds, digits=3)))
     if not explain:
-        return table(found)
+        return table(lines)
     counted = [(name, f"{count:>13}  {text}") for name, count, text in rows(image.counters)]
-    return "\n\n".join((table(list(plan.reasons)), table(counted), table(found)))
+    return "\n\n".join((table(list(plan.reasons)), table(counted), table(lines)))

@@ -1,4 +1,4 @@
-"""`fhash selftest`: hard cases through encode, decode and render on this machine, and whether what must hold does."""
+"""`fhash selftest`: encodes, decodes and draws hard cases, and checks what must hold."""
 
 from __future__ import annotations
 
@@ -53,22 +53,24 @@ def command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Encode, decode and draw data on which codecs break; exit code 1 if anything that must hold does not.
+    """Encode, decode and draw data on which codecs break; exit code 1 if anything does not hold.
 
-    Constant, infinite and missing values, extremes of every number type, thin and tiny shapes, steep fronts, features at the borders,
-    strange times: each with bounds, promises and equal bytes to be kept. What does not hold is listed with its figures.
+    Constant, infinite and missing values, extremes of every number type, thin and tiny shapes,
+    steep fronts, features at the borders, strange times: each must keep its bounds, promises and
+    bytes.
+    What does not hold is listed with its figures.
     """
     if report is not None:
         check_writable(report, force)
-    from fhash_codec.selftest.cases.catalogue import chosen
+    from fhash_codec.selftest.cases.catalogue import choose_cases
     from fhash_codec.selftest.workers import run_cases
 
     begun = time.perf_counter()
-    cases = chosen(names=names, groups=groups, everything=everything)
+    cases = choose_cases(names=names, groups=groups, everything=everything)
     with Progress(quiet=quiet) as progress:
         summary = run_cases(cases, everything=everything, processes=processes, progress=progress)
     if report is not None:
-        from fhash_codec.selftest.environment import surroundings
+        from fhash_codec.selftest.environment import describe_machine
         from fhash_codec.selftest.report import markdown
         from fhash_formats.support.atomic import replacing
 
@@ -79,7 +81,8 @@ def command(
                 *(f" --group {name}" for name in groups),
             ]
         )
-        where = f"It took {(time.perf_counter() - begun) / 60:.1f} minutes with {surroundings()}."
+        minutes = (time.perf_counter() - begun) / 60
+        where = f"It took {minutes:.1f} minutes with {describe_machine()}."
         with replacing(Path(report), force=force) as temporary:
             temporary.write_text(markdown(summary, options=given, where=where), encoding="utf-8")
     emit(summary.to_dict(), _text(summary), as_json)

@@ -1,4 +1,7 @@
-"""VTK beside this renderer on one machine, in turns: the same decoded frames, transfer functions, cameras and steps."""
+"""VTK beside this renderer on one machine, in turns.
+
+Both get the same decoded frames, transfer functions, cameras and steps.
+"""
 
 from __future__ import annotations
 
@@ -35,10 +38,13 @@ Single = npt.NDArray[np.float32]
 PLAYED = 12
 """Steps that are played back at most."""
 FINE = 0.05
-"""Step in vertex spacings at which pictures are compared: the places of the samples then matter little."""
+"""Ray step, in vertex spacings, of compared pictures: so fine that sample places hardly matter."""
 FINE_SIZE = 256
-EXPLAINED, EXPLAINED_SIZE = 0.2, 128
-"""Step and size at which VTK's picture is compared with one by its own conventions, which takes long."""
+"""Pixels along both sides of pictures with fine steps."""
+EXPLAINED = 0.2
+"""Ray step, in vertex spacings, of pictures by VTK's own conventions, which are slow."""
+EXPLAINED_SIZE = 128
+"""Pixels along both sides of those pictures."""
 SHADING = Shading()
 
 
@@ -56,8 +62,11 @@ class Comparison:
         self.version = ""
 
     def against(self) -> tuple[Against, ...]:
-        """Marching beside the fixed-point ray caster: each transfer function unlit and lit, at the size and at twice the size."""
-        found = []
+        """Time marching beside VTK's fixed-point ray caster.
+
+        Each transfer function is drawn unlit and lit, at the size and at twice the size.
+        """
+        results = []
         frame = Frame(values=self.values, first=(0, 0, 0))
         bricks = Bricks.of(frame)
         variants = [
@@ -100,8 +109,8 @@ class Comparison:
                         )
                     )
                     samples = max(samples, int(marched.counters["samples"]))
-            known = [psnr for psnr, _ in likeness if psnr is not None]
-            found.append(
+            different = [psnr for psnr, _ in likeness if psnr is not None]
+            results.append(
                 Against(
                     scene=name,
                     shaded=shaded,
@@ -110,17 +119,17 @@ class Comparison:
                     whole_ms=1e3 * median(whole),
                     vtk_ms=1e3 * max(median(theirs) - median(nothing), 0.0),
                     window_ms=1e3 * median(nothing),
-                    psnr=median(known) if known else None,
-                    ssim=median(each for _, each in likeness),
+                    psnr=median(different) if different else None,
+                    ssim=median(similarity for _, similarity in likeness),
                     samples=samples,
                 )
             )
             self.progress("beside VTK", number + 1, len(variants), name)
-        return tuple(found)
+        return tuple(results)
 
     def exactness(self) -> tuple[Exactness, ...]:
         """Pictures of VTK's mapper for graphics cards, at fine steps."""
-        found = []
+        results = []
         frame = Frame(values=self.values, first=(0, 0, 0))
         for name in self.functions:
             explained = {shaded: self._explained(name, shaded) for shaded in (False, True)}
@@ -138,7 +147,7 @@ class Comparison:
                     peer.draw()  # the first picture is of a frame that is not all there yet
                     theirs = peer.draw().pixels
                 ours = black(march(frame, plan.task).rgba)
-                found.append(
+                results.append(
                     Exactness(
                         scene=name,
                         gradient=gradient,
@@ -150,11 +159,11 @@ class Comparison:
                         explained=explained[bool(gradient)],
                     )
                 )
-            self.progress("exactness", len(found), 3 * len(self.functions), name)
-        return tuple(found)
+            self.progress("exactness", len(results), 3 * len(self.functions), name)
+        return tuple(results)
 
     def _explained(self, name: str, shaded: bool) -> float | None:
-        """PSNR of VTK's picture to one that takes its samples, gradients and highlights as VTK does."""
+        """PSNR of VTK's picture to a slow one with VTK's own samples, gradients and highlights."""
         scene = self._scene(name, shaded, EXPLAINED_SIZE)
         plan = self.renderer.plan(
             replace(scene, march=replace(scene.march, step=EXPLAINED, threshold=0.0))
@@ -166,8 +175,11 @@ class Comparison:
         return picture_psnr(black(vtk_picture(self.values, plan.task)), theirs, 255.0)
 
     def playback(self) -> tuple[Playback, ...]:
-        """Steps from the first on, each for the first time: a renderer of its own here, frames in memory in VTK."""
-        found = []
+        """Time playing the steps from the first on, each drawn for the first time.
+
+        This renderer starts empty and decodes each frame; VTK's frames are decoded in memory.
+        """
+        results = []
         steps = [float(step) for step in range(min(self.volume.shape[0], PLAYED + 1))]
         frames = [whole_frame(self.volume, step, self.units) for step in steps]
         for name in self.functions:
@@ -179,17 +191,18 @@ class Comparison:
                 with self._peer(plan, "cpu") as peer:
                     peer.look(plan.task.rays)
                     shown = [replace(scene, step=step, time=None) for step in steps]
-                    for each, following, values in zip(
+                    for current, following, values in zip(
                         shown, [*shown[1:], None], frames, strict=True
                     ):
-                        ours.append(timed(partial(renderer.render, each, upcoming=following))[1])
+                        draw = partial(renderer.render, current, upcoming=following)
+                        ours.append(timed(draw)[1])
                         begun = time.perf_counter()
                         peer.load(values)
                         peer.draw()
                         theirs.append(time.perf_counter() - begun)
                 # The first step pays for what happens once.
                 rest = slice(1 if len(steps) > 1 else 0, None)
-                found.append(
+                results.append(
                     Playback(
                         scene=name,
                         shaded=shaded,
@@ -199,8 +212,8 @@ class Comparison:
                         vtk_ms=1e3 * median(theirs[rest]),
                     )
                 )
-            self.progress("playback", len(found), 2 * len(self.functions), name)
-        return tuple(found)
+            self.progress("playback", len(results), 2 * len(self.functions), name)
+        return tuple(results)
 
     def _scene(self, name: str, shaded: bool, side: int) -> Scene:
         effects = replace(self.scene.effects, shading=SHADING if shaded else None, isosurfaces=())
@@ -243,14 +256,21 @@ def turned(scene: Scene, turn: int, turns: int) -> Scene:
 
 
 def whole_frame(volume: Volume, step: float, units: Units) -> Single:
-    """The values (z, y, x) of all the domain in marched units, the background where there is none: VTK knows no missing values."""
+    """Values (z, y, x) of the whole domain in marched units.
+
+    The background stands for missing values, which VTK does not know.
+    """
     values = volume.read(step, outside="background")
     values[~np.isfinite(values)] = volume.background
     return np.ascontiguousarray(values if units == Units() else units.to(values), dtype=np.float32)
 
 
 def transfer_functions(values: Single, units: Units) -> dict[str, TransferFunctionSpec]:
-    """A narrow band of frequent values away from the background, as features are, and fog over all values that grows with them."""
+    """Two transfer functions that suit the values: a feature and a fog.
+
+    `feature` is a narrow band of frequent values away from the background; `fog` grows with the
+    value.
+    """
     low, high = float(values.min()), float(values.max())
     extent = max(high - low, 1e-6 * abs(low), 1e-30)
     above = values[values > low + 0.01 * extent]
@@ -270,7 +290,7 @@ def transfer_functions(values: Single, units: Units) -> dict[str, TransferFuncti
 
 
 def timed(run: Callable[[], Any]) -> tuple[Any, float]:
-    """What a call gives and the seconds it takes."""
+    """Result of a call, and the seconds it took."""
     begun = time.perf_counter()
     result = run()
     return result, time.perf_counter() - begun

@@ -1,4 +1,4 @@
-"""How alike two pictures are."""
+"""Likeness of two pictures: PSNR and SSIM."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ def black(rgba: Single) -> Pixels:
 
 
 def picture_psnr(
-    one: npt.NDArray[np.generic], other: npt.NDArray[np.generic], peak: float
+    picture: npt.NDArray[np.generic], other: npt.NDArray[np.generic], peak: float
 ) -> float | None:
     """PSNR in dB over all pixels and channels, `peak` being white; None where nothing differs."""
-    error = float(np.mean((one.astype(np.float64) - other.astype(np.float64)) ** 2))
+    error = float(np.mean((picture.astype(np.float64) - other.astype(np.float64)) ** 2))
     return 10 * math.log10(peak * peak / error) if error else None
 
 
-def picture_ssim(one: Pixels, other: Pixels) -> float:
-    """Mean structural similarity of bytes (H, W, 3) over the channels, as `fhash_codec.measure.ssim` has it for a plane."""
+def picture_ssim(picture: Pixels, other: Pixels) -> float:
+    """Mean structural similarity of bytes (H, W, 3) over the channels; see
+    `fhash_codec.measure.ssim`."""
     total = count = 0.0
     for channel in range(3):
-        part, number = ssim(one[None, ..., channel], other[None, ..., channel], 255.0)
-        total, count = total + part, count + number
+        similarity, number = ssim(picture[None, ..., channel], other[None, ..., channel], 255.0)
+        total, count = total + similarity, count + number
     return total / count if count else 1.0

@@ -1,4 +1,4 @@
-"""`fhash bench render`: what effects and accelerations cost, ARM beside streaming, VTK beside this renderer, and quality against time."""
+"""`fhash bench render`: cost of effects and accelerations, ARM, VTK, and quality against time."""
 
 from __future__ import annotations
 
@@ -34,24 +34,33 @@ from fhash_formats.errors import InputError, MissingDependencyError
 __all__ = ["bench_render", "in_turns"]
 
 TURNS = 5
+"""Runs of each median, by default."""
 SIZE = 512
+"""Pixels along both sides, by default."""
 STREAM_SIZE = 128
-"""Pixels along a side where rays are streamed through the model, which takes long on a CPU."""
+"""Pixels along both sides where rays march through the model, which is slow on a CPU."""
 NEAREST = 1e-2
-"""Zoom down to which one is looked for at which a pixel is as wide as several vertices."""
+"""Smallest zoom of the search for one at which a pixel is as wide as several vertices."""
 STEPS = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125)
+"""Ray steps, in vertex spacings."""
 THRESHOLDS = (0.3, 0.1, 0.03, 0.01, 1 / 256, 1 / 1024)
+"""Shares of light at which a ray ends."""
 LEVELS = (3, 2, 1)
+"""Levels of detail."""
 FINEST = {"step": 1 / 32, "threshold": 0.0, "lod": 0.0}
-"""What the qualities of each knob are measured against."""
+"""Finest setting of each knob; pictures of other settings are compared with its picture."""
 NOTES = (
-    "milliseconds are medians of runs in turns: each turn runs every variant once, from another side in comparisons with VTK",
-    "pictures are compared over black; 'ours' against VTK is marching a decoded frame, 'whole' all of Renderer.render with the frame kept",
-    "VTK's time is that of Render less that of a window with nothing in it; both take as many threads as there are processors",
+    "milliseconds are medians of runs in turns: each turn runs every variant once,"
+    " from another side in comparisons with VTK",
+    "pictures are compared over black; 'ours' against VTK is marching a decoded frame,"
+    " 'whole' all of Renderer.render with the frame kept",
+    "VTK's time is that of Render less that of a window with nothing in it;"
+    " both take as many threads as there are processors",
     "playback: decoding counts here, VTK has its frames decoded and takes them up",
-    "VTK takes its samples at whole steps from the entry of a ray, here they lie in the middle of steps; its gradients are central "
-    "differences over two vertices, here they are those of the cell; its highlights follow the mirrored ray: 'by its rules' is the PSNR of "
-    "VTK's picture to a slow one that does all three as VTK does",
+    "VTK takes its samples at whole steps from the entry of a ray, here they lie in the middle of"
+    " steps; its gradients are central differences over two vertices, here they are those of the"
+    " cell; its highlights follow the mirrored ray: 'by its rules' is the PSNR of VTK's picture to"
+    " a slow one that does all three as VTK does",
 )
 
 
@@ -66,9 +75,16 @@ def bench_render(
 ) -> RenderBench:
     """Measure pictures of a volume.
 
-    scene: what is shown where effects, accelerations, streams and curves are measured; its size and effects are not. size: pixels along
-    both sides; VTK is compared at twice the size too. turns: runs that medians are of.
-    Raises InputError for parts that are not known, a size or turns below 1; without VTK its parts are refused in the result.
+    Args:
+        volume: an open container.
+        scene: shown where effects, accelerations, streams and curves are measured; its own size and
+            effects are ignored.
+        parts: names of `PARTS` to measure.
+        size: pixels along both sides; VTK is compared at twice the size too.
+        turns: runs of each median.
+
+    Raises InputError for unknown parts, or for a size or turns that are too small. Without VTK the
+    result lists its parts as refused.
     """
     scene = scene or Scene()
     for part in parts:
@@ -76,7 +92,8 @@ def bench_render(
             raise InputError(f"part is '{part}'; allowed: {', '.join(PARTS)}")
     if not parts or turns < 1 or size < 16:
         raise InputError(
-            f"{len(parts)} parts, {turns} turns, {size} pixels; at least one part, one turn and 16 pixels are needed"
+            f"{len(parts)} parts, {turns} turns, {size} pixels;"
+            " at least one part, one turn and 16 pixels are needed"
         )
     plain = replace(
         scene,
@@ -85,14 +102,39 @@ def bench_render(
         background="black",
     )
     bench = _Bench(volume, plain, turns, progress)
-    found: dict[str, tuple[Any, ...]] = {}
-    refused: dict[str, str] = {}
+    results, refused, version = _measure(bench, parts)
+    used = machine(choose_device("cpu"))
+    if version is not None:
+        used["vtk"] = version
+    return RenderBench(
+        series=f"{volume.path} {volume.name}",
+        shape=volume.shape,
+        step=bench.step,
+        size=size,
+        turns=turns,
+        effects=results.get("effects", ()),
+        accelerations=results.get("accelerations", ()),
+        streams=results.get("streams", ()),
+        against=results.get("vtk", ()),
+        exactness=results.get("exactness", ()),
+        playback=results.get("playback", ()),
+        curves=results.get("curves", ()),
+        refused=refused,
+        machine=used,
+        notes=NOTES,
+    )
+
+
+def _measure(
+    bench: _Bench, parts: Sequence[str]
+) -> tuple[dict[str, tuple[Any, ...]], dict[str, str], str | None]:
+    """Measure the parts: results, reasons of parts that were refused, and VTK's version if used."""
 
     @cache
     def beside() -> Comparison:
-        return Comparison(volume, plain, turns, progress)
+        return Comparison(bench.volume, bench.scene, bench.turns, bench.progress)
 
-    ways: Mapping[str, Callable[[], tuple[Any, ...]]] = {
+    measurements: Mapping[str, Callable[[], tuple[Any, ...]]] = {
         "effects": bench.effects,
         "accelerations": bench.accelerations,
         "streams": bench.streams,
@@ -101,35 +143,21 @@ def bench_render(
         "playback": lambda: beside().playback(),
         "curves": bench.curves,
     }
+    results: dict[str, tuple[Any, ...]] = {}
+    refused: dict[str, str] = {}
     for part in dict.fromkeys(parts):
         try:
-            found[part] = ways[part]()
+            results[part] = measurements[part]()
         except MissingDependencyError as error:
             refused[part] = str(error)
-    used = machine(choose_device("cpu"))
-    if beside.cache_info().currsize:
-        used["vtk"] = beside().version
-    return RenderBench(
-        series=f"{volume.path} {volume.name}",
-        shape=volume.shape,
-        step=bench.step,
-        size=size,
-        turns=turns,
-        effects=found.get("effects", ()),
-        accelerations=found.get("accelerations", ()),
-        streams=found.get("streams", ()),
-        against=found.get("vtk", ()),
-        exactness=found.get("exactness", ()),
-        playback=found.get("playback", ()),
-        curves=found.get("curves", ()),
-        refused=refused,
-        machine=used,
-        notes=NOTES,
-    )
+    return results, refused, beside().version if beside.cache_info().currsize else None
 
 
 def in_turns(runs: Mapping[str, Callable[[], Image]], turns: int) -> dict[str, tuple[float, Image]]:
-    """Run every variant once without counting, then in turns; the median milliseconds and the last picture of each."""
+    """Run every variant once without timing, then in turns.
+
+    Returns the median milliseconds and the last picture of each variant.
+    """
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     images = {name: run() for name, run in runs.items()}
     for _ in range(turns):
@@ -141,7 +169,7 @@ def in_turns(runs: Mapping[str, Callable[[], Image]], turns: int) -> dict[str, t
 
 
 class _Bench:
-    """What needs no peer."""
+    """Measurements that need no peer."""
 
     def __init__(self, volume: Volume, scene: Scene, turns: int, progress: Progress) -> None:
         self.volume, self.scene, self.turns, self.progress = volume, scene, turns, progress
@@ -180,7 +208,8 @@ class _Bench:
         )
 
     def accelerations(self) -> tuple[Switch, ...]:
-        """Skipping, early termination and level of detail on and off; their pictures are compared."""
+        """Measure skipping, early termination and level of detail on and off, and compare their
+        pictures."""
         scene, march = self.scene, self.scene.march
         opaque = replace(scene, transfer_function=_dense(scene.transfer_function))
         pairs = {
@@ -234,7 +263,10 @@ class _Bench:
         return tuple(found)
 
     def streams(self) -> tuple[Stream, ...]:
-        """Marching the cache, streaming, and adaptive ray marching with N_r of the rays and of 2^20, of a small picture."""
+        """Measure the cached march, streaming, and adaptive ray marching on a small picture.
+
+        Adaptive ray marching runs with N_r equal to the number of rays and to 2^20.
+        """
         small = replace(
             self.scene, size=(STREAM_SIZE, STREAM_SIZE), march=replace(self.scene.march, lod=0)
         )
@@ -271,9 +303,7 @@ class _Bench:
         """Each knob swept, the others as the scene has them, against its finest setting."""
         knobs: dict[str, Sequence[float]] = {"step": STEPS, "threshold": THRESHOLDS}
         if self.volume.profile == "compact":
-            most = max(
-                int(np.log2(max(min(high - low for low, high in self.volume.box) - 1, 1))), 0
-            )
+            most = max(int(np.log2(max(min(self.volume.box.shape) - 1, 1))), 0)
             knobs["lod"] = [level for level in LEVELS if level <= most]
         found = []
         for knob, values in knobs.items():

@@ -1,4 +1,4 @@
-"""The picture of `fhash bench render`: quality against time for every knob, and times beside VTK's."""
+"""The plot of `fhash bench render`: quality against time for each knob, and times beside VTK's."""
 
 from __future__ import annotations
 
@@ -10,11 +10,19 @@ from fhash_codec.bench.rate.plot import require_matplotlib
 from fhash_formats.errors import InputError
 
 KNOBS = {"step": "#d1604b", "threshold": "#4a86c0", "lod": "#2f9e6e"}
-OURS, VTK = "#d1604b", "#8a8f98"
+"""Colours of the knobs' curves."""
+OURS = "#d1604b"
+"""Colour of this renderer."""
+VTK = "#8a8f98"
+"""Colour of VTK."""
 
 
 def plot(result: RenderBench, path: Path) -> None:
-    """Draw a result as a PNG at `path`: a panel for the curves and one for VTK, of those that were measured; InputError for neither."""
+    """Draw a result as a PNG at `path`.
+
+    It has a panel for the curves and one for VTK, where they were measured. Raises InputError where
+    neither was.
+    """
     figure_module = require_matplotlib()
     panels = [
         panel

@@ -1,7 +1,8 @@
-"""A picture by VTK's conventions in numpy and float64, to tell what the difference between VTK's pictures and ours is made of.
+"""A picture by VTK's conventions in numpy and float64, which explains how VTK's pictures differ.
 
-Three things differ: VTK takes samples at whole steps from the entry of a ray, ours lie in the middle of steps; its gradients are central
-differences over two vertices, ours those of the cell; its highlights follow the mirrored ray (Phong). All else is as in `march`.
+Three things differ. VTK takes samples at whole steps from the entry of a ray, `march` in the middle
+of steps. VTK's gradients are central differences over two vertices, those of `march` are of the
+cell. VTK's highlights follow the mirrored ray (Phong). All else is as in `march`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,11 @@ DARK = 1e-5
 
 
 def vtk_picture(values: Single, task: Task) -> Single:
-    """The picture (H, W, 4) of a task without surfaces, of a whole frame (z, y, x) of finite values, lit from the camera if it is lit."""
+    """Draw a task without surfaces over a whole frame (z, y, x) of finite values; picture (H, W,
+    4).
+
+    A lit task is lit from the camera.
+    """
     assert task.table is not None
     rays = task.rays
     origin, along = (
@@ -89,7 +94,10 @@ def _central(values: Single, places: Floats) -> Floats:
 
 
 def _lit(shade: Floats, gradient: Floats, along: Floats, lighting: Lighting) -> Floats:
-    """Phong's model with the light at the eye: the mirrored ray and the way back to the eye enclose twice the angle to the normal."""
+    """Phong's model with the light at the eye.
+
+    The mirrored ray and the way back to the eye enclose twice the angle to the normal.
+    """
     length = np.linalg.norm(gradient, axis=1)
     known = length > 0
     cosine = np.where(

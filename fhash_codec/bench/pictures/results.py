@@ -1,4 +1,7 @@
-"""What `fhash bench render` finds, as records and JSON values. Times are medians in milliseconds of runs in turns."""
+"""Results of `fhash bench render`, as records and JSON values.
+
+Times are medians, in milliseconds, of runs in turns.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,16 @@ from statistics import median
 from typing import Any
 
 PARTS = ("effects", "accelerations", "streams", "vtk", "exactness", "playback", "curves")
-"""What there is to measure."""
+"""Names of the parts that can be measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Switch:
     """An effect or an acceleration on and off, all else alike.
 
-    counters_on, counters_off: of the last picture. psnr: between the two pictures in dB, None where they are equal or meant to differ.
+    Attributes:
+        counters_off, counters_on: counters of the last picture.
+        psnr: dB between the two pictures; None where they are equal or meant to differ.
     """
 
     name: str
@@ -32,7 +37,13 @@ class Switch:
 
 @dataclass(frozen=True, kw_only=True)
 class Stream:
-    """A way to march: `budget` is N_r, None for the number of rays; psnr (dB) and the largest difference (0..1) to the cached march."""
+    """One march.
+
+    Attributes:
+        budget: N_r, None for the number of rays.
+        psnr: dB to the picture of the cached march, None where nothing differs.
+        largest: largest difference to that picture, 0..1.
+    """
 
     mode: str
     budget: int | None
@@ -46,10 +57,17 @@ class Stream:
 
 @dataclass(frozen=True, kw_only=True)
 class Against:
-    """A scene here and by VTK's fixed-point ray caster: the same decoded frame, transfer function, camera, step and threads.
+    """A scene drawn here and by VTK's fixed-point ray caster.
 
-    ours_ms: of marching. whole_ms: of `Renderer.render`, plan and all. vtk_ms: of `Render` less `window_ms`, that of an empty window.
-    psnr (dB), ssim: between the pictures. samples: values that were looked up here.
+    Both have the same decoded frame, transfer function, camera, step and number of threads.
+
+    Attributes:
+        ours_ms: time of marching.
+        whole_ms: time of `Renderer.render`, planning included.
+        vtk_ms: time of VTK's `Render` less `window_ms`.
+        window_ms: time of VTK's `Render` with an empty window.
+        psnr, ssim: likeness of the pictures, PSNR in dB.
+        samples: values that were looked up here.
     """
 
     scene: str
@@ -71,10 +89,15 @@ class Against:
 
 @dataclass(frozen=True, kw_only=True)
 class Exactness:
-    """The picture here and by VTK's mapper for graphics cards at a step of `step` vertex spacings: PSNR (dB), SSIM, largest byte apart.
+    """A picture drawn here and by VTK's mapper for graphics cards.
 
-    gradient: that the picture here is lit by, of the cell or by central differences, as VTK's is; empty where it is not lit.
-    explained: PSNR of VTK's picture to one computed slowly by VTK's conventions for samples, gradients and highlights, at a coarser step.
+    Attributes:
+        gradient: what the picture here is lit by, `cell` or `central` (as VTK); empty where it is
+            unlit.
+        step: ray step in vertex spacings.
+        psnr, ssim, largest: likeness; PSNR in dB, largest difference in bytes.
+        explained: PSNR of VTK's picture to a slow one with VTK's conventions for samples, gradients
+            and highlights, at a coarser step.
     """
 
     scene: str
@@ -89,7 +112,10 @@ class Exactness:
 
 @dataclass(frozen=True, kw_only=True)
 class Playback:
-    """A step after another, each for the first time: decoding included here; frames already decoded, taking them up included, in VTK."""
+    """Steps drawn one after the other, each for the first time.
+
+    The time here includes decoding. VTK's frames are decoded; its time includes loading them.
+    """
 
     scene: str
     shaded: bool
@@ -106,7 +132,11 @@ class Playback:
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """One setting of a knob: time, samples, and the PSNR (dB) to the picture of its finest setting, None where they are equal."""
+    """One setting of a knob.
+
+    Attributes:
+        psnr: dB to the picture of the finest setting, None where they are equal.
+    """
 
     knob: str
     value: float
@@ -117,7 +147,12 @@ class Quality:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderBench:
-    """What `bench_render` measured; `refused`: by part, why it could not be. turns: runs that each median is of."""
+    """Everything that `bench_render` measured.
+
+    Attributes:
+        turns: runs of each median.
+        refused: for each part that could not be measured, the reason.
+    """
 
     series: str
     shape: tuple[int, ...]
@@ -136,20 +171,20 @@ class RenderBench:
     notes: tuple[str, ...]
 
     def summary(self) -> dict[str, float]:
-        """Medians and the least of the ratios to VTK, for unlit and lit scenes apart, where there are any."""
-        found: dict[str, float] = {}
+        """Median and smallest ratio to VTK, for unlit and lit scenes apart; empty without VTK."""
+        ratios_to_vtk: dict[str, float] = {}
         for name, shaded in (("unshaded", False), ("shaded", True)):
-            ratios = [each.ratio for each in self.against if each.shaded == shaded]
+            ratios = [scene.ratio for scene in self.against if scene.shaded == shaded]
             if ratios:
-                found |= {f"{name}_median": median(ratios), f"{name}_least": min(ratios)}
+                ratios_to_vtk |= {f"{name}_median": median(ratios), f"{name}_least": min(ratios)}
         if self.playback:
-            found["playback_median"] = median(each.ratio for each in self.playback)
-        return found
+            ratios_to_vtk["playback_median"] = median(run.ratio for run in self.playback)
+        return ratios_to_vtk
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name, the ratios of each, and "summary"."""
         values = asdict(self)
         for name in ("effects", "accelerations", "against", "playback"):
-            for entry, each in zip(values[name], getattr(self, name), strict=True):
-                entry["ratio"] = each.ratio
+            for entry, record in zip(values[name], getattr(self, name), strict=True):
+                entry["ratio"] = record.ratio
         return {**values, "summary": self.summary()}

@@ -1,4 +1,7 @@
-"""VTK as a peer of the renderer: the same decoded frame, transfer function, camera and steps through VTK's own volume mappers."""
+"""VTK as a peer of the renderer, through its own volume mappers.
+
+It gets the same decoded frame, transfer function, camera and steps.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import os
 import time
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +25,8 @@ Single = npt.NDArray[np.float32]
 Pixels = npt.NDArray[np.uint8]
 
 MAPPERS = ("cpu", "gpu")
-"""vtkFixedPointVolumeRayCastMapper, and the mapper for graphics cards, which a software OpenGL runs as well."""
+"""vtkFixedPointVolumeRayCastMapper, and the mapper for graphics cards, which software OpenGL also
+runs."""
 POINTS = 2048
 """Points of the transfer functions that VTK is given."""
 MODULES = {
@@ -42,17 +47,17 @@ MODULES = {
 
 
 def require_vtk() -> SimpleNamespace:
-    """The names of VTK that are used here; raises MissingDependencyError."""
-    found = {}
+    """Import the names of VTK that are used here; raises MissingDependencyError."""
+    loaded_names = {}
     try:
         for module, names in MODULES.items():
             loaded = importlib.import_module(f"vtkmodules.{module}")
-            found.update({name: getattr(loaded, name) for name in names})
+            loaded_names.update({name: getattr(loaded, name) for name in names})
     except ImportError as error:
         raise MissingDependencyError(
             "comparing with VTK needs it: pip install 'fhash[vtk]'"
         ) from error
-    return SimpleNamespace(**found)
+    return SimpleNamespace(**loaded_names)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,9 +85,19 @@ class VtkPeer:
         threads: int | None = None,
         empty: bool = False,
     ) -> None:
-        """values: (z, y, x), all finite, of all the domain. unit: length that VTK's opacities are of, in units of the coordinates, as step.
+        """Open a window.
 
-        lighting: from the camera, whatever its lamp, or none. empty: a window with nothing in it.
+        Args:
+            values: (z, y, x) of the whole domain, all finite.
+            grid: vertices and spacing of the domain.
+            table: transfer function.
+            unit: length that VTK's opacities refer to, in units of the coordinates.
+            size: pixels across and down.
+            step: ray step, in units of the coordinates.
+            mapper: one of MAPPERS.
+            lighting: light from the camera; None for an unlit volume.
+            threads: threads of the `cpu` mapper.
+            empty: the window shows nothing.
         """
         self.vtk = vtk = require_vtk()
         self.grid = grid
@@ -92,20 +107,7 @@ class VtkPeer:
         self.image.SetSpacing(*(abs(float(part)) for part in grid.spacing))
         self.image.SetOrigin(*(float(min(part)) for part in grid.corners))
         self.load(values)
-        self.mapper = (
-            vtk.vtkFixedPointVolumeRayCastMapper()
-            if mapper == "cpu"
-            else vtk.vtkOpenGLGPUVolumeRayCastMapper()
-        )
-        self.mapper.SetInputData(self.image)
-        self.mapper.AutoAdjustSampleDistancesOff()
-        self.mapper.SetSampleDistance(step)
-        if mapper == "cpu":
-            self.mapper.SetInteractiveSampleDistance(step)
-            self.mapper.LockSampleDistanceToInputSpacingOff()
-            self.mapper.SetNumberOfThreads(threads or os.cpu_count() or 1)
-        else:
-            self.mapper.SetUseJittering(False)
+        self.mapper = self._mapper(mapper, step, threads)
         self.property = vtk.vtkVolumeProperty()
         self.property.SetInterpolationTypeToLinear()
         self.property.SetScalarOpacityUnitDistance(unit)
@@ -118,18 +120,36 @@ class VtkPeer:
         if not empty:
             self.renderer.AddVolume(volume)
         self.renderer.SetBackground(0, 0, 0)
-        vtk.vtkLogger.SetStderrVerbosity(
-            vtk.vtkLogger.VERBOSITY_ERROR
-        )  # it warns of every display that it tries in vain
+        # VTK warns of every display that it tries in vain.
+        vtk.vtkLogger.SetStderrVerbosity(vtk.vtkLogger.VERBOSITY_ERROR)
         self.window = vtk.vtkRenderWindow()
         if not self.window.SupportsOpenGL():
             raise MissingDependencyError(
-                "VTK finds no OpenGL; install a software one such as Mesa's EGL (libegl1, libgl1-mesa-dri)"
+                "VTK finds no OpenGL;"
+                " install a software one such as Mesa's EGL (libegl1, libgl1-mesa-dri)"
             )
         self.window.SetOffScreenRendering(1)
         self.window.SetMultiSamples(0)
         self.window.SetSize(*size)
         self.window.AddRenderer(self.renderer)
+
+    def _mapper(self, name: str, step: float, threads: int | None) -> Any:
+        """One of MAPPERS with a fixed ray step, for the image."""
+        mapper = (
+            self.vtk.vtkFixedPointVolumeRayCastMapper()
+            if name == "cpu"
+            else self.vtk.vtkOpenGLGPUVolumeRayCastMapper()
+        )
+        mapper.SetInputData(self.image)
+        mapper.AutoAdjustSampleDistancesOff()
+        mapper.SetSampleDistance(step)
+        if name == "cpu":
+            mapper.SetInteractiveSampleDistance(step)
+            mapper.LockSampleDistanceToInputSpacingOff()
+            mapper.SetNumberOfThreads(threads or os.cpu_count() or 1)
+        else:
+            mapper.SetUseJittering(False)
+        return mapper
 
     def load(self, values: Single) -> None:
         """Another frame; the mapper takes it up when it draws."""
@@ -183,7 +203,7 @@ class VtkPeer:
 
     @property
     def version(self) -> str:
-        """Of VTK, and the OpenGL that it found."""
+        """Versions of VTK and of the OpenGL that it uses."""
         lines = str(self.window.ReportCapabilities()).splitlines()
         graphics = next(
             (
@@ -204,9 +224,9 @@ class VtkPeer:
             [np.interp(values, entries, channel) for channel in table.colours.T], axis=-1
         )
         colour, opacity = self.vtk.vtkColorTransferFunction(), self.vtk.vtkPiecewiseFunction()
-        for value, shade, part in zip(values, shades, opacities, strict=True):
-            colour.AddRGBPoint(float(value), *(float(each) for each in shade))
-            opacity.AddPoint(float(value), float(part))
+        for value, shade, share in zip(values, shades, opacities, strict=True):
+            colour.AddRGBPoint(float(value), *(float(channel) for channel in shade))
+            opacity.AddPoint(float(value), float(share))
         self.property.SetColor(colour)
         self.property.SetScalarOpacity(opacity)
 

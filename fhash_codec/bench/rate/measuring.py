@@ -1,4 +1,5 @@
-"""The measuring behind `fhash bench rate`: for every quality asked the smallest size of each codec, then its speed."""
+"""The measurements of `fhash bench rate`: the smallest size of each codec at each quality, and
+speed."""
 
 from __future__ import annotations
 
@@ -36,19 +37,33 @@ from fhash_codec.volume import decoded_type
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
 
-TRIALS, SLACK, BOUND_SLACK = 8, 0.05, 0.1
-"""Of each search: new trials at most, and dB of quality above what is asked that end it."""
+TRIALS = 8
+"""New trials of each search, at most."""
+SLACK = 0.05
+"""dB of PSNR above the target at which a search ends."""
+BOUND_SLACK = 0.1
+"""dB of the largest error below the bound at which a search ends."""
 UNIFORM = 20 * math.log10(math.sqrt(3))
-"""dB by which the RMSE of an even error is below the tolerance."""
-RUNS, LONG_SECONDS = 3, 20.0
-"""The best of so many runs counts; after so many seconds of encoding there is no further run."""
-PLACES, REGION = 8, 16
-"""Random places at which access is measured, and the vertices of a region along each axis."""
+"""dB by which the RMSE of a uniformly distributed error lies below the tolerance."""
+RUNS = 3
+"""Runs of which the best counts."""
+LONG_SECONDS = 20.0
+"""Seconds of encoding after which there is no further run."""
+PLACES = 8
+"""Random places at which access is measured."""
+REGION = 16
+"""Vertices of a region along each axis."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
-    """A trial that reached what was asked, or with `reached` unset the closest, and how to have it again."""
+class Best:
+    """The trial of a codec that reached a quality, or else the closest one.
+
+    Attributes:
+        as_asked: for a bound, whether the codec's own tolerance of that bound kept it; None where
+            it has no such setting.
+        how: variant or settings that give the trial again.
+    """
 
     codec: str
     trial: Trial
@@ -59,7 +74,7 @@ class Found:
 
 
 class Bench:
-    """One run of the bench: the data, and what has been found so far by quality asked and codec."""
+    """One run of the bench: the data, and the best trial so far by quality and codec."""
 
     def __init__(
         self,
@@ -75,14 +90,17 @@ class Bench:
         floats = np.asarray(series.values, dtype=decoded_type(series.dtype))
         self.filled: npt.NDArray[Any] = filled(floats) if missing else floats
         self.own = Own(series, self.range, folder)
-        self.found: dict[tuple[str, float], dict[str, Found]] = {goal: {} for goal in goals}
+        self.best: dict[tuple[str, float], dict[str, Best]] = {goal: {} for goal in goals}
         self.refused: dict[str, str] = {}
         self.speeds: list[Speed] = []
         self.access: list[Access] = []
         self.done, self.total = 0, 1
 
     def search(self, variant: Variant) -> None:
-        """Find the smallest size of a variant for every goal it is tried for; the codec keeps the best of its variants."""
+        """Find the smallest size of a variant for each of its goals.
+
+        The codec keeps the best of its variants.
+        """
         search = self._search(variant)
         for goal, asked in self.goals:
             if goal not in variant.goals:
@@ -108,7 +126,7 @@ class Bench:
                 continue
             reached = trial is not None
             closest = trial or max(search.trials.values(), key=lambda tried: tried.quality(goal))
-            found = Found(
+            best = Best(
                 codec=variant.peer,
                 trial=closest,
                 setting=variant.name,
@@ -116,7 +134,7 @@ class Bench:
                 as_asked=as_asked,
                 how=variant,
             )
-            self._keep((goal, asked), found)
+            self._keep((goal, asked), best)
 
     def _search(self, variant: Variant) -> Search:
         """The trials of a variant on these data."""
@@ -139,12 +157,12 @@ class Bench:
             self.done += 1
             self.progress("comparing", self.done, self.total, f"fhash {profile}")
             trial = self.own.trial(config)
-            # A bound is kept in data units; dividing by the range may round the share up by its last bit.
+            # A bound is kept in data units; the division by the range may round the share up.
             reached = (
                 trial.psnr >= asked if goal == "psnr" else trial.max_error <= asked * (1 + 1e-12)
             )
             as_asked = reached if goal == "bound" and profile != "paper" else None
-            found = Found(
+            best = Best(
                 codec=f"{OWN}{profile}",
                 trial=trial,
                 setting=f"{OWN}{profile}",
@@ -152,50 +170,54 @@ class Bench:
                 as_asked=as_asked,
                 how=config,
             )
-            self._keep((goal, asked), found)
+            self._keep((goal, asked), best)
 
-    def _keep(self, goal: tuple[str, float], new: Found) -> None:
-        """Take what was found unless the codec has something better: reached before not reached, then fewer bytes."""
-        old = self.found[goal].get(new.codec)
+    def _keep(self, goal: tuple[str, float], new: Best) -> None:
+        """Keep a trial unless the codec has a better one: one that reached the goal, then fewer
+        bytes."""
+        old = self.best[goal].get(new.codec)
         if old is None or (not old.reached, old.trial.bytes) > (not new.reached, new.trial.bytes):
-            self.found[goal][new.codec] = new
+            self.best[goal][new.codec] = new
 
     def points(self) -> list[Point]:
-        """What was found, by goal and codec."""
+        """The kept trials, by goal and codec."""
         return [
             Point(
-                codec=found.codec,
+                codec=best.codec,
                 goal=goal,
                 asked=asked,
-                reached=found.reached,
-                bytes=found.trial.bytes,
-                psnr=_shown(found.trial),
-                max_error=found.trial.max_error,
-                setting=found.setting,
-                as_asked=found.as_asked,
+                reached=best.reached,
+                bytes=best.trial.bytes,
+                psnr=_shown(best.trial),
+                max_error=best.trial.max_error,
+                setting=best.setting,
+                as_asked=best.as_asked,
             )
-            for (goal, asked), codecs in self.found.items()
-            for found in codecs.values()
+            for (goal, asked), codecs in self.best.items()
+            for best in codecs.values()
         ]
 
-    def measure_speed(self, target: float, known: Mapping[str, Sequence[Variant]]) -> None:
-        """Encoding, decoding and access of every codec as it was found for a PSNR, and access to small chunks at the same PSNR."""
-        codecs = self.found["psnr", target].values()
-        for number, found in enumerate(codecs):
-            if isinstance(found.how, EncodeConfig):
-                self._speed_of_own(found, found.how)
-            else:
-                self._speed_of_peer(found, found.how)
-                self._access_of_peer(found.how, found.trial)
-                if max(self.series.shape[1:]) > SMALL_CHUNK:
-                    self._small_access(small_chunks(known[found.codec]), target)
-            self.progress("timing", number + 1, len(codecs), found.codec)
+    def measure_speed(self, target: float, variants: Mapping[str, Sequence[Variant]]) -> None:
+        """Measure encoding, decoding and access of each codec at its setting for a PSNR.
 
-    def _speed_of_peer(self, found: Found, variant: Variant) -> None:
+        Peers are also measured with small chunks at the same PSNR.
+        """
+        codecs = self.best["psnr", target].values()
+        for number, best in enumerate(codecs):
+            if isinstance(best.how, EncodeConfig):
+                self._speed_of_own(best, best.how)
+            else:
+                self._speed_of_peer(best, best.how)
+                self._access_of_peer(best.how, best.trial)
+                if max(self.series.shape[1:]) > SMALL_CHUNK:
+                    self._small_access(small_chunks(variants[best.codec]), target)
+            self.progress("timing", number + 1, len(codecs), best.codec)
+
+    def _speed_of_peer(self, best: Best, variant: Variant) -> None:
         values, path = self._values(variant), self.folder / "peer.h5"
 
         def encode() -> None:
-            with stored(values, variant, self.range, found.trial.level, path):
+            with stored(values, variant, self.range, best.trial.level, path):
                 pass
 
         def decode() -> None:
@@ -203,7 +225,7 @@ class Bench:
                 read_all(file, variant)
 
         self._add_speed(
-            found, [_timed(encode) for _ in range(RUNS)], [_timed(decode) for _ in range(RUNS)]
+            best, [_timed(encode) for _ in range(RUNS)], [_timed(decode) for _ in range(RUNS)]
         )
 
     def _small_access(self, variant: Variant, target: float) -> None:
@@ -232,28 +254,26 @@ class Bench:
 
         self._add_access(variant.peer, variant.name, trial, read)
 
-    def _speed_of_own(self, found: Found, config: EncodeConfig) -> None:
+    def _speed_of_own(self, best: Best, config: EncodeConfig) -> None:
         while len(self.own.seconds[config]) < RUNS and sum(self.own.seconds[config]) < LONG_SECONDS:
             self.own.encode(config)
         self._add_speed(
-            found, self.own.seconds[config], [self.own.decode(config) for _ in range(RUNS)]
+            best, self.own.seconds[config], [self.own.decode(config) for _ in range(RUNS)]
         )
         self._add_access(
-            found.codec,
-            found.setting,
-            found.trial,
+            best.codec,
+            best.setting,
+            best.trial,
             lambda step, box: self.own.read_region(config, step, box),
         )
 
-    def _add_speed(
-        self, found: Found, encoding: Sequence[float], decoding: Sequence[float]
-    ) -> None:
+    def _add_speed(self, best: Best, encoding: Sequence[float], decoding: Sequence[float]) -> None:
         megabytes = self.series.values.nbytes / 1e6
         self.speeds.append(
             Speed(
-                codec=found.codec,
-                setting=found.setting,
-                psnr=_shown(found.trial),
+                codec=best.codec,
+                setting=best.setting,
+                psnr=_shown(best.trial),
                 encode_mb_s=megabytes / min(encoding),
                 decode_mb_s=megabytes / min(decoding),
                 encode_runs=len(encoding),
@@ -263,7 +283,7 @@ class Bench:
     def _add_access(
         self, codec: str, setting: str, trial: Trial, read: Callable[[int, Box], tuple[int, float]]
     ) -> None:
-        """Read regions at the same places for every codec, and one before them that does not count."""
+        """Read regions at the same places for every codec; the first is a warm-up."""
         rng = np.random.default_rng(0)
         steps, *space = self.series.shape
         size = [min(REGION, n) for n in space]
@@ -273,9 +293,7 @@ class Bench:
                 int(rng.integers(0, n - length + 1)) for n, length in zip(space, size, strict=True)
             ]
             step = int(rng.integers(0, steps))
-            box: Box = tuple(
-                (start, start + length) for start, length in zip(low, size, strict=True)
-            )  # type: ignore[assignment]
+            box = Box.of_shape(size).shift(low)
             if place:
                 measured.append(read(step, box))
             else:

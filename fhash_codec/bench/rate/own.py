@@ -1,4 +1,5 @@
-"""fhash's own profiles in `fhash bench rate`, through the public functions alone, each encoding in a file of its own."""
+"""fhash's own profiles in `fhash bench rate`, through public functions; each encoding has its
+file."""
 
 from __future__ import annotations
 
@@ -22,9 +23,16 @@ PROFILES: tuple[str, ...] = EncodeConfig.__dataclass_fields__["profile"].metadat
 
 
 def promised(settings: Mapping[str, Any], profile: str, goal: str, asked: float) -> EncodeConfig:
-    """Those of the settings that a profile has, for PSNR `asked` (dB), or for "bound" a largest error of `asked` (share of the range).
+    """Settings of a profile that promise a quality.
 
-    The paper profile is not steered by quality: its settings are the same for every goal.
+    Settings that belong to other profiles are left out. The paper profile is not steered by
+    quality: its settings are the same for every goal.
+
+    Args:
+        settings: settings by name.
+        profile: name of the profile.
+        goal: `psnr` (dB) or `bound` (largest error as a share of the range).
+        asked: the quality.
     """
     others = {
         field.name
@@ -37,14 +45,17 @@ def promised(settings: Mapping[str, Any], profile: str, goal: str, asked: float)
 
 
 class Own:
-    """Encodings of one series, each made once, and what was measured of it.
+    """Encodings of one series, each made once, and their figures.
 
     Attributes:
-        seconds: of each encoding so far, by its settings.
+        seconds: times of each encoding so far, by its settings.
     """
 
     def __init__(self, series: Series, data_range: float, folder: Path) -> None:
-        """folder: where the files go, which the caller removes. data_range: of the series."""
+        """Prepare encodings of a series.
+
+        data_range: range of the series. folder: place of the files, which the caller removes.
+        """
         self._series = series
         self._range = data_range
         self._folder = folder
@@ -63,7 +74,7 @@ class Own:
         return spent
 
     def trial(self, config: EncodeConfig) -> Trial:
-        """The figures of the file of these settings, from every frame as it decodes."""
+        """Figures of the file with these settings, from every decoded frame."""
         if config not in self._trials:
             self.encode(config)
             errors = Errors(self._range)
@@ -74,7 +85,7 @@ class Own:
         return self._trials[config]
 
     def decode(self, config: EncodeConfig) -> float:
-        """Decode every frame of a file that is opened for it; the seconds that took."""
+        """Open the file and decode every frame; seconds."""
         begun = time.perf_counter()
         with fhash_codec.open(self._paths[config]) as volume:
             for step in range(volume.shape[0]):
@@ -82,7 +93,7 @@ class Own:
         return time.perf_counter() - begun
 
     def read_region(self, config: EncodeConfig, step: int, region: Box) -> tuple[int, float]:
-        """Read a region of one step of a file that is opened for it; the bytes that were read of the file, and the seconds it took."""
+        """Open the file and read a region of one step; bytes read of the file, and seconds."""
         begun = time.perf_counter()
         with fhash_codec.open(self._paths[config]) as volume:
             volume.read(step, region)

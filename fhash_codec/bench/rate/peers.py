@@ -1,9 +1,12 @@
-"""The peers of `fhash bench rate`: other codecs, each with the layouts and settings it is at its best with, kept in HDF5 files.
+"""The peers of `fhash bench rate`: other codecs in their best layouts and settings, in HDF5 files.
 
-SZ3, SPERR, ZFP and Blosc are the HDF5 filters of hdf5plugin; BitRound is numcodecs' followed by Blosc (zstd, shuffle). What there is to
-know: SPERR's filter takes the axes in reverse unless `swap` is set; its PSNR refers to the range of one chunk, so that a constant error
-over all frames takes a setting for each; it crashes on NaN, and ZFP silently replaces it; ZFP's tolerance is rounded down to a power of
-two. Chunk caches are off: reading back would otherwise return what was written.
+SZ3, SPERR, ZFP and Blosc are the HDF5 filters of hdf5plugin. BitRound is that of numcodecs,
+followed by Blosc (zstd, shuffle). Traps:
+
+- SPERR's filter takes the axes in reverse unless `swap` is set, and crashes on NaN. Its PSNR refers
+  to the range of one chunk, so a constant error over all frames needs a setting for each chunk.
+- ZFP silently replaces NaN, and rounds its tolerance down to a power of two.
+- Chunk caches are off: otherwise reading back would return what was written.
 """
 
 from __future__ import annotations
@@ -29,26 +32,33 @@ Filter = Mapping[str, Any]
 LADDER = 20 * math.log10(2)
 """dB between settings that are powers of two apart."""
 SMALL_CHUNK = 32
-"""Vertices along an axis of the chunks that a user who wants regions would choose."""
+"""Vertices along an axis of a chunk, as a user who reads regions would choose."""
 LAYOUTS = {"frame": 0, "plane": 1, "series": None}
-"""A chunk is one step, all steps of one z, or everything; each name with the axis that is cut, a dataset for each part."""
+"""Axis that each layout cuts into datasets: a chunk is one step, all steps of one z, or
+everything."""
 MAX_CHUNK = 2**31
-"""Bytes; HDF5 has no chunks of 4 GiB or more."""
+"""Bytes of the largest chunk; HDF5 allows less than 4 GiB."""
+
+
+BOTH = ("psnr", "bound")
+"""Goals of a peer that is tried for every kind of quality."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """One way to use a peer.
+    """One mode and layout of a peer.
 
     Attributes:
-        peer: its name. mode: what its setting is, for people. layout: one of LAYOUTS.
-        goals: what it is tried for, "psnr", "bound" or both.
-        setting: the HDF5 filter for (part of the data, range of the data, level). level: quality aimed at in dB, a scale on which a
-            uniform tolerance of range * 10^(-level / 20) stands at `level`.
+        peer: its name.
+        mode: the kind of its setting, for people.
+        layout: one of LAYOUTS.
+        goals: qualities it is tried for, `psnr`, `bound` or both.
+        setting: gives the HDF5 filter for (part of the data, range of the data, level). A level is
+            a quality in dB: a uniform tolerance of range * 10^(-level / 20) stands at `level`.
         step: distance in dB of levels that differ at all, 0 for any.
-        prepare: what happens to the values before the filter, at a level.
-        chunk: the largest length of a chunk along an axis of its layout, None for no limit.
-        lossless: there is nothing to set, and the values may be of any type and not finite.
+        prepare: changes the values before the filter, at a level.
+        chunk: largest length of a chunk along an axis of its layout, None for no limit.
+        lossless: there is nothing to set, and values may be of any type and not finite.
     """
 
     peer: str
@@ -63,11 +73,12 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """For people: "SPERR rate, a chunk per frame"."""
-        return f"{self.peer} {self.mode}, {'a chunk' if self.chunk is None else f'chunks of {self.chunk}'} per {self.layout}"
+        """Description such as "SPERR rate, a chunk per frame"."""
+        chunks = "a chunk" if self.chunk is None else f"chunks of {self.chunk}"
+        return f"{self.peer} {self.mode}, {chunks} per {self.layout}"
 
     def chunk_shape(self, part: Values) -> tuple[int, ...]:
-        """The shape of chunks of a dataset: all of it, or even parts within the limits."""
+        """Shape of the chunks of a dataset: all of it, or even parts within the limits."""
         if self.chunk is not None:
             return tuple(-(-n // -(-n // self.chunk)) for n in part.shape)
         first, *others = part.shape
@@ -87,86 +98,95 @@ def peers() -> dict[str, tuple[Variant, ...]]:
         raise MissingDependencyError(
             "bench rate compares with the codecs of hdf5plugin; pip install 'fhash[bench]'"
         ) from error
-
-    def absolute(part: Values, data_range: float, level: float) -> Filter:
-        return plugins.SZ3(absolute=tolerance(data_range, level))  # type: ignore[no-any-return]
-
-    def sperr_tolerance(part: Values, data_range: float, level: float) -> Filter:
-        return plugins.Sperr(absolute=tolerance(data_range, level), swap=True)  # type: ignore[no-any-return]
-
-    def sperr_psnr(part: Values, data_range: float, level: float) -> Filter:
-        own = max(float(part.max()) - float(part.min()), 1e-9 * data_range)
-        psnr = max(0.1, level + 20 * math.log10(own / data_range))
-        return plugins.Sperr(peak_signal_to_noise_ratio=psnr, swap=True)  # type: ignore[no-any-return]
-
-    def sperr_rate(part: Values, data_range: float, level: float) -> Filter:
-        # Bits a value; a fixed ratio for each 6 dB is near the truth at low rates, and the search does the rest.
-        return plugins.Sperr(rate=min(63.9, max(2.0**-15, 2.0 ** (level / 6 - 9))), swap=True)  # type: ignore[no-any-return]
-
-    def zfp(part: Values, data_range: float, level: float) -> Filter:
-        return plugins.Zfp(accuracy=tolerance(data_range, level))  # type: ignore[no-any-return]
-
-    def blosc(part: Values, data_range: float, level: float) -> Filter:
-        return plugins.Blosc(cname="zstd", clevel=5, shuffle=plugins.Blosc.SHUFFLE)  # type: ignore[no-any-return]
-
-    both, quality, bound = (
-        ("psnr", "bound"),
-        ("psnr",),
-        ("bound",),
-    )  # a tolerance of SPERR costs more bytes at equal PSNR
     return {
-        "SZ3": tuple(
-            Variant(peer="SZ3", mode="tolerance", layout=layout, goals=both, setting=absolute)
-            for layout in ("frame", "series")
-        ),
-        "SPERR": tuple(
-            Variant(peer="SPERR", mode=mode, layout=layout, goals=goals, setting=setting)
-            for mode, goals, setting in (
-                ("PSNR", quality, sperr_psnr),
-                ("rate", quality, sperr_rate),
-                ("tolerance", bound, sperr_tolerance),
-            )
-            for layout in ("frame", "plane")
-        ),
-        "ZFP": tuple(
-            Variant(
-                peer="ZFP", mode="tolerance", layout=layout, goals=both, setting=zfp, step=LADDER
-            )
-            for layout in ("frame", "series")
-        ),
-        "BitRound": (
-            Variant(
-                peer="BitRound",
-                mode="bits",
-                layout="frame",
-                goals=both,
-                setting=blosc,
-                step=LADDER,
-                prepare=_bit_round,
-            ),
-        ),
-        "Blosc": (
-            Variant(
-                peer="Blosc",
-                mode="lossless",
-                layout="frame",
-                goals=both,
-                setting=blosc,
-                lossless=True,
-            ),
-        ),
+        "SZ3": _sz3(plugins),
+        "SPERR": _sperr(plugins),
+        "ZFP": _zfp(plugins),
+        "BitRound": _bit_round(plugins),
+        "Blosc": _blosc(plugins),
     }
 
 
+def _sz3(plugins: Any) -> tuple[Variant, ...]:
+    def absolute(part: Values, data_range: float, level: float) -> Filter:
+        return plugins.SZ3(absolute=tolerance(data_range, level))  # type: ignore[no-any-return]
+
+    return tuple(
+        Variant(peer="SZ3", mode="tolerance", layout=layout, goals=BOTH, setting=absolute)
+        for layout in ("frame", "series")
+    )
+
+
+def _sperr(plugins: Any) -> tuple[Variant, ...]:
+    def absolute(part: Values, data_range: float, level: float) -> Filter:
+        return plugins.Sperr(absolute=tolerance(data_range, level), swap=True)  # type: ignore[no-any-return]
+
+    def psnr(part: Values, data_range: float, level: float) -> Filter:
+        own = max(float(part.max()) - float(part.min()), 1e-9 * data_range)
+        quality = max(0.1, level + 20 * math.log10(own / data_range))
+        return plugins.Sperr(peak_signal_to_noise_ratio=quality, swap=True)  # type: ignore[no-any-return]
+
+    def rate(part: Values, data_range: float, level: float) -> Filter:
+        # Bits a value. Each 6 dB double them, nearly true at low rates; the search does the rest.
+        return plugins.Sperr(rate=min(63.9, max(2.0**-15, 2.0 ** (level / 6 - 9))), swap=True)  # type: ignore[no-any-return]
+
+    # At equal PSNR a tolerance costs more bytes than the other modes: it is for bounds alone.
+    modes = (("PSNR", "psnr", psnr), ("rate", "psnr", rate), ("tolerance", "bound", absolute))
+    return tuple(
+        Variant(peer="SPERR", mode=mode, layout=layout, goals=(goal,), setting=setting)
+        for mode, goal, setting in modes
+        for layout in ("frame", "plane")
+    )
+
+
+def _zfp(plugins: Any) -> tuple[Variant, ...]:
+    def accuracy(part: Values, data_range: float, level: float) -> Filter:
+        return plugins.Zfp(accuracy=tolerance(data_range, level))  # type: ignore[no-any-return]
+
+    return tuple(
+        Variant(
+            peer="ZFP", mode="tolerance", layout=layout, goals=BOTH, setting=accuracy, step=LADDER
+        )
+        for layout in ("frame", "series")
+    )
+
+
+def _bit_round(plugins: Any) -> tuple[Variant, ...]:
+    return (
+        replace(
+            _lossless(plugins, "BitRound", "bits"),
+            lossless=False,
+            step=LADDER,
+            prepare=_rounded,
+        ),
+    )
+
+
+def _blosc(plugins: Any) -> tuple[Variant, ...]:
+    return (_lossless(plugins, "Blosc", "lossless"),)
+
+
+def _lossless(plugins: Any, peer: str, mode: str) -> Variant:
+    """Blosc (zstd, shuffle) on single frames."""
+
+    def setting(part: Values, data_range: float, level: float) -> Filter:
+        return plugins.Blosc(cname="zstd", clevel=5, shuffle=plugins.Blosc.SHUFFLE)  # type: ignore[no-any-return]
+
+    return Variant(peer=peer, mode=mode, layout="frame", goals=BOTH, setting=setting, lossless=True)
+
+
 def small_chunks(variants: Sequence[Variant]) -> Variant:
-    """How to use a peer for random access: small chunks of a frame, with one tolerance for all, as chunks differ in range and detail."""
+    """Variant of a peer for random access: small chunks of a frame.
+
+    All chunks share one tolerance, since they differ in range and detail.
+    """
     return replace(
         next(variant for variant in reversed(variants) if variant.layout == "frame"),
         chunk=SMALL_CHUNK,
     )
 
 
-def _bit_round(values: Values, level: float) -> Values:
+def _rounded(values: Values, level: float) -> Values:
     """Values with as many bits of the mantissa as a level has steps."""
     from numcodecs import BitRound
 
@@ -266,18 +286,19 @@ def _parts(
 
 
 def filled(values: Values) -> Values:
-    """Values with every one that is not finite replaced by the nearest finite one before it in its row along x, else behind it.
+    """Replace each value that is not finite by the nearest finite one before it in its row along x.
 
-    Where a row has none, the same along y, z and t. There must be a finite value.
+    Where there is none before it, by the nearest after it; where a row has none, along y, z and t.
+    At least one value must be finite.
     """
     result = values.copy()
     for axis in (3, 2, 1, 0):
         for line in (result, np.flip(result, axis)):
-            known = np.isfinite(line)
-            if known.all():
+            finite = np.isfinite(line)
+            if finite.all():
                 return result
             shape = [-1 if number == axis else 1 for number in range(4)]
-            places = np.where(known, np.arange(line.shape[axis]).reshape(shape), 0)
+            places = np.where(finite, np.arange(line.shape[axis]).reshape(shape), 0)
             np.maximum.accumulate(places, axis=axis, out=places)
             line[...] = np.take_along_axis(line, places, axis)
     return result

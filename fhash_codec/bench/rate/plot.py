@@ -30,7 +30,11 @@ def require_matplotlib() -> Any:
 
 
 def plot(result: RateBench, path: Path) -> None:
-    """Draw a result as a PNG at `path`: a panel for each kind of quality, bytes on a logarithmic axis, what was not reached left out."""
+    """Draw a result as a PNG at `path`.
+
+    Each kind of quality has a panel, with bytes on a logarithmic axis; qualities that were not
+    reached are left out.
+    """
     figure_module = require_matplotlib()
     goals = [
         goal for goal in ("psnr", "bound") if any(point.goal == goal for point in result.points)

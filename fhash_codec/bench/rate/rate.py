@@ -1,4 +1,4 @@
-"""`fhash bench rate`: bytes, speed and access of fhash's profiles and of other codecs, at equal quality on one series."""
+"""`fhash bench rate`: bytes, speed and access of fhash and other codecs at equal quality."""
 
 from __future__ import annotations
 
@@ -26,15 +26,18 @@ TARGETS = (35.0, 40.0, 45.0, 50.0, 60.0)
 BOUNDS = (0.05, 0.02, 0.01, 0.005, 0.001)
 """Largest errors as shares of the range."""
 SPEED_AT = 50.0
-"""dB at which speed and access are measured, or the target nearest to it."""
+"""PSNR in dB at which speed and access are measured; the target nearest to it is taken."""
 NOTES = (
     "the whole series is held in memory",
-    "bytes of a peer are those of its stored chunks alone, the structure of its file is left out; bytes of fhash are the whole file",
-    "of every peer the smallest of its layouts and modes counts; for a bound, the coarsest setting whose decoded values keep it",
-    "tolerances of ZFP are powers of two and BitRound keeps whole bits: both may exceed what was asked by up to 6 dB, as their PSNR says",
+    "bytes of a peer are those of its stored chunks alone, the structure of its file is left out;"
+    " bytes of fhash are the whole file",
+    "of every peer the smallest of its layouts and modes counts;"
+    " for a bound, the coarsest setting whose decoded values keep it",
+    "tolerances of ZFP are powers of two and BitRound keeps whole bits:"
+    " both may exceed what was asked by up to 6 dB, as their PSNR says",
     "peers run on one thread as HDF5 filters; fhash takes the threads it takes by default",
-    "access opens the file anew, the operating system has it in memory; bytes read are those of whole chunks for a peer, "
-    "and all that is read of the file, directory included, for fhash",
+    "access opens the file anew, the operating system has it in memory; bytes read are those of"
+    " whole chunks for a peer, and all that is read of the file, directory included, for fhash",
 )
 
 
@@ -49,17 +52,25 @@ def bench_rate(
     speed: bool = True,
     progress: Progress = silent,
 ) -> RateBench:
-    """Measure fhash's `profiles` and the peers `names` on a series, which is held in memory whole.
+    """Measure fhash's profiles and its peers on a series, which is held in memory.
 
-    settings: further ones of fhash by name, as `EncodeConfig.from_dict` takes them; each profile takes those it has. All of the domain
-    counts here, so a feature is refused. targets: PSNR in dB over every finite value of all frames, the range being the global one of
-    the series. bounds: largest errors as shares of that range. Everything is measured on what is really decoded. speed: also measure
-    encoding, decoding and access at the target nearest to SPEED_AT, unless there is none.
+    Everything is measured on decoded values.
+
+    Args:
+        source: a file, a Series or an array.
+        settings: further settings of fhash by name, as for `EncodeConfig.from_dict`; each profile
+            takes those it has. A feature is refused, since the whole domain counts here.
+        targets: PSNR in dB over every finite value of all frames, with the range of the series.
+        bounds: largest errors as shares of that range.
+        names: peers, of PEERS.
+        profiles: profiles of fhash.
+        speed: also measure encoding, decoding and access, at the target nearest to SPEED_AT.
+
     Raises InputError for what cannot be measured, MissingDependencyError without hdf5plugin.
     """
     settings = settings or {}
     _check(settings, targets, bounds, names, profiles)
-    known = peers() if names else {}
+    variants = peers() if names else {}
     with (
         open_source(source) as series,
         tempfile.TemporaryDirectory(prefix="fhash-bench-") as folder,
@@ -73,22 +84,19 @@ def bench_rate(
         values = np.stack(list(series.frames()))
         missing = values.size - scanned.finite_count
         plain = ArraySeries(values, name=series.name, units=series.units, coords=series.coords)
-        goals = [("psnr", target) for target in sorted(targets)] + [
-            ("bound", bound) for bound in sorted(bounds, reverse=True)
-        ]
+        goals = [("psnr", target) for target in sorted(targets)]
+        goals += [("bound", bound) for bound in sorted(bounds, reverse=True)]
         bench = Bench(plain, value_range, missing, Path(folder), goals, progress)
-        chosen = [variant for name in names for variant in known[name]]
-        bench.total = sum(goal in variant.goals for variant in chosen for goal, _ in goals) + len(
-            goals
-        ) * len(profiles)
+        chosen = [variant for name in names for variant in variants[name]]
+        peer_trials = sum(goal in variant.goals for variant in chosen for goal, _ in goals)
+        bench.total = peer_trials + len(goals) * len(profiles)
         for variant in chosen:
             bench.search(variant)
         for profile in profiles:
             bench.search_own(settings, profile)
         if speed and targets:
-            bench.measure_speed(
-                min(targets, key=lambda target: (abs(target - SPEED_AT), target)), known
-            )
+            nearest = min(targets, key=lambda target: (abs(target - SPEED_AT), target))
+            bench.measure_speed(nearest, variants)
         return RateBench(
             series=f"{series.source} {series.name}",
             shape=series.shape,
@@ -129,7 +137,8 @@ def _check(
         )
     if tuple(settings.get("features", ("all",))) != ("all",):
         raise InputError(
-            f"feature is {', '.join(settings['features'])}; bench rate compares whole domains, leave it out"
+            f"feature is {', '.join(settings['features'])};"
+            " bench rate compares whole domains, leave it out"
         )
     for profile in profiles:
         promised(settings, profile, "psnr", SPEED_AT)

@@ -1,4 +1,4 @@
-"""What `fhash bench rate` finds, as records and JSON values."""
+"""Results of `fhash bench rate`, as records and JSON values."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 PEERS = ("SZ3", "SPERR", "ZFP", "BitRound", "Blosc")
 """Names of the peers."""
 OWN = "fhash "
-"""How the names of fhash's own profiles begin among codecs."""
+"""Prefix of the names of fhash's own profiles among the codecs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,10 +16,15 @@ class Point:
     """The smallest size at which a codec reached a quality, or the closest it came.
 
     Attributes:
-        codec: name of a peer, or "fhash PROFILE". goal: "psnr" (dB) or "bound" (share of the range), and `asked` of it.
-        reached: whether it did. bytes, psnr (dB, None where exact), max_error (share of the range): what it came to.
-        setting: for people.
-        as_asked: for a bound, whether the codec's own tolerance of just that bound kept it; None where it has no such setting.
+        codec: name of a peer, or "fhash PROFILE".
+        goal: "psnr" (dB) or "bound" (share of the range).
+        asked: the quality.
+        reached: whether the codec reached it.
+        bytes, psnr, max_error: figures of the file; psnr in dB, None where exact, max_error as a
+            share of the range.
+        setting: setting in words.
+        as_asked: for a bound, whether the codec's own tolerance of that bound kept it; None where
+            it has no such setting.
     """
 
     codec: str
@@ -35,7 +40,7 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True)
 class Speed:
-    """10^6 bytes of raw data a second of a codec at a quality, the best of some runs."""
+    """Speed of a codec at a quality in 10^6 bytes of raw data a second, the best of some runs."""
 
     codec: str
     setting: str
@@ -47,9 +52,13 @@ class Speed:
 
 @dataclass(frozen=True, kw_only=True)
 class Access:
-    """Reading a small region of one step: medians over random places.
+    """Access to a small region of one step: medians over random places.
 
-    bytes: of all the data, so stored that this is the cost, at a PSNR in dB. region: lengths (z, y, x).
+    Attributes:
+        region: lengths (z, y, x).
+        bytes: size of all the data in this layout.
+        psnr: dB of all the data.
+        bytes_read: bytes that one region takes.
     """
 
     codec: str
@@ -63,11 +72,13 @@ class Access:
 
 @dataclass(frozen=True, kw_only=True)
 class RateBench:
-    """What `bench_rate` measured.
+    """Everything that `bench_rate` measured.
 
     Attributes:
-        missing: number of values that are not finite; peers other than lossless ones were given their neighbours' values instead.
-        refused: by codec or variant, why it could not be measured. machine, notes: what the figures were taken on, and how.
+        missing: number of values that are not finite. Lossy peers were given neighbouring values in
+            their place.
+        refused: for each codec or variant that could not be measured, the reason.
+        machine: the machine. notes: how the figures were taken.
     """
 
     series: str
@@ -84,7 +95,11 @@ class RateBench:
     notes: tuple[str, ...]
 
     def best_peers(self) -> list[dict[str, Any]]:
-        """For each quality asked: {goal, asked, peer, bytes, ratios: {codec of fhash: bytes of the best peer / its own, or None}}."""
+        """The best peer at each quality, beside fhash.
+
+        A row is {goal, asked, peer, bytes, ratios}; ratios: for each profile of fhash the bytes of
+        the best peer over its own, or None.
+        """
         rows = []
         for goal, asked in dict.fromkeys((point.goal, point.asked) for point in self.points):
             here = [point for point in self.points if (point.goal, point.asked) == (goal, asked)]

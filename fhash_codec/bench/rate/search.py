@@ -1,4 +1,8 @@
-"""Finding the coarsest setting of a codec that still reaches a quality: few trials, each of them kept."""
+"""Search for the coarsest setting of a codec that still reaches a quality, in few trials.
+
+Every trial is kept, and helps the next search. Unlike the searches of `compact/choices`, this one
+knows nothing of the codec: it brackets the level from both sides.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 EXACT = 400.0
-"""dB that stand for an error of nothing."""
+"""PSNR in dB that stands for no error at all."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """What a codec made of the data at one level.
+    """Figures of a codec at one level.
 
-    psnr: in dB over every finite value of all frames, EXACT where nothing differs. max_error: the largest difference / range.
+    psnr: dB over every finite value of all frames, EXACT where nothing differs. max_error: the
+    largest difference as a share of the range.
     """
 
     level: float
@@ -23,19 +28,25 @@ class Trial:
     max_error: float
 
     def quality(self, goal: str) -> float:
-        """What a goal asks of, in dB: PSNR, or for "bound" the largest error on the same scale."""
+        """Quality in dB: the PSNR, or for "bound" the largest error on the same scale."""
         if goal == "psnr":
             return self.psnr
         return EXACT if self.max_error == 0 else -20 * math.log10(self.max_error)
 
 
 class Search:
-    """The trials of one way to use a codec; what one search measured helps the next."""
+    """The trials of one variant of a codec."""
 
     def __init__(
         self, measure: Callable[[float], Trial], *, step: float = 0.0, fixed: bool = False
     ) -> None:
-        """measure: a trial at a level. step: levels are multiples of it, 0 for any. fixed: every level gives the same."""
+        """Prepare the search.
+
+        Args:
+            measure: makes a trial at a level.
+            step: levels are multiples of it; 0 for any level.
+            fixed: every level gives the same trial.
+        """
         self._measure = measure
         self._step = step
         self._fixed = fixed
@@ -57,9 +68,16 @@ class Search:
     def find(
         self, goal: str, asked: float, *, first: float, slack: float, most: int
     ) -> Trial | None:
-        """The smallest trial of all whose quality is at least `asked`; looks on until one exceeds it by no more than `slack`.
+        """The smallest trial whose quality is at least `asked`, None where no trial reached it.
 
-        first: level to begin with where nothing is known. most: new trials at most. None if no trial reached it.
+        The search ends once a trial exceeds `asked` by no more than `slack`.
+
+        Args:
+            goal: "psnr" or "bound".
+            asked: quality in dB.
+            first: level to begin with before any trial.
+            slack: dB.
+            most: limit of new trials.
         """
         before = len(self.trials)
         last = None
@@ -107,7 +125,10 @@ class Search:
 
 
 def _slope(nearest: list[Trial], goal: str) -> float:
-    """dB of quality for each dB of level between two trials, within limits; 1 for a single trial and where one is exact."""
+    """dB of quality for each dB of level between two trials, within 0.2 to 4.
+
+    It is 1 for a single trial, and where one trial is exact.
+    """
     qualities = [trial.quality(goal) for trial in nearest]
     if len(nearest) < 2 or EXACT in qualities:
         return 1.0

@@ -1,1 +1,1 @@
-"""One file per choice: a sample and settings in, better settings out."""
+"""One file per choice of the compact profile: sample and settings in, better settings out."""

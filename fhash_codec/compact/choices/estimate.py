@@ -1,7 +1,8 @@
-"""The error that a quantiser step will cause, foretold from the coefficients of all tiles: far cheaper than coding them.
+"""Estimates of error and size at a quantiser step, from the coefficients of all tiles.
 
-A coefficient below a part of the step becomes 0 and errs by itself, another one errs by a share of the step. Both constants are rough; how
-far they are off is measured on a few coded tiles, and that hardly depends on the step.
+They are far cheaper than coding the tiles. A coefficient below a share of the step becomes 0 and
+errs by itself; another one errs by a share of the step. Both constants are rough. Their common
+error is measured on a few coded tiles, since it hardly depends on the step.
 """
 
 from __future__ import annotations
@@ -18,22 +19,32 @@ import numpy.typing as npt
 from fhash_codec import native
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Blocks, Index
-from fhash_codec.compact.tiles.coding import SMALLEST_STEP, Coding, code
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Coding, code
 from fhash_codec.compact.tiles.tiling import even_tile
-from fhash_formats.transform.tile.encoding import transform_for
+from fhash_formats.transform.tile.decoding import transform_for
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["Magnitudes", "foreseen_size", "foreseen_step", "magnitudes", "tile_costs"]
+__all__ = ["Magnitudes", "estimated_size", "estimated_step", "magnitudes", "tile_costs"]
 
-DEAD, SPREAD = 0.8, 0.1
-"""Part of a step below which a coefficient becomes 0, and mean square of the other errors in squared steps."""
-TRIALS, TRIAL_VERTICES, TRIAL_STEPS = 8, 1 << 18, 8
-"""Tiles that are coded to see how far the foresight is off; larger tiles are cut to about so many vertices for it."""
-BYTES_EACH = 0.7
-"""That a coefficient which is not 0 takes, roughly."""
+DEAD_ZONE = 0.8
+"""Share of the step below which a coefficient becomes 0."""
+SPREAD = 0.1
+"""Mean square of the error of the other coefficients, in squared steps."""
+TRIALS = 8
+"""Tiles that are coded at most to measure the error of the estimate."""
+TRIAL_VERTICES = 1 << 18
+"""Vertices of a tile coded for it; larger tiles are cut to about this size."""
+TRIAL_STEPS = 8
+"""Time steps of such a smaller tile."""
+BYTES_PER_COEFFICIENT = 0.7
+"""Approximate bytes per coefficient that is not 0."""
 SHIFT = 21
-"""A bin of magnitudes is a quarter of an octave: exponent and two bits of the mantissa of a float32."""
+"""Low bits of a float32 that a bin leaves out.
+
+The rest is the exponent and two bits of the mantissa: a bin is a quarter of an octave.
+"""
 BINS = 1 << (31 - SHIFT)
+"""Number of bins of magnitudes."""
 
 with np.errstate(invalid="ignore"):
     _EDGES = (np.arange(BINS, dtype=np.uint32) << SHIFT).view(np.float32).astype(np.float64)
@@ -42,70 +53,77 @@ _EDGES[~np.isfinite(_EDGES)] = np.inf
 
 @dataclass(frozen=True, kw_only=True)
 class Magnitudes:
-    """counts, squares: number and sum of squares of coefficients by magnitude."""
+    """Histogram of the magnitudes of coefficients, with logarithmic bins."""
 
     counts: npt.NDArray[np.int64]
+    """Number of coefficients in each bin."""
     squares: npt.NDArray[np.float64]
+    """Sum of the squares of the coefficients in each bin."""
 
     def error(self, step: float) -> float:
-        """The sum of squared errors at a step, roughly."""
-        limit = DEAD * step
-        number = int(np.searchsorted(_EDGES, min(limit, 1e38), side="right")) - 1
-        part = (limit - _EDGES[number]) / (_EDGES[number + 1] - _EDGES[number])
-        lost = math.fsum(self.squares[:number]) + float(part * self.squares[number])
-        kept = float(self.counts[number:].sum() - part * self.counts[number])
-        return lost + kept * SPREAD * step * step
+        """Return the approximate sum of the squared errors at a step."""
+        limit = DEAD_ZONE * step
+        number = self._bin_of(limit)
+        share = (limit - _EDGES[number]) / (_EDGES[number + 1] - _EDGES[number])
+        zeroed = math.fsum(self.squares[:number]) + float(share * self.squares[number])
+        kept = float(self.counts[number:].sum() - share * self.counts[number])
+        return zeroed + kept * SPREAD * step * step
 
     def size(self, step: float) -> float:
-        """The bytes that coding takes at a step, roughly."""
-        number = int(np.searchsorted(_EDGES, min(DEAD * step, 1e38), side="right")) - 1
-        return BYTES_EACH * float(self.counts[number:].sum())
+        """Return the approximate number of bytes at a step."""
+        number = self._bin_of(DEAD_ZONE * step)
+        return BYTES_PER_COEFFICIENT * float(self.counts[number:].sum())
 
-    def step(self, error: float, smallest: float) -> float:
-        """The step at which the sum of squared errors should be as given, at least `smallest`."""
-        low, high = smallest, smallest * 2
-        while self.error(high) < error and high < smallest * 2.0**60:
+    def step(self, error: float, min_step: float) -> float:
+        """Return the step for a sum of squared errors, at least `min_step`."""
+        low, high = min_step, min_step * 2
+        while self.error(high) < error and high < min_step * 2.0**60:
             low, high = high, high * 2
         for _ in range(30):
             middle = math.sqrt(low * high)
             low, high = (middle, high) if self.error(middle) < error else (low, middle)
         return low
 
+    @staticmethod
+    def _bin_of(magnitude: float) -> int:
+        """Return the bin that holds a magnitude."""
+        return int(np.searchsorted(_EDGES, min(magnitude, 1e38), side="right")) - 1
+
 
 def magnitudes(coefficients: npt.NDArray[np.float32]) -> Magnitudes:
-    """How large coefficients are; the same figures native (fhash_codec/native/quality.cpp) and in numpy."""
+    """Return the histogram of coefficients.
+
+    The native code (fhash_codec/native/quality.cpp) and numpy give the same figures.
+    """
     flat = np.ascontiguousarray(coefficients, dtype=np.float32).reshape(-1)
     library = native.library()
     if library is None:
         bins = (flat.view(np.uint32) & np.uint32(0x7FFFFFFF)) >> np.uint32(SHIFT)
         weights = np.square(flat, dtype=np.float64)
         squares = np.bincount(bins, weights=weights, minlength=BINS).astype(np.float64)
-        return Magnitudes(
-            counts=np.bincount(bins, minlength=BINS).astype(np.int64), squares=squares
-        )
-    found = Magnitudes(counts=np.zeros(BINS, np.int64), squares=np.zeros(BINS))
-    pointers = (ctypes.c_void_p(array.ctypes.data) for array in (found.counts, found.squares))
+        counts = np.bincount(bins, minlength=BINS).astype(np.int64)
+        return Magnitudes(counts=counts, squares=squares)
+    histogram = Magnitudes(counts=np.zeros(BINS, np.int64), squares=np.zeros(BINS))
     library.fhash_magnitudes(
         ctypes.c_void_p(flat.ctypes.data),
         ctypes.c_int64(flat.size),
         ctypes.c_int64(SHIFT),
-        *pointers,
+        ctypes.c_void_p(histogram.counts.ctypes.data),
+        ctypes.c_void_p(histogram.squares.ctypes.data),
     )
-    return found
+    return histogram
 
 
 def tile_costs(
     blocks: Blocks, settings: TileSettings, workers: ThreadPoolExecutor
 ) -> list[float] | None:
-    """The bytes that each tile takes with the settings, roughly, in C order; None for a series that is not held in memory."""
-    return (
-        [found.size(settings.step) for found in _look(blocks, settings, workers)]
-        if blocks.held
-        else None
-    )
+    """Return the approximate bytes of each tile, in C order; None for a series not in memory."""
+    if not blocks.in_memory:
+        return None
+    return [tile.size(settings.step) for tile in _tile_magnitudes(blocks, settings, workers)]
 
 
-def foreseen_size(
+def estimated_size(
     blocks: Blocks,
     settings: TileSettings,
     *,
@@ -113,16 +131,16 @@ def foreseen_size(
     data_range: float,
     workers: ThreadPoolExecutor,
 ) -> float:
-    """The bytes that the tiles of a series as in `foreseen_step` take at a PSNR, very roughly."""
-    seen = _together(_look(blocks, settings, workers))
-    return seen.size(
-        seen.step(
-            math.prod(blocks.shape) * data_range**2 * 10 ** (-psnr / 10), data_range * SMALLEST_STEP
-        )
-    )
+    """Return a very rough number of bytes that the tiles of a series take at a PSNR (dB).
+
+    The series must be as in `estimated_step`.
+    """
+    series = _sum(_tile_magnitudes(blocks, settings, workers))
+    error = _squared_error(blocks, psnr, data_range)
+    return series.size(series.step(error, data_range * MIN_STEP_SHARE))
 
 
-def foreseen_step(
+def estimated_step(
     blocks: Blocks,
     settings: TileSettings,
     coding: Coding,
@@ -131,55 +149,60 @@ def foreseen_step(
     data_range: float,
     workers: ThreadPoolExecutor,
 ) -> float:
-    """The step at which the tiles of a series that is held, counts whole and is coded in float32 should reach a PSNR, in dB."""
+    """Return the step at which the tiles of a series should reach a PSNR (dB).
 
-    smallest = data_range * SMALLEST_STEP
-    wanted = math.prod(blocks.shape) * data_range**2 * 10 ** (-psnr / 10)
-    seen = _together(_look(blocks, settings, workers))
-    step = seen.step(wanted, smallest)
+    The series must be in memory, all of its vertices in the coreset, and coded in float32.
+    """
+    min_step = data_range * MIN_STEP_SHARE
+    error = _squared_error(blocks, psnr, data_range)
+    series = _sum(_tile_magnitudes(blocks, settings, workers))
+    step = series.step(error, min_step)
     if math.prod(blocks.tile) > TRIAL_VERTICES:
-        # Large tiles take long to code, and what is asked of them, parts of them can tell.
-        blocks = blocks.retile(
-            even_tile(blocks.tile, math.prod(blocks.tile) // TRIAL_VERTICES + 1, TRIAL_STEPS)
-        )
+        # Large tiles take long to code, and smaller ones tell as much.
+        parts = math.prod(blocks.tile) // TRIAL_VERTICES + 1
+        blocks = blocks.retile(even_tile(blocks.tile, parts, TRIAL_STEPS))
         settings = replace(settings, transform=usual_transform(blocks.tile))
-    settings, indices, tiles = (
-        replace(settings, step=step),
-        list(blocks.indices()),
-        _look(blocks, settings, workers),
-    )
+    settings = replace(settings, step=step)
+    indices = list(blocks.indices())
+    tiles = _tile_magnitudes(blocks, settings, workers)
 
-    def trial(number: int) -> float:
-        values, care = blocks.read(indices[number])
-        found, guess = code(values, care, settings, coding)[1].squares, tiles[number].error(step)
-        return found / guess if guess > 0 and found > 0 else 1.0
+    def measured_to_estimated(number: int) -> float:
+        measured = code(blocks.read(indices[number]), settings, coding)[1].squares
+        estimate = tiles[number].error(step)
+        return measured / estimate if estimate > 0 and measured > 0 else 1.0
 
-    # Those that err most stand for all: a tile's chance is its share of the error.
-    shares = np.cumsum([tile.error(step) for tile in tiles])
-    chosen = np.searchsorted(shares, shares[-1] * (np.arange(TRIALS) + 0.5) / TRIALS).clip(
-        0, len(tiles) - 1
-    )
-    off = list(workers.map(trial, (int(number) for number in np.unique(chosen))))
-    return seen.step(wanted * len(off) / math.fsum(off), smallest)
+    # The chance of a tile is its share of the error, so that those of most error stand for all.
+    sums = np.cumsum([tile.error(step) for tile in tiles])
+    chosen = np.searchsorted(sums, sums[-1] * (np.arange(TRIALS) + 0.5) / TRIALS)
+    numbers = np.unique(chosen.clip(0, len(tiles) - 1))
+    ratios = list(workers.map(measured_to_estimated, (int(number) for number in numbers)))
+    return series.step(error * len(ratios) / math.fsum(ratios), min_step)
 
 
-def _look(blocks: Blocks, settings: TileSettings, workers: ThreadPoolExecutor) -> list[Magnitudes]:
-    """The magnitudes of each tile."""
-    transform = transform_for(
-        replace(settings, double=False, step=1.0), blocks.tile
-    )  # only the kinds matter
+def _squared_error(blocks: Blocks, psnr: float, data_range: float) -> float:
+    """Return the sum of the squared errors over a series at a PSNR (dB)."""
+    return math.prod(blocks.shape) * data_range**2 * 10 ** (-psnr / 10)
 
-    def look(index: Index) -> Magnitudes:
+
+def _tile_magnitudes(
+    blocks: Blocks, settings: TileSettings, workers: ThreadPoolExecutor
+) -> list[Magnitudes]:
+    """Return the magnitudes of the coefficients of each tile, in C order."""
+    # Only the kinds of the transform matter; float32 is precise enough.
+    transform = transform_for(replace(settings, double=False, step=1.0), blocks.tile)
+
+    def tile_magnitudes(index: Index) -> Magnitudes:
         with np.errstate(over="ignore", invalid="ignore"):
-            values = blocks.read(index)[0].astype(np.float32)
+            values = blocks.read(index).values.astype(np.float32)
             values -= np.float32(settings.center)
             values[~np.isfinite(values)] = 0
             return magnitudes(transform.forward(values))
 
-    return list(workers.map(look, blocks.indices()))
+    return list(workers.map(tile_magnitudes, blocks.indices()))
 
 
-def _together(tiles: Sequence[Magnitudes]) -> Magnitudes:
+def _sum(tiles: Sequence[Magnitudes]) -> Magnitudes:
+    """Return the histogram of all tiles together."""
     counts, squares = np.zeros(BINS, np.int64), np.zeros(BINS)
     for tile in tiles:
         counts += tile.counts

@@ -1,43 +1,48 @@
-"""Which values shall stand where none count: found by several ways, of which the one that takes the fewest bytes is kept."""
+"""Choice of the fill values for vertices that do not count: the candidate of fewest bytes wins."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from fhash_codec.compact.choices.search import EXCHANGE
-from fhash_codec.compact.choices.step import solve
+from fhash_codec.compact.choices.step import find_step
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["race"]
+__all__ = ["choose_filling"]
 
-PARTS = (0.0, 0.25, 0.5, 1.0)
-"""Of the quantiser's step that is to come, the steps of the fillings; with 0 the values that are there stay."""
-DENSITY, TRIES = 2, 3
-"""Of the fillings that compete, and of the search for the step that makes them comparable."""
+STEP_SHARES = (0.0, 0.25, 0.5, 1.0)
+"""Quantiser steps tried for filling, as shares of the final step; 0 keeps the existing values."""
+TRIAL_DENSITY = 2
+"""Thoroughness (density) of the fillings that compete."""
+TRIES = 3
+"""Trials of the search for the step that makes the fillings comparable."""
 
 
-def race(
+def choose_filling(
     sample: Sample, settings: TileSettings, coding: Coding, goal: Goal, density: int
 ) -> Sample:
-    """The sample with the filling that takes the fewest bytes where the promise is kept, found with `density` (`fill`)."""
+    """Return the sample with the filling that takes the fewest bytes where the promise is kept.
 
-    def trial(part: float) -> tuple[float, float]:
-        filled = sample.filled(
-            replace(settings, step=settings.step * (part or 1.0)), DENSITY if part else 0
-        )
-        return _cost(solve(filled, settings, coding, goal, tries=TRIES)[1], goal), part
+    density: thoroughness of the chosen filling, see `fill`.
+    """
 
-    part = min(trial(part) for part in PARTS)[1]
-    return sample.filled(
-        replace(settings, step=settings.step * (part or 1.0)), density if part else 0
-    )
+    def filled(share: float, density: int) -> Sample:
+        step = settings.step * (share or 1.0)
+        return sample.filled(replace(settings, step=step), density if share else 0)
+
+    def trial(share: float) -> tuple[float, float]:
+        outcome = find_step(filled(share, TRIAL_DENSITY), settings, coding, goal, tries=TRIES)[1]
+        return _cost(outcome, goal), share
+
+    return filled(min(trial(share) for share in STEP_SHARES)[1], density)
 
 
 def _cost(outcome: Outcome, goal: Goal) -> float:
-    """Bytes where the promise is kept, by what is left to it."""
+    """Return the bytes at the PSNR of the goal, by the usual exchange rate of dB for bytes."""
     if goal.psnr is None or not outcome.size:
         return outcome.size
-    return float(outcome.size * 2 ** ((goal.psnr - outcome.psnr(goal.data_range)) / EXCHANGE))
+    missing = goal.psnr - outcome.psnr(goal.data_range)
+    return float(outcome.size * 2 ** (missing / EXCHANGE))

@@ -1,60 +1,117 @@
-"""The trained head in the race for bytes: it stays only where a file of equal quality gets smaller by it."""
+"""Choice of the trained head: it stays only where it makes a file of equal quality smaller."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
 
-from fhash_codec.compact.choices.search import EXCHANGE, exchange
-from fhash_codec.compact.choices.step import SLOPE
+from fhash_codec.compact.choices.head_samples import Pair
+from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.errors import InputError
-from fhash_formats.transform.head.inputs import CROSS, FEATURES
+from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
 
 if TYPE_CHECKING:
-    from fhash_codec.compact.choices.head_training import Pair, TrainedHead
+    from fhash_codec.compact.choices.head_training import TrainedHead
 
-HEADS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
-"""Widths of the two hidden layers, the second over the cross, and their part of the gain in dB of the head that is tried first."""
-CHOICES = {5: 4, 6: 4, 7: 4, 8: 5, 9: 5}
-"""How many of them by effort."""
-STEPS = {5: 1500, 6: 2500, 7: 4000, 8: 6000, 9: 10000}
-"""Training steps by effort."""
-SAMPLES = {5: 200_000, 6: 200_000, 7: 400_000, 8: 400_000, 9: 400_000}
-"""Voxels that are learnt from by effort."""
-PERCEPTRON = (12, 8)
-"""Widths of the head without a cross that competes, too: where little is to be gained, its fewer weights may win."""
-LONGER = 2
-"""Times that its training is longer: its steps cost less."""
-TRIED = (8, 8)
-"""The head of the quick trial."""
+__all__ = ["HeadHistory", "choose_head"]
+
+HeadHistory = list[dict[str, float | None]]
+"""Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB."""
+StepSearch = Callable[[TileSettings, list[Outcome]], tuple[TileSettings, Outcome]]
+"""Search for the step that keeps the promise; it appends all outcomes on the way to the list."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Widths of the two hidden layers of a head, and whether it looks at the voxels of a cross."""
+
+    widths: tuple[int, int]
+    cross: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """Length of the training of a head."""
+
+    updates: int
+    """Number of training updates."""
+    samples: int
+    """Number of voxels that are learned from."""
+
+    def times(self, factor: int) -> Budget:
+        """Return a training so many times as long, with so many times as many voxels."""
+        return Budget(updates=self.updates * factor, samples=self.samples * factor)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """Effort that is spent on the choice of a head."""
+
+    candidates: int
+    """Number of the first entries of GAIN_BY_WIDTHS that are considered."""
+    budget: Budget
+    """Training of a head."""
+
+
+GAIN_BY_WIDTHS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
+"""Gain in dB of a head with a cross by its widths, as a multiple of the gain of the trial head."""
+EFFORTS = {
+    5: Effort(candidates=4, budget=Budget(updates=1500, samples=200_000)),
+    6: Effort(candidates=4, budget=Budget(updates=2500, samples=200_000)),
+    7: Effort(candidates=4, budget=Budget(updates=4000, samples=400_000)),
+    8: Effort(candidates=5, budget=Budget(updates=6000, samples=400_000)),
+    9: Effort(candidates=5, budget=Budget(updates=10000, samples=400_000)),
+}
+"""Effort spent on heads by the effort of the encoder; below 5 there is no head."""
+TRIAL_HEAD = Shape((8, 8), cross=True)
+"""Head of the quick trial."""
+TRIAL_BUDGET = Budget(updates=400, samples=80_000)
+"""Training of the quick trial."""
+PERCEPTRON = Shape((12, 8), cross=False)
+"""Head that competes, too: where little is to be gained, its fewer weights may win."""
+PERCEPTRON_LONGER = 2
+"""Factor of the training of the perceptron, whose updates cost less."""
 MIN_GAIN = 0.02
-"""dB on held-out samples below which a quick trial says that a head will not pay."""
-GROWTH, HOPE = 1.2, 0.02
-"""What the whole training gains, roughly: so many times the gain of the trial, and so many dB besides."""
-WEIGHT_BYTES, HEAD_BYTES = 0.9, 240
-"""Of a head in the file: per weight, and besides, the course of the training included."""
-COURSE_BYTES = 200
-"""Of the course of the training."""
+"""Gain in dB of the quick trial on held-out samples below which no head will pay."""
+GAIN_FACTOR = 1.2
+"""Gain of the full training as a multiple of the gain of the trial, roughly."""
+GAIN_BESIDES = 0.02
+"""Gain in dB of the full training besides that multiple."""
+WEIGHT_BYTES = 0.9
+"""Bytes that each weight of a head adds to the file."""
+HEAD_BYTES = 240
+"""Bytes that a head adds to the file besides its weights (its training history included)."""
+HISTORY_BYTES = 200
+"""Bytes of the training history in the file."""
 WEIGHT_TIME = 5e-6
-"""Of the file, what a weight must save for the time that decoding takes by it."""
+"""Share of the file that each weight must save to pay for the decoding time it costs."""
 TRAINING_VERTICES = 8 << 20
-"""Of the tiles that are learnt from: few tiles teach what holds for them alone."""
+"""Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
 MIN_BYTES = 1000
-"""Of coded tiles: of less, a head could not save what it takes."""
+"""Bytes of coded tiles below which a head cannot save what it takes."""
 
 
-def race(
+class _Candidate(NamedTuple):
+    """A trained head, the step that keeps the promise with it, and the search for that step."""
+
+    trained: TrainedHead
+    settings: TileSettings
+    outcome: Outcome
+    tried: list[Outcome]
+
+
+def choose_head(
     sample: Sample,
     settings: TileSettings,
     outcome: Outcome,
     coding: Coding,
-    solve: Callable[[TileSettings, list[Outcome]], tuple[TileSettings, Outcome]],
+    find_step: StepSearch,
     tried: list[Outcome],
     *,
     strict: bool,
@@ -62,149 +119,150 @@ def race(
     effort: int,
     seed: int,
     device: str,
-) -> tuple[TileSettings, Outcome, list[dict[str, float | None]]]:
-    """Settings with a head and a larger step if the sample gets smaller by it, else as they were; the course of the training.
+) -> tuple[TileSettings, Outcome, HeadHistory]:
+    """Return settings with a head and a larger step if they make the sample smaller.
 
-    solve: the step that keeps the promise with a head, and all outcomes on the way. tried: those without a head. strict: the promise is
-    a bound, which all outcomes keep; else it is a PSNR, and sizes are compared at the same one. way: without the bound, for what a head is
-    trained on.
-    The history has `seconds`, `epoch` (training steps) and `psnr` of held-out samples.
+    Otherwise the settings and their outcome are returned as they are. The last result is the
+    training history of the best head, empty if none was trained.
+
+    outcome: outcome of the settings, without a head.
+    coding: coding without a bound, for the values that a head is trained on.
+    find_step: search for the step that keeps the promise with a head.
+    tried: outcomes of that search without a head.
+    strict: whether the promise is a bound, which all outcomes keep; else sizes are compared at
+        the same PSNR.
+    data_range: range of the values, in data units.
     """
     if outcome.size < MIN_BYTES:
         return settings, outcome, []
     wider = sample.wider(TRAINING_VERTICES)
-    trial = _train(
-        _pairs(wider, settings, coding),
-        settings,
-        hidden=TRIED,
-        cross=True,
-        steps=400,
-        samples=80_000,
-        seed=seed,
-        device=device,
-    )
+    training = _Training(seed=seed, device=device)
+    pairs = _training_pairs(wider, settings, coding)
+    trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET)
     if trial is None or trial.gain_db < MIN_GAIN:
         return settings, outcome, []
-    hidden = _widths(
-        outcome.size, GROWTH * trial.gain_db + HOPE, _octave(tried, data_range), effort
-    )
-    # The head is trained on what it will meet: coarser data, which it lifts to the quality that was asked for.
+    gain = GAIN_FACTOR * trial.gain_db + GAIN_BESIDES
+    widths = _best_widths(outcome.size, gain, _octave(tried, data_range), effort)
+    # A head is trained on what it will meet: coarser data, which it lifts to the quality asked for.
     coarser = replace(settings, step=settings.step * math.exp(trial.gain_db / SLOPE))
-    pairs = _pairs(wider, coarser, coding)
+    pairs = _training_pairs(wider, coarser, coding)
+    budget = EFFORTS[effort].budget
 
-    def train(
-        widths: tuple[int, int], cross: bool
-    ) -> tuple[TrainedHead, tuple[TileSettings, Outcome], list[Outcome]] | None:
-        longer = 1 if cross else LONGER
-        steps, samples = STEPS[effort] * longer, SAMPLES[effort] * longer
-        trained = _train(
-            pairs,
-            coarser,
-            hidden=widths,
-            cross=cross,
-            steps=steps,
-            samples=samples,
-            seed=seed,
-            device=device,
-        )
-        again: list[Outcome] = []
-        return (
-            None
-            if trained is None
-            else (trained, solve(replace(coarser, head=trained.head), again), again)
-        )
+    def train(shape: Shape) -> _Candidate | None:
+        factor = 1 if shape.cross else PERCEPTRON_LONGER
+        trained = training.run(pairs, coarser, shape, budget.times(factor))
+        if trained is None:
+            return None
+        tried_with_head: list[Outcome] = []
+        with_head = replace(coarser, head=trained.head)
+        settings_with_head, outcome_with_head = find_step(with_head, tried_with_head)
+        return _Candidate(trained, settings_with_head, outcome_with_head, tried_with_head)
 
+    shapes = [Shape(widths, cross=True), PERCEPTRON] if widths else [PERCEPTRON]
     # Side by side: a training takes one processor, and so does coding a single tile.
     with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
-        runs = list(
-            workers.map(
-                lambda head: train(*head),
-                [*([(hidden, True)] if hidden else []), (PERCEPTRON, False)],
-            )
+        trained_heads = list(workers.map(train, shapes))
+    candidates = [candidate for candidate in trained_heads if candidate is not None]
+    return _cheapest(settings, outcome, candidates, strict=strict, data_range=data_range)
+
+
+def _cheapest(
+    settings: TileSettings,
+    outcome: Outcome,
+    candidates: Sequence[_Candidate],
+    *,
+    strict: bool,
+    data_range: float,
+) -> tuple[TileSettings, Outcome, HeadHistory]:
+    """Return the cheapest of the settings without a head and of the candidates."""
+    best, lowest_cost, history = (settings, outcome), 0.0, HeadHistory()
+    for candidate in candidates:
+        psnr = candidate.outcome.psnr(data_range)
+        # Bytes more than without a head; the file has a head as text of 4/3 of its bytes.
+        cost = (
+            candidate.outcome.size
+            - outcome.size
+            + len(candidate.trained.head.to_bytes()) * 4 / 3
+            + HISTORY_BYTES
         )
-    best, least, curve = (settings, outcome), 0.0, list[dict[str, float | None]]()
-    for run in runs:
-        if run is None:
-            continue
-        trained, found, again = run
-        reached = found[1].psnr(data_range)
-        cost = found[1].size - outcome.size + len(trained.head.to_bytes()) * 4 / 3 + COURSE_BYTES
         if not strict:
-            # Equal quality: what is left between the two searches, in bytes.
-            cost += outcome.size * (
-                2 ** ((outcome.psnr(data_range) - reached) / _octave(again, data_range)) - 1
-            )
-        if cost < least or not curve:
-            base = reached - trained.gain_db
-            curve = [
-                {"seconds": seconds, "epoch": step, "psnr": base + gain}
-                for seconds, step, gain in trained.history
+            # The rest of the difference in quality between the two searches, in bytes.
+            missing = outcome.psnr(data_range) - psnr
+            cost += outcome.size * (2 ** (missing / _octave(candidate.tried, data_range)) - 1)
+        if cost < lowest_cost or not history:
+            psnr_without = psnr - candidate.trained.gain_db
+            history = [
+                {"seconds": seconds, "epoch": update, "psnr": psnr_without + gain}
+                for seconds, update, gain in candidate.trained.history
             ]
-        if cost < least:
-            best, least = found, cost
-    return *best, curve
+        if cost < lowest_cost:
+            best, lowest_cost = (candidate.settings, candidate.outcome), cost
+    return *best, history
 
 
 def _octave(tried: list[Outcome], data_range: float) -> float:
-    """dB that an octave of bytes buys."""
-    return exchange(
-        [(math.log2(found.size), found.psnr(data_range)) for found in tried if found.size], EXCHANGE
-    )
+    """Return the dB that an octave of bytes buys."""
+    points = [
+        (math.log2(outcome.size), outcome.psnr(data_range)) for outcome in tried if outcome.size
+    ]
+    return exchange(points, EXCHANGE)
 
 
-def _widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, int] | None:
-    """Those of the head that should save the most in a file of so many bytes, where the tried one gains so many dB; None if none does.
+def _best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, int] | None:
+    """Return the widths of the head with a cross that should save most; None if none should.
 
+    size: bytes of the coded tiles.
+    gain: expected gain in dB of a head of the widths of the trial head.
     octave: dB that an octave of bytes buys.
     """
 
-    def saved(hidden: tuple[int, int]) -> float:
-        first, second = hidden
-        weights = FEATURES * first + len(CROSS) * first * second + second
+    def saved(widths: tuple[int, int]) -> float:
+        first, second = widths
+        weights = INPUTS * first + len(CROSS) * first * second + second
         return (
-            size * (1 - 2 ** (-HEADS[hidden] * gain / octave) - WEIGHT_TIME * weights)
+            size * (1 - 2 ** (-GAIN_BY_WIDTHS[widths] * gain / octave) - WEIGHT_TIME * weights)
             - WEIGHT_BYTES * weights
             - HEAD_BYTES
         )
 
-    best = max(list(HEADS)[: CHOICES[effort]], key=saved)
+    best = max(list(GAIN_BY_WIDTHS)[: EFFORTS[effort].candidates], key=saved)
     return best if saved(best) > 0 else None
 
 
-def _pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:
-    """The tiles as they decode without a head, as they were, and what counts in them."""
+def _training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:
+    """Return the tiles as they decode without a head, with their originals and masks."""
     decoded = sample.decoded(replace(settings, head=None, mask=None), coding)
     return [
-        (found, values, care) for found, (values, care) in zip(decoded, sample.tiles, strict=True)
+        Pair(values, tile.values, tile.counted)
+        for values, tile in zip(decoded, sample.tiles, strict=True)
     ]
 
 
-def _train(
-    pairs: Sequence[Pair],
-    settings: TileSettings,
-    *,
-    hidden: tuple[int, int],
-    cross: bool,
-    steps: int,
-    samples: int,
-    seed: int,
-    device: str,
-) -> TrainedHead | None:
-    # torch takes seconds to import, and an effort without training does not need it.
-    from fhash_codec.compact.choices.head_training import train_head
+@dataclass(frozen=True, kw_only=True)
+class _Training:
+    """Training of heads: the part of its options that is the same for all heads."""
 
-    try:
-        return train_head(
-            pairs,
-            low=settings.low,
-            high=settings.high,
-            hidden=hidden,
-            cross=cross,
-            steps=steps,
-            samples=samples,
-            seed=seed,
-            device=device,
-        )
-    except InputError:
-        # Nothing to correct: the decoded values are exact.
-        return None
+    seed: int
+    device: str
+
+    def run(
+        self, pairs: Sequence[Pair], settings: TileSettings, shape: Shape, budget: Budget
+    ) -> TrainedHead | None:
+        """Train a head; None where the decoded values are exact, so that there is no error."""
+        # torch takes seconds to import, and an effort without training does not need it.
+        from fhash_codec.compact.choices.head_training import train_head
+
+        try:
+            return train_head(
+                pairs,
+                low=settings.low,
+                high=settings.high,
+                hidden=shape.widths,
+                cross=shape.cross,
+                steps=budget.updates,
+                samples=budget.samples,
+                seed=self.seed,
+                device=self.device,
+            )
+        except InputError:
+            return None

@@ -1,4 +1,8 @@
-"""What decoded values say of the occupancy: scores (fhash_formats.transform.entropy.mask_levels) from the features, or learned from a sample."""
+"""Choice of the scores by which decoded values predict the mask of the vertices that count.
+
+The scores (fhash_formats.transform.entropy.mask_levels) follow from the features or are learned
+from a sample of the tiles.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fhash_codec.compact.tiles.blocks import Care, Values
+from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.coreset.features import Feature, Interval, Isosurface, Segmentation
 from fhash_formats.transform.entropy.mask_levels import MAX_EDGES, MAX_REACH, UNIT, MaskLevels
 
@@ -18,32 +22,35 @@ OFFSETS = {
     5: (0, 0.8),
     MAX_EDGES: (0,),
 }
-"""Edges around a threshold, to both sides, in errors: fewer where there are many thresholds."""
-SURE = 2.0**-16
+"""Edges to both sides of a threshold, in errors, by the largest number of thresholds for them."""
+MIN_PROBABILITY = 2.0**-16
+"""Smallest probability that a score expresses."""
 CLASSES = 16
+"""Number of classes of values where scores are learned."""
 
 
 def mask_levels(
-    features: Sequence[Feature], dilation: int, error: float, tiles: Iterable[tuple[Values, Care]]
+    features: Sequence[Feature], dilation: int, error: float, tiles: Iterable[Tile]
 ) -> MaskLevels:
-    """Scores for features that grew by `dilation`, where values are decoded with that root of the mean squared error.
+    """Return the scores for features.
 
-    Features whose thresholds say nothing, or too many of them, are learned from tiles.
+    Features without thresholds, or with too many of them, are learned from tiles.
+
+    features: what was selected.
+    dilation: vertices by which the features were grown.
+    error: root of the mean squared error of the decoded values, in data units.
+    tiles: tiles of a sample.
     """
     reach = min(dilation, MAX_REACH)
     error = max(error, 1e-30)
     if len(features) == 1 and isinstance(features[0], Isosurface):
-        value = features[0].value
-        edges = _edges([value], error)
-        above = [_normal((center - value) / error) for center in _centers(edges, error)]
-        scores, others = (tuple(map(_score, odds)) for odds in (above, [1 - p for p in above]))
-        return MaskLevels(edges=edges, scores=scores, others=others, reach=max(reach, 1))
+        return _isosurface_levels(features[0].value, reach, error)
     spans = [_span(feature) for feature in features]
     thresholds = sorted(
         {end for span in spans if span is not None for end in span if math.isfinite(end)}
     )
     if None in spans or not 1 <= len(thresholds) <= MAX_EDGES:
-        return _learned(tiles)
+        return _learned_levels(tiles)
     edges = _edges(thresholds, error)
     outside = [
         math.prod(
@@ -55,7 +62,20 @@ def mask_levels(
     return MaskLevels(edges=edges, scores=tuple(_score(1 - p) for p in outside), reach=reach)
 
 
+def _isosurface_levels(value: float, reach: int, error: float) -> MaskLevels:
+    """Return the scores that a vertex lies above and below an isosurface."""
+    edges = _edges([value], error)
+    above = [_normal((center - value) / error) for center in _centers(edges, error)]
+    return MaskLevels(
+        edges=edges,
+        scores=tuple(_score(p) for p in above),
+        others=tuple(_score(1 - p) for p in above),
+        reach=max(reach, 1),
+    )
+
+
 def _span(feature: Feature) -> tuple[float, float] | None:
+    """Return the interval of values that a feature selects; None if it selects otherwise."""
     if isinstance(feature, Interval):
         return feature.low, feature.high
     if isinstance(feature, Segmentation) and feature.threshold is not None:
@@ -64,58 +84,58 @@ def _span(feature: Feature) -> tuple[float, float] | None:
 
 
 def _edges(thresholds: list[float], error: float) -> tuple[float, ...]:
+    """Return the edges of the classes of values around thresholds."""
     offsets = OFFSETS[min(count for count in OFFSETS if count >= len(thresholds))]
-    every = {
-        _short(threshold + sign * offset * error)
+    edges = {
+        _rounded(threshold + sign * offset * error)
         for threshold in thresholds
         for offset in offsets
         for sign in (-1, 1)
     }
-    return tuple(sorted(every))[:MAX_EDGES]
+    return tuple(sorted(edges))[:MAX_EDGES]
 
 
 def _centers(edges: tuple[float, ...], error: float) -> list[float]:
-    """A value that stands for each class."""
+    """Return a value that stands for each class."""
     inner = [low + (high - low) / 2 for low, high in pairwise(edges)]
     return [edges[0] - 0.8 * error, *inner, edges[-1] + 0.8 * error]
 
 
-def _learned(tiles: Iterable[tuple[Values, Care]]) -> MaskLevels:
-    """How many of the vertices of each class count; classes of equal size."""
-    pairs = [
-        (values.ravel(), np.ones(values.size, bool) if care is None else care.ravel())
-        for values, care in tiles
-    ]
-    values, care = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+def _learned_levels(tiles: Iterable[Tile]) -> MaskLevels:
+    """Return scores by the share of vertices that count in each of some classes of equal size."""
+    tiles = list(tiles)
+    values = np.concatenate([tile.values.ravel() for tile in tiles])
+    counted = np.concatenate(
+        [
+            np.ones(tile.values.size, bool) if tile.counted is None else tile.counted.ravel()
+            for tile in tiles
+        ]
+    )
     finite = np.isfinite(values)
-    values, care = values[finite].astype(np.float64), care[finite]
+    values, counted = values[finite].astype(np.float64), counted[finite]
     if not values.size:
         return MaskLevels()
-    edges = tuple(
-        sorted(
-            {_short(float(edge)) for edge in np.quantile(values, np.arange(1, CLASSES) / CLASSES)}
-        )
-    )
+    quantiles = np.quantile(values, np.arange(1, CLASSES) / CLASSES)
+    edges = tuple(sorted({_rounded(float(edge)) for edge in quantiles}))
     classes = np.searchsorted(edges, values, side="right")
-    share = np.bincount(classes, weights=care, minlength=len(edges) + 1) / np.maximum(
-        np.bincount(classes, minlength=len(edges) + 1), 1
-    )
-    return MaskLevels(edges=edges, scores=tuple(_score(float(p)) for p in share))
+    sizes = np.bincount(classes, minlength=len(edges) + 1)
+    counted_sizes = np.bincount(classes, weights=counted, minlength=len(edges) + 1)
+    shares = counted_sizes / np.maximum(sizes, 1)
+    return MaskLevels(edges=edges, scores=tuple(_score(float(p)) for p in shares))
 
 
 def _score(p: float) -> int:
-    return round(-UNIT * math.log2(max(1 - p, SURE)))
+    """Return the score of a probability that a vertex counts."""
+    return round(-UNIT * math.log2(max(1 - p, MIN_PROBABILITY)))
 
 
 def _normal(deviation: float) -> float:
-    """Of the standard normal distribution, up to a deviation."""
-    return (
-        0.5 * (1 + math.erf(deviation / math.sqrt(2)))
-        if math.isfinite(deviation)
-        else float(deviation > 0)
-    )
+    """Return the standard normal distribution function."""
+    if not math.isfinite(deviation):
+        return float(deviation > 0)
+    return 0.5 * (1 + math.erf(deviation / math.sqrt(2)))
 
 
-def _short(value: float) -> float:
-    """Few digits: the settings are text."""
+def _rounded(value: float) -> float:
+    """Return a value of few digits: the settings are stored as text."""
     return float(f"{value:.7g}")

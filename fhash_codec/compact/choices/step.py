@@ -1,4 +1,4 @@
-"""The quantiser's step that keeps a promise on a sample, and what goes with it."""
+"""Choice of the quantiser step that keeps a promise on a sample, and of what follows from it."""
 
 from __future__ import annotations
 
@@ -8,71 +8,77 @@ from dataclasses import replace
 
 import numpy as np
 
-from fhash_codec.compact.choices.search import EXCHANGE, cheapest, secant
+from fhash_codec.compact.choices.search import (
+    EXCHANGE,
+    SLOPE,
+    Bracket,
+    PsnrSearch,
+    arithmetic_mean,
+    cheapest,
+)
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.tiles.coding import SMALLEST_STEP, Coding, Outcome
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.errors import InputError
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["SLOPE", "nearer", "solve", "with_step"]
+__all__ = ["find_step", "psnr_search", "with_step"]
 
-SLOPE = 5.5
-"""dB by which the PSNR falls when the step grows by a factor of e: to begin a search with."""
-MAX_STEP = 16.0
-"""Of the range: with a larger one no more than nothing is coded."""
-AIM, CLOSE = 0.005, 0.004
-"""dB above what was asked for that a search aims at, and from that aim at which it ends: all tiles should not fall short again."""
-STEPS_TO_OCTAVE, MAX_OF_ERROR = 3, 15
-"""Quantiser steps that may be tried under a strict bound: from the bound on in so many parts of an octave, and up to which."""
+MAX_STEP_SHARE = 16.0
+"""Largest step as a multiple of the value range: with a larger one nothing at all is coded."""
+AIM = 0.005
+"""dB above the PSNR asked for that a search aims at: all tiles should not fall short again."""
+CLOSE = 0.004
+"""Distance in dB from that aim at which a search ends."""
+STEPS_TO_OCTAVE = 3
+"""Steps per octave that are tried under a strict bound."""
+MAX_STEP_NUMBER = 15
+"""Number of the largest step tried under a strict bound; step 0 is the bound itself."""
 SLACK = 1e-6
-"""The quantum of the residual is this part less than twice the bound, and less by the rounding of what is decoded."""
-SLACK_OF_TYPE = 0.1
-"""At most so much less for that rounding: a bound near the precision of the type is not helped by it."""
+"""Share of twice the bound by which the residual's quantum is smaller, rounding not included."""
+MAX_ROUNDING_SLACK = 0.1
+"""Largest such share for rounding: it does not help a bound near the precision of the type."""
 MIN_STEP = 1e-153
-"""Its square is a number above 0. Ranges that would need a smaller one are coded exactly."""
+"""Smallest step: its square is above 0. Ranges that need a smaller one are coded exactly."""
 DOUBLE_STEPS = 2.0**20
-"""Steps in the range from which on float32 is not precise enough."""
+"""Number of steps in the range above which float32 is not precise enough."""
 
 
 def with_step(
     settings: TileSettings, step: float, goal: Goal, rounding: float = 0.0
 ) -> TileSettings:
-    """The step, and the working type and residual that go with it. rounding: of the type that is decoded to, as a part of a value."""
+    """Return settings with a step, and the working type and residual quantum that go with it.
+
+    rounding: largest relative rounding error of the type that values are decoded to.
+    """
     data_range = settings.high - settings.low
     largest = max(abs(settings.low), abs(settings.high))
-    # Integers beyond 2^30 cannot be coded. In a constant series the step only has to be small enough for the centre, a float32.
-    step = max(
-        step, data_range * SMALLEST_STEP, largest * 2.0**-30 if data_range == 0 else 0.0, MIN_STEP
-    )
+    # Integers beyond 2^30 cannot be coded. In a constant series the step only has to be small
+    # enough for the centre, a float32.
+    constant_step = largest * 2.0**-30 if data_range == 0 else 0.0
+    step = max(step, data_range * MIN_STEP_SHARE, constant_step, MIN_STEP)
     double = (
         data_range / step > DOUBLE_STEPS
         or largest > step * DOUBLE_STEPS
         or largest > 1e37
         or step < 1e-30
     )
-    # Half a quantum off, and then rounded to the type of the source, must still keep the bound: if not, a whole tile is stored exactly.
-    quantum = (
-        0.0
-        if not goal.error
-        else 2 * goal.error * (1 - SLACK - min(rounding * largest / goal.error, SLACK_OF_TYPE))
-    )
+    # An error of half a quantum, plus the rounding to the type of the source, must still keep the
+    # bound: otherwise the whole tile is stored exactly.
+    quantum = 0.0
+    if goal.error:
+        slack = min(rounding * largest / goal.error, MAX_ROUNDING_SLACK)
+        quantum = 2 * goal.error * (1 - SLACK - slack)
     return replace(settings, step=step, double=double, quantum=quantum)
 
 
-def nearer(
-    settings: TileSettings, points: Sequence[tuple[float, float]], psnr: float
-) -> TileSettings:
-    """The step at which a PSNR should be reached, from the points (log step, PSNR) that were tried, the last of them with `settings`."""
-    smallest, largest = (
-        math.log((settings.high - settings.low) * part) for part in (SMALLEST_STEP, MAX_STEP)
-    )
-    return replace(
-        settings, step=math.exp(min(max(secant(points, psnr, SLOPE), smallest), largest))
-    )
+def psnr_search(settings: TileSettings) -> PsnrSearch:
+    """Begin a search for the step of a PSNR within the steps that the settings allow."""
+    data_range = settings.high - settings.low
+    return PsnrSearch(data_range * MIN_STEP_SHARE, data_range * MAX_STEP_SHARE)
 
 
-def solve(
+def find_step(
     sample: Sample,
     settings: TileSettings,
     coding: Coding,
@@ -81,31 +87,30 @@ def solve(
     tries: int = 5,
     tried: list[Outcome] | None = None,
 ) -> tuple[TileSettings, Outcome]:
-    """The step that keeps the promise on the sample, or for a bound the one that costs least; what it gives.
+    """Return settings with the step that keeps the promise on the sample, and their outcome.
 
-    tried: takes all outcomes on the way of the search for a PSNR. Raises InputError where a ratio cannot be had.
+    Of the steps that keep a strict bound, it is the one that costs least.
+
+    tries: number of trials for a PSNR; the other searches derive theirs from it.
+    tried: list to which a search for a PSNR appends all its outcomes.
+
+    Raises InputError for a ratio that is out of reach.
     """
     if goal.psnr is not None:
         if goal.data_range == 0:
             return settings, sample.run(settings, coding)
-        return _solve_psnr(
-            sample,
-            settings,
-            coding,
-            goal.psnr,
-            goal.data_range,
-            tries,
-            [] if tried is None else tried,
-        )
+        outcomes = [] if tried is None else tried
+        return _step_for_psnr(sample, settings, coding, goal.psnr, goal.data_range, tries, outcomes)
     if goal.error is not None:
         if goal.error == 0:
             return settings, sample.run(settings, replace(coding, error=0.0))
-        return _solve_bound(sample, settings, coding, goal, goal.error, quick=tries <= 2)
+        return _step_for_bound(sample, settings, coding, goal, goal.error, quick=tries <= 2)
     assert goal.size is not None
-    return _solve_size(sample, settings, coding, goal.size - goal.overhead, goal.data_range, tries)
+    size = goal.size - goal.overhead
+    return _step_for_size(sample, settings, coding, size, goal.data_range, tries)
 
 
-def _solve_psnr(
+def _step_for_psnr(
     sample: Sample,
     settings: TileSettings,
     coding: Coding,
@@ -114,61 +119,56 @@ def _solve_psnr(
     tries: int,
     tried: list[Outcome],
 ) -> tuple[TileSettings, Outcome]:
-    psnr += AIM
-    points: list[tuple[float, float]] = []
+    """Search for the step of a PSNR; the trial nearest to it."""
+    target = psnr + AIM
+    search = psnr_search(settings)
     best: tuple[float, TileSettings, Outcome] | None = None
-    for _ in range(tries):
-        if points:
-            settings = nearer(settings, points, psnr)
+    for trial in range(tries):
+        if trial:
+            settings = replace(settings, step=search.step_for(target))
         outcome = sample.run(settings, coding)
         tried.append(outcome)
         reached = outcome.psnr(data_range)
-        if best is None or abs(reached - psnr) < abs(best[0] - psnr):
+        if best is None or abs(reached - target) < abs(best[0] - target):
             best = (reached, settings, outcome)
-        if abs(reached - psnr) < CLOSE or math.isinf(reached):
+        if abs(reached - target) < CLOSE or math.isinf(reached):
             break
-        points.append((math.log(settings.step), reached))
+        search.add(settings.step, reached)
     assert best is not None
     return best[1], best[2]
 
 
-def _solve_bound(
+def _step_for_bound(
     sample: Sample, settings: TileSettings, coding: Coding, goal: Goal, error: float, *, quick: bool
 ) -> tuple[TileSettings, Outcome]:
-    """The step at which coefficients and residual together cost least."""
-    rounding = (
-        float(np.finfo(sample.blocks.dtype).eps) / 2 if sample.blocks.dtype.kind == "f" else 0.0
-    )
+    """Search for the step at which coefficients and residual together cost least."""
+    dtype = sample.blocks.dtype
+    rounding = float(np.finfo(dtype).eps) / 2 if dtype.kind == "f" else 0.0
 
-    def trial(number: int) -> TileSettings | None:
-        stepped = with_step(
-            replace(settings, head=None), error * 2 ** (number / STEPS_TO_OCTAVE), goal, rounding
-        )
-        if settings.head is not None:
-            return None if stepped.double else replace(stepped, head=settings.head)
-        return stepped
+    def settings_of(number: int) -> TileSettings | None:
+        step = error * 2 ** (number / STEPS_TO_OCTAVE)
+        stepped = with_step(replace(settings, head=None), step, goal, rounding)
+        if settings.head is None:
+            return stepped
+        # A head works in float32 only.
+        return None if stepped.double else replace(stepped, head=settings.head)
 
     def run(numbers: Sequence[int]) -> list[tuple[float, tuple[TileSettings, Outcome]] | None]:
-        trials = [trial(number) for number in numbers]
-        outcomes = iter(
-            sample.run_all(
-                [(one, replace(coding, error=error)) for one in trials if one is not None]
-            )
-        )
+        trials = [settings_of(number) for number in numbers]
+        bounded = replace(coding, error=error)
+        outcomes = iter(sample.run_all([(trial, bounded) for trial in trials if trial is not None]))
         return [
-            None if one is None else ((outcome := next(outcomes)).size, (one, outcome))
-            for one in trials
+            None if trial is None else ((outcome := next(outcomes)).size, (trial, outcome))
+            for trial in trials
         ]
 
-    # Upwards: with a head, a smaller step could need float64.
-    start = min(
-        max(math.ceil(STEPS_TO_OCTAVE * math.log2(settings.step / error) - 1e-6), 0),
-        MAX_OF_ERROR,
-    )
-    return cheapest(run, start, MAX_OF_ERROR, strides=(2,) if quick else (2, 1))
+    # Rounded up: with a head, a smaller step could need float64.
+    number = math.ceil(STEPS_TO_OCTAVE * math.log2(settings.step / error) - 1e-6)
+    start = min(max(number, 0), MAX_STEP_NUMBER)
+    return cheapest(run, start, MAX_STEP_NUMBER, strides=(2,) if quick else (2, 1))
 
 
-def _solve_size(
+def _step_for_size(
     sample: Sample,
     settings: TileSettings,
     coding: Coding,
@@ -176,29 +176,33 @@ def _solve_size(
     data_range: float,
     tries: int,
 ) -> tuple[TileSettings, Outcome]:
-    """The step at which the tiles take so many bytes."""
+    """Search for the step at which the tiles take a number of bytes."""
     if size <= 0:
         raise InputError(
-            "the ratio leaves no room for values: the rest of the file is larger already; ask for a smaller ratio"
+            "the ratio leaves no room for values: the rest of the file is larger already; ask for"
+            " a smaller ratio"
         )
     if data_range == 0:
         return settings, sample.run(settings, coding)
-    low, high = math.log(max(data_range, 1e-300) * 2.0**-24), math.log(max(data_range, 1e-300) * 4)
-    log_step, fall = math.log(settings.step), SLOPE / EXCHANGE
-    before: tuple[float, float] | None = None
+    data_range = max(data_range, 1e-300)
+    bracket = Bracket(
+        math.log(data_range * 2.0**-24), math.log(data_range * 4), middle=arithmetic_mean
+    )
+    log_step = math.log(settings.step)
+    fall = SLOPE / EXCHANGE  # octaves of bytes that a step larger by a factor of e saves
+    previous: tuple[float, int] | None = None
     for _ in range(2 * tries + 2):
-        log_step = min(max(log_step, low), high)
+        log_step = min(max(log_step, bracket.low), bracket.high)
         settings = replace(settings, step=math.exp(log_step))
         outcome = sample.run(settings, coding)
-        got = outcome.size
-        if abs(got - size) < 0.005 * size:
+        if abs(outcome.size - size) < 0.005 * size:
             break
-        low, high = (log_step, high) if got > size else (low, log_step)
-        if before is not None and (before[0] - log_step) * (got - before[1]) > 0:
-            # Octaves of bytes that a step larger by a factor of e saves, as it was from the last step to this one.
-            fall = min(max(math.log2(got / before[1]) / (before[0] - log_step), fall / 3), fall * 3)
-        before = log_step, got
-        log_step += math.log2(got / size) / fall
-        if not low < log_step < high:
-            log_step = (low + high) / 2
+        bracket = bracket.narrowed(log_step, too_low=outcome.size > size)
+        if previous is not None:
+            log_step_before, size_before = previous
+            if (log_step_before - log_step) * (outcome.size - size_before) > 0:
+                measured = math.log2(outcome.size / size_before) / (log_step_before - log_step)
+                fall = min(max(measured, fall / 3), fall * 3)
+        previous = log_step, outcome.size
+        log_step = bracket.inside(log_step + math.log2(outcome.size / size) / fall)
     return settings, outcome

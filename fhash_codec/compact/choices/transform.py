@@ -1,7 +1,8 @@
-"""Which transform goes along each axis: by trial on bytes.
+"""Choice of the transform along each axis, by trial on bytes.
 
-Candidates are coded on a sample at one step; what counts is J = bytes + squared error / (0.8 step^2), so that a transform that gives less
-error for the same bytes wins as well. Axes are decided one after the other.
+Candidates are coded on a sample at one step. The cost J = bytes + squared error / (0.8 step^2)
+decides, so that a transform of less error for the same bytes wins as well. The plane, time and z
+are decided one after the other.
 """
 
 from __future__ import annotations
@@ -17,95 +18,131 @@ from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.transform.axes.basis import MAX_LENGTH, fit_basis
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
 Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
+"""Transforms along (t, z, y, x)."""
 NONE = AxisTransform(kind="none")
-BASIS_LENGTH = 128
-"""A longer axis gets no basis of its own: its factors would cost too much. Nor does a series that is not in memory."""
+"""Marks an axis without a transform."""
+MAX_BASIS_LENGTH = 128
+"""Longest axis in vertices that gets a basis of the data's own: longer factors cost too much."""
+PLANE_WAVELETS = (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3), ("5/3", 2))
+"""Kinds and depths tried along y and x.
+
+5/3 wins under tight bounds alone, and is never much better at another depth.
+"""
+LINE_WAVELETS = (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3), ("5/3", 1))
+"""Kinds and depths tried along t and along z."""
+ERROR_PRICE = 0.8
+"""Squared error in squared steps that is worth a byte."""
 
 
 def wavelet(kind: str, depth: int, length: int) -> AxisTransform:
-    """A wavelet of at most this depth, less deep on a short axis; nothing on an axis of one vertex."""
+    """Return a wavelet of at most this depth for an axis of `length` vertices.
+
+    It is less deep on a short axis; an axis of one vertex gets no transform.
+    """
     depth = min(depth, max(0, (length - 1).bit_length()))
     return AxisTransform(kind=kind, depth=depth) if depth else NONE
 
 
 def usual_transform(shape: Shape) -> TransformSpec:
-    """A good guess without trial: 9/7 everywhere, deepest in the plane."""
+    """Return a good guess without trial: 9/7 along all axes, deepest in the plane."""
     t, z, y, x = shape
-    plane = min(4, max(1, max(y, x).bit_length() - 2))
+    depth = min(4, max(1, max(y, x).bit_length() - 2))
     return TransformSpec(
-        axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), *_plane("9/7", plane, y, x))
+        axes=(wavelet("9/7", 2, t), wavelet("9/7", 2, z), *_plane("9/7", depth, y, x))
     )
 
 
 def choose_transform(
     sample: Sample, settings: TileSettings, coding: Coding, *, quick: bool = False
 ) -> tuple[TileSettings, float]:
-    """Settings with the transform of the lowest J on the sample, and that J.
+    """Return settings with the transform of the lowest J on the sample, and that J.
 
-    quick: only the kinds that the settings have, the usual ones, and the data's own bases in the plane and along z.
+    quick: tries only the kinds of the settings, the usual ones, and the data's own bases in the
+        plane and along z.
     """
-    shape: Shape = sample.tiles[0][0].shape
+    shape: Shape = sample.tiles[0].values.shape
     bases = _Bases(sample, settings)
     if quick:
-        usual = usual_transform(shape).axes
-        own = tuple(
-            _known(axis, length)
-            for axis, length in zip(settings.transform.axes, shape, strict=True)
-        )
-        trials = [usual, own]
-        if bases.possible(*shape[1:]):
-            trials.append((usual[0], *(bases.along(axis) for axis in (1, 2, 3))))
-        costs = _judge(sample, settings, trials, coding)  # type: ignore[arg-type]
-        best = min(costs)
-        return replace(settings, transform=TransformSpec(axes=trials[costs.index(best)])), best  # type: ignore[arg-type]
-    axes: Axes = settings.transform.axes
-    best = math.inf
-    for candidates in (_planes(shape, bases), _along(0, shape, bases), _along(1, shape, bases)):
-        others = [tuple(change.get(axis, axes[axis]) for axis in range(4)) for change in candidates]
-        group: list[Axes] = [
-            *([axes] if math.isinf(best) else []),
-            *(other for other in others if other != axes),  # type: ignore[list-item]
+        trials = _quick_trials(shape, settings.transform.axes, bases)
+        costs = _costs(sample, settings, trials, coding)
+        lowest = min(costs)
+        axes = trials[costs.index(lowest)]
+        return replace(settings, transform=TransformSpec(axes=axes)), lowest
+    axes = settings.transform.axes
+    lowest = math.inf
+    groups = (
+        _plane_trials(shape, bases),
+        _line_trials(0, shape, bases),
+        _line_trials(1, shape, bases),
+    )
+    for changes in groups:
+        changed = [_changed(axes, change) for change in changes]
+        trials = [
+            *([axes] if math.isinf(lowest) else []),
+            *(candidate for candidate in changed if candidate != axes),
         ]
-        costs = _judge(sample, settings, group, coding)
-        if group and min(costs) < best:
-            best = min(costs)
-            axes = group[costs.index(best)]
-    return replace(settings, transform=TransformSpec(axes=axes)), best
+        costs = _costs(sample, settings, trials, coding)
+        if trials and min(costs) < lowest:
+            lowest = min(costs)
+            axes = trials[costs.index(lowest)]
+    return replace(settings, transform=TransformSpec(axes=axes)), lowest
 
 
 def refit(sample: Sample, settings: TileSettings) -> TileSettings:
-    """Settings with the data's own bases made anew for the step; the same object where there are none."""
+    """Return settings with the data's own bases made anew for their step.
+
+    Settings without such bases are returned themselves, the same object.
+    """
     axes = settings.transform.axes
     if not any(axis.basis is not None for axis in axes):
         return settings
     bases = _Bases(sample, settings)
-    fresh = tuple(
-        axis if axis.basis is None else bases.along(number) for number, axis in enumerate(axes)
-    )
-    return replace(settings, transform=TransformSpec(axes=fresh))  # type: ignore[arg-type]
+    fresh = {
+        number: bases.along(number) for number, axis in enumerate(axes) if axis.basis is not None
+    }
+    return replace(settings, transform=TransformSpec(axes=_changed(axes, fresh)))
 
 
-def _known(axis: AxisTransform, length: int) -> AxisTransform:
-    """The same kind on an axis of another length; 9/7 for a basis, which fits one length alone."""
+def _changed(axes: Axes, change: dict[int, AxisTransform]) -> Axes:
+    """Return transforms with some replaced, by the number of the axis."""
+    t, z, y, x = (change.get(number, axis) for number, axis in enumerate(axes))
+    return t, z, y, x
+
+
+def _quick_trials(shape: Shape, axes: Axes, bases: _Bases) -> list[Axes]:
+    """Return the usual transform, the kinds of `axes`, and bases where they are possible."""
+    usual = usual_transform(shape).axes
+    t, z, y, x = (_fitted(axis, length) for axis, length in zip(axes, shape, strict=True))
+    trials = [usual, (t, z, y, x)]
+    if bases.possible(*shape[1:]):
+        trials.append((usual[0], bases.along(1), bases.along(2), bases.along(3)))
+    return trials
+
+
+def _fitted(axis: AxisTransform, length: int) -> AxisTransform:
+    """Return the same kind for another length; 9/7 for a basis, which fits one length only."""
     if axis.basis is not None:
         return wavelet("9/7", 2, length)
     return wavelet(axis.kind, axis.depth, length) if axis.wavelet else axis
 
 
-def _judge(
+def _costs(
     sample: Sample, settings: TileSettings, trials: Sequence[Axes], coding: Coding
 ) -> list[float]:
-    """J of each."""
+    """Return J of each trial."""
 
     def cost(axes: Axes, outcome: Outcome) -> float:
-        factors = sum(len(axis.basis.to_bytes()) * 4 / 3 for axis in axes if axis.basis is not None)
-        # Under a bound all that is wrong is mended, in bytes.
-        wrong = 0.0 if coding.error is not None else outcome.squares / (0.8 * settings.step**2)
-        return outcome.size + factors + wrong
+        # The file has a basis as text of 4/3 of its bytes.
+        bases = sum(len(axis.basis.to_bytes()) * 4 / 3 for axis in axes if axis.basis is not None)
+        # Under a bound, bytes of the residual correct the errors already.
+        error = 0.0
+        if coding.error is None:
+            error = outcome.squares / (ERROR_PRICE * settings.step**2)
+        return outcome.size + bases + error
 
     outcomes = sample.run_all(
         [(replace(settings, transform=TransformSpec(axes=axes)), coding) for axes in trials]
@@ -114,30 +151,31 @@ def _judge(
 
 
 def _plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTransform]:
-    """A wavelet along y and x, coupled where both are longer than one vertex."""
+    """Return a wavelet along y and x, of one depth where both have more than one vertex."""
     if min(y, x) > 1:
         depth = min(depth, max(1, (max(y, x) - 1).bit_length()))
         return AxisTransform(kind=kind, depth=depth), AxisTransform(kind=kind, depth=depth)
     return wavelet(kind, depth, y), wavelet(kind, depth, x)
 
 
-def _planes(shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+def _plane_trials(shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+    """Yield the transforms tried along y and x."""
     y, x = shape[2:]
-    # 5/3 wins under tight bounds alone, and is never much better at another depth.
-    for kind, depth in (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3), ("5/3", 2)):
+    for kind, depth in PLANE_WAVELETS:
         if 2 ** (depth - 1) < max(y, x):
-            pair = _plane(kind, depth, y, x)
-            yield {2: pair[0], 3: pair[1]}
+            along_y, along_x = _plane(kind, depth, y, x)
+            yield {2: along_y, 3: along_x}
     if bases.possible(y, x):
         yield {2: bases.along(2), 3: bases.along(3)}
 
 
-def _along(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+def _line_trials(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+    """Yield the transforms tried along one axis."""
     length = shape[axis]
     if length == 1:
         return
     yield {axis: NONE}
-    for kind, depth in (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3), ("5/3", 1)):
+    for kind, depth in LINE_WAVELETS:
         if 2 ** (depth - 1) < length:
             yield {axis: AxisTransform(kind=kind, depth=depth)}
     if bases.possible(length):
@@ -145,33 +183,37 @@ def _along(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTra
 
 
 class _Bases:
-    """The data's own bases, made when they are asked for."""
+    """The data's own bases along the axes of a tile, computed when they are asked for."""
 
     def __init__(self, sample: Sample, settings: TileSettings) -> None:
         self._sample, self._settings = sample, settings
-        self._known: dict[int, AxisTransform] = {}
+        self._cache: dict[int, AxisTransform] = {}
 
     def possible(self, *lengths: int) -> bool:
-        """Whether axes of these lengths can have one."""
-        return self._sample.blocks.held and min(lengths) > 1 and max(lengths) <= BASIS_LENGTH
+        """Whether axes of these lengths can have a basis; only a series in memory can."""
+        in_memory = self._sample.blocks.in_memory
+        return in_memory and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
 
     def along(self, axis: int) -> AxisTransform:
-        if axis not in self._known:
-            # Of all tiles: what the basis leaves out, no coefficient of any of them could bring back.
-            gram = np.zeros((length := self._sample.tiles[0][0].shape[axis], length))
-            for part in self._sample.map_all(lambda tile: self._gram(tile[0], axis)):
-                gram += part
-            self._known[axis] = AxisTransform(
-                kind="klt", basis=fit_basis(gram, self._settings.step)
-            )
-        return self._known[axis]
+        """Return the basis along an axis, as precise as the step of the settings needs."""
+        if axis not in self._cache:
+            # Fitted on all tiles: a direction that the basis drops cannot be restored by any
+            # coefficient.
+            length = self._sample.tiles[0].values.shape[axis]
+            gram = np.zeros((length, length))
+            for tile_gram in self._sample.map_all(lambda tile: self._gram(tile.values, axis)):
+                gram += tile_gram
+            basis = fit_basis(gram, self._settings.step)
+            self._cache[axis] = AxisTransform(kind="klt", basis=basis)
+        return self._cache[axis]
 
     def _gram(self, values: npt.NDArray[np.generic], axis: int) -> npt.NDArray[np.float64]:
-        # With what does not count as it is: a border to zeros would be what costs most.
+        """Return the products of the lines of a tile along an axis, (length, length)."""
+        # Values that do not count are kept: zeroing them would create an edge that dominates.
         centred = values.astype(np.float64) - self._settings.center
         centred[~np.isfinite(centred)] = 0.0
         columns = np.moveaxis(centred, axis, 0).reshape(values.shape[axis], -1)
         return columns @ columns.T
 
 
-assert BASIS_LENGTH <= MAX_LENGTH
+assert MAX_BASIS_LENGTH <= MAX_LENGTH

@@ -1,1 +1,1 @@
-"""A series as tiles, and some of the tiles as a sample."""
+"""A series cut into tiles, a sample of them, and the coding of one tile."""

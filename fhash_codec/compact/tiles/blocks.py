@@ -1,4 +1,4 @@
-"""A series cut into tiles: what each holds, and what of it counts."""
+"""A series cut into tiles: the values of each tile, and the mask of its vertices that count."""
 
 from __future__ import annotations
 
@@ -6,107 +6,138 @@ from collections.abc import Iterator
 from itertools import product
 from math import prod
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import box_size, crop
 from fhash_codec.coreset.extent import Extent
 from fhash_formats.series import Series
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 
 Values = npt.NDArray[Any]
-Care = npt.NDArray[np.bool_] | None
+Mask = npt.NDArray[np.bool_]
 Index = tuple[int, int, int, int]
+"""Position (t, z, y, x) of a tile in the grid of tiles."""
 
-HELD_BYTES = 1 << 30
-"""A box of at most this size is kept in memory, of a larger one a layer of tiles at a time."""
+MAX_BYTES_IN_MEMORY = 1 << 30
+"""Largest size of a box that stays in memory, in bytes; a larger one is read by layers of tiles."""
 
 
-class _Whole:
-    """Values and mask of the whole box once they were read, shared by all its tilings."""
+class Tile(NamedTuple):
+    """Values (t, z, y, x) of a tile, and which of its vertices count.
+
+    Vertices that count are those whose error is measured and bounded: in the coreset and finite.
+    The mask may still include values that are not finite; the coder leaves those out itself.
+    """
+
+    values: Values
+    counted: Mask | None
+    """Mask of the same shape, True where a vertex counts; None if all vertices count."""
+
+    @property
+    def counted_vertices(self) -> int:
+        """Number of vertices that count."""
+        if self.counted is None:
+            return self.values.size
+        return int(np.count_nonzero(self.counted))
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no vertex counts."""
+        return self.counted is not None and not self.counted.any()
+
+
+class _BoxInMemory:
+    """Values and mask of the box over all steps once they were read, shared by all tilings."""
 
     def __init__(self) -> None:
         self.lock = Lock()
-        self.content: tuple[Values, Care] | None = None
+        self.content: Tile | None = None
 
 
 class Blocks:
     """The feature bounding box over all steps as a grid of tiles (t, z, y, x).
 
     Attributes:
-        shape: vertices of the box over all steps. tile: vertices of a tile; the last of an axis may reach beyond the box.
-        grid: tiles along each axis. dtype: of the series. complete: whether all of the box counts.
+        shape: vertices of the box over all steps.
+        tile: vertices of a tile; the last tile along an axis may reach beyond the box.
+        grid: number of tiles along each axis.
+        dtype: type of the series, in the byte order of this machine.
+        complete: whether all vertices of the box are in the coreset at all steps.
     """
 
     def __init__(self, series: Series, extent: Extent, tile: Shape) -> None:
         self._series, self._extent = series, extent
         self.dtype: np.dtype[Any] = series.dtype.newbyteorder("=")
-        self.shape: Shape = (series.shape[0], *box_size(extent.box))
+        self.shape: Shape = (series.shape[0], *extent.box.shape)
         self.tile: Shape = tuple(min(n, length) for n, length in zip(tile, self.shape, strict=True))  # type: ignore[assignment]
         self.grid: Index = tuple(
             -(-length // n) for length, n in zip(self.shape, self.tile, strict=True)
         )  # type: ignore[assignment]
         self.complete = extent.samples == prod(self.shape)
-        self._held: tuple[int, Values, Care] | None = None
-        self._whole = _Whole()
+        self._last_layer: tuple[int, Tile] | None = None
+        self._box = _BoxInMemory()
 
     def retile(self, tile: Shape) -> Blocks:
-        """The same series in other tiles; what is in memory is shared."""
+        """Return the same series in other tiles; the box in memory is shared."""
         other = Blocks(self._series, self._extent, tile)
-        other._whole = self._whole
+        other._box = self._box
         return other
 
     @property
-    def held(self) -> bool:
-        """Whether the whole box is kept in memory."""
-        return prod(self.shape) * self.dtype.itemsize <= HELD_BYTES
+    def in_memory(self) -> bool:
+        """Whether the box over all steps stays in memory."""
+        return prod(self.shape) * self.dtype.itemsize <= MAX_BYTES_IN_MEMORY
 
     def indices(self) -> Iterator[Index]:
-        """All tiles in C order."""
+        """Yield the indices of all tiles in C order."""
         yield from product(*(range(n) for n in self.grid))
 
-    def read(self, index: Index) -> tuple[Values, Care]:
-        """A tile's values in the type of the source, its rest beyond the box repeating the border, and what counts (None: everything).
+    def read(self, index: Index) -> Tile:
+        """Return a tile in the type of the source; beyond the box, border values are repeated.
 
-        Any thread where the whole is held, else one at a time and in C order, since the layer of one t is kept.
+        Vertices beyond the box do not count. Any thread may call this where the box is in memory.
+        Otherwise only one thread may, in C order, because just the last layer in t is kept.
         """
-        values, care = self._layer(index[0])
+        layer = self._layer(index[0])
         spans = [
             slice(i * n, min((i + 1) * n, length))
             for i, n, length in zip(index[1:], self.tile[1:], self.shape[1:], strict=True)
         ]
-        part = values[:, spans[0], spans[1], spans[2]]
-        kept = None if care is None else care[:, spans[0], spans[1], spans[2]]
-        beyond = [(0, n - m) for n, m in zip(self.tile, part.shape, strict=True)]
-        if not any(after for _, after in beyond):
-            return np.ascontiguousarray(
-                part
-            ), None if kept is None or kept.all() else np.ascontiguousarray(kept)
-        inside = np.ones(part.shape, bool) if kept is None else kept
-        return np.pad(part, beyond, mode="edge"), np.pad(inside, beyond)
+        values = layer.values[:, spans[0], spans[1], spans[2]]
+        in_coreset = None
+        if layer.counted is not None:
+            in_coreset = layer.counted[:, spans[0], spans[1], spans[2]]
+        padding = [(0, n - m) for n, m in zip(self.tile, values.shape, strict=True)]
+        if not any(after for _, after in padding):
+            if in_coreset is None or in_coreset.all():
+                return Tile(np.ascontiguousarray(values), None)
+            return Tile(np.ascontiguousarray(values), np.ascontiguousarray(in_coreset))
+        if in_coreset is None:
+            in_coreset = np.ones(values.shape, bool)
+        return Tile(np.pad(values, padding, mode="edge"), np.pad(in_coreset, padding))
 
-    def _layer(self, t: int) -> tuple[Values, Care]:
-        """Values and mask of one layer of tiles, (up to tile t, z, y, x of the box)."""
+    def _layer(self, t: int) -> Tile:
+        """Return one layer of tiles, (up to tile t, z, y, x of the box)."""
         steps = range(t * self.tile[0], min((t + 1) * self.tile[0], self.shape[0]))
-        if self.held:
-            with self._whole.lock:
-                if self._whole.content is None:
-                    self._whole.content = self._load(range(self.shape[0]))
-            values, care = self._whole.content
-            return values[steps[0] : steps[-1] + 1], None if care is None else care[
-                steps[0] : steps[-1] + 1
-            ]
-        if self._held is None or self._held[0] != t:
-            self._held = None
-            self._held = (t, *self._load(steps))
-        return self._held[1], self._held[2]
+        if self.in_memory:
+            with self._box.lock:
+                if self._box.content is None:
+                    self._box.content = self._load(range(self.shape[0]))
+            values, in_coreset = self._box.content
+            span = slice(steps[0], steps[-1] + 1)
+            return Tile(values[span], None if in_coreset is None else in_coreset[span])
+        if self._last_layer is None or self._last_layer[0] != t:
+            self._last_layer = None  # frees its memory before the next layer is read
+            self._last_layer = (t, self._load(steps))
+        return self._last_layer[1]
 
-    def _load(self, steps: range) -> tuple[Values, Care]:
+    def _load(self, steps: range) -> Tile:
+        """Read the box at some steps from the series."""
         values = np.empty((len(steps), *self.shape[1:]), dtype=self.dtype)
         for number, step in enumerate(steps):
-            values[number] = crop(self._series.read(step), self._extent.box)
-        return values, None if self.complete else np.stack(
-            [self._extent.mask(step) for step in steps]
-        )
+            values[number] = self._series.read(step)[self._extent.box.slices()]
+        if self.complete:
+            return Tile(values, None)
+        return Tile(values, np.stack([self._extent.mask(step) for step in steps]))

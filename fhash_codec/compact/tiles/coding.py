@@ -1,4 +1,4 @@
-"""Coding one tile, and measuring what that gave."""
+"""Coding of one tile, and the size and error that it gives."""
 
 from __future__ import annotations
 
@@ -8,101 +8,90 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fhash_codec.compact.tiles.blocks import Care, Values
+from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.measure.sums import squared_errors
 from fhash_codec.measure.value_range import power_of_two
+from fhash_formats.transform.tile import encoding
 from fhash_formats.transform.tile.encoding import CodedTile, encode_tile, exact_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
 WEIGHT = 0.09
-"""Squared steps that a bit is worth to the quantiser (findings: best between 0.07 and 0.11)."""
-
+"""Squared quantiser steps that a bit is worth (best between 0.07 and 0.11 in experiments)."""
 
 OFFSETS = (-5, -1, 0)
-"""Where magnitudes of 1, 2 and more stand after rate-distortion optimisation, in 1/128 step."""
+"""Shift, in 1/128 step, of the decoded magnitudes 1, 2 and more after the optimisation."""
 
-
-SMALLEST_STEP = 2.0**-26
-"""Of the range: integers beyond 2^30 cannot be coded."""
+MIN_STEP_SHARE = 2.0**-26
+"""Smallest quantiser step as a share of the value range: integers beyond 2^30 cannot be coded."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coding:
-    """How tiles are coded besides their settings: see `encode_tile`. exact: without loss, by `exact_tile`."""
+class Coding(encoding.Coding):
+    """Options of the encoder for the tiles of a series.
+
+    They change the bytes, but a decoder does not need them. What a decoder needs is in
+    `TileSettings`.
+    """
 
     weight: float = WEIGHT
-    rounds: int = 0
-    passes: int = 1
-    error: float | None = None
-    filled: bool = False
-    density: int = 1
+    keep_missing: bool = False
     exact: bool = False
+    """Whether tiles are stored without loss, by `exact_tile`; the other options are then unused."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What coding some tiles gave: bytes of the streams, squared error and number of the values that count, the largest error."""
+    """Size and error of some coded tiles."""
 
     size: int
+    """Bytes of the streams."""
     squares: float
+    """Sum of the squared errors over the vertices that count, in squared data units."""
     count: int
-    largest: float
+    """Number of finite values that count."""
+    max_error: float
+    """Largest absolute error, in data units."""
     nonzero: int = 0
+    """Number of coefficients that are not 0."""
 
     def psnr(self, data_range: float) -> float:
-        """In dB; infinite without error."""
+        """Return the PSNR in dB; infinite without error."""
         if self.squares == 0 or self.count == 0 or data_range == 0:
             return math.inf
         return 20 * math.log10(data_range) - 10 * math.log10(self.squares / self.count)
 
 
-def code(
-    values: Values, care: Care, settings: TileSettings, coding: Coding
-) -> tuple[CodedTile, Outcome]:
-    """Code one tile and measure it."""
+def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile, Outcome]:
+    """Code one tile and measure its size and error."""
+    values, counted = tile
     if coding.exact:
-        count = values.size if care is None else int(np.count_nonzero(care))
-        coded = exact_tile(
-            values,
-            occupied=None
-            if settings.mask is None
-            else np.ones(values.shape, bool)
-            if care is None
-            else care,
-        )
-        return coded, Outcome(size=len(coded.data), squares=0.0, count=count, largest=0.0)
-    coded = encode_tile(
-        values,
-        settings,
-        care=care,
-        weight=coding.weight,
-        error=coding.error,
-        rounds=coding.rounds,
-        passes=coding.passes,
-        keep_missing=False,
-        filled=coding.filled,
-        density=coding.density,
-    )
+        occupied = None
+        if settings.mask is not None:
+            occupied = np.ones(values.shape, bool) if counted is None else counted
+        coded = exact_tile(values, occupied=occupied)
+        size = len(coded.data)
+        return coded, Outcome(size=size, squares=0.0, count=tile.counted_vertices, max_error=0.0)
+    coded = encode_tile(values, settings, coding, in_coreset=counted)
     # Scaled, so that neither huge nor tiny ranges over- or underflow.
     scale = power_of_two(settings.high - settings.low)
-    count, squares, largest = squared_errors(values, coded.decoded, care, scale)
+    count, squares, max_error = squared_errors(values, coded.decoded, counted, scale)
     outcome = Outcome(
         size=len(coded.data),
         squares=squares / scale**2,
         count=count,
-        largest=largest / scale,
+        max_error=max_error / scale,
         nonzero=coded.nonzero,
     )
     return coded, outcome
 
 
 def total(outcomes: Sequence[Outcome], weights: Sequence[int] | None = None) -> Outcome:
-    """All of them as one. weights: how many tiles each stands for, 1 if left out."""
+    """Sum outcomes up to one. weights: number of tiles that each stands for (default 1)."""
     pairs = list(zip(weights or [1] * len(outcomes), outcomes, strict=True))
     return Outcome(
         size=sum(weight * o.size for weight, o in pairs),
         squares=math.fsum(weight * o.squares for weight, o in pairs),
         count=sum(weight * o.count for weight, o in pairs),
-        largest=max((o.largest for o in outcomes), default=0.0),
+        max_error=max((o.max_error for o in outcomes), default=0.0),
         nonzero=sum(weight * o.nonzero for weight, o in pairs),
     )

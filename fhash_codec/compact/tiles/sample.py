@@ -1,4 +1,4 @@
-"""Some tiles of a series, on which choices are tried before the whole is coded."""
+"""A sample of the tiles of a series, on which choices are tried before all tiles are coded."""
 
 from __future__ import annotations
 
@@ -11,32 +11,45 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.tiles.blocks import Blocks, Care, Values
+from fhash_codec.compact.tiles.blocks import Blocks, Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome, code, total
 from fhash_codec.compact.tiles.filling import fill
-from fhash_formats.support.threads import usable_threads
+from fhash_formats.support.threads import map_ahead
 from fhash_formats.transform.tile.settings import TileSettings
 
-Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-GOLDEN = 0.6180339887498949
-BATCH = 16
-CHEAPEST = 0.05
-"""What a tile is taken to cost at the least, as a part of the mean: the cheapest must be represented, too."""
+GOLDEN_RATIO = 0.6180339887498949
+"""Fractional part of the golden ratio: its multiples modulo 1 are spread evenly."""
+MAX_TILES_AHEAD = 16
+"""Tiles of a series larger than memory that are worked on at a time."""
+MIN_COST_SHARE = 0.05
+"""Share of the mean cost that is added to each tile's cost: the sample needs cheap tiles, too."""
 
 
-def strata(costs: Sequence[float], number: int) -> list[tuple[int, int]]:
-    """At most so many of the tiles, each with the number of tiles that it stands for, in the order of the tiles.
+def spread_order(count: int) -> list[int]:
+    """Return the numbers 0 to count - 1 in an order of which each beginning is spread evenly.
 
-    costs: what each tile costs, roughly. Tiles of similar cost form a stratum, which its middle one stands for; all strata cost about the
-    same, so that a dear tile stands for itself, and a cheap one for many.
+    The order follows the golden ratio, so that no row or column of a grid of tiles is preferred.
+    """
+    return sorted(range(count), key=lambda number: number * GOLDEN_RATIO % 1.0)
+
+
+def strata(costs: Sequence[float], max_tiles: int) -> list[tuple[int, int]]:
+    """Choose tiles by cost: pairs of a tile and the number of tiles it stands for, in tile order.
+
+    Tiles of similar cost form a stratum; its middle tile stands for all of them. All strata cost
+    about the same, so an expensive tile stands for itself and a cheap one for many.
+
+    costs: approximate cost of each tile.
+    max_tiles: number of tiles chosen at most.
     """
     order = np.argsort(costs, kind="stable")
-    floor = CHEAPEST * float(np.mean(costs)) or 1.0
+    floor = MIN_COST_SHARE * float(np.mean(costs)) or 1.0
     so_far = np.cumsum(np.asarray(costs, dtype=np.float64)[order] + floor)
-    groups = np.minimum((so_far / so_far[-1] * number * (1 - 1e-12)).astype(int), number - 1)
+    shares = so_far / so_far[-1] * max_tiles * (1 - 1e-12)
+    groups = np.minimum(shares.astype(int), max_tiles - 1)
     chosen = []
     for group in np.unique(groups):
         members = order[groups == group]
@@ -45,111 +58,106 @@ def strata(costs: Sequence[float], number: int) -> list[tuple[int, int]]:
 
 
 class Sample:
-    """Tiles in memory that stand for all.
+    """Tiles in memory that stand for all tiles of a series.
 
     Attributes:
-        tiles: (values, what counts). indices: which tiles these are. weights: how many tiles of the series each stands for.
-        complete: whether these are all that count.
-        counted: vertices that count, of the whole series, roughly. blocks: the whole series.
+        blocks: the series as a grid of tiles.
+        tiles: the tiles of the sample.
+        indices: their indices in the grid.
+        weights: number of tiles of the series that each of them stands for.
+        complete: whether the sample has all tiles with vertices that count.
+        counted: approximate number of vertices that count in the series.
     """
 
     def __init__(
         self,
         blocks: Blocks,
-        most_vertices: int,
+        max_vertices: int,
         pool: ThreadPoolExecutor,
         costs: Sequence[float] | None = None,
     ) -> None:
-        """Tiles of at most so many vertices together, at least one.
+        """Read tiles of at most `max_vertices` vertices together, at least one tile.
 
-        costs: what each tile costs, roughly, in C order; tiles are then chosen by it (`strata`), else spread evenly.
+        costs: approximate cost of each tile, in C order. Tiles are then chosen by `strata`, else
+        spread evenly.
         """
         indices = list(blocks.indices())
-        wanted = min(len(indices), max(1, most_vertices // prod(blocks.tile)))
-        if wanted == len(indices):
-            chosen = [(number, 1) for number in range(wanted)]
-        elif costs is not None:
-            chosen = strata(costs, wanted)
-        else:
-            # By the golden ratio, so that no row or column of the grid is preferred; then in C order, for the reader's sake.
-            order = sorted(range(len(indices)), key=lambda number: number * GOLDEN % 1.0)
-            weights = [
-                len(indices) * (place + 1) // wanted - len(indices) * place // wanted
-                for place in range(wanted)
-            ]
-            chosen = list(zip(sorted(order[:wanted]), weights, strict=True))
-        found = [
+        count = min(len(indices), max(1, max_vertices // prod(blocks.tile)))
+        chosen = _choose_tiles(len(indices), count, costs)
+        tiles = [
             (indices[number], blocks.read(indices[number]), weight) for number, weight in chosen
         ]
-        found = [one for one in found if one[1][1] is None or one[1][1].any()] or found[:1]
-        self.indices, self.tiles, self.weights = (
-            [one[0] for one in found],
-            [one[1] for one in found],
-            [one[2] for one in found],
-        )
-        self.complete = wanted == len(indices)
-        self.counted = sum(
-            weight * (values.size if care is None else int(np.count_nonzero(care)))
-            for _, (values, care), weight in found
-        )
+        # At least one tile, even if no vertex counts.
+        tiles = [entry for entry in tiles if not entry[1].is_empty] or tiles[:1]
+        self.indices = [index for index, _, _ in tiles]
+        self.tiles = [tile for _, tile, _ in tiles]
+        self.weights = [weight for _, _, weight in tiles]
+        self.complete = count == len(indices)
+        self.counted = sum(weight * tile.counted_vertices for _, tile, weight in tiles)
         self.blocks = blocks
         self._pool, self._costs, self._source = pool, costs, self.tiles
         self._filling: tuple[TileSettings, int] | None = None
 
-    def wider(self, most_vertices: int) -> Sample:
-        """A sample of more tiles, up to so many vertices together and filled alike; this one where it has them all."""
+    def wider(self, max_vertices: int) -> Sample:
+        """Return a sample of more tiles, up to `max_vertices` together, filled in the same way.
+
+        A sample that has all tiles is returned itself.
+        """
         if self.complete:
             return self
-        other = Sample(self.blocks, most_vertices, self._pool, self._costs)
+        other = Sample(self.blocks, max_vertices, self._pool, self._costs)
         return other if self._filling is None else other.filled(*self._filling)
 
     def filled(self, settings: TileSettings, density: int) -> Sample:
-        """The same tiles with values that suit the settings where they do not count, whatever stood there before; see `fill`."""
+        """Return the same tiles, filled for these settings (see `fill`) from the source."""
         if self.blocks.complete:
             return self
         other = copy(self)
         other._filling = settings, density
-        other.tiles = list(
-            self._pool.map(lambda tile: fill(tile[0], tile[1], settings, density), self._source)
-        )
+        other.tiles = list(self._pool.map(lambda tile: fill(tile, settings, density), self._source))
         return other
 
-    def map(self, work: Callable[[tuple[Values, Care]], Result]) -> list[Result]:
-        """The results for all tiles, in order, by all processors."""
+    def map(self, work: Callable[[Tile], Result]) -> list[Result]:
+        """Return the results of `work` for the tiles of the sample, in order, by all threads."""
         return list(self._pool.map(work, self.tiles))
 
-    def map_all(self, work: Callable[[tuple[Values, Care]], Result]) -> Iterator[Result]:
-        """The results for all tiles of the series, some at a time."""
+    def map_all(self, work: Callable[[Tile], Result]) -> Iterator[Result]:
+        """Yield the results of `work` for all tiles of the series, in C order."""
         indices = list(self.blocks.indices())
-        if self.blocks.held:
+        if self.blocks.in_memory:
             yield from self._pool.map(lambda index: work(self.blocks.read(index)), indices)
-            return
-        for start in range(0, len(indices), BATCH):
-            yield from self._pool.map(
-                work, [self.blocks.read(index) for index in indices[start : start + BATCH]]
-            )
+        else:
+            tiles = (self.blocks.read(index) for index in indices)
+            yield from map_ahead(self._pool, work, tiles, MAX_TILES_AHEAD)
 
     def run(self, settings: TileSettings, coding: Coding) -> Outcome:
-        """Code the tiles; what coding the whole series would give."""
+        """Code the tiles; the outcome that the series would have, by their weights."""
         return self.run_all([(settings, coding)])[0]
 
     def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
-        """What each of some ways to code the tiles would give: at once, so that a few large tiles keep all processors busy, too."""
-        jobs = [(tile, *trial) for trial in trials for tile in self.tiles]
-        found = list(self._pool.map(lambda job: code(*job[0], *job[1:])[1], jobs))
+        """Return the outcome of `run` for each pair of settings and coding.
+
+        All trials run at once, so that a few large tiles keep all processors busy, too.
+        """
+        jobs = [(tile, settings, coding) for settings, coding in trials for tile in self.tiles]
+        outcomes = list(self._pool.map(lambda job: code(*job)[1], jobs))
         number = len(self.tiles)
         return [
-            total(found[start : start + number], self.weights)
-            for start in range(0, len(found), number)
+            total(outcomes[start : start + number], self.weights)
+            for start in range(0, len(outcomes), number)
         ]
 
     def decoded(self, settings: TileSettings, coding: Coding) -> list[npt.NDArray[np.float32]]:
-        """What the tiles decode to, float32."""
-        return self.map(
-            lambda tile: code(tile[0], tile[1], settings, coding)[0].decoded.astype(np.float32)
-        )
+        """Code and decode the tiles; the decoded values, float32."""
+        return self.map(lambda tile: code(tile, settings, coding)[0].decoded.astype(np.float32))
 
 
-def pool() -> ThreadPoolExecutor:
-    """One thread per processor: the native coder lets go of the interpreter."""
-    return ThreadPoolExecutor(usable_threads(), thread_name_prefix="fhash-tile")
+def _choose_tiles(tiles: int, count: int, costs: Sequence[float] | None) -> list[tuple[int, int]]:
+    """Choose `count` of the tiles; pairs as of `strata`."""
+    if count == tiles:
+        return [(number, 1) for number in range(count)]
+    if costs is not None:
+        return strata(costs, count)
+    # In C order: a reader of a large series keeps one layer of tiles only.
+    weights = [tiles * (place + 1) // count - tiles * place // count for place in range(count)]
+    return list(zip(sorted(spread_order(tiles)[:count]), weights, strict=True))

@@ -1,4 +1,4 @@
-"""Engines: how the network is trained and evaluated on the lattice; same results, different speed."""
+"""Engines: implementations of training and evaluation on the lattice, equal but for their speed."""
 
 from __future__ import annotations
 
@@ -17,35 +17,47 @@ if TYPE_CHECKING:
     from fhash_codec.paper.architecture import Architecture
     from fhash_codec.paper.engines.initial import Parameters
 
+Chosen = npt.NDArray[np.int64]
+"""Numbers (n,) of some bricks of the coreset, without repetition."""
+
 
 class Engine(Protocol):
-    """Trains one model on one coreset, a batch of bricks at a time, by Adam on the mean squared error of the batch.
+    """One model in training on one coreset, a batch of bricks at a time.
 
-    `rates` holds the learning rate of every step of the training, 1-based (rates[0] is unused).
+    Training is Adam on the mean squared error of the batch. Engines start from the same parameters
+    and follow the same learning rates.
+
+    Attributes:
+        rates: learning rate of every training step, float64 and counted from 1; rates[0] is unused.
+        step: training steps done so far.
     """
 
+    rates: npt.NDArray[np.float64]
     step: int
 
-    def train(self, chosen: npt.NDArray[np.int64]) -> torch.Tensor:
-        """One Adam step on the bricks `chosen`; the sum of squared errors (float64 scalar) before it."""
+    def train(self, chosen: Chosen) -> torch.Tensor:
+        """Do one training step on a batch of bricks.
+
+        Returns the sum of squared errors before the step, a scalar on the device.
+        """
 
     def settle(self) -> None:
-        """Finish what training has put off; until the next step, evaluation is faster for it."""
+        """Finish work that training put off: evaluation is then faster until the next step."""
 
-    def infer(self, chosen: npt.NDArray[np.int64]) -> torch.Tensor:
-        """Values (bricks, vertices), normalised, of the bricks `chosen` at all their vertices."""
+    def infer(self, chosen: Chosen) -> torch.Tensor:
+        """Return the normalised values (bricks, vertices) of some bricks at all their vertices."""
 
-    def squared_error(self, chosen: npt.NDArray[np.int64]) -> float:
-        """Sum of squared errors over the coreset vertices of the bricks `chosen`."""
+    def squared_error(self, chosen: Chosen) -> float:
+        """Return the sum of squared errors over the coreset vertices of some bricks."""
 
     def parameters(self) -> Parameters:
-        """The trained numbers, on the CPU."""
+        """Return the trained numbers, on the CPU."""
 
     def state(self) -> dict[str, npt.NDArray[np.generic]]:
-        """Everything that the next step depends on, as arrays."""
+        """Return everything that the next step depends on, as arrays for a checkpoint."""
 
     def restore(self, state: Mapping[str, npt.NDArray[np.generic]]) -> None:
-        """Go on from `state`."""
+        """Continue from a `state`; KeyError, RuntimeError or ValueError for another model."""
 
 
 def make_engine(
@@ -57,7 +69,19 @@ def make_engine(
     seed: int,
     device: torch.device,
 ) -> Engine:
-    """The engine of this name; 'auto' is the fastest at hand. Raises InputError for an unknown name."""
+    """Return a new engine.
+
+    Args:
+        name: slab, naive, or auto for the fastest.
+        architecture: the sizes of the model.
+        coreset: the training samples.
+        rates: learning rate of every training step, counted from 1.
+        seed: seed of the initial parameters.
+        device: where the engine computes.
+
+    Raises:
+        InputError: the name is unknown.
+    """
     if name in ("auto", "slab"):
         from fhash_codec.paper.engines.slab import SlabEngine
 

@@ -1,4 +1,4 @@
-"""Where training starts, the same for every engine and device."""
+"""The parameters of a model, and where training starts: the same for every engine and device."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from torch import Tensor
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 
-SPREAD = (
-    1e-4  # of the initial embeddings, uniform in -SPREAD .. SPREAD (Mueller et al. 2022, section 4)
-)
+SPREAD = 1e-4
+"""Bound of the initial embeddings, uniform in -SPREAD .. SPREAD (Müller et al. 2022, section 4)."""
 
 
 @dataclass(frozen=True)
 class Parameters:
     """The trained numbers of a model.
 
-    fine: embeddings of the finest level (bricks, E, vertices of a brick), only for bricks that hold coreset vertices.
-    coarse: the coarser tables level by level, each (buckets, E), in one vector.
-    network: each layer as a matrix (out, in + 1) whose last column is the bias, in one vector.
+    Attributes:
+        fine: embeddings of the finest level (bricks, E, vertices of a brick), only for bricks that
+            hold coreset vertices.
+        coarse: the coarser tables, each (buckets, E), level by level in one vector.
+        network: the layers, each a matrix (out, in + 1) whose last column is the bias, in one
+            vector.
     """
 
     fine: Tensor
@@ -30,7 +32,11 @@ class Parameters:
     network: Tensor
 
     def dense(self, architecture: Architecture) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
-        """The coarse tables (buckets, E) and the layers (weight (out, in), bias (out,)), as views."""
+        """Return views of the coarse tables and of the layers.
+
+        Returns:
+            The tables (buckets, E), and weight (out, in) and bias (out,) of each layer.
+        """
         size = architecture.embedding_size
         tables = (
             torch.split(self.coarse, [prod(level) * size for level in architecture.levels[1:]])
@@ -44,25 +50,27 @@ class Parameters:
 
 
 def layer_matrices(architecture: Architecture, network: Tensor) -> list[Tensor]:
-    """Views of the layers (out, in + 1) inside one vector."""
+    """Return views of the layers (out, in + 1) inside one vector."""
     shapes = [(outputs, inputs + 1) for outputs, inputs in architecture.layer_shapes]
-    return [
-        part.view(shape)
-        for part, shape in zip(
-            torch.split(network, [prod(shape) for shape in shapes]), shapes, strict=True
-        )
-    ]
+    vectors = torch.split(network, [prod(shape) for shape in shapes])
+    return [vector.view(shape) for vector, shape in zip(vectors, shapes, strict=True)]
 
 
 def initial_parameters(architecture: Architecture, coreset: Coreset, seed: int) -> Parameters:
-    """Uniform embeddings and layers (uniform in +-1/sqrt(inputs), torch's own start), float32 on the CPU."""
+    """Return random parameters that depend on the seed alone, float32 on the CPU.
+
+    Embeddings are uniform in +-SPREAD (paper, section 3.2.4: uniform initialization). Layers are
+    uniform in +-1/sqrt(inputs), as torch.nn.Linear starts them.
+    """
     random = torch.Generator().manual_seed(seed)
     fine = torch.empty(len(coreset.bricks), architecture.embedding_size, prod(coreset.brick_shape))
     fine.uniform_(-SPREAD, SPREAD, generator=random)
-    coarse = sum(prod(level) for level in architecture.levels[1:]) * architecture.embedding_size
-    tables = torch.empty(coarse).uniform_(-SPREAD, SPREAD, generator=random)
-    parts = []
+    coarse_numbers = (
+        sum(prod(level) for level in architecture.levels[1:]) * architecture.embedding_size
+    )
+    coarse = torch.empty(coarse_numbers).uniform_(-SPREAD, SPREAD, generator=random)
+    layers = []
     for outputs, inputs in architecture.layer_shapes:
         bound = inputs**-0.5
-        parts.append(torch.empty(outputs * (inputs + 1)).uniform_(-bound, bound, generator=random))
-    return Parameters(fine=fine, coarse=tables, network=torch.cat(parts))
+        layers.append(torch.empty(outputs * (inputs + 1)).uniform_(-bound, bound, generator=random))
+    return Parameters(fine=fine, coarse=coarse, network=torch.cat(layers))

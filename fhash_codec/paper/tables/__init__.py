@@ -1,1 +1,1 @@
-"""The paper profile's tables through the coder of the compact profile: `--tables transform`."""
+"""The paper profile's tables through the coder of the profile compact: `--tables transform`."""

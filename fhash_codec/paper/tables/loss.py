@@ -1,4 +1,7 @@
-"""What a network decodes the coreset to, compared with the samples it was trained on; and how much each embedding matters to it."""
+"""Comparison of decoded networks with the samples of the coreset that they were trained on.
+
+It tells the error that coding the tables makes, and how much each embedding matters.
+"""
 
 from __future__ import annotations
 
@@ -8,30 +11,89 @@ from math import fsum
 
 import numpy as np
 
-from fhash_codec.coreset.boxes import box_size
+from fhash_codec.compact.tiles.sample import spread_order
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats, Network
-from fhash_codec.paper.points import feature_slopes
-from fhash_codec.paper.regions import Box, decode_region
+from fhash_codec.paper.points import input_slopes
+from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.tables.bricks import Bricks
 from fhash_codec.paper.tables.tiles import Index
-from fhash_formats.transform.tile.encoding import Shape
+from fhash_formats.transform.tile.sections import Shape
 
-GOLDEN = 0.6180339887498949
-SLOPE_TILES, SLOPE_POINTS = 16, 1024
-"""Tiles, and samples of each, at which derivatives are taken, about."""
+SLOPE_TILES = 16
+"""About the number of tiles at which derivatives are taken."""
+SLOPE_POINTS = 1024
+"""About the number of samples of each of them."""
 
 
 class Samples:
     """The coreset at the key frames, tile by tile of the finest level.
 
     Attributes:
-        counts: samples of each tile that holds any, by its index, in C order. tile, sizes: vertices (t, z, y, x) of a tile and in all.
+        counts: number of samples of each tile that holds any, by its place, in C order.
+        tile: vertices (t, z, y, x) of a tile.
+        sizes: vertices (t, z, y, x) of the finest level.
     """
 
     def __init__(self, coreset: Coreset, bricks: Bricks, tile: Shape) -> None:
         self._bricks = bricks
-        self.tile, self.sizes = tile, (len(coreset.key_frames), *box_size(coreset.box))
+        self.tile, self.sizes = tile, (len(coreset.key_frames), *coreset.box.shape)
+        counts = {
+            index: sum(int(np.count_nonzero(bricks.mask(key, box))) for key in keys)
+            for index in sorted(self._touched(coreset))
+            for keys, box in [self._keys_and_box(index)]
+        }
+        self.counts = {index: count for index, count in counts.items() if count}
+
+    def choose(self, samples: int) -> list[Index]:
+        """Return evenly spread tiles, at least one, in C order.
+
+        They hold at most so many samples together, unless a single tile holds more.
+        """
+        indices = list(self.counts)
+        chosen: list[Index] = []
+        for number in spread_order(len(indices)):
+            if not chosen or samples >= self.counts[indices[number]]:
+                chosen.append(indices[number])
+                samples -= self.counts[indices[number]]
+        return sorted(chosen)
+
+    def squares(self, network: Network, tiles: Sequence[Index]) -> tuple[float, int]:
+        """Return the sum of squared errors at the samples of some tiles, and their number.
+
+        The errors are of normalised values, which a reader decodes and clips to their range.
+        """
+        squares, count = [], 0
+        for index in tiles:
+            keys, box = self._keys_and_box(index)
+            for key in keys:
+                in_coreset = self._bricks.mask(key, box)
+                if in_coreset.any():
+                    frame = decode_region(network, key, box, requested=in_coreset)
+                    decoded = np.clip(frame[in_coreset].astype(np.float64), 0.0, 1.0)
+                    samples = self._bricks.samples(key, box)[in_coreset]
+                    squares.append(float(np.square(decoded - samples).sum()))
+                    count += len(decoded)
+        return fsum(squares), count
+
+    def slopes(self, network: Network, tiles: Sequence[Index]) -> Floats:
+        """Return the derivatives (inputs, n) of the value by each input of the network.
+
+        They are taken at evenly spread samples of some of the tiles.
+        """
+        slopes = []
+        for index in tiles[:: -(-len(tiles) // SLOPE_TILES)]:
+            keys, box = self._keys_and_box(index)
+            points = np.argwhere(np.stack([self._bricks.mask(key, box) for key in keys]))
+            points = points[:: -(-len(points) // SLOPE_POINTS)] + np.array(
+                [keys[0], *(low for low, _ in box)]
+            )
+            slopes.append(input_slopes(network, points.T.astype(np.float64)))
+        return np.concatenate(slopes, axis=1)
+
+    def _touched(self, coreset: Coreset) -> set[Index]:
+        """Return the places of the tiles that some brick of the coreset touches."""
         corners = coreset.bricks[:, 1:].astype(np.int64) * np.array(coreset.brick_shape)
         touched: set[Index] = set()
         for (key, *_), corner in zip(coreset.bricks.tolist(), corners.tolist(), strict=True):
@@ -41,63 +103,15 @@ class Samples:
             ]
             z, y, x = (
                 range(low // n, end // n + 1)
-                for low, end, n in zip(corner, ends, tile[1:], strict=True)
+                for low, end, n in zip(corner, ends, self.tile[1:], strict=True)
             )
-            touched.update(product((key // tile[0],), z, y, x))
-        counts = {
-            index: sum(int(np.count_nonzero(bricks.mask(key, box))) for key in keys)
-            for index, keys, box in map(self._at, sorted(touched))
-        }
-        self.counts = {index: count for index, count in counts.items() if count}
+            touched.update(product((key // self.tile[0],), z, y, x))
+        return touched
 
-    def chosen(self, most: int) -> list[Index]:
-        """Evenly spread tiles of about so many samples together, at least one; in C order."""
-        indices = list(self.counts)
-        order = sorted(range(len(indices)), key=lambda number: number * GOLDEN % 1.0)
-        taken: list[Index] = []
-        for number in order:
-            if not taken or most >= self.counts[indices[number]]:
-                taken.append(indices[number])
-                most -= self.counts[indices[number]]
-        return sorted(taken)
-
-    def squares(self, network: Network, tiles: Sequence[Index]) -> tuple[float, int]:
-        """Sum of the squared errors of normalised values, as a reader decodes and clips them, and number of the samples in some tiles."""
-        total, count = [], 0
-        for index in tiles:
-            _, keys, box = self._at(index)
-            for key in keys:
-                wanted = self._bricks.mask(key, box)
-                if wanted.any():
-                    decoded = decode_region(network, key, box, wanted=wanted)[wanted].astype(
-                        np.float64
-                    )
-                    total.append(
-                        float(
-                            np.square(
-                                np.clip(decoded, 0.0, 1.0) - self._bricks.samples(key, box)[wanted]
-                            ).sum()
-                        )
-                    )
-                    count += len(decoded)
-        return fsum(total), count
-
-    def slopes(self, network: Network, tiles: Sequence[Index]) -> Floats:
-        """Derivatives (features, n) by each interpolated embedding at evenly spread samples of some of the tiles."""
-        found = []
-        for index in tiles[:: -(-len(tiles) // SLOPE_TILES)]:
-            _, keys, box = self._at(index)
-            places = np.argwhere(np.stack([self._bricks.mask(key, box) for key in keys]))
-            places = places[:: -(-len(places) // SLOPE_POINTS)] + np.array(
-                [keys[0], *(low for low, _ in box)]
-            )
-            found.append(feature_slopes(network, places.T.astype(np.float64)))
-        return np.concatenate(found, axis=1)
-
-    def _at(self, index: Index) -> tuple[Index, range, Box]:
-        """A tile, its key frames and its vertices of the box."""
+    def _keys_and_box(self, index: Index) -> tuple[range, Box]:
+        """Return the key frames and the vertices of the box that a tile covers."""
         spans = [
             (i * n, min((i + 1) * n, size))
             for i, n, size in zip(index, self.tile, self.sizes, strict=True)
         ]
-        return index, range(*spans[0]), (spans[1], spans[2], spans[3])
+        return range(*spans[0]), Box.of(spans[1:])

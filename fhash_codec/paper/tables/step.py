@@ -1,4 +1,8 @@
-"""Trained tables to tiles with one quantiser step, as large as the allowed loss lets it be: searched on what the decoder returns."""
+"""Coding of trained tables with one quantiser step, as large as the allowed loss permits.
+
+The step is found by trials: the tables are coded, decoded, and the network is compared with the
+samples of the coreset.
+"""
 
 from __future__ import annotations
 
@@ -10,35 +14,48 @@ from math import prod
 
 import numpy as np
 
-from fhash_codec.compact.tiles.coding import SMALLEST_STEP
-from fhash_codec.compact.tiles.sample import pool
+from fhash_codec.compact.choices.search import Bracket, geometric_mean
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats, Network
 from fhash_codec.paper.storage import component_name
 from fhash_codec.paper.tables.bricks import Bricks
-from fhash_codec.paper.tables.codings import SMALLEST, choose_codings
+from fhash_codec.paper.tables.codings import MIN_STEP, choose_codings
 from fhash_codec.paper.tables.loss import Samples
-from fhash_codec.paper.tables.tiles import Index, TiledTable, tile_shape
+from fhash_codec.paper.tables.tiles import Index, LevelCoding, TiledTable, tile_shape
 from fhash_codec.paper.tables.trained_tables import TrainedTable, trained_tables
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
+from fhash_formats.support.threads import thread_pool
 
 MAX_LOSS = 0.1
-"""dB that the coded tables may cost over the samples, where no PSNR is promised or it is out of reach."""
+"""dB that coding may cost over the samples where no PSNR is promised or the promise is lost."""
 SAFE = 1e-3
-"""dB above a promised PSNR that are aimed at."""
+"""dB by which the search aims above a promised PSNR."""
 SAMPLE = 1 << 20
-"""Samples on which the step is searched for first, about."""
-TRIALS, TRIALS_OF_ALL, MORE_TRIALS = 6, 3, 20
-"""Steps tried on the sample and on everything, and how many more while none has kept what is allowed."""
+"""About the number of samples on which the step is searched for first."""
+TRIALS = 6
+"""Steps tried on the sample."""
+TRIALS_OF_ALL = 3
+"""Steps tried on all samples."""
+MORE_TRIALS = 20
+"""Further steps tried while none has kept the allowed error."""
 CLOSE = 0.98
-"""Part of the allowed error from which on it is not worth another trial."""
+"""Share of the allowed error from which on another trial is not worth its time."""
+MIN_TABLES_ERROR = 1e-20
+"""Smallest mean squared error that coding may reach, for tables without any error."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CodedTables:
-    """Tables, finest first, coded with one step so that they cost `loss` dB over the samples at the key frames."""
+    """Trained tables coded with one quantiser step.
+
+    Attributes:
+        step: the quantiser step.
+        tables: the tables, finest first.
+        loss: dB of PSNR over the samples at the key frames that coding costs.
+    """
 
     step: float
     tables: list[TiledTable]
@@ -55,80 +72,146 @@ def code_tables(
     workers: ThreadPoolExecutor,
     progress: Progress,
 ) -> CodedTables:
-    """Code trained tables: fine (bricks, E, vertices of a brick), tables (buckets, E), layers (weight, bias).
+    """Code trained tables with the largest quantiser step that keeps the allowed error.
 
-    The step is as large as MAX_LOSS allows; with `psnr`, in dB over the samples, as large as keeps it, if the tables themselves do.
+    Args:
+        architecture: the sizes of the tables.
+        coreset: the training samples.
+        fine: finest embeddings (bricks, E, vertices of a brick).
+        tables: the coarser tables, each (buckets, E).
+        layers: weight and bias of each layer.
+        psnr: promised PSNR in dB over the samples. It sets the allowed error if the tables have it
+            before they are coded. Without it, coding may cost MAX_LOSS.
+        workers: threads for the coding.
+        progress: called before each trial.
     """
     bricks = Bricks(coreset)
     trained = trained_tables(architecture, coreset, bricks, fine, tables)
+    samples = Samples(coreset, bricks, tile_shape(architecture.levels[0]))
+    search = _StepSearch(architecture, trained, layers, samples, psnr, workers, progress)
+    some_tiles, all_tiles = samples.choose(SAMPLE), list(samples.counts)
+    search.choose_codings(coreset.values.size, some_tiles)
+    sampled = search.largest_step(search.step, some_tiles, TRIALS, "trying tables")
+    return search.largest_step(sampled.step, all_tiles, TRIALS_OF_ALL, "coding tables")
 
-    def network(sources: Sequence[TrainedTable | TiledTable]) -> Network:
-        return Network(
-            levels=architecture.levels,
-            embedding_size=architecture.embedding_size,
-            tables=sources,
-            layers=tuple(layers),
-            box_size=architecture.box_size,
-            key_frames=architecture.key_frames,
+
+class _StepSearch:
+    """The search for the largest quantiser step that keeps the allowed error.
+
+    Attributes:
+        step: first guess of the step.
+    """
+
+    def __init__(
+        self,
+        architecture: Architecture,
+        trained: Sequence[TrainedTable],
+        layers: Sequence[tuple[Floats, Floats]],
+        samples: Samples,
+        psnr: float | None,
+        workers: ThreadPoolExecutor,
+        progress: Progress,
+    ) -> None:
+        self._architecture, self._trained, self._layers = architecture, trained, layers
+        self._samples, self._psnr = samples, psnr
+        self._workers, self._progress = workers, progress
+        self._exact = self._network(trained)
+        self._codings: list[LevelCoding] = []
+        self.step = self._min_step = MIN_STEP
+
+    def choose_codings(self, samples: int, tiles: Sequence[Index]) -> None:
+        """Guess the step and choose the coding of each level.
+
+        Args:
+            samples: number of samples in the coreset.
+            tiles: some tiles, on which the error of the tables is measured.
+        """
+        squares, count = self._samples.squares(self._exact, tiles)
+        # First guess: a uniform quantiser with the error step^2 / 12, as if every number of the
+        # tables contributed equally to the errors of all values.
+        numbers = sum(prod(table.shape) for table in self._trained)
+        self.step = math.sqrt(
+            12 * (_allowed_error(squares / count, self._psnr) - squares / count) * samples / numbers
+        )
+        slopes = self._samples.slopes(self._exact, tiles)
+        self._codings = choose_codings(
+            self._architecture, samples, self._trained, slopes, self.step, self._workers
+        )
+        self._min_step = max(
+            MIN_STEP,
+            MIN_STEP_SHARE
+            * max(
+                settings.high - settings.low
+                for coding in self._codings
+                for settings in coding.settings
+            ),
         )
 
-    exact = network(trained)
-    samples = Samples(coreset, bricks, tile_shape(architecture.levels[0]))
-    chosen, everything = samples.chosen(SAMPLE), list(samples.counts)
-    own, count = samples.squares(exact, chosen)
-    # The error of a plain quantiser, if every number of the tables were as large an error in all the values as the choice makes it.
-    numbers = sum(prod(table.shape) for table in trained)
-    step = math.sqrt(
-        12 * (_allowed(own / count, psnr) - own / count) * coreset.values.size / numbers
-    )
-    codings = choose_codings(
-        architecture, coreset.values.size, trained, samples.slopes(exact, chosen), step, workers
-    )
-    smallest = max(
-        SMALLEST, SMALLEST_STEP * max(s.high - s.low for coding in codings for s in coding.settings)
-    )
+    def largest_step(
+        self, step: float, tiles: Sequence[Index], trials: int, stage: str
+    ) -> CodedTables:
+        """Return the tables coded with the largest step found that keeps the allowed error.
 
-    def nearest(step: float, tiles: Sequence[Index], trials: int, stage: str) -> CodedTables:
-        """With the largest step found that keeps what is allowed on some tiles."""
-        own, count = samples.squares(exact, tiles)
-        allowed = _allowed(own / count, psnr) * count - own
-        step, low, high = max(step, smallest), smallest, math.inf
+        If no step keeps it, return those of the last trial.
+
+        Args:
+            step: the step to try first.
+            tiles: the tiles on which the error counts.
+            trials: number of steps to try.
+            stage: name of the search for `progress`.
+        """
+        exact_squares, count = self._samples.squares(self._exact, tiles)
+        allowed = _allowed_error(exact_squares / count, self._psnr) * count - exact_squares
+        step = max(step, self._min_step)
+        bracket = Bracket(self._min_step, math.inf, middle=geometric_mean)
         best: CodedTables | None = None
         for trial in range(trials + MORE_TRIALS):
-            progress(stage, min(trial, trials), trials, f"step {step:.3g}")
-            coded = [
-                TiledTable(table, coding.with_step(step), workers)
-                for table, coding in zip(trained, codings, strict=True)
-            ]
-            total, _ = samples.squares(network(coded), tiles)
-            found = CodedTables(
-                step=step,
-                tables=coded,
-                loss=10 * math.log10(total / own) if own > 0 and total > 0 else 0.0,
-            )
-            share = max(total - own, 0.0) / allowed
+            self._progress(stage, min(trial, trials), trials, f"step {step:.3g}")
+            coded, squares = self._coded(step, tiles, exact_squares)
+            share = max(squares - exact_squares, 0.0) / allowed
             if share <= 1 and (best is None or step > best.step):
-                best = found
-            low, high = (max(low, step), high) if share <= 1 else (low, min(high, step))
-            if (
-                CLOSE <= share <= 1
-                or step == smallest
-                or (best is not None and trial + 1 >= trials)
-            ):
+                best = coded
+            bracket = bracket.narrowed(step, too_low=share <= 1)
+            last_trial = trial + 1 >= trials
+            enough = best is not None and last_trial
+            if CLOSE <= share <= 1 or step == self._min_step or enough:
                 break
-            # The error grows as the square of the step, nearly; in small tables not even steadily.
-            wanted = step * math.sqrt((1 + CLOSE) / 2 / max(share, 1e-3))
-            if best is None and trial + 1 >= trials:
-                wanted = min(wanted, step / 2)
-            step = max(wanted if low < wanted < high else math.sqrt(low * high), smallest)
-        return best or found
+            # The error grows nearly as the square of the step; in small tables it may even fall.
+            next_step = step * math.sqrt((1 + CLOSE) / 2 / max(share, 1e-3))
+            if last_trial:
+                next_step = min(next_step, step / 2)
+            step = max(bracket.inside(next_step), self._min_step)
+        return best or coded
 
-    return nearest(
-        nearest(step, chosen, TRIALS, "trying tables").step,
-        everything,
-        TRIALS_OF_ALL,
-        "coding tables",
-    )
+    def _coded(
+        self, step: float, tiles: Sequence[Index], exact_squares: float
+    ) -> tuple[CodedTables, float]:
+        """Return the tables coded with a step, and their squared error on some tiles.
+
+        Args:
+            step: the quantiser step.
+            tiles: the tiles.
+            exact_squares: the squared error before the tables are coded.
+        """
+        tables = [
+            TiledTable(table, coding.with_step(step), self._workers)
+            for table, coding in zip(self._trained, self._codings, strict=True)
+        ]
+        squares, _ = self._samples.squares(self._network(tables), tiles)
+        loss = 0.0
+        if exact_squares > 0 and squares > 0:
+            loss = 10 * math.log10(squares / exact_squares)
+        return CodedTables(step=step, tables=tables, loss=loss), squares
+
+    def _network(self, tables: Sequence[TrainedTable | TiledTable]) -> Network:
+        return Network(
+            levels=self._architecture.levels,
+            embedding_size=self._architecture.embedding_size,
+            tables=tables,
+            layers=tuple(self._layers),
+            box_size=self._architecture.box_size,
+            key_frames=self._architecture.key_frames,
+        )
 
 
 def write_coded(
@@ -141,31 +224,47 @@ def write_coded(
     psnr: float | None,
     progress: Progress,
 ) -> float:
-    """Code trained tables as `code_tables` does and write them; the dB that it costs."""
-    with pool() as workers:
+    """Code trained tables and write them; return the dB of PSNR that this costs.
+
+    The arguments are those of `code_tables`, after the container that is being written.
+    """
+    with thread_pool() as workers:
         coded = code_tables(architecture, coreset, fine, tables, layers, psnr, workers, progress)
         for level, table in enumerate(coded.tables, start=1):
-            for number, (settings, mixing) in enumerate(
-                zip(table.coding.settings, table.coding.mixing.tolist(), strict=True)
-            ):
-                writer.add_sharded(
-                    component_name(level, number + 1),
-                    shape=table.shape[:4],
-                    dtype=np.float32,
-                    chunk_shape=table.coding.tile,
-                    shard_shape=table.shard,
-                    chunks=table.streams(number),
-                    dimension_names=("t", "z", "y", "x"),
-                    attributes={"mixing": mixing},
-                    codecs=[
-                        {"name": "fhash.transform", "configuration": settings.to_dict()},
-                        {"name": "crc32c"},
-                    ],
-                )
+            _write_table(writer, level, table)
     return coded.loss
 
 
-def _allowed(own: float, psnr: float | None) -> float:
-    """The mean squared error that the decoded samples may have, above that of the tables themselves."""
+def _write_table(writer: ContainerWriter, level: int, table: TiledTable) -> None:
+    """Write each component of a coded table; levels count from 1."""
+    coding = table.coding
+    for component, (settings, mixing) in enumerate(
+        zip(coding.settings, coding.mixing.tolist(), strict=True)
+    ):
+        writer.add_sharded(
+            component_name(level, component + 1),
+            shape=table.shape[:4],
+            dtype=np.float32,
+            chunk_shape=coding.tile,
+            shard_shape=table.shard,
+            chunks=table.streams(component),
+            dimension_names=("t", "z", "y", "x"),
+            attributes={"mixing": mixing},
+            codecs=[
+                {"name": "fhash.transform", "configuration": settings.to_dict()},
+                {"name": "crc32c"},
+            ],
+        )
+
+
+def _allowed_error(exact_error: float, psnr: float | None) -> float:
+    """Return the mean squared error that decoded samples may have.
+
+    Args:
+        exact_error: mean squared error of the tables before they are coded.
+        psnr: promised PSNR in dB, if any.
+    """
     promised = 0.0 if psnr is None else 10 ** (-(psnr + SAFE) / 10)
-    return promised if promised > own else max(own * 10 ** (MAX_LOSS / 10), 1e-20)
+    if promised > exact_error:
+        return promised
+    return max(exact_error * 10 ** (MAX_LOSS / 10), MIN_TABLES_ERROR)

@@ -1,4 +1,7 @@
-"""A trained table as coded tiles, and what they decode to: what the reader of the file will get, before it is written."""
+"""A trained table as coded tiles, and the embeddings that they decode to.
+
+The decoded embeddings are those that a reader of the file will get, known before it is written.
+"""
 
 from __future__ import annotations
 
@@ -15,31 +18,39 @@ import numpy.typing as npt
 from fhash_codec.compact.tiles.coding import WEIGHT
 from fhash_codec.paper.network import Floats
 from fhash_codec.paper.regions import block_shape
-from fhash_codec.paper.storage import mixed
-from fhash_codec.paper.tables.trained_tables import Region, TrainedTable
+from fhash_codec.paper.storage import mix_components
+from fhash_codec.paper.tables.trained_tables import Mask, Region, TrainedTable
+from fhash_formats.container import shard_shape
 from fhash_formats.container.cache import ChunkCache
-from fhash_formats.transform.tile.encoding import Shape, decode_tile, encode_tile
+from fhash_formats.transform.tile.decoding import decode_tile
+from fhash_formats.transform.tile.encoding import Coding, encode_tile
+from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
 Index = tuple[int, int, int, int]
-TILE_STEPS, TILE_VERTICES = 8, 1 << 16
-"""Time nodes of a tile, and about how many vertices of each."""
-MAX_TILES = 4096
-"""In one shard."""
+"""Place (t, z, y, x) of a tile in the grid of tiles."""
+TILE_STEPS = 8
+"""Largest number of time nodes in a tile."""
+TILE_VERTICES = 1 << 16
+"""Vertices (z, y, x) that a tile may grow to at each time node."""
 CACHE_BYTES = 64 << 20
+"""Bytes of decoded tiles of one table that stay in memory."""
 BATCH = 16
 """Tiles that are worked on at a time."""
 ROUNDS = 2
-"""Projections of what does not count."""
+"""Projections by which the coder fills vertices that are not needed."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Coding:
-    """How a level is coded.
+class LevelCoding:
+    """The coding of the table of a level.
 
     Attributes:
-        tile: vertices (t, z, y, x) of a tile. mixing: float32 (E, E), the embeddings that 1 of each component adds (`storage.mixed`).
-        unmixing: float64 (E, E), components = unmixing @ embedding. settings: of each component; their steps are all the same.
+        tile: vertices (t, z, y, x) of a tile.
+        mixing: float32 (E, E), the embeddings that 1 of each component adds
+            (`storage.mix_components`).
+        unmixing: float64 (E, E); components = unmixing @ embedding.
+        settings: settings of each component. Their quantiser steps are all the same.
     """
 
     tile: Shape
@@ -47,107 +58,104 @@ class Coding:
     unmixing: npt.NDArray[np.float64]
     settings: tuple[TileSettings, ...]
 
-    def with_step(self, step: float) -> Coding:
-        """The same with another quantiser step."""
+    def with_step(self, quantiser_step: float) -> LevelCoding:
+        """Return the same coding with another quantiser step."""
         return replace(
-            self, settings=tuple(replace(settings, step=step) for settings in self.settings)
+            self,
+            settings=tuple(replace(settings, step=quantiser_step) for settings in self.settings),
         )
 
 
 class TiledTable:
-    """A `TableSource` of what the tiles of a table decode to; each is coded when it is first asked for. One thread at a time."""
+    """A `TableSource` of the embeddings that the tiles of a table decode to.
 
-    def __init__(self, table: TrainedTable, coding: Coding, workers: ThreadPoolExecutor) -> None:
+    A tile is coded when it is first read. One thread at a time may use the table.
+    """
+
+    def __init__(
+        self, table: TrainedTable, coding: LevelCoding, workers: ThreadPoolExecutor
+    ) -> None:
         self.table, self.coding = table, coding
         self.shape = table.shape
         self.grid: Index = tuple(
-            -(-n // part) for n, part in zip(self.shape[:4], coding.tile, strict=True)
+            -(-length // n) for length, n in zip(self.shape[:4], coding.tile, strict=True)
         )  # type: ignore[assignment]
         self._workers = workers
         self._streams: dict[Index, list[bytes]] = {}
         self._decoded = ChunkCache(CACHE_BYTES)
 
     def read(self, region: Region) -> Floats:
-        """Embeddings (t, z, y, x, E) of a region of 5 slices, float32, as the file will have them."""
+        """Return the embeddings (t, z, y, x, E) of a region of 5 slices, as the file has them."""
         tile = self.coding.tile
         spans = [
-            range(part.start // n, -(-part.stop // n))
-            for part, n in zip(region, tile, strict=False)
+            range(axis.start // n, -(-axis.stop // n))
+            for axis, n in zip(region, tile, strict=False)
         ]
-        result = np.empty([part.stop - part.start for part in region], np.float32)
+        result = np.empty([axis.stop - axis.start for axis in region], np.float32)
         for index, values in self._tiles(list(product(*spans))):  # type: ignore[arg-type]
             target, source = [], []
-            for i, n, part in zip(index, tile, region, strict=False):
-                low, high = max(part.start, i * n), min(part.stop, (i + 1) * n)
-                target.append(slice(low - part.start, high - part.start))
+            for i, n, axis in zip(index, tile, region, strict=False):
+                low, high = max(axis.start, i * n), min(axis.stop, (i + 1) * n)
+                target.append(slice(low - axis.start, high - axis.start))
                 source.append(slice(low - i * n, high - i * n))
             result[tuple(target)] = values[(*source, region[4])]
         return result
 
     @property
     def shard(self) -> tuple[int, ...]:
-        """Vertices (t, z, y, x) of a shard: everything, or one layer of tiles in time where there are many."""
-        layers = self.grid[0] if prod(self.grid) <= MAX_TILES else 1
-        return (
-            layers * self.coding.tile[0],
-            *(n * count for n, count in zip(self.coding.tile[1:], self.grid[1:], strict=True)),
-        )
+        """Vertices (t, z, y, x) of a shard."""
+        return shard_shape(self.coding.tile, self.grid)
 
     def streams(self, component: int) -> Iterator[bytes]:
-        """The coded tiles of a component, in C order."""
+        """Return the coded tiles of a component, in C order."""
         indices: list[Index] = list(product(*(range(n) for n in self.grid)))  # type: ignore[arg-type]
         for _ in self._tiles([index for index in indices if index not in self._streams]):
             pass
         return (self._streams[index][component] for index in indices)
 
-    def region(self, index: Index) -> Region:
-        """The part of the table that a tile holds."""
-        return tuple(
-            slice(i * n, min((i + 1) * n, length))
-            for i, n, length in zip(index, self.coding.tile, self.shape, strict=False)
-        )
-
     def _tiles(self, indices: Sequence[Index]) -> Iterator[tuple[Index, Floats]]:
-        """Decoded tiles (t, z, y, x, E), full ones; a few are worked on at a time."""
+        """Yield decoded tiles (t, z, y, x, E), all of full size; a few are worked on at a time."""
         for start in range(0, len(indices), BATCH):
             batch = indices[start : start + BATCH]
-            # What is cached, and what is read, is asked of one thread; coding is done by all.
-            known = {index: self._decoded.get(("", index, 0)) for index in batch}
-            pending = {index: self._begin(index) for index, found in known.items() if found is None}
-            for index, found in known.items():
-                if found is None:
-                    self._streams[index], found = pending[index].result()
-                    self._decoded.put(("", index, 0), found)
-                yield index, found
+            # This thread alone uses the cache and reads the table; all threads code.
+            cached = {index: self._decoded.get(("", index, 0)) for index in batch}
+            pending = {index: self._begin(index) for index, tile in cached.items() if tile is None}
+            for index, tile in cached.items():
+                if tile is None:
+                    self._streams[index], tile = pending[index].result()
+                    self._decoded.put(("", index, 0), tile)
+                yield index, tile
 
     def _begin(self, index: Index) -> Future[tuple[list[bytes], Floats]]:
+        """Start the work on a tile; its result is the stream of each component, and the tile."""
         if index in self._streams:
             return self._workers.submit(self._decode, self._streams[index])
-        return self._workers.submit(
-            self._code, *components_of(self.table, self.coding, self.region(index))
-        )
+        region = tile_region(index, self.coding.tile, self.shape)
+        return self._workers.submit(self._code, *components_of(self.table, self.coding, region))
 
-    def _code(
-        self, components: list[Floats], care: npt.NDArray[np.bool_]
-    ) -> tuple[list[bytes], Floats]:
+    def _code(self, components: list[Floats], needed: Mask) -> tuple[list[bytes], Floats]:
         coded = [
-            code_tile(part, care, settings)
-            for part, settings in zip(components, self.coding.settings, strict=True)
+            code_tile(component, needed, settings)
+            for component, settings in zip(components, self.coding.settings, strict=True)
         ]
-        return [data for data, _ in coded], mixed(
+        return [data for data, _ in coded], mix_components(
             [decoded for _, decoded in coded], self.coding.mixing
         )
 
     def _decode(self, streams: list[bytes]) -> tuple[list[bytes], Floats]:
-        parts = [
+        components = [
             decode_tile(data, self.coding.tile, np.float32, settings)
             for data, settings in zip(streams, self.coding.settings, strict=True)
         ]
-        return streams, mixed(parts, self.coding.mixing)
+        return streams, mix_components(components, self.coding.mixing)
 
 
 def tile_shape(resolution: Shape) -> Shape:
-    """A tile of a level: whole blocks of the decoder, about TILE_VERTICES of them, of TILE_STEPS time nodes."""
+    """Return the tile (t, z, y, x) of a level of a resolution (t, z, y, x).
+
+    It consists of whole blocks of the decoder (`regions.block_shape`), with about TILE_VERTICES
+    vertices at each of at most TILE_STEPS time nodes.
+    """
     box = resolution[1:]
     shape = list(block_shape(box))
     while (growing := [axis for axis in range(3) if shape[axis] < box[axis]]) and 2 * prod(
@@ -159,25 +167,45 @@ def tile_shape(resolution: Shape) -> Shape:
     return -(-resolution[0] // -(-resolution[0] // TILE_STEPS)), z, y, x
 
 
+def tile_region(index: Index, tile: Shape, shape: Sequence[int]) -> Region:
+    """Return the part (t, z, y, x) of a table that a tile covers.
+
+    Args:
+        index: place of the tile in the grid of tiles.
+        tile: vertices of a tile.
+        shape: lengths of the axes of the table; those after x are ignored.
+    """
+    return tuple(
+        slice(i * n, min((i + 1) * n, length))
+        for i, n, length in zip(index, tile, shape, strict=False)
+    )
+
+
 def components_of(
-    table: TrainedTable, coding: Coding, region: Region
-) -> tuple[list[Floats], npt.NDArray[np.bool_]]:
-    """The components of a region of a table, filled up to a whole tile, and what of them counts (t, z, y, x)."""
-    embeddings, care = table.read((*region, slice(0, table.shape[4]))), table.cares(region)
-    beyond = [(0, n - m) for n, m in zip(coding.tile, care.shape, strict=True)]
-    parts = [
-        np.pad((embeddings @ row).astype(np.float32), beyond, mode="edge")
+    table: TrainedTable, coding: LevelCoding, region: Region
+) -> tuple[list[Floats], Mask]:
+    """Return the components of a region, padded to a whole tile, and the needed vertices.
+
+    The components repeat their border values beyond the table; vertices there are not needed.
+    """
+    embeddings, needed = table.read((*region, slice(0, table.shape[4]))), table.needed(region)
+    padding = [(0, n - m) for n, m in zip(coding.tile, needed.shape, strict=True)]
+    components = [
+        np.pad((embeddings @ row).astype(np.float32), padding, mode="edge")
         for row in coding.unmixing
     ]
-    return parts, np.pad(care, beyond)
+    return components, np.pad(needed, padding)
 
 
 def code_tile(
-    values: Floats, care: npt.NDArray[np.bool_], settings: TileSettings
+    component: Floats, needed: Mask, settings: TileSettings
 ) -> tuple[bytes, npt.NDArray[Any]]:
-    """The stream of one component of a tile, and what it decodes to."""
-    whole = bool(care.all())
+    """Return the stream of one component of a tile, and the values that it decodes to."""
+    complete = bool(needed.all())
     coded = encode_tile(
-        values, settings, care=None if whole else care, weight=WEIGHT, rounds=0 if whole else ROUNDS
+        component,
+        settings,
+        Coding(weight=WEIGHT, rounds=0 if complete else ROUNDS),
+        in_coreset=None if complete else needed,
     )
     return coded.data, coded.decoded

@@ -1,1 +1,1 @@
-"""The training loop of the paper profile, its restarts and its checkpoints."""
+"""Training of the paper's model: the loop, restarts at a lower rate, and interruption."""

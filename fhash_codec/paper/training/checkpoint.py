@@ -1,4 +1,7 @@
-"""Interrupted training on disk: beside the output, named after what is being trained, so that only the same command goes on from it."""
+"""Checkpoints: interrupted trainings on disk, beside their output.
+
+A checkpoint is named after the data and the settings, so that only the same command continues it.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +19,24 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.paper.training.train import Course
+from fhash_codec.paper.training.train import TrainingProgress
 from fhash_formats.errors import InputError
 from fhash_formats.support.atomic import replacing
 from fhash_formats.support.leftovers import clear
 
-# Settings that change neither the model nor the course of its training.
-PARTIAL_BYTES = 24  # what a temporary name adds while the checkpoint is written
+MAX_NAME_BYTES = 250
+"""Bytes of a checkpoint's file name, with those that a temporary name adds; systems allow 255."""
+PARTIAL_BYTES = 24
+"""Bytes that a temporary name adds while the checkpoint is written."""
 UNRELATED = ("psnr", "tables", "timings")
+"""Settings that change neither the model nor the course of its training."""
 
 
 def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Path:
-    """Where the checkpoint of this training stands: `OUTPUT.<digest of coreset and settings>.checkpoint`."""
+    """Return the path of a training's checkpoint.
+
+    It is `OUTPUT.<digest of coreset and settings>.checkpoint`, beside the output.
+    """
     settings = {name: value for name, value in config.to_dict().items() if name not in UNRELATED}
     digest = hashlib.sha256(
         json.dumps(
@@ -37,22 +46,33 @@ def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Pat
     for array in (coreset.values, coreset.bricks, coreset.mask_bits):
         digest.update(array.data)
     end = f".{digest.hexdigest()[:12]}.checkpoint"
-    # A name may have 255 bytes; what is cut off of a long one does not matter, since the digest tells checkpoints apart.
-    start = output.name.encode()[: 250 - len(end) - PARTIAL_BYTES].decode(errors="ignore")
+    # A long name may lose its end: the digest tells checkpoints apart.
+    room = MAX_NAME_BYTES - len(end) - PARTIAL_BYTES
+    start = output.name.encode()[:room].decode(errors="ignore")
     return output.with_name(start + end)
 
 
-def save_checkpoint(path: Path, state: Mapping[str, npt.NDArray[Any]], course: Course) -> None:
-    """Replace the checkpoint by this state; the old one stays until the new one is complete."""
-    text = np.frombuffer(json.dumps(asdict(course)).encode(), dtype=np.uint8)
+def save_checkpoint(
+    path: Path, state: Mapping[str, npt.NDArray[Any]], reached: TrainingProgress
+) -> None:
+    """Write a checkpoint; the old one stays until the new one is complete.
+
+    Args:
+        path: the checkpoint.
+        state: state of the engine.
+        reached: how far the training has come.
+    """
+    text = np.frombuffer(json.dumps(asdict(reached)).encode(), dtype=np.uint8)
     with replacing(path, force=True) as temporary, temporary.open("wb") as file:
         np.savez(file, course=text, **state)  # type: ignore[arg-type]
 
 
-def load_checkpoint(path: Path) -> tuple[dict[str, npt.NDArray[Any]], Course] | None:
-    """The state and course saved at `path`, or None where there is none; InputError for one that cannot be read.
+def load_checkpoint(path: Path) -> tuple[dict[str, npt.NDArray[Any]], TrainingProgress] | None:
+    """Read a checkpoint: the state of the engine, and how far the training had come.
 
-    What a training left that was killed while it saved is cleared away, since this one may never save.
+    Returns None where there is no checkpoint. Raises InputError for one that cannot be read.
+    Temporary files of a training that was killed while it saved are deleted here, since this
+    training may never save.
     """
     clear([path])
     if not path.exists():
@@ -60,7 +80,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, npt.NDArray[Any]], Course] | 
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             state = {name: file[name] for name in file.files}
-        return state, Course(**json.loads(state.pop("course").tobytes()))
+        return state, TrainingProgress(**json.loads(state.pop("course").tobytes()))
     except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(
             f"checkpoint {path} cannot be read; delete it to train from the start"

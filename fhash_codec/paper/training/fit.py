@@ -1,11 +1,13 @@
-"""A trained model: from a checkpoint or the start, again at a lower rate where it diverges, kept where it is interrupted."""
+"""Fitting a model: from a checkpoint or the start, and again at a lower rate where it diverges."""
 
 from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -21,19 +23,36 @@ from fhash_formats.errors import (
     OutputError,
     TrainingError,
 )
+from fhash_formats.support.interrupts import StopRequest, deferred_interrupts
 
-__all__ = ["Trained", "train_model"]
+# torch takes seconds to import, and nothing before the training needs it. Functions below import
+# the modules that load it.
+if TYPE_CHECKING:
+    import torch
+
+    from fhash_codec.paper.engines import Engine
+    from fhash_codec.paper.training.train import TrainingPlan, TrainingProgress
+
+__all__ = ["TrainedModel", "train_model"]
 
 KEEP_SECONDS = 5.0
-"""Of training, from which on it is kept until its file is complete."""
+"""Seconds of training from which on its checkpoint is kept until the output file is complete."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trained:
-    """What training gives: the model's numbers, how it went, and the checkpoint that is no longer needed once they are written.
+class TrainedModel:
+    """The numbers of a trained model, and how the training went.
 
-    fine: (bricks, E, vertices of a brick); tables: the coarser levels (buckets, E); layers: (weight (out, in), bias (out,)).
-    learning_rate: at which it came to its end, after so many `restarts` at lower and lower ones.
+    Attributes:
+        fine: finest embeddings (bricks, E, vertices of a brick).
+        tables: coarser tables, each (buckets, E).
+        layers: weight (out, in) and bias (out,) of each layer.
+        epochs: epochs of the training.
+        history: {seconds, epoch, psnr} after epochs.
+        device: type of the device.
+        checkpoint: path of the checkpoint, of no more use once the numbers are written.
+        restarts: restarts at a lower learning rate.
+        learning_rate: learning rate of the last start.
     """
 
     fine: npt.NDArray[np.float32]
@@ -53,104 +72,173 @@ def train_model(
     config: EncodeConfig,
     path: Path,
     progress: Progress = silent,
-) -> Trained:
-    """Train the model of a coreset, from the checkpoint of the same training beside `path` if there is one.
+) -> TrainedModel:
+    """Train the model of a coreset.
 
-    A training that diverges begins again at a lower learning rate, with a FhashWarning. Raises TrainingError where no rate helps.
+    The training continues from the checkpoint of the same training beside `path`, if there is one.
+    A training that diverges begins again at a lower learning rate, with a FhashWarning.
+
+    Args:
+        coreset: the training samples.
+        architecture: the sizes of the model.
+        config: the settings.
+        path: the output file.
+        progress: called after each batch.
+
+    Raises:
+        TrainingError: no learning rate gives a model.
+        InterruptedEncodingError: a signal asked for the end; a checkpoint was saved.
+        InputError: the checkpoint cannot be read, or the device or the engine is not available.
     """
-    # torch takes seconds to import, and nothing that comes before needs it.
-    from fhash_codec.interrupts import deferred_interrupts
-    from fhash_codec.paper.engines import make_engine
-    from fhash_codec.paper.training.checkpoint import (
-        checkpoint_path,
-        load_checkpoint,
-        save_checkpoint,
-    )
-    from fhash_codec.paper.training.train import (
-        MAX_RESTARTS,
-        Course,
-        Diverged,
-        plan_training,
-        train,
-    )
-    from fhash_codec.training.devices import choose_device
-    from fhash_codec.training.threads import threads_for
+    from fhash_codec.paper.training.train import Diverged
 
-    device = choose_device(config.device)
-    checkpoint = checkpoint_path(path, coreset, config)
-    saved = load_checkpoint(checkpoint)
-    course = saved[1] if saved else Course()
-
-    def save(now: Course) -> None:
+    fitting = _Fitting(coreset, architecture, config, path, progress)
+    while True:
         try:
-            save_checkpoint(checkpoint, engine.state(), now)
+            return fitting.run()
+        except Diverged as error:
+            # Nothing but the error refers to the engine any more, so that its memory is free before
+            # the next one is made: a large model would not fit twice.
+            fitting.restart(error)
+
+
+class _Fitting:
+    """The training of one model, over all its restarts."""
+
+    def __init__(
+        self,
+        coreset: Coreset,
+        architecture: Architecture,
+        config: EncodeConfig,
+        path: Path,
+        progress: Progress,
+    ) -> None:
+        """Read the checkpoint if there is one."""
+        from fhash_codec.paper.training.checkpoint import checkpoint_path, load_checkpoint
+        from fhash_codec.paper.training.train import TrainingProgress
+        from fhash_codec.training.devices import choose_device
+
+        self._coreset, self._architecture, self._config = coreset, architecture, config
+        self._progress = progress
+        self._device: torch.device = choose_device(config.device)
+        self._checkpoint = checkpoint_path(path, coreset, config)
+        saved = load_checkpoint(self._checkpoint)
+        self._saved_state = saved[0] if saved else None
+        self._reached: TrainingProgress = saved[1] if saved else TrainingProgress()
+
+    def run(self) -> TrainedModel:
+        """Train to the end of the plan. Raises Diverged where the learning rate is too high."""
+        from fhash_codec.paper.training.train import train
+        from fhash_codec.training.threads import threads_for
+
+        plan = self._plan()
+        engine = self._engine(plan)
+        finished_before = self._reached.epoch == plan.epochs
+        vertices = plan.batch_bricks * prod(self._coreset.brick_shape)
+        with deferred_interrupts() as stop, threads_for(vertices):
+            save = partial(self._save, engine, stop)
+            done = train(
+                engine,
+                plan,
+                self._coreset,
+                self._reached,
+                stop=stop,
+                save=save,
+                progress=self._progress,
+            )
+            # Later work may fail or be interrupted as well. A training worth keeping is kept until
+            # the output file is complete.
+            worth_keeping = stop.asked or self._reached.seconds > KEEP_SECONDS
+            if done and not finished_before and worth_keeping:
+                save(self._reached)
+        if stop.asked:
+            raise InterruptedEncodingError(
+                f"interrupted after {self._reached.epoch} of {plan.epochs} epochs; "
+                f"saved in {self._checkpoint}; the same command goes on from there"
+            )
+        return self._trained(engine, plan)
+
+    def restart(self, error: TrainingError) -> None:
+        """Begin again at a lower learning rate, with a warning.
+
+        Raises TrainingError after MAX_RESTARTS.
+        """
+        from fhash_codec.paper.training.train import MAX_RESTARTS
+
+        configured = self._config.learning_rate
+        if self._reached.restarts == MAX_RESTARTS:
+            rate = self._reached.rate(configured)
+            raise TrainingError(f"{error}, even at a learning rate of {rate:.3g}") from error
+        self._reached, self._saved_state = self._reached.restarted(), None
+        lower = self._reached.rate(configured)
+        warnings.warn(
+            f"{error}; it begins again at a learning rate of {lower:.3g}",
+            FhashWarning,
+            stacklevel=3,
+        )
+
+    def _plan(self) -> TrainingPlan:
+        from fhash_codec.paper.training.train import plan_training
+
+        return plan_training(
+            self._coreset,
+            epochs=self._config.epochs,
+            learning_rate=self._reached.rate(self._config.learning_rate),
+            schedule=self._config.schedule,
+            batch=self._config.batch,
+            seed=self._config.seed,
+        )
+
+    def _engine(self, plan: TrainingPlan) -> Engine:
+        """Return a new engine, in the state of the checkpoint if there is one."""
+        from fhash_codec.paper.engines import make_engine
+
+        engine = make_engine(
+            self._config.engine,
+            self._architecture,
+            self._coreset,
+            plan.rates,
+            seed=self._config.seed,
+            device=self._device,
+        )
+        if self._saved_state is not None:
+            try:
+                engine.restore(self._saved_state)
+            except (KeyError, RuntimeError, ValueError) as error:
+                raise InputError(
+                    f"checkpoint {self._checkpoint} does not fit; delete it to train from the start"
+                ) from error
+        return engine
+
+    def _save(self, engine: Engine, stop: StopRequest, reached: TrainingProgress) -> None:
+        """Write a checkpoint. A failure is only a warning, unless the training is asked to end."""
+        from fhash_codec.paper.training.checkpoint import save_checkpoint
+
+        try:
+            save_checkpoint(self._checkpoint, engine.state(), reached)
         except OutputError as error:
             if stop.asked:
                 raise
-            # The training itself can go on; only an interruption would cost more.
+            # The training itself can go on. Only a later interruption would lose it.
             warnings.warn(f"no checkpoint: {error}", FhashWarning, stacklevel=2)
 
-    while True:
-        rate = course.rate(config.learning_rate)
-        plan = plan_training(
-            coreset,
-            epochs=config.epochs,
-            learning_rate=rate,
-            schedule=config.schedule,
-            batch=config.batch,
-            seed=config.seed,
+    def _trained(self, engine: Engine, plan: TrainingPlan) -> TrainedModel:
+        """Return the numbers of the engine. Raises TrainingError if they are not finite."""
+        parameters = engine.parameters()
+        if not all(
+            bool(vector.isfinite().all())
+            for vector in (parameters.fine, parameters.coarse, parameters.network)
+        ):
+            raise TrainingError("the trained numbers are not finite; set a lower --learning-rate")
+        tables, layers = parameters.dense(self._architecture)
+        return TrainedModel(
+            fine=parameters.fine.numpy(),
+            tables=[table.numpy() for table in tables],
+            layers=[(weight.numpy(), bias.numpy()) for weight, bias in layers],
+            epochs=plan.epochs,
+            history=self._reached.history,
+            device=self._device.type,
+            checkpoint=self._checkpoint,
+            restarts=self._reached.restarts,
+            learning_rate=self._reached.rate(self._config.learning_rate),
         )
-        engine = make_engine(
-            config.engine, architecture, coreset, plan.rates, seed=config.seed, device=device
-        )
-        if saved:
-            try:
-                engine.restore(saved[0])
-            except (KeyError, RuntimeError, ValueError) as error:
-                raise InputError(
-                    f"checkpoint {checkpoint} does not fit; delete it to train from the start"
-                ) from error
-        kept = course.epoch == plan.epochs
-        try:
-            with (
-                deferred_interrupts() as stop,
-                threads_for(plan.batch_bricks * prod(coreset.brick_shape)),
-            ):
-                done = train(engine, plan, coreset, course, stop=stop, save=save, progress=progress)
-                # What follows may fail or be interrupted as well: a training worth keeping is kept until the file is complete.
-                if done and not kept and (stop.asked or course.seconds > KEEP_SECONDS):
-                    save(course)
-            break
-        except Diverged as error:
-            if course.restarts == MAX_RESTARTS:
-                raise TrainingError(f"{error}, even at a learning rate of {rate:.3g}") from error
-            course, saved = course.again(), None
-            lower = course.rate(config.learning_rate)
-            warnings.warn(
-                f"{error}; it begins again at a learning rate of {lower:.3g}",
-                FhashWarning,
-                stacklevel=2,
-            )
-        del engine  # before the next one: a large model would not fit twice
-    if stop.asked:
-        raise InterruptedEncodingError(
-            f"interrupted after {course.epoch} of {plan.epochs} epochs; saved in {checkpoint}; the same command goes on from there"
-        )
-    parameters = engine.parameters()
-    if not all(
-        bool(part.isfinite().all())
-        for part in (parameters.fine, parameters.coarse, parameters.network)
-    ):
-        raise TrainingError("the trained numbers are not finite; set a lower --learning-rate")
-    tables, layers = parameters.dense(architecture)
-    return Trained(
-        fine=parameters.fine.numpy(),
-        tables=[table.numpy() for table in tables],
-        layers=[(weight.numpy(), bias.numpy()) for weight, bias in layers],
-        epochs=plan.epochs,
-        history=course.history,
-        device=device.type,
-        checkpoint=checkpoint,
-        restarts=course.restarts,
-        learning_rate=rate,
-    )

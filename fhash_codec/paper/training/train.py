@@ -1,4 +1,4 @@
-"""The training loop: batches of bricks, a learning rate that falls to zero, history, checkpoints."""
+"""The training loop: batches of bricks, learning rates, history, checkpoints."""
 
 from __future__ import annotations
 
@@ -12,37 +12,64 @@ import numpy.typing as npt
 from torch import Tensor
 
 from fhash_codec.coreset.bricks import Coreset
-from fhash_codec.interrupts import StopRequest
 from fhash_codec.paper.engines import Engine
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import TrainingError
+from fhash_formats.support.interrupts import StopRequest
 
-BATCH_BRICKS = 64  # of 1024 vertices: below 2^16 samples a step, its fixed cost shows; above, each epoch teaches less
+BATCH_BRICKS = 64
+"""Usual bricks of 1024 vertices in a batch.
+
+Below 2^16 samples a step, its fixed cost shows; above, an epoch teaches less.
+"""
 STEPS_AN_EPOCH = (20, 256)
-USUAL_EPOCHS, USUAL_STEPS = 20, 1000
+"""Smallest and largest number of training steps in an epoch, unless a batch size is given."""
+USUAL_EPOCHS = 20
+"""Smallest number of epochs where none is given."""
+USUAL_STEPS = 1000
+"""Training steps that the epochs make at least where no number of epochs is given."""
 HISTORY_POINTS = 100
-PROBE_BRICKS = 512  # on which the quality of an epoch is measured
+"""Largest number of points in the history."""
+PROBE_BRICKS = 512
+"""Bricks on which the quality of an epoch is measured."""
 DIVERGED = 4.0
-"""Mean squared error of a batch, in squares of the range, above which a training diverged: no start is as wrong, and what is ends as a
-constant for the most part (a rate of 0.1 reaches 2.3 and recovers)."""
+"""Mean squared error of a batch above which a training diverged, in squares of the value range.
+
+No training starts with so large an error. One that exceeds it ends as a constant as a rule; a
+learning rate of 0.1 reaches 2.3 and recovers.
+"""
 WATCHED = 16
-"""Batches after which their errors are looked at: a GPU would have to wait after each."""
-USUAL_RATE, DEAD, STILL = 0.01, 0.05, 0.5
-"""A model is dead whose error is the values' variance but for a share of DEAD, and moved by no more than STILL dB over the second half of
-the training: it says a constant, and a rate above the usual one killed it. What learnt too little is still on its way."""
-LOWER, MAX_RESTARTS = 0.25, 8
-"""What a rate that diverged is multiplied by, and how often."""
+"""Batches between two checks of their errors. A GPU would have to wait for each check."""
+USUAL_RATE = 0.01
+"""Learning rate up to which a model that gives a constant is not blamed on the rate."""
+DEAD = 0.05
+"""Share of the values' variance by which the last error of a dead model may differ from it."""
+STILL = 0.5
+"""Largest distance in dB between the PSNR of a dead model and that of a constant.
+
+It holds in the second half of a training. A model that strays further is still learning.
+"""
+LOWER = 0.25
+"""Factor on the learning rate after a training diverged."""
+MAX_RESTARTS = 8
+"""Largest number of restarts at a lower learning rate."""
 
 
 class Diverged(TrainingError):
-    """The error grew beyond all that a lower learning rate would not mend."""
+    """A training came to nothing at its learning rate; a lower rate may do better."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
-    """The course of a training: `epochs` passes over `bricks` bricks in `batches` random batches each.
+class TrainingPlan:
+    """The batches and learning rates of a training.
 
-    rates: learning rate of every step, 1-based, float64 (epochs * batches + 1,).
+    Attributes:
+        epochs: passes over all bricks.
+        bricks: bricks of the coreset.
+        batches: random batches of an epoch.
+        seed: seed of the order of the bricks.
+        rates: learning rate of every training step, counted from 1, float64
+            (epochs * batches + 1,).
     """
 
     epochs: int
@@ -57,7 +84,7 @@ class Plan:
         return -(-self.bricks // self.batches)
 
     def order(self, epoch: int) -> list[npt.NDArray[np.int64]]:
-        """The batches of an epoch: every brick once; depends on nothing but the seed and the epoch."""
+        """Return the batches of an epoch, each brick once; the seed and the epoch decide alone."""
         return np.array_split(
             np.random.default_rng([self.seed, epoch]).permutation(self.bricks), self.batches
         )
@@ -65,11 +92,17 @@ class Plan:
 
 def plan_training(
     coreset: Coreset, *, epochs: int, learning_rate: float, schedule: str, batch: int, seed: int
-) -> Plan:
-    """A plan for a coreset.
+) -> TrainingPlan:
+    """Return a plan for the training on a coreset.
 
-    epochs: 0 for 20 of them, or as many as make 1000 steps. batch: in samples, 0 for 64 bricks where that makes 20 to 256 steps an
-    epoch, else the nearest size that does.
+    Args:
+        coreset: the training samples.
+        epochs: number of epochs; 0 for 20, or for as many as make 1000 training steps.
+        learning_rate: learning rate of the first step.
+        schedule: cosine lets the rate fall to zero; any other name keeps it constant.
+        batch: samples in a batch; 0 for 64 bricks where that makes 20 to 256 steps an epoch, and
+            else for the nearest size that does.
+        seed: seed of the order of the bricks.
     """
     bricks = len(coreset.bricks)
     if batch:
@@ -83,14 +116,19 @@ def plan_training(
     rates = learning_rate * (
         0.5 + 0.5 * np.cos(np.pi * share) if schedule == "cosine" else np.ones_like(share)
     )
-    return Plan(epochs=epochs, bricks=bricks, batches=batches, seed=seed, rates=rates)
+    return TrainingPlan(epochs=epochs, bricks=bricks, batches=batches, seed=seed, rates=rates)
 
 
 @dataclass(kw_only=True)
-class Course:
-    """How far a training has come: finished epochs, batches within the present one, seconds spent, and the quality after each epoch.
+class TrainingProgress:
+    """The progress of a training. Checkpoints store it under the names of these fields.
 
-    restarts: how often it diverged and began again, each time at LOWER times the learning rate; the seconds are those of all.
+    Attributes:
+        epoch: finished epochs.
+        batch: finished batches of the present epoch.
+        seconds: time spent, restarts included.
+        history: {seconds, epoch, psnr} after epochs; psnr is None where the error is 0.
+        restarts: number of restarts, each at LOWER times the learning rate before.
     """
 
     epoch: int = 0
@@ -99,82 +137,165 @@ class Course:
     history: list[dict[str, float | None]] = field(default_factory=list)
     restarts: int = 0
 
-    def rate(self, asked: float) -> float:
-        """The learning rate to begin with where `asked` was asked for."""
-        return asked * LOWER**self.restarts
+    def rate(self, configured: float) -> float:
+        """Return the learning rate of the first step, given the one that was configured."""
+        return configured * LOWER**self.restarts
 
-    def again(self) -> Course:
-        """The course from the start at a lower rate. What led here is no place to go back to: the state of Adam has grown with it."""
-        return Course(seconds=self.seconds, restarts=self.restarts + 1)
+    def restarted(self) -> TrainingProgress:
+        """Return the progress of a training that begins again at a lower rate.
+
+        It does not return to an earlier state: the moments of Adam have grown with the error.
+        """
+        return TrainingProgress(seconds=self.seconds, restarts=self.restarts + 1)
+
+
+SaveProgress = Callable[[TrainingProgress], None]
 
 
 def train(
     engine: Engine,
-    plan: Plan,
+    plan: TrainingPlan,
     coreset: Coreset,
-    course: Course,
+    reached: TrainingProgress,
     *,
     stop: StopRequest | None = None,
-    save: Callable[[Course], None] | None = None,
+    save: SaveProgress | None = None,
     save_seconds: float = 60.0,
     budget_seconds: float = float("inf"),
     progress: Progress = silent,
 ) -> bool:
-    """Train from where `course` stands to the end of the plan; true if it got there.
+    """Train from where `reached` stands to the end of the plan. Return whether that was reached.
 
-    Every epoch (of more than 100: every 2nd, 3rd, ...) adds {seconds, epoch, psnr} to the history; PSNR in dB of the normalised
-    values on a fixed random choice of bricks.
-    `save` is called with the course every `save_seconds`, and when `stop` asks for an end, which comes after the running batch.
-    The loop also ends once `budget_seconds` are spent. Raises Diverged where the error of a batch is above DIVERGED or not finite,
-    and where a higher rate than the usual one left nothing but a constant.
+    Every epoch adds {seconds, epoch, psnr} to the history; of more than 100 epochs every 2nd, 3rd,
+    ... does. The PSNR in dB is of normalised values on a fixed random choice of bricks.
+
+    Args:
+        engine: the model in training.
+        plan: batches and learning rates.
+        coreset: the training samples.
+        reached: how far the training has come; changed in place.
+        stop: asks for an end, which comes after the running batch.
+        save: called with `reached` every `save_seconds`, and before `stop` ends the training.
+        save_seconds: least time between two calls of `save`.
+        budget_seconds: time after which the training ends.
+        progress: called after each batch.
+
+    Raises:
+        Diverged: the error of a batch exceeds DIVERGED or is not finite, or a learning rate above
+            USUAL_RATE left nothing but a constant.
     """
-    probe = np.sort(np.random.default_rng(plan.seed).permutation(plan.bricks)[:PROBE_BRICKS])
-    begun = saved = time.perf_counter()
-    before, note = course.seconds, ""
-    every = -(-plan.epochs // HISTORY_POINTS)
-    counts, worst = np.diff(coreset.offsets), None
-    while course.epoch < plan.epochs:
-        for chosen in plan.order(course.epoch)[course.batch :]:
-            error = engine.train(chosen) / max(int(counts[chosen].sum()), 1)
-            worst = error if worst is None else worst.maximum(error)
-            course.batch += 1
-            now = time.perf_counter()
-            course.seconds = before + now - begun
+    loop = _Loop(engine, plan, coreset, reached)
+    saving = _Saving(save, save_seconds)
+    while reached.epoch < plan.epochs:
+        for chosen in plan.order(reached.epoch)[reached.batch :]:
+            loop.train_batch(chosen)
             asked = stop is not None and stop.asked
-            saving = save is not None and (asked or now - saved > save_seconds)
-            if saving or course.batch % WATCHED == 0 or course.batch == plan.batches:
-                _watch(worst, course)
-                worst = None
-            if save and saving:
-                save(course)
-                # Saving may take long for a large model: never more than a twentieth of the time.
-                saved = time.perf_counter()
-                save_seconds = max(save_seconds, 20 * (saved - now))
-            if asked or course.seconds > budget_seconds:
+            due = saving.due(asked)
+            if due or reached.batch % WATCHED == 0 or reached.batch == plan.batches:
+                loop.check_errors()
+            if due:
+                saving.save(reached)
+            if asked or reached.seconds > budget_seconds:
                 return False
-            progress(
-                "training",
-                course.epoch * plan.batches + course.batch,
-                plan.epochs * plan.batches,
-                note,
-            )
-        course.epoch, course.batch = course.epoch + 1, 0
-        if course.epoch % every == 0 or course.epoch == plan.epochs:
-            psnr = probe_psnr(engine, coreset, probe)
-            course.seconds = before + time.perf_counter() - begun
-            course.history.append({"seconds": course.seconds, "epoch": course.epoch, "psnr": psnr})
-            note = "exact" if psnr is None else f"epoch {course.epoch}: {psnr:.1f} dB"
-    if plan.rates[0] > USUAL_RATE and _dead(course, _variance(coreset, probe)):
-        raise Diverged("training ended in a constant")
+            done = reached.epoch * plan.batches + reached.batch
+            progress("training", done, plan.epochs * plan.batches, loop.note)
+        loop.end_epoch()
+    loop.check_dead()
     return True
 
 
+class _Loop:
+    """The steps of a training and the measurements along the way.
+
+    Attributes:
+        note: quality at the end of the last epoch, for the progress line.
+    """
+
+    def __init__(
+        self, engine: Engine, plan: TrainingPlan, coreset: Coreset, reached: TrainingProgress
+    ) -> None:
+        self.note = ""
+        self._engine, self._plan, self._coreset, self._reached = engine, plan, coreset, reached
+        self._samples = np.diff(coreset.offsets)
+        self._probe = np.sort(
+            np.random.default_rng(plan.seed).permutation(plan.bricks)[:PROBE_BRICKS]
+        )
+        self._epochs_a_point = -(-plan.epochs // HISTORY_POINTS)
+        self._largest_error: Tensor | None = None
+        self._seconds_before, self._begun = reached.seconds, time.perf_counter()
+
+    def train_batch(self, chosen: npt.NDArray[np.int64]) -> None:
+        """Train on a batch of bricks and keep the largest error since the last check."""
+        error = self._engine.train(chosen) / max(int(self._samples[chosen].sum()), 1)
+        largest = self._largest_error
+        self._largest_error = error if largest is None else largest.maximum(error)
+        self._reached.batch += 1
+        self._count_seconds()
+
+    def check_errors(self) -> None:
+        """Raise Diverged if a mean squared error since the last check is too large."""
+        error = 0.0 if self._largest_error is None else float(self._largest_error)
+        # A comparison that NaN fails, too.
+        if not error <= DIVERGED:
+            raise Diverged(
+                f"training diverged in epoch {self._reached.epoch + 1}: "
+                f"the error reached {error**0.5:.3g} times the range of the values"
+            )
+        self._largest_error = None
+
+    def end_epoch(self) -> None:
+        """Count the epoch and, where one is due, add a point to the history."""
+        reached = self._reached
+        reached.epoch, reached.batch = reached.epoch + 1, 0
+        if reached.epoch % self._epochs_a_point == 0 or reached.epoch == self._plan.epochs:
+            psnr = probe_psnr(self._engine, self._coreset, self._probe)
+            self._count_seconds()
+            reached.history.append(
+                {"seconds": reached.seconds, "epoch": reached.epoch, "psnr": psnr}
+            )
+            self.note = "exact" if psnr is None else f"epoch {reached.epoch}: {psnr:.1f} dB"
+
+    def check_dead(self) -> None:
+        """Raise Diverged if a learning rate above the usual one left nothing but a constant."""
+        if self._plan.rates[0] > USUAL_RATE and _dead(
+            self._reached, _variance(self._coreset, self._probe)
+        ):
+            raise Diverged("training ended in a constant")
+
+    def _count_seconds(self) -> None:
+        self._reached.seconds = self._seconds_before + time.perf_counter() - self._begun
+
+
+class _Saving:
+    """The clock that says when the next checkpoint is due."""
+
+    def __init__(self, save: SaveProgress | None, seconds: float) -> None:
+        self._save, self._seconds = save, seconds
+        self._saved = time.perf_counter()
+
+    def due(self, asked: bool) -> bool:
+        """Return whether to save: where the training is asked to end, or where it is time."""
+        late = time.perf_counter() - self._saved > self._seconds
+        return self._save is not None and (asked or late)
+
+    def save(self, reached: TrainingProgress) -> None:
+        """Save, and spend at most a twentieth of the time on saving: a large model takes long."""
+        assert self._save is not None
+        begun = time.perf_counter()
+        self._save(reached)
+        self._saved = time.perf_counter()
+        self._seconds = max(self._seconds, 20 * (self._saved - begun))
+
+
 def probe_psnr(engine: Engine, coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float | None:
-    """PSNR in dB of the normalised values (range 1) over the coreset vertices of `bricks`; None where the error is exactly 0."""
+    """Return the PSNR in dB over the coreset vertices of some bricks; None if the error is 0.
+
+    The values are normalised, so their range is 1. Raises Diverged if the error is not finite.
+    """
     samples = int(np.diff(coreset.offsets)[bricks].sum())
     error = sum(
-        engine.squared_error(part)
-        for part in np.array_split(bricks, -(-len(bricks) // BATCH_BRICKS))
+        engine.squared_error(batch)
+        for batch in np.array_split(bricks, -(-len(bricks) // BATCH_BRICKS))
     )
     if not np.isfinite(error):
         raise Diverged(
@@ -183,29 +304,28 @@ def probe_psnr(engine: Engine, coreset: Coreset, bricks: npt.NDArray[np.int64]) 
     return None if error == 0 else -10 * log10(error / samples)
 
 
-def _watch(worst: Tensor | None, course: Course) -> None:
-    """Raise Diverged for a largest mean squared error that is beyond DIVERGED or not finite."""
-    error = 0.0 if worst is None else float(worst)
-    if not error <= DIVERGED:
-        raise Diverged(
-            f"training diverged in epoch {course.epoch + 1}: the error reached {error**0.5:.3g} times the range of the values"
-        )
+def _dead(reached: TrainingProgress, variance: float) -> bool:
+    """Return whether the model gave nothing but a constant in the second half of a training.
 
-
-def _dead(course: Course, variance: float) -> bool:
-    """Whether the second half of a training said nothing but the mean of values of this variance (normalised)."""
-    late = [point["psnr"] for point in course.history[len(course.history) // 2 :]]
+    The error of the best constant, the mean, is the variance of the (normalised) values. The model
+    is dead if its PSNR stayed within STILL dB of that and its last error within the share DEAD.
+    """
+    late = [point["psnr"] for point in reached.history[len(reached.history) // 2 :]]
     if not variance > 0 or len(late) < 2:
         return False
     constant = -10 * log10(variance)
-    off = [abs(psnr - constant) for psnr in late if psnr is not None]
-    return len(off) == len(late) and max(off) <= STILL and off[-1] <= -10 * log10(1 - DEAD)
+    distances = [abs(psnr - constant) for psnr in late if psnr is not None]
+    return (
+        len(distances) == len(late)
+        and max(distances) <= STILL
+        and distances[-1] <= -10 * log10(1 - DEAD)
+    )
 
 
 def _variance(coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float:
-    """Of the normalised values over the coreset vertices of `bricks`."""
-    parts = [
+    """Return the variance of the normalised values at the coreset vertices of some bricks."""
+    values = [
         coreset.values[first:end]
         for first, end in zip(coreset.offsets[bricks], coreset.offsets[bricks + 1], strict=True)
     ]
-    return float(np.var(np.concatenate(parts), dtype=np.float64))
+    return float(np.var(np.concatenate(values), dtype=np.float64))

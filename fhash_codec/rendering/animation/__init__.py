@@ -1,1 +1,1 @@
-"""Several pictures: animations, evolutions and tracked features."""
+"""Several pictures: animations, films and tracked features."""

@@ -1,4 +1,4 @@
-"""Animations on disk: numbered pictures, of which those that are there already are kept, and films."""
+"""Animations on disk: numbered pictures, of which complete ones are kept, and films."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import re
 import time
 import warnings
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +19,10 @@ import numpy.typing as npt
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.animation.animation import Animation
 from fhash_codec.rendering.animation.film import FILMS, check_film, film
-from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.scene.png_text import digest_in_png, scene_in_png
-from fhash_codec.rendering.scene.scene import Scene
+from fhash_codec.rendering.picture.image import Draw, Image
+from fhash_codec.rendering.renderer import Renderer
+from fhash_codec.rendering.scene.png_text import digest_in_png
+from fhash_codec.rendering.scene.scene import Scene, scene_in_png
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.support.atomic import check_output
@@ -29,23 +30,23 @@ from fhash_formats.support.leftovers import clear
 
 __all__ = ["Animated", "animate", "numbered"]
 
-
-class Draw(Protocol):
-    """What renders a scene while it prepares another one, as `Renderer.render` does."""
-
-    def __call__(self, scene: Scene, /, *, upcoming: Scene | None = None) -> Image:
-        """The picture."""
-
-
 Pixels = npt.NDArray[np.uint8]
 
-END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
-"""The last bytes of every complete PNG."""
+PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+"""Last bytes of every complete PNG."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Animated:
-    """What `animate` did: the files that are now there, how many pictures were rendered and kept, the sum of their counters, seconds."""
+    """Result of `animate`.
+
+    Attributes:
+        paths: files that are now there.
+        rendered: number of pictures that were rendered.
+        kept: number of pictures that were there already.
+        counters: sums of the counters of the rendered pictures.
+        seconds: time of the whole job.
+    """
 
     paths: tuple[Path, ...]
     rendered: int
@@ -56,6 +57,15 @@ class Animated:
     def to_dict(self) -> dict[str, Any]:
         """JSON values."""
         return {**dataclasses.asdict(self), "paths": [str(path) for path in self.paths]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Frame:
+    """One picture of an animation: its scene, its numbered file if any, whether that is kept."""
+
+    scene: Scene
+    path: Path | None
+    kept: bool
 
 
 def animate(
@@ -69,99 +79,98 @@ def animate(
     progress: Progress = silent,
     draw: Draw | None = None,
 ) -> Animated:
-    """Render every picture of an animation: to NAME.0000.png and so on for an output NAME.png, to a film for NAME.mp4 and NAME.gif.
+    """Render every picture of an animation to numbered files or to a film.
 
-    pictures: NAME.png; the numbered pictures of a film are written too, and kept. A numbered picture that is there, complete, of the same
-    scene and the same volume (by its digest) is not rendered again; any other is replaced only with `force`.
-    draw: what renders, `Renderer(volume).render` if None.
-    Raises InputError for names of other kinds and what `Animation.scenes` refuses, OutputExistsError before anything is rendered,
-    OutputError, MissingDependencyError without the package for MP4.
+    A numbered picture that is already there is kept if it is complete, of the same scene and of the
+    same volume (by its digest). Any other file is replaced only with `force`.
+
+    Args:
+        volume: an open container.
+        scene: what is shown where the animation changes nothing.
+        animation: what changes.
+        output: NAME.png for pictures NAME.0000.png and so on, NAME.mp4 or NAME.gif for a film.
+        pictures: NAME.png; the numbered pictures of a film are written too, and kept.
+        force: whether to replace files.
+        progress: is told about each finished picture.
+        draw: renders one picture; `Renderer(volume).render` if None.
+
+    Raises InputError for file names of other kinds and for what `Animation.scenes` refuses,
+    OutputExistsError before anything is rendered, OutputError for what cannot be written,
+    MissingDependencyError without the package for MP4.
     """
     output = Path(output)
-    suffix = output.suffix.lower()
-    if suffix not in (".png", *FILMS):
-        raise InputError(
-            f"{output}: an animation is written as .png (numbered), {' or '.join(FILMS)}; use such a name"
-        )
-    if pictures is not None and (suffix == ".png" or Path(pictures).suffix.lower() != ".png"):
-        raise InputError(
-            f"{pictures}: pictures beside a film are written as .png; use such a name, and .mp4 or .gif for the film"
-        )
+    _check_names(output, pictures)
+    is_film = output.suffix.lower() != ".png"
     begun = time.perf_counter()
     scenes = animation.scenes(scene, volume)
-    base = output if suffix == ".png" else None if pictures is None else Path(pictures)
-    paths = [] if base is None else numbered(base, len(scenes))
-    clear(paths)  # also beside the pictures that are kept, which no one writes anew
-    kept = (
-        [_kept(path, each, volume) for path, each in zip(paths, scenes, strict=bool(paths))]
-        if paths
-        else []
-    )
-    if suffix != ".png":
+    base = pictures if is_film else output
+    paths = [] if base is None else numbered(Path(base), len(scenes))
+    clear(paths)  # the temporary files beside kept pictures too, which are not written anew
+    frames = _frames(scenes, paths, volume)
+    if is_film:
         check_output(output, force, sources=[volume.path])
-        check_film(suffix)
-    for path, good in zip(paths, kept, strict=True):
-        if not good:
-            check_output(path, force, sources=[volume.path])
+        check_film(output.suffix.lower())
+    for frame in frames:
+        if frame.path is not None and not frame.kept:
+            check_output(frame.path, force, sources=[volume.path])
     _warn_of_others(paths)
-    if draw is None:
-        from fhash_codec.rendering.renderer import Renderer
-
-        draw = Renderer(volume).render
     counters: Counter[str] = Counter()
-
-    def frames() -> Generator[Pixels, None, None]:
-        for number, each in enumerate(scenes):
-            if kept and kept[number]:
-                if suffix != ".png":
-                    yield _pixels(paths[number])
-            else:
-                assert draw is not None
-                following = number + 1 < len(scenes) and not (kept and kept[number + 1])
-                image = draw(each, upcoming=scenes[number + 1] if following else None)
-                counters.update(image.counters)
-                image = dataclasses.replace(
-                    image,
-                    scene=each.to_dict(),
-                    source=str(volume.path),
-                    digest=volume.container.digest,
-                )
-                if paths:
-                    image.save(paths[number], force=force)
-                yield image.to_uint8("#ffffff" if image.background == "transparent" else None)
-            progress("rendering", number + 1, len(scenes), "")
-
-    if suffix == ".png":
-        for _ in frames():
-            pass
-        written = paths
-    else:
-        with closing(frames()) as source:
-            film(output, source, scene.size, animation.rate, force=force)
-        written = [*paths, output]
+    draw = Renderer(volume).render if draw is None else draw
+    with closing(_made(frames, volume, draw, force, counters, progress)) as made:
+        if is_film:
+            film(output, map(_pixels, made), scene.size, animation.rate, force=force)
+        else:
+            for _ in made:
+                pass
+    kept = sum(frame.kept for frame in frames)
     return Animated(
-        paths=tuple(written),
-        rendered=len(scenes) - sum(kept),
-        kept=sum(kept),
+        paths=(*paths, output) if is_film else tuple(paths),
+        rendered=len(frames) - kept,
+        kept=kept,
         counters=dict(counters),
         seconds=time.perf_counter() - begun,
     )
 
 
 def numbered(path: Path, count: int) -> list[Path]:
-    """NAME.0000.png and so on for NAME.png, with as many digits as the last needs and no fewer than 4."""
+    """NAME.0000.png and so on for NAME.png, with as many digits as needed and at least 4."""
     digits = max(4, len(str(count - 1)))
     return [
         path.with_name(f"{path.stem}.{number:0{digits}}{path.suffix}") for number in range(count)
     ]
 
 
-def _kept(path: Path, scene: Scene, volume: Volume) -> bool:
-    """Whether a picture is there, complete, and still that of a scene and a volume."""
+def _check_names(output: Path, pictures: str | Path | None) -> None:
+    """Raise InputError for names of files that are neither pictures nor films."""
+    suffix = output.suffix.lower()
+    if suffix not in (".png", *FILMS):
+        raise InputError(
+            f"{output}: an animation is written as .png (numbered), {' or '.join(FILMS)}; "
+            "use such a name"
+        )
+    if pictures is not None and (suffix == ".png" or Path(pictures).suffix.lower() != ".png"):
+        raise InputError(
+            f"{pictures}: pictures beside a film are written as .png; use such a name, "
+            "and .mp4 or .gif for the film"
+        )
+
+
+def _frames(scenes: Sequence[Scene], paths: Sequence[Path], volume: Volume) -> list[_Frame]:
+    """The frames of an animation; `paths` are empty if no numbered pictures are written."""
+    if not paths:
+        return [_Frame(scene=scene, path=None, kept=False) for scene in scenes]
+    return [
+        _Frame(scene=scene, path=path, kept=_is_good(path, scene, volume))
+        for scene, path in zip(scenes, paths, strict=True)
+    ]
+
+
+def _is_good(path: Path, scene: Scene, volume: Volume) -> bool:
+    """Whether a picture is there, complete, and of a scene and a volume."""
     try:
         with path.open("rb") as file:
-            file.seek(-len(END), 2)
-            if file.read() != END:
+            file.seek(-len(PNG_END), 2)
+            if file.read() != PNG_END:
                 return False
         if not all(
             path.with_name(f"{path.stem}.{name}.npy").is_file() for name in scene.effects.buffers
@@ -172,8 +181,44 @@ def _kept(path: Path, scene: Scene, volume: Volume) -> bool:
         return False
 
 
-def _warn_of_others(paths: list[Path]) -> None:
-    """Numbered pictures of the same name behind the last one would go into a film that another program makes of them."""
+def _made(
+    frames: Sequence[_Frame],
+    volume: Volume,
+    draw: Draw,
+    force: bool,
+    counters: Counter[str],
+    progress: Progress,
+) -> Generator[Image | Path, None, None]:
+    """Make the frames in order: the paths of kept pictures, and rendered images, which are saved.
+
+    The counters of rendered images are added to `counters`.
+    """
+    for number, frame in enumerate(frames):
+        if frame.kept:
+            assert frame.path is not None
+            yield frame.path
+        else:
+            following = frames[number + 1 : number + 2]
+            upcoming = following[0].scene if following and not following[0].kept else None
+            image = draw(frame.scene, upcoming=upcoming)
+            counters.update(image.counters)
+            image = dataclasses.replace(
+                image,
+                scene=frame.scene.to_dict(),
+                source=str(volume.path),
+                digest=volume.container.digest,
+            )
+            if frame.path is not None:
+                image.save(frame.path, force=force)
+            yield image
+        progress("rendering", number + 1, len(frames), "")
+
+
+def _warn_of_others(paths: Sequence[Path]) -> None:
+    """Warn of numbered pictures of the same name beyond the last one.
+
+    Another program that makes a film of the numbered pictures would take them too.
+    """
     if not paths:
         return
     stem = paths[0].stem.rpartition(".")[0]
@@ -190,12 +235,14 @@ def _warn_of_others(paths: list[Path]) -> None:
         )
 
 
-def _pixels(path: Path) -> Pixels:
-    """Bytes (H, W, 3) of a picture that was kept; what is transparent lies on white, as in a film of pictures that are rendered."""
+def _pixels(picture: Image | Path) -> Pixels:
+    """The pixels (H, W, 3) of a picture in a film; what is transparent lies on white."""
+    if isinstance(picture, Image):
+        return picture.to_uint8("#ffffff" if picture.background == "transparent" else None)
     from PIL import Image as Pictures
 
-    with Pictures.open(path) as picture:
-        if picture.mode != "RGBA":
-            return np.asarray(picture.convert("RGB"))
-        paper = Pictures.new("RGBA", picture.size, "white")
-        return np.asarray(Pictures.alpha_composite(paper, picture).convert("RGB"))
+    with Pictures.open(picture) as kept:
+        if kept.mode != "RGBA":
+            return np.asarray(kept.convert("RGB"))
+        paper = Pictures.new("RGBA", kept.size, "white")
+        return np.asarray(Pictures.alpha_composite(paper, kept).convert("RGB"))

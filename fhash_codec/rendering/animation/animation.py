@@ -1,4 +1,7 @@
-"""What changes from picture to picture: time, a turn of the camera, and scenes that an animation comes through."""
+"""Animations: what changes from picture to picture, as one record.
+
+Time may run, the camera may turn, and the scene may pass through keys.
+"""
 
 from __future__ import annotations
 
@@ -9,30 +12,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from fhash_codec.rendering.camera.camera import Grid
-from fhash_codec.rendering.camera.poses import CameraPath
-from fhash_codec.rendering.colour.colours import parse_colour
+from fhash_codec.rendering.animation.timeline import Timeline
 from fhash_codec.rendering.scene.record import Record, limits
 from fhash_codec.rendering.scene.scene import Camera, Effects, Scene, TransferFunctionSpec
 from fhash_codec.volume import Volume
-from fhash_formats.errors import InputError, RegionError
+from fhash_formats.errors import InputError
 
-__all__ = ["Animation", "Key", "mixed"]
+__all__ = ["Animation", "Key"]
 
-Floats = npt.NDArray[np.float64]
-
-MOVING, RESTING = 24.0, 8.0
-"""Pictures per second where the camera moves or time runs between steps, and where each picture is a step of its own."""
-MOST = 100_000
-"""Pictures of an animation."""
+MOVING = 24.0
+"""Pictures per second where the camera moves or time runs between steps."""
+RESTING = 8.0
+"""Pictures per second where each picture is a step of its own."""
+MAX_FRAMES = 100_000
+"""Most pictures of an animation."""
+DEFAULT_FRAMES = 96
+"""Pictures of an animation that does not consist of whole steps alone."""
 FORMS = "steps, steps=FIRST:LAST, time=FIRST:LAST, orbit, orbit=DEGREES"
+"""Words that an animation is written in on the command line."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Key(Record):
-    """A scene that an animation comes through: that of a file, or the one rendered, with the parts that are given in place of its own."""
+    """A scene that an animation passes through.
+
+    It is the scene of a file, or the scene being rendered, with the settings of the key in place of
+    its own.
+    """
 
     at: float | None = limits(
         None,
@@ -55,32 +62,33 @@ class Key(Record):
     )
 
     def over(self, scene: Scene) -> Scene:
-        """The scene it stands for; raises InputError for a file that is none."""
-        base = (
-            scene
-            if self.scene is None
-            else dataclasses.replace(Scene.load(self.scene), size=scene.size, march=scene.march)
-        )
-        parts = {
+        """Apply the key to the scene being rendered; raises InputError for an unreadable file."""
+        base = scene
+        if self.scene is not None:
+            base = dataclasses.replace(Scene.load(self.scene), size=scene.size, march=scene.march)
+        settings = {
             name: getattr(self, name)
             for name in ("camera", "transfer_function", "effects", "background")
         }
-        moment: dict[str, Any] = (
-            {}
-            if self.step is None and self.time is None
-            else {"step": self.step, "time": self.time}
-        )
-        return dataclasses.replace(
-            base, **{name: part for name, part in parts.items() if part is not None}, **moment
-        )
+        given = {name: value for name, value in settings.items() if value is not None}
+        if self.step is not None or self.time is not None:
+            given |= {"step": self.step, "time": self.time}
+        return dataclasses.replace(base, **given)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Animation(Record):
-    """How a scene becomes many: picture i of n is at the share i / (n - 1), or i / n where the last is followed by the first."""
+    """An animation: how a scene changes over many pictures.
+
+    Picture i of n lies at the share i / (n - 1) of the animation. In an animation that ends where
+    it begins it lies at i / n.
+    """
 
     frames: int | None = limits(
-        None, "pictures; one for each step if only whole steps pass, else 96", low=1, high=MOST
+        None,
+        "pictures; one for each step if only whole steps pass, else 96",
+        low=1,
+        high=MAX_FRAMES,
     )
     fps: float | None = limits(
         None,
@@ -100,27 +108,29 @@ class Animation(Record):
     keys: tuple[Key, ...] = ()
 
     def __post_init__(self) -> None:
+        """Check the fields and the keys; raises InputError."""
         super().__post_init__()
         if self.steps is not None and self.times is not None:
             raise InputError("animation: steps and times exclude each other")
         given = [key.at for key in self.keys if key.at is not None]
-        if given and (
-            len(given) != len(self.keys)
-            or any(low >= high for low, high in itertools.pairwise(given))
-        ):
+        ascending = all(low < high for low, high in itertools.pairwise(given))
+        if given and (len(given) != len(self.keys) or not ascending):
             raise InputError(
-                "animation: 'at' of the keys must ascend, each above the one before, and be given for all of them or none"
+                "animation: 'at' of the keys must ascend, each above the one before, and be given "
+                "for all of them or none"
             )
-        if (self.steps or self.times) and any(
-            key.step is not None or key.time is not None for key in self.keys
-        ):
+        timed = any(key.step is not None or key.time is not None for key in self.keys)
+        if (self.steps or self.times) and timed:
             raise InputError(
                 "animation: time is given by 'steps' or 'times', or by the keys, not by both"
             )
 
     @classmethod
     def load(cls, path: str | Path) -> Animation:
-        """From a file: TOML by its suffix .toml, else JSON. Raises InputError."""
+        """Read an animation from a file: TOML if its suffix is .toml, else JSON.
+
+        Raises InputError.
+        """
         return cls.read(
             Path(path),
             "an animation",
@@ -129,32 +139,27 @@ class Animation(Record):
 
     @classmethod
     def parse(cls, text: str, volume: Volume) -> Animation:
-        """From words such as "steps,orbit=180", whole series if no steps are given; any other text is the name of a file."""
+        """Read an animation from words such as "steps,orbit=180", or from the file of that name.
+
+        Without a range, "steps" and "time" mean the whole series of `volume`. Raises InputError.
+        """
         words = [word.strip().partition("=") for word in text.split(",")]
         if not all(name in ("steps", "time", "orbit") for name, _, _ in words):
             return cls.load(text)
         values: dict[str, Any] = {}
         for name, _, value in words:
             try:
-                if name == "orbit":
-                    values["orbit"] = float(value) if value else 360.0
-                elif value:
-                    first, last = value.split(":")
-                    values["steps" if name == "steps" else "times"] = (float(first), float(last))
-                elif name == "steps":
-                    values["steps"] = (0.0, float(volume.shape[0] - 1))
-                else:
-                    times = volume.coords["t"].values
-                    values["times"] = (float(times[0]), float(times[-1]))
+                values |= _field(name, value, volume)
             except ValueError:
                 raise InputError(
-                    f"animation '{text[:60]}': '{name}={value}' is malformed; write {FORMS}, separated by commas"
+                    f"animation '{text[:60]}': '{name}={value}' is malformed; "
+                    f"write {FORMS}, separated by commas"
                 ) from None
         return cls(**values)
 
     @property
     def closed(self) -> bool:
-        """Whether the last picture is followed by the first: whole turns and nothing else."""
+        """Whether the first picture follows the last: the camera alone moves, in whole turns."""
         return (
             self.orbit != 0
             and self.orbit % 360 == 0
@@ -163,141 +168,65 @@ class Animation(Record):
 
     @property
     def count(self) -> int:
-        """How many pictures there are."""
+        """Number of pictures."""
         if self.frames is not None:
             return self.frames
-        if self.steps is not None and not self.orbit and not self.keys:
-            return min(round(abs(self.steps[1] - self.steps[0])) + 1, MOST)
-        return 96
+        passed = self._steps_alone
+        return DEFAULT_FRAMES if passed is None else min(round(passed) + 1, MAX_FRAMES)
 
     @property
     def rate(self) -> float:
         """Pictures per second."""
         if self.fps is not None:
             return self.fps
-        whole = self.steps is not None and not self.orbit and not self.keys
-        return (
-            RESTING
-            if whole
-            and self.steps is not None
-            and self.count <= abs(self.steps[1] - self.steps[0]) + 1
-            else MOVING
-        )
+        passed = self._steps_alone
+        return RESTING if passed is not None and self.count <= passed + 1 else MOVING
+
+    @property
+    def _steps_alone(self) -> float | None:
+        """Steps that pass, if nothing else changes; None otherwise."""
+        if self.steps is None or self.orbit or self.keys:
+            return None
+        return abs(self.steps[1] - self.steps[0])
 
     def scenes(self, scene: Scene, volume: Volume) -> list[Scene]:
         """The scene of every picture.
 
-        Raises InputError where nothing would change, and for keys that name no scene; RegionError for steps and times outside the series.
+        Args:
+            scene: what is shown where the animation changes nothing.
+            volume: the volume being rendered.
+
+        Raises InputError if nothing changes, and for keys whose file is no scene; RegionError for
+        steps and times outside the series.
         """
         if not (self.steps or self.times or self.orbit or len(self.keys) > 1):
             raise InputError(
                 f"animation: nothing changes; give {FORMS}, or a file with two keys or more"
             )
+        key_scenes = [key.over(scene) for key in self.keys] or [scene]
+        given = [float(key.at) for key in self.keys if key.at is not None]
+        at = given or np.linspace(0, 1, len(key_scenes)).tolist()
+        timeline = Timeline(
+            list(zip(at, key_scenes, strict=True)),
+            volume,
+            scale=scene.scale,
+            steps=self.steps,
+            times=self.times,
+            orbit=self.orbit,
+        )
         shares = np.arange(self.count) / max(self.count if self.closed else self.count - 1, 1)
-        way = _Way(self, scene, volume)
-        return [way.scene(float(share)) for share in shares]
+        return [timeline.scene(float(share)) for share in shares]
 
 
-class _Way:
-    """The scenes of the keys, and what lies between them."""
-
-    def __init__(self, animation: Animation, scene: Scene, volume: Volume) -> None:
-        keys, self.orbit = animation.keys, animation.orbit
-        self.scenes = [key.over(scene) for key in keys] or [scene]
-        given = [float(key.at) for key in keys if key.at is not None]
-        self.at = np.array(given or np.linspace(0, 1, len(self.scenes)))
-        cameras = tuple(each.camera for each in self.scenes)
-        self.path = CameraPath(
-            at=self.at, cameras=cameras, grid=Grid.of(volume.coords, scene.scale), size=scene.size
-        )
-        steps = [_step(each, volume) for each in self.scenes]
-        self.moments, self.steps = self.at, np.array(steps)
-        self.moving = any(step != steps[0] for step in steps)
-        if animation.steps is not None or animation.times is not None:
-            ends = animation.steps or animation.times
-            assert ends is not None
-            field = "step" if animation.steps is not None else "time"
-            self.moments, self.moving = np.array([0.0, 1.0]), True
-            if animation.steps is not None:
-                self.steps = np.array([_step(Scene(step=end), volume) for end in ends])
-            else:
-                for end in ends:
-                    _step(Scene(time=end), volume)
-            self.times = np.array(ends) if field == "time" else None
-        else:
-            self.times = None
-
-    def scene(self, share: float) -> Scene:
-        """The scene at a share of the animation."""
-        later = int(
-            np.clip(np.searchsorted(self.at, share, side="right"), 1, max(len(self.at) - 1, 1))
-        )
-        first, second = self.scenes[later - 1], self.scenes[min(later, len(self.scenes) - 1)]
-        weight = 0.0
-        if second is not first:
-            part = float(
-                np.clip((share - self.at[later - 1]) / (self.at[later] - self.at[later - 1]), 0, 1)
-            )
-            weight = part * part * (3 - 2 * part)
-        found: Scene = mixed(first, second, weight)
-        camera = self.path.camera(share)
-        moment: dict[str, Any]
-        if self.times is not None:
-            moment = {"step": None, "time": float(np.interp(share, self.moments, self.times))}
-        elif self.moving:
-            # The 12th digit of a step is nothing; a whole step is one that was encoded and needs no other.
-            moment = {
-                "step": round(float(np.interp(share, self.moments, self.steps)), 12),
-                "time": None,
-            }
-        else:
-            moment = {"step": self.scenes[0].step, "time": self.scenes[0].time}
-        turned = (
-            dataclasses.replace(camera, azimuth=camera.azimuth + self.orbit * share)
-            if self.orbit
-            else camera
-        )
-        return dataclasses.replace(found, camera=turned, **moment)
-
-
-def _step(scene: Scene, volume: Volume) -> float:
-    """The step of a scene; raises RegionError outside the series."""
-    if scene.time is not None:
-        return float(volume.step_of_time(scene.time))
-    step, last = scene.step or 0.0, volume.shape[0] - 1
-    if not 0 <= step <= last:
-        raise RegionError(f"{volume.path}: step {step:g} is outside 0..{last}")
-    return step
-
-
-def mixed(first: Any, second: Any, weight: float) -> Any:
-    """Settings between two: numbers and colours by weight 0..1, so that what ascends still does; what cannot be mixed is the first's.
-
-    Time and camera of two scenes are left as the first has them: they follow ways of their own.
-    """
-    if weight == 0 or first == second:
-        return first
-    if weight == 1:
-        return second
-    if isinstance(first, Record) and type(first) is type(second):
-        names = [field.name for field in dataclasses.fields(first)]  # type: ignore[arg-type]
-        changed = {
-            name: mixed(getattr(first, name), getattr(second, name), weight)
-            for name in names
-            if name not in ("camera", "step", "time")
-        }
-        return dataclasses.replace(first, **changed)  # type: ignore[type-var]
-    if isinstance(first, float) and isinstance(second, float):
-        return (1 - weight) * first + weight * second
-    if isinstance(first, tuple) and isinstance(second, tuple) and len(first) == len(second):
-        return tuple(mixed(one, other, weight) for one, other in zip(first, second, strict=True))
-    if isinstance(first, str) and isinstance(second, str):
-        try:
-            colours = np.array([parse_colour(first), parse_colour(second)])
-        except InputError:
-            return first
-        return "#" + "".join(
-            f"{round(255 * float(part)):02x}"
-            for part in (1 - weight) * colours[0] + weight * colours[1]
-        )
-    return first
+def _field(name: str, value: str, volume: Volume) -> dict[str, Any]:
+    """The field of an Animation that a word such as "steps=0:9" gives; raises ValueError."""
+    if name == "orbit":
+        return {"orbit": float(value) if value else 360.0}
+    field = "steps" if name == "steps" else "times"
+    if value:
+        first, last = value.split(":")
+        return {field: (float(first), float(last))}
+    if name == "steps":
+        return {field: (0.0, float(volume.shape[0] - 1))}
+    times = volume.coords["t"].values
+    return {field: (float(times[0]), float(times[-1]))}

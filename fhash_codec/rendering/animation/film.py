@@ -19,12 +19,16 @@ __all__ = ["FILMS", "check_film", "film"]
 Pixels = npt.NDArray[np.uint8]
 
 FILMS = (".mp4", ".gif")
+"""Suffixes of films."""
 QUALITY = 18
-"""x264's constant rate factor: nearly without visible loss."""
+"""Constant rate factor of x264: nearly without visible loss."""
 
 
 def check_film(suffix: str) -> str | None:
-    """The program that writes MP4, None for a GIF; raises MissingDependencyError where it is not installed."""
+    """Find the program that writes MP4; None for a GIF.
+
+    Raises MissingDependencyError where it is not installed.
+    """
     if suffix != ".mp4":
         return None
     try:
@@ -38,11 +42,21 @@ def check_film(suffix: str) -> str | None:
 def film(
     path: Path, frames: Iterator[Pixels], size: tuple[int, int], rate: float, *, force: bool = False
 ) -> None:
-    """Write frames (H, W, 3) of `size` (W, H), at least one, as a film of `rate` pictures per second, complete or not at all.
+    """Write a film, complete or not at all.
 
-    An MP4 is H.264 with 4:2:0 colours, as browsers play it; an odd side gets its last row or column twice. A GIF has 256 colours to a
-    picture, repeats for ever, and its pictures last whole hundredths of a second, at least two.
-    Raises InputError for another kind of file, OutputError, MissingDependencyError.
+    An MP4 is H.264 with 4:2:0 colours, as browsers play it; an odd side gets its last row or column
+    twice. A GIF has 256 colours to a picture and repeats for ever; its pictures last whole
+    hundredths of a second, at least two.
+
+    Args:
+        path: NAME.mp4 or NAME.gif.
+        frames: pictures (H, W, 3), at least one.
+        size: W, H of the frames.
+        rate: pictures per second.
+        force: whether to replace a file.
+
+    Raises InputError for another kind of file, OutputError for what cannot be written,
+    MissingDependencyError without the package for MP4.
     """
     suffix = path.suffix.lower()
     if suffix not in FILMS:
@@ -83,9 +97,12 @@ def _write_mp4(
     rate: float,
 ) -> None:
     wide, high = (side + side % 2 for side in size)
-    words = f"-y -loglevel error -f rawvideo -pix_fmt rgb24 -s {wide}x{high} -r {rate:.6g} -i - -an -c:v libx264 -pix_fmt yuv420p"
-    # The name of a file on its way says nothing of its kind. The index comes first, so that a film plays before it is all there.
-    words += f" -crf {QUALITY} -movflags +faststart -f mp4"
+    # The format is named, since the temporary file has another suffix. `faststart` puts the index
+    # first, so that a film plays before all of it is loaded.
+    words = (
+        f"-y -loglevel error -f rawvideo -pix_fmt rgb24 -s {wide}x{high} -r {rate:.6g} -i - "
+        f"-an -c:v libx264 -pix_fmt yuv420p -crf {QUALITY} -movflags +faststart -f mp4"
+    )
     with tempfile.TemporaryFile() as log:
         with subprocess.Popen(
             [ffmpeg, *words.split(), str(temporary)], stdin=subprocess.PIPE, stdout=log, stderr=log
@@ -96,7 +113,7 @@ def _write_mp4(
                     padding = ((0, high - frame.shape[0]), (0, wide - frame.shape[1]), (0, 0))
                     process.stdin.write(np.pad(frame, padding, mode="edge").tobytes())
                 process.stdin.close()
-            except BrokenPipeError:  # it says why in its log
+            except BrokenPipeError:  # ffmpeg says why in its log
                 pass
             except BaseException:
                 process.kill()

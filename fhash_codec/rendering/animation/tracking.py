@@ -1,4 +1,4 @@
-"""Feature tracking: several features in colours of their own in one scene, and where each of them is from step to step."""
+"""Feature tracking: several features in one scene, each in its colour, and where they are."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fhash_codec.coreset.features import (
 )
 from fhash_codec.coreset.features import Isosurface as SurfaceFeature
 from fhash_codec.progress import Progress, silent
-from fhash_codec.rendering.colour.colours import parse_colour
+from fhash_codec.rendering.colour.colours import colour_code, parse_colour
 from fhash_codec.rendering.colour.opacity import opacity_preset
 from fhash_codec.rendering.scene.scene import Isosurface, Scene, TransferFunctionSpec
 from fhash_codec.volume import Volume
@@ -33,14 +33,14 @@ __all__ = ["COLOURS", "Tracked", "follow", "parse_tracked", "tracking_scene"]
 Floats = npt.NDArray[np.float64]
 
 COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#555555")
-"""Of features that are given none: those that Okabe and Ito chose for people who tell few colours apart."""
+"""Default colours of features: Okabe and Ito chose them to be told apart by colour-blind people."""
 EDGE = 1e-6
-"""Of the value range: how far a colour reaches over into the next."""
+"""Width over which one colour changes into the next, as a share of the value range."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tracked:
-    """A feature to follow, an interval, isosurface or segmentation, and its colour."""
+    """A feature to follow (interval, isosurface or segmentation) and its colour."""
 
     feature: Feature
     colour: str
@@ -49,140 +49,177 @@ class Tracked:
 def parse_tracked(
     texts: Sequence[str], volume: Volume, progress: Progress = silent
 ) -> list[Tracked]:
-    """Features such as "interval:0.2:1=#ff8800", each with a colour of COLOURS if it names none; those of the file if there are no texts.
+    """Read features with colours, such as "interval:0.2:1=#ff8800".
 
-    A segmentation without a threshold takes that of the file, else Otsu's, of all the decoded steps.
-    Raises InputError for what is not known, and for features that values do not tell: masks, and all of a domain.
+    Args:
+        texts: features, each with "=COLOUR" or a default colour of COLOURS; the features of the
+            file if empty. A segmentation without a threshold takes that of the file, else Otsu's
+            threshold over all decoded steps.
+        volume: an open container.
+        progress: is told about the search for a threshold.
+
+    Raises InputError for unknown features and colours, and for features that cannot be told by
+    values: masks, and all of a domain.
     """
     own = [str(text) for text in volume.container.header["features"]]
-    parts = [
-        text.rpartition("=") if "=" in text and not text.startswith("mask:") else (text, "", "")
-        for text in texts or own
-    ]
-    names, colours = [part[0] for part in parts], [part[2] for part in parts]
-    threshold = next((text for text in own if text.startswith("segmentation:")), None)
-    names = [
-        threshold if name == "segmentation" and threshold is not None else name for name in names
-    ]
+    names, colours = _names_and_colours(texts or own)
+    thresholded = next((text for text in own if text.startswith("segmentation:")), "segmentation")
+    names = [thresholded if name == "segmentation" else name for name in names]
     for name in names:
-        feature = parse_feature(name)
-        if isinstance(feature, Mask) or not isinstance(
-            feature, Interval | SurfaceFeature | Segmentation
-        ):
-            raise InputError(
-                f"feature '{name[:60]}' cannot be drawn by its values; track interval:LO:HI, isosurface:V or segmentation[:T]"
-            )
+        _check_trackable(name)
     if len(names) > len(COLOURS) and not all(colours):
         raise InputError(
-            f"{len(names)} features are tracked, and there are {len(COLOURS)} colours; give each its own as FEATURE=#rrggbb"
+            f"{len(names)} features are tracked, and there are {len(COLOURS)} colours; "
+            "give each its own as FEATURE=#rrggbb"
         )
-    # A volume reads like the series that features are found in.
-    found = resolve_features(
+    # A volume reads like the series that features are resolved in.
+    features = resolve_features(
         names, cast(Series, volume), range(volume.shape[0]), volume.value_range, progress
     )
     for colour in colours:
         if colour:
             parse_colour(colour)
     return [
-        Tracked(feature=feature, colour=colours[i] or COLOURS[i]) for i, feature in enumerate(found)
+        Tracked(feature=feature, colour=colours[number] or COLOURS[number])
+        for number, feature in enumerate(features)
     ]
 
 
-def tracking_scene(scene: Scene, tracked: Sequence[Tracked], volume: Volume) -> Scene:
-    """A scene of several features: intervals and segmentations by colour and opacity of their values, isosurfaces as surfaces.
+def _names_and_colours(texts: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split texts into features and colours; the colour is empty where a text has none."""
+    names, colours = [], []
+    for text in texts:
+        # The file name of a mask may hold "=".
+        has_colour = "=" in text and not text.startswith("mask:")
+        name, _, colour = text.rpartition("=") if has_colour else (text, "", "")
+        names.append(name)
+        colours.append(colour)
+    return names, colours
 
-    A value of several features has the largest of their opacities, and the mean of their colours.
+
+def _check_trackable(name: str) -> None:
+    """Raise InputError for a feature that cannot be drawn by its values."""
+    feature = parse_feature(name)
+    if isinstance(feature, Mask) or not isinstance(
+        feature, Interval | SurfaceFeature | Segmentation
+    ):
+        raise InputError(
+            f"feature '{name[:60]}' cannot be drawn by its values; "
+            "track interval:LO:HI, isosurface:V or segmentation[:T]"
+        )
+
+
+def tracking_scene(scene: Scene, tracked: Sequence[Tracked], volume: Volume) -> Scene:
+    """Show several features in a scene, each in its colour.
+
+    Intervals and segmentations are shown by the transfer function, isosurfaces as surfaces. A value
+    of several features has the largest of their opacities and the mean of their colours. Raises
+    InputError without a feature.
     """
     if not tracked:
         raise InputError("no feature to track; give at least one")
     surfaces = tuple(
-        Isosurface(value=each.feature.value, colour=each.colour)
-        for each in tracked
-        if isinstance(each.feature, SurfaceFeature)
+        Isosurface(value=item.feature.value, colour=item.colour)
+        for item in tracked
+        if isinstance(item.feature, SurfaceFeature)
     )
-    filled = [each for each in tracked if not isinstance(each.feature, SurfaceFeature)]
-    low, high = volume.value_range.low, volume.value_range.high
-    given = scene.transfer_function
-    if filled:
-        texts = [str(each.feature) for each in filled]
-        points = opacity_preset(
-            "feature", shown=(low, high), value_range=(low, high), features=texts, histogram=None
-        )
-        spec = TransferFunctionSpec(
-            colours=_colours(filled, low, high),
-            opacity=tuple((float(value), float(opacity)) for value, opacity in points),
-            density=given.density,
-            unit_distance=given.unit_distance,
-        )
-    else:
-        spec = dataclasses.replace(given, nothing=True)
+    filled = [item for item in tracked if not isinstance(item.feature, SurfaceFeature)]
     effects = dataclasses.replace(
         scene.effects, isosurfaces=(*scene.effects.isosurfaces, *surfaces)
     )
-    return dataclasses.replace(scene, transfer_function=spec, effects=effects)
+    function = (
+        _transfer_function(scene.transfer_function, filled, volume)
+        if filled
+        else dataclasses.replace(scene.transfer_function, nothing=True)
+    )
+    return dataclasses.replace(scene, transfer_function=function, effects=effects)
+
+
+def _transfer_function(
+    given: TransferFunctionSpec, filled: Sequence[Tracked], volume: Volume
+) -> TransferFunctionSpec:
+    """The transfer function of intervals and segmentations, with the density that is given."""
+    low, high = volume.value_range.low, volume.value_range.high
+    points = opacity_preset(
+        "feature",
+        shown=(low, high),
+        value_range=(low, high),
+        features=[str(item.feature) for item in filled],
+        histogram=None,
+    )
+    return TransferFunctionSpec(
+        colours=_colours(filled, low, high),
+        opacity=tuple((float(value), float(opacity)) for value, opacity in points),
+        density=given.density,
+        unit_distance=given.unit_distance,
+    )
 
 
 def _colours(tracked: Sequence[Tracked], low: float, high: float) -> tuple[tuple[float, str], ...]:
-    """Colours constant over the values of each feature, mixed where several hold, as points that jump."""
-    spans = []
-    for each in tracked:
-        if isinstance(each.feature, Interval):
-            spans.append((max(each.feature.low, low), min(each.feature.high, high)))
-        else:
-            assert isinstance(each.feature, Segmentation)
-            spans.append(
-                (low if each.feature.threshold is None else max(each.feature.threshold, low), high)
-            )
+    """Colour points that are constant over each feature and jump between them.
+
+    Where several features overlap, the colour is their mean.
+    """
+    spans = [_span(item.feature, low, high) for item in tracked]
+    colours = np.array([parse_colour(item.colour) for item in tracked])
     edge = EDGE * (high - low) or max(abs(low) * 1e-6, 1e-30)
-    shades = np.array([parse_colour(each.colour) for each in tracked])
     bounds = sorted({end for span in spans for end in span})
     points: dict[float, Floats] = {}
-    shade = shades[0]
+    colour = colours[0]
     for first, last in itertools.pairwise(bounds):
         inside = [span[0] < last and span[1] > first for span in spans]
-        shade = (
-            shades[inside].mean(axis=0) if any(inside) else shade
-        )  # between two features nothing is seen
-        points[first if not points else min(first + edge, (first + last) / 2)] = shade
-        points[last] = shade
+        if any(inside):  # otherwise the values lie between two features and are not seen
+            colour = colours[inside].mean(axis=0)
+        points[first if not points else min(first + edge, (first + last) / 2)] = colour
+        points[last] = colour
     if not points:
-        points = dict(zip(bounds, (shades[:1] if len(bounds) == 1 else shades), strict=False))
-    return tuple(
-        (float(value), "#" + "".join(f"{round(255 * float(part)):02x}" for part in shade))
-        for value, shade in points.items()
-    )
+        points = dict(zip(bounds, (colours[:1] if len(bounds) == 1 else colours), strict=False))
+    return tuple((float(value), colour_code(colour)) for value, colour in points.items())
+
+
+def _span(feature: Feature, low: float, high: float) -> tuple[float, float]:
+    """The values of an interval or a segmentation within a value range."""
+    if isinstance(feature, Interval):
+        return max(feature.low, low), min(feature.high, high)
+    assert isinstance(feature, Segmentation)
+    return low if feature.threshold is None else max(feature.threshold, low), high
 
 
 def follow(
     volume: Volume, tracked: Sequence[Tracked], steps: Sequence[float]
 ) -> list[dict[str, Any]]:
-    """Where each feature is at each step: {feature, colour, steps: [{step, time, vertices, centroid, bounds}]}.
+    """Find where each feature is at each step.
 
-    vertices: how many are of the feature. centroid (x, y, z): their mean in physical coordinates; bounds ((x, x), (y, y), (z, z)): the
-    first and last position; both None where the feature is not.
+    Returns:
+        For each feature {feature, colour, steps: [{step, time, vertices, centroid, bounds}]}.
+        `vertices` is their number, `centroid` (x, y, z) their mean in physical coordinates,
+        `bounds` ((x, x), (y, y), (z, z)) their first and last positions. The last two are None
+        where the feature has no vertex.
     """
     times = volume.coords["t"].values
     axes = [volume.coords[axis].values for axis in "xyz"]
-    found: list[list[dict[str, Any]]] = [[] for _ in tracked]
+    places: list[list[dict[str, Any]]] = [[] for _ in tracked]
     for step in steps:
         frame = volume.read(step)
         time = float(np.interp(step, np.arange(len(times)), times))
-        for each, places in zip(tracked, found, strict=True):
-            at = np.nonzero(each.feature.select(frame, int(step)))[::-1]
-            count = len(at[0])
-            positions = [axis[part] for axis, part in zip(axes, at, strict=True)]
-            places.append(
-                {
-                    "step": float(step),
-                    "time": time,
-                    "vertices": count,
-                    "centroid": [float(part.mean()) for part in positions] if count else None,
-                    "bounds": [[float(part.min()), float(part.max())] for part in positions]
-                    if count
-                    else None,
-                }
-            )
+        for item, items_places in zip(tracked, places, strict=True):
+            selected = np.asarray(item.feature.select(frame, int(step)))
+            items_places.append({"step": float(step), "time": time, **_place(selected, axes)})
     return [
-        {"feature": str(each.feature), "colour": each.colour, "steps": places}
-        for each, places in zip(tracked, found, strict=True)
+        {"feature": str(item.feature), "colour": item.colour, "steps": items_places}
+        for item, items_places in zip(tracked, places, strict=True)
     ]
+
+
+def _place(selected: npt.NDArray[np.bool_], axes: Sequence[Floats]) -> dict[str, Any]:
+    """Number, centroid and bounds of the selected vertices (z, y, x) at coordinates x, y, z."""
+    indices = np.nonzero(selected)[::-1]
+    count = len(indices[0])
+    if not count:
+        return {"vertices": 0, "centroid": None, "bounds": None}
+    positions = [axis[index] for axis, index in zip(axes, indices, strict=True)]
+    return {
+        "vertices": count,
+        "centroid": [float(axis.mean()) for axis in positions],
+        "bounds": [[float(axis.min()), float(axis.max())] for axis in positions],
+    }

@@ -1,4 +1,4 @@
-"""The edges of the volume in the picture: which lie before it, which behind, and which make its outline."""
+"""The edges of the volume's box in the picture: before the volume, behind it, on its outline."""
 
 from __future__ import annotations
 
@@ -15,28 +15,29 @@ __all__ = ["Edge", "edges", "outer_edges"]
 Floats = npt.NDArray[np.float64]
 
 NEAREST = 1e-4
-"""Of the box's diagonal: what is nearer to a perspective camera is cut off an edge."""
+"""Distance from a perspective camera at which edges are cut off, as a share of the diagonal."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Edge:
-    """One edge of the box.
+    """An edge of the box.
 
     Attributes:
-        axis: that it runs along, 0, 1 or 2 for x, y or z.
+        axis: 0, 1 or 2 for an edge along x, y or z.
         ends: pixels (2, 2), from the left and from the top, of the first vertex and of the last.
-        fronts: how many of its two faces look at the camera: 0 behind all of the volume, 1 the outline, 2 before it.
-        whole: whether nothing is cut off because it reaches behind the camera.
+        fronts: number of its faces that look at the camera: 0 behind all of the volume, 1 on the
+            outline, 2 before the volume.
+        uncut: whether all of the edge lies before the camera, so that nothing is cut off.
     """
 
     axis: int
     ends: Floats
     fronts: int
-    whole: bool
+    uncut: bool
 
 
 def edges(rays: Rays) -> list[Edge]:
-    """Those of the twelve edges that reach before the camera."""
+    """Find those of the twelve edges that lie before the camera, at least in part."""
     bounds = rays.grid.bounds
     toward = (
         np.array([[1.0], [-1.0]]) * rays.forward
@@ -44,58 +45,57 @@ def edges(rays: Rays) -> list[Edge]:
         else np.stack([bounds[:, 0] - rays.eye, rays.eye - bounds[:, 1]])
     )
     looking = toward > 0  # (low or high face, axis)
-    found = []
+    seen = []
     for axis in range(3):
         others = [other for other in range(3) if other != axis]
         for sides in itertools.product((0, 1), repeat=2):
+            faces = list(zip(sides, others, strict=True))
             ends = np.empty((2, 3))
             ends[:, axis] = bounds[axis]
-            for other, side in zip(others, sides, strict=True):
+            for side, other in faces:
                 ends[:, other] = bounds[other, side]
             clipped = _clipped(rays, ends)
             if clipped is not None:
-                fronts = sum(
-                    bool(looking[side, other]) for other, side in zip(others, sides, strict=True)
-                )
                 pixels, _ = rays.project(clipped)
-                found.append(Edge(axis=axis, ends=pixels, fronts=fronts, whole=clipped is ends))
-    return found
-
-
-def _clipped(rays: Rays, ends: Floats) -> Floats | None:
-    """The part of a line (2, 3) of index space that is before a perspective camera, itself if all of it is."""
-    if rays.parallel:
-        return ends
-    _, depth = rays.project(ends)
-    least = NEAREST * float(np.linalg.norm(rays.grid.corners[:, 1] - rays.grid.corners[:, 0]))
-    if np.all(depth >= least):
-        return ends
-    if np.all(depth < least):
-        return None
-    share = (least - depth[0]) / (depth[1] - depth[0])
-    cut = ends.copy()
-    cut[int(depth[1] < depth[0])] = ends[0] + share * (ends[1] - ends[0])
-    return cut
+                fronts = sum(bool(looking[face]) for face in faces)
+                seen.append(Edge(axis=axis, ends=pixels, fronts=fronts, uncut=clipped is ends))
+    return seen
 
 
 def outer_edges(rays: Rays) -> list[Edge]:
-    """The edge of each axis that its scale stands at: on the outline, the lowest in the picture, of equally low ones the leftmost.
+    """Choose the edge of each axis that its scale stands at.
 
-    None for an axis that is not seen whole, as from inside the volume.
+    It is the lowest edge of the outline in the picture, and of equally low ones the leftmost. An
+    axis without an edge that is seen whole, as from inside the volume, has none.
     """
-    found = []
+    chosen = []
     for axis in range(3):
         outline = [
-            edge for edge in edges(rays) if edge.axis == axis and edge.fronts == 1 and edge.whole
+            edge for edge in edges(rays) if edge.axis == axis and edge.fronts == 1 and edge.uncut
         ]
         if outline:
-            found.append(
-                max(
-                    outline,
-                    key=lambda edge: (
-                        round(float(edge.ends[:, 1].max()), 3),
-                        -float(edge.ends[:, 0].min()),
-                    ),
-                )
-            )
-    return found
+            chosen.append(max(outline, key=_lowest_then_leftmost))
+    return chosen
+
+
+def _lowest_then_leftmost(edge: Edge) -> tuple[float, float]:
+    return round(float(edge.ends[:, 1].max()), 3), -float(edge.ends[:, 0].min())
+
+
+def _clipped(rays: Rays, ends: Floats) -> Floats | None:
+    """Cut a line (2, 3) of index space off behind a perspective camera.
+
+    The line itself if all of it is before the camera, None if nothing is.
+    """
+    if rays.parallel:
+        return ends
+    _, depth = rays.project(ends)
+    nearest = NEAREST * float(np.linalg.norm(rays.grid.corners[:, 1] - rays.grid.corners[:, 0]))
+    if np.all(depth >= nearest):
+        return ends
+    if np.all(depth < nearest):
+        return None
+    share = (nearest - depth[0]) / (depth[1] - depth[0])
+    cut = ends.copy()
+    cut[int(depth[1] < depth[0])] = ends[0] + share * (ends[1] - ends[0])
+    return cut

@@ -1,4 +1,4 @@
-"""What of a volume lies in the picture, and how large a pixel is there."""
+"""The part of a volume that is in view, and the size of a pixel there."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ __all__ = ["part_in_view", "pixel_vertices"]
 
 Floats = npt.NDArray[np.float64]
 
-WHOLE = 0.5
-"""Share of the volume from which on all of it is decoded: the next picture may look at the rest."""
+MAX_PART = 0.5
+"""Largest share of the volume that is decoded alone; above it all is, for the next pictures."""
 
 
 def pixel_vertices(rays: Rays) -> float:
-    """Width of a pixel in vertices where the volume is nearest to the camera, along the axis along which it is smallest; 0 inside."""
+    """Measure a pixel in vertices, where the volume is nearest to the camera; 0 inside the volume.
+
+    Both the side of the pixel and the axis of the volume are those that give the smallest number.
+    """
     bounds = rays.grid.bounds
-    across = (
-        np.minimum(np.abs(rays.right) * 2 / rays.size[0], np.inf),
-        np.abs(rays.up) * 2 / rays.size[1],
-    )
-    lengths = [float(np.linalg.norm(part * rays.grid.spacing)) for part in across]
+    across = np.abs(rays.right) * 2 / rays.size[0], np.abs(rays.up) * 2 / rays.size[1]
+    lengths = [float(np.linalg.norm(side * rays.grid.spacing)) for side in across]
     width = min(lengths) / float(np.max(np.abs(rays.grid.spacing)))
     if rays.parallel:
         return width
     nearest = np.clip(rays.eye, bounds[:, 0], bounds[:, 1])
-    # The distance of the nearest plane across the view: forward has a physical length of 1.
+    # The distance of the box along the direction of view: `forward` has a physical length of 1.
     corners = np.array(list(itertools.product(*bounds)))
     depth = float(
         np.min((corners - rays.eye) * rays.grid.spacing @ (rays.forward * rays.grid.spacing))
@@ -40,18 +40,18 @@ def pixel_vertices(rays: Rays) -> float:
 
 
 def part_in_view(rays: Rays, volume: Volume) -> Box:
-    """The region (z, y, x) of vertices around what the picture shows, widened to whole chunks; all where that is not much more.
+    """Find the region (z, y, x) of vertices around what is in view, widened to whole chunks.
 
-    One vertex where the picture shows nothing of the volume.
+    The region is all of the domain where that is not much more, and one vertex where nothing of the
+    volume is in view.
     """
-    everything: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
-    with np.errstate(
-        over="ignore", divide="ignore", invalid="ignore"
-    ):  # of cameras at the ends of float64
+    domain = Box.of_shape(volume.shape[1:])
+    # Cameras at the ends of float64 overflow.
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         seen = _seen(rays)
     if seen is None:
-        return ((0, 1), (0, 1), (0, 1))
-    found = []
+        return Box.of_shape((1, 1, 1))
+    region = []
     for low, high, length, chunk, (first, _) in zip(
         *seen[::-1].T, volume.shape[1:], volume.chunks[1:], volume.box, strict=True
     ):
@@ -59,43 +59,48 @@ def part_in_view(rays: Rays, volume: Volume) -> Box:
         # Chunks begin at the feature bounding box.
         start = max(first + (start - first) // chunk * chunk, 0)
         stop = min(first - (first - stop) // chunk * chunk, length)
-        found.append((start, max(stop, start + 1)))
-    share = np.prod([stop - start for start, stop in found]) / np.prod(volume.shape[1:])
-    return everything if share > WHOLE else (found[0], found[1], found[2])
+        region.append((start, max(stop, start + 1)))
+    share = np.prod([stop - start for start, stop in region]) / np.prod(volume.shape[1:])
+    return domain if share > MAX_PART else Box.of(region)
 
 
 def _seen(rays: Rays) -> Floats | None:
-    """Bounds (3, 2), x, y, z in vertices, of the part of the box that is in the picture; None where there is none.
+    """Bounds (3, 2) of the part of the box that is in view, x, y, z in vertices; None if none is.
 
-    The part is convex, of at most ten planes: its corners are the places where three of them meet and none of the others cuts off.
+    The part is convex and bounded by at most ten planes. Its corners are the points where three
+    planes meet and that no other plane cuts off.
     """
     bounds = rays.grid.bounds
-    normals = [*np.eye(3), *-np.eye(3)]
-    offsets = [*-bounds[:, 0], *bounds[:, 1]]
-    middle = rays.forward
+    side_normals, side_offsets = _view_planes(rays)
+    normals = np.array([*np.eye(3), *-np.eye(3), *side_normals])
+    offsets = np.array([*-bounds[:, 0], *bounds[:, 1], *side_offsets])
+    if not (np.isfinite(normals).all() and np.isfinite(offsets).all()):
+        return bounds
+    tolerance = 1e-9 * float(np.abs(bounds).max() + np.abs(rays.eye).max())
+    threes = np.array(list(itertools.combinations(range(len(normals)), 3)))
+    threes = threes[np.abs(np.linalg.det(normals[threes])) >= 1e-12]
+    points = np.linalg.solve(normals[threes], -offsets[threes][..., None])[..., 0]
+    corners = list(points[np.all(points @ normals.T + offsets >= -tolerance, axis=1)])
+    if not rays.parallel and np.all((rays.eye >= bounds[:, 0]) & (rays.eye <= bounds[:, 1])):
+        corners.append(rays.eye)
+    if not corners:
+        return None
+    return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)], axis=-1)
+
+
+def _view_planes(rays: Rays) -> tuple[list[Floats], list[float]]:
+    """The planes through the four edges of the picture: unit normals (3,) inwards, and offsets."""
+    normals, offsets = [], []
     for side, other in ((rays.right, rays.up), (rays.up, rays.right)):
         for sign in (1.0, -1.0):
-            # A plane holds the other direction and the ray at the picture's edge; the rest of the picture is on its inner side.
-            along = middle if rays.parallel else middle + sign * side
+            # A plane contains the other direction and the ray at the picture's edge.
+            along = rays.forward if rays.parallel else rays.forward + sign * side
             normal = np.cross(along, other)
-            normal = (
-                normal / np.abs(normal).max()
-            )  # first, since the squares of the largest scales go beyond float64
+            # Scaled first, since the squares of the largest scales are beyond float64.
+            normal = normal / np.abs(normal).max()
             normal = normal / np.linalg.norm(normal)
             normal = -normal if normal @ side * sign > 0 else normal
             place = rays.eye + sign * side if rays.parallel else rays.eye
             normals.append(normal)
             offsets.append(-float(normal @ place))
-    normal, offset = np.array(normals), np.array(offsets)
-    if not (np.isfinite(normal).all() and np.isfinite(offset).all()):
-        return bounds
-    tolerance = 1e-9 * float(np.abs(bounds).max() + np.abs(rays.eye).max())
-    threes = np.array(list(itertools.combinations(range(len(normal)), 3)))
-    threes = threes[np.abs(np.linalg.det(normal[threes])) >= 1e-12]
-    places = np.linalg.solve(normal[threes], -offset[threes][..., None])[..., 0]
-    corners = list(places[np.all(places @ normal.T + offset >= -tolerance, axis=1)])
-    if not rays.parallel and np.all((rays.eye >= bounds[:, 0]) & (rays.eye <= bounds[:, 1])):
-        corners.append(rays.eye)
-    return (
-        np.stack([np.min(corners, axis=0), np.max(corners, axis=0)], axis=-1) if corners else None
-    )
+    return normals, offsets

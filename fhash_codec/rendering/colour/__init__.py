@@ -1,1 +1,1 @@
-"""Colour and opacity of a value."""
+"""Colours and opacities of values: colour maps, presets, transfer functions."""

@@ -1,6 +1,6 @@
-"""Opacities by name: PyVista's presets, and those that suit the features of a file or the values of a series.
+"""Opacities by name: PyVista's presets, and opacities for the features or values of a series.
 
-Every preset is a list of points (value, opacity) between which the opacity is linear.
+Every preset becomes a list of points (value, opacity) between which the opacity is linear.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["PRESETS", "Histogram", "about", "opacity_preset", "shown_range"]
 Floats = npt.NDArray[np.float64]
 Range = tuple[float, float]
 Histogram = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
-"""Edges (n + 1,), ascending, and counts (n,) of values."""
+"""Bin edges (n + 1,), ascending, and counts (n,) of values."""
 
 PRESETS = (
     "auto",
@@ -34,16 +34,23 @@ PRESETS = (
     "foreground",
     "opaque",
 )
+"""Names of the presets."""
 FAINTEST = 1 / 255
-"""Opacities below are 0, as in PyVista's tables of bytes, so that what they are of need not be marched through."""
-INTERVAL, SURFACE, BACKGROUND = 0.3, 0.6, 0.25
-"""Largest opacities per vertex spacing: within an interval or segmentation, at an isosurface's value, and far from the background."""
+"""Smallest opacity of PyVista's tables of bytes; below it is 0, and need not be marched through."""
+INTERVAL = 0.3
+"""Largest opacity per vertex spacing within an interval or a segmentation."""
+SURFACE = 0.6
+"""Largest opacity per vertex spacing at the value of an isosurface."""
+BACKGROUND = 0.25
+"""Largest opacity per vertex spacing of values far from the background."""
 EDGE = 0.1
-"""Share of an interval over which its opacity rises, and falls again."""
+"""Share of an interval's width over which its opacity rises, and falls again."""
 TENT = 0.02
-"""Half the width of an isosurface's tent, of the value range."""
+"""Half the width of an isosurface's tent, as a share of the value range."""
 SHARES = np.linspace(0.0, 1.0, 65)
-ENDS = (-float(np.finfo(np.float64).max), float(np.finfo(np.float64).max))
+"""Shares of the range shown at which curved presets have points."""
+MAX_VALUE = float(np.finfo(np.float64).max)
+"""Largest value of float64."""
 
 
 def opacity_preset(
@@ -54,27 +61,41 @@ def opacity_preset(
     features: Sequence[str],
     histogram: Histogram | None,
 ) -> Floats:
-    """Points float64 (n, 2), values strictly ascending, of a preset by name.
+    """Find a preset by name: points (value, opacity), float64 (n, 2), values strictly ascending.
 
-    shown: the values that the colours reach over, and PyVista's presets. Raises InputError for an unknown name, offering the
-    nearest, and for `feature` where the file has none that tells values apart.
+    Args:
+        name: one of PRESETS.
+        shown: the values that the colours reach over; PyVista's presets reach over them too.
+        value_range: lowest and highest value of the series.
+        features: of the file, as texts.
+        histogram: of the values of the series, for `auto` without a suitable feature.
+
+    Raises InputError for an unknown name, with the nearest one, and for `feature` if the file has
+    no feature that tells values apart.
     """
     if name not in PRESETS:
         near = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.0)[0]
         raise InputError(
-            f"opacity '{name[:60]}' is not known; did you mean '{near}'? Known: {', '.join(PRESETS)}"
+            f"opacity '{name[:60]}' is not known; did you mean '{near}'? "
+            f"Known: {', '.join(PRESETS)}"
         )
-    if name in ("auto", "feature"):
-        points = _of_features(features, value_range)
-        if points is not None:
-            return points
-        if name == "feature":
-            raise InputError(
-                "opacity 'feature' needs a file of an interval, an isosurface or a segmentation; use 'auto'"
-            )
-        if histogram is not None:
-            return _away_from_background(histogram, value_range)
-        return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
+    if name not in ("auto", "feature"):
+        return _pyvista(name, shown)
+    points = _of_features(features, value_range)
+    if points is not None:
+        return points
+    if name == "feature":
+        raise InputError(
+            "opacity 'feature' needs a file of an interval, an isosurface or a segmentation; "
+            "use 'auto'"
+        )
+    if histogram is not None:
+        return _away_from_background(histogram, value_range)
+    return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
+
+
+def _pyvista(name: str, shown: Range) -> Floats:
+    """The points of PyVista's presets over the values shown."""
     if name == "opaque":
         return np.array([[shown[0], 1.0]])
     if name == "foreground":
@@ -94,29 +115,33 @@ def opacity_preset(
 
 
 def shown_range(features: Sequence[str], value_range: Range) -> Range:
-    """The values that colours reach over where the scene does not say: those of the intervals and segmentations, else all."""
-    found = [
-        range_ for range_ in (_values(text, value_range) for text in features) if range_ is not None
+    """Choose the values that colours reach over where the scene gives none.
+
+    They are those of the features, if all features are intervals or segmentations, else all values.
+    """
+    ranges = [
+        inside for inside in (_inside(text, value_range) for text in features) if inside is not None
     ]
     low, high = value_range
-    if found and len(found) == len(features):
-        low, high = min(part[0] for part in found), max(part[1] for part in found)
+    if ranges and len(ranges) == len(features):
+        low, high = min(inside[0] for inside in ranges), max(inside[1] for inside in ranges)
     return (low, high) if low < high else about(low)
 
 
 def about(value: float) -> Range:
-    """A narrow range that begins at a value, or where float64 ends there, ends at it."""
+    """Make a narrow range from a value upwards, or up to it where float64 ends above it."""
     extent = max(abs(value) * 1e-6, 1e-30)
     return (value, value + extent) if math.isfinite(value + extent) else (value - extent, value)
 
 
-def _part(share: float, reach: Range) -> float:
+def _share_of(width: Range, share: float) -> float:
     """A share of the width of a range; the width itself may overflow."""
-    low, high = reach
+    low, high = width
     return share * (high - low) if math.isfinite(high - low) else share * high - share * low
 
 
-def _values(text: str, value_range: Range) -> Range | None:
+def _inside(text: str, value_range: Range) -> Range | None:
+    """The values of an interval or segmentation that the data have; None if there are none."""
     feature = parse_feature(text)
     low, high = value_range
     if isinstance(feature, Interval):
@@ -129,56 +154,57 @@ def _values(text: str, value_range: Range) -> Range | None:
 
 
 def _of_features(texts: Sequence[str], value_range: Range) -> Floats | None:
-    """The largest of the features' opacities, or None unless all of them tell values apart."""
+    """The largest opacity of several features; None unless all of them tell values apart."""
     curves = [_of_feature(text, value_range) for text in texts]
-    known = [curve for curve in curves if curve is not None]
-    return None if not known or len(known) < len(curves) else _largest(known)
+    drawn = [curve for curve in curves if curve is not None]
+    return None if not drawn or len(drawn) < len(curves) else _largest(drawn)
 
 
 def _of_feature(text: str, value_range: Range) -> Floats | None:
+    """The points of one feature; None if it does not tell values apart."""
     feature = parse_feature(text)
     low, high = value_range
     if isinstance(feature, Isosurface):
-        half = _part(TENT, value_range) or max(abs(low) * 1e-6, 1e-30)
-        tent = [[feature.value - half, 0.0], [feature.value, SURFACE], [feature.value + half, 0.0]]
-        return np.array([point for point in tent if math.isfinite(point[0])])
-    inside = _values(text, value_range)
+        return _tent(feature.value, value_range)
+    inside = _inside(text, value_range)
     if inside is None:
-        # A feature of one value, or of none that the data have, is drawn as a surface.
-        return (
-            _of_feature(f"isosurface:{feature.low}", value_range)
-            if isinstance(feature, Interval) and math.isfinite(feature.low)
-            else None
-        )
-    edge = _part(EDGE, inside)
+        # An interval of one value, or of none that the data have, is drawn as a surface.
+        if isinstance(feature, Interval) and math.isfinite(feature.low):
+            return _tent(feature.low, value_range)
+        return None
+    edge = _share_of(inside, EDGE)
+    rise = [[inside[0], 0.0], [inside[0] + edge, INTERVAL]]
     if isinstance(feature, Segmentation):
-        return np.array([[inside[0], 0.0], [inside[0] + edge, INTERVAL]])
+        return np.array(rise)
     assert isinstance(feature, Interval)
+    fall = [[inside[1] - edge, INTERVAL], [inside[1], 0.0]]
     # An end that the data do not reach cuts nothing off, and needs no soft edge.
-    rise = (
-        [[inside[0], INTERVAL]]
-        if feature.low < low
-        else [[inside[0], 0.0], [inside[0] + edge, INTERVAL]]
-    )
-    fall = (
-        [[inside[1], INTERVAL]]
-        if feature.high > high
-        else [[inside[1] - edge, INTERVAL], [inside[1], 0.0]]
-    )
+    if feature.low < low:
+        rise = [[inside[0], INTERVAL]]
+    if feature.high > high:
+        fall = [[inside[1], INTERVAL]]
     return np.array(rise + fall)
 
 
+def _tent(value: float, value_range: Range) -> Floats:
+    """The points of a peak at a value; those beyond float64 are left out."""
+    half = _share_of(value_range, TENT) or max(abs(value_range[0]) * 1e-6, 1e-30)
+    points = [[value - half, 0.0], [value, SURFACE], [value + half, 0.0]]
+    return np.array([point for point in points if math.isfinite(point[0])])
+
+
 def _largest(curves: list[Floats]) -> Floats:
-    """The largest of several piecewise linear curves, exactly: their points, and where two of them cross."""
+    """The largest of several piecewise linear curves, with the points where two of them cross."""
     values = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
     heights = np.array([np.interp(values, *curve.T) for curve in curves])
     crossings = []
-    for one in range(len(curves)):
-        apart = heights[one] - heights[one + 1 :]
+    for number in range(len(curves)):
+        apart = heights[number] - heights[number + 1 :]
         left, right = apart[:, :-1], apart[:, 1:]
-        share = (left / np.where(left == right, 1.0, left - right))[left * right < 0]
-        begin = np.broadcast_to(values[:-1], left.shape)[left * right < 0]
-        end = np.broadcast_to(values[1:], left.shape)[left * right < 0]
+        crossed = left * right < 0
+        share = (left / np.where(left == right, 1.0, left - right))[crossed]
+        begin = np.broadcast_to(values[:-1], left.shape)[crossed]
+        end = np.broadcast_to(values[1:], left.shape)[crossed]
         crossings.append(begin * (1 - share) + end * share)
     values = np.unique(np.concatenate([values, *crossings]))
     return np.stack(
@@ -187,9 +213,10 @@ def _largest(curves: list[Floats]) -> Floats:
 
 
 def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
-    """Opacity 0 about the most frequent value, rising with the distance from it to that of the rarest values.
+    """Make the most frequent value, the background, transparent and values far from it opaque.
 
-    It is 0 within the distance that holds half of the vertices, and largest from the distance beyond which 0.5 % lie.
+    The opacity is 0 within the distance from the background that holds half of the vertices. It
+    rises to BACKGROUND at the distance beyond which 0.5 % of them lie.
     """
     edges, counts = histogram
     low, high = value_range
@@ -197,7 +224,8 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
         return np.array([[low, BACKGROUND]])
     if len(edges) != len(counts) + 1 or len(counts) == 0 or not counts.sum() > 0:
         return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
-    # By a power of two, 1 for every ordinary range, so that no difference overflows or is a denormal.
+    # Scaled by a power of two, 1 for every ordinary range, so that no difference overflows or is a
+    # denormal.
     scale = ValueRange(low, high).scale
     edges, low, high = edges * scale, low * scale, high * scale
     middles = edges[:-1] / 2 + edges[1:] / 2
@@ -206,9 +234,9 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
     order = np.argsort(distance, kind="stable")
     share = np.cumsum(counts[order]) / counts.sum()
     width = float(edges[1] - edges[0])
-    half, most = np.minimum(np.searchsorted(share, [0.5, 0.995]), len(order) - 1)
+    half, nearly_all = np.minimum(np.searchsorted(share, [0.5, 0.995]), len(order) - 1)
     near = float(distance[order[half]]) + width
-    far = max(float(distance[order[most]]), near + width)
+    far = max(float(distance[order[nearly_all]]), near + width)
     rise = (
         [[background + near, 0.0], [background + far, BACKGROUND]]
         if background + near < high
@@ -220,11 +248,12 @@ def _away_from_background(histogram: Histogram, value_range: Range) -> Floats:
         else []
     )
     points = np.array(fall + rise or [[low, BACKGROUND]])
-    points[:, 0] = np.clip(points[:, 0], ENDS[0] * scale, ENDS[1] * scale) / scale
+    points[:, 0] = np.clip(points[:, 0], -MAX_VALUE * scale, MAX_VALUE * scale) / scale
     return points
 
 
 def _over(shown: Range, shares: Floats, opacities: Floats) -> Floats:
+    """Points with opacities (n,) at shares (n,) of a range."""
     low, high = shown
     if not low < high:
         low, high = about(low)

@@ -125,7 +125,7 @@ class _Buffers:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Skipping:
-    """What lets rays pass over invisible parts of a frame; None where all of it is looked at.
+    """Bricks and cells that rays may pass over; None where all of a frame is looked at.
 
     Attributes:
         distance: int32 (z, y, x), as `Bricks.distance` has it.
@@ -139,7 +139,7 @@ class _Skipping:
 
 
 def _skipping(library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Bricks) -> _Skipping:
-    """What a task's rays may pass over."""
+    """The parts of a frame that a task's rays may pass over."""
     if not task.skipping:
         return _Skipping()
     if task.maximum:

@@ -1,32 +1,26 @@
-"""A plan in words: what is done for a picture and why, a line for each topic."""
+"""A plan in words: what is done for a picture and why, one line for each topic."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.volume import Volume
-
-if TYPE_CHECKING:
-    from fhash_codec.rendering.picture.plan import Plan
 
 __all__ = ["reasons"]
 
 
 def reasons(plan: Plan, volume: Volume) -> list[tuple[str, str]]:
-    """What is done and why, a line for each topic."""
-    task, scene, effects = plan.task, plan.scene, plan.scene.effects
+    """Explain a plan: (topic, what is done and why)."""
+    task, scene = plan.task, plan.scene
     width, height = scene.size
-    found = [
+    z, y, x = plan.region
+    lines = [
         (
             "picture",
-            f"{width} x {height}, {scene.camera.projection}, {task.antialiasing**2} ray(s) for each pixel",
+            f"{width} x {height}, {scene.camera.projection}, "
+            f"{task.antialiasing**2} ray(s) for each pixel",
         ),
         ("proportions", _scale_text(plan)),
-        (
-            "time",
-            f"step {plan.step:g}"
-            + ("" if float(plan.step).is_integer() else ", between two: both are decoded"),
-        ),
+        ("time", _time_text(plan)),
         ("march", _mode_text(plan, volume)),
         ("value", _value_text(plan)),
         ("gradient", _gradient_text(plan)),
@@ -34,27 +28,28 @@ def reasons(plan: Plan, volume: Volume) -> list[tuple[str, str]]:
         ("level of detail", f"{plan.lod}: {plan.why_lod}"),
         (
             "region",
-            "z {}:{}, y {}:{}, x {}:{}".format(*(end for part in plan.region for end in part))
-            + _region_text(plan, volume),
+            f"z {z[0]}:{z[1]}, y {y[0]}:{y[1]}, x {x[0]}:{x[1]}{_region_text(plan, volume)}",
         ),
         ("bricks", _brick_text(plan)),
-        (
-            "rays end",
-            f"where less than {task.threshold:.3g} of the light is left"
-            if task.threshold > 0
-            else "behind the volume",
-        ),
+        ("rays end", _end_text(plan)),
         ("step", f"{task.step:.6g}, {scene.march.step:g} of the distance between vertices"),
     ]
+    return lines + _extras(plan)
+
+
+def _extras(plan: Plan) -> list[tuple[str, str]]:
+    """The lines about buffers and about what is drawn around the volume, if there are any."""
+    task, effects = plan.task, plan.scene.effects
     buffers = [name for name, on in (("depth", task.depth), ("normal", task.normal)) if on]
     around = [
         name for name in ("box", "axes", "colour_bar", "time_label") if getattr(effects, name)
     ]
+    lines = []
     if buffers:
-        found.append(("buffers", ", ".join(buffers)))
+        lines.append(("buffers", ", ".join(buffers)))
     if around:
-        found.append(("around", ", ".join(around) + ": drawn afterwards"))
-    return found
+        lines.append(("around", ", ".join(around) + ": drawn afterwards"))
+    return lines
 
 
 def _scale_text(plan: Plan) -> str:
@@ -69,6 +64,11 @@ def _scale_text(plan: Plan) -> str:
     return f"x, y, z are stretched by {', '.join(f'{factor:.4g}' for factor in scale)}: {why}"
 
 
+def _time_text(plan: Plan) -> str:
+    between = "" if float(plan.step).is_integer() else ", between two: both are decoded"
+    return f"step {plan.step:g}{between}"
+
+
 def _mode_text(plan: Plan, volume: Volume) -> str:
     if plan.mode == "cache":
         return "cache: decode once, then march what was decoded"
@@ -80,7 +80,8 @@ def _mode_text(plan: Plan, volume: Volume) -> str:
     if plan.mode == "stream":
         return f"stream: one sample of each ray in a pass, straight through {through}"
     budget = plan.scene.march.samples_per_pass
-    return f"arm: {'as many samples as rays' if budget is None else f'{budget:,} samples'} in a pass, straight through {through}"
+    samples = "as many samples as rays" if budget is None else f"{budget:,} samples"
+    return f"arm: {samples} in a pass, straight through {through}"
 
 
 def _value_text(plan: Plan) -> str:
@@ -90,14 +91,13 @@ def _value_text(plan: Plan) -> str:
     if task.table is None:
         return f"at each sample, for {len(task.surfaces)} surface(s) alone"
     low, high = plan.function.span
-    return f"at each sample; values from {low:.6g} to {high:.6g} can be seen" + (
-        f", and {len(task.surfaces)} surface(s)" * bool(task.surfaces)
-    )
+    surfaces = f", and {len(task.surfaces)} surface(s)" if task.surfaces else ""
+    return f"at each sample; values from {low:.6g} to {high:.6g} can be seen{surfaces}"
 
 
 def _gradient_text(plan: Plan) -> str:
     task = plan.task
-    wanted = [
+    uses = [
         text
         for text, on in (
             ("where a sample has opacity, for shading", task.shaded),
@@ -106,42 +106,48 @@ def _gradient_text(plan: Plan) -> str:
         )
         if on
     ]
-    return "; ".join(wanted) if wanted else "none: no effect asks for it"
+    return "; ".join(uses) if uses else "none: no effect asks for it"
 
 
 def _secondary_text(plan: Plan) -> str:
-    wanted = []
+    uses = []
     if plan.shadows is not None:
-        wanted.append(f"shadows on a grid of {plan.shadows.resolution:g} vertices")
+        uses.append(f"shadows on a grid of {plan.shadows.resolution:g} vertices")
     if plan.occlusion is not None:
-        wanted.append(f"ambient occlusion within {plan.occlusion.radius:g} vertices")
-    return "; ".join(wanted) if wanted else "none: no effect asks for them"
+        uses.append(f"ambient occlusion within {plan.occlusion.radius:g} vertices")
+    return "; ".join(uses) if uses else "none: no effect asks for them"
 
 
 def _region_text(plan: Plan, volume: Volume) -> str:
     if plan.lights:
         return " (all: light comes from everywhere)"
-    whole = all(
+    is_domain = all(
         high - low == length
         for (low, high), length in zip(plan.region, volume.shape[1:], strict=True)
     )
-    return " (all)" if whole else " (what is in the picture)"
+    return " (all)" if is_domain else " (what is in the picture)"
 
 
 def _brick_text(plan: Plan) -> str:
-    if not plan.task.skipping:
+    task = plan.task
+    if not task.skipping:
         return "all are marched: skipping is off"
-    wanted = [
+    tests = [
         text
         for text, on in (
-            ("hold visible values", plan.task.table is not None),
-            ("cross a surface", bool(plan.task.surfaces)),
+            ("hold visible values", task.table is not None),
+            ("cross a surface", bool(task.surfaces)),
         )
         if on
     ]
-    if plan.task.maximum:
-        wanted = ["can hold a larger value than was met", *wanted[1:]]
-    rare = (
-        "" if plan.task.maximum or plan.mode != "cache" else "; all, where few could be passed over"
-    )
-    return f"only those that {' or '.join(wanted)}{rare}"
+    if task.maximum:
+        tests = ["can hold a larger value than was met", *tests[1:]]
+    few = "" if task.maximum or plan.mode != "cache" else "; all, where few could be passed over"
+    return f"only those that {' or '.join(tests)}{few}"
+
+
+def _end_text(plan: Plan) -> str:
+    threshold = plan.task.threshold
+    if threshold > 0:
+        return f"where less than {threshold:.3g} of the light is left"
+    return "behind the volume"

@@ -1,7 +1,7 @@
-"""A finished picture: its pixels, the buffers beside them, what they cost, and the scene that they show.
+"""A finished picture: pixels, buffers, what they cost, and the scene that they show.
 
-A PNG holds the scene as JSON in an iTXt chunk `fhash.scene`, the name of the volume's file in `fhash.source` and its digest in
-`fhash.digest`.
+A PNG holds the scene as JSON in an iTXt chunk `fhash.scene`, the name of the volume's file in
+`fhash.source` and its digest in `fhash.digest`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -22,22 +22,32 @@ from fhash_codec.rendering.scene.scene import Scene
 from fhash_formats.errors import InputError
 from fhash_formats.support.atomic import check_output, replacing_all
 
-__all__ = ["Image"]
+__all__ = ["Draw", "Image"]
 
 Single = npt.NDArray[np.float32]
 
 
+class Draw(Protocol):
+    """Renders a scene while the next one is prepared, as `Renderer.render` does."""
+
+    def __call__(self, scene: Scene, /, *, upcoming: Scene | None = None) -> Image:
+        """Render `scene`; `upcoming` is the scene of the next picture."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Image:
-    """What `render` gives.
+    """A rendered picture.
 
     Attributes:
         rgba: float32 (H, W, 4), 0..1, colours multiplied by the opacity; the first row is the top.
-        depth: float32 (H, W), from the eye along the ray in units of the coordinates, infinite where nothing is; or None.
+        depth: float32 (H, W), distance from the eye along the ray in units of the coordinates,
+            infinite where nothing is; or None.
         normal: float32 (H, W, 3), unit vectors in physical x, y, z, 0 where nothing is; or None.
         counters: what the picture took: rays, passes, samples and so on.
-        scene: as `Scene.to_dict` gives it. source: the name of the volume's file, digest: `Container.digest` of it.
-        seconds: of rendering.
+        scene: as `Scene.to_dict` gives it.
+        source: name of the volume's file.
+        digest: `Container.digest` of the volume.
+        seconds: time that rendering took.
     """
 
     rgba: Single
@@ -51,20 +61,21 @@ class Image:
 
     @property
     def background(self) -> str:
-        """Of the scene: '#rrggbb', a name, or 'transparent'."""
+        """Background of the scene: '#rrggbb', a name, or 'transparent'."""
         return str(self.scene.get("background", Scene().background))
 
     def to_uint8(self, background: str | None = None) -> npt.NDArray[np.uint8]:
-        """Bytes (H, W, 3) over a background, that of the scene if None; (H, W, 4), not multiplied, over 'transparent'.
+        """Convert to uint8 pixels over a background, that of the scene if None.
 
-        What is not finite counts as 0, so that it never reaches a pixel. Raises InputError for an unknown colour.
+        The pixels are (H, W, 3); over 'transparent' (H, W, 4), with colours not multiplied by the
+        opacity. Numbers that are not finite count as 0. Raises InputError for an unknown colour.
         """
         name = self.background if background is None else background
         rgba = np.clip(np.nan_to_num(self.rgba, nan=0.0, posinf=0.0, neginf=0.0), 0.0, 1.0)
         colour, opacity = rgba[..., :3], rgba[..., 3:]
         if name == "transparent":
-            plain = np.minimum(colour / np.where(opacity > 0, opacity, np.float32(1)), 1.0)
-            mixed = np.concatenate([plain, opacity], axis=-1)
+            unmultiplied = np.minimum(colour / np.where(opacity > 0, opacity, np.float32(1)), 1.0)
+            mixed = np.concatenate([unmultiplied, opacity], axis=-1)
         else:
             mixed = np.minimum(
                 colour + (1 - opacity) * np.array(parse_colour(name), dtype=np.float32), 1.0
@@ -72,9 +83,10 @@ class Image:
         return np.asarray(np.rint(mixed * 255), dtype=np.uint8)
 
     def save(self, path: str | Path, *, force: bool = False) -> list[Path]:
-        """Write the PNG, and buffers as NAME.depth.npy and NAME.normal.npy; the paths written, complete or none of them.
+        """Write NAME.png, and the buffers as NAME.depth.npy and NAME.normal.npy; return the paths.
 
-        Raises InputError for a name that does not end in .png, OutputExistsError unless `force`, OutputError.
+        All files are written completely, or none is. Raises InputError for a name that does not end
+        in .png, OutputExistsError unless `force`, OutputError for what cannot be written.
         """
         path = Path(path)
         outputs = self.outputs(path)
@@ -90,7 +102,7 @@ class Image:
         return outputs
 
     def outputs(self, path: Path) -> list[Path]:
-        """Every path that `save` writes, the PNG last."""
+        """List every path that `save` writes, the PNG last."""
         if path.suffix.lower() != ".png":
             raise InputError(f"{path}: pictures are written as .png; use such a name")
         named = (("depth", self.depth), ("normal", self.normal))
@@ -116,11 +128,12 @@ class Image:
         Pictures.fromarray(self.to_uint8()).save(file, format="PNG", pnginfo=info)
 
     def _repr_png_(self) -> bytes:
-        """How a notebook shows it."""
+        """PNG bytes, for notebooks."""
         file = io.BytesIO()
         self._write_png(file)
         return file.getvalue()
 
     def __repr__(self) -> str:
         height, width = self.rgba.shape[:2]
-        return f"<fhash Image {width}x{height} of {Path(self.source).name or 'a volume'} in {self.seconds:.3g} s>"
+        source = Path(self.source).name or "a volume"
+        return f"<fhash Image {width}x{height} of {source} in {self.seconds:.3g} s>"

@@ -1,1 +1,1 @@
-"""What is asked of a picture, as records and text. No arrays."""
+"""Scenes: what is asked of a picture, as records and text without arrays."""

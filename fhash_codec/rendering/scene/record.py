@@ -1,4 +1,4 @@
-"""Records of settings: frozen dataclasses that check their fields and go to and from JSON values."""
+"""Records of settings: frozen dataclasses that check their fields and convert to and from JSON."""
 
 from __future__ import annotations
 
@@ -21,45 +21,63 @@ __all__ = ["Record", "limits"]
 
 
 class Record:
-    """A frozen dataclass that is checked field by field against its annotations and its `limits`, and goes to and from JSON values."""
+    """A frozen dataclass that checks each field against its annotation and its `limits`.
+
+    It converts to and from JSON values. Values are converted to the annotated types where that
+    loses nothing: see `_converted`.
+    """
 
     def __post_init__(self) -> None:
+        """Check and convert every field; raises InputError."""
         hints = _hints(type(self))  # type: ignore[arg-type]
-        for each in dataclasses.fields(self):  # type: ignore[arg-type]
-            object.__setattr__(
-                self, each.name, _checked(each, hints[each.name], getattr(self, each.name))
-            )
+        for setting in dataclasses.fields(self):  # type: ignore[arg-type]
+            value = _checked(setting, hints[setting.name], getattr(self, setting.name))
+            object.__setattr__(self, setting.name, value)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values by field name, without those that are the default."""
+        """JSON values by field name, without the fields that have their defaults."""
         return {
-            each.name: _plain(getattr(self, each.name))
-            for each in dataclasses.fields(self)  # type: ignore[arg-type]
-            if getattr(self, each.name) != _default(each)
+            setting.name: _plain(getattr(self, setting.name))
+            for setting in dataclasses.fields(self)  # type: ignore[arg-type]
+            if getattr(self, setting.name) != _default(setting)
         }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """From `to_dict`'s values; raises InputError for an unknown name (offering the nearest) or a value that is not allowed."""
+        """Make a record of the values of `to_dict`.
+
+        Raises InputError for a value that is not allowed, and for an unknown name, with the nearest
+        known one.
+        """
         if not isinstance(values, Mapping):
             raise InputError(
                 f"{cls.__name__.lower()} is {values!r:.40}; a table of settings is needed"
             )
-        known = [each.name for each in dataclasses.fields(cls)]  # type: ignore[arg-type]
+        settings = dataclasses.fields(cls)  # type: ignore[arg-type]
+        names = [setting.name for setting in settings]
         for name in values:
-            if name not in known:
-                near = difflib.get_close_matches(str(name), known, n=1, cutoff=0.0)
+            if name not in names:
+                near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)
                 raise InputError(
-                    f"unknown setting '{str(name)[:60]}' of {cls.__name__.lower()}; did you mean '{near[0]}'?"
+                    f"unknown setting '{str(name)[:60]}' of {cls.__name__.lower()}; "
+                    f"did you mean '{near[0]}'?"
                 )
-        for each in dataclasses.fields(cls):  # type: ignore[arg-type]
-            if each.name not in values and _default(each) is dataclasses.MISSING:
-                raise InputError(f"{each.name} is missing: {_wanted(each)} is needed")
+        for setting in settings:
+            if setting.name not in values and _default(setting) is dataclasses.MISSING:
+                raise InputError(f"{setting.name} is missing: {_description(setting)} is needed")
         return cls(**values)
 
     @classmethod
     def read(cls, path: Path, what: str, missing: str) -> Self:
-        """From a file: TOML by its suffix .toml, else JSON. what: it is, missing: what is said where there is none. Raises InputError."""
+        """Read a record from a file: TOML if its suffix is .toml, else JSON.
+
+        Args:
+            path: of the file.
+            what: the kind of file, for messages, such as "a scene".
+            missing: message for a file that does not exist.
+
+        Raises InputError, MissingInputError for a file that does not exist.
+        """
         try:
             text = path.read_text(encoding="utf-8")
             return cls.from_dict(
@@ -81,7 +99,15 @@ def limits(
     high: float | None = None,
     choices: tuple[str, ...] = (),
 ) -> Any:
-    """A field with its help (units and range included) and what it may be."""
+    """Declare a field of a Record with its help and the values that it may have.
+
+    Args:
+        default: of the field; dataclasses.MISSING for a field that must be given.
+        help: one line, with units, also for the options of the command line.
+        low: smallest number allowed; checked only together with `high`.
+        high: largest number allowed.
+        choices: texts allowed; any text if empty.
+    """
     return field(
         default=default, metadata={"help": help, "low": low, "high": high, "choices": choices}
     )
@@ -92,83 +118,114 @@ def _hints(cls: type) -> dict[str, Any]:
     return typing.get_type_hints(cls)
 
 
-def _default(each: dataclasses.Field[Any]) -> Any:
+def _default(setting: dataclasses.Field[Any]) -> Any:
+    if setting.default_factory is not dataclasses.MISSING:
+        return setting.default_factory()
+    return setting.default
+
+
+def _description(setting: dataclasses.Field[Any]) -> str:
+    """The name of a field and its help, for messages."""
     return (
-        each.default_factory() if each.default_factory is not dataclasses.MISSING else each.default
+        f"'{setting.name}' ({setting.metadata.get('help', 'a table of settings, true or false')})"
     )
 
 
 def _plain(value: Any) -> Any:
+    """A value of a field as a JSON value."""
     if isinstance(value, Record):
         return value.to_dict()
-    return [_plain(part) for part in value] if isinstance(value, tuple) else value
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
-def _checked(each: dataclasses.Field[Any], hint: Any, value: Any) -> Any:
-    """The value as its annotation wants it; raises InputError."""
-    found = _fitted(hint, value)
-    if found is _WRONG:
-        raise InputError(f"{each.name} is {value!r:.60}; {_wanted(each)} is needed")
-    low: float | None = each.metadata.get("low")
-    high: float | None = each.metadata.get("high")
-    choices: tuple[str, ...] = each.metadata.get("choices", ())
-    for part in found if isinstance(found, tuple) else (found,):
-        if (
-            low is not None
-            and high is not None
-            and isinstance(part, int | float)
-            and not isinstance(part, bool)
-            and not low <= part <= high
-        ):
-            raise InputError(f"{each.name} is {part:g}; allowed: {low:g} to {high:g}")
-        if choices and isinstance(part, str) and part not in choices:
-            near = difflib.get_close_matches(part, choices, n=1, cutoff=0.6)
-            raise InputError(
-                f"{each.name} is '{part[:60]}'; allowed: {', '.join(choices)}"
-                + (f"; did you mean '{near[0]}'?" if near else "")
-            )
-    return found
+def _checked(setting: dataclasses.Field[Any], hint: Any, value: Any) -> Any:
+    """Convert a value to the type of its field and check it; raises InputError."""
+    converted = _converted(hint, value)
+    if converted is _WRONG:
+        raise InputError(f"{setting.name} is {value!r:.60}; {_description(setting)} is needed")
+    for item in converted if isinstance(converted, tuple) else (converted,):
+        if isinstance(item, str):
+            _check_choice(setting, item)
+        elif isinstance(item, int | float) and not isinstance(item, bool):
+            _check_range(setting, item)
+    return converted
 
 
-def _wanted(each: dataclasses.Field[Any]) -> str:
-    return f"'{each.name}' ({each.metadata.get('help', 'a table of settings, true or false')})"
+def _check_range(setting: dataclasses.Field[Any], number: float) -> None:
+    low: float | None = setting.metadata.get("low")
+    high: float | None = setting.metadata.get("high")
+    if low is not None and high is not None and not low <= number <= high:
+        raise InputError(f"{setting.name} is {number:g}; allowed: {low:g} to {high:g}")
+
+
+def _check_choice(setting: dataclasses.Field[Any], text: str) -> None:
+    choices: tuple[str, ...] = setting.metadata.get("choices", ())
+    if choices and text not in choices:
+        near = difflib.get_close_matches(text, choices, n=1, cutoff=0.6)
+        raise InputError(
+            f"{setting.name} is '{text[:60]}'; allowed: {', '.join(choices)}"
+            + (f"; did you mean '{near[0]}'?" if near else "")
+        )
 
 
 _WRONG = object()
+"""Result of a conversion that is not possible; None is a value that fields may have."""
 
 
-def _fitted(hint: Any, value: Any) -> Any:
-    """The value converted to a type, or _WRONG: numbers are finite, tuples come from lists too, records from tables and `true`."""
+def _converted(hint: Any, value: Any) -> Any:
+    """Convert a value to an annotated type; _WRONG if that is not possible.
+
+    Lists become tuples, tables and `true` become records, `false` becomes None where a field may be
+    None, integers become floats. Numbers must be finite.
+    """
     origin = typing.get_origin(hint)
     if origin in (types.UnionType, typing.Union):
-        for option in typing.get_args(hint):
-            found = _fitted(option, value)
-            if found is not _WRONG:
-                return found
-        return _WRONG
+        return _first_option(typing.get_args(hint), value)
     if origin is tuple:
-        parts = typing.get_args(hint)
-        if not isinstance(value, list | tuple):
-            return _WRONG
-        kinds = [parts[0]] * len(value) if parts[-1] is ... else parts
-        if len(kinds) != len(value):
-            return _WRONG
-        fitted = tuple(_fitted(kind, part) for kind, part in zip(kinds, value, strict=True))
-        return _WRONG if _WRONG in fitted else fitted
+        return _tuple(typing.get_args(hint), value)
     if isinstance(hint, type) and issubclass(hint, Record):
-        if isinstance(value, hint):
-            return value
-        if value is True:
-            return hint.from_dict({})
-        return hint.from_dict(value) if isinstance(value, Mapping) else _WRONG
+        return _record(hint, value)
     if hint is type(None):
         return None if value is None or value is False else _WRONG
     if hint is bool or isinstance(value, bool):
+        # Python's booleans are integers: they are kept apart from numbers here.
         return value if hint is bool and isinstance(value, bool) else _WRONG
     if hint is float:
-        return (
-            float(value)
-            if isinstance(value, int | float) and abs(value) <= sys.float_info.max
-            else _WRONG
-        )
+        return _finite(value)
     return value if isinstance(value, hint) else _WRONG
+
+
+def _first_option(options: tuple[Any, ...], value: Any) -> Any:
+    """Convert a value to the first of several types that it fits."""
+    for option in options:
+        converted = _converted(option, value)
+        if converted is not _WRONG:
+            return converted
+    return _WRONG
+
+
+def _tuple(hints: tuple[Any, ...], value: Any) -> Any:
+    """Convert the items of a list or tuple; `hints` may end in `...` for any number of items."""
+    if not isinstance(value, list | tuple):
+        return _WRONG
+    item_hints = [hints[0]] * len(value) if hints[-1] is ... else hints
+    if len(item_hints) != len(value):
+        return _WRONG
+    items = tuple(_converted(hint, item) for hint, item in zip(item_hints, value, strict=True))
+    return _WRONG if _WRONG in items else items
+
+
+def _record(cls: type[Record], value: Any) -> Any:
+    """Convert a table, or `true` for the defaults, to a record."""
+    if isinstance(value, cls):
+        return value
+    if value is True:
+        return cls.from_dict({})
+    return cls.from_dict(value) if isinstance(value, Mapping) else _WRONG
+
+
+def _finite(value: Any) -> Any:
+    """Convert a number to a float; integers beyond float64 are not possible."""
+    if isinstance(value, int | float) and abs(value) <= sys.float_info.max:
+        return float(value)
+    return _WRONG

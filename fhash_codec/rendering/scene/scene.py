@@ -1,16 +1,18 @@
-"""What a picture shows: camera, image, time, transfer function and effects, as one record that is written as TOML or JSON.
+"""Scenes: camera, image, time, transfer function and effects of a picture, as one record.
 
-An effect that the scene does not name is off, and costs nothing. Every record refuses an unknown key and names the nearest known one.
+Scenes are written as TOML or JSON. An effect that the scene does not name is off and costs nothing.
+Every record refuses an unknown key and names the nearest known one.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from fhash_codec.rendering.scene.png_text import scene_text_in_png
 from fhash_codec.rendering.scene.record import Record, limits
-from fhash_codec.rendering.task.devices import DEVICES
 from fhash_formats.errors import InputError
 
 __all__ = [
@@ -24,24 +26,32 @@ __all__ = [
     "Shading",
     "Shadows",
     "TransferFunctionSpec",
+    "scene_in_png",
 ]
 
 Vector = tuple[float, float, float]
 Point = tuple[float, float]
+
 MAX_SIDE = 16384
-"""Pixels along a side of an image."""
+"""Most pixels along a side of an image."""
 VIEWS = ("iso", "xy", "xz", "yz", "yx", "zx", "zy")
-"""Directions a camera looks from by name, as PyVista has them: `xy` has x to the right and y upwards."""
+"""Names of the directions to look from, as in PyVista: `xy` has x to the right and y upwards."""
 MARCHES = ("auto", "cache", "arm", "stream")
+"""Names of the ways to march: through a decoded frame, or straight through the model."""
+DEVICES = ("auto", "cpu", "cuda")
+"""Names of the devices that rays are marched on."""
 BUFFERS = ("depth", "normal")
+"""Names of the buffers beside the colours."""
 GRADIENTS = ("cell", "central")
+"""Names of the gradients for shading."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Camera(Record):
-    """Where the picture is taken from, in the physical coordinates of the series (x, y, z).
+    """Place and lens of the camera, in the physical coordinates of the series (x, y, z).
 
-    `position` with `focal_point` and `view_up` (as in PyVista), or a `view` by name that `azimuth` and `elevation` turn.
+    The place is a `position` with `focal_point` and `view_up` (as in PyVista), or a `view` by name.
+    `azimuth` and `elevation` turn the camera from there.
     """
 
     view: str = limits("iso", "direction to look from", choices=VIEWS)
@@ -78,7 +88,8 @@ class TransferFunctionSpec(Record):
     )
     range: Point | None = limits(
         None,
-        "values that the colour map reaches from and to; those of the feature or the series if left out",
+        "values that the colour map reaches from and to; "
+        "those of the feature or the series if left out",
     )
     opacity: str | tuple[Point, ...] = limits(
         "auto", "name of an opacity preset, or points [value, opacity]"
@@ -86,7 +97,8 @@ class TransferFunctionSpec(Record):
     density: float = limits(1.0, "factor of the extinction", low=0, high=1e6)
     unit_distance: float | None = limits(
         None,
-        "length after which the opacity is as given, in units of the coordinates; a vertex spacing if left out",
+        "length after which the opacity is as given, in units of the coordinates; "
+        "a vertex spacing if left out",
         low=1e-100,
         high=1e100,
     )
@@ -95,7 +107,7 @@ class TransferFunctionSpec(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Shading(Record):
-    """Phong shading by the gradient, two-sided; shares of the light."""
+    """Phong shading by the gradient, two-sided; the light is given in shares."""
 
     ambient: float = limits(0.2, "light from everywhere", low=0, high=10)
     diffuse: float = limits(0.8, "scattered light", low=0, high=10)
@@ -113,7 +125,7 @@ class Shading(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Shadows(Record):
-    """Light that the volume takes away on its way to a sample."""
+    """Shadows: light that the volume takes away on its way to a sample."""
 
     strength: float = limits(0.8, "share of the light that a shadow takes", low=0, high=1)
     light: Vector | None = limits(
@@ -125,7 +137,7 @@ class Shadows(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class AmbientOcclusion(Record):
-    """Light from everywhere that the surroundings take away."""
+    """Ambient occlusion: light from everywhere that the surroundings take away."""
 
     strength: float = limits(0.7, "share of the ambient light that it takes", low=0, high=1)
     radius: float = limits(8.0, "how far the surroundings reach, in vertices", low=1, high=256)
@@ -144,7 +156,7 @@ class Isosurface(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Effects(Record):
-    """Each is off unless it is named; `true` switches one on with its defaults."""
+    """Effects of a picture: each is off unless it is named; `true` stands for its defaults."""
 
     shading: Shading | None = None
     shadows: Shadows | None = None
@@ -166,7 +178,7 @@ class Effects(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Marching(Record):
-    """How rays are sampled: what accuracy costs in time."""
+    """Sampling of the rays: accuracy against time."""
 
     mode: str = limits("auto", "way to march", choices=MARCHES)
     step: float = limits(0.5, "length of a step in vertex spacings", low=1e-6, high=64)
@@ -195,7 +207,7 @@ class Marching(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Evolution(Record):
-    """Several steps side by side in one picture, each of the size of the scene."""
+    """Several steps side by side in one picture, each as large as the scene says."""
 
     steps: tuple[float, ...] = limits(
         dataclasses.MISSING, "steps of the series, between two of them too", low=0, high=1e15
@@ -207,14 +219,14 @@ class Evolution(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class Scene(Record):
-    """All that a picture is made from beside the volume."""
+    """Everything that a picture is made from, apart from the volume."""
 
     camera: Camera = Camera()
     size: tuple[int, int] = limits((512, 512), "pixels across and down", low=1, high=MAX_SIDE)
     scale: Vector | None = limits(
         None,
-        "factors by which the axes (x, y, z) are stretched; if left out, one in other units than the rest has its vertices as far apart. "
-        "The camera lives in the stretched coordinates",
+        "factors by which the axes (x, y, z) are stretched; if left out, one in other units than "
+        "the rest has its vertices as far apart. The camera lives in the stretched coordinates",
         low=1e-30,
         high=1e30,
     )
@@ -234,6 +246,7 @@ class Scene(Record):
     evolution: Evolution | None = None
 
     def __post_init__(self) -> None:
+        """Check the fields, and that the time is given once; raises InputError."""
         super().__post_init__()
         if self.step is not None and self.time is not None:
             raise InputError("scene: step and time exclude each other")
@@ -242,10 +255,26 @@ class Scene(Record):
 
     @classmethod
     def load(cls, path: str | Path) -> Scene:
-        """From a file: TOML by its suffix .toml, the text in a PNG that `fhash render` wrote, else JSON. Raises InputError."""
+        """Read a scene from a file; raises InputError, MissingInputError without the file.
+
+        The suffix tells the kind: .toml for TOML, .png for a picture of `fhash render`, which holds
+        its scene; any other file is JSON.
+        """
         path = Path(path)
         if path.suffix.lower() == ".png":
-            from fhash_codec.rendering.scene.png_text import scene_in_png
-
             return scene_in_png(path)
         return cls.read(path, "a scene", "no such scene")
+
+
+def scene_in_png(path: str | Path) -> Scene:
+    """Read the scene that a picture shows.
+
+    Raises InputError for a file that is no PNG of `fhash render`, damaged ones included.
+    """
+    text = scene_text_in_png(path)
+    try:
+        return Scene.from_dict(json.loads(text))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: its scene is damaged: {' '.join(str(error).split())}") from error

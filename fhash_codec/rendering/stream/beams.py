@@ -14,7 +14,7 @@ from fhash_codec.rendering.task.task import Task
 __all__ = ["ENDLESS", "Beams", "shares", "slab"]
 
 ENDLESS = 2.0**62
-"""More samples than a ray can have."""
+"""A number of samples that no ray reaches."""
 NEAR = 1e-7
 """Largest distance from a face, in vertices, that is taken for rounding. Rounding moves a place by
 less, even where the camera is far away.
@@ -165,7 +165,7 @@ def _paths(eye: Array, direction: Array, box: Array, within: Array, arrays: Arra
 
 
 def slab(origin: Array, direction: Array, bounds: Array, arrays: Arrays) -> tuple[Array, Array]:
-    """Where rays (n, 3) enter and leave a box (3, 2), in lengths of their direction.
+    """Entry and exit of rays (n, 3) at a box (3, 2), in lengths of their direction.
 
     A ray that misses the box leaves it before it enters.
     """

@@ -1,4 +1,4 @@
-"""What streamed rays have seen: events joined front to back and lit, and the other buffers."""
+"""The picture of streamed rays: events joined front to back and lit, and the other buffers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Canvas", "Events"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Events:
-    """What the rays of a pass meet, the nearest first: surfaces before a sample, then the sample.
+    """Events along the rays of a pass, the nearest first: surfaces, then the sample behind them.
 
     With s surfaces a ray has s + 1 events for each sample.
 

@@ -1,4 +1,4 @@
-"""Where streamed rays cross isosurfaces.
+"""Crossings of streamed rays with isosurfaces.
 
 A crossing lies between two samples of which one is below the surface's value and one above. Its
 place is found by the Illinois method.

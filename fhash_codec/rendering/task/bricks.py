@@ -27,8 +27,8 @@ SIDE = 4
 FARTHEST = 255
 """Largest distance of bricks, in bricks, and so the largest leap of a ray."""
 ROUNDING = 2.0**-22
-"""How far an interpolated float32 may lie beyond the values it is interpolated from, as a share of
-the largest magnitude.
+"""Distance of an interpolated float32 beyond the values around it, at most, as a share of the
+largest magnitude.
 """
 SMALL = 2**18
 """Vertices of a frame below which threads take longer to start than the work takes."""

@@ -5,13 +5,12 @@ from __future__ import annotations
 import ctypes
 import sys
 
+from fhash_codec.rendering.scene.scene import DEVICES
 from fhash_codec.rendering.task.arrays import NUMPY, Arrays
 from fhash_formats.errors import InputError
 
-__all__ = ["DEVICES", "arrays_on"]
+__all__ = ["arrays_on"]
 
-DEVICES = ("auto", "cpu", "cuda")
-"""Names of devices that can be asked for."""
 DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 """File name of the driver of CUDA."""
 

@@ -1,4 +1,4 @@
-"""What a marcher is given and what it returns. All marchers take one task and make one picture.
+"""The task of a marcher, and its result. All marchers take one task and make one picture.
 
 Sample k of a ray lies `(k + 0.5) * step` behind the place where the ray enters the drawn box of the
 whole domain (`Grid.bounds`); with jitter `(k + a share of the ray's own) * step`. The last step is

@@ -1,4 +1,4 @@
-"""All hard cases."""
+"""The catalogue of all hard cases."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from fhash_codec.selftest.cases import (
 )
 from fhash_formats.errors import InputError
 
-__all__ = ["cases", "chosen"]
+__all__ = ["cases", "choose_cases"]
 
 
 @cache
 def cases() -> tuple[Case, ...]:
-    """Every case, group by group."""
+    """All cases, group by group."""
     return (
         *values.CASES,
         *shapes.CASES,
@@ -37,23 +37,24 @@ def cases() -> tuple[Case, ...]:
     )
 
 
-def chosen(
+def choose_cases(
     *, names: Sequence[str] = (), groups: Sequence[str] = (), everything: bool = False
 ) -> tuple[Case, ...]:
-    """The cases of these names and groups; all quick ones where none is given, or all with `everything`.
+    """The cases with these names or of these groups; without names and groups, all quick cases.
 
-    Raises InputError for an unknown name or group, and offers the nearest.
+    With `everything`, a call without names and groups returns the long set too. Raises InputError
+    for an unknown name or group; its message offers the nearest one.
     """
-    every = cases()
-    _check("case", names, [case.name for case in every])
-    _check("group", groups, list(dict.fromkeys(case.group for case in every)))
+    all_cases = cases()
+    _check_names("case", names, [case.name for case in all_cases])
+    _check_names("group", groups, list(dict.fromkeys(case.group for case in all_cases)))
     if names or groups:
-        return tuple(case for case in every if case.name in names or case.group in groups)
-    return tuple(case for case in every if case.quick or everything)
+        return tuple(case for case in all_cases if case.name in names or case.group in groups)
+    return tuple(case for case in all_cases if case.quick or everything)
 
 
-def _check(what: str, given: Sequence[str], known: Sequence[str]) -> None:
-    for name in given:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
-            raise InputError(f"unknown {what} '{name}'; did you mean '{near}'?")
+def _check_names(kind: str, names: Sequence[str], allowed: Sequence[str]) -> None:
+    for name in names:
+        if name not in allowed:
+            near = difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
+            raise InputError(f"unknown {kind} '{name}'; did you mean '{near}'?")

@@ -1,4 +1,4 @@
-"""Cases of features: at the borders, of one vertex, far apart, empty at times, everywhere."""
+"""Cases of features: at borders, of one vertex, far apart, empty at times, everywhere."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["CASES"]
 Values = npt.NDArray[Any]
 
 INSIDE = "interval:10:30"
-"""What `_marked` lifts there."""
+"""The interval into which `_lifted` lifts the values of the feature."""
 
 
 def _case(
@@ -41,13 +41,13 @@ def _case(
     )
 
 
-def _marked(where: Callable[..., Values]) -> Callable[[], Values]:
-    """Waves in 0..1, lifted to 10..11 in the feature."""
+def _lifted(where: Callable[..., Values]) -> Callable[[], Values]:
+    """Waves in 0..1, lifted to 10..11 at the vertices that `where(t, z, y, x)` selects."""
     return lambda: np.where(where(*lattice()), 10.0, 0.0) + waves()
 
 
 def _borders(t: Values, z: Values, y: Values, x: Values) -> Values:
-    ends = [(part == 0) | (part == n - 1) for part, n in zip((z, y, x), SHAPE[1:], strict=True)]
+    ends = [(index == 0) | (index == n - 1) for index, n in zip((z, y, x), SHAPE[1:], strict=True)]
     return np.asarray(np.logical_or.reduce(ends))
 
 
@@ -61,13 +61,13 @@ def _vertex(t: Values, z: Values, y: Values, x: Values) -> Values:
 
 
 def _ends(t: Values, z: Values, y: Values, x: Values) -> Values:
-    """Two vertices that span the whole domain."""
+    """Selects two opposite corners, so that the bounding box is the whole domain."""
     return np.asarray(((z == 0) & (y == 0) & (x == 0)) | ((z == 8) & (y == 9) & (x == 10)))
 
 
 def _with_holes() -> Values:
-    """The feature meets what is missing."""
-    values = _marked(lambda t, z, y, x: x > 4)()
+    """A feature that touches missing values."""
+    values = _lifted(lambda t, z, y, x: x > 4)()
     t, _, y, x = lattice()
     values[(y == 5) | ((t == 2) & (x < 6))] = np.nan
     return values
@@ -76,35 +76,38 @@ def _with_holes() -> Values:
 KEYS = EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0,2,3", tables="transform")
 
 CASES: tuple[Case, ...] = (
-    _case("at-every-border", "a feature that is the surface of the domain", _marked(_borders)),
+    _case("at-every-border", "a feature that is the surface of the domain", _lifted(_borders)),
     _case(
-        "at-every-border-grown", "the same, grown beyond the domain", _marked(_borders), dilation=64
+        "at-every-border-grown",
+        "the surface of the domain, grown beyond the domain",
+        _lifted(_borders),
+        dilation=64,
     ),
-    _case("one-vertex", "a feature of one vertex that moves", _marked(_vertex)),
+    _case("one-vertex", "a feature of one vertex that moves", _lifted(_vertex)),
     _case(
-        "one-vertex-grown", "a feature of one vertex, grown by one", _marked(_vertex), dilation=1
+        "one-vertex-grown", "a feature of one vertex, grown by one", _lifted(_vertex), dilation=1
     ),
-    _case("opposite-corners", "in opposite corners in turns", _marked(_corners)),
-    _case("whole-box", "two vertices whose bounding box is the domain", _marked(_ends)),
+    _case("opposite-corners", "a feature in opposite corners in turn", _lifted(_corners)),
+    _case("whole-box", "two vertices whose bounding box is the domain", _lifted(_ends)),
     _case("everything", "an interval that holds all values", waves, ("interval:-1:2",)),
     _case(
         "empty-key-frames",
-        "nothing to be kept in some of the key frames",
-        _marked(lambda t, z, y, x: (t == 2) & (x > 3)),
+        "a feature that is empty in some key frames",
+        _lifted(lambda t, z, y, x: (t == 2) & (x > 3)),
         settings={**QUICK, "paper-keys": KEYS},
     ),
     _case(
         "one-key-frame-filled",
-        "the feature is there at the last step alone",
-        _marked(lambda t, z, y, x: (t == 3) & (y == 2)),
+        "a feature that exists only at the last step",
+        _lifted(lambda t, z, y, x: (t == 3) & (y == 2)),
     ),
     _case(
         "every-second-vertex",
-        "no two vertices of the feature touch",
-        _marked(lambda t, z, y, x: (t + z + y + x) % 2 == 0),
+        "a feature of which no two vertices touch",
+        _lifted(lambda t, z, y, x: (t + z + y + x) % 2 == 0),
     ),
     _case("beside-missing", "a feature that meets missing values", _with_holes, dilation=1),
-    _case("open-interval", "an interval without ends", waves, ("interval:-inf:inf",)),
+    _case("open-interval", "an interval from -inf to inf", waves, ("interval:-inf:inf",)),
     _case(
         "one-value", "an interval of one value", lambda: np.rint(10 * waves()), ("interval:5:5",)
     ),
@@ -120,14 +123,14 @@ CASES: tuple[Case, ...] = (
     ),
     _case(
         "segmented-step",
-        "a threshold found in values of two kinds",
-        _marked(lambda t, z, y, x: x > 5),
+        "segmentation of values that form two clusters",
+        _lifted(lambda t, z, y, x: x > 5),
         ("segmentation",),
         1,
     ),
     _case(
         "nothing-selected",
-        "refused: the feature is nowhere",
+        "refused: the feature selects no vertex",
         waves,
         ("interval:5:6",),
         more={},

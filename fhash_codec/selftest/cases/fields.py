@@ -1,4 +1,4 @@
-"""Small fields that cases are made from, and series of them. Axes (t, z, y, x)."""
+"""Small fields from which cases are made, and series of them. All arrays are (t, z, y, x)."""
 
 from __future__ import annotations
 
@@ -11,29 +11,30 @@ from fhash_formats.series import AXIS_NAMES, ArraySeries, Coordinate
 
 __all__ = ["SHAPE", "lattice", "noise", "series", "waves"]
 
-Four = tuple[int, int, int, int]
+Shape = tuple[int, int, int, int]
 Floats = npt.NDArray[np.float64]
 
-SHAPE: Four = (4, 9, 10, 11)
-"""Of most cases: 3,960 values, no length a power of two but that of time."""
+SHAPE: Shape = (4, 9, 10, 11)
+"""Shape (t, z, y, x) of most cases: 3,960 values; only the number of steps is a power of two."""
 
 
-def lattice(shape: Four = SHAPE) -> tuple[Floats, Floats, Floats, Floats]:
-    """The indices t, z, y and x of every vertex."""
+def lattice(shape: Shape = SHAPE) -> tuple[Floats, Floats, Floats, Floats]:
+    """The indices t, z, y and x of every vertex, each as an array of the given shape."""
     t, z, y, x = np.meshgrid(*(np.arange(float(n)) for n in shape), indexing="ij")
     return t, z, y, x
 
 
-def waves(shape: Four = SHAPE) -> Floats:
-    """A smooth moving field with values in 0..1, both ends among them where the shape has more than one value."""
-    t, z, y, x = (part / max(n - 1, 1) for part, n in zip(lattice(shape), shape, strict=True))
+def waves(shape: Shape = SHAPE) -> Floats:
+    """A smooth moving field with values in 0..1; 0 and 1 both occur unless the shape has one value
+    only."""
+    t, z, y, x = (index / max(n - 1, 1) for index, n in zip(lattice(shape), shape, strict=True))
     values = np.sin(5 * x + 3 * t) * np.cos(4 * y) + z
     low, high = values.min(), values.max()
     return np.asarray((values - low) / (high - low if high > low else 1.0))
 
 
-def noise(shape: Four = SHAPE, seed: int = 0) -> Floats:
-    """White noise, normal with deviation 1."""
+def noise(shape: Shape = SHAPE, seed: int = 0) -> Floats:
+    """White noise from a normal distribution with standard deviation 1."""
     return np.random.default_rng(seed).standard_normal(shape)
 
 
@@ -44,7 +45,14 @@ def series(
     units: str = "1",
     **axes: Floats,
 ) -> ArraySeries:
-    """A series in memory. times: of its steps. axes: positions along z, y or x; those left out are 0, 1, 2, ..."""
+    """A series in memory.
+
+    Args:
+        values: values (t, z, y, x).
+        times: times of the steps in hours; without them the series has no times.
+        units: unit of the values.
+        axes: positions along z, y or x; an axis that is left out has the positions 0, 1, 2, ...
+    """
     coords = {
         axis: Coordinate(name=AXIS_NAMES[axis], values=np.asarray(positions, dtype=np.float64))
         for axis, positions in axes.items()

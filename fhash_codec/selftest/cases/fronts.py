@@ -1,4 +1,5 @@
-"""Cases of fronts: noise, spikes, steps on and between vertices, fronts that move less than a vertex a step."""
+"""Cases of fronts: noise, spikes, steps on and between vertices, fronts that move less than one
+vertex per step."""
 
 from __future__ import annotations
 
@@ -52,12 +53,13 @@ def _spikes() -> Values:
 
 
 def _step(place: float) -> Callable[[], Values]:
-    """0 before a place along x, 1 behind it, a half on it."""
+    """A step along x: 0 before `place`, 1 behind it, 0.5 on it."""
     return lambda: np.heaviside(lattice()[3] - place, 0.5)
 
 
 def _front(speed: float, width: float) -> Callable[[], Values]:
-    """A plane front across all axes that moves so many vertices a step."""
+    """A plane front, oblique to all axes, that moves `speed` vertices per step and is `width`
+    vertices wide."""
 
     def make() -> Values:
         t, z, y, x = lattice()
@@ -86,11 +88,17 @@ CASES: tuple[Case, ...] = (
         "the sign changes with every step",
         lambda: (-1) ** lattice()[0] * (1 + lattice()[3]),
     ),
-    _case("white-noise", "nothing can be foretold", noise),
-    _case("white-noise-float64", "nothing can be foretold", noise, dtype="float64", quick=False),
+    _case("white-noise", "white noise: no value can be predicted", noise),
+    _case(
+        "white-noise-float64",
+        "white noise: no value can be predicted",
+        noise,
+        dtype="float64",
+        quick=False,
+    ),
     _case(
         "white-noise-int16",
-        "nothing can be foretold",
+        "white noise: no value can be predicted",
         lambda: 1e4 * noise(),
         {**QUICK, **EXACT},
         dtype="int16",

@@ -1,4 +1,8 @@
-"""Cases of one field in many guises: scaled, shifted, negated, flipped along each axis, its axes exchanged; the errors stay the same."""
+"""Cases of one field in many guises: scaled, shifted, negated, flipped along each axis, with
+exchanged axes.
+
+The errors must stay the same in every guise.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ import numpy.typing as npt
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
 from fhash_codec.selftest.case import Case, Finding, Run
-from fhash_codec.selftest.cases.fields import Four, noise, series, waves
+from fhash_codec.selftest.cases.fields import Shape, noise, series, waves
 from fhash_codec.selftest.cases.settings import Settings
 from fhash_codec.volume import open as open_volume
 from fhash_formats.series import ArraySeries
@@ -21,35 +25,50 @@ __all__ = ["CASES"]
 
 Values = npt.NDArray[Any]
 
-SHAPE: Four = (4, 9, 10, 12)
+SHAPE: Shape = (4, 9, 10, 12)
 POWERS = (2.0, 2.0**-20, 2.0**40)
-"""Factors that change no digit of a float32, and so nothing that is decided by digits."""
+"""Factors that change the exponent of a float32 but none of its digits, so no decision of the
+encoder changes."""
 AFFINE = ((3.0, 0.0), (1.0, 1.0), (0.7, 0.3), (1000.0, -500.0))
-"""Factors and shifts that round each value anew, by 2^-24 of the largest: a search for a promise may end one step earlier or later."""
-DECIBELS = 0.5
-"""By which a promised PSNR may be passed differently: a step of the quantiser is searched to within some 0.25 dB. Measured: 0.23 dB."""
-BYTES = 0.06
-"""Of the size. The transform begins at the first vertex of a tile: what is left over lies at the other end of a flipped one, and its
-context models see the signs and coefficients in another order. Measured: 2.5 %."""
-SEARCHED_BYTES = 0.3
-"""From effort 2 on the transform is chosen by trial on a sample, from 5 on a head is trained from a random start: a field in another guise
-may fall on the other side of a choice. Measured: 17 %, of no more than 0.25 dB."""
+"""Factors and shifts that round each value anew, by up to 2^-24 of the largest value. The search
+for a promised quality may then end one step earlier or later."""
+MAX_PSNR_DIFFERENCE = 0.5
+"""Allowed difference of the PSNR between two guises, in dB. The search for the quantiser's step
+resolves about 0.25 dB. The largest measured difference is 0.23 dB."""
+MAX_SIZE_DIFFERENCE = 0.06
+"""Allowed difference of the sizes of two guises, as a share of the size.
+
+The transform begins at the first vertex of a tile, so a flipped tile has its incomplete end at the
+other side, and its context models see signs and coefficients in another order. The largest measured
+difference is 2.5 %.
+"""
+MAX_SIZE_DIFFERENCE_BY_TRIAL = 0.3
+"""Allowed difference of the sizes of two guises for settings that search by trial, as a share.
+
+From effort 2 on, the transform is chosen by trial on a sample; from effort 5 on, a head is trained
+from a random start. Another guise may lead to another choice. The largest measured difference is
+17 %, at a difference of no more than 0.25 dB.
+"""
 SEEDS = range(1, 4)
-BELOW_SEEDS = 6.0
-"""dB below the worst of other random starts, by which a flipped training may end: a guise is one more random start, and a few of them
-are 10 dB apart, whatever the field."""
+"""Seeds of the trainings to compare with."""
+MAX_BELOW_SEEDS = 6.0
+"""Allowed loss of a flipped training, in dB below the worst of some other seeds.
+
+A guise acts like one more random start, and some random starts differ by 10 dB, whatever the field.
+"""
 
 
 def powers_of_two(run: Run) -> Iterator[Finding]:
-    """Values times a power of two: the same bytes but for the header, and errors that are the same times that power, bit for bit."""
+    """Values times a power of two give arrays of the same size, and errors times the same power,
+    bit for bit."""
     values = run.values.astype(np.float32)
     error = run.decoded - values.astype(np.float64)
     for factor in POWERS:
         other, size = _encoded(run, values * np.float32(factor), factor)
-        unlike = np.count_nonzero((other.astype(np.float64) / factor - values) != error)
+        unequal = np.count_nonzero((other.astype(np.float64) / factor - values) != error)
         yield Finding(
             name="times a power of two",
-            worst=float(unlike),
+            worst=float(unequal),
             limit=0.0,
             unit="errors",
             under=f"{factor:g}",
@@ -64,14 +83,16 @@ def powers_of_two(run: Run) -> Iterator[Finding]:
 
 
 def affine(run: Run) -> Iterator[Finding]:
-    """Values times a factor and shifted: the same errors to rounding of the source, or one step of a search apart."""
+    """Scaled and shifted values give the same errors up to the rounding of the source, or differ by
+    one step of the quality search."""
     for factor, shift in AFFINE:
         values = run.values.astype(np.float32) * np.float32(factor) + np.float32(shift)
         other, size = _encoded(run, values, factor)
         under = f"{factor:g} x + {shift:g}"
         yield from _alike(run, values, other, size, under)
         if run.config.max_error_rel is not None:
-            # Nothing is searched: every value is rounded to the same step, but for those between two steps.
+            # Without a search, each value is rounded to the same step, unless it lies halfway
+            # between two steps.
             error = (run.decoded - run.values.astype(np.float64)) / run.data_range
             apart = np.abs((other - values.astype(np.float64)) / _range(values) - error)
             worst = float(np.quantile(apart, 0.99))
@@ -85,7 +106,8 @@ def affine(run: Run) -> Iterator[Finding]:
 
 
 def guises(run: Run) -> Iterator[Finding]:
-    """Values negated, flipped along each axis, and with axes exchanged: the same quality, and nearly the same size."""
+    """Values that are negated, flipped or have exchanged axes give the same quality and nearly the
+    same size."""
     seeds = (
         [_quality(run.values, _encoded(run, run.values, 1.0, seed=seed)[0]) for seed in SEEDS]
         if run.config.profile == "paper"
@@ -94,7 +116,7 @@ def guises(run: Run) -> Iterator[Finding]:
     for under, values in _guises(run.values):
         other, size = _encoded(run, np.ascontiguousarray(values), 1.0)
         if seeds:
-            least = min(*seeds, _quality(run.values, run.decoded)) - BELOW_SEEDS
+            least = min(*seeds, _quality(run.values, run.decoded)) - MAX_BELOW_SEEDS
             yield Finding(
                 name="flipped, PSNR",
                 worst=least - _quality(values, other),
@@ -119,13 +141,27 @@ def _guises(values: Values) -> Iterator[tuple[str, Values]]:
 
 
 def _alike(run: Run, values: Values, other: Values, size: int, under: str) -> Iterator[Finding]:
-    """Quality and size beside those of the run; a bound is kept strictly, which the figures of every encoding say."""
+    """Differences in quality and size from the run. A strict bound must hold in every guise.
+
+    Args:
+        run: the run with the original values.
+        values: the values in another guise.
+        other: those values, decoded.
+        size: bytes of their arrays.
+        under: name of the guise.
+    """
     apart = abs(_quality(values, other) - _quality(run.values, run.decoded))
     yield Finding(
-        name="same PSNR in any guise", worst=apart, limit=DECIBELS, unit="dB", under=under
+        name="same PSNR in any guise",
+        worst=apart,
+        limit=MAX_PSNR_DIFFERENCE,
+        unit="dB",
+        under=under,
     )
     allowed = (
-        SEARCHED_BYTES if run.config.effort >= 2 and run.config.profile == "compact" else BYTES
+        MAX_SIZE_DIFFERENCE_BY_TRIAL
+        if run.config.effort >= 2 and run.config.profile == "compact"
+        else MAX_SIZE_DIFFERENCE
     )
     yield Finding(
         name="same size in any guise",
@@ -147,7 +183,11 @@ def _alike(run: Run, values: Values, other: Values, size: int, under: str) -> It
 
 
 def _encoded(run: Run, values: Values, factor: float, **changes: Any) -> tuple[Values, int]:
-    """Other values with the settings of the run, an absolute bound times a factor: as decoded, and the bytes of the arrays."""
+    """The decoded values, and the bytes of the arrays, of other values under the settings of the
+    run.
+
+    An absolute bound is multiplied by `factor`; `changes` replace fields of the settings.
+    """
     config = replace(run.config, **changes)
     if config.max_error is not None:
         config = replace(config, max_error=config.max_error * factor)
@@ -165,7 +205,7 @@ def _range(values: Values) -> float:
 
 
 def _quality(values: Values, decoded: Values) -> float:
-    """PSNR in dB."""
+    """PSNR in dB, with the range of `values`."""
     error = (decoded - values.astype(np.float64)) / _range(values)
     return float(-10 * np.log10(np.mean(error**2)))
 
@@ -186,11 +226,21 @@ MORE: Settings = {
 
 CASES = (
     Case(
-        name="scaled-and-shifted", group="values", about="errors do not depend on the unit or the offset of the values", make=_make,
-        settings=QUICK, more=MORE, checks=(powers_of_two, affine),
+        name="scaled-and-shifted",
+        group="values",
+        about="errors do not depend on the unit or the offset of the values",
+        make=_make,
+        settings=QUICK,
+        more=MORE,
+        checks=(powers_of_two, affine),
     ),
     Case(
-        name="flipped-and-transposed", group="shapes", about="errors do not depend on signs, directions or the order of axes", make=_make,
-        settings=QUICK, more=MORE, checks=(guises,),
+        name="flipped-and-transposed",
+        group="shapes",
+        about="errors do not depend on signs, directions or the order of axes",
+        make=_make,
+        settings=QUICK,
+        more=MORE,
+        checks=(guises,),
     ),
-)  # fmt: skip
+)

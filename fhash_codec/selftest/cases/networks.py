@@ -1,4 +1,5 @@
-"""Cases of networks: their sizes, trainings that diverge, tables at the ends of their number type, kinks, engines and devices."""
+"""Cases of networks: sizes, diverging trainings, tables at the ends of their number type, kinks,
+engines, devices."""
 
 from __future__ import annotations
 
@@ -90,7 +91,7 @@ CASES = (
     ),
     _case(
         "embeddings",
-        "1 to 8 numbers at each corner",
+        "embeddings of 1 to 8 numbers",
         _sizes("embedding_size", (1, 8)),
         agrees,
         gradients,
@@ -98,14 +99,14 @@ CASES = (
     ),
     _case(
         "widths",
-        "layers of one neuron, and about those of a kernel",
+        "layers of one neuron, and of widths around the size of a kernel",
         _sizes("width", (1, 65)),
         agrees,
         more=_sizes("width", (2, 63, 64, 257)),
     ),
     _case(
         "wild-rates",
-        "rates at which training diverges: found, begun again at a lower one, told",
+        "learning rates at which training diverges: it restarts at a lower one and says so",
         {"2-layers-rate-1": WILD["2-layers-rate-1"]},
         recovered,
         diverged,
@@ -118,7 +119,7 @@ CASES = (
     ),
     _case(
         "rates-on-the-edge",
-        "rates that may diverge or not: what is written is better than a constant",
+        "learning rates at which training may diverge: the result is better than a constant",
         {"1-layers-rate-0.3": WILD["1-layers-rate-0.3"]},
         recovered,
         more={
@@ -130,7 +131,7 @@ CASES = (
     ),
     _case(
         "barely-trained",
-        "embeddings as small as at the start",
+        "embeddings as small as at the start of training",
         {
             tables: replace(PLAIN, epochs=1, learning_rate=1e-8, tables=tables)
             for tables in ("float16", "uint8")
@@ -143,7 +144,7 @@ CASES = (
     ),
     _case(
         "ends-of-tables",
-        "embeddings beyond float16, at its ends, constant and tiny",
+        "embeddings beyond the range of float16, at its ends, constant and tiny",
         {"float16": PLAIN},
         ends_of_half_precision,
         large_tables,
@@ -170,7 +171,7 @@ CASES = (
     ),
     _case(
         "engines-on-noise",
-        "two engines and two devices where everything differs",
+        "two engines and two devices train one network on noise",
         {"1-layer": EXACT},
         engines,
         devices,
@@ -179,7 +180,7 @@ CASES = (
     ),
     _case(
         "spike-in-a-network",
-        "one vertex apart from all others",
+        "one vertex that differs from all others",
         {"2-layers": replace(PLAIN, hidden_layers=2)},
         agrees,
         make=_spike,

@@ -1,4 +1,5 @@
-"""Cases of rays: opacities and steps at their ends, rays along faces, edges and through corners, cameras near and far, hard volumes."""
+"""Cases of rays: extreme opacities and steps, rays along faces and edges and through corners,
+cameras near and far, volumes of hard shapes."""
 
 from __future__ import annotations
 
@@ -9,14 +10,14 @@ import numpy as np
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.selftest.case import Case, Check
-from fhash_codec.selftest.cases.fields import Four, series, waves
+from fhash_codec.selftest.cases.fields import Shape, series, waves
 from fhash_codec.selftest.cases.settings import Settings
 from fhash_codec.selftest.checks.ray_checks import blocks, closed_form, key_times, scene, scenes
 from fhash_formats.series import ArraySeries
 
 __all__ = ["CASES"]
 
-SHAPE: Four = (2, 7, 6, 5)
+SHAPE: Shape = (2, 7, 6, 5)
 BOUND: Settings = {"bound": EncodeConfig(max_error_rel=1e-3, effort=1)}
 EXACT: Settings = {"exact": EncodeConfig(max_error=0.0, effort=1)}
 NETWORK: Settings = {"paper": EncodeConfig(profile="paper", width=8, epochs=30)}
@@ -29,7 +30,7 @@ def _waves() -> ArraySeries:
     return series(waves(SHAPE).astype(np.float32))
 
 
-def _of(values: Callable[[], np.ndarray[Any, Any]], **axes: Any) -> Callable[[], ArraySeries]:
+def _placed(values: Callable[[], np.ndarray[Any, Any]], **axes: Any) -> Callable[[], ArraySeries]:
     return lambda: series(values(), **axes)
 
 
@@ -39,12 +40,12 @@ def _scaled(
     return lambda: series((waves(SHAPE) * factor + offset).astype(dtype))
 
 
-def _shaped(shape: Four) -> Callable[[], ArraySeries]:
+def _shaped(shape: Shape) -> Callable[[], ArraySeries]:
     return lambda: series(waves(shape).astype(np.float32))
 
 
 def _constant() -> ArraySeries:
-    """One value but for a far corner, so that there is a range."""
+    """A volume that is 1 everywhere."""
     return series(np.ones((1, 2, 3, 3), np.float32))
 
 
@@ -53,7 +54,8 @@ def _even(origin: float, spacing: float, length: int) -> np.ndarray[Any, np.dtyp
 
 
 def _stairs() -> ArraySeries:
-    """Whole numbers: every surface of a whole number goes through vertices, and lies along whole faces of cells."""
+    """Integer values: every isosurface of an integer passes through vertices and coincides with
+    faces of cells."""
     t, z, y, x = np.meshgrid(*(np.arange(n) for n in SHAPE), indexing="ij")
     return series((np.maximum(np.maximum(z, y), x) + t).astype(np.float32))
 
@@ -80,7 +82,8 @@ def _case(
 
 
 def _grid_camera(view: str) -> dict[str, Any]:
-    """Seen along an axis with a parallel projection of 9 x 9 pixels, one vertex apart: rays through vertices, along edges and faces."""
+    """A parallel camera along an axis with 9 x 9 pixels, one vertex apart: rays hit vertices, edges
+    and faces."""
     across = {"x": 5, "y": 6, "z": 7}
     return {
         "view": view,
@@ -102,6 +105,7 @@ def _towards(
 
 
 FAR = 1e6 * 10.0
+"""A distance of a million times the size of the volume."""
 CAMERAS = {
     "inside": _towards((2.1, 2.7, 3.2), (4.0, 1.0, 6.0)),
     "on-a-vertex": _towards((2.0, 3.0, 3.0), (4.0, 1.0, 6.0)),
@@ -144,7 +148,7 @@ RANGE = {
 CASES = (
     _case(
         "opacity-1",
-        "opaque values, alone and beside clear ones",
+        "opaque values, alone and beside transparent ones",
         scenes(
             {
                 "everywhere": scene(transfer_function={"opacity": [[0.0, 1.0]]}),
@@ -159,7 +163,7 @@ CASES = (
     ),
     _case(
         "opacity-0",
-        "next to nothing is seen, and nothing but a clear surface",
+        "volumes that are hardly visible, and a fully transparent surface",
         scenes(
             {
                 "thin": scene(transfer_function={"opacity": [[0.0, 0.0], [1.0, 1e-9]]}),
@@ -174,7 +178,7 @@ CASES = (
     ),
     _case(
         "tiny-steps",
-        "a million samples a ray add up to what they stand for",
+        "a million samples of each ray add up to the closed form",
         closed_form(
             {
                 "step-1e-6": scene(
@@ -225,7 +229,7 @@ CASES = (
     ),
     _case(
         "cameras",
-        "the camera inside, on a face, an edge, a corner, and a million sizes away",
+        "a camera inside the volume, on a face, edge or corner, and a million sizes away",
         scenes(
             {name: scene(camera=camera, transfer_function=FOG) for name, camera in CAMERAS.items()}
         ),
@@ -234,7 +238,8 @@ CASES = (
         _case(
             f"spacing-{name}",
             "cells of extreme shape",
-            # An odd number of pixels: a ray through the middle hits the thinnest side. Long steps: a needle has 10^7 of the usual ones.
+            # An odd number of pixels, so that a ray through the middle hits the thinnest side. Long
+            # steps, since a needle takes 10^7 of the usual ones.
             scenes(
                 {
                     view: scene(
@@ -246,7 +251,7 @@ CASES = (
                     for view in ("xy", "xz", "yz", "iso")
                 }
             ),
-            make=_of(
+            make=_placed(
                 lambda: waves(SHAPE).astype(np.float32),
                 z=_even(0, dz, 7),
                 y=_even(0, dy, 6),
@@ -263,9 +268,9 @@ CASES = (
     ),
     _case(
         "far-origin",
-        "positions whose offset is large beside the volume",
+        "positions far from the origin compared with the size of the volume",
         scenes({"iso": scene(transfer_function=FOG)}),
-        make=_of(
+        make=_placed(
             lambda: waves(SHAPE).astype(np.float32),
             z=_even(1e8, 1.0, 7),
             y=_even(-1e8, 0.5, 6),
@@ -275,7 +280,7 @@ CASES = (
     *(
         _case(
             f"drawn-range-{name}",
-            "a range of values at the ends of float32, or small beside its offset",
+            "a range of values at the ends of float32, or small compared with its offset",
             scenes(RANGE),
             make=_scaled(factor, offset, dtype),
         )
@@ -290,14 +295,14 @@ CASES = (
     ),
     _case(
         "surfaces-on-vertices",
-        "surfaces of exactly the values of vertices, of no less and of no more than there are",
+        "isosurfaces at exactly the values of vertices, from the smallest to above the largest",
         scenes(SURFACES),
         make=_stairs,
         settings=EXACT,
     ),
     _case(
         "surface-on-a-face",
-        "a surface of the value that a whole face of the volume has",
+        "an isosurface that coincides with a face of the volume",
         scenes(
             {
                 "6": scene(
@@ -347,7 +352,7 @@ CASES = (
     _case("blocks", "a volume cut in two at every layer, and put together again", blocks),
     _case(
         "pictures-at-key-times",
-        "pictures of steps by number and by time",
+        "pictures at key times, given by step and by time",
         key_times,
         settings={**BOUND, **NETWORK},
     ),

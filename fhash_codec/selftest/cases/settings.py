@@ -1,4 +1,5 @@
-"""Settings that many cases share: both profiles, every kind of promise, every type of tables; small networks and short trainings."""
+"""Settings that many cases share: both profiles, every kind of promise, every type of tables.
+Networks are small and trainings short."""
 
 from __future__ import annotations
 
@@ -32,9 +33,9 @@ MORE: Settings = {
     ),
     "paper-transform": EncodeConfig(profile="paper", width=8, epochs=20, tables="transform"),
 }
-"""Of the long set."""
+"""Additional settings of the long set."""
 
 
 def of_all(settings: Settings, **changes: Any) -> dict[str, EncodeConfig]:
-    """The same settings with something changed in each of them."""
+    """The same settings with the fields in `changes` replaced in each of them."""
     return {name: replace(config, **changes) for name, config in settings.items()}

@@ -1,4 +1,5 @@
-"""Cases of shapes: axes of one vertex, two, three and primes, extreme aspect ratios, tiles that do not fit, positions of all kinds."""
+"""Cases of shapes: axes of one vertex, two, three and primes, extreme aspect ratios, tiles that do
+not fit, hard positions."""
 
 from __future__ import annotations
 
@@ -9,13 +10,11 @@ import numpy as np
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.selftest.case import Case
-from fhash_codec.selftest.cases.fields import SHAPE, series, waves
+from fhash_codec.selftest.cases.fields import SHAPE, Shape, series, waves
 from fhash_codec.selftest.cases.settings import MORE, QUICK, Settings, of_all
 from fhash_formats.series import ArraySeries
 
 __all__ = ["CASES"]
-
-Four = tuple[int, int, int, int]
 
 ONE_KEY_FRAME: Settings = {
     "paper-first": EncodeConfig(profile="paper", width=8, epochs=5, key_frames="0"),
@@ -32,7 +31,7 @@ TILES: Settings = {
 TILES_OF_ONE: Settings = {"bound": EncodeConfig(max_error_rel=1e-2, effort=1, tile="1x1x1x1")}
 
 
-def _case(name: str, about: str, shape: Four, settings: Settings = QUICK, **rest: Any) -> Case:
+def _case(name: str, about: str, shape: Shape, settings: Settings = QUICK, **rest: Any) -> Case:
     make = _field(shape)
     return Case(
         name=name,
@@ -44,12 +43,12 @@ def _case(name: str, about: str, shape: Four, settings: Settings = QUICK, **rest
     )
 
 
-def _field(shape: Four) -> Callable[[], ArraySeries]:
+def _field(shape: Shape) -> Callable[[], ArraySeries]:
     return lambda: series(waves(shape).astype(np.float32))
 
 
 def _placed(name: str, about: str, **axes: Any) -> Case:
-    """Positions in space: decoding does not look at them, pictures do."""
+    """A case of positions in space. Decoding ignores them, rendering does not."""
 
     def make() -> ArraySeries:
         return series(waves().astype(np.float32), **axes)
@@ -105,14 +104,14 @@ CASES: tuple[Case, ...] = (
     _placed("tiny-positions", "vertices 1e-12 apart", z=1e-12 * Z, y=1e-12 * Y, x=1e-12 * X),
     _placed(
         "far-positions",
-        "positions whose distance float64 can hardly tell",
+        "positions whose spacing float64 can hardly resolve",
         z=1e9 + 1e-6 * Z,
         y=1e9 + 1e-6 * Y,
         x=1e9 + 1e-6 * X,
     ),
     _placed(
         "flat-positions",
-        "distances that differ by a factor of a million",
+        "spacings that differ by a factor of a million",
         z=1e-3 * Z,
         y=Y,
         x=1e3 * X,
@@ -123,7 +122,7 @@ CASES: tuple[Case, ...] = (
     ),
     _placed(
         "equal-positions",
-        "positions that are all the same, or not numbers",
+        "positions that are all equal, or NaN",
         z=0 * Z,
         y=np.full(SHAPE[2], np.nan),
         x=X,

@@ -1,4 +1,5 @@
-"""Cases of times: uneven, tiny, huge, descending, repeated, and asked for outside of the series."""
+"""Cases of times: uneven, tiny, huge, descending and repeated times, and requests outside the
+series."""
 
 from __future__ import annotations
 
@@ -19,6 +20,7 @@ from fhash_formats.series import ArraySeries
 __all__ = ["CASES"]
 
 STEPS = 6
+"""Steps of the series."""
 SETTINGS: Settings = {
     "bound": COMPACT["bound"],
     **PAPER,
@@ -49,7 +51,7 @@ def _case(
 
 
 def _outside(run: Run) -> Iterator[Finding]:
-    """Steps and times before and after the series are refused, wherever they are asked for."""
+    """Steps and times before and after the series are refused by every call that takes them."""
     volume, times = run.volume, run.series.coords["t"].values
     last = volume.shape[0] - 1
     low, high = sorted((float(times[0]), float(times[-1])))
@@ -84,21 +86,23 @@ CASES: tuple[Case, ...] = (
     _case("uneven", "steps from 1e-3 to 1e3 long", np.cumsum([0, 1e-3, 1, 1e3, 0.5, 30])),
     _case("tiny", "steps of 1e-12", 1e-12 * EVEN),
     _case("denormal", "steps of the smallest number", 5e-324 * EVEN),
-    _case("huge", "3.5e5 hours and on", 3.5e5 + EVEN),
+    _case("huge", "times from 3.5e5 hours on", 3.5e5 + EVEN),
     _case(
         "huge-and-fine",
-        "times of which float64 can tell no two more between",
+        "times that are consecutive float64 numbers",
         np.array([3.5e5 + 2.0**-34 * n for n in range(STEPS)]),
     ),
     _case("descending", "times that run backwards", 10 - EVEN**2),
     _case("negative", "times before the epoch", -1e9 + 3600 * EVEN),
     _case("both-ends", "times from -1.7e308 to 1.7e308", 1.7e308 * np.linspace(-1, 1, STEPS), ENDS),
     _case(
-        "repeated", "a time that comes twice: steps stand for times", np.array([0.0, 1, 1, 2, 3, 4])
+        "repeated",
+        "a repeated time: step numbers replace the times",
+        np.array([0.0, 1, 1, 2, 3, 4]),
     ),
     _case(
         "not-a-time",
-        "times that are no numbers: steps stand for them",
+        "times that are NaN or infinite: step numbers replace them",
         np.array([0.0, 1, np.nan, np.inf, 4, 5]),
     ),
     _case(

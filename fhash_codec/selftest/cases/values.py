@@ -1,4 +1,5 @@
-"""Cases of values: constants, extremes of every number type, denormals, what is missing and what is infinite."""
+"""Cases of values: constants, extremes of every number type, denormals, missing and infinite
+values."""
 
 from __future__ import annotations
 
@@ -50,13 +51,14 @@ def _one_ulp() -> Values:
 
 
 def _magnitudes(exponent: float, dtype: str) -> Values:
-    """Of both signs, evenly spread over the exponents."""
+    """Values of both signs, spread evenly over the exponents from -`exponent` to `exponent` (base
+    10)."""
     sign = np.where(noise(seed=1) > 0, 1.0, -1.0)
     return np.asarray(sign * 10.0 ** (exponent * (2 * waves() - 1)), dtype=dtype)
 
 
 def _denormals(dtype: str) -> Values:
-    """Whole multiples of the smallest number."""
+    """Integer multiples of the smallest positive number of the dtype."""
     return np.asarray(np.rint(1000 * waves()) * np.finfo(dtype).smallest_subnormal, dtype=dtype)
 
 
@@ -103,15 +105,16 @@ def _one_finite() -> Values:
 
 
 def _integers(dtype: str) -> Callable[[], Values]:
-    """Smooth over the whole type, both ends among the values, and noise of the whole type in one corner."""
+    """A smooth field over all values of the dtype, both ends included, with noise over all values
+    in one corner."""
 
     def make() -> Values:
         limits = np.iinfo(dtype)
-        part = np.asarray(
+        shares = np.asarray(
             [round(share * 2**52) for share in waves().ravel().tolist()], dtype=object
         )
         values = np.asarray(
-            limits.min + part * (int(limits.max) - int(limits.min)) // 2**52, dtype=dtype
+            limits.min + shares * (int(limits.max) - int(limits.min)) // 2**52, dtype=dtype
         ).reshape(SHAPE)
         values[:, :3, :3, :3] = np.random.default_rng(0).integers(
             limits.min, limits.max, (SHAPE[0], 3, 3, 3), dtype=dtype, endpoint=True
@@ -126,7 +129,7 @@ def _largest_whole() -> Values:
 
 
 def _beyond_floats() -> Values:
-    """Whole numbers near 2^62 that differ by less than float64 can tell."""
+    """Integers near 2^62 that differ by less than float64 can represent."""
     return np.asarray(2**62 + np.rint(200 * waves()).astype(np.int64), dtype=np.int64)
 
 
@@ -140,7 +143,8 @@ def _declared() -> Values:
 
 
 def _from_file() -> Series:
-    """What a reader makes of a file whose attributes say something of its values."""
+    """The series that a reader makes of a file whose attributes declare a fill value and a valid
+    range."""
     import zarr
 
     from fhash_formats import open_series
@@ -157,7 +161,7 @@ def _from_file() -> Series:
 
 
 def _declared_values(run: Run) -> Iterator[Finding]:
-    """The fill value is missing; what lies outside of `valid_range` is data, as in xarray."""
+    """The fill value is missing; values outside `valid_range` are data, as in xarray."""
     expected = np.where(_declared() == -999, np.nan, _declared())
     wrong = np.count_nonzero(
         ~((run.values == expected) | (np.isnan(run.values) & np.isnan(expected)))
@@ -170,7 +174,8 @@ LOSSLESS: Settings = {**COMPACT, **EXACT}
 COUNTED: Settings = {**LOSSLESS, "one": EncodeConfig(max_error=1.0, effort=2), **PAPER}
 WIDE: Settings = {"wide": EncodeConfig(max_error=512.0, effort=2), **PAPER}
 OF_64_BITS: Settings = {**COMPACT, "wide": EncodeConfig(max_error=1024.0, effort=2), **PAPER}
-"""For whole numbers that float64, in which volumes give them, has not: a bound of its rounding."""
+"""Settings for 64-bit integers. Volumes return them as float64, so the bound covers the rounding to
+float64."""
 
 CASES: tuple[Case, ...] = (
     _case(
@@ -184,7 +189,7 @@ CASES: tuple[Case, ...] = (
     ),
     _case(
         "constant-float64",
-        "a constant that float32 has not comes back exactly",
+        "a constant that float32 cannot represent comes back exactly",
         _constant(1e8 + 1e-3, "float64"),
     ),
     _case(
@@ -197,17 +202,21 @@ CASES: tuple[Case, ...] = (
     ),
     _case(
         "constant-uint64",
-        "the largest whole number that float64 has",
+        "the largest 64-bit integer that float64 can represent",
         lambda: np.full(SHAPE, 2**64 - 2048, dtype=np.uint64),
     ),
     _case(
         "constant-uint64-beyond",
-        "the largest whole number, which float64 has not",
+        "the largest 64-bit integer, which float64 cannot represent",
         _largest_whole,
         {**PAPER, **WIDE},
         more={},
     ),
-    _case("nearly-constant-float32", "1e8 but for one vertex that is the next number", _one_ulp),
+    _case(
+        "nearly-constant-float32",
+        "1e8 everywhere but at one vertex, which has the next float32",
+        _one_ulp,
+    ),
     _case(
         "nearly-constant-float64",
         "1e8 + 1e-3: a range of 1e-11 of the offset",
@@ -238,7 +247,7 @@ CASES: tuple[Case, ...] = (
     ),
     _case(
         "range-overflows",
-        "a range that float64 has not: -1.7e308 to 1.7e308",
+        "a range that overflows float64: -1.7e308 to 1.7e308",
         lambda: 1.7e308 * (2 * waves() - 1),
     ),
     _case(
@@ -248,10 +257,16 @@ CASES: tuple[Case, ...] = (
         quick=False,
     ),
     _case(
-        "denormals-float32", "denormals alone", lambda: _denormals("float32"), {**QUICK, **EXACT}
+        "denormals-float32",
+        "denormal numbers only",
+        lambda: _denormals("float32"),
+        {**QUICK, **EXACT},
     ),
     _case(
-        "denormals-float64", "denormals alone", lambda: _denormals("float64"), {**QUICK, **EXACT}
+        "denormals-float64",
+        "denormal numbers only",
+        lambda: _denormals("float64"),
+        {**QUICK, **EXACT},
     ),
     _case(
         "denormals-and-ordinary", "denormals beside values of order 1", _denormals_beside_ordinary
@@ -259,7 +274,7 @@ CASES: tuple[Case, ...] = (
     _case("signed-zero", "0 and -0 alternate, one vertex is 1", _signed_zero, {**QUICK, **EXACT}),
     _case(
         "isolated-missing",
-        "single NaN, Inf and -Inf: missing there alone, NaN in their place",
+        "single NaN, Inf and -Inf: NaN at these vertices only",
         _isolated,
     ),
     _case(
@@ -316,14 +331,14 @@ CASES: tuple[Case, ...] = (
     ),
     _case(
         "beyond-float64",
-        "whole numbers near 2^62 that differ by less than float64 can tell",
+        "integers near 2^62 that differ by less than float64 can represent",
         _beyond_floats,
         WIDE,
         more={},
     ),
     _case(
         "beyond-float64-exactly",
-        "the same to be exact: the miss is said",
+        "integers near 2^62 with a bound of 0: the missed bound is reported",
         _beyond_floats,
         {**EXACT, **COMPACT},
         more={},
@@ -331,7 +346,7 @@ CASES: tuple[Case, ...] = (
     ),
     _case(
         "other-byte-order",
-        "values of the other byte order",
+        "values in the other byte order",
         lambda: waves().astype(np.dtype("float32").newbyteorder("S")),
     ),
     Case(

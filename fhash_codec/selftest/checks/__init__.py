@@ -1,1 +1,1 @@
-"""What must hold for every case of the self-test."""
+"""The properties that must hold for the cases of the self-test."""

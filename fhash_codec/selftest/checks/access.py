@@ -1,4 +1,4 @@
-"""Properties of reading: regions, key times, times between them, points, levels of detail."""
+"""Properties of reading: regions, key times, times between key times, points, levels of detail."""
 
 from __future__ import annotations
 
@@ -10,38 +10,44 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box, crop
+from fhash_codec.coreset.boxes import Box
 from fhash_codec.selftest.case import Finding, Run
 
 __all__ = ["CHECKS", "rounding"]
 
 Values = npt.NDArray[Any]
 
-REGIONS, POINTS = 6, 32
+N_REGIONS = 6
+"""Random regions of each run."""
+N_POINTS = 32
+"""Random vertices of each run that are sampled."""
 ROUNDING = 1e-5
-"""Of the range, by which a point of the paper profile may differ from the same vertex: float32 in another order."""
+"""Allowed difference between a point and the same vertex in profile paper, as a share of the range:
+float32 sums in another order."""
 WEIGHTS = (0.25, 0.5, 0.875)
+"""Positions between two steps, as shares of the distance between them."""
 
 
 def regions(run: Run) -> Iterator[Finding]:
-    """A region, at any step, holds the bits of that slice of the whole."""
+    """A region at any step has the same bits as that slice of all decoded values."""
     generator = _generator(run)
     wrong = 0
-    for _ in range(REGIONS):
+    for _ in range(N_REGIONS):
         step = int(generator.integers(run.values.shape[0]))
         region = _region(generator, run.volume.shape[1:])
-        wrong += _unlike(run.volume.read(step, region), crop(run.decoded[step], region))
+        wrong += _count_unequal(run.volume.read(step, region), run.decoded[step][region.slices()])
     t, z, y, x = (
         slice(*sorted(generator.integers(0, n + 1, 2).tolist())) for n in run.volume.shape
     )
-    wrong += _unlike(run.volume[t, z, y, x], run.decoded[t, z, y, x])
+    wrong += _count_unequal(run.volume[t, z, y, x], run.decoded[t, z, y, x])
     yield Finding(name="region = slice", worst=float(wrong), limit=0.0, unit="values")
 
 
 def key_times(run: Run) -> Iterator[Finding]:
-    """Times of the series lead back to their steps, and a whole number given as a float to the same bits."""
+    """Times of the series lead back to their steps, and a step given as a float reads the same
+    bits."""
     steps = range(run.volume.shape[0])
-    wrong = sum(_unlike(run.volume.read(float(step)), run.decoded[step]) for step in steps)
+    wrong = sum(_count_unequal(run.volume.read(float(step)), run.decoded[step]) for step in steps)
     times = run.volume.coords["t"].values
     if np.array_equal(run.volume.key_times.times, times):
         wrong += sum(run.volume.step_of_time(float(times[step])) != step for step in steps)
@@ -51,7 +57,8 @@ def key_times(run: Run) -> Iterator[Finding]:
 
 
 def between(run: Run) -> Iterator[Finding]:
-    """Between two steps values are finite where they count; of a compact file they lie evenly between those of the steps."""
+    """Values between two steps are finite in the coreset; in profile compact they are interpolated
+    linearly."""
     last = run.volume.shape[0] - 1
     if last == 0:
         return
@@ -63,11 +70,11 @@ def between(run: Run) -> Iterator[Finding]:
             read = run.volume.read(before + weight)
             lost += int(np.count_nonzero(np.isnan(read) == run.volume.occupancy(before + weight)))
             if run.volume.profile == "compact":
-                one, other, read = (
+                before_frame, after_frame, read = (
                     frame.astype(np.float64) / scale
                     for frame in (run.decoded[before], run.decoded[after], read)
                 )
-                off = np.abs(read - (one * (1 - weight) + other * weight))
+                off = np.abs(read - (before_frame * (1 - weight) + after_frame * weight))
                 worst = max(worst, float(np.nanmax(off, initial=0.0)))
     yield Finding(name="finite between steps", worst=float(lost), limit=0.0, unit="values")
     if run.volume.profile == "compact":
@@ -79,42 +86,42 @@ def between(run: Run) -> Iterator[Finding]:
 
 
 def points(run: Run) -> Iterator[Finding]:
-    """Samples at vertices are what `read` gives."""
+    """Samples at vertices equal the values that `read` returns."""
     generator = _generator(run)
-    t, z, y, x = (generator.integers(0, n, POINTS) for n in run.volume.shape)
-    found = np.asarray(run.volume.sample(t=t, z=z, y=y, x=x))
+    t, z, y, x = (generator.integers(0, n, N_POINTS) for n in run.volume.shape)
+    sampled = np.asarray(run.volume.sample(t=t, z=z, y=y, x=x))
     expected = run.decoded[t, z, y, x]
     yield Finding(
         name="points: finite as read",
-        worst=float(np.count_nonzero(np.isnan(found) != np.isnan(expected))),
+        worst=float(np.count_nonzero(np.isnan(sampled) != np.isnan(expected))),
         limit=0.0,
         unit="values",
     )
     if run.volume.profile == "compact":
-        wrong = np.count_nonzero((found != expected) & ~np.isnan(expected))
+        wrong = np.count_nonzero((sampled != expected) & ~np.isnan(expected))
         yield Finding(name="points = read", worst=float(wrong), limit=0.0, unit="values")
         return
     yield Finding(
         name="points = read",
-        worst=rounding(run, found, expected),
+        worst=rounding(run, sampled, expected),
         limit=1.0,
         unit="of 1e-5 of the range",
     )
 
 
 def levels_of_detail(run: Run) -> Iterator[Finding]:
-    """Level 0 is what `read` gives, coarser ones are finite where the vertices count."""
+    """Level 0 equals what `read` returns; coarser levels are finite at the vertices of the
+    coreset."""
     if run.volume.profile != "compact":
         return
+    box = run.volume.box.slices()
     wrong, lost = 0, 0
     for step in {0, run.volume.shape[0] - 1}:
-        wrong += _unlike(run.volume.read_lod(step, 0), crop(run.decoded[step], run.volume.box))
+        wrong += _count_unequal(run.volume.read_lod(step, 0), run.decoded[step][box])
         for lod in (1, 2):
             coarse = run.volume.read_lod(step, lod)
-            known = np.isfinite(
-                crop(run.decoded[step], run.volume.box)[(slice(None, None, 1 << lod),) * 3]
-            )
-            lost += int(np.count_nonzero(np.isfinite(coarse) != known))
+            in_coreset = np.isfinite(run.decoded[step][box][(slice(None, None, 1 << lod),) * 3])
+            lost += int(np.count_nonzero(np.isfinite(coarse) != in_coreset))
     yield Finding(name="level 0 = read", worst=float(wrong), limit=0.0, unit="values")
     yield Finding(name="coarse levels finite", worst=float(lost), limit=0.0, unit="values")
 
@@ -123,7 +130,10 @@ CHECKS = (regions, key_times, between, points, levels_of_detail)
 
 
 def rounding(run: Run, one: Values, other: Values) -> float:
-    """The largest difference in parts of what the paper profile may round: 1e-5 of the range, and two last digits of the type."""
+    """The largest difference of two arrays, as a multiple of what profile paper may round.
+
+    It may round 1e-5 of the range, plus the epsilon of the dtype times the largest value.
+    """
     kind = np.finfo(run.decoded.dtype)
     low, high = (end / 2 for end in (run.volume.value_range.low, run.volume.value_range.high))
     allowed = (
@@ -131,13 +141,13 @@ def rounding(run: Run, one: Values, other: Values) -> float:
         + float(kind.eps) * max(abs(low), abs(high))
         + float(kind.smallest_subnormal)
     )
-    # In halves, which do not overflow.
+    # Halves of the values, so that the difference does not overflow.
     off = np.abs(one.astype(np.float64) / 2 - other.astype(np.float64) / 2)
     return float(np.nanmax(off, initial=0.0)) / allowed
 
 
-def _unlike(one: Values, other: Values) -> int:
-    """How many bit patterns differ; all of them where the shapes or types do."""
+def _count_unequal(one: Values, other: Values) -> int:
+    """The number of values whose bits differ; all of them if the shapes or dtypes differ."""
     if one.shape != other.shape or one.dtype != other.dtype:
         return max(one.size, other.size, 1)
     kind = f"u{one.dtype.itemsize}"
@@ -149,7 +159,8 @@ def _unlike(one: Values, other: Values) -> int:
 
 
 def _generator(run: Run) -> np.random.Generator:
-    """The same numbers for a case and its settings on every run and machine."""
+    """A generator that gives the same numbers for a case and its settings on every run and
+    machine."""
     return np.random.default_rng(zlib.crc32(f"{run.case.name} {run.under}".encode()))
 
 
@@ -158,5 +169,4 @@ def _region(generator: np.random.Generator, shape: tuple[int, ...]) -> Box:
     for length in shape:
         low, high = sorted(generator.choice(length + 1, 2, replace=False).tolist())
         spans.append((int(low), int(high)))
-    z, y, x = spans
-    return z, y, x
+    return Box.of(spans)

@@ -1,4 +1,5 @@
-"""Properties of values: finite where they must be, missing where they must be, within the bound, the range and the promise."""
+"""Properties of values: finite or missing where they must be, within the bound, the range and the
+promise."""
 
 from __future__ import annotations
 
@@ -13,32 +14,34 @@ import numpy.typing as npt
 from fhash_codec.compact.goal import promise
 from fhash_codec.selftest.case import Finding, Run
 
-__all__ = ["CHECKS", "coreset", "largest_difference"]
+__all__ = ["CHECKS", "expected_coreset", "largest_difference"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
 
 def presence(run: Run) -> Iterator[Finding]:
-    """Every vertex of the coreset is finite, every other one NaN: Inf of the source is missing just like NaN."""
-    wanted = coreset(run)
+    """Every vertex of the coreset is finite, every other one is NaN. Infinite values of the source
+    are missing, just as NaN."""
+    in_coreset = expected_coreset(run)
     yield Finding(
         name="finite in the coreset",
-        worst=_count(wanted & ~np.isfinite(run.decoded)),
+        worst=_count(in_coreset & ~np.isfinite(run.decoded)),
         limit=0.0,
         unit="values",
     )
     yield Finding(
         name="NaN outside of it",
-        worst=_count(~wanted & ~np.isnan(run.decoded)),
+        worst=_count(~in_coreset & ~np.isnan(run.decoded)),
         limit=0.0,
         unit="values",
     )
 
 
 def bound(run: Run) -> Iterator[Finding]:
-    """The strict bound, in exact arithmetic; a bound of 0 by the number of values that differ."""
-    error = _bound_of(run)
+    """The strict bound holds in exact arithmetic. For a bound of 0, the number of differing values
+    is counted."""
+    error = _error_bound(run)
     if error is None:
         return
     worst = largest_difference(run.values, run.decoded, np.isfinite(run.decoded))
@@ -57,7 +60,8 @@ def bound(run: Run) -> Iterator[Finding]:
 
 
 def quality(run: Run) -> Iterator[Finding]:
-    """The PSNR that was promised, and that the figures in the file are no better than the truth."""
+    """The promised PSNR is reached, and the figures in the file are no better than the measured
+    ones."""
     where = np.isfinite(run.decoded)
     reached = _psnr(run, where)
     promised = (
@@ -70,7 +74,7 @@ def quality(run: Run) -> Iterator[Finding]:
     stated = run.volume.container.header["quality"]
     worst = largest_difference(run.values, run.decoded, where)
     if stated["max_abs_error"]:
-        # Differences of float64 are rounded while they are measured.
+        # The stated error is a difference of two float64, which is rounded.
         beyond = max(float(worst / Fraction(stated["max_abs_error"]) - 1), 0.0)
         yield Finding(
             name="beyond the stated error", worst=beyond, limit=1e-12, unit="of the stated error"
@@ -88,7 +92,7 @@ def quality(run: Run) -> Iterator[Finding]:
 
 
 def constants(run: Run) -> Iterator[Finding]:
-    """A constant series comes back exactly, as far as the type of the volume has the number."""
+    """A constant series comes back exactly, rounded to the dtype of the volume."""
     finite = run.values[np.isfinite(run.values)]
     if finite.min() == finite.max():
         same = run.values.astype(run.decoded.dtype) == run.decoded
@@ -101,7 +105,7 @@ def constants(run: Run) -> Iterator[Finding]:
 
 
 def within_range(run: Run) -> Iterator[Finding]:
-    """No decoded value lies beyond those of the series, by more than the bound where there is one."""
+    """Decoded values exceed the range of the series by no more than the bound."""
     finite = run.values[np.isfinite(run.values)]
     low, high = Fraction(finite.min().item()), Fraction(finite.max().item())
     decoded = run.decoded[np.isfinite(run.decoded)]
@@ -110,7 +114,7 @@ def within_range(run: Run) -> Iterator[Finding]:
     excess = max(
         low - Fraction(decoded.min().item()), Fraction(decoded.max().item()) - high, Fraction(0)
     )
-    allowed = _bound_of(run) or Fraction(0)
+    allowed = _error_bound(run) or Fraction(0)
     span = high - low if high > low else Fraction(1)
     yield Finding(
         name="beyond the range",
@@ -123,8 +127,12 @@ def within_range(run: Run) -> Iterator[Finding]:
 CHECKS = (presence, bound, quality, constants, within_range)
 
 
-def coreset(run: Run) -> Mask:
-    """The vertices (t, z, y, x) that have to be there, found anew for intervals; by the file's own mask for what values do not tell."""
+def expected_coreset(run: Run) -> Mask:
+    """The coreset as a mask (t, z, y, x).
+
+    It is computed here anew for features of intervals. Other features depend on the encoder's
+    choices, so the file's own occupancy is used for them.
+    """
     finite: Mask = np.isfinite(run.values)
     if "all" in run.config.features:
         return finite
@@ -132,23 +140,23 @@ def coreset(run: Run) -> Mask:
         return np.asarray([run.volume.occupancy(step) for step in range(run.values.shape[0])])
     selected = np.zeros(run.values.shape, dtype=bool)
     for feature in run.config.features:
-        low, high = (np.float64(part) for part in feature.split(":")[1:])
+        low, high = (np.float64(end) for end in feature.split(":")[1:])
         if run.values.dtype.kind == "f":
             low, high = low.astype(run.values.dtype), high.astype(run.values.dtype)
         selected |= finite & (run.values >= low) & (run.values <= high)
     keys = run.volume.key_times.key_frames
     grown = [_grown(selected[step], run.config.dilation) & finite[step] for step in keys]
-    found = np.zeros(run.values.shape, dtype=bool)
-    for step in range(len(found)):
-        # A step between two key frames has what either of them has.
+    mask = np.zeros(run.values.shape, dtype=bool)
+    for step in range(len(mask)):
+        # The coreset of a step between two key frames is the union of theirs.
         after = int(np.clip(np.searchsorted(keys, step), 0, len(keys) - 1))
         before = after if keys[after] == step or after == 0 or step > keys[-1] else after - 1
-        found[step] = grown[before] | grown[after]
-    return np.asarray(found & finite)
+        mask[step] = grown[before] | grown[after]
+    return np.asarray(mask & finite)
 
 
 def _grown(mask: Mask, reach: int) -> Mask:
-    """A mask grown by so many vertices in the 26-neighbourhood, by sums over windows."""
+    """A mask (z, y, x) grown by `reach` vertices in the 26-neighbourhood, by sums over windows."""
     for axis, length in enumerate(mask.shape):
         sums = np.insert(np.cumsum(mask, axis=axis, dtype=np.int64), 0, 0, axis=axis)
         at = np.arange(length)
@@ -158,50 +166,53 @@ def _grown(mask: Mask, reach: int) -> Mask:
 
 
 def largest_difference(values: Values, decoded: Values, where: Mask) -> Fraction:
-    """max |value - decoded| where it counts, exactly."""
-    one, other = values[where], decoded[where]
-    if not one.size:
+    """max |value - decoded| over the mask `where`, exactly."""
+    given_values, decoded_values = values[where], decoded[where]
+    if not given_values.size:
         return Fraction(0)
-    if one.dtype.kind in "iu" and one.dtype.itemsize == 8:
+    if given_values.dtype.kind in "iu" and given_values.dtype.itemsize == 8:
         return max(
             abs(Fraction(a) - Fraction(b))
-            for a, b in zip(one.tolist(), other.tolist(), strict=True)
+            for a, b in zip(given_values.tolist(), decoded_values.tolist(), strict=True)
         )
-    # Halves do not overflow; the few that look largest are compared exactly.
-    rough = np.abs(one.astype(np.float64) / 2 - other.astype(np.float64) / 2)
+    # Halves do not overflow. The values that seem to differ most are compared exactly.
+    rough = np.abs(given_values.astype(np.float64) / 2 - decoded_values.astype(np.float64) / 2)
     near = np.flatnonzero(rough >= rough.max() * (1 - 1e-12))[:8]
-    return max(abs(Fraction(one[n].item()) - Fraction(other[n].item())) for n in near)
+    return max(
+        abs(Fraction(given_values[n].item()) - Fraction(decoded_values[n].item())) for n in near
+    )
 
 
 def _psnr(run: Run, where: Mask) -> float:
-    """In dB over the coreset, with differences in parts of the range; infinite without error, 0 without a range."""
+    """PSNR in dB over the mask `where`; infinite without an error, 0 for a constant series."""
     finite = run.values[np.isfinite(run.values)]
     span = Fraction(finite.max().item()) - Fraction(finite.min().item())
     if span == 0:
         return 0.0
-    one, other = run.values[where], run.decoded[where]
-    if one.dtype.kind in "iu" and one.dtype.itemsize == 8:
-        parts = np.array(
+    given_values, decoded_values = run.values[where], run.decoded[where]
+    if given_values.dtype.kind in "iu" and given_values.dtype.itemsize == 8:
+        shares = np.array(
             [
                 float((a - Fraction(b)) / span)
-                for a, b in zip(one.tolist(), other.tolist(), strict=True)
+                for a, b in zip(given_values.tolist(), decoded_values.tolist(), strict=True)
             ]
         )
     else:
-        # By a power of two, which is exact, so that differences neither overflow nor vanish.
+        # Scaling by a power of two is exact and keeps differences from overflowing or vanishing.
         exponent = math.frexp(
             float(max(abs(Fraction(finite.max().item())), abs(Fraction(finite.min().item()))))
         )[1]
-        scaled = np.ldexp(one.astype(np.float64), -exponent) - np.ldexp(
-            other.astype(np.float64), -exponent
+        scaled = np.ldexp(given_values.astype(np.float64), -exponent) - np.ldexp(
+            decoded_values.astype(np.float64), -exponent
         )
-        parts = scaled / float(span / Fraction(2) ** exponent)
-    mean = float(np.mean(np.square(parts))) if parts.size else 0.0
+        shares = scaled / float(span / Fraction(2) ** exponent)
+    mean = float(np.mean(np.square(shares))) if shares.size else 0.0
     return -10 * math.log10(mean) if mean > 0 else math.inf
 
 
-def _bound_of(run: Run) -> Fraction | None:
-    """The strict bound in data units; that of a range beyond float64 is a number, too."""
+def _error_bound(run: Run) -> Fraction | None:
+    """The strict bound in data units, None without one; finite even if the range overflows
+    float64."""
     config = run.config
     if config.max_error is not None:
         return Fraction(config.max_error)

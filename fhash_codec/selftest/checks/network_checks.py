@@ -1,4 +1,5 @@
-"""What networks have to keep: recovery from divergence, tables at the ends of their number type, kinks, engines, devices."""
+"""Checks of networks: recovery from divergence, tables at the ends of their number type, kinks,
+engines, devices."""
 
 from __future__ import annotations
 
@@ -12,7 +13,9 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
-from fhash_codec.paper.regions import ArrayTable, Network, decode_region, sample_points
+from fhash_codec.paper.network import ArrayTable, Network
+from fhash_codec.paper.points import sample_points
+from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.storage import NumberType
 from fhash_codec.selftest.case import Finding, Run
 from fhash_codec.selftest.checks.oracle import Oracle
@@ -30,24 +33,34 @@ __all__ = [
     "recovered",
 ]
 
-ENGINES_APART, DEVICES_APART = 1e-5, 1e-3
-"""Of the range, by which two engines may differ after 90 steps, and two devices, whose products round differently at each of them. Adam
-divides each gradient by its own size, so that the sign of one that is nothing but rounding moves an embedding by a whole step. Measured of
-engines: 3e-7; a false gradient gives 1e-2 and more."""
-BEYOND_HALF = (65505.0, 65520.0, 1e9, 3e38)
-HALF_LARGEST = 65504.0
+MAX_ENGINE_DIFFERENCE = 1e-5
+"""Allowed difference of two engines after 90 updates, as a share of the range.
+
+Measured: 3e-7. A wrong gradient gives 1e-2 and more.
+"""
+MAX_DEVICE_DIFFERENCE = 1e-3
+"""Allowed difference of two devices after 90 updates, as a share of the range.
+
+Their products round differently in each update. Adam divides each gradient by its own size, so the
+sign of a gradient that is rounding error alone moves an embedding by a full step.
+"""
+BEYOND_FLOAT16 = (65505.0, 65520.0, 1e9, 3e38)
+"""Table entries that float16 cannot represent."""
+MAX_FLOAT16 = 65504.0
+"""The largest float16."""
 
 
 def recovered(run: Run) -> Iterator[Finding]:
-    """However high the rate was: the training says how often it began again, and what it made is better than a constant."""
+    """The training reports its learning rate and restarts, and its result is better than a
+    constant, however high the first rate was."""
     training, values = run.volume.container.header["training"], run.values.astype(np.float64)
     rate, restarts = (
         training.get("learning_rate", run.config.learning_rate),
         training.get("restarts", 0),
     )
-    told = rate == run.config.learning_rate * 0.25**restarts
+    consistent = rate == run.config.learning_rate * 0.25**restarts
     yield Finding(
-        name="rate and restarts told", worst=float(not told), limit=0.0, unit="of them wrong"
+        name="rate and restarts told", worst=float(not consistent), limit=0.0, unit="of them wrong"
     )
     yield Finding(name="rate at the end", worst=rate, limit=run.config.learning_rate, unit="")
     error = float(np.sqrt(np.mean((run.decoded - values) ** 2)))
@@ -60,7 +73,7 @@ def recovered(run: Run) -> Iterator[Finding]:
 
 
 def diverged(run: Run) -> Iterator[Finding]:
-    """A rate at which this training cannot stay is found out."""
+    """A training that diverges at its learning rate has restarted."""
     yield Finding(
         name="divergence not found",
         worst=float(not run.volume.container.header["training"].get("restarts", 0)),
@@ -70,25 +83,25 @@ def diverged(run: Run) -> Iterator[Finding]:
 
 
 def engines(run: Run) -> Iterator[Finding]:
-    """The slab engine trains what the naive one does."""
-    yield _apart(run, "slab = naive", replace(run.config, engine="naive"), ENGINES_APART)
+    """The slab engine trains the same network as the naive engine."""
+    yield _apart(run, "slab = naive", replace(run.config, engine="naive"), MAX_ENGINE_DIFFERENCE)
 
 
 def devices(run: Run) -> Iterator[Finding]:
-    """A CUDA device trains what the processor does; nothing is compared where there is none."""
+    """A CUDA device trains the same network as the CPU; nothing is compared without CUDA."""
     from fhash_codec.training.devices import choose_device
 
     try:
         choose_device("cuda")
     except InputError:
         return
-    yield _apart(run, "cuda = cpu", replace(run.config, device="cuda"), DEVICES_APART)
+    yield _apart(run, "cuda = cpu", replace(run.config, device="cuda"), MAX_DEVICE_DIFFERENCE)
 
 
 def ends_of_half_precision(run: Run) -> Iterator[Finding]:
-    """Tables that float16 does not hold are refused, and the largest that it holds come back."""
+    """Tables beyond the range of float16 are refused, and the largest float16 comes back."""
     accepted = 0
-    for largest in BEYOND_HALF:
+    for largest in BEYOND_FLOAT16:
         for sign in (1.0, -1.0):
             try:
                 NumberType.of(np.array([0.5, sign * largest], np.float32), "float16")
@@ -98,19 +111,20 @@ def ends_of_half_precision(run: Run) -> Iterator[Finding]:
     yield Finding(
         name="too large for float16", worst=float(accepted), limit=0.0, unit="tables accepted"
     )
-    ends = np.array([HALF_LARGEST, -HALF_LARGEST], np.float32)
+    ends = np.array([MAX_FLOAT16, -MAX_FLOAT16], np.float32)
     kept = NumberType.of(ends, "float16").stored(ends)
     yield Finding(
         name="largest of float16",
-        worst=float(np.count_nonzero(np.abs(kept) != HALF_LARGEST)),
+        worst=float(np.count_nonzero(np.abs(kept) != MAX_FLOAT16)),
         limit=0.0,
         unit="values",
     )
 
 
 def large_tables(run: Run) -> Iterator[Finding]:
-    """Tables at the ends of float16 and of float32 decode to finite values, to the rounding of what they cancel."""
-    for dtype, largest in ((np.float16, HALF_LARGEST), (np.float32, 1e30)):
+    """Tables at the ends of float16 and float32 decode to finite values, correct up to the rounding
+    of the terms that cancel."""
+    for dtype, largest in ((np.float16, MAX_FLOAT16), (np.float32, 1e30)):
         table = np.full((1, 2, 2, 2, 1), largest, dtype)
         table[0, 0] = -largest
         network = _linear([table], weight=1 / (2 * largest), bias=0.5)
@@ -118,9 +132,9 @@ def large_tables(run: Run) -> Iterator[Finding]:
         places = np.array(
             list(itertools.product((0.0,), (0.0, 0.3, 1.0, 2.0), (0.0, 0.7, 2.0), (1.1,)))
         ).T
-        found = sample_points(network, *places)
+        sampled = sample_points(network, *places)
         answers = [oracle.at(point) for point in places.T]
-        off = np.abs(found.astype(np.float64) - [answer.value for answer in answers]) / [
+        off = np.abs(sampled.astype(np.float64) - [answer.value for answer in answers]) / [
             answer.rounding for answer in answers
         ]
         name = np.dtype(dtype).name
@@ -139,7 +153,7 @@ def large_tables(run: Run) -> Iterator[Finding]:
 
 
 def constant_tables(run: Run) -> Iterator[Finding]:
-    """Tables of one number, however small, give one value and no slope; every number type gives them back."""
+    """Constant tables, however small, give one value and no slope; each number type stores them."""
     worst, slope = 0.0, 0.0
     for value in (0.0, 1e-45, 1e-30, 1e-7, 1.0):
         table = np.full((2, 3, 3, 3, 1), value, np.float32)
@@ -165,12 +179,16 @@ def constant_tables(run: Run) -> Iterator[Finding]:
 
 
 def kinks(run: Run) -> Iterator[Finding]:
-    """On a ReLU's kink the derivative is that of its flat side, beside it that of its side; both kinds of kink, one of them hidden."""
+    """The derivative on a ReLU's kink is that of its flat side, and beside the kink that of its
+    side.
+
+    Both directions of a kink are tested, in the first layer and behind another layer.
+    """
     ramp = np.arange(5, dtype=np.float32).reshape(1, 1, 1, 5, 1) / 4
     one, zero = np.ones((1, 1), np.float32), np.zeros(1, np.float32)
     wrong, off = 0, 0.0
     for rises, deep in itertools.product((1.0, -1.0), (False, True)):
-        # max(0, +-(x - 2) / 4): flat on one side of x = 2.
+        # max(0, +-(x - 2) / 4), which is flat on one side of x = 2.
         first = (np.float32(rises) * one, np.array([-0.5 * rises], np.float32))
         layers = (first, (one, zero), (one, zero)) if deep else (first, (one, zero))
         network = Network(
@@ -190,7 +208,7 @@ def kinks(run: Run) -> Iterator[Finding]:
         )
         for place, value, slope in zip(x, values, slopes[:, 3], strict=True):
             off = max(off, abs(float(value) - oracle.at((0, 0, 0, place)).value))
-            # Towards the flat side, and away from it, where one does not step over the kink.
+            # Differences towards both sides. On the kink, only those towards its flat side.
             for step in (-(2.0**-12), 2.0**-12):
                 if (place == 2.0 and step * rises > 0) or not 0 <= place + step <= 4:
                     continue
@@ -205,7 +223,13 @@ def kinks(run: Run) -> Iterator[Finding]:
 
 
 def _linear(tables: Sequence[npt.NDArray[Any]], *, weight: float, bias: float) -> Network:
-    """A linear readout of tables over a box of 3 x 3 x 3 vertices and one key frame."""
+    """A network without hidden layers over a box of 3 x 3 x 3 vertices and one key frame.
+
+    Args:
+        tables: a table (t, z, y, x, 1) for each level.
+        weight: weight of every embedding.
+        bias: value that is added.
+    """
     size = sum(table.shape[4] for table in tables)
     layer = (np.full((1, size), weight, np.float32), np.array([bias], np.float32))
     levels = tuple(
@@ -222,7 +246,8 @@ def _linear(tables: Sequence[npt.NDArray[Any]], *, weight: float, bias: float) -
 
 
 def _apart(run: Run, name: str, config: EncodeConfig, limit: float) -> Finding:
-    """How far another training of the same series is from this one."""
+    """The largest difference between this run and another training of the same series, as a share
+    of the range."""
     encode(run.series, run.folder / "other.fhz", config, force=True)
     with open_volume(run.folder / "other.fhz") as volume:
         worst = float(np.nanmax(np.abs(volume[...] - run.decoded))) / run.data_range

@@ -1,7 +1,9 @@
-"""The network of the profile paper in float64, written as its definition reads: loops over points, levels and corners.
+"""The network of profile paper in float64, written as its definition: loops over points, levels and
+corners.
 
-Nothing is shared with the decoder but the numbers: no blocks, no separable products, no float32. Beside each value stands how far the
-decoder's float32 may be from it: the magnitudes of all that is added up on the way to it, times the roundings that it goes through.
+The oracle shares only the stored numbers with the decoder: it has no blocks, no separable products
+and no float32. With each value it gives a bound on the error of the decoder's float32 arithmetic:
+the sum of the magnitudes of all terms, times the number of roundings that they undergo.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.paper.network import Network
-from fhash_codec.paper.regions import decode_region, sample_points
+from fhash_codec.paper.points import sample_points
+from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.storage import load_network
 from fhash_codec.selftest.case import Finding, Run
 
@@ -23,19 +26,25 @@ __all__ = ["Answer", "Oracle", "agrees", "gradients"]
 Floats = npt.NDArray[np.float64]
 
 UNIT = 2.0**-24
-"""Relative error of one float32 rounding."""
-POINTS = 40
-BESIDE = 2.0**-16
-"""Of a vertex spacing, how far from a point its differences are taken; a power of two, so that the places are exact."""
+"""Largest relative error of one float32 rounding."""
+N_POINTS = 40
+"""Random points of each comparison."""
+DIFFERENCE_STEP = 2.0**-16
+"""Step of the finite differences in vertex spacings; a power of two, so that positions are exact.
+"""
 NEAR = 1e-4
-"""Of the range, by which float32 may be off in a network that was trained to an end; one that is not may have more to cancel."""
+"""Allowed float32 error of a trained network, as a share of the range. A network whose training was
+stopped early may need more, since larger terms cancel in it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What the network says at one point, normalised.
+    """The network's output at one point, normalised.
 
-    rounding: bound of what float32 may be off. active: of every ReLU in turn, whether it lets through.
+    Attributes:
+        value: the output.
+        rounding: bound on the error of a float32 evaluation.
+        active: for every ReLU in order, whether its input is positive.
     """
 
     value: float
@@ -44,7 +53,7 @@ class Answer:
 
 
 class Oracle:
-    """A network's tables and layers, read once, as float64."""
+    """A network's tables and layers as float64, read once."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -55,23 +64,24 @@ class Oracle:
 
     @cached_property
     def tables(self) -> list[Floats]:
-        """Of each level (t, z, y, x, embedding)."""
-        parts = [
+        """The table (t, z, y, x, embedding) of each level."""
+        regions = [
             tuple(slice(0, length) for length in table.shape[:4]) for table in self.network.tables
         ]
         return [
-            self.network.read(level, part).astype(np.float64) for level, part in enumerate(parts)
+            self.network.read(level, region).astype(np.float64)
+            for level, region in enumerate(regions)
         ]
 
     def at(self, point: Sequence[float]) -> Answer:
-        """The value at (key index, z, y, x), in vertices of the box."""
-        features, magnitudes = [], []
+        """The output at a point (key index, z, y, x), in vertices of the box."""
+        inputs, magnitudes = [], []
         for table in self.tables:
             value, magnitude = self._embedding(table, point)
-            features.append(value)
+            inputs.append(value)
             magnitudes.append(magnitude)
-        hidden, reach = np.concatenate(features), np.concatenate(magnitudes)
-        # Along each of four axes: the weight and its complement, two products and a sum.
+        hidden, reach = np.concatenate(inputs), np.concatenate(magnitudes)
+        # Five roundings along each of four axes: weight, its complement, two products and a sum.
         rounding = 4 * 5 * UNIT * reach
         active: list[bool] = []
         for number, (weight, bias) in enumerate(self.layers):
@@ -79,7 +89,8 @@ class Oracle:
                 active += (hidden > 0).tolist()
                 hidden = np.maximum(hidden, 0.0)
             terms = np.abs(weight) @ np.abs(hidden) + np.abs(bias)
-            # A sum of n + 1 products in any order; what was rounded before goes through the weights, and a ReLU lets through no more of it.
+            # A sum of n + 1 products in any order. Earlier errors are multiplied by the weights; a
+            # ReLU does not enlarge them.
             rounding = np.abs(weight) @ rounding + (weight.shape[1] + 2) * UNIT * (
                 terms + np.abs(weight) @ rounding
             )
@@ -87,7 +98,8 @@ class Oracle:
         return Answer(value=float(hidden[0]), rounding=float(rounding[0]), active=tuple(active))
 
     def _embedding(self, table: Floats, point: Sequence[float]) -> tuple[Floats, Floats]:
-        """The quadrilinear mean of the 16 corners around a point, and the largest magnitude among them."""
+        """The quadrilinear mean of the embeddings at the 16 corners around a point, and the largest
+        magnitude among these."""
         before, share = [], []
         for place, size, corners in zip(point, self.sizes, table.shape, strict=False):
             position = place * (corners - 1) / max(size - 1, 1)
@@ -97,8 +109,8 @@ class Oracle:
         value, magnitude = np.zeros(table.shape[4]), np.zeros(table.shape[4])
         for corner in np.ndindex(2, 2, 2, 2):
             factor = 1.0
-            for up, part in zip(corner, share, strict=True):
-                factor *= part if up else 1.0 - part
+            for up, weight in zip(corner, share, strict=True):
+                factor *= weight if up else 1.0 - weight
             at = tuple(
                 min(first + up, length - 1)
                 for first, up, length in zip(before, corner, table.shape, strict=False)
@@ -109,25 +121,25 @@ class Oracle:
 
 
 def agrees(run: Run) -> Iterator[Finding]:
-    """Decoding and sampling are what the definition says, to the rounding of float32."""
+    """Decoded and sampled values equal the oracle's up to the rounding of float32."""
     oracle = Oracle(load_network(run.volume.container))
     network, generator = oracle.network, np.random.default_rng(11)
     ends = np.array(oracle.sizes)[:, None] - 1.0
-    places = generator.random((4, POINTS)) * ends
-    vertices = np.rint(generator.random((4, POINTS)) * ends)
+    places = generator.random((4, N_POINTS)) * ends
+    vertices = np.rint(generator.random((4, N_POINTS)) * ends)
     key = float(generator.random() * ends[0, 0])
     z, y, x = ((0, length) for length in network.box_size)
     frame = decode_region(network, key, (z, y, x))
-    decoded = np.array([frame[tuple(vertices[1:, n].astype(int))] for n in range(POINTS)])
-    on_frame = np.concatenate([np.full((1, POINTS), key), vertices[1:]])
+    decoded = np.array([frame[tuple(vertices[1:, n].astype(int))] for n in range(N_POINTS)])
+    on_frame = np.concatenate([np.full((1, N_POINTS), key), vertices[1:]])
     compared = {
         "sampling": (places, sample_points(network, *places)),
         "sampling at vertices": (vertices, sample_points(network, *vertices)),
         "decoding between key frames": (on_frame, decoded),
     }
-    for name, (points, found) in compared.items():
+    for name, (points, values) in compared.items():
         expected = [oracle.at(point) for point in points.T]
-        off = np.abs(found.astype(np.float64) - [answer.value for answer in expected])
+        off = np.abs(values.astype(np.float64) - [answer.value for answer in expected])
         allowed = np.array([answer.rounding for answer in expected])
         yield Finding(
             name="float64 oracle",
@@ -146,40 +158,42 @@ def agrees(run: Run) -> Iterator[Finding]:
 
 
 def gradients(run: Run) -> Iterator[Finding]:
-    """The analytic gradient equals the oracle's differences, on the side of a cell or a kink where it is documented to be.
+    """The analytic gradient equals the oracle's finite differences on the documented side of a cell
+    or kink.
 
-    On a vertex the derivative is that of the cell after it, so differences are taken there too; at the end of an axis, before it.
-    Within a cell the network is a polynomial between kinks: differences over one are counted, not compared.
+    On a vertex, the derivative is that of the cell after it, so the differences are taken towards
+    that cell; at the end of an axis they are taken towards the cell before it. Within a cell, the
+    network is a polynomial between kinks: differences across a kink are counted, not compared.
     """
     oracle = Oracle(load_network(run.volume.container))
     generator = np.random.default_rng(12)
     ends = np.array(oracle.sizes) - 1.0
-    points = generator.random((POINTS, 4)) * ends
+    points = generator.random((N_POINTS, 4)) * ends
     points[::4] = np.rint(points[::4])
-    points = np.rint(points / BESIDE) * BESIDE
+    points = np.rint(points / DIFFERENCE_STEP) * DIFFERENCE_STEP
     points = np.clip(points, 0.0, ends)
     _, slopes = sample_points(oracle.network, *points.T, gradient=True)
     scale = float(np.abs(slopes).max()) or 1.0
     worst, over = 0.0, 0
     for point, slope in zip(points, slopes, strict=True):
-        here = oracle.at(point)
+        start = oracle.at(point)
         for axis in range(4):
             if ends[axis] == 0:
                 worst = max(worst, abs(float(slope[axis])) / scale)
                 continue
-            step = BESIDE if point[axis] < ends[axis] else -BESIDE
-            one, two = (oracle.at(point + np.eye(4)[axis] * step * times) for times in (1, 2))
-            if not here.active == one.active == two.active:
+            step = DIFFERENCE_STEP if point[axis] < ends[axis] else -DIFFERENCE_STEP
+            first, second = (oracle.at(point + np.eye(4)[axis] * step * times) for times in (1, 2))
+            if not start.active == first.active == second.active:
                 over += 1
                 continue
-            difference = (-3 * here.value + 4 * one.value - two.value) / (2 * step)
+            difference = (-3 * start.value + 4 * first.value - second.value) / (2 * step)
             worst = max(worst, abs(difference - float(slope[axis])) / scale)
     yield Finding(
         name="gradient = differences", worst=worst, limit=1e-3, unit="of the largest derivative"
     )
     yield Finding(
         name="derivatives beside kinks",
-        worst=over / (4 * POINTS),
+        worst=over / (4 * N_POINTS),
         limit=0.25,
         unit="of all, not compared",
     )

@@ -1,4 +1,4 @@
-"""Properties of a default picture: finite, within 0..1, and the same however it is marched."""
+"""Properties of a default picture: finite, within 0..1, and the same for every march."""
 
 from __future__ import annotations
 
@@ -14,24 +14,27 @@ from fhash_codec.selftest.environment import environment
 __all__ = ["CHECKS"]
 
 SIZE = (48, 48)
+"""Width and height of the picture in pixels."""
 NEAR = 1e-3
-"""Of a channel, by which two ways to march the same values may differ."""
+"""Allowed difference of a colour channel between two marches through the same values."""
 MODES = ("stream", "arm")
+"""Modes of marching to compare with the mode `cache`."""
 
 
 def picture(run: Run) -> Iterator[Finding]:
-    """Halfway to the second step, where there is one, since there the step before and after must not show through."""
-    shown = _rendered(run, "cache")
+    """A picture halfway between the first two steps, where values missing in either of them must
+    not be drawn."""
+    cached = _rendered(run, "cache")
     yield Finding(
         name="finite pixels",
-        worst=float(np.count_nonzero(~np.isfinite(shown))),
+        worst=float(np.count_nonzero(~np.isfinite(cached))),
         limit=0.0,
         unit="channels",
     )
-    beyond = max(-float(np.nanmin(shown)), float(np.nanmax(shown)) - 1.0, 0.0)
+    beyond = max(-float(np.nanmin(cached)), float(np.nanmax(cached)) - 1.0, 0.0)
     yield Finding(name="pixels in 0..1", worst=beyond, limit=0.0, unit="of a channel")
     if run.volume.profile != "compact":
-        # What lies between vertices is the network's there, and what the cache holds is not.
+        # The arm evaluates the network between vertices, the cache interpolates: they differ.
         for mode in MODES:
             other = _rendered(run, mode)
             yield Finding(
@@ -42,11 +45,11 @@ def picture(run: Run) -> Iterator[Finding]:
             )
         return
     for mode in MODES:
-        off = np.max(np.abs(_rendered(run, mode) - shown))
+        off = np.max(np.abs(_rendered(run, mode) - cached))
         yield Finding(name=f"cache = {mode}", worst=float(off), limit=NEAR, unit="of a channel")
     if native.library() is not None:
         with environment(FHASH_NATIVE="0"):
-            off = np.max(np.abs(_rendered(run, "cache") - shown))
+            off = np.max(np.abs(_rendered(run, "cache") - cached))
         yield Finding(
             name="native = portable march", worst=float(off), limit=NEAR, unit="of a channel"
         )
@@ -56,8 +59,8 @@ CHECKS = (picture,)
 
 
 def _rendered(run: Run, mode: str) -> npt.NDArray[np.float32]:
-    # Pictures are a package of their own, which decoding does not need.
-    from fhash_codec.rendering.renderer import render
+    # Imported late: decoding does not need the renderer.
+    from fhash_codec.rendering import render
     from fhash_codec.rendering.scene.scene import Marching, Scene
 
     step = 0.5 if run.volume.shape[0] > 1 else 0.0

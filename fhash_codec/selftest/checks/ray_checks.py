@@ -1,4 +1,5 @@
-"""What pictures of hard scenes have to keep: finite pixels, the float64 picture, one picture by every way to march, blocks, key times."""
+"""Checks of pictures of hard scenes: finite pixels, equal to the float64 picture, the same for
+every march, by blocks, and at key times."""
 
 from __future__ import annotations
 
@@ -12,24 +13,31 @@ import numpy.typing as npt
 from fhash_codec import native
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.picture.plan import Plan
+from fhash_codec.rendering.picture.planning import plan_picture
 from fhash_codec.rendering.renderer import Renderer, decoded_frame
 from fhash_codec.rendering.scene.scene import Scene
 from fhash_codec.rendering.task.task import Frame
 from fhash_codec.selftest.case import Check, Finding, Run
-from fhash_codec.selftest.checks.ray_oracle import drawn
+from fhash_codec.selftest.checks.ray_oracle import reference_picture
 from fhash_codec.selftest.environment import environment
 
-__all__ = ["SAME", "blocks", "closed_form", "key_times", "scene", "scenes"]
+__all__ = ["MODES", "blocks", "closed_form", "key_times", "scene", "scenes"]
 
 Picture = npt.NDArray[Any]
 
 NEAR = 1e-3
-"""Of a channel, by which two ways to march the same values, and float64, may differ."""
-SAME = ("cache", "stream", "arm")
+"""Allowed difference of a colour channel between two marches through the same values, and from the
+float64 picture."""
+MODES = ("cache", "stream", "arm")
+"""Modes of marching through the same values."""
 
 
 def scene(**parts: Any) -> Scene:
-    """A scene from its JSON values, small, over nothing, whose rays do not end early; lit from everywhere, so that colours stay."""
+    """A scene from its JSON values: 16 x 16 pixels on a transparent background, with ambient light
+    only.
+
+    Ambient light leaves the colours unchanged, and a threshold of 0 keeps rays from ending early.
+    """
     march_ = {"threshold": 0.0, "lod": 0, **parts.pop("march", {})}
     effects = {
         "shading": {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
@@ -47,26 +55,34 @@ def scene(**parts: Any) -> Scene:
 
 
 def scenes(
-    chosen: Mapping[str, Scene], *, modes: tuple[str, ...] = SAME, oracle: bool = True
+    scenes_by_name: Mapping[str, Scene], *, modes: tuple[str, ...] = MODES, oracle: bool = True
 ) -> Check:
-    """Every one of these scenes: finite, within 0..1, the float64 picture, and the same by each mode, natively and without."""
+    """A check that draws each scene: finite, within 0..1, and the same in each mode and without the
+    native library.
+
+    Args:
+        scenes_by_name: the scenes.
+        modes: the modes of marching; the first one is compared with the others.
+        oracle: whether the picture is also compared with the float64 picture.
+    """
 
     def check(run: Run) -> Iterator[Finding]:
         renderer = Renderer(run.volume)
-        for name, one in chosen.items():
-            yield from _pictures(run, renderer, name, one, modes, oracle)
+        for name, scene_ in scenes_by_name.items():
+            yield from _pictures(run, renderer, name, scene_, modes, oracle)
 
     return check
 
 
-def closed_form(chosen: Mapping[str, Scene], value: float) -> Check:
-    """A series that is `value` everywhere has the opacity 1 - exp(-extinction * path) of each ray, at any length of a step."""
+def closed_form(scenes_by_name: Mapping[str, Scene], value: float) -> Check:
+    """A check for a series that is `value` everywhere: each ray has the opacity 1 - exp(-extinction
+    * path), for steps of any length."""
 
     def check(run: Run) -> Iterator[Finding]:
         renderer = Renderer(run.volume)
-        for name, one in chosen.items():
-            plan = renderer.plan(one)
-            table, picture = plan.task.table, renderer.render(one).rgba
+        for name, scene_ in scenes_by_name.items():
+            plan = renderer.plan(scene_)
+            table, picture = plan.task.table, renderer.render(scene_).rgba
             assert table is not None
             extinction = np.interp(
                 value, np.linspace(table.low, table.high, len(table.extinctions)), table.extinctions
@@ -77,22 +93,26 @@ def closed_form(chosen: Mapping[str, Scene], value: float) -> Check:
             yield Finding(
                 name="closed form", worst=worst, limit=NEAR, unit="of a channel", under=name
             )
-            yield _shown(float(path.max()), name)
+            yield _not_empty(float(path.max()), name)
 
     return check
 
 
 def blocks(run: Run) -> Iterator[Finding]:
-    """The front part of a volume over its back part is the whole: compositing is associative, wherever it is cut between two samples."""
-    one = scene(camera={"view": "xy", "projection": "parallel"}, transfer_function=FOG)
-    plan = Plan.of(run.volume, one)
+    """The front part of a volume, drawn over its back part, gives the picture of the volume.
+
+    Compositing is associative, so this holds wherever the volume is cut between two samples.
+    """
+    cut_scene = scene(camera={"view": "xy", "projection": "parallel"}, transfer_function=FOG)
+    plan = plan_picture(run.volume, cut_scene)
     frame = decoded_frame(run.volume, plan.step, 0, _everything(run), plan.units)
-    whole = march(frame, plan.task).rgba
+    uncut = march(frame, plan.task).rgba
     for cut in range(1, frame.values.shape[0] - 1):
-        # Seen from above: the front has the larger z. Samples lie at quarters, never on the vertex that both parts have.
+        # Seen from above, so the front has the larger z. Samples lie at quarters of a vertex
+        # spacing, never on the layer that both parts share.
         front = march(Frame(values=frame.values[cut:], first=(cut, 0, 0)), plan.task).rgba
         back = march(Frame(values=frame.values[: cut + 1], first=(0, 0, 0)), plan.task).rgba
-        worst = float(np.abs(front + (1 - front[..., 3:]) * back - whole).max())
+        worst = float(np.abs(front + (1 - front[..., 3:]) * back - uncut).max())
         yield Finding(
             name="blocks = whole",
             worst=worst,
@@ -100,11 +120,12 @@ def blocks(run: Run) -> Iterator[Finding]:
             unit="of a channel",
             under=f"cut at {cut}",
         )
-        yield _shown(float(min(front[..., 3].max(), back[..., 3].max())), f"cut at {cut}")
+        yield _not_empty(float(min(front[..., 3].max(), back[..., 3].max())), f"cut at {cut}")
 
 
 def key_times(run: Run) -> Iterator[Finding]:
-    """A picture at a key time is that of its step, bit for bit, however it is named; close beside it, it is close."""
+    """A picture at a key time equals that of its step bit for bit, given by step or by time; a
+    picture close to a key time is close to it."""
     renderer = Renderer(run.volume)
     times = run.volume.coords["t"].values
     for step in range(run.volume.shape[0]):
@@ -135,18 +156,26 @@ def key_times(run: Run) -> Iterator[Finding]:
 
 
 FOG = {"opacity": [[0.0, 0.0], [1.0, 0.3]]}
+"""A transfer function through which all of the volume is seen."""
 
 
 def _pictures(
-    run: Run, renderer: Renderer, name: str, one: Scene, modes: tuple[str, ...], oracle: bool
+    run: Run,
+    renderer: Renderer,
+    name: str,
+    picture_scene: Scene,
+    modes: tuple[str, ...],
+    oracle: bool,
 ) -> Iterator[Finding]:
     by_mode = {
-        mode: renderer.render(replace(one, march=replace(one.march, mode=mode))).rgba
+        mode: renderer.render(
+            replace(picture_scene, march=replace(picture_scene.march, mode=mode))
+        ).rgba
         for mode in modes
     }
     if native.library() is not None:
         with environment(FHASH_NATIVE="0"):
-            by_mode["portable"] = Renderer(run.volume).render(one).rgba
+            by_mode["portable"] = Renderer(run.volume).render(picture_scene).rgba
     bad = sum(int(np.count_nonzero(~np.isfinite(picture))) for picture in by_mode.values())
     yield Finding(name="finite pixels", worst=float(bad), limit=0.0, unit="channels", under=name)
     beyond = max(
@@ -158,34 +187,38 @@ def _pictures(
         if mode != modes[0]:
             yield Finding(
                 name=f"{mode} = {modes[0]}",
-                worst=_off(picture, first),
+                worst=_difference(picture, first),
                 limit=NEAR,
                 unit="of a channel",
                 under=name,
             )
     if oracle:
-        plan = renderer.plan(one)
+        plan = renderer.plan(picture_scene)
         frame = decoded_frame(run.volume, plan.step, 0, _everything(run), plan.units)
-        expected = drawn(frame, plan.task)
+        expected = reference_picture(frame, plan.task)
         yield Finding(
             name="float64 picture",
-            worst=_off(first, expected),
+            worst=_difference(first, expected),
             limit=NEAR,
             unit="of a channel",
             under=name,
         )
         if not name.startswith("nothing"):
-            yield _shown(float(expected[..., 3].max()), name)
+            yield _not_empty(float(expected[..., 3].max()), name)
 
 
-def _shown(most: float, name: str) -> Finding:
-    """That a comparison is one of something."""
+def _not_empty(max_opacity: float, name: str) -> Finding:
+    """A finding that fails for an empty picture, since comparing empty pictures proves nothing."""
     return Finding(
-        name="empty pictures", worst=float(not most > 0), limit=0.0, unit="pictures", under=name
+        name="empty pictures",
+        worst=float(not max_opacity > 0),
+        limit=0.0,
+        unit="pictures",
+        under=name,
     )
 
 
-def _off(one: Picture, other: Picture) -> float:
+def _difference(one: Picture, other: Picture) -> float:
     return float(np.abs(one.astype(np.float64) - other).max())
 
 

@@ -1,4 +1,7 @@
-"""Pictures in float64, ray by ray, as `fhash_codec.rendering.task.task` defines them: no packets, no skipping, no early end of a ray."""
+"""Pictures in float64, ray by ray, as `fhash_codec.rendering.task.task` defines them.
+
+The oracle has no packets, skips no empty space and ends no ray early.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +13,22 @@ import numpy.typing as npt
 
 from fhash_codec.rendering.task.task import Frame, Task
 
-__all__ = ["drawn"]
+__all__ = ["reference_picture"]
 
 Floats = npt.NDArray[np.float64]
 
 SNAP = 1e-9
-"""Of a vertex spacing: nearer to a vertex, a coordinate is that of the vertex."""
+"""Distance from a vertex, in vertex spacings, below which a coordinate is that of the vertex."""
 HALVINGS = 60
-"""Of the search for the place of a surface."""
+"""Bisections of the search for the position of a surface."""
 
 
-def drawn(frame: Frame, task: Task) -> Floats:
-    """The picture (H, W, 4) of an unshaded volume and surfaces of one colour each, multiplied by the opacity; without a threshold."""
+def reference_picture(frame: Frame, task: Task) -> Floats:
+    """The picture (H, W, 4) of an unshaded volume and surfaces of one colour each, with
+    premultiplied opacity.
+
+    Rays do not end at a threshold of opacity.
+    """
     width, height = task.rays.size
     eyes, directions = task.rays.pixels()
     picture = np.zeros((height, width, 4))
@@ -41,7 +48,7 @@ def _ray(frame: Frame, task: Task, eye: Floats, direction: Floats) -> Floats:
     at = enter + (np.arange(count) + 0.5) * task.step
     lengths = np.full(count, task.step)
     lengths[-1] = (steps - (count - 1)) * task.step
-    # Surfaces begin where the frame does.
+    # Surfaces exist within the frame only, which may be smaller than the drawn box.
     counts = np.array(frame.values.shape[::-1])
     first = np.array(frame.first[::-1], dtype=np.float64)
     seen = np.where(
@@ -62,12 +69,12 @@ def _ray(frame: Frame, task: Task, eye: Floats, direction: Floats) -> Floats:
     ends = np.concatenate(
         [[entered], np.clip(at, entered, max(entered, left_at)), [max(entered, left_at)]]
     )
-    found = [_crossings(value, ends, value(ends), surface.value) for surface in task.surfaces]
+    crossings = [_crossings(value, ends, value(ends), surface.value) for surface in task.surfaces]
     for sample in range(count + 1):
-        # The surfaces between the sample before and this one, the nearest first, then the sample.
+        # The surfaces between the previous sample and this one, nearest first, then the sample.
         between = sorted(
             (places[sample], number)
-            for number, places in enumerate(found)
+            for number, places in enumerate(crossings)
             if np.isfinite(places[sample])
         )
         for _, number in between:
@@ -83,15 +90,16 @@ def _ray(frame: Frame, task: Task, eye: Floats, direction: Floats) -> Floats:
             )
             numbers = np.arange(len(table.extinctions))
             opacity = -np.expm1(-np.interp(entry, numbers, table.extinctions) * lengths[sample])
-            own = np.array(
+            emitted = np.array(
                 [np.interp(entry, numbers, table.colours[:, channel]) for channel in range(3)]
             )
-            colour, left = colour + left * opacity * own, left * (1 - opacity)
+            colour, left = colour + left * opacity * emitted, left * (1 - opacity)
     return np.array([*colour, 1 - left])
 
 
 def _within(eye: Floats, direction: Floats, bounds: Floats) -> tuple[float, float]:
-    """Where a ray enters a box (3, 2) in front of the eye and where it leaves it, not before; both 0 where it misses it."""
+    """The distances at which a ray enters a box (3, 2) in front of the eye and leaves it; both 0 if
+    it misses the box."""
     enter, leave = 0.0, np.inf
     for axis, (low, high) in enumerate(bounds):
         if direction[axis] == 0:
@@ -108,11 +116,19 @@ def _within(eye: Floats, direction: Floats, bounds: Floats) -> tuple[float, floa
 def _crossings(
     value: Callable[[Floats], Floats], ends: Floats, values: Floats, level: float
 ) -> Floats:
-    """Where a level lies between two places each (n - 1,), infinite where it does not, or where there is no value."""
+    """The position of an isosurface in each interval of a ray, (n - 1,); infinite where there is
+    none or values are missing.
+
+    Args:
+        value: returns the values at distances along the ray.
+        ends: distances (n,) of the ends of the intervals.
+        values: values (n,) at these ends.
+        level: value of the isosurface.
+    """
     places = np.full(len(ends) - 1, np.inf)
     below = values < level
-    known = ~np.isnan(values)
-    for number in np.flatnonzero((below[1:] != below[:-1]) & known[1:] & known[:-1]):
+    finite = ~np.isnan(values)
+    for number in np.flatnonzero((below[1:] != below[:-1]) & finite[1:] & finite[:-1]):
         near, far = ends[number], ends[number + 1]
         for _ in range(HALVINGS):
             middle = (near + far) / 2
@@ -126,10 +142,13 @@ def _crossings(
 
 
 def _trilinear(frame: Frame, places: Floats) -> Floats:
-    """Values (n,) at places (n, 3), x, y, z in vertices of the domain; NaN outside the frame and where a vertex of weight is."""
+    """Values (n,) at places (n, 3), which are x, y, z in vertices of the domain.
+
+    A value is NaN outside the frame, and where a vertex with a weight above 0 is NaN.
+    """
     counts = np.array(frame.values.shape[::-1])
     local = (places - np.array(frame.first[::-1])) / frame.stride
-    # A place on a face of the frame is on it, whatever the rounding on the way there.
+    # A place on a face of the frame counts as on it, whatever its rounding.
     local = np.where(np.abs(local - np.rint(local)) < SNAP, np.rint(local), local)
     outside = np.any(((local < 0) | (local > counts - 1)) & (counts > 1), axis=1)
     local = np.clip(local, 0, counts - 1.0)
@@ -140,12 +159,12 @@ def _trilinear(frame: Frame, places: Floats) -> Floats:
     corners = frame.values[zs[:, None, None], ys[None, :, None], xs[None, None, :]].astype(
         np.float64
     )
-    # One axis after the other as a + s (b - a): between two equal values stands exactly that value.
+    # One axis after the other as a + s (b - a), which is exact between two equal values.
     for axis in (2, 1, 0):
         corners = _between(corners[0], corners[1], share[:, axis])
     return np.where(outside, np.nan, corners)
 
 
 def _between(one: Floats, other: Floats, share: Floats) -> Floats:
-    """Linear from one to the other; what has no weight may have no value."""
+    """Linear interpolation from one value to another; a NaN with the weight 0 does not matter."""
     return np.where(share == 0, one, np.where(share == 1, other, one + share * (other - one)))

@@ -1,4 +1,5 @@
-"""Properties of repeating: the same bytes again and with any number of threads, the same bits by the native and the portable decoder."""
+"""Properties of repetition: the same bytes again and with any number of threads, and the same
+values from the native and the portable decoder."""
 
 from __future__ import annotations
 
@@ -18,17 +19,23 @@ from fhash_formats import native
 __all__ = ["CHECKS"]
 
 THREADS = (1, 2)
-"""Beside `case.RUN_THREADS`, by which the file of a run was made."""
+"""Numbers of threads to compare with `case.RUN_THREADS`, with which the file of a run was made."""
 
 
 def same_bytes(run: Run) -> Iterator[Finding]:
-    """The same input gives the same bytes; a compact file with 1, 2 and 4 threads, too, of which the quick set takes one by turns."""
+    """The same input gives the same bytes; in profile compact with any number of threads, too.
+
+    The long set compares all of `THREADS`, the quick set one of them in turn.
+    """
     written = run.path.read_bytes()
     again = run.folder / "again.fhz"
     if run.config.profile == "paper":
         encode(run.series, again, run.config, force=True)
         yield Finding(
-            name="same bytes again", worst=_unlike(written, again), limit=0.0, unit="bytes"
+            name="same bytes again",
+            worst=_count_unequal_bytes(written, again),
+            limit=0.0,
+            unit="bytes",
         )
         return
     wrong = 0.0
@@ -36,12 +43,16 @@ def same_bytes(run: Run) -> Iterator[Finding]:
     for count in THREADS if run.thorough else THREADS[turn : turn + 1]:
         with environment(FHASH_THREADS=str(count)):
             encode(run.series, again, run.config, force=True)
-        wrong = max(wrong, _unlike(written, again))
+        wrong = max(wrong, _count_unequal_bytes(written, again))
     yield Finding(name="same bytes by other threads", worst=wrong, limit=0.0, unit="bytes")
 
 
 def portable_encoder(run: Run) -> Iterator[Finding]:
-    """In the long set: a compact file of effort 1 has the same bytes without the native library, which takes its time with more effort."""
+    """A compact file of effort 1 has the same bytes without the native library. In the long set
+    only.
+
+    With more effort, the portable encoder takes too long.
+    """
     if (
         native.library() is None
         or not run.thorough
@@ -54,14 +65,14 @@ def portable_encoder(run: Run) -> Iterator[Finding]:
         encode(run.series, again, run.config)
     yield Finding(
         name="same bytes, portable encoder",
-        worst=_unlike(run.path.read_bytes(), again),
+        worst=_count_unequal_bytes(run.path.read_bytes(), again),
         limit=0.0,
         unit="bytes",
     )
 
 
 def portable(run: Run) -> Iterator[Finding]:
-    """What the native decoder gives, the portable one gives as well."""
+    """The portable decoder gives the values of the native one."""
     if native.library() is None:
         return
     with environment(FHASH_NATIVE="0"), open_volume(run.path) as volume:
@@ -82,7 +93,7 @@ def portable(run: Run) -> Iterator[Finding]:
 
 
 def sound(run: Run) -> Iterator[Finding]:
-    """The file passes `verify`, which raises where it does not."""
+    """The file passes `verify`, which raises for a damaged file."""
     yield Finding(
         name="verify",
         worst=0.0 if run.volume.verify() > 0 else 1.0,
@@ -94,11 +105,11 @@ def sound(run: Run) -> Iterator[Finding]:
 CHECKS = (same_bytes, portable_encoder, portable, sound)
 
 
-def _unlike(written: bytes, path: Path) -> float:
-    """How many bytes differ."""
+def _count_unequal_bytes(written: bytes, path: Path) -> float:
+    """The number of bytes that differ."""
     other = path.read_bytes()
-    one, two = (
+    first, second = (
         np.frombuffer(data[: min(len(written), len(other))], dtype=np.uint8)
         for data in (written, other)
     )
-    return float(np.count_nonzero(one != two) + abs(len(written) - len(other)))
+    return float(np.count_nonzero(first != second) + abs(len(written) - len(other)))

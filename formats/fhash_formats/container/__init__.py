@@ -1,21 +1,39 @@
-"""The `.fhz` container: a stored ZIP that holds a Zarr v3 hierarchy; FORMAT.md beside this package is its normative description.
+"""The `.fhz` container: a ZIP of stored members that holds a Zarr v3 hierarchy.
 
-The small fixed subset of Zarr v3 that a container uses is read and written here and not through the zarr library, for three reasons:
-arrays are streamed to the file chunk by chunk, so that no second copy is held in memory; a hostile file is checked before anything
-is allocated; and 0.4 ms per chunk are saved. The tests prove that the zarr library reads every array equal.
+FORMAT.md beside this package is the normative description.
 
-    layout        the bytes of the ZIP                source      a file that is read at offsets
-    zip_checked   opening the ZIP safely              strict_json metadata documents
-    array         metadata of one array               coding      values of a chunk to bytes and back
-    header        what the root says of the volume    hierarchy   members to arrays and header
-    sharding      many chunks in one member           coordinates positions in the header
-    stored        StoredArray, the cache of chunks    reader      Container            writer      ContainerWriter
+A container uses a small fixed subset of Zarr v3. This package reads and writes the subset itself
+and not through the zarr library, for three reasons:
+
+- arrays are streamed to the file chunk by chunk, so that no second copy is held in memory;
+- a hostile file is checked before anything is allocated;
+- 0.4 ms per chunk are saved.
+
+The tests prove that the zarr library reads every array equal.
+
+    source           bytes at offsets of a file
+    layout           bytes of the ZIP
+    zip_checked      safe opening of the ZIP
+    strict_json      metadata documents as JSON
+    hierarchy        members of the ZIP -> header and arrays
+    record           checked access to a JSON object
+    header           checks of the header
+    expected_arrays  arrays that a header asks for
+    coordinates      positions in the header
+    array            metadata of one array
+    coding           values of a chunk <-> bytes
+    chunks           arrays cut into chunks
+    sharding         many chunks in one member
+    cache            decoded chunks
+    stored           StoredArray: one array, read region by region
+    reader           Container: a file for reading
+    writer           ContainerWriter: a file for writing
 """
 
 from fhash_formats.container.coordinates import describe_coordinates
 from fhash_formats.container.header import FORMAT_VERSION, validate_header
 from fhash_formats.container.reader import Container, is_container
-from fhash_formats.container.sharding import shard_order
+from fhash_formats.container.sharding import shard_order, shard_shape
 from fhash_formats.container.stored import StoredArray
 from fhash_formats.container.writer import ContainerWriter
 
@@ -27,5 +45,6 @@ __all__ = [
     "describe_coordinates",
     "is_container",
     "shard_order",
+    "shard_shape",
     "validate_header",
 ]

@@ -1,4 +1,4 @@
-"""Metadata of one array: the part of Zarr v3 that a container uses, checked before it is believed."""
+"""Metadata of one array: the subset of Zarr v3 that a container uses, checked on reading."""
 
 from __future__ import annotations
 
@@ -31,9 +31,13 @@ DTYPES = {
         "float64",
     )
 }
+"""Number types of arrays by the name that Zarr gives them, in native byte order."""
 MAX_CHUNK_BYTES = 1 << 30
+"""Bytes of a decoded inner chunk."""
 MAX_DIMENSIONS = 8
+"""Axes of an array."""
 MAX_AXIS = 1 << 62
+"""Length of an array or a chunk along one axis."""
 
 _INDEX = re.compile(r"0|[1-9][0-9]{0,18}")
 _KEYS = {
@@ -53,10 +57,12 @@ _OPTIONAL_KEYS = {"attributes", "dimension_names", "storage_transformers"}
 class ArrayMetadata:
     """Shape, number type, chunking and codecs of an array.
 
-    A member of the file holds one chunk of `chunk_shape`. Where the codecs say so (`sharding`) that is a shard of many inner chunks, each
-    of which is decoded alone; elsewhere it is its own and only inner chunk.
-    Raises DamagedFileError or UnsupportedFileError for what a container cannot hold.
-    Every length is at least 1; the last inner chunks along an axis are stored in full, padded with 0.
+    A member of the file holds one chunk of `chunk_shape`. Where the codecs ask for shards
+    (`sharding`), that chunk is a shard of many inner chunks, each decoded alone. Elsewhere the
+    chunk is its own and only inner chunk.
+
+    Every length is at least 1. The last inner chunks along an axis are stored in full, padded
+    with 0. Raises DamagedFileError or UnsupportedFileError for what a container cannot hold.
     """
 
     shape: tuple[int, ...]
@@ -69,7 +75,8 @@ class ArrayMetadata:
     def __post_init__(self) -> None:
         if not 1 <= len(self.shape) <= MAX_DIMENSIONS or len(self.chunk_shape) != len(self.shape):
             raise DamagedFileError(
-                f"shape {self.shape} with chunks {self.chunk_shape}; 1 to {MAX_DIMENSIONS} axes are allowed"
+                f"shape {self.shape} with chunks {self.chunk_shape}; "
+                f"1 to {MAX_DIMENSIONS} axes are allowed"
             )
         if self.dimension_names is not None and len(self.dimension_names) != len(self.shape):
             raise DamagedFileError(
@@ -79,22 +86,22 @@ class ArrayMetadata:
             raise DamagedFileError(
                 f"chunks of {self.chunk_bytes} bytes; the limit is {MAX_CHUNK_BYTES}"
             )
-        _ = self.coder
+        _ = self.coder  # which refuses unsuitable codecs
 
     @cached_property
     def sharding(self) -> Sharding | None:
-        """How inner chunks lie in a member; None where it is one chunk."""
+        """Division of a member into inner chunks; None where the member is one chunk."""
         return parse_sharding(self.codecs, self.chunk_shape)
 
     @cached_property
     def coder(self) -> CheckedCoder:
-        """Codes full inner chunks."""
+        """The coder of full inner chunks."""
         codecs = self.codecs if self.sharding is None else self.sharding.codecs
         return chunk_coder(codecs, self.dtype, self.inner_shape)
 
     @property
     def inner_shape(self) -> tuple[int, ...]:
-        """Shape of what is decoded alone."""
+        """Shape of an inner chunk, the least that is decoded."""
         return self.chunk_shape if self.sharding is None else self.sharding.chunk_shape
 
     @property
@@ -104,38 +111,38 @@ class ArrayMetadata:
 
     @property
     def grid(self) -> tuple[int, ...]:
-        """Members along each axis."""
+        """Number of members along each axis."""
         return tuple(-(-n // chunk) for n, chunk in zip(self.shape, self.chunk_shape, strict=True))
 
     @property
     def inner_grid(self) -> tuple[int, ...]:
-        """Inner chunks along each axis."""
+        """Number of inner chunks along each axis."""
         return tuple(-(-n // chunk) for n, chunk in zip(self.shape, self.inner_shape, strict=True))
 
     def chunk_key(self, index: Sequence[int]) -> str:
-        """Name of a chunk below its array."""
+        """Name of the member of a chunk, below that of its array: "c/0/0"."""
         return "c/" + "/".join(str(i) for i in index)
 
     def parse_key(self, key: str) -> tuple[int, ...]:
-        """The index of a chunk from its name; raises DamagedFileError if it is none of this array's."""
-        parts = key.split("/")
+        """The index of a chunk from its name; raises DamagedFileError if the array lacks it."""
+        prefix, *numbers = key.split("/")
         if (
-            parts[0] == "c"
-            and len(parts) == len(self.shape) + 1
-            and all(_INDEX.fullmatch(part) for part in parts[1:])
+            prefix == "c"
+            and len(numbers) == len(self.shape)
+            and all(_INDEX.fullmatch(number) for number in numbers)
         ):
-            index = tuple(int(part) for part in parts[1:])
+            index = tuple(int(number) for number in numbers)
             if all(i < n for i, n in zip(index, self.grid, strict=True)):
                 return index
         raise DamagedFileError(f"no chunk of the array's grid {self.grid}")
 
     def inner_region(self, index: Sequence[int]) -> tuple[slice, ...]:
-        """The part of the array that an inner chunk holds, cut at the array's end."""
+        """The region of the array that an inner chunk holds, cut at the array's end."""
         spans = zip(index, self.inner_shape, self.shape, strict=True)
         return tuple(slice(i * chunk, min((i + 1) * chunk, n)) for i, chunk, n in spans)
 
     def to_dict(self) -> dict[str, Any]:
-        """The array's zarr.json."""
+        """The array's zarr.json as JSON values."""
         values: dict[str, Any] = {
             "zarr_format": 3,
             "node_type": "array",
@@ -157,7 +164,10 @@ class ArrayMetadata:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> ArrayMetadata:
-        """The metadata in a zarr.json; raises DamagedFileError or UnsupportedFileError naming the key."""
+        """The metadata in a zarr.json.
+
+        Raises DamagedFileError or UnsupportedFileError that names the key.
+        """
         missing = sorted(_KEYS - values.keys())
         if missing:
             raise DamagedFileError(f"key {missing[0]} is missing")
@@ -167,15 +177,8 @@ class ArrayMetadata:
                 f"data_type is {_shown(values['data_type'])}; allowed: {', '.join(DTYPES)}"
             )
         shape = _lengths(values["shape"], "shape")
-        grid, encoding = values["chunk_grid"], values["chunk_key_encoding"]
-        if (
-            not isinstance(grid, Mapping)
-            or grid.get("name") != "regular"
-            or not isinstance(grid.get("configuration"), Mapping)
-        ):
-            raise UnsupportedFileError(
-                f"chunk_grid is {_shown(grid)}; only regular grids are allowed"
-            )
+        chunk_shape = _chunk_shape(values["chunk_grid"])
+        encoding = values["chunk_key_encoding"]
         if encoding not in (
             {"name": "default", "configuration": {"separator": "/"}},
             {"name": "default"},
@@ -194,27 +197,40 @@ class ArrayMetadata:
         return cls(
             shape=shape,
             dtype=DTYPES[values["data_type"]],
-            chunk_shape=_lengths(grid["configuration"].get("chunk_shape"), "chunk_shape"),
+            chunk_shape=chunk_shape,
             codecs=values["codecs"],
             dimension_names=_dimension_names(values.get("dimension_names")),
             attributes=attributes_of(values),
         )
 
 
-def check_keys(values: Mapping[str, Any], known: set[str]) -> None:
-    """Refuse a key of a zarr.json that is not known, unless it says that it need not be understood (Zarr v3, extension points)."""
-    for key in values.keys() - known:
+def check_keys(values: Mapping[str, Any], allowed: set[str]) -> None:
+    """Raise UnsupportedFileError for a key of a zarr.json that is not allowed.
+
+    A key whose object says that it need not be understood is ignored (Zarr v3, extension points).
+    """
+    for key in values.keys() - allowed:
         extension = values[key]
         if not isinstance(extension, Mapping) or extension.get("must_understand") is not False:
             raise UnsupportedFileError(f"key {_shown(key)} is not known")
 
 
 def attributes_of(values: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The attributes in a zarr.json; raises DamagedFileError."""
+    """The attributes in a zarr.json; raises DamagedFileError if they are no object."""
     attributes = values.get("attributes", {})
     if not isinstance(attributes, dict):
         raise DamagedFileError("attributes is not an object")
     return attributes
+
+
+def _chunk_shape(grid: object) -> tuple[int, ...]:
+    if (
+        not isinstance(grid, Mapping)
+        or grid.get("name") != "regular"
+        or not isinstance(grid.get("configuration"), Mapping)
+    ):
+        raise UnsupportedFileError(f"chunk_grid is {_shown(grid)}; only regular grids are allowed")
+    return _lengths(grid["configuration"].get("chunk_shape"), "chunk_shape")
 
 
 def _lengths(value: object, key: str) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""The most recently used decoded chunks, up to a number of bytes."""
+"""A cache of decoded chunks, bounded in bytes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ Key = tuple[str, tuple[int, ...], int]
 
 
 class ChunkCache:
-    """Least recently used chunks go first; safe for several threads. A chunk larger than `limit` bytes is not kept."""
+    """The most recently used chunks, up to `limit` bytes together; safe for several threads.
+
+    The least recently used chunks are dropped first. A chunk larger than `limit` is not kept.
+    """
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
@@ -23,7 +26,7 @@ class ChunkCache:
         self._lock = threading.Lock()
 
     def get(self, key: Key) -> npt.NDArray[Any] | None:
-        """The chunk, or None."""
+        """The chunk, or None if it is not kept."""
         with self._lock:
             chunk = self._chunks.get(key)
             if chunk is not None:
@@ -31,7 +34,7 @@ class ChunkCache:
             return chunk
 
     def put(self, key: Key, chunk: np.ndarray[Any, Any]) -> None:
-        """Keep a chunk; others go until the limit holds."""
+        """Keep a chunk, and drop others until the limit holds."""
         if chunk.nbytes > self._limit:
             return
         with self._lock:
@@ -40,11 +43,11 @@ class ChunkCache:
             self._chunks[key] = chunk
             self._bytes += chunk.nbytes
             while self._bytes > self._limit:
-                _, gone = self._chunks.popitem(last=False)
-                self._bytes -= gone.nbytes
+                _, dropped = self._chunks.popitem(last=False)
+                self._bytes -= dropped.nbytes
 
     def clear(self) -> None:
-        """Keep nothing."""
+        """Drop all chunks."""
         with self._lock:
             self._chunks.clear()
             self._bytes = 0

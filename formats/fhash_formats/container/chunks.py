@@ -1,4 +1,4 @@
-"""From what a writer is given to the bytes of a member: chunks cut and padded, shards joined."""
+"""Arrays cut into chunks, chunks padded and coded, and coded chunks joined to shards."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from fhash_formats.container.sharding import Sharding, pack_index
 from fhash_formats.errors import InputError
 
 Coded = npt.NDArray[Any] | bytes
-"""A chunk: its values, or the bytes that its coder made of them."""
+"""A chunk to write: its values, or the bytes that the coder of its first codec made of them."""
 
 
 def cut(array: npt.NDArray[Any], chunk_shape: Sequence[int]) -> Iterator[npt.NDArray[Any]]:
-    """The chunks of an array in memory, in C order."""
+    """Yield the chunks of an array in memory, in C order; the last along an axis may be shorter."""
     starts = (
         range(0, n, max(1, chunk)) for n, chunk in zip(array.shape, chunk_shape, strict=False)
     )
@@ -33,9 +33,9 @@ def cut(array: npt.NDArray[Any], chunk_shape: Sequence[int]) -> Iterator[npt.NDA
         ]
 
 
-def expect_end(name: str, metadata: ArrayMetadata, given: Iterator[Any]) -> None:
-    """Raise InputError if more chunks were given than the array has."""
-    if next(given, None) is not None:
+def expect_end(name: str, metadata: ArrayMetadata, chunks: Iterator[Any]) -> None:
+    """Raise InputError if chunks are left that the grid of the array has no place for."""
+    if next(chunks, None) is not None:
         grid = metadata.inner_grid
         raise InputError(
             f"array {name}: more chunks were given than the {prod(grid)} of the grid {grid}"
@@ -47,42 +47,58 @@ def shard_parts(
     metadata: ArrayMetadata,
     sharding: Sharding,
     shard: tuple[int, ...],
-    given: Iterator[Coded | tuple[tuple[int, ...], Coded]],
+    chunks: Iterator[Coded | tuple[tuple[int, ...], Coded]],
 ) -> list[bytes]:
-    """The parts of a shard: its inner chunks in C order, and its index."""
-    wanted: dict[tuple[int, ...], bytes | None] = dict.fromkeys(
+    """The parts of a shard, in the order of the file: its inner chunks in C order, and its index.
+
+    Args:
+        name: the array's, for messages.
+        metadata: the array's.
+        sharding: the array's.
+        shard: index of the shard.
+        chunks: takes the shard's inner chunks from here, each alone (then in C order) or with its
+            index in the array's grid of inner chunks (then in any order).
+
+    Raises:
+        InputError: if an inner chunk is missing, given twice, or does not fit.
+    """
+    coded: dict[tuple[int, ...], bytes | None] = dict.fromkeys(
         sharding.chunks_of(shard, metadata.shape)
     )
-    for expected in list(wanted):
-        item = next(given, None)
+    for expected in list(coded):
+        item = next(chunks, None)
         if item is None:
             raise InputError(
                 f"array {name}: chunk {expected} was not given; the grid has {metadata.inner_grid}"
             )
         index, chunk = item if isinstance(item, tuple) else (expected, item)
-        if wanted.get(index, b"") is not None:
+        if coded.get(index, b"") is not None:
             raise InputError(
                 f"array {name}: chunk {index} is none of shard {shard}, or was given twice"
             )
         if isinstance(chunk, bytes):
-            wanted[index] = with_crc32c(chunk)
+            coded[index] = with_crc32c(chunk)
         else:
-            wanted[index] = metadata.coder.encode(full_chunk(name, metadata, index, chunk))
-    parts = [part for part in wanted.values() if part is not None]
+            coded[index] = metadata.coder.encode(full_chunk(name, metadata, index, chunk))
+    inner_chunks = [data for data in coded.values() if data is not None]
     return [
-        *parts,
-        pack_index([len(part) for part in parts], sharding.present(shard, metadata.shape)),
+        *inner_chunks,
+        pack_index([len(data) for data in inner_chunks], sharding.present(shard, metadata.shape)),
     ]
 
 
 def full_chunk(
     name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: npt.NDArray[Any]
 ) -> npt.NDArray[Any]:
-    """A chunk padded with 0 to the full shape, as Zarr stores those at an end of the array."""
-    expected = tuple(part.stop - part.start for part in metadata.inner_region(index))
+    """A chunk padded with 0 to the full shape, as Zarr stores those at an end of the array.
+
+    Raises InputError for a chunk of another shape or number type than the array needs at `index`.
+    """
+    expected = tuple(span.stop - span.start for span in metadata.inner_region(index))
     if chunk.shape != expected or chunk.dtype.newbyteorder("=") != metadata.dtype:
         raise InputError(
-            f"array {name}: chunk {tuple(index)} is {chunk.dtype} {chunk.shape}; {metadata.dtype} {expected} is needed"
+            f"array {name}: chunk {tuple(index)} is {chunk.dtype} {chunk.shape}; "
+            f"{metadata.dtype} {expected} is needed"
         )
     if expected == metadata.inner_shape:
         return chunk

@@ -1,7 +1,8 @@
-"""Values of a chunk to bytes and back: the codecs that a container may name.
+"""The codecs that a container may name: values of a chunk to bytes and back.
 
-Every list of codecs ends in `crc32c`, so that any Zarr reader notices damage. The first codec, the one from an array to bytes, decides
-about what is between: `ARRAY_CODECS` is the one place where another is added.
+Every list of codecs ends in `crc32c`, so that any Zarr reader notices damage. The first codec makes
+bytes of an array and decides which codecs may follow it. `ARRAY_CODECS` is the one place where
+another first codec is added.
 """
 
 from __future__ import annotations
@@ -26,30 +27,39 @@ Codec = Mapping[str, Any]
 """A codec as Zarr v3 names it: {"name": str, "configuration": {...}}."""
 
 ZSTD_LEVEL = 9
-ZSTD_MOST_RATIO = 32 << 10
-"""Bytes in a byte of zstd at most: a block of at most 128 KiB takes at least a header of three bytes and one more (RFC 8878, 3.1.1.2)."""
+"""Level at which arrays are written; a reader takes any."""
+ZSTD_MAX_RATIO = 32 << 10
+"""Decoded bytes per byte of zstd data.
+
+A block of at most 128 KiB takes at least a header of three bytes and one more (RFC 8878, 3.1.1.2).
+"""
 CRC32C: Codec = {"name": "crc32c"}
 
 _CRC = struct.Struct("<I")
 _ZSTD_MARK = 0xFD2FB528
+_LITTLE: Codec = {"name": "bytes", "configuration": {"endian": "little"}}
 
 
 class ChunkCoder(Protocol):
-    """Codes chunks of one dtype and full shape; `decode` raises DamagedFileError before it allocates for bytes that do not fit.
+    """A coder of chunks of one number type and full shape.
 
-    One that can decode with less detail takes a level of detail as a further argument: `decode(data, lod)`, 0 for everything. One whose
-    chunks say which values are occupied has `masked` True and `decode_masked(data)`, which gives values and mask.
+    `decode` raises DamagedFileError before it allocates for bytes that do not fit. Two abilities
+    are optional:
+
+    - A coder that can decode with less detail has `decode(data, lod)`; level of detail 0 is all.
+    - A coder whose chunks say which values are occupied has `masked` True and
+      `decode_masked(data)`, which returns values and mask.
     """
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The bytes of a full chunk."""
 
     def decode(self, data: memoryview) -> npt.NDArray[Any]:
-        """The full chunk, native byte order, read-only or not."""
+        """The full chunk in native byte order; it may be read-only."""
 
 
 class PlainCoder:
-    """`bytes` (little-endian, C order), then `zstd`."""
+    """The coder of ordinary arrays: `bytes` (little-endian, C order), then `zstd`."""
 
     def __init__(
         self, codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
@@ -69,7 +79,8 @@ class PlainCoder:
         allowed = [expected[0], _LITTLE] if dtype.itemsize == 1 else [expected[0]]
         if codecs[0] not in allowed or codecs[1] != expected[1]:
             raise UnsupportedFileError(
-                f"codecs {_names(codecs)} with settings that a container does not allow; {expected} is allowed"
+                f"codecs {_names(codecs)} with settings that a container does not allow; "
+                f"{expected} is allowed"
             )
         self._level, self._shape = level, shape
         self._stored, self._native = dtype.newbyteorder("<"), dtype.newbyteorder("=")
@@ -83,42 +94,32 @@ class PlainCoder:
         return data
 
     def decode(self, data: memoryview) -> npt.NDArray[Any]:
-        """The full chunk; raises DamagedFileError."""
+        """The full chunk; raises DamagedFileError for data that are not a full chunk."""
         from numcodecs.zstd import decompress
 
         declared = zstd_content_size(data)
         if declared != self._size:
             raise DamagedFileError(f"zstd declares {declared} bytes; the chunk has {self._size}")
-        if declared > ZSTD_MOST_RATIO * len(data):
+        if declared > ZSTD_MAX_RATIO * len(data):
             raise DamagedFileError(
                 f"zstd declares {declared} bytes, which {len(data)} bytes cannot hold"
             )
-        # Into a buffer of exactly the chunk's size, which bounds what a hostile frame can write.
+        # The buffer has exactly the chunk's size, which bounds what a hostile frame can write.
         values = np.empty(self._shape, dtype=self._stored)
         try:
             decompress(data, values)
         except (RuntimeError, ValueError) as error:
-            if "Allocation error" in str(
-                error
-            ):  # zstd's own work space, which says nothing of the data
+            # zstd found no memory for its own work space: the data may be sound.
+            if "Allocation error" in str(error):
                 raise MemoryError("no memory to decompress a chunk") from error
             raise DamagedFileError(f"zstd data are damaged: {error}") from error
         return values.astype(self._native, copy=False)
 
 
-MAX_TILE_VERTICES = 1 << 27
-"""Of a tile of the codec `fhash.transform`: decoding takes some 30 bytes for each, and a damaged file may claim any number."""
-
-
 def _transform_coder(
     codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
 ) -> ChunkCoder:
-    """The coder of `fhash.transform`; raises DamagedFileError for tiles that are too large."""
-    if prod(shape) > MAX_TILE_VERTICES:
-        raise DamagedFileError(
-            f"tiles of {prod(shape):,} vertices; the limit is {MAX_TILE_VERTICES:,}"
-        )
-    # Containers without it are read without loading it.
+    """The coder of `fhash.transform`, loaded only for containers that have this codec."""
     from fhash_formats.transform.stream import TransformCoder
 
     return TransformCoder(codecs, dtype, shape)
@@ -129,23 +130,24 @@ ARRAY_CODECS: dict[str, Callable[[Sequence[Codec], np.dtype[Any], tuple[int, ...
     "bytes": PlainCoder,
     TRANSFORM: _transform_coder,
 }
-"""Coder by the name of the first codec; it is given all codecs but the last, `crc32c`."""
+"""Coder by the name of the first codec; the coder is given all codecs but the last, `crc32c`."""
 
 
 class CheckedCoder:
-    """Any coder with the CRC-32C of its bytes behind them."""
+    """A coder that puts the CRC-32C of a chunk's bytes behind them, and checks it on decoding."""
 
     def __init__(self, coder: ChunkCoder) -> None:
         self._coder = coder
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
-        """The bytes of a full chunk."""
+        """The bytes of a full chunk and their CRC-32C."""
         return with_crc32c(self._coder.encode(chunk))
 
     def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
-        """The full chunk, at a level of detail where that is not 0.
+        """The full chunk at a level of detail; 0 is all of it.
 
-        Raises DamagedFileError, and InputError for a level of detail of a coder that has none.
+        Raises DamagedFileError for damaged data, and InputError for another level of detail of a
+        coder that has none.
         """
         coded = self._checked(data)
         if lod == 0:
@@ -156,7 +158,7 @@ class CheckedCoder:
 
     @property
     def features(self) -> tuple[str, ...]:
-        """Required features that the coding of the chunks stands for, besides that of the codec itself."""
+        """Features that a reader of the chunks must know, besides that of the codec itself."""
         return tuple(getattr(self._coder, "features", ()))
 
     @property
@@ -165,7 +167,7 @@ class CheckedCoder:
         return bool(getattr(self._coder, "masked", False))
 
     def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
-        """The full chunk and its mask; only where `masked`. Raises DamagedFileError."""
+        """The full chunk and its mask, for a coder that is `masked`; raises DamagedFileError."""
         values, mask = self._coder.decode_masked(self._checked(data))  # type: ignore[attr-defined]
         return values, mask
 
@@ -181,34 +183,39 @@ class CheckedCoder:
 def chunk_coder(
     codecs: Sequence[Any], dtype: np.dtype[Any], shape: tuple[int, ...]
 ) -> CheckedCoder:
-    """The coder for chunks of this dtype and full shape; raises UnsupportedFileError for codecs that are not known."""
+    """The coder for chunks of this number type and full shape.
+
+    Raises DamagedFileError for a list that is none of codecs, UnsupportedFileError for codecs that
+    a container does not allow.
+    """
     for codec in codecs:
-        named = isinstance(codec, Mapping) and isinstance(codec.get("name"), str)
-        if not named or not isinstance(codec.get("configuration", {}), Mapping):
+        has_name = isinstance(codec, Mapping) and isinstance(codec.get("name"), str)
+        if not has_name or not isinstance(codec.get("configuration", {}), Mapping):
             raise DamagedFileError("an array's codecs are not a list of {name, configuration}")
     if len(codecs) < 2 or codecs[-1] != CRC32C or codecs[0]["name"] not in ARRAY_CODECS:
         raise UnsupportedFileError(
-            f"codecs {_names(codecs)}; known are {', '.join(ARRAY_CODECS)} at the beginning and crc32c at the end"
+            f"codecs {_names(codecs)}; "
+            f"known are {', '.join(ARRAY_CODECS)} at the beginning and crc32c at the end"
         )
     return CheckedCoder(ARRAY_CODECS[codecs[0]["name"]](codecs[:-1], dtype, shape))
 
 
-_LITTLE: Codec = {"name": "bytes", "configuration": {"endian": "little"}}
-
-
 def plain_codecs(dtype: np.dtype[Any], level: int = ZSTD_LEVEL) -> list[Codec]:
-    """The codecs of ordinary arrays, as the zarr library writes them."""
+    """The codecs of ordinary arrays, in the form in which the zarr library writes them."""
     first = {"name": "bytes"} if dtype.itemsize == 1 else _LITTLE
     return [first, {"name": "zstd", "configuration": {"level": level, "checksum": False}}, CRC32C]
 
 
 def with_crc32c(data: bytes) -> bytes:
-    """`data` and its CRC-32C behind it: the codec `crc32c`."""
+    """`data` followed by its CRC-32C: the codec `crc32c`."""
     return data + _CRC.pack(crc32c(data))
 
 
 def zstd_content_size(data: memoryview) -> int | None:
-    """The content size in the header of a zstd frame, None where it has none (RFC 8878, 3.1.1.1); raises DamagedFileError."""
+    """The content size in the header of a zstd frame; None where the header has none.
+
+    Raises DamagedFileError for data that do not begin with such a header (RFC 8878, 3.1.1.1).
+    """
     if len(data) < 6 or int.from_bytes(data[:4], "little") != _ZSTD_MARK:
         raise DamagedFileError("not a zstd frame")
     descriptor = data[4]
@@ -223,15 +230,15 @@ def zstd_content_size(data: memoryview) -> int | None:
 
 
 def crc32c(data: bytes | memoryview) -> int:
-    """CRC-32C (Castagnoli) of `data`; raises MissingDependencyError."""
+    """CRC-32C (Castagnoli) of `data`; raises MissingDependencyError without google-crc32c."""
     try:
-        # The implementation that zarr and numcodecs use. Checking cannot be left out where it is missing.
+        # zarr and numcodecs use this implementation, too. Without it nothing could be checked.
         import google_crc32c
     except ImportError as error:
         raise MissingDependencyError(
             "the CRC-32C of .fhz files needs google-crc32c: pip install google-crc32c"
         ) from error
-    # It takes bytes and arrays, but no memoryview.
+    # google_crc32c takes bytes and arrays, but no memoryview.
     value: int = google_crc32c.value(
         data if isinstance(data, bytes) else np.frombuffer(data, dtype=np.uint8)
     )

@@ -1,7 +1,8 @@
-"""Positions along an axis in the header, where an array of their own would cost more: by a rule, or as a short list.
+"""Positions along an axis, described in the header: by a rule or as a short list.
 
-The rule is start + i * step for position i: one product and one sum in float64, each rounded, then rounded to `dtype`; `last`, where it
-is there, stands for the last position. It is used only where it gives every bit of the positions.
+An array of their own would cost more bytes. The rule gives position i as start + i * step: one
+product and one sum in float64, each rounded, then rounded to `dtype`. `last`, where it is given,
+replaces the last position. A rule is used only where it gives every bit of the positions.
 """
 
 from __future__ import annotations
@@ -17,18 +18,23 @@ from fhash_formats.container.record import Record
 from fhash_formats.series import AXIS_NAMES, Coordinate
 
 MAX_LISTED = 64
-"""Most positions that are written as a list; a reader takes any number."""
+"""Positions that are written as a list; a reader takes any number."""
 MAX_RULED = 1 << 20
-"""Most positions in the header, so that a few bytes do not ask for much memory."""
+"""Positions that a header describes; the limit keeps a few bytes from asking for much memory."""
 TYPES = ("float64", "float32")
+"""Number types that positions are rounded to; the first is the default."""
 
 _DIGITS = (*range(1, 16), 17)
+"""Numbers of significant decimal digits that guesses of a step are rounded to."""
 
 Floats = npt.NDArray[np.float64]
 
 
 def describe_coordinates(coords: Mapping[str, Coordinate]) -> dict[str, Any]:
-    """The header's `coordinates` for coordinates by axis ("t", "z", "y", "x"), without those that need an array of their own."""
+    """The header's `coordinates`, without those that need an array of their own.
+
+    `coords` holds a coordinate for each of "t", "z", "y" and "x".
+    """
     described = {}
     for axis, stored in AXIS_NAMES.items():
         coordinate = coords[axis]
@@ -43,7 +49,13 @@ def describe_coordinates(coords: Mapping[str, Coordinate]) -> dict[str, Any]:
 
 
 def described_coordinate(description: Mapping[str, Any], stored: str, length: int) -> Coordinate:
-    """The coordinate of `length` positions that a checked description stands for; `stored`: its name in the container."""
+    """The coordinate that a description stands for, once `check_positions` has passed it.
+
+    Args:
+        description: the axis' object in the header.
+        stored: name of the axis in the container.
+        length: number of positions.
+    """
     values = positions(description, length)
     return Coordinate(
         name=description.get("name", stored),
@@ -53,7 +65,10 @@ def described_coordinate(description: Mapping[str, Any], stored: str, length: in
 
 
 def describe_positions(values: Floats) -> dict[str, Any] | None:
-    """What the header says of positions float64 (n,), from which `positions` makes them bit by bit; None where only an array will do."""
+    """The header's description of positions, float64 (n,); None where only an array will do.
+
+    `positions` turns the description into the same positions, bit by bit.
+    """
     if not np.isfinite(values).all() or values.size > MAX_RULED:
         return None
     with np.errstate(over="ignore"):
@@ -78,8 +93,11 @@ def describe_positions(values: Floats) -> dict[str, Any] | None:
 
 
 def positions(description: Mapping[str, Any], length: int) -> Floats:
-    """The positions that a checked description stands for, float64 (length,)."""
-    # A position beyond its type becomes an infinity, which an array may hold as well.
+    """The positions that a description stands for, float64 (length,).
+
+    The description is one that `check_positions` has passed.
+    """
+    # A position beyond its type becomes an infinity; arrays of positions may hold infinities too.
     with np.errstate(over="ignore", invalid="ignore"):
         if "values" in description:
             values = np.array(description["values"], dtype=np.float64)
@@ -92,7 +110,7 @@ def positions(description: Mapping[str, Any], length: int) -> Floats:
 
 
 def check_positions(record: Record, length: int) -> None:
-    """Whether the header describes `length` positions; raises DamagedFileError naming the key."""
+    """Raise DamagedFileError, naming the key, unless `record` describes `length` positions."""
     for key in ("start", "step", "last"):
         if record.has(key):
             record.number(key)
@@ -107,12 +125,12 @@ def check_positions(record: Record, length: int) -> None:
 
 
 def _same(a: Floats, b: Floats) -> bool:
-    """Whether all bits are equal: -0 is not 0."""
+    """Whether all bits are equal; -0 and 0 differ."""
     return a.tobytes() == b.tobytes()
 
 
 def _rule(start: float, step: float, last: float | None, kind: str) -> dict[str, Any]:
-    """A rule without what is usual."""
+    """A rule as the header holds it: values equal to their defaults are left out."""
     rule: dict[str, Any] = {}
     if start != 0 or np.signbit(start):
         rule["start"] = _plain(start)
@@ -124,25 +142,24 @@ def _rule(start: float, step: float, last: float | None, kind: str) -> dict[str,
 
 
 def _candidates(values: Floats, kind: str) -> Iterator[tuple[float, float]]:
-    """Starts and steps that may be those of the source, the shortest in digits first."""
+    """Yield starts and steps that the source may have used, those of few digits first."""
     starts = list(dict.fromkeys((_shortest(values[0], kind), float(values[0]))))
     if values.size == 1:
         yield from ((start, 1.0) for start in starts)
         return
     first, last = _shortest(values[0], kind), _shortest(values[-1], kind)
-    with np.errstate(
-        over="ignore", invalid="ignore"
-    ):  # at the ends of float64; what is no number is no guess
+    # Differences overflow at the ends of float64; guesses that are not finite are dropped below.
+    with np.errstate(over="ignore", invalid="ignore"):
         guesses = [
             float(values[1] - values[0]),
             float((values[-1] - values[0]) / (values.size - 1)),
             (last - first) / (values.size - 1),
         ]
-        # The middle of the steps that every position allows for, each within half of its spacing; the last may be no part of the rule.
-        numbers, spacing = (
-            np.arange(1, values.size),
-            np.spacing(values[1:].astype(kind)).astype(np.float64),
-        )
+        # Each position bounds the step: it was rounded by at most half of its spacing. A further
+        # guess is the middle of the steps that all positions allow for, with the last and
+        # without it, since the last may not follow the rule.
+        numbers = np.arange(1, values.size)
+        spacing = np.spacing(values[1:].astype(kind)).astype(np.float64)
         low, high = (
             (values[1:] + sign * 0.5 * np.abs(spacing) - first) / numbers for sign in (-1, 1)
         )
@@ -151,7 +168,7 @@ def _candidates(values: Floats, kind: str) -> Iterator[tuple[float, float]]:
     guesses = [guess for guess in guesses if np.isfinite(guess)]
     rounded = [float(f"{guess:.{digits - 1}e}") for digits in _DIGITS for guess in guesses]
     for step in dict.fromkeys([*rounded, *guesses]):
-        # Most guesses fail at the second position; they are not tried on all.
+        # Most guesses fail at the second position, so that the whole rule need not be tried.
         for start in starts:
             with np.errstate(over="ignore"):
                 second = np.dtype(kind).type(np.float64(start) + np.float64(step))
@@ -165,6 +182,7 @@ def _shortest(value: np.floating[Any] | float, kind: str) -> float:
 
 
 def _plain(value: float) -> float | int:
-    """Whole numbers without '.0', which costs two bytes."""
-    whole = abs(value) < 2**53 and value == int(value) and not (value == 0 and np.signbit(value))
-    return int(value) if whole else float(value)
+    """The number, as an int where it is whole: '.0' would cost two bytes of JSON."""
+    negative_zero = value == 0 and np.signbit(value)
+    is_whole = abs(value) < 2**53 and value == int(value) and not negative_zero
+    return int(value) if is_whole else float(value)

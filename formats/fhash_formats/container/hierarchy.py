@@ -1,4 +1,7 @@
-"""From the members of a ZIP to the header and the arrays: every member has a place, every array has all of its chunks."""
+"""The Zarr v3 hierarchy in a ZIP: members become a header and arrays.
+
+Every member must have a place in the hierarchy, and every array must have all of its chunks.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +19,20 @@ from fhash_formats.container.zip_checked import DOCUMENT, read_member
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 GROUP: dict[str, Any] = {"zarr_format": 3, "node_type": "group"}
+"""The zarr.json of a group without attributes."""
 
 _CHUNK = re.compile(r"(.+)/(c(?:/[0-9]+)+)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hierarchy:
-    """`header`: the attribute "fhash" of the root; `arrays`: metadata by name; `chunks`: members by array name and chunk index."""
+    """The content of a container's ZIP.
+
+    Attributes:
+        header: attribute "fhash" of the root.
+        arrays: metadata by name of the array.
+        chunks: members by name of the array and index of the chunk.
+    """
 
     header: dict[str, Any]
     arrays: dict[str, ArrayMetadata]
@@ -30,22 +40,25 @@ class Hierarchy:
 
 
 def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
-    """Raises DamagedFileError or UnsupportedFileError naming the member."""
+    """The hierarchy of the members.
+
+    Raises DamagedFileError or UnsupportedFileError that names the member.
+    """
     if DOCUMENT not in members:
         raise DamagedFileError(f"member {DOCUMENT} is missing")
     groups: dict[str, Mapping[str, Any]] = {}
     arrays: dict[str, ArrayMetadata] = {}
     chunk_members: list[tuple[str, str, Member]] = []
     for name, member in members.items():
-        node, _, last = name.rpartition("/")
-        if last == DOCUMENT:
+        node, _, file_name = name.rpartition("/")
+        if file_name == DOCUMENT:
             document = _read_document(source, member)
             if isinstance(document, ArrayMetadata):
                 arrays[node] = document
             else:
                 groups[node] = document
-        elif found := _CHUNK.fullmatch(name):
-            chunk_members.append((found[1], found[2], member))
+        elif match := _CHUNK.fullmatch(name):
+            chunk_members.append((match[1], match[2], member))
         else:
             raise DamagedFileError(f"member {name} belongs to no array")
     if "" not in groups or not isinstance(groups[""].get("fhash"), dict):
@@ -60,10 +73,11 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
 
 def _read_document(source: Source, member: Member) -> ArrayMetadata | Mapping[str, Any]:
     """The metadata of an array or the attributes of a group."""
-    # Before reading; the data of a chunk may be that large, metadata may not.
+    # Checked before reading: the data of a chunk may be that large, metadata may not.
     if max(member.sizes) > strict_json.MAX_BYTES:
         raise DamagedFileError(
-            f"member {member.name}: {max(member.sizes)} bytes of metadata; the limit is {strict_json.MAX_BYTES}"
+            f"member {member.name}: {max(member.sizes)} bytes of metadata; "
+            f"the limit is {strict_json.MAX_BYTES}"
         )
     data = read_member(source, member)
     try:
@@ -81,7 +95,11 @@ def _read_document(source: Source, member: Member) -> ArrayMetadata | Mapping[st
 def _place_chunks(
     arrays: Mapping[str, ArrayMetadata], members: list[tuple[str, str, Member]]
 ) -> dict[str, dict[tuple[int, ...], Member]]:
-    """Chunks by array and index; a chunk that is missing must never read as the fill value, one too many may hide anything."""
+    """The members of chunks by name of the array and index of the chunk.
+
+    Raises DamagedFileError for a missing chunk, which must never read as the fill value, and for
+    one too many, which could hide anything.
+    """
     chunks: dict[str, dict[tuple[int, ...], Member]] = {name: {} for name in arrays}
     for name, key, member in members:
         if name not in arrays:
@@ -91,7 +109,8 @@ def _place_chunks(
         except DamagedFileError as error:
             raise DamagedFileError(f"member {member.name}: {error}") from error
     for name, metadata in arrays.items():
-        # Names are unique and each is an index within the grid, so an equal number means that all are there.
+        # Names are unique and indices lie within the grid, so an equal count means that no chunk
+        # is missing.
         if len(chunks[name]) != prod(metadata.grid):
             raise DamagedFileError(
                 f"array {name} has {len(chunks[name])} chunks; {prod(metadata.grid)} are declared"

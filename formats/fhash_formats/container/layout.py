@@ -1,7 +1,12 @@
-"""The bytes of a container's ZIP: every field that carries no information is fixed, so that one content has one file.
+"""The bytes of a container's ZIP (PKWARE APPNOTE 6.3).
 
-Layout (PKWARE APPNOTE 6.3): members one after the other without gaps, each a local header of 30 bytes, its name and its data; then the
-directory (one entry per member, in the same order); then the end records with the comment. Numbers are little-endian.
+The file has three parts. Numbers are little-endian.
+
+1. the members, one after the other without gaps: a local header of 30 bytes, the name, the data;
+2. the directory: one entry per member, in the same order;
+3. the end records with the comment.
+
+Every field that carries no information is fixed, so that one content has one file.
 """
 
 from __future__ import annotations
@@ -14,8 +19,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 LAYOUT_VERSION = 2
-"""Of what is written; version 1 has no deflated members."""
+"""Version of the layout that is written; version 1 has no deflated members."""
 COMMENT = re.compile(rb"fhash ([0-9]{1,4}) sha256=[0-9a-f]{64}\Z")
+"""The comment at the end of a container: layout version and digest of the directory."""
 
 LOCAL = struct.Struct("<4s5H3I2H")
 ENTRY = struct.Struct("<4s4B4H3I5H2I")
@@ -24,23 +30,44 @@ END_64 = struct.Struct("<4sQ2H2I4Q")
 LOCATOR_64 = struct.Struct("<4sIQI")
 END = struct.Struct("<4s4H2IH")
 
-LOCAL_MARK, ENTRY_MARK, END_MARK = b"PK\x03\x04", b"PK\x01\x02", b"PK\x05\x06"
-END_64_MARK, LOCATOR_64_MARK = b"PK\x06\x06", b"PK\x06\x07"
+LOCAL_MARK = b"PK\x03\x04"
+ENTRY_MARK = b"PK\x01\x02"
+END_MARK = b"PK\x05\x06"
+END_64_MARK = b"PK\x06\x06"
+LOCATOR_64_MARK = b"PK\x06\x07"
 
-VERSION, VERSION_64 = 20, 45
+VERSION = 20
+"""ZIP version 2.0, in tenths."""
+VERSION_64 = 45
+"""ZIP version 4.5, in tenths: the first with 64-bit offsets."""
 UNIX = 3
+"""The system on which a member was made, which gives its attributes a meaning."""
 FILE_MODE = 0o100644 << 16
-TIME, DATE = 0, (1980 - 1980) << 9 | 1 << 5 | 1
-STORED, DEFLATED = 0, 8
-MAX_16, MAX_32 = 0xFFFF, 0xFFFFFFFF
-"""A field of this value says that the true one is in the 64-bit record."""
+"""External attributes of a member: a regular file of mode 0644."""
+TIME = 0
+"""Midnight, as MS-DOS writes times."""
+DATE = (1980 - 1980) << 9 | 1 << 5 | 1
+"""1 January 1980, as MS-DOS writes dates."""
+STORED = 0
+"""Method of a member whose data are stored as they are."""
+DEFLATED = 8
+"""Method of a member whose data are deflated (RFC 1951)."""
+MAX_16 = 0xFFFF
+"""Value of a 16-bit field whose true value stands in a 64-bit record."""
+MAX_32 = 0xFFFFFFFF
+"""Value of a 32-bit field whose true value stands in a 64-bit record."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Member:
-    """One file in the ZIP: `offset` of its local header, `size` of its data there. Sizes stay below 4 GiB, offsets need not.
+    """One file in the ZIP. Sizes stay below 4 GiB, offsets need not.
 
-    full_size: of the data once they are inflated; None where they are stored as they are. crc: CRC-32 of the full data.
+    Attributes:
+        name: path in the ZIP, ASCII.
+        offset: offset of the local header.
+        size: bytes of the data in the ZIP.
+        crc: CRC-32 of the full data.
+        full_size: bytes of the inflated data; None for data that are stored as they are.
     """
 
     name: str
@@ -51,22 +78,22 @@ class Member:
 
     @property
     def method(self) -> int:
-        """How ZIP calls what was done with the data."""
+        """ZIP's number of the compression method."""
         return STORED if self.full_size is None else DEFLATED
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """Of the data in the file and in full."""
+        """Bytes of the data in the file, and bytes of the full data."""
         return self.size, self.size if self.full_size is None else self.full_size
 
     @property
     def header_size(self) -> int:
-        """Bytes of the local header."""
+        """Bytes of the local header and the name."""
         return LOCAL.size + len(self.name)
 
     @property
     def data_offset(self) -> int:
-        """Offset of its data."""
+        """Offset of the data."""
         return self.offset + self.header_size
 
     @property
@@ -76,7 +103,7 @@ class Member:
 
 
 def local_header(member: Member) -> bytes:
-    """The bytes before a member's data."""
+    """The bytes before a member's data: the local header and the name."""
     name = member.name.encode("ascii")
     return (
         LOCAL.pack(
@@ -102,7 +129,13 @@ def deflated(data: bytes) -> bytes:
 
 
 def document_member(name: str, offset: int, data: bytes) -> tuple[Member, bytes]:
-    """The member of a metadata document, and its data in the file: deflated where that is shorter."""
+    """The member of a metadata document, and its data in the file, deflated where that is shorter.
+
+    Args:
+        name: path of the document in the ZIP.
+        offset: offset of its local header.
+        data: bytes of the document.
+    """
     packed = deflated(data)
     if len(packed) >= len(data):
         return Member(name=name, offset=offset, size=len(data), crc=zlib.crc32(data)), data
@@ -112,7 +145,10 @@ def document_member(name: str, offset: int, data: bytes) -> tuple[Member, bytes]
 
 
 def directory_entry(member: Member) -> bytes:
-    """A member's entry in the directory; an offset of 4 GiB or more goes to the zip64 extra field."""
+    """A member's entry in the directory.
+
+    An offset of 2^32 - 1 or more stands in an extra field (zip64).
+    """
     name = member.name.encode("ascii")
     far = member.offset >= MAX_32
     extra = OFFSET_64.pack(1, 8, member.offset) if far else b""
@@ -142,10 +178,16 @@ def directory_entry(member: Member) -> bytes:
 
 
 def end_records(count: int, size: int, offset: int) -> bytes:
-    """What follows a directory of `count` entries and `size` bytes at `offset`, up to the comment; zip64 records only where needed."""
+    """The end records behind a directory, up to the comment; zip64 records only where needed.
+
+    Args:
+        count: entries of the directory.
+        size: bytes of the directory.
+        offset: offset of the directory.
+    """
     comment_size = len(comment(b""))
-    short = (min(count, MAX_16), min(count, MAX_16), min(size, MAX_32), min(offset, MAX_32))
-    end = END.pack(END_MARK, 0, 0, *short, comment_size)
+    limited = (min(count, MAX_16), min(count, MAX_16), min(size, MAX_32), min(offset, MAX_32))
+    end = END.pack(END_MARK, 0, 0, *limited, comment_size)
     if count < MAX_16 and size < MAX_32 and offset < MAX_32:
         return end
     end_64 = END_64.pack(
@@ -155,12 +197,15 @@ def end_records(count: int, size: int, offset: int) -> bytes:
 
 
 def comment(directory: bytes, version: int = LAYOUT_VERSION) -> bytes:
-    """The signature of a container: its layout version and the SHA-256 of everything from the first directory entry to the comment."""
+    """The signature of a container: its layout version and a SHA-256.
+
+    `directory` is what is digested: every byte from the first directory entry to the comment.
+    """
     return b"fhash %d sha256=%s" % (version, hashlib.sha256(directory).hexdigest().encode("ascii"))
 
 
 def ending(members: Sequence[Member]) -> bytes:
-    """Everything after the data of the last member: directory, end records and comment."""
+    """The bytes after the data of the last member: directory, end records and comment."""
     entries = b"".join(directory_entry(member) for member in members)
     directory = entries + end_records(len(members), len(entries), members[-1].end if members else 0)
     return directory + comment(directory)

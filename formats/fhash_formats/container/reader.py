@@ -1,4 +1,4 @@
-"""`Container`: a `.fhz` file, opened only if it is sound."""
+"""`Container`: a `.fhz` file for reading, checked when it is opened."""
 
 from __future__ import annotations
 
@@ -10,12 +10,8 @@ from typing import Any
 
 from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.coordinates import described_coordinate
-from fhash_formats.container.header import (
-    POSITIONS,
-    check_arrays,
-    check_key_frames,
-    validate_header,
-)
+from fhash_formats.container.expected_arrays import check_arrays, check_key_frames
+from fhash_formats.container.header import POSITIONS, validate_header
 from fhash_formats.container.hierarchy import read_hierarchy
 from fhash_formats.container.source import CountedSource, FileSource, Source
 from fhash_formats.container.stored import StoredArray, damage_named
@@ -24,10 +20,14 @@ from fhash_formats.errors import FhashError
 from fhash_formats.series import Coordinate
 
 CACHE_BYTES = 256 << 20
+"""Bytes of decoded chunks that an open container keeps."""
 
 
 def is_container(path: str | Path) -> bool:
-    """Whether a file ends in a container's signature; False for one that cannot be read, and for one that was cut short."""
+    """Whether a file ends in a container's signature.
+
+    False for a file that cannot be read, and for one that was cut short.
+    """
     try:
         source = FileSource(Path(path))
     except FhashError:
@@ -46,8 +46,9 @@ class Container:
     Attributes:
         path: as given.
         size: bytes of the file.
-        digest: hexadecimal SHA-256 of its directory, which holds a checksum of everything: files of another content have another.
-        header: the attribute "fhash" of the root (FORMAT.md).
+        digest: SHA-256 of the file's directory, hexadecimal. The directory holds a checksum of
+            everything, so that files of different content have different digests.
+        header: attribute "fhash" of the root (FORMAT.md).
         arrays: StoredArray by name, in the order of the file.
     """
 
@@ -58,7 +59,10 @@ class Container:
     arrays: Mapping[str, StoredArray]
 
     def __init__(self, path: Path, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
-        """Over an open source, which it closes; `open` is for files. Raises as `open` does."""
+        """Read a container from an open source, which `close` closes; `open` is for files.
+
+        Raises DamagedFileError, or UnsupportedFileError for a newer format.
+        """
         self.path, self.size = path, source.size
         self._source = source = CountedSource(source)
         self._cache = ChunkCache(cache_bytes)
@@ -71,20 +75,20 @@ class Container:
                 self._documents = sum(
                     member.name.endswith("zarr.json") for member in members.values()
                 )
-                found = read_hierarchy(source, members)
-                validate_header(found.header)
-                check_arrays(found.header, found.arrays)
-            self.header = found.header
+                tree = read_hierarchy(source, members)
+                validate_header(tree.header)
+                check_arrays(tree.header, tree.arrays)
+            self.header = tree.header
             self.arrays = MappingProxyType(
                 {
-                    name: StoredArray(path, name, array, found.chunks[name], source, self._cache)
-                    for name, array in found.arrays.items()
+                    name: StoredArray(path, name, array, tree.chunks[name], source, self._cache)
+                    for name, array in tree.arrays.items()
                 }
             )
             if "key_frames" in self.arrays:
                 key_frames = self.arrays["key_frames"].read()
                 with damage_named(path):
-                    check_key_frames(found.header, key_frames)
+                    check_key_frames(tree.header, key_frames)
         except BaseException:
             source.close()
             raise
@@ -93,17 +97,24 @@ class Container:
     def open(cls, path: str | Path, *, cache_bytes: int = CACHE_BYTES) -> Container:
         """Open a file; `cache_bytes` bounds the decoded chunks that are kept.
 
-        Raises MissingInputError, InputError (a folder, no permission), DamagedFileError, UnsupportedFileError (a newer format).
+        Raises:
+            MissingInputError: for no such file.
+            InputError: for a folder, or a file without permission.
+            DamagedFileError: for a file that is no container, or a damaged one.
+            UnsupportedFileError: for a newer format.
         """
         return cls(Path(path), FileSource(Path(path)), cache_bytes=cache_bytes)
 
     @property
     def bytes_read(self) -> int:
-        """Bytes of the file that were read so far, since before it was opened."""
+        """Bytes of the file that were read so far, opening included."""
         return self._source.bytes_read
 
     def coordinate(self, stored: str) -> Coordinate:
-        """Positions along the axis `stored` ("time", "z", "y" or "x"), from the header or from their array."""
+        """Positions along the axis `stored`: "time", "z", "y" or "x".
+
+        They come from their array or, where there is none, from the header.
+        """
         axis = POSITIONS.index(stored)
         if f"coords/{stored}" not in self.arrays:
             return described_coordinate(
@@ -116,9 +127,10 @@ class Container:
         )
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
-        """Read and decode every member (metadata were at opening); the number of arrays.
+        """Read and decode every chunk; the number of arrays. Metadata were read at opening.
 
-        `progress(done, total)` counts documents and chunks. Raises DamagedFileError naming the member.
+        `progress(done, total)` counts metadata documents, as read already, and chunks. Raises
+        DamagedFileError that names the member.
         """
         total = self._documents + sum(prod(array.grid) for array in self.arrays.values())
         done = self._documents
@@ -135,7 +147,7 @@ class Container:
         return len(self.arrays)
 
     def overhead(self) -> int:
-        """Bytes of the file that are not data of chunks: metadata, names, directory."""
+        """Bytes of the file that are no data of chunks: metadata, names, directory."""
         return self.size - sum(array.nbytes_stored for array in self.arrays.values())
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A JSON object whose keys are checked as they are taken; every failure names the key and what it should be."""
+"""Checked access to a JSON object: every failure names the key and what its value should be."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ from typing import Any
 from fhash_formats.errors import DamagedFileError
 
 MAX_LENGTH = 1 << 40
+"""Length that a header may declare for an axis, and a limit for other counts in it."""
 
 
 class Record:
-    """Checked access to a JSON object; `prefix` comes before a key in messages, "header key model.". Raises DamagedFileError."""
+    """A JSON object whose values are checked as they are taken; raises DamagedFileError.
+
+    `prefix` comes before a key in messages, for example "header key model.".
+    """
 
     def __init__(self, values: Mapping[str, Any], prefix: str) -> None:
         self._values = values
         self._prefix = prefix
 
     def get(self, key: str) -> Any:
-        """The value, which must be there."""
+        """The value of `key`; the key must be there."""
         if key not in self._values:
             raise DamagedFileError(f"{self._prefix}{key} is missing")
         return self._values[key]
@@ -29,20 +33,20 @@ class Record:
         return key in self._values
 
     def need(self, condition: bool, key: str, allowed: str) -> None:
-        """Refuse the value of `key` unless `condition` holds."""
+        """Refuse the value of `key` unless `condition` holds; `allowed` says what is needed."""
         if not condition:
             raise DamagedFileError(
                 f"{self._prefix}{key} is {ascii(self.get(key))[:80]}; needed: {allowed}"
             )
 
     def record(self, key: str) -> Record:
-        """An object."""
+        """The value of `key`, an object."""
         value = self.get(key)
         self.need(isinstance(value, Mapping), key, "an object")
         return Record(value, f"{self._prefix}{key}.")
 
     def records(self, key: str) -> list[Record]:
-        """A list of objects."""
+        """The value of `key`, a list of objects."""
         values = self.get(key)
         self.need(
             isinstance(values, list) and all(isinstance(value, Mapping) for value in values),
@@ -54,13 +58,13 @@ class Record:
         ]
 
     def text(self, key: str) -> str:
-        """A string."""
+        """The value of `key`, a string."""
         value = self.get(key)
         self.need(isinstance(value, str), key, "a string")
         return str(value)
 
     def texts(self, key: str) -> list[str]:
-        """A list of strings."""
+        """The value of `key`, a list of strings."""
         values = self.get(key)
         self.need(
             isinstance(values, list) and all(isinstance(value, str) for value in values),
@@ -70,54 +74,57 @@ class Record:
         return list(values)
 
     def choice(self, key: str, allowed: tuple[str, ...]) -> str:
-        """One of some strings."""
+        """The value of `key`, one of the strings `allowed`."""
         value = self.get(key)
         self.need(isinstance(value, str) and value in allowed, key, " or ".join(allowed))
         return str(value)
 
-    def whole(self, key: str, low: int, high: int) -> int:
-        """A whole number from `low` to `high`."""
+    def integer(self, key: str, low: int, high: int) -> int:
+        """The value of `key`, a whole number from `low` to `high`."""
         value = self.get(key)
         self.need(
             type(value) is int and low <= value <= high, key, f"a whole number from {low} to {high}"
         )
         return int(value)
 
-    def wholes(self, key: str, count: int, low: int, high: int) -> list[int]:
-        """A list of `count` whole numbers from `low` to `high`."""
+    def integers(self, key: str, count: int, low: int, high: int) -> list[int]:
+        """The value of `key`, a list of `count` whole numbers from `low` to `high`."""
         values = self.get(key)
-        whole = (
+        fits = (
             isinstance(values, list)
             and len(values) == count
             and all(type(n) is int and low <= n <= high for n in values)
         )
-        self.need(whole, key, f"{count} whole numbers from {low} to {high}")
+        self.need(fits, key, f"{count} whole numbers from {low} to {high}")
         return list(values)
 
     def number(self, key: str) -> float:
-        """A finite number."""
+        """The value of `key`, a finite number."""
         value = self.get(key)
         self.need(_is_finite(value), key, "a finite number")
         return float(value)
 
     def number_or_null(self, key: str) -> float | None:
-        """A finite number, or None where the key is null or missing."""
+        """The value of `key`, a finite number, or None where the key is null or missing."""
         return None if self._values.get(key) is None else self.number(key)
 
     def numbers(self, key: str, count: int) -> list[float]:
-        """A list of `count` finite numbers."""
+        """The value of `key`, a list of `count` finite numbers."""
         values = self.get(key)
-        finite = (
+        fits = (
             isinstance(values, list)
             and len(values) == count
             and all(_is_finite(value) for value in values)
         )
-        self.need(finite, key, f"{count} finite numbers")
+        self.need(fits, key, f"{count} finite numbers")
         return [float(value) for value in values]
 
 
 def _is_finite(value: object) -> bool:
-    """Whether a JSON value is a number that float64 can hold; `True` is none, and whole numbers may be too large."""
+    """Whether a JSON value is a number that float64 can hold.
+
+    Python takes `True` for a number, and whole numbers of JSON may be too large for float64.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     try:

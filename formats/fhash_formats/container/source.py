@@ -1,4 +1,4 @@
-"""Bytes at offsets: a file on disk, or the beginning of one with an end that is not written yet."""
+"""Sources of bytes at offsets: a file on disk, or the beginning of a file with an unwritten end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
 
 
 class Source(Protocol):
-    """What a container is read from; `read` may be called by several threads."""
+    """A source that a container is read from; several threads may call `read`.
+
+    `size` is the number of bytes.
+    """
 
     size: int
 
@@ -23,11 +26,11 @@ class Source(Protocol):
 
 
 class FileSource:
-    """A regular file; raises MissingInputError or InputError if it cannot be opened."""
+    """A regular file on disk; raises MissingInputError or InputError if it cannot be opened."""
 
     def __init__(self, path: Path) -> None:
         try:
-            # Asked before opening, because opening a named pipe waits for a writer.
+            # The kind is asked before opening, because opening a named pipe waits for a writer.
             if not stat.S_ISREG(path.stat().st_mode):
                 raise InputError(f"{path}: not a regular file; a .fhz container is one file")
             self._file = path.open("rb", buffering=0)
@@ -44,22 +47,23 @@ class FileSource:
             raise DamagedFileError(
                 f"{size} bytes at offset {offset} are outside the file of {self.size} bytes"
             )
-        parts = []
-        # A lock and not os.pread, which Windows lacks; decoding, the greater part of the time, is outside of it.
+        pieces = []
+        # Windows lacks os.pread, so a lock is needed. Decoding takes longer, and is outside it.
         with self._lock:
             if self._file.closed:
                 raise InputError("the container is closed")
             self._file.seek(offset)
             while size > 0:
-                part = self._file.read(size)
-                if not part:
+                piece = self._file.read(size)
+                if not piece:
                     raise DamagedFileError(
-                        f"the file was cut short while it was read, {size} bytes from offset {offset} are missing"
+                        "the file was cut short while it was read, "
+                        f"{size} bytes from offset {offset} are missing"
                     )
-                parts.append(part)
-                size -= len(part)
-                offset += len(part)
-        return parts[0] if len(parts) == 1 else b"".join(parts)
+                pieces.append(piece)
+                size -= len(piece)
+                offset += len(piece)
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def close(self) -> None:
         """Release the file, once no other thread reads it."""
@@ -68,7 +72,7 @@ class FileSource:
 
 
 class CountedSource:
-    """Any source, and how many bytes were read from it."""
+    """A source that counts in `bytes_read` how many bytes were read from it."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -89,7 +93,10 @@ class CountedSource:
 
 
 class PreviewSource:
-    """The first `length` bytes of a file followed by `tail`: a container as it will be once its end is written."""
+    """A container as it will be once its end is written.
+
+    Its bytes are the first `length` bytes of a file, followed by `tail`.
+    """
 
     def __init__(self, begin: FileSource, length: int, tail: bytes) -> None:
         self._begin = begin

@@ -1,4 +1,4 @@
-"""One array of an open container, read region by region."""
+"""`StoredArray`: one array of an open container, read region by region."""
 
 from __future__ import annotations
 
@@ -22,18 +22,22 @@ from fhash_formats.container.zip_checked import check_member, read_member
 from fhash_formats.errors import DamagedFileError, RegionError
 from fhash_formats.support.threads import in_threads
 
-FEW = 4
-"""Entries are read alone where fewer than one in so many of a shard's index is wanted."""
+SPARSE_SHARE = 4
+"""Index entries are read one by one for fewer than one in SPARSE_SHARE inner chunks of a shard."""
 MASK = ":mask"
-"""Behind the name of an array, for its masks in the cache."""
+"""Suffix of an array's name for its masks in the cache."""
+
+ChunkIndex = tuple[int, ...]
 
 
 @contextmanager
 def damage_named(path: object) -> Iterator[None]:
-    """Put the path before what is wrong with a file, and turn what a hostile or unreadable file provokes into DamagedFileError.
+    """A block whose errors about a file begin with its path.
 
-    MemoryError passes: the coders refuse sizes that the bytes of a chunk cannot hold, so what is left is a machine with less memory than a
-    sound file takes, and whoever is told that a file is damaged may well delete it.
+    Other errors that a hostile or unreadable file provokes become DamagedFileError. MemoryError
+    passes: the coders refuse sizes that the bytes of a chunk cannot hold, so that only a machine
+    with too little memory for a sound file is left as its cause. A user who is told that a file is
+    damaged may delete it.
     """
     try:
         yield
@@ -51,14 +55,18 @@ class StoredArray:
     """An array (Zarr v3) in a container. Reading is safe for several threads.
 
     Attributes:
-        name: path in the hierarchy, "tables/level_1".
-        shape: lengths per axis, at least 1; dtype: native byte order.
-        chunk_shape: of a chunk, the least that is decoded; grid: chunks along each axis.
-        shard_shape: of a shard of many chunks; None where each chunk is a member of its own.
-        dimension_names, attributes: as stored.
-        masked: whether each chunk says which of its values are occupied; then `read_mask` reads it.
-        chunks: member of the file by index of the chunk, or of the shard where there are shards, in the order of the file.
-        nbytes_stored: bytes of its members in the file.
+        name: path in the hierarchy, for example "tables/level_1".
+        shape: length of each axis, at least 1.
+        dtype: number type, native byte order.
+        chunk_shape: shape of a chunk, the least that is decoded.
+        grid: number of chunks along each axis.
+        shard_shape: shape of a shard of many chunks; None where each chunk is a member of its own.
+        dimension_names: names of the axes, as stored.
+        attributes: as stored.
+        masked: whether each chunk says which of its values are occupied, for `read_mask`.
+        chunks: members of the file, in its order, by index of the chunk or, where there are
+            shards, of the shard.
+        nbytes_stored: bytes of the members' data in the file.
     """
 
     def __init__(
@@ -66,7 +74,7 @@ class StoredArray:
         path: object,
         name: str,
         metadata: ArrayMetadata,
-        chunks: Mapping[tuple[int, ...], Member],
+        chunks: Mapping[ChunkIndex, Member],
         source: Source,
         cache: ChunkCache,
     ) -> None:
@@ -83,33 +91,38 @@ class StoredArray:
         self.dimension_names = metadata.dimension_names
         self.attributes = metadata.attributes
         self.nbytes_stored = sum(member.size for member in chunks.values())
-        self._indices: dict[tuple[int, ...], npt.NDArray[np.int64]] = {}
-        self._entries: dict[tuple[tuple[int, ...], int], tuple[int, int]] = {}
+        self._indices: dict[ChunkIndex, npt.NDArray[np.int64]] = {}
+        self._entries: dict[tuple[ChunkIndex, int], tuple[int, int]] = {}
         self._lock = threading.Lock()
 
     def read(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[Any]:
-        """The values in `region`, one slice per axis without step, everything if None; a fresh array.
+        """The values in `region`, in a new array.
 
-        Touches only the chunks that intersect the region, those of shards in several threads. They are kept in the container's cache,
-        except when everything is read. Of a shard of which few chunks are wanted just their entries of the index are read: the index's own
-        CRC-32C stays unread then, but each chunk has one of its own, and `verify` reads all.
-        Raises RegionError for a region outside the array, DamagedFileError for a damaged chunk.
+        Only the chunks that intersect the region are read; chunks of shards are decoded in several
+        threads. The container's cache keeps them, unless the whole array is read.
+
+        Where few chunks of a shard are needed, only their entries of its index are read. The
+        CRC-32C of the index then stays unread; but each chunk has one of its own, and `verify`
+        reads all.
+
+        Args:
+            region: one slice without step per axis; None for the whole array.
+
+        Raises:
+            RegionError: for a region outside the array.
+            DamagedFileError: for a damaged chunk.
         """
         return self._gathered(region, self._chunk, self.dtype)
 
     def read_mask(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[np.bool_]:
-        """Which values in `region` are occupied, as `read` takes it and from the same chunks, which are decoded once for both.
+        """A mask of the occupied values in `region`, which is that of `read`.
 
-        True everywhere, without a look at the file, where the array is not `masked`. Raises what `read` raises.
+        Mask and values come from the same chunks, which are decoded once for both. The mask is
+        True everywhere, without reading the file, where the array is not `masked`. Raises what
+        `read` raises.
         """
         if not self.masked:
-            return np.ones(
-                [
-                    stop - start
-                    for start, stop in map(self._bounds, range(len(self.shape)), self._full(region))
-                ],
-                dtype=bool,
-            )
+            return np.ones([stop - start for start, stop in self._bounds(region)], dtype=bool)
         return self._gathered(region, self._mask, np.dtype(bool))
 
     def _gathered(
@@ -118,39 +131,48 @@ class StoredArray:
         read: Callable[..., npt.NDArray[Any]],
         dtype: np.dtype[Any],
     ) -> npt.NDArray[Any]:
-        """A region of what `read` gives of each chunk."""
-        bounds = [self._bounds(axis, part) for axis, part in enumerate(self._full(region))]
+        """A region, gathered from the arrays that `read` returns for each of its chunks."""
+        bounds = self._bounds(region)
         with damage_named(self._path):
             lengths = [stop - start for start, stop in bounds]
             if 0 in lengths:
                 return np.empty(lengths, dtype=dtype)
 
-            def fill(index: tuple[int, ...]) -> None:
+            def fill(index: ChunkIndex) -> None:
                 chunk = read(index, keep=region is not None)
-                target, origin = [], []
+                in_region, in_chunk = [], []
                 for i, (start, stop), size in zip(index, bounds, self.chunk_shape, strict=True):
                     low, high = max(start, i * size), min(stop, (i + 1) * size)
-                    target.append(slice(low - start, high - start))
-                    origin.append(slice(low - i * size, high - i * size))
-                values[tuple(target)] = chunk[tuple(origin)]
+                    in_region.append(slice(low - start, high - start))
+                    in_chunk.append(slice(low - i * size, high - i * size))
+                values[tuple(in_region)] = chunk[tuple(in_chunk)]
 
             spans = [
                 range(start // chunk, -(-stop // chunk))
                 for (start, stop), chunk in zip(bounds, self.chunk_shape, strict=True)
             ]
-            # What finds hostile shards comes before the array that they ask for; the work itself is done as it is asked for.
-            work = self._each(fill, spans)
+            # `_for_chunks` reads the indices of shards at once, so that hostile shards are refused
+            # before the result is allocated. The chunks are decoded as its iterator is consumed.
+            filling = self._for_chunks(fill, spans)
             values = np.empty(lengths, dtype=dtype)
-            for _ in work:
+            for _ in filling:
                 pass
         return values
 
     def decode_chunk(self, index: tuple[int, ...], lod: int = 0) -> npt.NDArray[Any]:
-        """A full chunk, padding included, from the container's cache or else from the file; read-only.
+        """A full chunk, padding included, from the container's cache or else from the file.
 
-        lod: level of detail, 0 for everything; what others give is for the coder of the array to say.
-        Raises RegionError for an index outside `grid`, InputError for a level of detail that there is none of, DamagedFileError naming
-        the member of the file.
+        Args:
+            index: of the chunk in `grid`.
+            lod: level of detail. 0 is the full chunk; the coder of the array defines others.
+
+        Returns:
+            A read-only array.
+
+        Raises:
+            RegionError: for an index outside `grid`.
+            InputError: for a level of detail that the coder does not have.
+            DamagedFileError: for a damaged chunk; the message names the member of the file.
         """
         if len(index) != len(self.grid) or not all(
             0 <= i < n for i, n in zip(index, self.grid, strict=True)
@@ -162,77 +184,88 @@ class StoredArray:
             return self._chunk(tuple(index), lod, keep=True)
 
     def verify(self, done: Callable[[], None]) -> None:
-        """Read and decode all of it straight from the file; `done()` after each chunk. Raises DamagedFileError naming the member."""
+        """Read and decode the whole array straight from the file; call `done` after each chunk.
+
+        Raises DamagedFileError that names the member.
+        """
         if self._metadata.sharding is not None:
             for member in self.chunks.values():
                 check_member(self._source, member)
-        for _ in self._each(self._decode_and_drop, [range(n) for n in self.grid]):
+        for _ in self._for_chunks(self._decode_and_drop, [range(n) for n in self.grid]):
             done()
 
-    def _decode_and_drop(self, index: tuple[int, ...]) -> None:
+    def _decode_and_drop(self, index: ChunkIndex) -> None:
         self._decode(index)
 
-    def _each(
-        self, work: Callable[[tuple[int, ...]], None], spans: Sequence[range]
+    def _for_chunks(
+        self, work: Callable[[ChunkIndex], None], spans: Sequence[range]
     ) -> Iterator[None]:
-        """Do the work for each chunk of `spans`, as the result is iterated; in threads if there are shards and several to decode."""
+        """Do `work` for each chunk whose index lies in `spans`, as the result is iterated.
+
+        The indices of shards are read before this returns. Where there are shards and several
+        chunks to decode, the work is done in threads.
+        """
         sharding = self._metadata.sharding
         if sharding is None:
             return map(work, product(*spans))
-        # Once for all chunks of a shard, before the threads that all need it.
+        # The indices are read once for all chunks of a shard, before threads that all need them.
+        self._read_indices(sharding, spans)
+        indices = list(product(*spans))
+        missing = sum(self._cache.get((self.name, index, 0)) is None for index in indices)
+        return in_threads(work, indices) if missing > 1 else map(work, indices)
+
+    def _read_indices(self, sharding: Sharding, spans: Sequence[range]) -> None:
+        """Read what the chunks of `spans` need of each shard's index: all of it, or entries."""
         shards = (
             range(span.start // count, (span.stop - 1) // count + 1)
             for span, count in zip(spans, sharding.counts, strict=True)
         )
         for shard in product(*shards):
-            ends = (
-                (max(span.start, s * n), min(span.stop, (s + 1) * n))
+            in_shard = [
+                range(max(span.start, s * n), min(span.stop, (s + 1) * n))
                 for span, s, n in zip(spans, shard, sharding.counts, strict=True)
-            )
-            inside = [range(*end) for end in ends]
-            if FEW * prod(map(len, inside)) >= prod(sharding.counts):
+            ]
+            if SPARSE_SHARE * prod(map(len, in_shard)) >= prod(sharding.counts):
                 self._shard_index(sharding, shard)
             else:
-                for index in product(*inside):
+                for index in product(*in_shard):
                     self._entry(sharding, *sharding.place(index))
-        chosen = list(product(*spans))
-        missing = sum(self._cache.get((self.name, index, 0)) is None for index in chosen)
-        return in_threads(work, chosen) if missing > 1 else map(work, chosen)
 
-    def _chunk(self, index: tuple[int, ...], lod: int = 0, *, keep: bool) -> npt.NDArray[Any]:
-        found = self._cache.get((self.name, index, lod))
-        return self._decoded(index, lod, keep)[0] if found is None else found
+    def _chunk(self, index: ChunkIndex, lod: int = 0, *, keep: bool) -> npt.NDArray[Any]:
+        """The values of a chunk, from the cache or decoded; `keep` puts them into the cache."""
+        cached = self._cache.get((self.name, index, lod))
+        return self._decoded(index, lod, keep)[0] if cached is None else cached
 
-    def _mask(self, index: tuple[int, ...], *, keep: bool) -> npt.NDArray[Any]:
-        """Which values of a chunk are occupied."""
-        found = self._cache.get((self.name + MASK, index, 0))
-        mask = self._decoded(index, 0, keep)[1] if found is None else found
+    def _mask(self, index: ChunkIndex, *, keep: bool) -> npt.NDArray[Any]:
+        """The mask of a chunk's occupied values, from the cache or decoded."""
+        cached = self._cache.get((self.name + MASK, index, 0))
+        mask = self._decoded(index, 0, keep)[1] if cached is None else cached
         assert mask is not None
         return mask
 
     def _decoded(
-        self, index: tuple[int, ...], lod: int, keep: bool
+        self, index: ChunkIndex, lod: int, keep: bool
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
-        """A full chunk and its mask, of which the cache then has both."""
+        """A full chunk and its mask, decoded and read-only; `keep` puts both into the cache."""
         values, mask = self._decode(index, lod)
-        for name, part in ((self.name, values), (self.name + MASK, mask)):
-            if part is not None:
-                part.flags.writeable = False
+        for name, array in ((self.name, values), (self.name + MASK, mask)):
+            if array is not None:
+                array.flags.writeable = False
                 if keep:
-                    self._cache.put((name, index, lod), part)
+                    self._cache.put((name, index, lod), array)
         return values, mask
 
     def _decode(
-        self, index: tuple[int, ...], lod: int = 0
+        self, index: ChunkIndex, lod: int = 0
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
-        """A full chunk, straight from the file, and where chunks have one its mask."""
+        """A full chunk straight from the file, and its mask where chunks have one."""
         sharding = self._metadata.sharding
         if sharding is None:
-            member, part = self.chunks[index], ""
+            member, place = self.chunks[index], ""
             data = read_member(self._source, member)
         else:
             shard, number = sharding.place(index)
-            member, part = self.chunks[shard], f"inner chunk {number}: "
+            member, place = self.chunks[shard], f"inner chunk {number}: "
             offset, size = self._entry(sharding, shard, number)
             data = memoryview(self._source.read(member.data_offset + offset, size))
         try:
@@ -243,67 +276,77 @@ class StoredArray:
                 else (coder.decode(data, lod), None)
             )
         except DamagedFileError as error:
-            raise type(error)(f"member {member.name}: {part}{error}") from error
+            raise type(error)(f"member {member.name}: {place}{error}") from error
 
-    def _entry(self, sharding: Sharding, shard: tuple[int, ...], number: int) -> tuple[int, int]:
-        """(offset in the member, bytes) of one inner chunk of a shard; read once, alone unless the whole index is known."""
+    def _entry(self, sharding: Sharding, shard: ChunkIndex, number: int) -> tuple[int, int]:
+        """(offset in the member, bytes) of one inner chunk of a shard.
+
+        They come from the shard's index if that was read, else from the entry alone, read once.
+        """
         with self._lock:
-            found = self._indices.get(shard)
-            if found is not None:
-                return int(found[number, 0]), int(found[number, 1])
-            known = self._entries.get((shard, number))
-            if known is None:
-                with self._index_of(sharding, shard) as (start, data_bytes):
-                    known = parse_entry(
+            shard_index = self._indices.get(shard)
+            if shard_index is not None:
+                return int(shard_index[number, 0]), int(shard_index[number, 1])
+            entry = self._entries.get((shard, number))
+            if entry is None:
+                with self._index_place(sharding, shard) as (start, data_bytes):
+                    entry = parse_entry(
                         self._source.read(start + number * ENTRY_BYTES, ENTRY_BYTES), data_bytes
                     )
-                self._entries[shard, number] = known
-        return known
+                self._entries[shard, number] = entry
+        return entry
 
-    def _shard_index(self, sharding: Sharding, shard: tuple[int, ...]) -> npt.NDArray[np.int64]:
-        """(offset in the member, bytes) of each inner chunk of a shard; read once."""
+    def _shard_index(self, sharding: Sharding, shard: ChunkIndex) -> npt.NDArray[np.int64]:
+        """(offset in the member, bytes) of each inner chunk of a shard, (chunks, 2); read once."""
         with self._lock:
-            found = self._indices.get(shard)
-            if found is None:
-                with self._index_of(sharding, shard) as (start, data_bytes):
-                    found = parse_index(
+            shard_index = self._indices.get(shard)
+            if shard_index is None:
+                with self._index_place(sharding, shard) as (start, data_bytes):
+                    shard_index = parse_index(
                         self._source.read(start, sharding.index_bytes),
                         sharding.present(shard, self.shape),
                         data_bytes,
                     )
-                self._indices[shard] = found
-        return found
+                self._indices[shard] = shard_index
+        return shard_index
 
     @contextmanager
-    def _index_of(self, sharding: Sharding, shard: tuple[int, ...]) -> Iterator[tuple[int, int]]:
-        """Where the index of a shard begins in the file, and the bytes before it in the shard; names the member in what goes wrong."""
+    def _index_place(self, sharding: Sharding, shard: ChunkIndex) -> Iterator[tuple[int, int]]:
+        """A block that reads a shard's index; its errors name the member.
+
+        Yields the offset of the index in the file, and the number of bytes in the shard before it.
+        """
         member = self.chunks[shard]
         data_bytes = member.size - sharding.index_bytes
         try:
             if data_bytes < 0:
                 raise DamagedFileError(
-                    f"{member.size} bytes are too few for the index of a shard, {sharding.index_bytes}"
+                    f"{member.size} bytes are too few for the index of a shard, "
+                    f"{sharding.index_bytes}"
                 )
             yield member.data_offset + data_bytes, data_bytes
         except DamagedFileError as error:
             raise type(error)(f"member {member.name}: {error}") from error
 
-    def _full(self, region: tuple[slice, ...] | None) -> tuple[slice, ...]:
+    def _bounds(self, region: tuple[slice, ...] | None) -> list[tuple[int, int]]:
+        """(start, stop) of a region along each axis; raises RegionError."""
         if region is None:
-            return tuple(slice(0, n) for n in self.shape)
+            return [(0, n) for n in self.shape]
         if len(region) != len(self.shape):
             raise RegionError(
-                f"{self._path}: {self.name}: a region of {len(region)} axes; the array has {len(self.shape)}"
+                f"{self._path}: {self.name}: a region of {len(region)} axes; "
+                f"the array has {len(self.shape)}"
             )
-        return region
+        return [self._axis_bounds(axis, span) for axis, span in enumerate(region)]
 
-    def _bounds(self, axis: int, part: slice) -> tuple[int, int]:
+    def _axis_bounds(self, axis: int, span: slice) -> tuple[int, int]:
         length = self.shape[axis]
-        start = 0 if part.start is None else int(part.start)
-        stop = length if part.stop is None else int(part.stop)
-        if part.step not in (None, 1) or not 0 <= start <= stop <= length:
+        start = 0 if span.start is None else int(span.start)
+        stop = length if span.stop is None else int(span.stop)
+        if span.step not in (None, 1) or not 0 <= start <= stop <= length:
             raise RegionError(
-                f"{self._path}: {self.name}: {part} on axis {axis}; slices without step within 0..{length} are allowed"
+                f"{self._path}: {self.name}: {span} on axis {axis}; "
+                f"slices without step within 0..{length} are allowed"
             )
         return start, stop
 

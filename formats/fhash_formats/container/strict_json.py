@@ -1,4 +1,4 @@
-"""JSON as RFC 8259 has it and no further: no NaN, no infinity, no key twice, bounded size and depth."""
+"""Strict JSON (RFC 8259): no NaN, no infinity, no key twice, bounded size and depth."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from typing import Any, NoReturn
 from fhash_formats.errors import DamagedFileError, InputError
 
 MAX_BYTES = 16 << 20
+"""Bytes of a document."""
 MAX_DEPTH = 64
+"""Objects and arrays within each other."""
 
-# Strings are skipped whole, one that never ends up to the end of the text; possessive, so that no text takes more than linear time.
+# Tokens are strings and brackets. A string without an end reaches to the end of the text. The
+# possessive quantifiers keep every text from taking more than linear time.
 _TOKEN = re.compile(r'"(?:[^"\\]++|\\.)*+(?:"|\\?\Z)|[\[{]|[\]}]', re.DOTALL)
 
 
 def loads(data: bytes | memoryview) -> dict[str, Any]:
-    """The JSON object in `data` (UTF-8); raises DamagedFileError that says what is wrong with it."""
+    """The JSON object in `data` (UTF-8); raises DamagedFileError that says what is wrong."""
     if len(data) > MAX_BYTES:
         raise DamagedFileError(f"JSON of {len(data)} bytes; the limit is {MAX_BYTES}")
     try:
@@ -27,7 +30,7 @@ def loads(data: bytes | memoryview) -> dict[str, Any]:
         value = json.loads(
             text, object_pairs_hook=_unique, parse_constant=_refuse_constant, parse_float=_finite
         )
-        # A lone surrogate passes the parser and would fail later, where the text is shown.
+        # The parser accepts a lone surrogate, which would fail later, where the text is shown.
         json.dumps(value, ensure_ascii=False).encode("utf-8")
     except DamagedFileError:
         raise
@@ -39,7 +42,10 @@ def loads(data: bytes | memoryview) -> dict[str, Any]:
 
 
 def dumps(value: Mapping[str, Any], what: str) -> bytes:
-    """Compact JSON with sorted keys, UTF-8; raises InputError, naming `what`, for values that JSON cannot hold."""
+    """Compact JSON with sorted keys, UTF-8.
+
+    Raises InputError, naming `what`, for values that JSON cannot hold.
+    """
     try:
         data = json.dumps(
             value, sort_keys=True, allow_nan=False, ensure_ascii=False, separators=(",", ":")
@@ -52,7 +58,10 @@ def dumps(value: Mapping[str, Any], what: str) -> bytes:
 
 
 def _check_depth(text: str) -> None:
-    """Before parsing, because a parser that recurses may exhaust the stack."""
+    """Raise DamagedFileError for text that is nested too deep.
+
+    This comes before parsing, because a parser that recurses may exhaust the stack.
+    """
     depth = 0
     for token in _TOKEN.finditer(text):
         kind = token[0][0]

@@ -1,4 +1,4 @@
-"""`ContainerWriter`: arrays streamed to a `.fhz` file that is complete or absent."""
+"""`ContainerWriter`: arrays streamed to a `.fhz` file, which ends up complete or absent."""
 
 from __future__ import annotations
 
@@ -29,21 +29,24 @@ from fhash_formats.support.atomic import replacing
 from fhash_formats.support.slabs import slab_shape
 
 USUAL_CHUNK_BYTES = 2 << 20
+"""Bytes of a decoded chunk that `add_whole` aims at."""
 
 
 class _Abandoned(Exception):
-    """Leaving without `commit`: no error, but the way to tell `replacing` that there is nothing to keep."""
+    """A block left without `commit`: no error, but it tells `replacing` to keep nothing."""
 
 
 class ContainerWriter:
-    """Writes a container; a context manager. The file takes its name in `commit`; without it nothing is left behind.
+    """A container for writing; a context manager.
 
-    Members are written as they come and once only: an array's metadata, its chunks, and at the end the groups and the root. Identical
-    calls give identical bytes. Raises OutputExistsError or OutputError on entering.
+    The file takes its name in `commit`; without `commit` nothing is left behind. Members are
+    written once, in this order: for each array its metadata and its chunks, then the groups, then
+    the root. Identical calls give identical bytes. Entering raises OutputExistsError or
+    OutputError.
     """
 
     def __init__(self, path: str | Path, *, force: bool = False) -> None:
-        """`force` replaces an existing file."""
+        """Prepare a writer; `force` allows it to replace an existing file."""
         self.path = Path(path)
         self._force = force
         self._stack = ExitStack()
@@ -80,19 +83,30 @@ class ContainerWriter:
         attributes: Mapping[str, Any] | None = None,
         codecs: Sequence[Codec] | None = None,
     ) -> None:
-        """Write an array chunk by chunk; never more than one is held.
+        """Write an array chunk by chunk; never more than one chunk is held.
 
-        `chunks` come in C order of the chunk grid, each of `dtype`; those at an end of the array are given as far as the array goes.
-        `codecs` as in Zarr's metadata, default bytes, zstd, crc32c. Raises InputError for anything that does not fit together.
+        Args:
+            name: path in the hierarchy.
+            shape: length of each axis.
+            dtype: number type of the array and of each chunk.
+            chunk_shape: shape of a full chunk.
+            chunks: the chunks in C order of their grid; those at an end of the array reach as far
+                as the array does.
+            dimension_names: names of the axes.
+            attributes: JSON values.
+            codecs: a list as in Zarr's metadata; by default `bytes`, `zstd`, `crc32c`.
+
+        Raises:
+            InputError: for anything that does not fit together.
         """
         number_type = np.dtype(dtype).newbyteorder("=")
         coding = plain_codecs(number_type) if codecs is None else codecs
         metadata = self._begin(
             name, shape, number_type, chunk_shape, coding, dimension_names, attributes
         )
-        given = iter(chunks)
+        remaining = iter(chunks)
         for index in product(*(range(n) for n in metadata.grid)):
-            chunk = next(given, None)
+            chunk = next(remaining, None)
             if chunk is None:
                 raise InputError(
                     f"array {name}: chunk {index} was not given; the grid has {metadata.grid}"
@@ -101,7 +115,7 @@ class ContainerWriter:
                 f"{name}/{metadata.chunk_key(index)}",
                 [metadata.coder.encode(full_chunk(name, metadata, index, chunk))],
             )
-        expect_end(name, metadata, given)
+        expect_end(name, metadata, remaining)
 
     def add_sharded(
         self,
@@ -116,11 +130,24 @@ class ContainerWriter:
         attributes: Mapping[str, Any] | None = None,
         codecs: Sequence[Codec] | None = None,
     ) -> None:
-        """Write an array whose chunks of `chunk_shape` lie many together in shards; the coded bytes of one shard are held at a time.
+        """Write an array of shards; the coded bytes of one shard are held at a time.
 
-        `chunks` come in the order of `shard_order`, or each with its index in the grid of chunks, (index, chunk): then shard by shard
-        in C order, and within a shard in any order. A chunk is an array of `dtype` as for `add_array`, or bytes: what the coder of its
-        first codec gave for the full chunk, without CRC-32C. Raises InputError for anything that does not fit together.
+        Args:
+            name: path in the hierarchy.
+            shape: length of each axis.
+            dtype: number type of the array.
+            chunk_shape: shape of a full chunk within a shard.
+            shard_shape: shape of a shard, a multiple of `chunk_shape`.
+            chunks: the chunks in the order of `shard_order`. Each may instead come as (index,
+                chunk) with its index in the grid of chunks: then shards come in C order, and the
+                chunks of a shard in any order. A chunk is an array as in `add_array`, or the bytes
+                that the coder of its first codec made of the full chunk, without CRC-32C.
+            dimension_names: names of the axes.
+            attributes: JSON values.
+            codecs: of the chunks, as in `add_array`.
+
+        Raises:
+            InputError: for anything that does not fit together.
         """
         number_type = np.dtype(dtype).newbyteorder("=")
         coding = sharding_codecs(
@@ -130,13 +157,13 @@ class ContainerWriter:
             name, shape, number_type, shard_shape, coding, dimension_names, attributes
         )
         assert metadata.sharding is not None
-        given = iter(chunks)
+        remaining = iter(chunks)
         for shard in product(*(range(n) for n in metadata.grid)):
             self._add(
                 f"{name}/{metadata.chunk_key(shard)}",
-                shard_parts(name, metadata, metadata.sharding, shard, given),
+                shard_parts(name, metadata, metadata.sharding, shard, remaining),
             )
-        expect_end(name, metadata, given)
+        expect_end(name, metadata, remaining)
 
     def add_whole(
         self,
@@ -148,18 +175,19 @@ class ContainerWriter:
         attributes: Mapping[str, Any] | None = None,
         codecs: Sequence[Codec] | None = None,
     ) -> None:
-        """Write an array that is in memory; by default one chunk up to 2 MiB, slabs of the leading axes above. Raises as `add_array`."""
-        chosen = (
-            slab_shape(array.shape, array.dtype.itemsize, USUAL_CHUNK_BYTES)
-            if chunk_shape is None
-            else tuple(chunk_shape)
-        )
+        """Write an array that is in memory.
+
+        By default an array of up to USUAL_CHUNK_BYTES is one chunk, and a larger one is cut into
+        slabs along its leading axes. Arguments and errors are those of `add_array`.
+        """
+        if chunk_shape is None:
+            chunk_shape = slab_shape(array.shape, array.dtype.itemsize, USUAL_CHUNK_BYTES)
         self.add_array(
             name,
             shape=array.shape,
             dtype=array.dtype,
-            chunk_shape=chosen,
-            chunks=cut(array, chosen),
+            chunk_shape=chunk_shape,
+            chunks=cut(array, chunk_shape),
             dimension_names=dimension_names,
             attributes=attributes,
             codecs=codecs,
@@ -185,7 +213,7 @@ class ContainerWriter:
                 dimension_names=None if dimension_names is None else tuple(dimension_names),
                 attributes=dict(attributes or {}),
             )
-            # What is written is what a reader accepts: the reader's checks are the writer's.
+            # The reader's checks are the writer's, so that a reader accepts what is written.
             document = strict_json.dumps(metadata.to_dict(), f"the metadata of array {name}")
             ArrayMetadata.from_dict(strict_json.loads(document))
         except DamagedFileError as error:
@@ -197,20 +225,27 @@ class ContainerWriter:
         return metadata
 
     def preview(self, header: Mapping[str, Any]) -> Container:
-        """What has been written so far as a container to read and to close, as if committed with this header.
+        """The container written so far, as if it were committed with this header.
 
-        `quality` and `history` may be left out of it, because they are what a preview is there to measure.
+        The caller reads and closes it. `quality` and `history` may be left out of the header,
+        because a preview is there to measure them.
         """
         return self._open(self._tail({"quality": {}, "history": [], **header}))
 
     def commit(self, header: Mapping[str, Any]) -> int:
-        """Write the groups, the root with its header and the directory, and give the file its name; the bytes of the file.
+        """Write the groups, the root with its header and the directory; give the file its name.
 
-        `format`, `format_version` and, unless given, `required_features` are added to the header. Raises InputError for a header that
-        does not fit the arrays, OutputError for a full disk.
+        `format`, `format_version` and, unless given, `required_features` are added to the header.
+
+        Returns:
+            Number of bytes of the file.
+
+        Raises:
+            InputError: for a header that does not fit the arrays.
+            OutputError: for a full disk.
         """
         tail = self._tail(header)
-        # A file that its own reader would refuse is not written.
+        # A file that fhash's reader would refuse is not written.
         self._open(tail).close()
         self._file.write(tail)
         self._position += len(tail)
@@ -227,13 +262,13 @@ class ContainerWriter:
             raise InputError(f"the container would not be readable: {error}") from error
 
     def _tail(self, header: Mapping[str, Any]) -> bytes:
-        """Everything that comes after the arrays."""
+        """The bytes after the arrays: groups, root and directory."""
         if self._file.closed:
             raise OutputError(f"{self.path}: the container is written already")
         groups = {
-            "/".join(parts[:n])
-            for parts in (name.split("/") for name in self._arrays)
-            for n in range(1, len(parts))
+            "/".join(folders[:depth])
+            for folders in (name.split("/")[:-1] for name in self._arrays)
+            for depth in range(1, len(folders) + 1)
         }
         documents = {
             f"{group}/{DOCUMENT}": strict_json.dumps(GROUP, "a group") for group in sorted(groups)
@@ -247,13 +282,13 @@ class ContainerWriter:
         documents[DOCUMENT] = strict_json.dumps(
             {**GROUP, "attributes": {"fhash": complete}}, "the header"
         )
-        members, parts, position = list(self._members), [], self._position
+        members, tail, position = list(self._members), [], self._position
         for name, data in documents.items():
             member, packed = document_member(name, position, data)
             members.append(member)
-            parts += [local_header(member), packed]
+            tail += [local_header(member), packed]
             position = member.end
-        return b"".join([*parts, ending(members)])
+        return b"".join([*tail, ending(members)])
 
     def _check_name(self, name: str) -> None:
         if (
@@ -262,17 +297,19 @@ class ContainerWriter:
             or name.rpartition("/")[2] == DOCUMENT
         ):
             raise InputError(
-                f"array name {name[:80]!a} is not allowed; allowed: paths of A-Z a-z 0-9 . _ - up to {MAX_NAME // 2} letters"
+                f"array name {name[:80]!a} is not allowed; "
+                f"allowed: paths of A-Z a-z 0-9 . _ - up to {MAX_NAME // 2} letters"
             )
         if name in self._arrays:
             raise InputError(f"array {name} is there already")
 
     def _add(self, name: str, parts: Sequence[bytes]) -> None:
-        """Write a chunk whose data are these parts, one after the other."""
+        """Write the member of a chunk, whose data are `parts`, one after the other."""
         size, crc = sum(len(part) for part in parts), 0
         if size > MAX_MEMBER:
             raise InputError(
-                f"{name} takes {size} bytes; the limit is {MAX_MEMBER}, take smaller chunks or shards"
+                f"{name} takes {size} bytes; the limit is {MAX_MEMBER}; "
+                "take smaller chunks or shards"
             )
         for part in parts:
             crc = zlib.crc32(part, crc)

@@ -1,8 +1,8 @@
-"""Opening a container's ZIP safely: nothing in it is believed before it is checked, and nothing big is allocated.
+"""Safe opening of a container's ZIP: every field is checked before it is used to allocate memory.
 
-The directory is digested, the members lie one after the other from the first byte to the directory, and each field has the value that
-`layout` writes. So every byte of the file is vouched for: the directory by its digest, a member's header by the directory, its data by
-its CRC.
+The comment holds a digest of the directory, the members lie one after the other from the first byte
+to the directory, and each field has the value that `layout` writes. So every byte of the file is
+checked: the directory by its digest, a member's header by the directory, its data by their CRC-32.
 """
 
 from __future__ import annotations
@@ -35,30 +35,40 @@ from fhash_formats.container.source import Source
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 MAX_DIRECTORY = 1 << 28
+"""Bytes of the directory."""
 MAX_MEMBER = 1 << 31
+"""Bytes of a member's data in the file."""
 MAX_DOCUMENT = 16 << 20
-"""Of a metadata document in full; nothing else is deflated."""
+"""Bytes of a full metadata document; no other members are deflated."""
 DOCUMENT = "zarr.json"
+"""Name of a metadata document, the last in its path."""
 MAX_NAME = 512
+"""Bytes of a member's name."""
 
-_PART = r"[A-Za-z0-9_-][A-Za-z0-9._-]*"
-NAME = re.compile(rf"{_PART}(/{_PART})*")
-"""Names of members: relative paths of plain parts, none of which starts with a dot."""
+_FOLDER = r"[A-Za-z0-9_-][A-Za-z0-9._-]*"
+NAME = re.compile(rf"{_FOLDER}(/{_FOLDER})*")
+"""A member's name: a relative path without spaces, in which no name starts with a dot."""
 
-_LONGEST_COMMENT = 128
+_MAX_COMMENT = 128
+"""Bytes at the end of a file in which the signature is looked for."""
 _PIECE = 1 << 20
+"""Bytes of a member that `check_member` reads at a time."""
 
 
 def find_signature(source: Source) -> tuple[int, bytes] | None:
-    """Layout version and comment, or None where the file does not end in a container's signature."""
-    start = max(0, source.size - _LONGEST_COMMENT)
+    """Layout version and comment; None where the file does not end in a container's signature."""
+    start = max(0, source.size - _MAX_COMMENT)
     end = source.read(start, source.size - start)
-    found = COMMENT.search(end)
-    return (int(found[1]), found[0]) if found else None
+    match = COMMENT.search(end)
+    return (int(match[1]), match[0]) if match else None
 
 
 def read_members(source: Source) -> dict[str, Member]:
-    """Every member by name, in the order of the file; raises DamagedFileError or UnsupportedFileError."""
+    """Every member by name, in the order of the file.
+
+    Raises DamagedFileError for a ZIP that `layout` could not have written, and
+    UnsupportedFileError for a newer layout.
+    """
     signature = find_signature(source)
     if signature is None:
         raise DamagedFileError(
@@ -68,7 +78,8 @@ def read_members(source: Source) -> dict[str, Member]:
     comment_at = source.size - len(signed)
     if version > LAYOUT_VERSION:
         raise UnsupportedFileError(
-            f"written by a newer fhash layout {version}; this version reads up to {LAYOUT_VERSION}; upgrade"
+            f"written by a newer fhash layout {version}; "
+            f"this version reads up to {LAYOUT_VERSION}; upgrade"
         )
     count, size, offset = _read_end(source, comment_at)
     directory = source.read(offset, comment_at - offset)
@@ -82,7 +93,7 @@ def read_members(source: Source) -> dict[str, Member]:
 
 
 def read_member(source: Source, member: Member) -> memoryview:
-    """The checked data of a member in full; raises DamagedFileError naming it."""
+    """The full data of a member, checked; raises DamagedFileError that names the member."""
     try:
         stored = source.read(member.offset, member.header_size + member.size)
     except DamagedFileError as error:
@@ -98,7 +109,7 @@ def read_member(source: Source, member: Member) -> memoryview:
 
 
 def check_member(source: Source, member: Member) -> None:
-    """`read_member` for a member that need not be held: piece by piece."""
+    """Check a member as `read_member` does, but piece by piece, without holding its data."""
     if member.full_size is not None:
         read_member(source, member)
         return
@@ -114,7 +125,7 @@ def check_member(source: Source, member: Member) -> None:
 
 
 def _inflated(member: Member, data: memoryview, size: int) -> bytes:
-    """No more than the declared bytes are ever made."""
+    """The inflated data of a member; no more than the declared `size` bytes are ever made."""
     inflate = zlib.decompressobj(-zlib.MAX_WBITS)
     try:
         full = inflate.decompress(data, size + 1)
@@ -130,7 +141,7 @@ def _inflated(member: Member, data: memoryview, size: int) -> bytes:
 
 
 def _read_end(source: Source, comment_at: int) -> tuple[int, int, int]:
-    """Number of entries, bytes and offset of the directory, from the end records before the comment."""
+    """(entries, bytes, offset) of the directory, from the end records before the comment."""
     end_at = comment_at - END.size
     if end_at < 0:
         raise DamagedFileError("the ZIP end record is missing")
@@ -157,12 +168,21 @@ def _read_end(source: Source, comment_at: int) -> tuple[int, int, int]:
         )
     if offset + size != records_at:
         raise DamagedFileError(
-            f"the ZIP directory is declared at {offset} with {size} bytes, but it ends at {records_at}"
+            f"the ZIP directory is declared at {offset} with {size} bytes, "
+            f"but it ends at {records_at}"
         )
     return count, size, offset
 
 
 def _parse(directory: bytes, count: int, data_end: int, version: int) -> dict[str, Member]:
+    """The members of a directory.
+
+    Args:
+        directory: bytes of its entries.
+        count: number of entries that the end record declares.
+        data_end: offset at which the members end and the directory begins.
+        version: of the layout.
+    """
     members: dict[str, Member] = {}
     at = position = 0
     while at < len(directory):
@@ -171,20 +191,26 @@ def _parse(directory: bytes, count: int, data_end: int, version: int) -> dict[st
             raise DamagedFileError(f"member {member.name} is there twice")
         if member.offset != position or member.end > data_end:
             raise DamagedFileError(
-                f"member {member.name} at {member.offset} overlaps another or leaves a gap; {position} was expected"
+                f"member {member.name} at {member.offset} overlaps another or leaves a gap; "
+                f"{position} was expected"
             )
         members[member.name] = member
         position = member.end
         at += length
     if len(members) != count or position != data_end:
         raise DamagedFileError(
-            f"the ZIP directory has {len(members)} entries that end at {position}; {count} and {data_end} are declared"
+            f"the ZIP directory has {len(members)} entries that end at {position}; "
+            f"{count} and {data_end} are declared"
         )
     return members
 
 
 def _parse_entry(directory: bytes, at: int, version: int) -> tuple[Member, int]:
-    """The member whose entry starts at `at`, and the bytes of the entry."""
+    """The member whose entry starts at `at`, and the number of bytes of the entry.
+
+    The fields that the format fixes are not checked one by one: the entry must equal the one that
+    `layout` writes for the member.
+    """
     if at + ENTRY.size > len(directory):
         raise DamagedFileError("the ZIP directory ends within an entry")
     fields = ENTRY.unpack_from(directory, at)
@@ -194,34 +220,20 @@ def _parse_entry(directory: bytes, at: int, version: int) -> tuple[Member, int]:
     if mark != ENTRY_MARK:
         raise DamagedFileError("the ZIP directory has an entry without its mark")
     name_at = at + ENTRY.size
-    raw_name = directory[name_at : name_at + name_size]
-    name = raw_name.decode("ascii", "replace")
-    if name_size > MAX_NAME or not raw_name.isascii() or not NAME.fullmatch(name):
-        raise DamagedFileError(
-            f"member name {name[:80]!a} is not allowed; names are relative paths of A-Z a-z 0-9 . _ -"
-        )
+    extra_at = name_at + name_size
+    name = _checked_name(directory[name_at:extra_at], name_size)
     if flags & 1:
         raise DamagedFileError(f"member {name} is encrypted")
-    document = version > 1 and name.rpartition("/")[2] == DOCUMENT
-    if method != STORED and not (document and method == DEFLATED):
+    may_be_deflated = version > 1 and name.rpartition("/")[2] == DOCUMENT
+    if method != STORED and not (may_be_deflated and method == DEFLATED):
         raise DamagedFileError(
-            f"member {name} is compressed by ZIP method {method}; only metadata may be, by 8 from layout version 2 on"
+            f"member {name} is compressed by ZIP method {method}; "
+            "only metadata may be, by 8 from layout version 2 on"
         )
-    if method == DEFLATED:
-        if not size < full_size <= MAX_DOCUMENT:
-            raise DamagedFileError(
-                f"member {name} declares {size} deflated and {full_size} full bytes; the limit is {MAX_DOCUMENT}"
-            )
-    elif size != full_size or size > MAX_MEMBER:
-        raise DamagedFileError(
-            f"member {name} declares {size} stored and {full_size} full bytes; equal sizes up to {MAX_MEMBER} are allowed"
-        )
-    if (
-        offset == MAX_32
-        and extra_size == OFFSET_64.size
-        and name_at + name_size + extra_size <= len(directory)
-    ):
-        offset = OFFSET_64.unpack_from(directory, name_at + name_size)[2]
+    _check_sizes(name, method, size, full_size)
+    has_offset_64 = offset == MAX_32 and extra_size == OFFSET_64.size
+    if has_offset_64 and extra_at + extra_size <= len(directory):
+        offset = OFFSET_64.unpack_from(directory, extra_at)[2]
     member = Member(
         name=name,
         offset=offset,
@@ -235,3 +247,28 @@ def _parse_entry(directory: bytes, at: int, version: int) -> tuple[Member, int]:
             f"member {name} has fields in its directory entry that the format does not allow"
         )
     return member, len(canonical)
+
+
+def _checked_name(name_bytes: bytes, size: int) -> str:
+    """A member's name; `size` is the number of bytes that its entry declares for it."""
+    name = name_bytes.decode("ascii", "replace")
+    if size > MAX_NAME or not name_bytes.isascii() or not NAME.fullmatch(name):
+        raise DamagedFileError(
+            f"member name {name[:80]!a} is not allowed; "
+            "names are relative paths of A-Z a-z 0-9 . _ -"
+        )
+    return name
+
+
+def _check_sizes(name: str, method: int, size: int, full_size: int) -> None:
+    if method == DEFLATED:
+        if not size < full_size <= MAX_DOCUMENT:
+            raise DamagedFileError(
+                f"member {name} declares {size} deflated and {full_size} full bytes; "
+                f"the limit is {MAX_DOCUMENT}"
+            )
+    elif size != full_size or size > MAX_MEMBER:
+        raise DamagedFileError(
+            f"member {name} declares {size} stored and {full_size} full bytes; "
+            f"equal sizes up to {MAX_MEMBER} are allowed"
+        )

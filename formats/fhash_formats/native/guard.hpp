@@ -1,7 +1,8 @@
-// Memory that cannot be had as a return value: no exception may cross the border of the library.
+// Failures of memory as a return value: no exception may leave the library.
 //
-// It is caught in the function that is cloned for several machines (FHASH_CLONES) and not by its caller: gcc 12 takes the call of such a
-// function for one that throws nothing, and an exception from it ends the process.
+// An exception is caught in the function that is cloned for several machines (FHASH_CLONES) and not
+// in its caller: gcc 12 assumes that a call of such a function throws nothing, and an exception
+// from it would end the process.
 #pragma once
 
 #include <new>
@@ -13,7 +14,7 @@ namespace {
 
 const std::int64_t NO_MEMORY = -2;
 
-// What the work returns, or NO_MEMORY.
+// The result of `work`, or NO_MEMORY where it ran out of memory.
 template <class Work> FHASH_INLINE std::int64_t guarded(Work work) {
     try {
         return work();

@@ -1,9 +1,11 @@
-// Entropy coding of masks: which vertices of a tile are occupied, told by what is known of each beforehand.
+// Entropy coding of masks, which say which vertices of a tile are occupied.
 //
-// Every bit is predicted by CONTEXTS adaptive estimates that are mixed as in coder.cpp. They see the bits that came before (left, above, one
-// layer and one step before) and two levels of each vertex, its neighbours ahead included, that encoder and decoder have from the decoded
-// values (transform/mask.py). Where all around agrees, a flag stands for SEGMENT vertices of a row. The portable coder
-// (transform/mask_portable.py) follows this file step by step and gives the same bytes.
+// Each bit is predicted by CONTEXTS adaptive estimates that are mixed as in coder.cpp. Contexts
+// come from the bits before it (to the left, above, one layer and one step before) and from two
+// levels of the vertex and of its neighbours, also of those after it: encoder and decoder have the
+// levels from the decoded values (transform/entropy/mask_levels.py). Where all segments around
+// agree, a flag stands for SEGMENT vertices of a row. The portable coder
+// (transform/entropy/mask_portable.py) follows this file step by step and gives the same bytes.
 #include <cstdlib>
 #include <type_traits>
 
@@ -11,51 +13,81 @@
 
 namespace {
 
-const int CONTEXTS = 10, LANES = 2 * CONTEXTS, SET = padded(LANES), LEVELS = 32, EVEN = 16;  // levels of the vertex; from EVEN on it is rather occupied
-const int SEGMENT = 16, NEAR = 16;                                     // vertices that share a flag; sets of weights by the nearest bits
-const int PADDING = 2;                                                 // zeros beside a row
-const int NOTHING = 3;                                                 // state of a segment that does not exist
-const int QUIET = 12;                                                  // levels of a segment, away from the end that it agrees with
-const int LIMIT = 400, RATE = 2;  // of what is learned: see mixing.hpp
+const int CONTEXTS = 10;         // estimates that are mixed for a bit
+const int LANES = 2 * CONTEXTS;  // weights of a set of the caller
+const int SET = padded(LANES);   // weights of a set as kept here
+const int LEVELS = 32, EVEN = 16;  // levels of a vertex; from EVEN on it is more likely occupied
+const int NEAR = 16;               // patterns of the four nearest bits; each has a set of weights
+const int SEGMENT = 16;            // vertices of a row that share a flag
+const int PADDING = 2;             // zeros beside a row of bits
+const int RATE = 2;                // LEARNING_RATE of masks
 const int SIZES[CONTEXTS] = {512, 1024, 4096, 2048, 2048, 1920, 2592, 4096, 4096, 2048};
 
-// MODE 0 encodes, 1 decodes.
-template <int MODE> struct MaskCoder {
-    typename std::conditional<MODE == 1, Decoder, Encoder>::type range;
+// States of a segment: its bits are all 0, all 1, or both; or it does not exist.
+const int ZEROS = 0, ONES = 1, MIXED = 2, NOTHING = 3;
+// A segment has a flag only if all its levels are among the QUIET ones at the end that agrees.
+const int QUIET = 12;
+
+// The bit of a vertex, and above it 1 for a 0 that the level spoke against, 2 for such a 1, else 0.
+FHASH_INLINE uint8_t mark(int bit, int level) {
+    return (uint8_t)(bit ? (level < EVEN ? 5 : 1) : level < EVEN ? 0 : 2);
+}
+
+// One run over a mask.
+template <bool DECODES> struct MaskCoder {
+    typename std::conditional<DECODES, Decoder, Encoder>::type range;
     State* state;
 
-    FHASH_INLINE int simple(int bit, int64_t number) { return code_simple(range, state->simples[number], bit); }
+    FHASH_INLINE int simple(int bit, int64_t number) {
+        return code_simple(range, state->simples[number], bit);
+    }
 
-    FHASH_INLINE void run(uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
+    // Code all bits. mask, level, other, shape: as for fhash_encode_mask and fhash_decode_mask.
+    FHASH_INLINE void run(uint8_t* mask, const uint8_t* level, const uint8_t* other,
+                          const int64_t* shape) {
         const int n0 = (int)shape[0], n1 = (int)shape[1], n2 = (int)shape[2], n3 = (int)shape[3];
-        const int64_t S2 = n3, S1 = S2 * n2, S0 = S1 * n1, M2 = n3 + 2 * PADDING, M1 = M2 * n2, M0 = M1 * n1;
         const int segments = (n3 + SEGMENT - 1) / SEGMENT;
+        // Strides of vertices, of marks and of the states of segments.
+        const int64_t S2 = n3, S1 = S2 * n2, S0 = S1 * n1;
+        const int64_t M2 = n3 + 2 * PADDING, M1 = M2 * n2, M0 = M1 * n1;
         const int64_t G2 = segments + 1, G1 = G2 * n2, G0 = G1 * n1;
-        // Of each vertex its bit, and in the bits above whether its level spoke against it: 1 for a zero, 2 for a one.
-        std::vector<uint8_t> known((size_t)M0 * n0, 0), nothing(M2, 0);
+        // Marks of all vertices, and a row of zeros that stands for rows that do not exist.
+        std::vector<uint8_t> marks((size_t)M0 * n0, 0), nothing(M2, 0);
         std::vector<uint8_t> segment_states((size_t)G0 * n0, NOTHING);
         Slot* slots[CONTEXTS];
         slots[0] = state->slots.data();
         for (int i = 1; i < CONTEXTS; i++) slots[i] = slots[i - 1] + SIZES[i - 1];
-        int informed = 0;
+        int informed = 0;  // whether any level is above 0
         for (int64_t i = 0; i < S0 * n0; i++) informed |= level[i];
 
         for (int t = 0; t < n0; t++) for (int z = 0; z < n1; z++) for (int y = 0; y < n2; y++) {
-            const bool has_y = y > 0, has_z = z > 0, has_t = t > 0, more_y = y + 1 < n2, more_z = z + 1 < n1, more_t = t + 1 < n0;
+            const bool has_y = y > 0, has_z = z > 0, has_t = t > 0;
+            const bool more_y = y + 1 < n2, more_z = z + 1 < n1, more_t = t + 1 < n0;
             const int64_t at = t * S0 + z * S1 + y * S2;
             uint8_t* const out = mask + at;
-            uint8_t* const K = known.data() + t * M0 + z * M1 + y * M2 + PADDING;
             uint8_t* const G = segment_states.data() + t * G0 + z * G1 + y * G2 + 1;
+            // Marks of this row (K) and of the rows before it: N along y, P along z, B along t,
+            // doubled for two before. A second letter moves on: N and S by -1 and +1 along y, P and
+            // F by -1 and +1 along z.
+            uint8_t* const K = marks.data() + t * M0 + z * M1 + y * M2 + PADDING;
             const uint8_t* const zeros = nothing.data() + PADDING;
-            const uint8_t *const N = has_y ? K - M2 : zeros, *const NN = y > 1 ? K - 2 * M2 : zeros;
-            const uint8_t *const P = has_z ? K - M1 : zeros, *const PN = has_z && has_y ? K - M1 - M2 : zeros;
+            const uint8_t* const N = has_y ? K - M2 : zeros;
+            const uint8_t* const NN = y > 1 ? K - 2 * M2 : zeros;
+            const uint8_t* const P = has_z ? K - M1 : zeros;
+            const uint8_t* const PP = z > 1 ? K - 2 * M1 : zeros;
+            const uint8_t* const PN = has_z && has_y ? K - M1 - M2 : zeros;
             const uint8_t* const PS = has_z && more_y ? K - M1 + M2 : zeros;
-            const uint8_t *const B = has_t ? K - M0 : zeros, *const BN = has_t && has_y ? K - M0 - M2 : zeros;
-            const uint8_t *const BS = has_t && more_y ? K - M0 + M2 : zeros, *const BP = has_t && has_z ? K - M0 - M1 : zeros;
-            const uint8_t *const PP = z > 1 ? K - 2 * M1 : zeros, *const BB = t > 1 ? K - 2 * M0 : zeros;
+            const uint8_t* const B = has_t ? K - M0 : zeros;
+            const uint8_t* const BB = t > 1 ? K - 2 * M0 : zeros;
+            const uint8_t* const BN = has_t && has_y ? K - M0 - M2 : zeros;
+            const uint8_t* const BS = has_t && more_y ? K - M0 + M2 : zeros;
+            const uint8_t* const BP = has_t && has_z ? K - M0 - M1 : zeros;
             const uint8_t* const BF = has_t && more_z ? K - M0 + M1 : zeros;
+            // Levels of this row (A, and O for the second ones) and of the next ones along y, z, t.
             const uint8_t *const A = level + at, *const O = other + at;
-            const uint8_t *const AS = more_y ? A + S2 : A, *const AF = more_z ? A + S1 : A, *const AT = more_t ? A + S0 : A;
+            const uint8_t* const AS = more_y ? A + S2 : A;
+            const uint8_t* const AF = more_z ? A + S1 : A;
+            const uint8_t* const AT = more_t ? A + S0 : A;
 
             for (int s = 0; s < segments; s++) {
                 const int x0 = s * SEGMENT, x1 = min(x0 + SEGMENT, n3);
@@ -64,74 +96,95 @@ template <int MODE> struct MaskCoder {
                     low = min<int>(low, A[x]);
                     high = max<int>(high, A[x]);
                 }
-                // The state that all segments around have, as far as they exist.
+                // The state that all segments around have, as far as they exist; where none exists,
+                // the state that the levels suggest.
                 int same = NOTHING, around = 0;
-                const int near[4] = {G[s - 1], has_y ? G[s - G2] : NOTHING, has_z ? G[s - G1] : NOTHING, has_t ? G[s - G0] : NOTHING};
+                const int near[4] = {G[s - 1], has_y ? G[s - G2] : NOTHING,
+                                     has_z ? G[s - G1] : NOTHING, has_t ? G[s - G0] : NOTHING};
                 for (int k = 0; k < 4; k++) {
                     if (near[k] == NOTHING) continue;
                     around++;
-                    same = same == NOTHING || same == near[k] ? near[k] : 2;
+                    same = same == NOTHING || same == near[k] ? near[k] : MIXED;
                 }
-                if (same == NOTHING) same = !informed || high < 4 ? 0 : low > LEVELS - 5 ? 1 : 2;
-                if (same < 2) {
-                    const int away = !informed ? 0 : same ? LEVELS - 1 - low : high;
+                if (same == NOTHING)
+                    same = !informed || high < 4 ? ZEROS : low > LEVELS - 5 ? ONES : MIXED;
+
+                // A flag for all bits of the segment.
+                if (same != MIXED) {
+                    const int away = !informed ? 0 : same == ONES ? LEVELS - 1 - low : high;
                     if (away < QUIET) {
                         int uniform = 1;
-                        if (MODE != 1) for (int x = x0; x < x1; x++) uniform &= out[x] == same;
+                        if (!DECODES) for (int x = x0; x < x1; x++) uniform &= out[x] == same;
                         if (simple(uniform, (same * 3 + away / 4) * 5 + around)) {
                             for (int x = x0; x < x1; x++) {
                                 out[x] = (uint8_t)same;
-                                K[x] = (uint8_t)(same ? (A[x] < EVEN ? 5 : 1) : A[x] < EVEN ? 0 : 2);
+                                K[x] = mark(same, A[x]);
                             }
                             G[s] = (uint8_t)same;
                             continue;
                         }
                     }
                 }
+
+                // The bits, one by one. Those before a vertex are w, n, p and b along x, y, z and
+                // t. A second letter moves on along x (w, e), y (n, s) or z (p, f). A 2 is for two
+                // vertices before.
                 int ones = 0;
                 for (int x = x0; x < x1; x++) {
                     const int a = A[x], ahead = x + 1 < n3 ? A[x + 1] : a, half = a >> 1;
                     const int w = K[x - 1] & 1, n = N[x] & 1, p = P[x] & 1, b = B[x] & 1;
-                    const int nw = N[x - 1] & 1, ne = N[x + 1] & 1, pw = P[x - 1] & 1, pe = P[x + 1] & 1, ps = PS[x] & 1, pn = PN[x] & 1;
-                    const int bw = B[x - 1] & 1, be = B[x + 1] & 1, bs = BS[x] & 1, bn = BN[x] & 1, bf = BF[x] & 1, bp = BP[x] & 1;
+                    const int nw = N[x - 1] & 1, ne = N[x + 1] & 1;
+                    const int pw = P[x - 1] & 1, pe = P[x + 1] & 1, ps = PS[x] & 1, pn = PN[x] & 1;
+                    const int bw = B[x - 1] & 1, be = B[x + 1] & 1, bs = BS[x] & 1, bn = BN[x] & 1;
+                    const int bf = BF[x] & 1, bp = BP[x] & 1;
+                    const int w2 = K[x - 2] & 1, y2 = NN[x] & 1, z2 = PP[x] & 1, t2 = BB[x] & 1;
                     const int near_bits = w | n << 1 | p << 2 | b << 3;
+                    const int before =
+                        b | be << 1 | bw << 2 | bs << 3 | bn << 4 | bf << 5 | bp << 6;
+                    const int sum_plane = w + n + nw + ne, sum_below = p + pw + pe + ps + pn;
+                    const int sum_before = b + bw + be + bs + bn + bf + bp;
+                    const int against = (a * 3 + (K[x - 1] >> 1)) * 3 + (N[x] >> 1);
+                    const int plane = w2 << 4 | nw << 5 | ne << 6 | y2 << 7;
+                    const int second = w2 << 4 | y2 << 5 | z2 << 6 | t2 << 7;
                     const int context[CONTEXTS] = {
                         a * NEAR + near_bits,
                         (a * 16 + O[x]) * 2 + w,
-                        near_bits | (K[x - 2] & 1) << 4 | nw << 5 | ne << 6 | (NN[x] & 1) << 7 | pe << 8 | ps << 9 | be << 10 | bs << 11,
+                        near_bits | plane | pe << 8 | ps << 9 | be << 10 | bs << 11,
                         ((half * 8 + (ahead >> 2)) * 8 + (AS[x] >> 2)) * 2 + w,
                         ((half * 8 + (AF[x] >> 2)) * 8 + (AT[x] >> 2)) * 2 + p,
-                        (((w + n + nw + ne) * 6 + p + pw + pe + ps + pn) * 8 + b + bw + be + bs + bn + bf + bp) * 8 + (a >> 2),
-                        (((a * 3 + (K[x - 1] >> 1)) * 3 + (N[x] >> 1)) * 3 + (P[x] >> 1)) * 3 + (B[x] >> 1),
-                        (a >> 3) << 10 | b | be << 1 | bw << 2 | bs << 3 | bn << 4 | bf << 5 | bp << 6 | w << 7 | n << 8 | p << 9,
-                        near_bits | (K[x - 2] & 1) << 4 | (NN[x] & 1) << 5 | (PP[x] & 1) << 6 | (BB[x] & 1) << 7 | be << 8 | bs << 9 | bf << 10 | pe << 11,
-                        half << 7 | b | be << 1 | bw << 2 | bs << 3 | bn << 4 | bf << 5 | bp << 6,
+                        ((sum_plane * 6 + sum_below) * 8 + sum_before) * 8 + (a >> 2),
+                        (against * 3 + (P[x] >> 1)) * 3 + (B[x] >> 1),
+                        (a >> 3) << 10 | before | w << 7 | n << 8 | p << 9,
+                        near_bits | second | be << 8 | bs << 9 | bf << 10 | pe << 11,
+                        half << 7 | before,
                     };
                     Mixed<CONTEXTS> now;
                     for (int i = 0; i < CONTEXTS; i++) now.slots[i] = slots[i] + context[i];
                     now.first = state->weights.data() + a * SET;
                     now.second = state->weights.data() + (LEVELS + near_bits) * SET;
                     const int probability = mix<CONTEXTS, true>(now);
-                    const int bit = range.code(MODE == 1 ? 0 : out[x], probability);
-                    learn<CONTEXTS, true, RATE>(now, bit, LIMIT);
-                    if (MODE == 1) out[x] = (uint8_t)bit;
-                    K[x] = (uint8_t)(bit ? (a < EVEN ? 5 : 1) : a < EVEN ? 0 : 2);
+                    const int bit = range.code(DECODES ? 0 : out[x], probability);
+                    learn<CONTEXTS, true, RATE>(now, bit, SLOW_LIMIT);
+                    if (DECODES) out[x] = (uint8_t)bit;
+                    K[x] = mark(bit, a);
                     ones += bit;
                 }
-                G[s] = (uint8_t)(ones == 0 ? 0 : ones == x1 - x0 ? 1 : 2);
+                G[s] = (uint8_t)(ones == 0 ? ZEROS : ones == x1 - x0 ? ONES : MIXED);
             }
         }
     }
 };
 
-FHASH_CLONES int64_t encode(MaskCoder<0> coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
+FHASH_CLONES int64_t encode(MaskCoder<false> coder, uint8_t* mask, const uint8_t* level,
+                            const uint8_t* other, const int64_t* shape) {
     return guarded([&]() FHASH_LAMBDA -> int64_t {
         coder.run(mask, level, other, shape);
         coder.range.finish();
         return 0;
     });
 }
-FHASH_CLONES int64_t decode(MaskCoder<1> coder, uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape) {
+FHASH_CLONES int64_t decode(MaskCoder<true> coder, uint8_t* mask, const uint8_t* level,
+                            const uint8_t* other, const int64_t* shape) {
     return guarded([&]() FHASH_LAMBDA -> int64_t {
         coder.run(mask, level, other, shape);
         return 0;
@@ -140,13 +193,23 @@ FHASH_CLONES int64_t decode(MaskCoder<1> coder, uint8_t* mask, const uint8_t* le
 
 }  // namespace
 
-// Encode a mask of zeros and ones (t, z, y, x); level: 0..31, other: 0..15 of each vertex. The state is what transform/mask.py describes;
-// it comes back as it was left if `keep` and the bytes fit. Bytes needed; data is filled if they fit. NO_MEMORY.
-FHASH_EXPORT int64_t fhash_encode_mask(const uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape, uint16_t* slots,
-                                       int64_t slot_count, int32_t* weights, int64_t weight_count, uint16_t* simples, int64_t simple_count,
-                                       int64_t keep, uint8_t* data, int64_t capacity) {
+// Encode a mask of zeros and ones (t, z, y, x).
+//
+// level, other: two levels of each vertex, 0 to 31 and 0 to 15.
+// slots, weights, simples: the state (transform/entropy/mask.py). It is left adapted if `keep` and
+// if the bytes fit.
+// data: receives the bytes if they fit the capacity.
+//
+// Returns the number of bytes, or NO_MEMORY.
+FHASH_EXPORT int64_t fhash_encode_mask(const uint8_t* mask, const uint8_t* level,
+                                       const uint8_t* other, const int64_t* shape, uint16_t* slots,
+                                       int64_t slot_count, int32_t* weights, int64_t weight_count,
+                                       uint16_t* simples, int64_t simple_count, int64_t keep,
+                                       uint8_t* data, int64_t capacity) {
     return guarded([&]() -> int64_t {
-        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
+                                 LANES);
+        // The run writes to its mask, also in encoding.
         std::vector<uint8_t> out, bits(mask, mask + shape[0] * shape[1] * shape[2] * shape[3]);
         const int64_t code = encode({{&out}, &state}, bits.data(), level, other, shape);
         if (code < 0) return code;
@@ -156,12 +219,18 @@ FHASH_EXPORT int64_t fhash_encode_mask(const uint8_t* mask, const uint8_t* level
     });
 }
 
-// Decode into mask. Any bytes give some mask: a digest must tell whether it is the right one. 0 or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_decode_mask(uint8_t* mask, const uint8_t* level, const uint8_t* other, const int64_t* shape, const uint16_t* slots,
-                                       int64_t slot_count, const int32_t* weights, int64_t weight_count, const uint16_t* simples,
+// Decode into a mask; the other arguments are those of fhash_encode_mask. Any bytes give some mask:
+// the caller must check a digest.
+//
+// Returns 0 or NO_MEMORY.
+FHASH_EXPORT int64_t fhash_decode_mask(uint8_t* mask, const uint8_t* level, const uint8_t* other,
+                                       const int64_t* shape, const uint16_t* slots,
+                                       int64_t slot_count, const int32_t* weights,
+                                       int64_t weight_count, const uint16_t* simples,
                                        int64_t simple_count, const uint8_t* data, int64_t size) {
     return guarded([&]() -> int64_t {
-        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count, LANES);
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
+                                 LANES);
         return decode({{data, size}, &state}, mask, level, other, shape);
     });
 }

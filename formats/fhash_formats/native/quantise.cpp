@@ -1,4 +1,5 @@
-// Coefficients to integers and back, element by element (transform/quantise.py has the portable twins).
+// Coefficients to integers and back, element by element. transform/values/quantise.py has the
+// portable twins.
 #include <cmath>
 #include <cstdint>
 
@@ -6,7 +7,9 @@
 
 namespace {
 
-template <class T> FHASH_INLINE void quantise(const T* in, std::int64_t count, T scale, T rounding, T largest, std::int32_t* out, float* scaled) {
+template <class T>
+FHASH_INLINE void quantise(const T* in, std::int64_t count, T scale, T rounding, T largest,
+                           std::int32_t* out, float* scaled) {
     for (std::int64_t i = 0; i < count; i++) {
         const T s = in[i] * scale;
         T magnitude = s < 0 ? -s : s;
@@ -17,44 +20,53 @@ template <class T> FHASH_INLINE void quantise(const T* in, std::int64_t count, T
     }
 }
 
-template <class T> FHASH_INLINE void dequantise(const std::int32_t* in, std::int64_t count, T step, T one, T two, T more, T* out) {
+// one, two, more: offsets of magnitudes 1, 2 and more, in steps.
+template <class T>
+FHASH_INLINE void dequantise(const std::int32_t* in, std::int64_t count, T step, T one, T two,
+                             T more, T* out) {
     const T offsets[4] = {0, one, two, more}, signs[2] = {1, -1};
     for (std::int64_t i = 0; i < count; i++) {
         const std::int32_t q = in[i], magnitude = q < 0 ? -q : q;
-        // From a table, and a sign as a factor: the loop has no branches then.
+        // Offsets from a table and the sign as a factor keep the loop free of branches.
         const T value = ((T)magnitude + offsets[magnitude < 3 ? magnitude : 3]) * step;
         out[i] = value * signs[q < 0];
     }
 }
 
-FHASH_CLONES void quantise_float(const float* in, std::int64_t n, float scale, float rounding, float largest, std::int32_t* out, float* scaled) {
-    quantise<float>(in, n, scale, rounding, largest, out, scaled);
-}
-FHASH_CLONES void quantise_double(const double* in, std::int64_t n, double scale, double rounding, double largest, std::int32_t* out, float* scaled) {
-    quantise<double>(in, n, scale, rounding, largest, out, scaled);
-}
-FHASH_CLONES void dequantise_float(const std::int32_t* in, std::int64_t n, float step, float one, float two, float more, float* out) {
-    dequantise<float>(in, n, step, one, two, more, out);
-}
-FHASH_CLONES void dequantise_double(const std::int32_t* in, std::int64_t n, double step, double one, double two, double more, double* out) {
-    dequantise<double>(in, n, step, one, two, more, out);
-}
+#define FHASH_CLONED(T) \
+    FHASH_CLONES void quantise_cloned(const T* in, std::int64_t n, T scale, T rounding, T largest, \
+                                      std::int32_t* out, float* scaled) { \
+        quantise<T>(in, n, scale, rounding, largest, out, scaled); \
+    } \
+    FHASH_CLONES void dequantise_cloned(const std::int32_t* in, std::int64_t n, T step, T one, \
+                                        T two, T more, T* out) { \
+        dequantise<T>(in, n, step, one, two, more, out); \
+    }
+
+FHASH_CLONED(float)
+FHASH_CLONED(double)
 
 }  // namespace
 
-FHASH_EXPORT std::int64_t fhash_quantise_f32(const float* in, std::int64_t n, double scale, double rounding, double largest, std::int32_t* out, float* scaled) {
-    quantise_float(in, n, (float)scale, (float)rounding, (float)largest, out, scaled);
+FHASH_EXPORT std::int64_t fhash_quantise_f32(const float* in, std::int64_t n, double scale,
+                                             double rounding, double largest, std::int32_t* out,
+                                             float* scaled) {
+    quantise_cloned(in, n, (float)scale, (float)rounding, (float)largest, out, scaled);
     return 0;
 }
-FHASH_EXPORT std::int64_t fhash_quantise_f64(const double* in, std::int64_t n, double scale, double rounding, double largest, std::int32_t* out, float* scaled) {
-    quantise_double(in, n, scale, rounding, largest, out, scaled);
+FHASH_EXPORT std::int64_t fhash_quantise_f64(const double* in, std::int64_t n, double scale,
+                                             double rounding, double largest, std::int32_t* out,
+                                             float* scaled) {
+    quantise_cloned(in, n, scale, rounding, largest, out, scaled);
     return 0;
 }
-FHASH_EXPORT std::int64_t fhash_dequantise_f32(const std::int32_t* in, std::int64_t n, double step, double one, double two, double more, float* out) {
-    dequantise_float(in, n, (float)step, (float)one, (float)two, (float)more, out);
+FHASH_EXPORT std::int64_t fhash_dequantise_f32(const std::int32_t* in, std::int64_t n, double step,
+                                               double one, double two, double more, float* out) {
+    dequantise_cloned(in, n, (float)step, (float)one, (float)two, (float)more, out);
     return 0;
 }
-FHASH_EXPORT std::int64_t fhash_dequantise_f64(const std::int32_t* in, std::int64_t n, double step, double one, double two, double more, double* out) {
-    dequantise_double(in, n, step, one, two, more, out);
+FHASH_EXPORT std::int64_t fhash_dequantise_f64(const std::int32_t* in, std::int64_t n, double step,
+                                               double one, double two, double more, double* out) {
+    dequantise_cloned(in, n, step, one, two, more, out);
     return 0;
 }

@@ -1,12 +1,8 @@
-"""Readers of time-varying volumes: one file per format, `registry` to find the right one.
+"""Readers of time-varying volumes: one file per format, and `registry` to find the right one.
 
-registry     formats, open_series             hdf5 netcdf zarr_store npy raw   the formats
-request      what the user may say            joined        many files as one series
-variables    which array is meant             masks         a mask over a series
-roles        which dimension is which axis    lattice       frames in (z, y, x) from any order
-positions    coordinates                      failures      errors in one line, files that change
-hdf5_tree    the datasets of an HDF5 file     cf_packing    packed values in zarr
-flat         values without chunks
+`hdf5`, `netcdf`, `zarr_store`, `npy` and `raw` are the formats. `joined` makes one series of many
+files, `masks` opens a mask over a series. `common/` holds what several formats share: the user's
+request, the choice of a variable and of its axes, coordinates, packed values, errors.
 """
 
 from fhash_formats.readers.common.request import RawLayout, parse_shape

@@ -1,4 +1,7 @@
-"""HDF5 files of any make, walked with h5py; NetCDF files are HDF5 too, but have rules of their own (see netcdf)."""
+"""HDF5 files of any make, walked with h5py.
+
+NetCDF files are HDF5 too, but have rules of their own (netcdf.py).
+"""
 
 from __future__ import annotations
 
@@ -26,13 +29,16 @@ from fhash_formats.series import Coordinate
 from fhash_formats.support.attributes import json_attributes, plain_text, text_of
 
 PACKED = {"scale_factor": 1, "add_offset": 0, "_FillValue": "NaN", "missing_value": "NaN"}
-"""Attributes by which NetCDF files pack values, and with which value they change none."""
+"""Attributes by which NetCDF files pack values, each with the value that changes nothing."""
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
 def is_hdf5(head: bytes) -> bool:
-    """Whether a file that begins so is HDF5; a user block of 512, 1024 or 2048 bytes may come before the signature."""
+    """Whether the first bytes of a file are those of HDF5.
+
+    A user block of 512, 1024 or 2048 bytes may precede the signature.
+    """
     return any(
         head[offset : offset + len(SIGNATURE)] == SIGNATURE for offset in (0, 512, 1024, 2048)
     )
@@ -44,10 +50,11 @@ def matches(head: bytes, path: Path) -> bool:
 
 
 def open_hdf5(path: Path, request: Request) -> FileSeries:
-    """The series in an HDF5 file: the only suitable dataset, or the one named.
+    """Open the series in an HDF5 file: the only suitable dataset, or the one named.
 
-    Coordinates are the dimension scales, else 1-D datasets of a conventional name beside the dataset or in the root.
-    Values are as stored: fill values and packing mean something in NetCDF files only.
+    Coordinates are the dimension scales, else 1-D datasets of a conventional name beside the
+    dataset or in the root. Values are as stored: fill values and packing have a meaning in NetCDF
+    files only.
     """
     import h5py
 
@@ -102,15 +109,19 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
 
 
 def _warn_of_packing(name: str, dataset: Any) -> None:
-    """Say that attributes which change the values of a NetCDF file change none here; without the path, so once for many files."""
+    """Warn that attributes which change the values of a NetCDF file change none here.
+
+    The message names no path, so that it appears once for many files.
+    """
     attributes = json_attributes(dataset.attrs)
-    found = [
+    packing = [
         key
         for key, idle in PACKED.items()
         if key in attributes and attributes[key] not in (idle, [idle])
     ]
-    if found:
-        text = f"{plain_text(name)} has the attribute{'s' if len(found) > 1 else ''} {', '.join(found)}"
+    if packing:
+        plural = "s" if len(packing) > 1 else ""
+        text = f"{plain_text(name)} has the attribute{plural} {', '.join(packing)}"
         warnings.warn(
             f"{text}; its values are read as they stand in HDF5, a file named .nc is unpacked",
             UserWarning,
@@ -119,7 +130,7 @@ def _warn_of_packing(name: str, dataset: Any) -> None:
 
 
 def _scale(dimension: Any) -> tuple[str, Any] | None:
-    """Name and dataset of the dimension scale attached first, if any."""
+    """Name and dataset of the dimension scale that was attached first; None without one."""
     if len(dimension) == 0:
         return None
     dataset = dimension[0]
@@ -137,7 +148,7 @@ def _hint(label: str, scale: tuple[str, Any] | None) -> str | None:
 def _scale_coordinates(
     source: str, axes: tuple[str, ...], shape: tuple[int, ...], scales: list[tuple[str, Any] | None]
 ) -> dict[str, Coordinate]:
-    found = {}
+    coords = {}
     for axis, length, scale in zip(axes, shape, scales, strict=True):
         # a NetCDF dimension without values is a scale too, and says so in its NAME
         if (
@@ -148,8 +159,8 @@ def _scale_coordinates(
         ):
             continue
         values = column(*scale)
-        found[axis] = coordinate(source, values.name, values.read(), values.attributes)
-    return found
+        coords[axis] = coordinate(source, values.name, values.read(), values.attributes)
+    return coords
 
 
 def _valueless(scale: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Many files, each a step or a few, as one series: "frames_*.raw"."""
+"""Many files, each with one or more steps, as one series: "frames_*.raw"."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def is_pattern(text: str) -> bool:
 
 
 def natural_order(text: str) -> list[tuple[int, str]]:
-    """A key that sorts frame_9 before frame_10: runs of digits count as numbers."""
+    """Sort key that puts frame_9 before frame_10: runs of digits count as numbers."""
     return [
         (int(part), "") if part[:1].isdecimal() and part.isascii() else (-1, part)
         for part in re.split(r"([0-9]+)", text)
@@ -36,16 +36,19 @@ def natural_order(text: str) -> list[tuple[int, str]]:
 
 
 def files_of(pattern: str) -> list[Path]:
-    """The files of a pattern in the order of the numbers in their names; raises MissingInputError if there are none."""
-    found = sorted(glob.glob(pattern), key=lambda name: (natural_order(name), name))
-    if not found:
+    """Files of a pattern in the order of the numbers in their names.
+
+    Raises MissingInputError if there are none.
+    """
+    files = sorted(glob.glob(pattern), key=lambda name: (natural_order(name), name))
+    if not files:
         raise MissingInputError(f"no file matches {pattern}")
-    return [Path(name) for name in found]
+    return [Path(name) for name in files]
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Part:
-    """What was seen of one file when the series was opened."""
+    """State of one file when the series was opened."""
 
     path: Path
     stamps: tuple[Stamp | FolderStamp, ...]
@@ -53,16 +56,17 @@ class _Part:
     time: Coordinate | None
 
     def check(self) -> None:
-        """Raise InputError if it is no longer what was opened."""
+        """Raise InputError if the file has changed since it was opened."""
         for stamp in self.stamps:
             stamp.check()
 
 
 class JoinedSeries(Series):
-    """The steps of several files one after the other; only the file that was read last is open.
+    """The steps of several files one after the other; only the file read last is open.
 
-    All files have the same variable, frame shape, type and spatial coordinates. Times are those of the files if they give them, and must
-    then increase from file to file; otherwise they are 0, 1, 2, ... Raises InputError that names the file which differs.
+    All files have the same variable, frame shape, type and spatial coordinates. Times are those of
+    the files if they give them, and must then increase from file to file; otherwise they are 0, 1,
+    2, ... Raises InputError that names the file which differs.
     """
 
     def __init__(
@@ -115,7 +119,8 @@ class JoinedSeries(Series):
             warnings.simplefilter("ignore")  # it was said when the series was opened
             series = self._open_part(part.path)
         try:
-            part.check()  # after, because from here on the series compares with the file that it opened
+            # after, because from here on the series compares with the file that it opened
+            part.check()
         except BaseException:
             series.close()
             raise
@@ -128,7 +133,8 @@ class JoinedSeries(Series):
         for part in self._parts:
             if part.time is None or dict(part.time.attributes) != dict(times[0].attributes):
                 raise InputError(
-                    f"{self.source}: the time in {part.path} has not the units of the time in {self._parts[0].path}"
+                    f"{self.source}: the time in {part.path} has not the units of the time in"
+                    f" {self._parts[0].path}"
                 )
         for before, after in zip(self._parts[:-1], self._parts[1:], strict=True):
             last, following = before.time, after.time
@@ -137,7 +143,10 @@ class JoinedSeries(Series):
                 and following is not None
                 and not last.values[-1] < following.values[0]
             ):
-                passed = f"{following.values[0]:g} in {after.path} after {last.values[-1]:g} in {before.path}"
+                passed = (
+                    f"{following.values[0]:g} in {after.path}"
+                    f" after {last.values[-1]:g} in {before.path}"
+                )
                 raise InputError(
                     f"{self.source}: times do not increase in the order of the file names: {passed}"
                 )
@@ -149,7 +158,8 @@ class JoinedSeries(Series):
 
 
 def _common_name(names: Sequence[str]) -> str:
-    """The name of all, or what their beginnings have in common before the numbers: "frame" of frame_01 and frame_02."""
+    """The name of all, or their common beginning before the numbers: "frame" for frame_01 and
+    frame_02."""
     low, high = min(names), max(names)
     if low == high:
         return low
@@ -173,5 +183,6 @@ def _check_alike(part: Series, path: Path, first: Series, first_path: Path) -> N
     for axis in ("z", "y", "x"):
         if not np.array_equal(part.coords[axis].values, first.coords[axis].values):
             raise InputError(
-                f"{path} has other coordinates along {axis} than {first_path}; files of one series must be alike"
+                f"{path} has other coordinates along {axis} than {first_path}; files of one series"
+                " must be alike"
             )

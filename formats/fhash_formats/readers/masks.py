@@ -1,4 +1,4 @@
-"""A user's own feature: a mask in a file, of the series' shape."""
+"""A feature of the user's own: a mask in a file, with the shape of the series."""
 
 from __future__ import annotations
 
@@ -15,32 +15,40 @@ from fhash_formats.series import Series
 
 
 class Mask:
-    """A mask over a series: `mask(step)` is the boolean frame (z, y, x). One file frame serves every step if it holds only one."""
+    """A mask over a series: `mask(step)` is the boolean frame (z, y, x).
+
+    A file with a single frame serves every step.
+    """
 
     def __init__(self, values: Series) -> None:
         self._values = values
         self.files = values.files
 
     def __call__(self, step: int) -> npt.NDArray[np.bool_]:
-        """True where the file's value at this step is neither zero nor NaN; raises InputError if the file cannot be read."""
+        """Frame (z, y, x), True where the file's value at this step is neither zero nor NaN.
+
+        Raises InputError if the file cannot be read.
+        """
         frame = self._values.read(step if self._values.shape[0] > 1 else 0)
         mask: npt.NDArray[np.bool_] = frame != 0
         return mask & ~np.isnan(frame) if frame.dtype.kind == "f" else mask
 
     def close(self) -> None:
-        """Release the file."""
+        """Close the file."""
         self._values.close()
 
 
 def open_mask(path: str | Path, shape: Sequence[int], var: str | None = None) -> Mask:
-    """The mask in a file for a series of `shape` (t, z, y, x): booleans or numbers of that shape, or (z, y, x) for all steps alike.
+    """Open a mask for a series of `shape` (t, z, y, x).
 
-    Any format that `open_series` reads. Raises InputError where the shape is another.
+    The file holds booleans or numbers of that shape, or of (z, y, x) for all steps alike, in any
+    format that `open_series` reads. Raises InputError for another shape.
     """
     values = open_whole(path, Request(var=var, booleans=True))
     if values.shape[1:] != tuple(shape[1:]) or values.shape[0] not in (1, shape[0]):
         values.close()
         raise InputError(
-            f"{path}: the mask has shape {values.shape} (t, z, y, x), the series {tuple(shape)}; it must be that, or one step of it"
+            f"{path}: the mask has shape {values.shape} (t, z, y, x), the series {tuple(shape)};"
+            " it must be that, or one step of it"
         )
     return Mask(values)

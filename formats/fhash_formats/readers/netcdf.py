@@ -1,8 +1,9 @@
-"""NetCDF files, read by the CF conventions with xarray: packing undone, fill values turned into NaN, times kept as numbers.
+"""NetCDF files, read by the CF conventions with xarray.
 
-NetCDF4 is HDF5 and goes through h5netcdf, NetCDF3 ("classic") through scipy. Times are not decoded: float64 hours near 347921 tell
-steps apart, calendars of models need no date, and `units` and `calendar` stay beside the numbers. `valid_range` never hides a value:
-files in use have wrong ones.
+Packing is undone, fill values become NaN, times stay numbers. NetCDF4 is HDF5 and goes through
+h5netcdf, NetCDF3 ("classic") through scipy. Times are not decoded: float64 hours near 347921 tell
+steps apart, calendars of models need no date, and `units` and `calendar` stay beside the numbers.
+`valid_range` never hides a value, since it is wrong in files that are in use.
 """
 
 from __future__ import annotations
@@ -40,20 +41,23 @@ Exact = Callable[[Values, tuple[slice, ...]], Values]
 SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
 CLASSIC = (b"CDF\x01", b"CDF\x02")
 MADE_UP = "phony_dim_"
-"""How the dimensions begin that a file does not name."""
+"""Prefix of the names that xarray makes up for dimensions without one."""
 
 CLASSIC_64 = b"CDF\x05"
 
 
 def matches(head: bytes, path: Path) -> bool:
-    """Whether this is NetCDF: classic, or HDF5 that says so by its suffix, by `_NCProperties` or by CF `Conventions`."""
+    """Whether this is NetCDF: classic, or an HDF5 file that claims to be NetCDF.
+
+    It claims so by its suffix, by `_NCProperties` or by CF `Conventions`.
+    """
     return head[:4] in (*CLASSIC, CLASSIC_64) or (
         is_hdf5(head) and (_says_netcdf(path) or path.suffix.lower() in SUFFIXES)
     )
 
 
 def _says_netcdf(path: Path) -> bool:
-    """Whether an HDF5 file says that it is NetCDF; raises InputError if it cannot be opened."""
+    """Whether an HDF5 file claims to be NetCDF; raises InputError if it cannot be opened."""
     import h5py
 
     with refusing(f"{path} cannot be read as HDF5"), h5py.File(path, "r") as file:
@@ -63,7 +67,7 @@ def _says_netcdf(path: Path) -> bool:
 
 
 def open_netcdf(path: Path, request: Request) -> FileSeries:
-    """The series in a NetCDF file: the only suitable variable (of the root, or of any group), or the one named."""
+    """Open the series in a NetCDF file: the only suitable variable of any group, or a named one."""
     source, stamp = str(path), Stamp.of(path)
     with path.open("rb") as file:
         head = file.read(4)
@@ -78,17 +82,21 @@ def open_netcdf(path: Path, request: Request) -> FileSeries:
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """xarray warns of every oddity of a file (several fill values, bounds that are missing); none of them changes what is read."""
+    """Silence xarray's warnings about a file (several fill values, bounds that are missing).
+
+    None of them changes the values that are read.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 
 
 def _open_groups(source: str, path: Path, head: bytes) -> Mapping[str, xr.Dataset]:
-    """The datasets of all groups by path, "/" first."""
+    """Datasets of all groups by path, "/" first."""
     if head == CLASSIC_64:
         raise InputError(
-            f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with: nccopy -k nc4 IN OUT"
+            f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with:"
+            " nccopy -k nc4 IN OUT"
         )
     try:
         import xarray as xr
@@ -127,10 +135,12 @@ def _open_classic(source: str, path: Path, options: Mapping[str, Any]) -> xr.Dat
         return xr.open_dataset(path, engine="scipy", **options)
     except Exception as error:
         message = condense(error)
-    # the error is not chained: its traceback holds scipy's half-open file, which warns when it is dropped, and here nobody hears that
+    # the error is not chained: its traceback holds scipy's half-open file, which warns when it is
+    # dropped, and here nobody hears that
     gc.collect()
     raise InputError(
-        f"{source} cannot be read as classic NetCDF3: {message}; nccopy -k nc4 IN OUT may convert it"
+        f"{source} cannot be read as classic NetCDF3: {message}; nccopy -k nc4 IN OUT may convert"
+        " it"
     )
 
 
@@ -143,7 +153,7 @@ def _close(groups: Mapping[str, xr.Dataset]) -> None:
 def _series(
     source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Dataset], request: Request
 ) -> FileSeries:
-    found = [
+    variables = [
         Variable(
             name=f"{group}/{name}".lstrip("/"),
             shape=array.shape,
@@ -154,7 +164,7 @@ def _series(
         for group, dataset in groups.items()
         for name, array in ((str(name), array) for name, array in dataset.variables.items())
     ]
-    variable = choose(source, found, request.var, booleans=request.booleans)
+    variable = choose(source, variables, request.var, booleans=request.booleans)
     group, name = variable.handle
     array = groups[group].variables[name]
     _check_filters(source, path, variable.name)
@@ -196,9 +206,9 @@ def _series(
 def _exactly_filled(
     source: str, path: Path, name: str, encoding: Mapping[str, Any]
 ) -> Exact | None:
-    """What tells the neighbours of a fill value from it, where float64 does not: None where it does.
+    """A test that tells a fill value from its neighbours; None where float64 suffices.
 
-    xarray compares as float64, in which many 64-bit integers beyond 2^53 are the same.
+    xarray compares as float64, in which many 64-bit integers beyond 2^53 are equal.
     """
     import h5py
 
@@ -234,19 +244,22 @@ def _check_filters(source: str, path: Path, name: str) -> None:
 
 
 def _upwards(group: str) -> list[str]:
-    """A group's path and those of the groups around it, the root last: NetCDF4 dimensions and coordinates are inherited."""
+    """Path of a group and of the groups around it, the root last.
+
+    NetCDF4 groups inherit dimensions and coordinates from those around them.
+    """
     parts = [part for part in group.split("/") if part]
     return ["/" + "/".join(parts[:count]) for count in range(len(parts), -1, -1)]
 
 
 def _along(dimension: str, scope: Sequence[xr.Dataset]) -> Iterator[tuple[str, xr.Variable]]:
-    """The number variables along one dimension alone: the one of its name, then coordinates, then the rest.
+    """Number variables along one dimension alone: its namesake, then coordinates, then the rest.
 
-    None for a made-up dimension: xarray shares those by length, and a length has no meaning.
+    A made-up dimension has none: xarray shares those by length, and a length has no meaning.
     """
     if dimension.startswith(MADE_UP):
         return
-    for wanted in ("named", "coordinate", "other"):
+    for rank in ("named", "coordinate", "other"):
         for dataset in scope:
             for key, array in dataset.variables.items():
                 kind = (
@@ -256,7 +269,7 @@ def _along(dimension: str, scope: Sequence[xr.Dataset]) -> Iterator[tuple[str, x
                     if key in dataset.coords
                     else "other"
                 )
-                if kind == wanted and array.dims == (dimension,) and usable(array.dtype):
+                if kind == rank and array.dims == (dimension,) and usable(array.dtype):
                     yield str(key), array
 
 
@@ -269,7 +282,7 @@ def _role(dimension: str, scope: Sequence[xr.Dataset]) -> str | None:
 
 
 def _columns(dataset: xr.Dataset) -> dict[str, Column]:
-    """The variables of a dataset that may be coordinates, by lower-case name."""
+    """Variables of a dataset that may be coordinates, by lower-case name."""
     arrays = [
         (str(key), array)
         for key, array in dataset.variables.items()
@@ -292,21 +305,22 @@ def _coordinates(
     values: xr.DataArray,
     certain: bool,
 ) -> dict[str, Coordinate]:
-    """For each dimension the coordinate of its name, else one along it whose CF role is its axis; scalar coordinates for axes it lacks.
+    """Coordinate of each dimension: its namesake, else one along it whose CF role is its axis.
 
-    Where the file names no dimension, by conventional names as in any HDF5 file.
+    Axes that the variable lacks take scalar coordinates. Where the file names no dimension,
+    coordinates go by conventional names, as in any HDF5 file.
     """
     if all(dimension.startswith(MADE_UP) for dimension in dimensions):
         return beside(
             source, axes, shape, [_columns(dataset) for dataset in scope], certain=certain
         )
-    found = {}
+    coords = {}
     for axis, dimension, length in zip(axes, dimensions, shape, strict=True):
         for name, array in _along(dimension, scope):
             if array.shape == (length,) and (
                 name == dimension or role_of_coordinate(name, array.attrs) == axis
             ):
-                found[axis] = coordinate(source, name, array.to_numpy(), array.attrs)
+                coords[axis] = coordinate(source, name, array.to_numpy(), array.attrs)
                 break
     for key, scalar in values.coords.items():
         role = role_of_coordinate(str(key), scalar.attrs)
@@ -315,7 +329,7 @@ def _coordinates(
             and usable(scalar.dtype)
             and role in AXES
             and role not in axes
-            and role not in found
+            and role not in coords
         ):
-            found[role] = coordinate(source, str(key), scalar.to_numpy(), scalar.attrs)
-    return found
+            coords[role] = coordinate(source, str(key), scalar.to_numpy(), scalar.attrs)
+    return coords

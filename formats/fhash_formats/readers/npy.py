@@ -23,15 +23,20 @@ def matches(head: bytes, path: Path) -> bool:
 
 
 def open_npy(path: Path, request: Request) -> FileSeries:
-    """The series in a .npy file, in file order (t, z, y, x) or (z, y, x) unless the request's axes say otherwise."""
+    """Open the series in a .npy file.
+
+    Its dimensions are (t, z, y, x) or (z, y, x) unless the request names the axes.
+    """
     source, stamp = str(path), Stamp.of(path)
     if path.suffix.lower() == ".npz":
         raise InputError(
-            f"{source} is a NumPy archive; save its array alone: numpy.save('array.npy', numpy.load('{path.name}')[NAME])"
+            f"{source} is a NumPy archive; save its array alone: numpy.save('array.npy',"
+            f" numpy.load('{path.name}')[NAME])"
         )
     request.refuse_var(source)
     with refusing(f"{source} cannot be read as .npy"):
-        # opened as a map for its header only: type, shape, order and the offset of the values; Python objects are refused by it
+        # opened as a map for its header only: type, shape, order and the offset of the values;
+        # Python objects are refused by it
         header = np.load(path, mmap_mode="r", allow_pickle=False)
         shape, dtype, offset = header.shape, header.dtype, int(header.offset)
         fortran = header.flags.f_contiguous and not header.flags.c_contiguous
@@ -44,12 +49,14 @@ def open_npy(path: Path, request: Request) -> FileSeries:
     )
     axes = assign_axes(source, shape, [None] * len(shape), [None] * len(shape), request.axes)
     if fortran:
-        # the last dimension is the slowest: the same bytes, read as C order with the dimensions reversed
+        # the last dimension is the slowest: the same bytes, read as C order with the dimensions
+        # reversed
         shape, axes = shape[::-1], axes[::-1]
     array = FlatArray(path, shape, dtype, offset=offset)
     if array.end != stamp.size:
         raise InputError(
-            f"{source} has {stamp.size} bytes, its header promises {array.end}; the file is cut or holds more than one array"
+            f"{source} has {stamp.size} bytes, its header promises {array.end}; the file is cut or"
+            " holds more than one array"
         )
     return FileSeries(
         source=source,

@@ -1,4 +1,7 @@
-"""Raw bytes without a header: the layout comes from the file's name, as in name_256x256x128x10_float32_be.raw, or from the user."""
+"""Raw bytes without a header.
+
+The layout comes from the user or from the file's name, such as name_256x256x128x10_float32_be.raw.
+"""
 
 from __future__ import annotations
 
@@ -21,26 +24,27 @@ FORM = "name_XxYxZ[xT]_TYPE[_be].raw, such as density_64x64x32x10_float32.raw"
 
 
 def matches(head: bytes, path: Path) -> bool:
-    """Whether this is raw by its suffix: what its bytes begin with is chance."""
+    """Whether this is raw by its suffix; the first bytes are values and say nothing."""
     return path.suffix.lower() == ".raw"
 
 
 def layout_of_name(stem: str) -> tuple[str, RawLayout]:
-    """The variable's name and the layout in a file name without its suffix; everything None where the name does not say."""
-    found = NAME.search(stem)
-    if found is None:
+    """Variable name and layout in a file name without its suffix; None for each unknown part."""
+    match = NAME.search(stem)
+    if match is None:
         return stem, RawLayout()
-    lengths = [int(length) for length in found["shape"].lower().split("x")]
-    endian = {"be": "big", "le": "little"}.get((found["endian"] or "").lower())
-    return stem[: found.start()] or stem, RawLayout(
-        dict(zip("xyzt", lengths, strict=False)), found["dtype"], endian
+    lengths = [int(length) for length in match["shape"].lower().split("x")]
+    endian = {"be": "big", "le": "little"}.get((match["endian"] or "").lower())
+    return stem[: match.start()] or stem, RawLayout(
+        dict(zip("xyzt", lengths, strict=False)), match["dtype"], endian
     )
 
 
 def open_raw(path: Path, request: Request) -> FileSeries:
-    """The series in a raw file, x fastest, then y, z, t; the request's axes (slowest first) may say another order of the same lengths.
+    """Open the series in a raw file: x fastest, then y, z, t.
 
-    Raises InputError where the layout is not known, or where the size of the file is not exactly the layout's.
+    The request's axes (slowest first) may state another order of the same lengths. Raises
+    InputError where the layout is unknown, or where the size of the file differs from it.
     """
     source, stamp = str(path), Stamp.of(path)
     request.refuse_var(source)
@@ -56,13 +60,15 @@ def open_raw(path: Path, request: Request) -> FileSeries:
             word for word, value in (("shape", lengths), ("type", dtype_name)) if value is None
         )
         raise InputError(
-            f"{source}: the {missing} of the raw values is not known; name the file {FORM}, or give --shape x=..,y=..,z=.. and --dtype"
+            f"{source}: the {missing} of the raw values is not known; name the file {FORM}, or"
+            " give --shape x=..,y=..,z=.. and --dtype"
         )
     axes = tuple(axis for axis in AXES if axis in lengths)
     if request.axes is not None:
         if set(request.axes) != set(axes):
             raise InputError(
-                f"{source}: --axes {','.join(request.axes)} does not name the axes of the raw shape, {','.join(axes)}"
+                f"{source}: --axes {','.join(request.axes)} does not name the axes of the raw"
+                f" shape, {','.join(axes)}"
             )
         axes = request.axes
     dtype = parse_dtype(dtype_name)

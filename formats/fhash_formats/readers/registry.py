@@ -1,4 +1,4 @@
-"""All formats that can be read, and how one is recognised: by the bytes a file begins with, then by its suffix."""
+"""All formats that can be read, recognised by the first bytes of a file, then by its suffix."""
 
 from __future__ import annotations
 
@@ -15,14 +15,21 @@ from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern
 from fhash_formats.series import Series, StepsSeries
 
 HEAD_BYTES = 4096
-"""Bytes that `matches` gets to see; HDF5 may begin at 2048."""
+"""Bytes that `matches` gets; HDF5 may begin at byte 2048."""
 
 CONTAINER_SUFFIX = ".fhz"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reader:
-    """One format: its name and suffixes, whether a file (its first bytes, or a folder with none) is of it, and how to open it."""
+    """One format.
+
+    Attributes:
+        name: name for messages.
+        suffixes: file name suffixes.
+        matches: whether a file is of the format, from its first bytes (none for a folder) and path.
+        open: opens it.
+    """
 
     name: str
     suffixes: tuple[str, ...]
@@ -51,7 +58,11 @@ REGISTRY = (
     Reader(name="NumPy", suffixes=(".npy",), matches=npy.matches, open=npy.open_npy),
     ZARR,
 )
-"""Raw comes first: its suffix says more than bytes that are someone's values. NetCDF comes before HDF5, which its files are too."""
+"""Formats in the order in which they are tried.
+
+Raw comes first: its suffix says more than bytes that are values. NetCDF comes before HDF5, since
+its files are HDF5 too.
+"""
 
 
 def open_series(
@@ -62,12 +73,19 @@ def open_series(
     steps: slice | None = None,
     raw: RawLayout | None = None,
 ) -> Series:
-    """Open a time-varying volume in any supported format; it is read frame by frame, later.
+    """Open a time-varying volume in any supported format; its frames are read later, one by one.
 
-    Arguments: `path` of a file or zarr folder, or a pattern of files ("frames_*.raw") with one or more steps each, sorted by the numbers
-    in their names; `var` names a variable; `axes` says what the file's dimensions are, in the file's order ("x,y,z,t"; axes left out
-    have length 1); `steps` is a slice of the steps; `raw` is the layout of headerless bytes.
-    Raises MissingInputError, InputError for an unsuitable input, MissingDependencyError that names what to install.
+    Args:
+        path: a file, a zarr folder, or a pattern of files ("frames_*.raw") with one or more steps
+            each, sorted by the numbers in their names.
+        var: name of the variable.
+        axes: the file's dimensions in its own order, such as "x,y,z,t"; axes left out have length
+            1.
+        steps: slice of the steps.
+        raw: layout of headerless bytes.
+
+    Raises MissingInputError, InputError for an unsuitable input, and MissingDependencyError that
+    names what to install.
     """
     request = Request(
         var=var,
@@ -80,7 +98,8 @@ def open_series(
     try:
         if steps.step == 0:
             raise InputError(
-                f"{path}: the steps {steps.start}:{steps.stop}:0 have a stride of 0; it is at least 1, or negative"
+                f"{path}: the steps {steps.start}:{steps.stop}:0 have a stride of 0; it is at"
+                " least 1, or negative"
             )
         return StepsSeries(series, range(*steps.indices(series.shape[0])))
     except BaseException:
@@ -89,10 +108,10 @@ def open_series(
 
 
 def open_whole(path: str | Path, request: Request) -> Series:
-    """All steps of the series in a file, folder or pattern of files."""
+    """Open all steps of the series in a file, folder or pattern of files."""
     text = str(path)
     if is_pattern(text):
-        return JoinedSeries(text, files_of(text), lambda part: _open_one(part, request))
+        return JoinedSeries(text, files_of(text), lambda file: _open_one(file, request))
     return _open_one(Path(path), request)
 
 
@@ -106,13 +125,14 @@ def _open_one(path: Path, request: Request) -> FileSeries:
 
 
 def find_reader(path: Path, request: Request) -> Reader:
-    """The format of a file or folder; raises InputError that lists the formats if it is none of them."""
+    """The format of a file or folder; raises InputError that lists the formats for any other."""
     if not path.exists():
         raise MissingInputError(f"{path} does not exist")
     if path.is_dir():
         if not ZARR.matches(b"", path):
             raise InputError(
-                f"{path} is a folder without zarr metadata; give a file, a zarr folder, or a pattern such as '{path}/*.raw'"
+                f"{path} is a folder without zarr metadata; give a file, a zarr folder, or a"
+                f" pattern such as '{path}/*.raw'"
             )
         if request.raw is not None:
             raise InputError(
@@ -129,7 +149,8 @@ def find_reader(path: Path, request: Request) -> Reader:
         )
         if other is not None:
             raise InputError(
-                f"{path} is a {other.name} file by its name; --shape, --dtype and --endian are for raw files only"
+                f"{path} is a {other.name} file by its name; --shape, --dtype and --endian are for"
+                " raw files only"
             )
         if suffix != CONTAINER_SUFFIX:
             return RAW

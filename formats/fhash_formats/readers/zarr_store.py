@@ -41,10 +41,11 @@ def _metadata(path: Path) -> Path | None:
 
 
 def open_zarr(path: Path, request: Request) -> FileSeries:
-    """The series in a zarr hierarchy: the only suitable array, or the one named.
+    """Open the series in a zarr hierarchy: the only suitable array, or the one named.
 
-    Dimension names (format 3, or xarray's `_ARRAY_DIMENSIONS`) give axes and coordinates. Packing is undone (see cf_packing).
-    Consolidated metadata is not used: a copy that was not renewed would hide what was appended since.
+    Dimension names (format 3, or xarray's `_ARRAY_DIMENSIONS`) give axes and coordinates. Packing
+    is undone (cf_packing.py). Consolidated metadata is ignored: an outdated copy would hide
+    appended steps.
     """
     from zarr.storage import LocalStore, ZipStore
 
@@ -84,7 +85,10 @@ def open_zarr(path: Path, request: Request) -> FileSeries:
 
 
 def _nodes_in_folder(folder: Path, place: str = "") -> Iterator[str]:
-    """The paths of all groups and arrays below a group. The folders of chunks have no metadata and are not entered."""
+    """Paths of all groups and arrays below a group.
+
+    Folders of chunks have no metadata and are not entered.
+    """
     for child in sorted(folder.iterdir()):
         if child.is_dir() and _metadata(child) is not None:
             yield f"{place}{child.name}"
@@ -93,7 +97,10 @@ def _nodes_in_folder(folder: Path, place: str = "") -> Iterator[str]:
 
 
 def _nodes_in_zip(source: str, path: Path) -> tuple[str, list[str]]:
-    """Where in a ZIP the hierarchy begins (at the top, or in the one folder that was zipped), and its groups and arrays from there."""
+    """Place of the hierarchy in a ZIP, and its groups and arrays from there.
+
+    The place is the top, or the one folder that was zipped.
+    """
     with refusing(f"{source} cannot be read as a ZIP"), zipfile.ZipFile(path) as file:
         names = file.namelist()
     nodes = sorted(
@@ -111,19 +118,22 @@ def _nodes_in_zip(source: str, path: Path) -> tuple[str, list[str]]:
 def _open_arrays(
     store: Any, inside: str, nodes: Iterable[str]
 ) -> tuple[dict[str, zarr.Array[Any]], dict[str, str]]:
-    """The arrays by path, and what was wrong with those that cannot be opened; one with an unknown codec does not bar the others."""
+    """Arrays by path, and the errors of those that cannot be opened.
+
+    An array with an unknown codec does not bar the others.
+    """
     import zarr
 
     arrays: dict[str, zarr.Array[Any]] = {}
     failed: dict[str, str] = {}
     for node in nodes:
         try:
-            found = zarr.open(store=store, path=f"{inside}/{node}".strip("/"), mode="r")
-        except Exception as error:  # whatever codecs, types and JSON raise
+            opened = zarr.open(store=store, path=f"{inside}/{node}".strip("/"), mode="r")
+        except Exception as error:  # codecs, types and JSON raise all kinds
             failed[node] = condense(error)
             continue
-        if isinstance(found, zarr.Array):
-            arrays[node] = found
+        if isinstance(opened, zarr.Array):
+            arrays[node] = opened
     return arrays, failed
 
 
@@ -135,53 +145,11 @@ def _series(
     request: Request,
 ) -> FileSeries:
     source = str(root)
-    bounds = {
-        sibling(name, str(array.attrs["bounds"]))
-        for name, array in arrays.items()
-        if "bounds" in array.attrs
-    }
-    found = [
-        Variable(
-            name=name or root.stem,
-            shape=array.shape,
-            dtype=array.dtype,
-            auxiliary=name in bounds,
-            handle=(name, array),
-        )
-        for name, array in arrays.items()
-    ]
-    found += [
-        Variable(name=name or root.stem, shape=(), dtype=np.dtype(object), error=error)
-        for name, error in failed.items()
-    ]
-    variable = choose(source, found, request.var, booleans=request.booleans)
-    path, array = variable.handle
-    names = dimension_names(array)
-    group = path.rpartition("/")[0]
-    columns = [_columns(source, arrays, place) for place in dict.fromkeys([group, ""])]
-    own = [
-        next((place[name] for place in columns if name in place), None) if name else None
-        for name in names
-    ]
-    hints = [
-        role_of_coordinate(name, column.attributes)
-        if name and column
-        else role_of_name(name)
-        if name
-        else None
-        for name, column in zip(names, own, strict=True)
-    ]
-    axes = assign_axes(source, array.shape, hints, names, request.axes)
-    lower = [{name.lower(): column for name, column in place.items()} for place in columns]
-    certain = request.axes is not None or all(hint is not None for hint in hints)
-    tied = [axis for axis, name in zip(axes, names, strict=True) if name is not None]
-    coords: dict[str, Coordinate] = beside(
-        source, axes, array.shape, lower, certain=certain, tied=tied
+    variable = choose(
+        source, _variables(root, arrays, failed), request.var, booleans=request.booleans
     )
-    for axis, length, name, column in zip(axes, array.shape, names, own, strict=True):
-        chosen = column or _along(columns, axis, name)
-        if chosen is not None and chosen.length == length:
-            coords[axis] = coordinate(source, chosen.name, chosen.read(), chosen.attributes)
+    path, array = variable.handle
+    axes, coords = _axes_and_coordinates(source, arrays, path, request)
     values = _Values(source, array)
     return FileSeries(
         source=source,
@@ -190,7 +158,8 @@ def _series(
         dtype=values.dtype,
         axes=axes,
         fetch=values.read,
-        # in a folder it is the array's metadata that tells of a change of shape at once, and all files at the end that of a chunk
+        # In a folder the array's metadata shows a change of shape at once; a changed chunk shows
+        # when all files are checked at the end.
         stamp=Stamp.of((_metadata(root / path) or root) if root.is_dir() else root),
         folder=FolderStamp.of(root / path) if root.is_dir() else None,
         coords=coords,
@@ -200,8 +169,74 @@ def _series(
     )
 
 
+def _variables(
+    root: Path, arrays: Mapping[str, zarr.Array[Any]], failed: Mapping[str, str]
+) -> list[Variable]:
+    """All arrays as Variables; the bounds of others are auxiliary."""
+    bounds = {
+        sibling(name, str(array.attrs["bounds"]))
+        for name, array in arrays.items()
+        if "bounds" in array.attrs
+    }
+    readable = [
+        Variable(
+            name=name or root.stem,
+            shape=array.shape,
+            dtype=array.dtype,
+            auxiliary=name in bounds,
+            handle=(name, array),
+        )
+        for name, array in arrays.items()
+    ]
+    return readable + [
+        Variable(name=name or root.stem, shape=(), dtype=np.dtype(object), error=error)
+        for name, error in failed.items()
+    ]
+
+
+def _axes_and_coordinates(
+    source: str, arrays: Mapping[str, zarr.Array[Any]], path: str, request: Request
+) -> tuple[tuple[str, ...], dict[str, Coordinate]]:
+    """The axis of each dimension of the array at `path`, and its coordinates by axis."""
+    array = arrays[path]
+    names = dimension_names(array)
+    group = path.rpartition("/")[0]
+    columns = [_columns(source, arrays, place) for place in dict.fromkeys([group, ""])]
+    namesakes = [_namesake(columns, name) for name in names]
+    hints = [_hint(name, column) for name, column in zip(names, namesakes, strict=True)]
+    axes = assign_axes(source, array.shape, hints, names, request.axes)
+    lower = [{name.lower(): column for name, column in place.items()} for place in columns]
+    certain = request.axes is not None or all(hint is not None for hint in hints)
+    tied = [axis for axis, name in zip(axes, names, strict=True) if name is not None]
+    coords: dict[str, Coordinate] = beside(
+        source, axes, array.shape, lower, certain=certain, tied=tied
+    )
+    for axis, length, name, namesake in zip(axes, array.shape, names, namesakes, strict=True):
+        column = namesake or _along(columns, axis, name)
+        if column is not None and column.length == length:
+            coords[axis] = coordinate(source, column.name, column.read(), column.attributes)
+    return axes, coords
+
+
+def _namesake(columns: Sequence[Mapping[str, Column]], name: str | None) -> Column | None:
+    """The column with the name of a dimension, from the nearest place."""
+    if not name:
+        return None
+    return next((place[name] for place in columns if name in place), None)
+
+
+def _hint(name: str | None, column: Column | None) -> str | None:
+    """The axis that a dimension's name or its coordinate's attributes say, or None."""
+    if not name:
+        return None
+    return role_of_coordinate(name, column.attributes) if column else role_of_name(name)
+
+
 def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
-    """The name of each dimension, None where there is none: format 3 has a field for them, xarray an attribute in format 2."""
+    """Name of each dimension, None for one without a name.
+
+    Format 3 has a field for them, xarray an attribute in format 2.
+    """
     names: Any = array.attrs.get("_ARRAY_DIMENSIONS") or getattr(
         array.metadata, "dimension_names", None
     )
@@ -213,7 +248,10 @@ def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
 def _along(
     columns: Sequence[Mapping[str, Column]], axis: str, dimension: str | None
 ) -> Column | None:
-    """An array along one named dimension that is no namesake of it, but is by its own name or attributes a coordinate of the axis."""
+    """Array along one dimension that is a coordinate of the axis by its own name or attributes.
+
+    Its name differs from that of the dimension.
+    """
     along = [
         column
         for place in columns
@@ -231,29 +269,30 @@ def _along(
 
 
 def _columns(source: str, arrays: Mapping[str, zarr.Array[Any]], group: str) -> dict[str, Column]:
-    """The arrays directly in a group that may be coordinates, by name."""
-    found = {}
+    """Arrays directly in a group that may be coordinates, by name."""
+    columns = {}
     for path, array in arrays.items():
         place, _, name = path.rpartition("/")
         if path and place == group and array.ndim < 2 and usable(array.dtype):
             along = dimension_names(array)[0] if array.ndim else None
             attributes = json_attributes(dict(array.attrs), without=PLUMBING | PACKING)
-            found[name] = Column(
+            columns[name] = Column(
                 name=path,
                 length=array.size,
                 along=along,
                 read=_Values(source, array).whole,
                 attributes=attributes,
             )
-    return found
+    return columns
 
 
 class _Values:
-    """The physical values of a zarr array, and their type."""
+    """Physical values of a zarr array, and their type."""
 
     def __init__(self, source: str, array: zarr.Array[Any]) -> None:
         self.array = array
-        # xarray keeps `_FillValue` as the fill value of zarr's own in format 2, where other writers use that for chunks never written
+        # xarray keeps `_FillValue` as the fill value of zarr's own in format 2, where other writers
+        # use that for chunks never written
         cf_fill = (
             array.fill_value
             if array.metadata.zarr_format == 2 and "_ARRAY_DIMENSIONS" in array.attrs
@@ -267,7 +306,7 @@ class _Values:
         self.dtype = self.packing.dtype if self.packing else array.dtype
 
     def read(self, ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """The values in some ranges of the array's dimensions."""
+        """Values in ranges of the array's dimensions."""
         stored = np.asarray(self.array[ranges])
         return self.packing.unpack(stored) if self.packing else stored
 

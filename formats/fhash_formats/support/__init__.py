@@ -1,1 +1,1 @@
-"""The ground of the package: atomic writes, interrupts, threads. It knows no file format."""
+"""The ground of the package: atomic writes, interrupts, threads. It depends on no file format."""

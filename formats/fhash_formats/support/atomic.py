@@ -1,8 +1,9 @@
-"""Outputs that are complete or absent, and never half of one: the one helper for every file that fhash writes.
+"""Atomic outputs: every file that fhash writes is complete or absent, never half written.
 
-The bytes go to a temporary sibling in the same folder, are synced to the disk, and only then take the output's name.
-Whatever happens before (an error, a full disk, Ctrl-C) removes the temporary and leaves an older output as it was. Of a writer that was
-killed the temporary stays, until the next writer of that output clears it away (see `leftovers`).
+The bytes go to a temporary in the folder of the output, are synced to the disk, and only then take
+the output's name. An error, a full disk or Ctrl-C before that removes the temporary and leaves an
+older output unchanged. The temporary of a killed writer stays until the next writer of the same
+output clears it away (see `leftovers`).
 """
 
 from __future__ import annotations
@@ -20,23 +21,26 @@ from fhash_formats.support.interrupts import signals_held
 from fhash_formats.support.leftovers import remove
 
 ZARR_METADATA = ("zarr.json", ".zgroup", ".zarray")
+"""Files by which a folder is recognised as a Zarr store, which `force` may replace."""
 
 
 def check_output(
     path: Path, force: bool, *, directory: bool = False, sources: Sequence[str | Path] = ()
 ) -> None:
-    """The checks of an output that can be made before any work.
+    """Check an output as far as that is possible before any work.
 
     Args:
         path: of the output; a link is followed.
-        force: whether an output that is there already may be replaced.
+        force: whether an existing output may be replaced.
         directory: whether the output is a directory (a Zarr store) and not a file.
-        sources: files and folders that the output is made from, which not even `force` lets it replace.
+        sources: files and folders that the output is made from; `force` does not allow it to
+            replace them.
 
     Raises:
         InputError: the output is one of the sources, lies inside one or contains one.
-        OutputExistsError: it is there already and `force` is not given.
-        OutputError: no such folder, no permission, or something is there that must not be replaced even with `force`.
+        OutputExistsError: the output exists and `force` is not given.
+        OutputError: the folder does not exist or gives no permission, or something exists at the
+            path that must not be replaced even with `force`.
     """
     target = Path(os.path.realpath(path))
     for source in sources:
@@ -53,7 +57,8 @@ def check_output(
             return
         if folder != Path(os.path.realpath(path.parent)):
             raise OutputError(
-                f"{path} is a link to {target}, and the folder {folder} does not exist; create it, or choose another name"
+                f"{path} is a link to {target}, and the folder {folder} does not exist; "
+                "create it, or choose another name"
             ) from error
         raise explained(path, error) from error
     except OSError as error:
@@ -66,7 +71,8 @@ def check_output(
         )
     if stat.S_ISDIR(mode) and not any(os.path.isfile(target / name) for name in ZARR_METADATA):
         raise OutputError(
-            f"{path} is a directory but no Zarr store: --force does not replace it; give another name"
+            f"{path} is a directory but no Zarr store: --force does not replace it; "
+            "give another name"
         )
     if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
         raise OutputError(
@@ -75,29 +81,32 @@ def check_output(
 
 
 def _check_source(path: Path, target: Path, source: str | Path) -> None:
-    own = Path(os.path.realpath(source))
-    if _same(target, own):
+    """Refuse an output `path`, resolved to `target`, that would replace or contain a source."""
+    resolved = Path(os.path.realpath(source))
+    if _same(target, resolved):
         raise InputError(f"{path} is the input itself; choose another name")
-    if own.is_dir() and any(_same(folder, own) for folder in target.parents):
+    if resolved.is_dir() and any(_same(folder, resolved) for folder in target.parents):
         raise InputError(f"{path} lies inside the input {source}; choose a name outside it")
-    if target in own.parents:
+    if target in resolved.parents:
         raise InputError(f"{path} contains the input {source}; choose another name")
 
 
-def _same(one: Path, other: Path) -> bool:
-    """Whether two resolved paths are one file or folder, by whatever names (hard links, another case)."""
+def _same(first: Path, second: Path) -> bool:
+    """Whether two resolved paths are one file or folder, also by hard links or another case."""
     try:
-        return os.path.samefile(one, other)
-    except OSError:  # one of them is not there
-        return one == other
+        return os.path.samefile(first, second)
+    except OSError:  # one of the two does not exist
+        return first == second
 
 
 @contextmanager
 def replacing(path: Path, *, force: bool, directory: bool = False) -> Iterator[Path]:
-    """A temporary path that becomes `path` when the block ends, and vanishes when the block fails.
+    """A block that writes to a temporary path, which becomes `path` when the block ends.
 
-    The block creates a file (or with `directory` a directory) at the path it is given, `.NAME.<writer>.partial` in the
-    same folder. Raises what `check_output` raises, before the block; an OSError of the block becomes an OutputError.
+    The block creates a file (or with `directory` a directory) at the path that it is given:
+    `.NAME.<writer>.partial` in the same folder. The temporary is removed if the block fails.
+    Raises what `check_output` raises, before the block; an OSError of the block becomes an
+    OutputError.
     """
     with replacing_all([path], force=force, directory=directory) as temporaries:
         yield temporaries[0]
@@ -107,10 +116,11 @@ def replacing(path: Path, *, force: bool, directory: bool = False) -> Iterator[P
 def replacing_all(
     paths: Sequence[Path], *, force: bool, directory: bool = False
 ) -> Iterator[list[Path]]:
-    """Temporary paths that become `paths`, in that order, when the block ends; if one cannot, none does.
+    """A block that writes to several temporary paths, which become `paths` when the block ends.
 
-    Raises and guarantees what `replacing` does. Only a process that is killed between two renames can leave some of
-    several outputs without the others: name the one that refers to the others last.
+    The outputs take their names in the order of `paths`; if one cannot, none does. Guarantees and
+    errors are those of `replacing`. Only a process that is killed between two renames leaves some
+    outputs without the others; so an output that refers to the others should be the last.
     """
     outputs = [_Output(path) for path in paths]
     leftovers.clear(output.target for output in outputs)
@@ -120,7 +130,9 @@ def replacing_all(
         yield [output.temporary for output in outputs]
         for output in outputs:
             _sync(output.temporary)
-        with signals_held():  # Ctrl-C comes before the first takes its name, or after the last, when all can be undone
+        # Ctrl-C comes before the first output takes its name or after the last one has taken its
+        # own; then all can be undone.
+        with signals_held():
             for output in outputs:
                 output.place(force, directory)
         for folder in {output.target.parent for output in outputs}:
@@ -143,7 +155,8 @@ def explained(path: Path, error: OSError) -> OutputError:
     code = error.errno
     if code in (errno.ENOSPC, errno.EDQUOT):
         return OutputError(
-            f"{path}: no space left on the disk of {folder}; nothing was written: make room or choose another folder"
+            f"{path}: no space left on the disk of {folder}; nothing was written: "
+            "make room or choose another folder"
         )
     if code == errno.ENOENT and not folder.exists():
         return OutputError(f"{path}: the folder {folder} does not exist; create it first")
@@ -158,7 +171,15 @@ def explained(path: Path, error: OSError) -> OutputError:
 
 
 class _Output:
-    """One output on its way from its temporary name to its own."""
+    """An output on its way from its temporary name to its final one.
+
+    Attributes:
+        path: as the caller gave it.
+        target: the resolved path, which is the final name.
+        temporary: path of the new output while it is written.
+        old: path of an older output while it is being replaced.
+        placed: whether the new output has its final name.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -169,9 +190,13 @@ class _Output:
         self.placed = False
 
     def place(self, force: bool, directory: bool) -> None:
-        """Give the temporary its own name; an older output stays under another until `forget_old` or `undo`."""
+        """Give the temporary its final name.
+
+        An older output stays under the name `old` until `forget_old` or `undo`.
+        """
         if force:
-            # Once more, because hours may have passed: a folder that appeared meanwhile is not ours to delete.
+            # Hours may have passed since the first check: a folder of another process may be there
+            # by now, which must not be deleted.
             check_output(self.path, force, directory=directory)
             if os.path.lexists(self.target):
                 self._keep_mode()
@@ -179,10 +204,8 @@ class _Output:
             try:
                 os.replace(self.temporary, self.target)
             except OSError as error:
-                if error.errno in (
-                    errno.ENOTEMPTY,
-                    errno.EEXIST,
-                ):  # a folder takes no name that another took since
+                # A folder cannot take a name that another process took meanwhile.
+                if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                     raise OutputError(
                         f"{self.path}: another process wrote it meanwhile, and that is kept"
                     ) from error
@@ -192,26 +215,30 @@ class _Output:
         self.placed = True
 
     def _keep_mode(self) -> None:
-        """Give the new file the permissions of the old one, which may have been meant for no one else's eyes."""
+        """Give the new file the permissions of the old one, which may be private."""
         if not self.target.is_dir():
-            with suppress(OSError):  # no permissions here, as on exFAT
+            with suppress(OSError):  # file systems such as exFAT have no permissions
                 os.chmod(self.temporary, stat.S_IMODE(os.stat(self.target).st_mode))
 
     def _keep_old(self) -> None:
+        """Give the older output the name `old`; with a hard link it keeps its present name, too."""
         if not self.target.is_dir():
-            with suppress(OSError):  # no hard links here, as on exFAT
+            with suppress(OSError):  # file systems such as exFAT have no hard links
                 os.link(self.target, self.old)
                 return
         os.rename(self.target, self.old)
 
     def _create(self) -> None:
-        """Take the name only if it is still free: a link, unlike a rename, never replaces what appeared meanwhile."""
+        """Take the final name only if it is still free.
+
+        Unlike a rename, a hard link never replaces a file that appeared meanwhile.
+        """
         if not self.temporary.is_dir():
             try:
                 os.link(self.temporary, self.target)
             except FileExistsError:
                 raise self._appeared() from None
-            except OSError:  # no hard links here: look once more, then rename
+            except OSError:  # without hard links: check again, then rename
                 pass
             else:
                 os.unlink(self.temporary)
@@ -221,25 +248,27 @@ class _Output:
         try:
             os.rename(self.temporary, self.target)
         except OSError as error:
-            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):  # a folder, just now
+            # A folder appeared between the check and the rename.
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 raise self._appeared() from None
             raise
 
     def _appeared(self) -> OutputExistsError:
         return OutputExistsError(
-            f"{self.path} exists: it appeared meanwhile; use --force (force=True) to replace it, or another name"
+            f"{self.path} exists: it appeared meanwhile; "
+            "use --force (force=True) to replace it, or another name"
         )
 
     def undo(self) -> None:
-        """Everything as it was before."""
-        with suppress(OSError):  # what went wrong first is what the user must see
+        """Restore the state before the block: the older output, and no new one."""
+        # A failure here is ignored, so that the user sees the first one.
+        with suppress(OSError):
             if self.placed:
                 remove(self.target)
             if not os.path.lexists(self.target):
                 os.rename(self.old, self.target)
-            elif (
-                not self.placed
-            ):  # what is there is the older output itself, or what another process put in its place
+            elif not self.placed:
+                # The target is the older output itself, or another process's new one.
                 remove(self.old)
         remove(self.temporary)
 
@@ -253,7 +282,10 @@ class _Output:
 
 
 def _sync(path: Path) -> None:
-    """Make a file, or every file and folder below a directory, survive a loss of power."""
+    """Write a file, or all files and folders below a directory, to the disk itself (fsync).
+
+    They then survive a loss of power.
+    """
     if not path.is_dir():
         with path.open("rb") as handle:
             os.fsync(handle.fileno())
@@ -265,7 +297,11 @@ def _sync(path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    # Some file systems and Windows cannot sync a folder. The bytes are safe by then; only the new name is less so.
+    """Write a folder's list of names to the disk itself.
+
+    Some file systems and Windows cannot. The bytes of its files are safe nevertheless; only their
+    new names may be lost with the power.
+    """
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -1,7 +1,9 @@
-"""What a killed writer left behind: temporaries that name their writer, and the next writer of the same output clears them away.
+"""Leftovers of a killed writer: the next writer of the same output clears them away.
 
-A temporary is `.OUTPUT.<machine>-<process>-<random>.partial`, an older output on its way out ends in `.old`. Nothing is taken from a
-writer that lives, or that may: one on another machine or in another container is never asked, so its leftovers stay.
+The name of a temporary names its writer: `.OUTPUT.<machine>-<process>-<random>.partial`. An older
+output that is being replaced has such a name with the ending `.old`. Files of a writer that may
+still live are never touched. So leftovers of writers on other machines or in other containers
+stay, since this process cannot tell whether those writers live.
 """
 
 from __future__ import annotations
@@ -17,9 +19,15 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
-PARTIAL, OLD = ".partial", ".old"
-LONGEST = 40
-"""Characters of an output's name in that of its temporary, which so stays below the 255 bytes of most file systems."""
+PARTIAL = ".partial"
+"""Ending of the name of a temporary."""
+OLD = ".old"
+"""Ending of the name of an older output that is being replaced."""
+MAX_NAME = 40
+"""Characters of an output's name in the name of its temporary.
+
+The name of the temporary so stays below the 255 bytes of most file systems.
+"""
 _NAME = re.compile(
     r"\.(?P<output>.+)\.(?P<machine>[0-9a-f]{8})-(?P<process>[0-9]{1,10})-[0-9a-f]{8}(?P<kind>\.partial|\.old)",
     re.DOTALL,
@@ -27,33 +35,34 @@ _NAME = re.compile(
 
 
 def new_stem(name: str) -> str:
-    """The start of the names of an output's temporaries, unlike that of any other writer's."""
+    """The name of an output's temporary without its ending; no other writer has the same."""
     return f".{_short(name)}.{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def clear(targets: Iterable[Path]) -> None:
-    """Clear away what killed writers of these outputs left; an output that one had moved aside and not yet replaced comes back."""
+    """Clear away the leftovers of killed writers of these outputs.
+
+    An output that a killed writer had moved aside but not replaced gets its name back.
+    """
     folders: dict[Path, dict[str, Path]] = {}
     for target in targets:
         folders.setdefault(target.parent, {})[_short(target.name)] = target
     for folder, outputs in folders.items():
-        with suppress(
-            OSError
-        ):  # no such folder, or not ours to read: the checks of the output say it better
+        # The checks of the output give a better message for a folder that cannot be listed.
+        with suppress(OSError):
             for name in sorted(os.listdir(folder)):
-                found = _NAME.fullmatch(name) if name.endswith((PARTIAL, OLD)) else None
+                match = _NAME.fullmatch(name) if name.endswith((PARTIAL, OLD)) else None
                 if (
-                    found
-                    and found["output"] in outputs
-                    and not _may_live(found["machine"], int(found["process"]))
+                    match
+                    and match["output"] in outputs
+                    and not _may_live(match["machine"], int(match["process"]))
                 ):
-                    _clear(
-                        folder / name, outputs[found["output"]], moved_aside=found["kind"] == OLD
-                    )
+                    target = outputs[match["output"]]
+                    _clear(folder / name, target, moved_aside=match["kind"] == OLD)
 
 
 def remove(path: Path) -> None:
-    """Delete a file or a folder, if that can be done."""
+    """Delete a file or a folder; a failure is ignored."""
     with suppress(OSError):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -70,36 +79,43 @@ def _clear(leftover: Path, target: Path, *, moved_aside: bool) -> None:
 
 
 def _short(name: str) -> str:
-    """A name, or of a long one the beginning and a digest of all of it, so that no two outputs share their leftovers."""
-    if len(name) <= LONGEST:
+    """The output's name in that of its temporary: at most MAX_NAME characters.
+
+    A longer name is cut and gets a digest of all of it, so that no two outputs share leftovers.
+    """
+    if len(name) <= MAX_NAME:
         return name
-    return f"{name[: LONGEST - 9]}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
+    return f"{name[: MAX_NAME - 9]}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
 
 
 @cache
 def _machine() -> str:
-    """A digest of what process numbers are good for: this machine, and on Linux this container of it."""
-    parts = [platform.node()]
+    """A digest of the place in which process numbers are unique.
+
+    That is this machine, and on Linux this container on it.
+    """
+    names = [platform.node()]
     with suppress(OSError):
-        parts.append(Path("/etc/machine-id").read_text(encoding="utf-8", errors="replace"))
+        names.append(Path("/etc/machine-id").read_text(encoding="utf-8", errors="replace"))
     with suppress(OSError):
-        parts.append(os.readlink("/proc/self/ns/pid"))
-    return hashlib.sha256("\n".join(parts).encode(errors="replace")).hexdigest()[:8]
+        names.append(os.readlink("/proc/self/ns/pid"))
+    return hashlib.sha256("\n".join(names).encode(errors="replace")).hexdigest()[:8]
 
 
 def _may_live(machine: str, process: int) -> bool:
-    """False only where the process is known to be gone."""
-    # A process number of our own is another thread's. On Windows the question itself, signal 0, would end a process.
+    """Whether a writer may still run; False only for a process that is known to be gone."""
+    # A temporary with this process's number belongs to one of its threads. On Windows, asking by
+    # signal 0 would end the process.
     if machine != _machine() or process == os.getpid() or os.name == "nt":
         return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except (OSError, OverflowError):  # another user's
+    except (OSError, OverflowError):  # the process is another user's
         return True
-    with suppress(OSError):  # killed, and its parent has not asked for it yet
-        return Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2].split()[
-            :1
-        ] != ["Z"]
+    # A zombie was killed, and its parent has not waited for it yet.
+    with suppress(OSError):
+        fields = Path(f"/proc/{process}/stat").read_text(errors="replace").rpartition(")")[2]
+        return fields.split()[:1] != ["Z"]
     return True

@@ -1,4 +1,4 @@
-"""How an array is cut into chunks."""
+"""Chunk shapes of a bounded size."""
 
 from __future__ import annotations
 
@@ -7,13 +7,19 @@ from math import prod
 
 
 def slab_shape(shape: Sequence[int], itemsize: int, limit: int) -> tuple[int, ...]:
-    """The chunk of an array of `shape` with at most `limit` bytes (and at least one value): all of it, or else slabs of equal thickness.
+    """The shape of chunks with at most `limit` bytes, but at least one value.
 
-    Leading axes are cut first, to single positions before the next is touched.
+    An array within the limit is one chunk. A larger one is cut into slabs of equal thickness.
+    Leading axes are cut first, down to single positions before the next axis is cut.
+
+    Args:
+        shape: of the array.
+        itemsize: bytes of a value.
+        limit: bytes of a chunk.
     """
     chunk = list(shape)
     for axis, length in enumerate(shape):
-        rest = itemsize * prod(chunk[:axis] + chunk[axis + 1 :])
-        parts = -(-length // max(1, limit // max(1, rest)))
-        chunk[axis] = -(-length // max(1, parts))
+        layer_bytes = itemsize * prod(chunk[:axis] + chunk[axis + 1 :])
+        slabs = -(-length // max(1, limit // max(1, layer_bytes)))
+        chunk[axis] = -(-length // max(1, slabs))
     return tuple(chunk)

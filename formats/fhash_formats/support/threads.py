@@ -1,8 +1,9 @@
-"""Work in threads, for what releases the interpreter's lock."""
+"""Work in threads, for functions that release the interpreter's lock."""
 
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -16,26 +17,28 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 MAX_THREADS = 1024
+"""Number that FHASH_THREADS may ask for."""
 ITEMS_PER_THREAD = 8
-"""Items of `share_out` below which a further thread does not pay."""
+"""Items of `share_out` for each thread; with fewer a further thread does not pay."""
 SHARES_PER_THREAD = 4
+"""Shares of `share_out` for each thread."""
 
 
 def usable_threads(threads: int | None = None) -> int:
-    """Number of threads to use: `threads` if given, else the processors that this process may use.
+    """The number of threads to use: `threads`, else FHASH_THREADS, else the usable processors.
 
-    The environment variable FHASH_THREADS=N stands for the processors; it is read at each call.
-    Raises InputError for a number of threads that is not allowed.
+    The environment variable FHASH_THREADS is read at each call. Raises InputError for a number of
+    threads that is not allowed.
     """
     if threads is not None:
         if threads < 1:
             raise InputError(f"threads is {threads}; at least 1 is needed")
         return threads
-    given = os.environ.get("FHASH_THREADS")
-    if given is not None:
-        if not (given.isascii() and given.isdigit() and 1 <= int(given) <= MAX_THREADS):
-            raise InputError(f"FHASH_THREADS is '{given:.40}'; allowed: 1 to {MAX_THREADS}")
-        return int(given)
+    setting = os.environ.get("FHASH_THREADS")
+    if setting is not None:
+        if not (setting.isascii() and setting.isdigit() and 1 <= int(setting) <= MAX_THREADS):
+            raise InputError(f"FHASH_THREADS is '{setting:.40}'; allowed: 1 to {MAX_THREADS}")
+        return int(setting)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -44,21 +47,22 @@ def in_threads(
 ) -> Iterator[Result]:
     """Yield `function(item)` for each item, in the order of the items.
 
-    Up to `threads` threads compute at once (default: `usable_threads()`); the caller's own is one
-    of them. The first failure is raised; items that were not begun by then are left out.
+    Up to `threads` threads compute at once (default: `usable_threads()`); the caller's own thread
+    is one of them. The first failure is raised, and items not begun by then are left out. Nothing
+    is computed before the first result is asked for.
     """
-    work = list(items)
-    results: list[Future[Result]] = [Future() for _ in work]
+    arguments = list(items)
+    results: list[Future[Result]] = [Future() for _ in arguments]
     numbers = count()
     stopped = False
 
     def compute_next() -> bool:
         """Compute the next item; False where none is left."""
-        number = next(numbers)
-        if stopped or number >= len(work):
+        number = next(numbers)  # atomic, since several threads call this
+        if stopped or number >= len(arguments):
             return False
         try:
-            results[number].set_result(function(work[number]))
+            results[number].set_result(function(arguments[number]))
         except BaseException as error:
             results[number].set_exception(error)
         return True
@@ -68,8 +72,9 @@ def in_threads(
             pass
 
     helpers: list[Future[None]] = []
-    with suppress(RuntimeError):  # no more threads can be started: those that run are enough
-        more = min(usable_threads() if threads is None else threads, len(work)) - 1
+    # RuntimeError: no more threads can be started. Those that run are enough.
+    with suppress(RuntimeError):
+        more = min(usable_threads() if threads is None else threads, len(arguments)) - 1
         for _ in range(more):
             helpers.append(_threads.pool(more).submit(compute_all))
     try:
@@ -88,7 +93,8 @@ def in_threads(
 def share_out(work: Callable[[Sequence[Item]], None], items: Sequence[Item], threads: int) -> None:
     """Call `work` on shares of `items`, in up to `threads` threads.
 
-    Each thread gets several shares, since the processors of a machine are rarely equally free.
+    There are several shares for each thread, since the processors of a machine are rarely equally
+    free. Few items are one share, in the caller's thread.
     """
     workers = min(threads, len(items) // ITEMS_PER_THREAD)
     if workers <= 1:
@@ -99,8 +105,41 @@ def share_out(work: Callable[[Sequence[Item]], None], items: Sequence[Item], thr
         pass
 
 
+def thread_pool() -> ThreadPoolExecutor:
+    """Create a pool of one thread per usable processor, for work that releases the GIL."""
+    return ThreadPoolExecutor(usable_threads(), thread_name_prefix="fhash-tile")
+
+
+def map_ahead(
+    pool: ThreadPoolExecutor,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    max_ahead: int,
+) -> Iterator[Result]:
+    """Yield `function(item)` for each item, in the order of the items.
+
+    The caller's thread reads the items, and at most `max_ahead` of them before their results are
+    yielded, so that memory stays bounded. Items that no thread has begun are left out if the
+    iteration ends early.
+    """
+    waiting: deque[Future[Result]] = deque()
+    try:
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) >= max_ahead:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
 class _Threads:
-    """Threads that wait for work: starting new ones for every call would take longer than small work itself."""
+    """A pool of threads that wait for work.
+
+    Starting new threads for every call would take longer than small work itself.
+    """
 
     def __init__(self) -> None:
         self._lock = Lock()
@@ -108,17 +147,17 @@ class _Threads:
         self._size = 0
 
     def pool(self, size: int) -> ThreadPoolExecutor:
-        """A pool of at least so many threads."""
+        """A pool of at least `size` threads."""
         with self._lock:
             if self._pool is None or self._size < size:
                 if self._pool is not None:
-                    self._pool.shutdown(wait=False)  # what it has begun it ends
+                    self._pool.shutdown(wait=False)  # work that it has accepted still ends
                 self._pool, self._size = ThreadPoolExecutor(size, thread_name_prefix="fhash"), size
             return self._pool
 
 
 def _forked() -> None:
-    """A forked process has none of its parent's threads, and their pool would hang there."""
+    """Forget the pool in a forked process, which has none of its parent's threads."""
     global _threads
     _threads = _Threads()
 

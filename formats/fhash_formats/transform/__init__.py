@@ -1,2 +1,4 @@
-"""The compact profile's arithmetic: transforms of a tile, their coefficients' coding, and back, in numpy or the native library with equal
-bits."""
+"""The codec `fhash.transform`: tiles of values to bytes and back.
+
+A tile is transformed, quantised and coded, in numpy or by the native library, with equal bits.
+"""

@@ -1,7 +1,8 @@
-"""One chunk of anybody's array to bytes and back: settings are chosen in closed form, chunk by chunk, and stand in the stream.
+"""One chunk of an array to bytes and back, with settings that are chosen for each chunk.
 
-Nothing is trained and nothing comes from a table of the data's own, so the same chunk gives the same bytes on every machine: what is
-chosen depends on sizes in bytes and on arithmetic in a stated order only.
+The settings are chosen in closed form and by trials, and stand in the stream. Nothing is trained,
+and the choice depends only on sizes in bytes and on arithmetic in a stated order, so the same chunk
+gives the same bytes on every machine.
 """
 
 from __future__ import annotations
@@ -16,40 +17,54 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.tile.encoding import (
-    CodedTile,
-    Shape,
-    decode_tile,
-    encode_tile,
-    exact_tile,
-    transform_for,
-    within,
-)
+from fhash_formats.transform.tile.decoding import decode_tile, transform_for
+from fhash_formats.transform.tile.encoding import CodedTile, Coding, encode_tile, exact_tile
+from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.transform.values.elementwise import within
 
 __all__ = ["Quality", "decode_chunk", "encode_chunk", "supported", "tile_shape"]
 
 Values = npt.NDArray[Any]
+Mask = npt.NDArray[np.bool_]
 
 _WEIGHT = 0.09
-"""Squared steps that a bit is worth: measured, the same for all data."""
-_RATIOS = (2.5, 4.0, 1.6)
-"""Steps, in units of half the residual's, that are tried under a bound: small ones pay for loose bounds, large ones for tight bounds."""
-_WINDOW = 1 << 16
-"""Most values of the part on which transforms and ratios are tried."""
-_SLACK = 1 - 1e-6
-_SAFE = 2.5e8
-"""Largest coefficient in steps, as estimated: the coder ends at four times as much."""
-_LARGEST, _SMALLEST = 1e300, 1e-290
-_LARGEST_SINGLE, _SMALLEST_SINGLE = 1e30, 1e-30
+"""Squared quantiser steps that a bit is worth; measured, the same for all data."""
+_FIRST_RATIO = 2.5
+"""Quantiser step under a bound, in units of half the quantum, with which transforms are tried."""
+_OTHER_RATIOS = (4.0, 1.6)
+"""Further steps that are tried under a bound.
+
+Small steps pay for loose bounds, large ones for tight bounds.
+"""
+_MAX_WINDOW = 1 << 16
+"""Most values of the window on which transforms and ratios are tried."""
+_QUANTUM_SHARE = 1 - 1e-6
+"""Quantum as a share of twice the largest error, so that rounding cannot break the bound."""
+_MAX_STEPS = 2.5e8
+"""Largest coefficient, as estimated, in quantiser steps. The coder ends at four times as much."""
+_MAX_VALUE = 1e300
+"""Largest magnitude of a value that is coded by transform."""
+_MIN_STEP = 1e-290
+"""Smallest quantiser step."""
+_MAX_SINGLE = 1e30
+"""Largest magnitude of values and steps for arithmetic in float32."""
+_MIN_SINGLE = 1e-30
+"""Smallest quantiser step for arithmetic in float32."""
+_MAX_DEPTHS = (1, 1, 5, 5)
+"""Most levels of a 9/7 transform along (t, z, y, x)."""
+_NO_TRANSFORM = TransformSpec(axes=(AxisTransform(kind="none"),) * 4)
+"""The shortest description of a transform."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """What is asked of a chunk: exactly one of the three. Raises InputError.
+    """The quality asked of a chunk: exactly one of the three. Raises InputError.
 
-    max_error: a bound on |decoded - value|, in units of the values, kept strictly; 0 is lossless. max_error_rel: the same as a fraction of
-    the range of the chunk's finite values. step: of the quantiser, in units of the values, without a bound.
+    Attributes:
+        max_error: bound on |decoded - value|, in units of the values, kept strictly; 0 is lossless.
+        max_error_rel: the same bound as a fraction of the range of the chunk's finite values.
+        step: quantiser step, in units of the values, without a bound.
     """
 
     max_error: float | None = None
@@ -74,17 +89,20 @@ class Quality:
             raise InputError("step is 0; a number above 0 is needed (max_error 0 is lossless)")
 
     def to_dict(self) -> dict[str, float]:
-        """The one that is given."""
-        every = {
+        """The quality that is given, by its name."""
+        qualities = {
             "max_error": self.max_error,
             "max_error_rel": self.max_error_rel,
             "step": self.step,
         }
-        return {name: value for name, value in every.items() if value is not None}
+        return {name: value for name, value in qualities.items() if value is not None}
 
 
 def supported(dtype: npt.DTypeLike) -> np.dtype[Any]:
-    """The type in this machine's byte order. Raises InputError unless it is float16 to float64 or an integer."""
+    """The type in this machine's byte order.
+
+    Raises InputError unless the type is float16, float32, float64 or an integer.
+    """
     kind = np.dtype(dtype)
     if kind.kind not in "fiu" or kind.itemsize > 8:
         raise InputError(
@@ -94,13 +112,13 @@ def supported(dtype: npt.DTypeLike) -> np.dtype[Any]:
 
 
 def tile_shape(shape: tuple[int, ...]) -> Shape:
-    """Four axes (t, z, y, x): ones in front of fewer, and of more axes the leading ones as one."""
-    t, z, y, x = (
-        (*(1,) * (4 - len(shape)), *shape)
-        if len(shape) <= 4
-        else (math.prod(shape[:-3]), *shape[-3:])
-    )
-    return t, z, y, x
+    """The shape (t, z, y, x) of a tile for an array of any number of axes.
+
+    Fewer axes get ones in front. Of more than four, the leading ones become one.
+    """
+    lengths = (1, 1, 1, *shape)
+    z, y, x = lengths[-3:]
+    return math.prod(lengths[:-3]), z, y, x
 
 
 def encode_chunk(
@@ -111,22 +129,33 @@ def encode_chunk(
     step: float | None = None,
     transform: TransformSpec | Mapping[str, Any] | None = None,
 ) -> bytes:
-    """The stream of an array of float16 to float64 or integers; axes as in `tile_shape`.
+    """The stream of an array.
 
-    max_error, max_error_rel, step: exactly one, as in `Quality`. transform: along (t, z, y, x); None for what codes best in a trial. NaN
-    and infinities come back where they were and take no part in range or bound. Raises InputError.
+    NaN and infinities come back where they were and take no part in range or bound.
+
+    Args:
+        values: array of a type that `supported` accepts; its axes become those of `tile_shape`.
+        max_error: as in `Quality`; exactly one of the three is given.
+        max_error_rel: as in `Quality`.
+        step: as in `Quality`.
+        transform: transform along (t, z, y, x); None for the one that codes best in a trial.
+
+    Raises InputError.
     """
     quality = Quality(max_error=max_error, max_error_rel=max_error_rel, step=step)
     values = np.asarray(values)
     tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(
         tile_shape(values.shape)
     )
-    specs = _candidates(tile.shape) if transform is None else (_spec(transform),)
+    specs = _candidates(tile_shape(tile.shape)) if transform is None else (_spec_from(transform),)
     return _encode(tile, quality, specs).data if tile.size else b""
 
 
 def decode_chunk(data: bytes | memoryview, shape: tuple[int, ...], dtype: npt.DTypeLike) -> Values:
-    """The values of a stream, of the shape and type that was coded. Raises DamagedFileError for bytes that no encoder writes."""
+    """The values of a stream, with the shape and type that were coded.
+
+    Raises DamagedFileError for bytes that no encoder writes.
+    """
     if not math.prod(shape):
         return np.empty(shape, dtype)
     return (
@@ -136,153 +165,231 @@ def decode_chunk(data: bytes | memoryview, shape: tuple[int, ...], dtype: npt.DT
     )
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Task:
+    """A chunk to code, of at least one finite value.
+
+    Attributes:
+        tile: the values (t, z, y, x).
+        finite: where they are finite; None where all are.
+        low: smallest finite value; for integers a Python integer, since float64 is too narrow for
+            64 bits.
+        high: largest finite value, likewise.
+        quality: the quality asked for.
+        error: bound on the decoded values; None for none.
+        reach: largest error before decoded values are rounded to their type; 0 without a bound.
+    """
+
+    tile: Values
+    finite: Mask | None
+    low: float
+    high: float
+    quality: Quality
+    error: float | None
+    reach: float
+
+    @property
+    def center(self) -> float:
+        """The middle of the range."""
+        return float(self.low) + self.half_range
+
+    @property
+    def half_range(self) -> float:
+        """Half of the range; each end is halved first, so that the range cannot overflow."""
+        return float(self.high) / 2 - float(self.low) / 2
+
+    @property
+    def largest(self) -> float:
+        """Largest magnitude of a value."""
+        return max(abs(float(self.low)), abs(float(self.high)))
+
+
 def _encode(tile: Values, quality: Quality, specs: tuple[TransformSpec, ...]) -> CodedTile:
-    finite = np.isfinite(tile)
-    every = bool(finite.all())
-    counted = tile if every else tile[finite]
-    plain = TileSettings(
-        transform=_candidates((1, 1, 1, 1))[0], step=1.0, center=0.0, low=0.0, high=0.0, double=True
-    )
-    nothing = np.zeros(tile.shape, bool)
-    if not counted.size:
-        return encode_tile(tile, plain, care=nothing, own=True)
-    # Whole numbers stay whole numbers of Python here: 64 bits do not fit into a float.
-    low, high = counted.min().item(), counted.max().item()
-    with_bound = quality.step is None
-    error, reach = _bound(quality, low, high, tile.dtype)
-    center = float(low) + (float(high) / 2 - float(low) / 2)
-    if high == low or (with_bound and float(high) / 2 - float(low) / 2 <= reach):
-        constant = encode_tile(
-            tile, replace(plain, center=center, low=center, high=center), care=nothing, own=True
-        )
-        # Without loss zeros keep their signs, which the constant has not.
-        signed = with_bound and error == 0 and low == 0 and bool(np.signbit(counted).any())
-        if within(tile, constant.decoded, error, None if every else finite) and not signed:
-            return constant
-    if high == low:
+    """The coded chunk, stored without loss where that takes no more bytes."""
+    task = _task(tile, quality)
+    if task is None:
+        return _constant_tile(tile, 0.0)
+    constant = _encode_constant(task)
+    if constant is not None:
+        return constant
+    settings = _first_settings(task, specs[0])
+    if settings is None:
         return exact_tile(tile)
-    first = float(quality.step) if quality.step is not None else _RATIOS[0] * reach
-    largest, span = max(abs(float(low)), abs(float(high))), float(high) / 2 - float(low) / 2
-    too_fine = with_bound and reach < error / 2
-    if too_fine or not (first >= _SMALLEST and largest <= _LARGEST and span / first < _SAFE):
+    settings = _best_settings(task, settings, specs)
+    gain = [float(norms.max()) for norms in transform_for(settings, tile_shape(tile.shape)).norms]
+    if task.half_range / settings.step * gain[0] * gain[1] > _MAX_STEPS:
         return exact_tile(tile)
-    settings = TileSettings(
-        transform=specs[0],
-        step=first,
-        center=center,
-        low=float(low),
-        high=float(high),
-        double=_double(tile.dtype, largest, 2 * span, first),
-        quantum=2 * reach * _SLACK if with_bound else 0.0,
-    )
-    bound = error if with_bound else None
-    settings = _chosen(tile, settings, specs, bound, reach)
-    gain = [float(norms.max()) for norms in transform_for(settings, _shape(tile)).norms]
-    if span / settings.step * gain[0] * gain[1] > _SAFE:
-        return exact_tile(tile)
-    coded = encode_tile(tile, settings, weight=_WEIGHT, error=bound, own=True)
+    coding = Coding(weight=_WEIGHT, error=task.error, own_settings=True)
+    coded = encode_tile(tile, settings, coding)
     if 2 * len(coded.data) < tile.nbytes:
         return coded
     exact = exact_tile(tile)
     return exact if len(exact.data) <= len(coded.data) else coded
 
 
+def _task(tile: Values, quality: Quality) -> _Task | None:
+    """The chunk with its range and bound; None where no value is finite."""
+    finite = np.isfinite(tile)
+    all_finite = bool(finite.all())
+    values = tile if all_finite else tile[finite]
+    if not values.size:
+        return None
+    low, high = values.min().item(), values.max().item()
+    with_bound = quality.step is None
+    error, reach = _bound(quality, low, high, tile.dtype) if with_bound else (None, 0.0)
+    mask = None if all_finite else finite
+    return _Task(
+        tile=tile, finite=mask, low=low, high=high, quality=quality, error=error, reach=reach
+    )
+
+
 def _bound(quality: Quality, low: Any, high: Any, dtype: np.dtype[Any]) -> tuple[float, float]:
     """The bound on decoded values, and the largest error before they are rounded to their type."""
     error = 0.0 if quality.max_error is None else float(quality.max_error)
     if quality.max_error_rel is not None:
-        part, span = float(quality.max_error_rel), float(high) - float(low)
-        error = part * span if math.isfinite(span) else part * float(high) - part * float(low)
+        fraction, span = float(quality.max_error_rel), float(high) - float(low)
+        error = fraction * span
+        if not math.isfinite(span):
+            error = fraction * float(high) - fraction * float(low)
     if dtype.kind != "f":
-        whole = math.floor(error) if math.isfinite(error) else 1 << 64
-        return error, whole + 0.5
+        largest = math.floor(error) if math.isfinite(error) else 1 << 64
+        return error, largest + 0.5
     return error, error - max(abs(low), abs(high)) * float(np.finfo(dtype).eps)
+
+
+def _constant_tile(tile: Values, center: float) -> CodedTile:
+    """A tile whose finite values all decode to one value."""
+    settings = TileSettings(
+        transform=_NO_TRANSFORM, step=1.0, center=center, low=center, high=center, double=True
+    )
+    nothing = np.zeros(tile.shape, bool)
+    return encode_tile(tile, settings, Coding(own_settings=True), in_coreset=nothing)
+
+
+def _encode_constant(task: _Task) -> CodedTile | None:
+    """The chunk as a constant, if all values are equal or the bound allows it; otherwise None."""
+    error, values_equal = task.error, task.high == task.low
+    if not values_equal and (error is None or task.half_range > task.reach):
+        return None
+    constant = _constant_tile(task.tile, task.center)
+    # A lossless zero keeps its sign, and a constant has one sign only.
+    counted = task.tile if task.finite is None else task.tile[task.finite]
+    signed = error == 0 and task.low == 0 and bool(np.signbit(counted).any())
+    if not signed and within(task.tile, constant.decoded, error or 0.0, task.finite):
+        return constant
+    return exact_tile(task.tile) if values_equal else None
+
+
+def _first_settings(task: _Task, transform: TransformSpec) -> TileSettings | None:
+    """The settings before anything is tried; None for a chunk to store without loss.
+
+    That is a chunk whose bound is below the precision of its type, or whose values or steps are out
+    of range.
+    """
+    step = task.quality.step
+    first = _FIRST_RATIO * task.reach if step is None else float(step)
+    too_fine = task.error is not None and task.reach < task.error / 2
+    in_range = (
+        first >= _MIN_STEP and task.largest <= _MAX_VALUE and task.half_range / first < _MAX_STEPS
+    )
+    if too_fine or not in_range:
+        return None
+    return TileSettings(
+        transform=transform,
+        step=first,
+        center=task.center,
+        low=float(task.low),
+        high=float(task.high),
+        double=_double(task.tile.dtype, task.largest, 2 * task.half_range, first),
+        quantum=0.0 if task.error is None else 2 * task.reach * _QUANTUM_SHARE,
+    )
 
 
 def _double(dtype: np.dtype[Any], largest: float, span: float, step: float) -> bool:
     """Whether float32 would lose what the step keeps."""
-    if max(largest, step) > _LARGEST_SINGLE or step < _SMALLEST_SINGLE:
+    if max(largest, step) > _MAX_SINGLE or step < _MIN_SINGLE:
         return True
     return dtype.itemsize >= 4 and (
         span / step > 1 << 18 or (dtype != np.float32 and largest / step > 1 << 20)
     )
 
 
-def _chosen(
-    tile: Values,
-    settings: TileSettings,
-    specs: tuple[TransformSpec, ...],
-    bound: float | None,
-    reach: float,
+def _best_settings(
+    task: _Task, settings: TileSettings, specs: tuple[TransformSpec, ...]
 ) -> TileSettings:
-    """The settings with the transform, then the step, by which a window takes the fewest bytes; the first of equals."""
+    """The settings with the transform, then the step, with which a window takes the fewest bytes.
+
+    The first of equals is taken.
+    """
     trials = [replace(settings, transform=spec) for spec in specs]
-    ratios = _RATIOS[1:] if bound is not None else ()
+    ratios = () if task.error is None else _OTHER_RATIOS
     if len(trials) + len(ratios) == 1:
         return trials[0]
-    window = _window(tile)
+    window = _window(task.tile)
+    coding = Coding(weight=_WEIGHT, error=task.error)
 
     def size(trial: TileSettings) -> int:
-        return len(encode_tile(window, trial, weight=_WEIGHT, error=bound).data)
+        return len(encode_tile(window, trial, coding).data)
 
     sizes = [size(trial) for trial in trials]
-    best = min(sizes)
-    settings = trials[sizes.index(best)]
-    result = settings
+    smallest = min(sizes)
+    best = transformed = trials[sizes.index(smallest)]
     for ratio in ratios:
-        trial = replace(settings, step=ratio * reach)
-        if (found := size(trial)) < best:
-            best, result = found, trial
-    return result
+        trial = replace(transformed, step=ratio * task.reach)
+        trial_size = size(trial)
+        if trial_size < smallest:
+            best, smallest = trial, trial_size
+    return best
 
 
 def _window(tile: Values) -> Values:
-    """A block in the middle, of few values."""
+    """A block of at most `_MAX_WINDOW` values from the middle of a tile."""
     lengths = list(tile.shape)
-    while math.prod(lengths) > _WINDOW:
+    while math.prod(lengths) > _MAX_WINDOW:
         longest = lengths.index(max(lengths))
         lengths[longest] = (lengths[longest] + 1) // 2
-    return np.ascontiguousarray(
-        tile[
-            tuple(
-                slice((n - k) // 2, (n - k) // 2 + k)
-                for n, k in zip(tile.shape, lengths, strict=True)
-            )
-        ]
+    middle = tuple(
+        slice((n - length) // 2, (n - length) // 2 + length)
+        for n, length in zip(tile.shape, lengths, strict=True)
     )
+    return np.ascontiguousarray(tile[middle])
 
 
-def _candidates(shape: tuple[int, ...]) -> tuple[TransformSpec, ...]:
-    """9/7 along all axes; then haar and nothing along the first that has a length, which often is time; then haar along all."""
-    lead = next((axis for axis, n in enumerate(shape) if n > 1), None)
-    if lead is None:
-        return (TransformSpec(axes=(AxisTransform(kind="none"),) * 4),)
+def _candidates(shape: Shape) -> tuple[TransformSpec, ...]:
+    """The transforms to try, each once.
+
+    9/7 along all axes; then Haar, and then no transform, along the first axis longer than 1, which
+    often is time; then Haar along all axes.
+    """
+    first = next((axis for axis, n in enumerate(shape) if n > 1), None)
+    if first is None:
+        return (_NO_TRANSFORM,)
     depths = [
-        0 if n < 2 else max(1, min(most, n.bit_length() - 3))
-        for n, most in zip(shape, (1, 1, 5, 5), strict=True)
+        0 if n < 2 else max(1, min(deepest, n.bit_length() - 3))
+        for n, deepest in zip(shape, _MAX_DEPTHS, strict=True)
     ]
     if min(shape[2:]) >= 16:
         depths[2:] = [min(depths[2:])] * 2
-    # Along time, which few chunks are long in, two levels of haar are worth it.
-    times = min(2, shape[lead].bit_length() - 1) if lead < 2 else depths[lead]
-    found = [
-        _along("9/7", depths, lead, kind, depth)
-        for kind, depth in (("9/7", depths[lead]), ("haar", times), ("none", 0))
-    ]
-    return tuple(dict.fromkeys([*found, _along("haar", depths, lead, "haar", times)]))
+    # Few chunks are long in time: there, two levels of Haar are worth it.
+    haar_depth = min(2, shape[first].bit_length() - 1) if first < 2 else depths[first]
+    specs = (
+        _spec("9/7", depths, first, "9/7", depths[first]),
+        _spec("9/7", depths, first, "haar", haar_depth),
+        _spec("9/7", depths, first, "none", 0),
+        _spec("haar", depths, first, "haar", haar_depth),
+    )
+    return tuple(dict.fromkeys(specs))
 
 
-def _along(kind: str, depths: list[int], lead: int, leading: str, depth: int) -> TransformSpec:
-    every = [(kind if n else "none", n) for n in depths]
-    every[lead] = (leading, depth)
-    t, z, y, x = (AxisTransform(kind=name, depth=levels) for name, levels in every)
+def _spec(
+    kind: str, depths: list[int], first: int, first_kind: str, first_depth: int
+) -> TransformSpec:
+    """A wavelet of one kind along all axes with a depth, but another kind along the first axis."""
+    kinds = [(kind if depth else "none", depth) for depth in depths]
+    kinds[first] = (first_kind, first_depth)
+    t, z, y, x = (AxisTransform(kind=name, depth=depth) for name, depth in kinds)
     return TransformSpec(axes=(t, z, y, x))
 
 
-def _spec(transform: TransformSpec | Mapping[str, Any]) -> TransformSpec:
+def _spec_from(transform: TransformSpec | Mapping[str, Any]) -> TransformSpec:
     return transform if isinstance(transform, TransformSpec) else TransformSpec.from_dict(transform)
-
-
-def _shape(tile: Values) -> Shape:
-    t, z, y, x = tile.shape
-    return t, z, y, x

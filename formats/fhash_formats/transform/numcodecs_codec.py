@@ -1,7 +1,8 @@
-"""The codec `fhash.transform` for numcodecs, and by that for Zarr format 2; found by numcodecs through its entry point.
+"""The codec `fhash.transform` for numcodecs, and so for Zarr format 2; loaded by its entry point.
 
-Bytes: the magic `FHC1`, the type as in numpy without byte order (such as `f4`), the number of axes (a byte), the lengths (uint64), the
-CRC-32 of all these (uint32), and the stream of one tile; numbers are little-endian.
+The bytes are, with little-endian numbers: the magic `FHC1`; the type as numpy writes it, without
+byte order (such as `f4`); the number of axes (one byte); the lengths (uint64); the CRC-32 of all
+these (uint32); and the stream of one tile.
 """
 
 from __future__ import annotations
@@ -23,15 +24,26 @@ from fhash_formats.transform.chunk import Quality, decode_chunk, encode_chunk, s
 __all__ = ["NumcodecsTransform"]
 
 _MAGIC = b"FHC1"
+"""First bytes of a coded array."""
 _TYPES = {b"f2", b"f4", b"f8", b"i1", b"i2", b"i4", b"i8", b"u1", b"u2", b"u4", b"u8"}
-_MOST_AXES = 32
-_MOST_VALUES = 1 << 40
+"""Types that are coded."""
+_MAX_AXES = 32
+"""Most axes of an array."""
+_MAX_VALUES = 1 << 40
+"""Most values of an array."""
 
 
 class NumcodecsTransform(Codec):  # type: ignore[misc]
-    """Arrays by transform: exactly one of max_error, max_error_rel and step, as in `Quality`. Raises InputError.
+    """The codec for arrays of float16 to float64 and integers, with any number of axes.
 
-    transform: along the last four axes (t, z, y, x), None for what codes each array best.
+    Args:
+        max_error: as in `Quality`; exactly one of the three is given.
+        max_error_rel: as in `Quality`.
+        step: as in `Quality`.
+        transform: transform along the last four axes (t, z, y, x); None for the one that codes each
+            array best.
+
+    Raises InputError.
     """
 
     codec_id = "fhash.transform"
@@ -50,36 +62,39 @@ class NumcodecsTransform(Codec):  # type: ignore[misc]
         )
 
     def get_config(self) -> dict[str, Any]:
-        """JSON values from which `from_config` makes the codec again."""
+        """The JSON values that `from_config` takes."""
         config: dict[str, Any] = {"id": self.codec_id, **self.quality.to_dict()}
         return (
             config if self.transform is None else {**config, "transform": self.transform.to_dict()}
         )
 
     def encode(self, buf: Any) -> bytes:
-        """The bytes of an array; raises InputError for what has no type of its own, such as bytes."""
+        """The bytes of an array. Raises InputError for bytes, which have no number type."""
         if isinstance(buf, bytes | bytearray):
             raise InputError("fhash.transform codes numbers: give an array, not bytes")
         values = np.asarray(buf)
         dtype = supported(values.dtype)
-        head = (
+        header = (
             _MAGIC
             + dtype.str[1:].encode("ascii")
             + struct.pack(f"<B{values.ndim}Q", values.ndim, *values.shape)
         )
         data = encode_chunk(values, **self.quality.to_dict(), transform=self.transform)
-        return head + zlib.crc32(head).to_bytes(4, "little") + data
+        return header + zlib.crc32(header).to_bytes(4, "little") + data
 
     def decode(self, buf: Any, out: Any = None) -> Any:
-        """The array of the shape and type that was coded, in this machine's byte order. Raises DamagedFileError."""
+        """The array, with the shape and type that were coded, in this machine's byte order.
+
+        Raises DamagedFileError.
+        """
         data = ensure_bytes(buf)
-        if len(data) < 11 or data[:4] != _MAGIC or data[4:6] not in _TYPES or data[6] > _MOST_AXES:
+        if len(data) < 11 or data[:4] != _MAGIC or data[4:6] not in _TYPES or data[6] > _MAX_AXES:
             raise DamagedFileError("these bytes are not of the codec fhash.transform")
         end = 7 + 8 * data[6]
         if zlib.crc32(data[:end]).to_bytes(4, "little") != data[end : end + 4]:
             raise DamagedFileError("the head of an array coded by fhash.transform is damaged")
         shape = struct.unpack_from(f"<{data[6]}Q", data, 7)
-        if math.prod(shape) > _MOST_VALUES:
+        if math.prod(shape) > _MAX_VALUES:
             raise DamagedFileError(f"an array coded by fhash.transform claims the shape {shape}")
         values = decode_chunk(memoryview(data)[end + 4 :], shape, data[4:6].decode("ascii"))
         return values if out is None else ndarray_copy(values, out)

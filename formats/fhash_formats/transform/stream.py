@@ -1,31 +1,54 @@
-"""The array-to-bytes codec `fhash.transform` as containers use it: one chunk, one tile."""
+"""The codec `fhash.transform` as containers use it: one chunk is one tile."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import prod
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
-from fhash_formats.transform.tile.encoding import Shape, decode_tile, decode_tile_mask, encode_tile
+from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
+from fhash_formats.transform.tile.encoding import encode_tile
+from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["TransformCoder"]
+__all__ = ["MAX_TILE_VERTICES", "TransformCoder"]
+
+MAX_TILE_VERTICES = 1 << 27
+"""Vertices of a tile. Decoding takes some 30 bytes each; a damaged file may claim any number."""
 
 
 class TransformCoder:
-    """Codes chunks of one type and shape with the settings in the codec's configuration, or with those in each chunk's stream.
+    """Coder of chunks of one type and shape.
 
-    features: that a container with these settings requires beside `transform`.
-    masked: whether the chunks say which of their values are occupied.
+    The settings are in the codec's configuration, or each chunk's stream has its own.
+
+    Attributes:
+        settings: settings that all chunks share; None where each stream has its own.
+        features: features that a container with these settings requires besides `transform`.
+        masked: whether the chunks say which of their values are occupied.
     """
 
     def __init__(
         self, codecs: Sequence[Mapping[str, Any]], dtype: np.dtype[Any], shape: tuple[int, ...]
     ) -> None:
-        """Raises DamagedFileError for a configuration that is not allowed, UnsupportedFileError for a second codec."""
+        """A coder from an array's metadata.
+
+        Args:
+            codecs: the codecs in the metadata; one, `{"name": ..., "configuration": ...}`.
+            dtype: type of the values.
+            shape: shape of a chunk, of at most 4 axes.
+
+        Raises DamagedFileError for a configuration that is not allowed and for tiles that are too
+        large, UnsupportedFileError for a second codec.
+        """
+        if prod(shape) > MAX_TILE_VERTICES:
+            raise DamagedFileError(
+                f"tiles of {prod(shape):,} vertices; the limit is {MAX_TILE_VERTICES:,}"
+            )
         if len(codecs) != 1:
             raise UnsupportedFileError(
                 "nothing may stand between the codecs fhash.transform and crc32c"
@@ -44,22 +67,27 @@ class TransformCoder:
         self.features = () if self.settings is None else self.settings.features
         self.masked = self.settings is not None and self.settings.mask is not None
         self._shape, self._dtype = shape, dtype.newbyteorder("=")
-        self._four: Shape = (*(1,) * (4 - len(shape)), *shape)  # type: ignore[assignment]
+        t, z, y, x = (1,) * (4 - len(shape)) + shape
+        self._tile_shape: Shape = (t, z, y, x)
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The stream of a full chunk."""
         if self.settings is None:
             raise InputError(
-                "fhash.transform without settings only decodes here; fhash_formats.transform.zarr_codec chooses them"
+                "fhash.transform without settings only decodes here; "
+                "fhash_formats.transform.zarr_codec chooses them"
             )
-        return encode_tile(chunk.reshape(self._four), self.settings).data
+        return encode_tile(chunk.reshape(self._tile_shape), self.settings).data
 
     def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
-        """The full chunk; with `lod`, every 2^lod-th vertex along z, y, x. Raises DamagedFileError."""
-        values = decode_tile(data, self._four, self._dtype, self.settings, lod)
+        """The full chunk, or with `lod` every 2^lod-th vertex along z, y, x.
+
+        Raises DamagedFileError.
+        """
+        values = decode_tile(data, self._tile_shape, self._dtype, self.settings, lod)
         return values.reshape(values.shape[4 - len(self._shape) :])
 
     def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
         """The full chunk, and which of its values are occupied. Raises DamagedFileError."""
-        values, mask = decode_tile_mask(data, self._four, self._dtype, self.settings)
+        values, mask = decode_tile_mask(data, self._tile_shape, self._dtype, self.settings)
         return values.reshape(self._shape), mask.reshape(self._shape)

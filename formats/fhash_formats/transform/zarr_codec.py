@@ -1,9 +1,18 @@
-"""The array-to-bytes codec `fhash.transform` for Zarr format 3, found by zarr through its entry point.
+"""The array-to-bytes codec `fhash.transform` for Zarr format 3; zarr loads it by its entry point.
 
-    zarr.create_array(store, shape=..., chunks=..., dtype="float32", fill_value=np.nan, serializer=TransformCodec(max_error=0.01))
+    zarr.create_array(
+        store,
+        shape=...,
+        chunks=...,
+        dtype="float32",
+        fill_value=np.nan,
+        serializer=TransformCodec(max_error=0.01),
+        compressors=None,
+    )
 
-Each chunk is one tile. Do not compress again: `compressors=None`, or the checksum `crc32c`. Zarr pads chunks that reach beyond the array
-with the fill value: NaN is best, since it takes no part in the range and costs next to nothing.
+Each chunk is one tile. Do not compress the chunks again: use `compressors=None`, or the checksum
+`crc32c`. Zarr pads chunks at the border of the array with the fill value. NaN is the best fill
+value, since it takes no part in the range and hardly any bytes.
 """
 
 from __future__ import annotations
@@ -19,7 +28,8 @@ from zarr.abc.codec import ArrayBytesCodec
 from fhash_formats.errors import InputError
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.chunk import Quality, decode_chunk, encode_chunk, supported, tile_shape
-from fhash_formats.transform.tile.encoding import decode_tile, encode_tile
+from fhash_formats.transform.tile.decoding import decode_tile
+from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
 if TYPE_CHECKING:
@@ -32,16 +42,27 @@ if TYPE_CHECKING:
 __all__ = ["NAME", "TransformCodec"]
 
 NAME = "fhash.transform"
+"""Name of the codec in Zarr metadata."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TransformCodec(ArrayBytesCodec):
-    """Chunks by transform, for arrays of float16 to float64 and integers, of any number of axes. Raises InputError.
+    """The codec for arrays of float16 to float64 and integers, with any number of axes.
 
-    max_error, max_error_rel, step: exactly one, as in `Quality`; a relative bound is relative to each chunk's own range. transform: along
-    the last four axes (t, z, y, x), None for what codes each chunk best. settings: instead of all these, those that all chunks share, as
-    containers have them; in the metadata they are a configuration with the key `center`. reading: instead of all these, only decode
-    streams that have their own settings, as in containers whose configuration is empty.
+    The quality and `transform`, or `settings`, or `reading` is given.
+
+    Attributes:
+        max_error: as in `Quality`; exactly one of the three is given.
+        max_error_rel: as in `Quality`, relative to the range of each chunk.
+        step: as in `Quality`.
+        transform: transform along the last four axes (t, z, y, x); None for the one that codes each
+            chunk best.
+        settings: settings that all chunks share, as in containers. In the metadata they are a
+            configuration with the key `center`.
+        reading: whether the codec only decodes streams with their own settings, as in containers
+            whose configuration is empty.
+
+    Raises InputError for other combinations.
     """
 
     is_fixed_size = False
@@ -67,7 +88,7 @@ class TransformCodec(ArrayBytesCodec):
 
     @classmethod
     def from_dict(cls, data: dict[str, JSON]) -> Self:
-        """From the metadata's `{"name": ..., "configuration": ...}`."""
+        """The codec from its metadata, `{"name": ..., "configuration": ...}`. Raises InputError."""
         configuration = data.get("configuration", {})
         if data.get("name") != NAME or not isinstance(configuration, Mapping):
             raise InputError(
@@ -77,10 +98,10 @@ class TransformCodec(ArrayBytesCodec):
             return cls(settings=TileSettings.from_dict(configuration))
         if not configuration:
             return cls(reading=True)
-        known = ("max_error", "max_error_rel", "step", "transform")
-        unknown = [key for key in configuration if key not in known]
+        keys = ("max_error", "max_error_rel", "step", "transform")
+        unknown = [key for key in configuration if key not in keys]
         if unknown:
-            raise InputError(f"{NAME}: unknown key {unknown[0]!r:.40}; known: {', '.join(known)}")
+            raise InputError(f"{NAME}: unknown key {unknown[0]!r:.40}; known: {', '.join(keys)}")
         values: dict[str, Any] = dict(configuration)
         return cls(**values)
 
@@ -111,18 +132,22 @@ class TransformCodec(ArrayBytesCodec):
         supported(dtype.to_native_dtype())
 
     def evolve_from_array_spec(self, array_spec: ArraySpec) -> Self:
-        """Nothing depends on the array; raises InputError for a type that is not coded."""
+        """The codec itself: no option depends on the array.
+
+        Raises InputError for a type that is not coded.
+        """
         supported(array_spec.dtype.to_native_dtype())
         return self
 
     def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> int:
-        """Not known before."""
+        """Raises NotImplementedError: the size is unknown before the chunk is coded."""
         raise NotImplementedError
 
     def _encode_sync(self, chunk_array: NDBuffer, chunk_spec: ArraySpec) -> Buffer | None:
         if self.reading:
             raise InputError(
-                f"{NAME} without a configuration only decodes: give max_error, max_error_rel or step to write"
+                f"{NAME} without a configuration only decodes: "
+                "give max_error, max_error_rel or step to write"
             )
         values = np.asarray(chunk_array.as_ndarray_like())
         if self.settings is None:
@@ -141,11 +166,8 @@ class TransformCodec(ArrayBytesCodec):
         return chunk_spec.prototype.buffer.from_bytes(data)
 
     def _decode_sync(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
-        data, shape, dtype = (
-            chunk_data.to_bytes(),
-            chunk_spec.shape,
-            chunk_spec.dtype.to_native_dtype(),
-        )
+        data, shape = chunk_data.to_bytes(), chunk_spec.shape
+        dtype = chunk_spec.dtype.to_native_dtype()
         if self.settings is None:
             values = decode_chunk(data, shape, dtype)
         else:

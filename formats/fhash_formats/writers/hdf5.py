@@ -1,8 +1,9 @@
-"""Writer of HDF5: one dataset (t, z, y, x) named after the variable, with its coordinates as dimension scales.
+"""Writer of HDF5: a dataset (t, z, y, x) named after the variable, coordinates as dimension scales.
 
-Chunks are single frames, compressed by gzip 1 after the byte shuffle: both are part of every HDF5 library (lzf is not), and
-what is decoded is mostly NaN outside the coreset. Tried on two series: 0.01 and 0.13 of the size where only a feature is
-decoded, 0.15 and 0.74 on full frames, at 50-400 MB/s; level 4 takes a third longer for at most a few percent.
+Chunks are single frames, compressed by gzip 1 after the byte shuffle. Both are part of every HDF5
+library (lzf is not), and decoded values are mostly NaN outside the coreset. Two series took 0.01
+and 0.13 of the size where only a feature was decoded, 0.15 and 0.74 on full frames, at 50-400 MB/s;
+level 4 takes a third longer for at most a few percent.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
 
 
 def _create(root: Any, region: Region) -> Any:
-    """The empty dataset in `root`, with its attributes and scales."""
+    """Create the empty dataset in `root`, with its attributes and scales."""
     variable, names = safe_names(region)
     dtype = little_endian(region.dtype, half=True)
     values = root.create_dataset(

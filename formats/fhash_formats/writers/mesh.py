@@ -1,4 +1,4 @@
-"""Triangle surfaces, and their writers: .vtp (VTK's XML, appended raw, little-endian) and .ply (binary, little-endian).
+"""Triangle surfaces and their writers: .vtp (VTK's XML) and .ply, both binary, little-endian.
 
 Formats: "VTK XML formats", docs.vtk.org; Greg Turk, "The PLY Polygon File Format", 1994.
 """
@@ -27,8 +27,11 @@ class Mesh:
 
     Attributes:
         vertices: float64 (n, 3), physical x, y, z.
-        triangles: int64 (m, 3), numbers of vertices, counterclockwise seen from where the values are lower.
-        name: of the variable. value: that the surface is of, in data units. time: physical.
+        triangles: int64 (m, 3), vertex numbers, counterclockwise seen from the side of lower
+            values.
+        name: name of the variable.
+        value: value of the surface, in data units.
+        time: physical time.
     """
 
     vertices: npt.NDArray[np.float64]
@@ -41,11 +44,15 @@ class Mesh:
 def check_mesh_output(
     path: str | Path, force: bool = False, sources: Sequence[str | Path] = ()
 ) -> None:
-    """The checks of `save_mesh` that can be made before any work; raises InputError, OutputExistsError or OutputError."""
+    """Make the checks of `save_mesh` that need no work.
+
+    Raises InputError, OutputExistsError or OutputError.
+    """
     target = Path(path)
     if target.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(
-            f"{path}: cannot write a surface with the suffix {target.suffix!r}; use one of {', '.join(MESH_SUFFIXES)}"
+            f"{path}: cannot write a surface with the suffix {target.suffix!r}; use one of"
+            f" {', '.join(MESH_SUFFIXES)}"
         )
     check_output(target, force, sources=sources)
 
@@ -53,7 +60,10 @@ def check_mesh_output(
 def save_mesh(
     path: str | Path, mesh: Mesh, *, force: bool = False, sources: Sequence[str | Path] = ()
 ) -> Path:
-    """Write a surface in the format that the suffix names, complete or not at all; raises what `check_mesh_output` raises."""
+    """Write a surface in the format of the suffix, complete or not at all.
+
+    Raises the errors of `check_mesh_output`.
+    """
     target = Path(path)
     check_mesh_output(target, force, sources)
     with replacing(target, force=force) as temporary, temporary.open("xb") as handle:
@@ -88,14 +98,24 @@ def _write_vtp(handle: BinaryIO, mesh: Mesh) -> None:
         np.arange(3, 3 * len(mesh.triangles) + 1, 3, dtype="<i8"),
     ]
     offsets = [sum(array.nbytes + 8 for array in arrays[:number]) for number in range(len(arrays))]
-    time = f'<DataArray type="Float64" Name="TimeValue" NumberOfTuples="1" format="ascii">{mesh.time!r}</DataArray>'
+    value = 'type="Float64" Name="TimeValue" NumberOfTuples="1" format="ascii"'
+    time = f"<DataArray {value}>{mesh.time!r}</DataArray>"
+    counts = (
+        f'NumberOfPoints="{len(mesh.vertices)}" NumberOfVerts="0" NumberOfLines="0"'
+        f' NumberOfStrips="0" NumberOfPolys="{len(mesh.triangles)}"'
+    )
+    values = f'type="Float64" Name={name} format="appended" offset="{offsets[0]}"'
+    points = (
+        'type="Float64" Name="Points" NumberOfComponents="3"'
+        f' format="appended" offset="{offsets[1]}"'
+    )
     text = f"""<?xml version="1.0" encoding="UTF-8"?>
 <VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64">
 <PolyData>
 <FieldData>{time}</FieldData>
-<Piece NumberOfPoints="{len(mesh.vertices)}" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" NumberOfPolys="{len(mesh.triangles)}">
-<PointData Scalars={name}><DataArray type="Float64" Name={name} format="appended" offset="{offsets[0]}"/></PointData>
-<Points><DataArray type="Float64" Name="Points" NumberOfComponents="3" format="appended" offset="{offsets[1]}"/></Points>
+<Piece {counts}>
+<PointData Scalars={name}><DataArray {values}/></PointData>
+<Points><DataArray {points}/></Points>
 <Polys>
 <DataArray type="Int64" Name="connectivity" format="appended" offset="{offsets[2]}"/>
 <DataArray type="Int64" Name="offsets" format="appended" offset="{offsets[3]}"/>

@@ -1,6 +1,6 @@
-"""Writer of NetCDF-4 by the CF conventions, through h5netcdf: one variable over four coordinate variables.
+"""Writer of NetCDF-4 by the CF conventions, through h5netcdf: a variable with four coordinates.
 
-NaN is declared as `_FillValue` of floats; NetCDF has no float16, which is stored as float32, exactly.
+NaN is declared as `_FillValue` of floats. NetCDF has no float16; it is stored as float32, exactly.
 Chunks and compression are those of `hdf5`, for the same reasons.
 """
 
@@ -50,7 +50,7 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
 
 
 def _create(root: Any, region: Region, dtype: np.dtype[Any]) -> Any:
-    """The empty variable in `root`, with its attributes, dimensions and coordinates."""
+    """Create the empty variable in `root`, with its attributes, dimensions and coordinates."""
     variable, names = safe_names(region)
     root.attrs["Conventions"] = "CF-1.8"
     root.dimensions = {names[axis]: length for axis, length in zip(AXES, region.shape, strict=True)}

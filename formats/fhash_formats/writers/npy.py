@@ -1,4 +1,4 @@
-"""Writer of NumPy's .npy: the header first, then the frames one after another; C order, (t, z, y, x)."""
+"""Writer of NumPy's .npy: the header, then the frames one by one; C order, (t, z, y, x)."""
 
 from __future__ import annotations
 

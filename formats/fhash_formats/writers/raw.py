@@ -1,11 +1,13 @@
 """Writer of .raw: the bare values, little-endian, x fastest, then y, z and t.
 
-A name `*_XxYxZxT_TYPE.raw`, such as `run_128x64x64x10_float32.raw`, says by itself how to read the file (as `readers.raw`
-understands it, `_be` for big-endian included) and must be true.
-Beside any other name goes a detached NRRD header, `NAME.nhdr`: text that ParaView, 3D Slicer and pynrrd open. It holds the
-grid in space where it is even, and every coordinate exactly as `coordinates_AXIS:=...`. NRRD has no float16, which is
-stored as float32, exactly. Limits of ParaView's NRRD reader (VTK 9.7): it takes the x of several steps, or an x of at most
-9 vertices, for the components of a vector; write .vti or .vtr for it then.
+A name `*_XxYxZxT_TYPE.raw`, such as `run_128x64x64x10_float32.raw`, says how to read the file (as
+`readers.raw` understands it, `_be` for big-endian included) and must be true.
+
+Any other name gets a detached NRRD header beside it, `NAME.nhdr`: text that ParaView, 3D Slicer and
+pynrrd open. It holds the grid in space where it is even, and every coordinate exactly as
+`coordinates_AXIS:=...`. NRRD has no float16; it is stored as float32, exactly. Limits of ParaView's
+NRRD reader (VTK 9.7): it takes the x of several steps, or an x of at most 9 vertices, for the
+components of a vector; write .vti or .vtr for it then.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ def _outputs(path: Path, region: Region) -> list[Path]:
     if layout.shape is None or layout.dtype is None:
         if not path.name.isprintable():
             raise InputError(
-                f"{path}: the file name holds control characters, which a .nhdr header cannot name; use another name"
+                f"{path}: the file name holds control characters, which a .nhdr header cannot"
+                " name; use another name"
             )
         return [path, path.with_suffix(".nhdr")]
     if (
@@ -44,7 +47,8 @@ def _outputs(path: Path, region: Region) -> list[Path]:
         t, z, y, x = region.shape
         true = f"*_{x}x{y}x{z}x{t}_{region.dtype.name}.raw"
         raise InputError(
-            f"{path}: the name says another layout than the values have; use {true} or a name that says none"
+            f"{path}: the name says another layout than the values have; use {true} or a name that"
+            " says none"
         )
     return [path]
 
@@ -68,9 +72,9 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
 
 
 def _header(region: Region, dtype: np.dtype[Any], data_file: str) -> str:
-    """The NRRD header (teem.sourceforge.net/nrrd/format.html): axes fastest first, a single step as a plain volume.
+    """The NRRD header (teem.sourceforge.net/nrrd/format.html): axes fastest first.
 
-    No `labels`: VTK would call the values by the first of them.
+    A single step is a plain volume. There are no `labels`: VTK would name the values by the first.
     """
     axes = "xyzt" if region.shape[0] > 1 else "xyz"
     sizes = dict(zip(AXES, region.shape, strict=True))
@@ -97,7 +101,7 @@ def _header(region: Region, dtype: np.dtype[Any], data_file: str) -> str:
 
 
 def _space(region: Region, axes: str) -> list[str]:
-    """The lines that place the grid in space, none where an axis is uneven."""
+    """Lines that place the grid in space; none where an axis is uneven."""
     steps = [even_spacing(region.coords[axis].values) for axis in "xyz"]
     if None in steps:
         return []

@@ -1,4 +1,7 @@
-"""The formats that can be written, and the one way through them all: check, write to temporaries, take the names."""
+"""The formats that can be written, and the steps common to them all.
+
+Every output is checked first, written to temporaries, and takes its name last.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +33,15 @@ def save_check(
     region: Region | None = None,
     sources: Sequence[str | Path] = (),
 ) -> None:
-    """The checks of `save_region` that can be made before any work; all of them where the region is known.
+    """Make the checks of `save_region` that need no work; all checks where the region is given.
 
     Raises:
-        InputError: a suffix that no writer has, a region that the format cannot hold, or an output that is one of the `sources`.
+        InputError: a suffix that no writer has, a region that the format cannot hold, or an output
+            that is one of the `sources`.
         MissingDependencyError: the format needs a library that is not installed.
-        OutputExistsError: the path, or with `region` any file that goes with it, is there already and `force` is not given.
-        OutputError: no such folder, no permission, or something there that must not be replaced.
+        OutputExistsError: the path, or with `region` any file that goes with it, exists and `force`
+            is not given.
+        OutputError: no such folder, no permission, or an existing object that must not be replaced.
     """
     target = Path(path)
     writer = _writer(target)
@@ -54,21 +59,24 @@ def save_region(
     force: bool = False,
     sources: Sequence[str | Path] = (),
 ) -> list[Path]:
-    """Write the frames of a region in the format that the suffix of `path` names; complete or absent.
+    """Write the frames of a region in the format of the suffix of `path`; complete or absent.
 
     Args:
         path: ends in .npy, .h5, .hdf5, .nc, .nc4, .zarr, .raw, .vti, .vtr, .pvd or .vtkhdf.
-        region: what the frames are.
-        frames: one array (z, y, x) of `region.dtype` for each step, taken one by one: no two are held here.
-        force: replace outputs that are there already; the old ones stay until the new are complete.
+        region: description of the frames.
+        frames: one array (z, y, x) of `region.dtype` for each step, taken one by one: never are two
+            held here.
+        force: replace outputs that exist; the old ones stay until the new are complete.
         sources: files and folders that the frames come from, which are never replaced.
 
     Returns:
-        The paths written: one, or for several steps in VTK's formats and for .raw those of the files that go together.
+        The paths written: one, or for several steps in VTK's formats and for .raw all files that
+            belong together.
 
     Raises:
-        InputError: what `save_check` raises, or frames that are not what the region says.
-        OutputError: it cannot be written, as on a full disk; nothing is left behind, and an old output is as it was.
+        InputError: an error of `save_check`, or frames that differ from the region's description.
+        OutputError: it cannot be written, as on a full disk; nothing is left behind, and an old
+            output is as it was.
     """
     target = Path(path)
     save_check(target, force, region, sources)
@@ -96,12 +104,15 @@ def _writer(path: Path) -> Writer:
         if suffix in writer.suffixes:
             if writer.module and importlib.util.find_spec(writer.module) is None:
                 raise MissingDependencyError(
-                    f"{path}: writing {writer.name} needs {writer.module}: pip install 'fhash[formats]'"
+                    f"{path}: writing {writer.name} needs {writer.module}: pip install"
+                    " 'fhash[formats]'"
                 )
             return writer
-    known = ", ".join(suffix for writer in WRITERS for suffix in writer.suffixes)
+    suffixes = ", ".join(suffix for writer in WRITERS for suffix in writer.suffixes)
     raise InputError(
-        f"{path}: cannot write {f'the suffix {path.suffix!r}' if suffix else 'a name without a suffix'}; use one of {known}"
+        f"{path}: cannot write"
+        f" {f'the suffix {path.suffix!r}' if suffix else 'a name without a suffix'}; use one of"
+        f" {suffixes}"
     )
 
 
@@ -113,7 +124,8 @@ def _frame(region: Region, source: Iterator[npt.NDArray[np.generic]], step: int)
         )
     if frame.shape != region.shape[1:] or frame.dtype.newbyteorder("=") != region.dtype:
         raise InputError(
-            f"region {region.name!r}: frame {step} is {frame.dtype} {frame.shape}; {region.dtype} {region.shape[1:]} (z, y, x) is needed"
+            f"region {region.name!r}: frame {step} is {frame.dtype} {frame.shape}; {region.dtype}"
+            f" {region.shape[1:]} (z, y, x) is needed"
         )
     return np.ascontiguousarray(frame, dtype=region.dtype)
 

@@ -1,10 +1,10 @@
-"""Writer of VTK's XML grids: .vti (even spacing) and .vtr (any ascending coordinates), and .pvd for several steps.
+"""Writer of VTK's XML grids: .vti (even spacing), .vtr (any ascending coordinates), .pvd (steps).
 
-One step goes to the name given. Several go to NAME_0000.vti, NAME_0001.vti, ... and NAME.pvd, which lists them with their
-physical times and takes its name last; a name .pvd takes .vti files where the grid is even, else .vtr files.
-Values are appended raw, little-endian with 64-bit sizes, as point data. VTK has no descending axis: one is turned round,
-values and coordinates. It has no float16 either, which is stored as float32, exactly. Format: "VTK XML formats",
-docs.vtk.org.
+One step goes to the name given. Several go to NAME_0000.vti, NAME_0001.vti, ... and NAME.pvd, which
+lists them with their physical times and takes its name last. A name .pvd takes .vti files where the
+grid is even, else .vtr files. Values are appended raw, little-endian with 64-bit sizes, as point
+data. VTK has no descending axis: such an axis is reversed, values and coordinates. It has no
+float16 either, which is stored as float32, exactly. Format: "VTK XML formats", docs.vtk.org.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ def _outputs(path: Path, region: Region) -> list[Path]:
         return [path]
     if not path.name.isprintable():
         raise InputError(
-            f"{path}: the file name holds control characters, which a .pvd cannot list; use another name"
+            f"{path}: the file name holds control characters, which a .pvd cannot list; use"
+            " another name"
         )
     digits = max(4, len(str(region.shape[0] - 1)))
     steps = [
@@ -50,7 +51,7 @@ def _is_even(region: Region) -> bool:
 
 
 def _check_grid(path: Path, region: Region, suffix: str) -> None:
-    """InputError where the coordinates do not fit the format."""
+    """Raise InputError where the coordinates do not fit the format."""
     if not np.all(np.isfinite(region.coords["t"].values)):
         raise InputError(
             f"{path}: the times are not all finite, and VTK's files need them; use .nc, .h5 or .npy"
@@ -59,12 +60,14 @@ def _check_grid(path: Path, region: Region, suffix: str) -> None:
         values = region.coords[axis].values
         if suffix == ".vti" and even_spacing(values) is None:
             raise InputError(
-                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly spaced, as .vti needs; use .vtr"
+                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly"
+                " spaced, as .vti needs; use .vtr"
             )
         steps = np.diff(values)
         if not np.all(np.isfinite(values)) or not (np.all(steps > 0) or np.all(steps < 0)):
             raise InputError(
-                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} neither ascends nor descends; use .nc, .h5 or .npy"
+                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} neither ascends"
+                " nor descends; use .nc, .h5 or .npy"
             )
 
 
@@ -94,7 +97,7 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
 
 
 def direction(values: npt.NDArray[np.float64]) -> int:
-    """1 for coordinates that ascend, -1 for those that descend."""
+    """1 for ascending coordinates, -1 for descending ones."""
     return -1 if values[-1] < values[0] else 1
 
 
@@ -107,7 +110,7 @@ def _write_grid(
     *,
     image: bool,
 ) -> None:
-    """One step: `frame` (z, y, x) on ascending `coords`, as ImageData or RectilinearGrid."""
+    """Write one step: `frame` (z, y, x) on ascending `coords`, as ImageData or RectilinearGrid."""
     dtype = little_endian(region.dtype)
     extent = " ".join(f"0 {length - 1}" for length in reversed(frame.shape))
     kind, place = "RectilinearGrid", ""
@@ -123,18 +126,17 @@ def _write_grid(
         if image
         else [frame.size * dtype.itemsize, *(coords[axis].nbytes for axis in "xyz")]
     )
-    offsets = [
-        sum(sizes[:i]) + 8 * i for i in range(len(sizes))
-    ]  # each array follows its 64-bit size
-    grid = (
-        ""
-        if image
-        else f"<Coordinates>{''.join(_axis(axis, offset) for axis, offset in zip('xyz', offsets[1:], strict=True))}</Coordinates>"
-    )
+    # Each array follows its 64-bit size.
+    offsets = [sum(sizes[:i]) + 8 * i for i in range(len(sizes))]
+    value = 'type="Float64" Name="TimeValue" NumberOfTuples="1" format="ascii"'
+    grid = ""
+    if not image:
+        axes = zip("xyz", offsets[1:], strict=True)
+        grid = f"<Coordinates>{''.join(_axis(axis, offset) for axis, offset in axes)}</Coordinates>"
     text = f"""<?xml version="1.0" encoding="UTF-8"?>
 <VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64">
 <{kind} WholeExtent="{extent}"{place}>
-<FieldData><DataArray type="Float64" Name="TimeValue" NumberOfTuples="1" format="ascii">{time!r}</DataArray></FieldData>
+<FieldData><DataArray {value}>{time!r}</DataArray></FieldData>
 <Piece Extent="{extent}">
 <PointData Scalars={name}>
 <DataArray type="{_vtk_type(dtype)}" Name={name} format="appended" offset="0">{units}</DataArray>
@@ -170,7 +172,10 @@ def _collection(region: Region, files: Sequence[Path]) -> str:
         f'<DataSet timestep="{time!r}" group="" part="0" file={quoteattr(file.name)}/>\n'
         for time, file in zip(times, files, strict=True)
     ]
-    head = '<?xml version="1.0" encoding="UTF-8"?>\n<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n<Collection>\n'
+    head = (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">\n<Collection>\n'
+    )
     return head + "".join(rows) + "</Collection>\n</VTKFile>\n"
 
 

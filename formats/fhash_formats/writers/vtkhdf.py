@@ -1,7 +1,8 @@
-"""Writer of VTK's HDF5 format (.vtkhdf): all steps of an evenly spaced grid in one file, as ParaView 5.12 and newer read it.
+"""Writer of VTK's HDF5 format (.vtkhdf): all steps of an evenly spaced grid in one file.
 
-VTKHDF 2.0, type ImageData: point data (t, z, y, x) and a group Steps with the physical times, docs.vtk.org ("VTKHDF file
-format"). As in .vti, a descending axis is turned round, values and coordinates, and float16 is stored as float32, exactly.
+ParaView 5.12 and newer read it. VTKHDF 2.0, type ImageData: point data (t, z, y, x) and a group
+Steps with the physical times, docs.vtk.org ("VTKHDF file format"). As in .vti, a descending axis is
+reversed, values and coordinates, and float16 is stored as float32, exactly.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ def _outputs(path: Path, region: Region) -> list[Path]:
     for axis in SPACE:
         if not even_spacing(region.coords[axis].values):
             raise InputError(
-                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly spaced, as .vtkhdf needs; use .vtr or .pvd"
+                f"{path}: the coordinate {region.coords[axis].name!r} of {axis} is not evenly"
+                " spaced, as .vtkhdf needs; use .vtr or .pvd"
             )
     return [path]
 
@@ -43,7 +45,8 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
     import h5py
 
     turn = tuple(slice(None, None, direction(region.coords[axis].values)) for axis in SPACE)
-    # Links in the order of their creation, as the reader of VTK demands for composite files and takes for all.
+    # Links in the order of their creation, as the reader of VTK demands for composite files and
+    # takes for all.
     with held_hdf5(temporaries[0], lambda file: h5py.File(file, "w", track_order=True)) as (
         file,
         root,
@@ -59,7 +62,7 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
 
 
 def _create(root: Any, region: Region) -> Any:
-    """The empty dataset in `root`, with all that describes it."""
+    """Create the empty dataset in `root`, with everything that describes it."""
     ascending = {
         axis: values[:: direction(values)]
         for axis in SPACE

@@ -1,8 +1,9 @@
-"""Writer of a Zarr v3 group: the variable and its four coordinates as arrays with dimension names, as xarray opens them.
+"""Writer of a Zarr v3 group: the variable and its coordinates as arrays with dimension names.
 
-One chunk per step (see `chunk_shape`), in zarr's default compression. zarr writes into memory and each frame's chunks go
-from there to plain files: its own writing to disk goes on in another thread after Ctrl-C and would bring back a store that
-was just removed.
+xarray opens it as a dataset. There is one chunk per step (see `chunk_shape`), in zarr's default
+compression. zarr writes into memory, and each frame's chunks go from there to plain files: zarr's
+own writing to disk continues in another thread after Ctrl-C and would bring back a store that was
+just removed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from fhash_formats.writers.common.writer import Frame, Put, Writer, chunk_shape,
 
 
 def _flush(memory: dict[str, Any], folder: Path) -> None:
-    """Move what zarr wrote into memory to files."""
+    """Move the chunks that zarr wrote from memory to files."""
     while memory:
         key, buffer = memory.popitem()
         path = folder / key
@@ -66,7 +67,8 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
             "write_empty_chunks": True
         },  # a chunk that is missing is then always a fault, not a frame of fill values
     )
-    with warnings.catch_warnings():  # that this is not yet in Zarr's specification; xarray looks for it and warns where it is not
+    # that this is not yet in Zarr's specification; xarray looks for it and warns where it is not
+    with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(store)
     _flush(memory, folder)

@@ -1,20 +1,34 @@
-"""`fhash bench`: figures for the engines or codecs asked for, and the machine they were taken on."""
+"""`fhash bench`: figures of the engines or codecs asked for, and of the machine."""
 
 from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import Result
 
+from fhash_codec.bench import train
+
 Fhash = Callable[..., Result]
 
 
+@pytest.fixture
+def steady(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock for `bench train` that advances by 10 ms whenever it is read."""
+    ticks = count()
+    clock = SimpleNamespace(perf_counter=lambda: next(ticks) / 100)
+    monkeypatch.setattr(train, "time", clock)
+    monkeypatch.setattr(train, "INFER_SECONDS", 0.03)
+
+
+@pytest.mark.usefixtures("steady")
 def test_bench_train_measures_each_engine(fhash: Fhash, data: Path) -> None:
-    result = fhash("bench", "train", data, "--seconds", "0.3", "--width", "4", "--json", "-q")
+    result = fhash("bench", "train", data, "--seconds", "0.1", "--width", "4", "--json", "-q")
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
     assert sorted(entry["engine"] for entry in report["engines"]) == ["naive", "slab"]
@@ -25,9 +39,10 @@ def test_bench_train_measures_each_engine(fhash: Fhash, data: Path) -> None:
     assert {"cores", "torch", "device"} <= set(report["machine"])
 
 
+@pytest.mark.usefixtures("steady")
 def test_bench_train_prints_a_table(fhash: Fhash, data: Path) -> None:
     result = fhash(
-        "bench", "train", data, "--seconds", "0.2", "--engines", "slab", "--width", "4", "-q"
+        "bench", "train", data, "--seconds", "0.1", "--engines", "slab", "--width", "4", "-q"
     )
     assert result.exit_code == 0
     header, row, _ = result.stdout.splitlines()

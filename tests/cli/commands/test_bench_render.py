@@ -1,4 +1,4 @@
-"""`fhash bench render`: tables, one JSON object, a plot, and what is refused."""
+"""`fhash bench render`: tables, one JSON object, a plot, and refusals."""
 
 from __future__ import annotations
 
@@ -9,12 +9,17 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
+from fhash_codec.bench.pictures import beside_vtk, pictures
+
 Fhash = Callable[..., Result]
 
 QUICK = ["--size", "16", "--turns", "1", "-q"]
 
 
-def test_prints_tables(fhash: Fhash, run: Path) -> None:
+def test_prints_tables(fhash: Fhash, run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "STREAM_SIZE", 16)
+    monkeypatch.setattr(beside_vtk, "FINE_SIZE", 16)
+    monkeypatch.setattr(beside_vtk, "EXPLAINED_SIZE", 16)
     result = fhash(
         "bench",
         "render",

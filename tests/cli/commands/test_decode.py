@@ -1,12 +1,10 @@
-"""`fhash decode`: what comes out of any region, time and format is what the volume itself gives."""
+"""`fhash decode`: values of any region, time and format are those that the volume gives."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
 
 import h5py
 import numpy as np
@@ -16,9 +14,7 @@ from click.testing import Result
 import fhash_codec
 import fhash_formats
 from fhash_cli.commands.decode import TYPES, Statistics, convert
-from fhash_cli.selection import region_of_box
-from fhash_formats.errors import InputError, RegionError
-from fhash_formats.series import Coordinate
+from fhash_formats.errors import InputError
 
 Fhash = Callable[..., Result]
 
@@ -220,40 +216,6 @@ def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(
     assert "the data have no value" in refused(
         2, "decode", tmp_path / "run.fhz", "--outside", "background", "--dtype", "uint8"
     )
-
-
-@pytest.mark.parametrize(
-    ("positions", "box", "expected"),
-    [
-        ([0.0, 5.0, 1.0, 6.0], (0.5, 2.0), (2, 3)),
-        ([0.0, 5.0, 1.0, 6.0], (0.0, 6.0), (0, 4)),
-        ([0.0, 5.0, 1.0, 6.0], (0.0, 1.0), None),
-        ([0.0, 1.0, 1.0, 2.0], (1.0, 1.0), (1, 3)),
-        ([3.0, 2.0, 1.0, 0.0], (1.0, 2.0), (1, 3)),
-    ],
-)
-def test_a_box_never_gives_vertices_outside_it(
-    positions: list[float], box: tuple[float, float], expected: tuple[int, int] | None
-) -> None:
-    coordinate = Coordinate(name="x", values=np.array(positions))
-    volume = cast(
-        fhash_codec.Volume,
-        SimpleNamespace(coords={"x": coordinate, "y": coordinate, "z": coordinate}),
-    )
-    if expected is None:
-        with pytest.raises(RegionError, match=r"neither ascend nor descend.*--roi"):
-            region_of_box(volume, [(None, None), (None, None), box])
-    else:
-        assert region_of_box(volume, [(None, None), (None, None), box])[2] == expected
-
-
-def test_a_box_outside_by_little_says_by_how_much() -> None:
-    coordinate = Coordinate(name="x", values=347921.0 + np.arange(3) / 1000)
-    volume = cast(fhash_codec.Volume, SimpleNamespace(coords=dict.fromkeys("zyx", coordinate)))
-    with pytest.raises(
-        RegionError, match=r"347921:347921\.003; the domain has positions 347921 to 347921\.002"
-    ):
-        region_of_box(volume, [(347921.0, 347921.003), (None, None), (None, None)])
 
 
 def test_an_output_name_that_is_no_utf8(fhash: Fhash, run: Path, tmp_path: Path) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import Result
 from PIL import Image
 
+import fhash_codec
 from fhash_cli.commands import demo
 from fhash_codec.demo.simulate import SCENES
 
@@ -18,9 +21,15 @@ Fhash = Callable[..., Result]
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scenes at a shape that takes no time."""
-    simulate = demo.simulate
+    """Scenes of a small shape, encoded with the least effort."""
+    simulate, encode = demo.simulate, fhash_codec.encode
+
+    def encode_fast(*words: Any, **options: Any) -> dict[str, Any]:
+        *files, config = words
+        return encode(*files, replace(config, effort=1), **options)
+
     monkeypatch.setattr(demo, "simulate", lambda name: simulate(name, (5, 8, 10, 12)))
+    monkeypatch.setattr(fhash_codec, "encode", encode_fast)
 
 
 @pytest.mark.usefixtures("small")

@@ -30,7 +30,7 @@ def test_diff_agrees_with_what_the_encoder_measured(
 ) -> None:
     stored = json.loads(fhash("info", run, "--json").stdout)["quality"]
     for name in ("psnr", "rmse", "max_abs_error", "psnr_domain"):
-        # The file has six digits of it, rounded to the worse side.
+        # The file has six digits of the figure, rounded to the worse side.
         assert report[name] == pytest.approx(stored[name], rel=1e-5)
         assert (report[name] >= stored[name]) == name.startswith("psnr")
 

@@ -1,4 +1,4 @@
-"""`fhash encode`: the report, determinism, what happens to promises, warnings and Ctrl-C."""
+"""`fhash encode`: the report, determinism, promises, warnings and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ Fhash = Callable[..., Result]
 SMALL = ["--effort", "1", "--quiet"]
 PAPER = ["--profile", "paper", "--epochs", "2", "--width", "4", "--quiet"]
 KEYS = {
-    "bytes", "raw_bytes", "ratio", "psnr", "rmse", "max_abs_error", "psnr_domain", "seconds", "epochs", "curve", "shape", "key_frames",
-    "feature_bounding_box", "coreset_fraction", "parameters", "profile", "device",
+    "bytes", "raw_bytes", "ratio", "psnr", "rmse", "max_abs_error", "psnr_domain", "seconds",
+    "epochs", "curve", "shape", "key_frames", "feature_bounding_box", "coreset_fraction",
+    "parameters", "profile", "device",
 }  # fmt: skip
 
 

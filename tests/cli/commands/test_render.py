@@ -1,4 +1,4 @@
-"""`fhash render`: pictures from the command line, what they say of themselves, and what is refused."""
+"""`fhash render`: pictures from the command line, their reports, and refusals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from PIL import Image as Pictures
 
 import fhash_codec
 from fhash_codec import native
-from fhash_codec.rendering.scene.png_text import scene_in_png
+from fhash_codec.rendering.scene.scene import scene_in_png
 from fhash_codec.rendering.task.counters import COUNTERS
 
 Fhash = Callable[..., Result]
@@ -50,7 +50,7 @@ def test_a_picture_is_that_of_the_library(fhash: Fhash, run: Path, tmp_path: Pat
     assert scene.effects.isosurfaces[0].colour == "red"
     with fhash_codec.open(run) as volume:
         np.testing.assert_array_equal(
-            np.asarray(Pictures.open(view)), fhash_codec.rendering(volume, scene).to_uint8()
+            np.asarray(Pictures.open(view)), fhash_codec.render(volume, scene).to_uint8()
         )
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import platform
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from click.testing import Result
 
 from fhash_codec.selftest import workers
 from fhash_codec.selftest.case import Case, Finding
@@ -16,24 +18,27 @@ from fhash_codec.selftest.results import CaseResult, Summary
 
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
-    """Puts a figure in place of every case: {"worst": figure}; what was asked for is added."""
+    """Replaces the run of cases: each has the figure {"worst": figure}.
+
+    The arguments of the call are added under their names.
+    """
     asked: dict[str, float] = {"worst": 0.5}
 
     def run(
         cases: list[Case], *, everything: bool, processes: int | None, progress: object
     ) -> Summary:
         asked.update(cases=len(cases), everything=everything, processes=processes or 0)
-        found = Finding(name="bound", worst=asked["worst"], limit=1.0, unit="of it", under="psnr")
+        finding = Finding(name="bound", worst=asked["worst"], limit=1.0, unit="of it", under="psnr")
         return Summary(
             results=[
                 CaseResult(
-                    name=one.name,
-                    group=one.group,
-                    about=one.about,
+                    name=case.name,
+                    group=case.group,
+                    about=case.about,
                     under=("psnr",),
-                    findings=(found,),
+                    findings=(finding,),
                 )
-                for one in cases
+                for case in cases
             ]
         )
 
@@ -41,14 +46,16 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
     return asked
 
 
-def test_one_case_runs_and_holds(fhash):
+def test_one_case_runs_and_holds(fhash: Callable[..., Result]) -> None:
     result = fhash("selftest", "--case", "nothing-finite", "--processes", "1", "--quiet")
     assert result.exit_code == 0, result.output
     assert "values      1        3" in result.stdout
     assert result.stdout.endswith("everything holds\n")
 
 
-def test_a_failure_is_listed_and_exits_with_1(fhash, measured):
+def test_a_failure_is_listed_and_exits_with_1(
+    fhash: Callable[..., Result], measured: dict[str, float]
+) -> None:
     measured["worst"] = 1.25
     result = fhash("selftest", "--group", "times", "--quiet")
     assert result.exit_code == 1
@@ -56,13 +63,13 @@ def test_a_failure_is_listed_and_exits_with_1(fhash, measured):
     assert result.stderr == ""
 
 
-def test_json_holds_every_figure(fhash, measured):
+def test_json_holds_every_figure(fhash: Callable[..., Result], measured: dict[str, float]) -> None:
     result = fhash("selftest", "--case", "spike", "--case", "twos", "--json")
-    found = json.loads(result.stdout)
+    printed = json.loads(result.stdout)
     assert result.exit_code == 0
-    assert found["holds"] is True
-    assert [case["name"] for case in found["cases"]] == ["twos", "spike"]
-    assert found["cases"][0]["findings"][0] == {
+    assert printed["holds"] is True
+    assert [case["name"] for case in printed["cases"]] == ["twos", "spike"]
+    assert printed["cases"][0]["findings"][0] == {
         "name": "bound",
         "worst": 0.5,
         "limit": 1.0,
@@ -72,7 +79,7 @@ def test_json_holds_every_figure(fhash, measured):
     }
 
 
-def test_all_runs_more(fhash, measured):
+def test_all_runs_more(fhash: Callable[..., Result], measured: dict[str, float]) -> None:
     assert fhash("selftest", "--quiet").exit_code == 0
     few = measured["cases"]
     assert not measured["everything"]
@@ -82,7 +89,9 @@ def test_all_runs_more(fhash, measured):
     assert measured["processes"] == 3
 
 
-def test_the_report_is_written_once(fhash, measured, tmp_path: Path):
+def test_the_report_is_written_once(
+    fhash: Callable[..., Result], measured: dict[str, float], tmp_path: Path
+) -> None:
     path = tmp_path / "stability.md"
     assert fhash("selftest", "--case", "spike", "--report", path, "--quiet").exit_code == 0
     assert (
@@ -110,5 +119,7 @@ def test_the_report_is_written_once(fhash, measured, tmp_path: Path):
         (("--processes", "0"), "0 is not in the range"),
     ],
 )
-def test_what_cannot_be_is_refused(refused, words, message):
+def test_what_cannot_be_is_refused(
+    refused: Callable[..., str], words: tuple[str, ...], message: str
+) -> None:
     assert message in refused(2, "selftest", *words)

@@ -5,7 +5,6 @@ from math import prod
 import numpy as np
 import pytest
 
-from fhash_codec.coreset.boxes import bounding_box, box_size, crop, fuse
 from fhash_codec.coreset.bricks import brick_shape, build_coreset
 from fhash_codec.coreset.features import Everything, Interval, Isosurface, Segmentation, dilate
 from fhash_codec.coreset.occupancy import unpack
@@ -19,7 +18,7 @@ SHAPES = [(1, 1, 1), (1, 20, 33), (9, 1, 40), (17, 18, 1), (11, 13, 19), (2, 70,
 
 
 def unpack_frame(coreset, key):
-    """The samples of one key frame back in the box: float32 (z, y, x), normalised, NaN where there is none."""
+    """The samples of a key frame, put back into the box: float32 (z, y, x), NaN elsewhere."""
     shape, grid = coreset.brick_shape, coreset.brick_grid
     first, last = np.searchsorted(coreset.bricks[:, 0], [key, key + 1])
     mask = np.unpackbits(coreset.mask_bits[first:last], axis=1, count=prod(shape)).view(np.bool_)
@@ -28,11 +27,11 @@ def unpack_frame(coreset, key):
     tiles = np.full((*grid, *shape), np.nan, dtype=np.float32)
     _, z, y, x = coreset.bricks[first:last].T
     tiles[z, y, x] = held.reshape(-1, *shape)
-    whole = tiles.transpose(0, 3, 1, 4, 2, 5).reshape(
+    frame = tiles.transpose(0, 3, 1, 4, 2, 5).reshape(
         [count * step for count, step in zip(grid, shape, strict=True)]
     )
-    z_size, y_size, x_size = box_size(coreset.box)
-    return whole[:z_size, :y_size, :x_size]
+    z_size, y_size, x_size = coreset.box.shape
+    return frame[:z_size, :y_size, :x_size]
 
 
 def smooth(steps, shape, dtype=np.float32, low=0.0, span=1.0):
@@ -52,7 +51,7 @@ def build(array, features=EVERYTHING, keys=None, dilation=1, **kwargs):
     return build_coreset(series, seen, keys, features, dilation, silent, **kwargs), seen
 
 
-def check_against_direct_crop(array, features, keys, dilation, **kwargs):
+def check_against_direct_crop(array, features, keys, dilation, **kwargs) -> None:
     coreset, seen = build(array, features, keys, dilation, **kwargs)
     selected = [
         np.any([feature.select(array[step], step) for feature in features], axis=0) for step in keys
@@ -67,9 +66,9 @@ def check_against_direct_crop(array, features, keys, dilation, **kwargs):
     )
     for key, (step, mask) in enumerate(zip(keys, masks, strict=True)):
         expected = np.where(mask, seen.value_range.to_unit(array[step]), np.float32(np.nan))
-        np.testing.assert_array_equal(unpack_frame(coreset, key), crop(expected, coreset.box))
+        np.testing.assert_array_equal(unpack_frame(coreset, key), expected[coreset.box.slices()])
         np.testing.assert_array_equal(
-            unpack(coreset.occupancy[key], box_size(coreset.box)), crop(mask, coreset.box)
+            unpack(coreset.occupancy[key], coreset.box.shape), mask[coreset.box.slices()]
         )
     assert coreset.fraction == pytest.approx(np.mean(masks))
     left = [
@@ -84,7 +83,7 @@ def check_against_direct_crop(array, features, keys, dilation, **kwargs):
     return coreset
 
 
-def check_structure(coreset):
+def check_structure(coreset) -> None:
     vertices = prod(coreset.brick_shape)
     counts = np.unpackbits(coreset.mask_bits, axis=1)[:, :vertices].sum(axis=1)
     assert (counts > 0).all()
@@ -100,8 +99,7 @@ def check_structure(coreset):
     order = np.ravel_multi_index(coreset.bricks.T, (len(coreset.key_frames), *coreset.brick_grid))
     assert (np.diff(order) > 0).all()
     grid = tuple(
-        -(-size // step)
-        for size, step in zip(box_size(coreset.box), coreset.brick_shape, strict=True)
+        -(-size // step) for size, step in zip(coreset.box.shape, coreset.brick_shape, strict=True)
     )
     assert coreset.brick_grid == grid
 
@@ -114,13 +112,13 @@ def check_structure(coreset):
     ids=["all", "interval", "two"],
 )
 @pytest.mark.parametrize("dilation", [0, 1, 2])
-def test_bricks_hold_the_direct_crop(shape, features, dilation):
+def test_bricks_hold_the_direct_crop(shape, features, dilation) -> None:
     array = smooth(4, shape)
     check_against_direct_crop(array, features, (0, 2, 3), dilation)
 
 
 @pytest.mark.parametrize("brick", [(1, 1, 1), (4, 2, 8), (16, 16, 16), (3, 5, 7)])
-def test_any_brick_shape_holds_the_same(brick):
+def test_any_brick_shape_holds_the_same(brick) -> None:
     coreset = check_against_direct_crop(
         smooth(2, (11, 13, 19)), (Interval(0.3, 0.8),), (0, 1), 1, brick=brick
     )
@@ -136,13 +134,13 @@ def test_any_brick_shape_holds_the_same(brick):
         (np.float64, -1.7e308, 1.7e308),
     ],
 )
-def test_number_types_and_narrow_ranges(dtype, low, span):
+def test_number_types_and_narrow_ranges(dtype, low, span) -> None:
     array = smooth(2, (5, 6, 7), dtype, low, span)
     feature = Segmentation(float(low) + 0.5 * span)
     check_against_direct_crop(array, (feature,), (0, 1), 1)
 
 
-def test_missing_values_are_neither_samples_nor_background():
+def test_missing_values_are_neither_samples_nor_background() -> None:
     array = smooth(4, (5, 9, 20))
     array[:, :, :3], array[1, 2, 4, 10], array[2] = np.nan, np.inf, np.nan
     coreset = check_against_direct_crop(array, (Interval(0.2, 2.0),), (0, 1, 2, 3), 1)
@@ -151,7 +149,7 @@ def test_missing_values_are_neither_samples_nor_background():
     assert np.isfinite(coreset.background)
 
 
-def test_a_key_frame_without_the_feature_is_fine_and_none_at_all_is_not():
+def test_a_key_frame_without_the_feature_is_fine_and_none_at_all_is_not() -> None:
     array = np.zeros((3, 4, 5, 6))
     array[1, 2, 2, 2] = 1.0
     coreset = check_against_direct_crop(array, (Interval(0.5, 1.0),), (0, 1, 2), 1)
@@ -164,7 +162,7 @@ def test_a_key_frame_without_the_feature_is_fine_and_none_at_all_is_not():
         build(array, (Interval(2.0, 3.0), Isosurface(9.0)))
 
 
-def test_a_coreset_of_everything_has_the_mean_of_all_as_background():
+def test_a_coreset_of_everything_has_the_mean_of_all_as_background() -> None:
     coreset, seen = build(smooth(2, (4, 5, 6)), keys=(0,))
     assert (coreset.fraction, coreset.background) == (1.0, seen.mean)
     assert coreset.box == ((0, 4), (0, 5), (0, 6))
@@ -186,11 +184,11 @@ def test_a_coreset_of_everything_has_the_mean_of_all_as_background():
         ((25, 125, 125), (7, 8, 16)),
     ],
 )
-def test_thin_axes_hand_their_factors_to_the_others(size, expected):
+def test_thin_axes_hand_their_factors_to_the_others(size, expected) -> None:
     assert brick_shape(size) == expected
 
 
-def test_default_bricks_have_at_most_1024_vertices_and_few_beyond_the_box():
+def test_default_bricks_have_at_most_1024_vertices_and_few_beyond_the_box() -> None:
     for size in np.random.default_rng(0).integers(1, 60, size=(300, 3)).tolist():
         brick = brick_shape(size)
         counts = [-(-length // edge) for edge, length in zip(brick, size, strict=True)]
@@ -202,20 +200,7 @@ def test_default_bricks_have_at_most_1024_vertices_and_few_beyond_the_box():
         assert prod(brick) >= 200 or prod(counts) < 40
 
 
-def test_boxes_are_the_smallest_and_their_fusion_holds_all():
-    mask = np.zeros((5, 6, 7), bool)
-    assert bounding_box(mask) is None
-    assert fuse([None, None]) is None
-    mask[1, 2, 3] = mask[4, 2, 6] = True
-    assert bounding_box(mask) == ((1, 5), (2, 3), (3, 7))
-    assert fuse([((1, 5), (2, 3), (3, 7)), None, ((0, 2), (4, 6), (3, 4))]) == (
-        (0, 5),
-        (2, 6),
-        (3, 7),
-    )
-
-
-def test_progress_has_two_stages():
+def test_progress_has_two_stages() -> None:
     calls = []
     series = ArraySeries(smooth(3, (2, 2, 2)))
     build_coreset(
@@ -234,6 +219,6 @@ def test_progress_has_two_stages():
     ]
 
 
-def test_a_feature_that_selects_nothing_beside_others_is_warned_of():
+def test_a_feature_that_selects_nothing_beside_others_is_warned_of() -> None:
     with pytest.warns(FhashWarning, match="feature isosurface:99 selects nothing; the others do"):
         build(smooth(2, (5, 6, 7)), (Interval(0.2, 2.0), Isosurface(99.0)), (0, 1), 1)

@@ -40,7 +40,7 @@ def random_frame(shape, dtype=np.float32, seed=0):
         ("mask:a:b/c.h5", Mask("a:b/c.h5")),
     ],
 )
-def test_text_and_feature_name_each_other(text, feature):
+def test_text_and_feature_name_each_other(text, feature) -> None:
     assert parse_feature(text) == feature
     assert str(feature) == text
     assert parse_feature(str(feature)) == feature
@@ -67,7 +67,7 @@ def test_text_and_feature_name_each_other(text, feature):
         ("segmentation:x", "malformed"),
     ],
 )
-def test_malformed_text_is_refused_in_one_line(text, message):
+def test_malformed_text_is_refused_in_one_line(text, message) -> None:
     with pytest.raises(InputError, match=message) as caught:
         parse_feature(text)
     assert "\n" not in str(caught.value)
@@ -88,14 +88,14 @@ def brute_force_isosurface(frame, value):
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int16, np.uint8])
 @pytest.mark.parametrize("value", [5.0, 3.3, -1.0])
-def test_isosurface_takes_both_ends_of_every_crossed_edge(shape, dtype, value):
+def test_isosurface_takes_both_ends_of_every_crossed_edge(shape, dtype, value) -> None:
     frame = random_frame(shape, dtype)
     np.testing.assert_array_equal(
         Isosurface(value).select(frame, 0), brute_force_isosurface(frame, value)
     )
 
 
-def test_isosurface_does_not_cross_to_a_missing_neighbour():
+def test_isosurface_does_not_cross_to_a_missing_neighbour() -> None:
     frame = np.array([[[0, np.inf, 0, np.nan, 0, 2]]])
     np.testing.assert_array_equal(
         Isosurface(1.0).select(frame, 0)[0, 0], [False, False, False, False, True, True]
@@ -114,12 +114,12 @@ def test_isosurface_does_not_cross_to_a_missing_neighbour():
     ],
     ids=str,
 )
-def test_missing_vertices_are_never_selected(feature, dtype):
+def test_missing_vertices_are_never_selected(feature, dtype) -> None:
     frame = np.array([[[np.nan, np.inf, -np.inf, 1.0]]], dtype=dtype)
     np.testing.assert_array_equal(feature.select(frame, 0)[0, 0], [False, False, False, True])
 
 
-def test_the_ends_of_an_interval_belong_to_it_and_a_threshold_does_not():
+def test_the_ends_of_an_interval_belong_to_it_and_a_threshold_does_not() -> None:
     frame = np.array([[[0.1, 0.2, 0.3, 0.4]]], dtype=np.float32)
     np.testing.assert_array_equal(
         Interval(0.2, 0.3).select(frame, 0)[0, 0], [False, True, True, False]
@@ -136,16 +136,16 @@ def test_the_ends_of_an_interval_belong_to_it_and_a_threshold_does_not():
     )
 
 
-def test_selecting_leaves_the_frame_and_the_mask_alone():
-    frame, marked = random_frame((3, 3, 3)), np.zeros((3, 3, 3), bool)
+def test_selecting_leaves_the_frame_and_the_mask_alone() -> None:
+    frame, mask = random_frame((3, 3, 3)), np.zeros((3, 3, 3), bool)
     before = frame.copy()
-    for feature in (Mask("m", lambda step: marked), Everything()):
+    for feature in (Mask("m", lambda step: mask), Everything()):
         feature.select(frame, 0)[:] = True
     np.testing.assert_array_equal(frame, before)
-    assert not marked.any()
+    assert not mask.any()
 
 
-def test_features_that_are_not_ready_say_so():
+def test_features_that_are_not_ready_say_so() -> None:
     frame = np.zeros((1, 1, 1))
     for feature in (Segmentation(), Mask("m")):
         with pytest.raises(InputError, match="resolve_features"):
@@ -164,14 +164,14 @@ def brute_force_dilation(mask, vertices):
 @pytest.mark.parametrize("shape", [*SHAPES, (9, 2, 20)])
 @pytest.mark.parametrize("vertices", [0, 1, 2, 3, 5, 64])
 @pytest.mark.parametrize("density", [0.0, 0.02, 0.3])
-def test_dilation_is_the_26_neighbourhood_without_wrap_around(shape, vertices, density):
+def test_dilation_is_the_26_neighbourhood_without_wrap_around(shape, vertices, density) -> None:
     mask = np.random.default_rng(vertices).random(shape) < density
     before = mask.copy()
     np.testing.assert_array_equal(dilate(mask, vertices), brute_force_dilation(mask, vertices))
     np.testing.assert_array_equal(mask, before)
 
 
-def test_dilation_is_extensive_monotone_additive_and_idempotent_on_the_whole():
+def test_dilation_is_extensive_monotone_additive_and_idempotent_on_the_whole() -> None:
     rng = np.random.default_rng(3)
     a = rng.random((6, 7, 8)) < 0.03
     b = a | (rng.random((6, 7, 8)) < 0.03)
@@ -200,14 +200,14 @@ def brute_force_otsu(counts, edges):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_otsu_against_every_split(seed):
+def test_otsu_against_every_split(seed) -> None:
     rng = np.random.default_rng(seed)
     counts = rng.integers(0, 30, size=12) * (rng.random(12) < 0.7)
     edges = np.linspace(-3, 5, 13)
     assert otsu_threshold(counts, edges) == pytest.approx(brute_force_otsu(counts, edges))
 
 
-def test_otsu_splits_two_values_in_the_middle_of_the_gap():
+def test_otsu_splits_two_values_in_the_middle_of_the_gap() -> None:
     counts = np.zeros(1024)
     counts[0], counts[-1] = 900, 100
     assert otsu_threshold(counts, np.linspace(0, 1, 1025)) == pytest.approx(0.5, abs=2e-3)
@@ -221,23 +221,23 @@ class CountedSeries(ArraySeries):
         return super().read(step)
 
 
-def test_resolving_reads_the_key_frames_once_and_only_for_otsu():
+def test_resolving_reads_the_key_frames_once_and_only_for_otsu() -> None:
     array = np.zeros((4, 3, 4, 5), np.float32)
     array[..., 2:] = 100.0
     array[0, 0, 0, 0] = np.nan
     array[1] = -1e3  # not a key frame, must not count
     series = CountedSeries(array)
     texts = ["segmentation", "segmentation:3", "all", "segmentation"]
-    found = resolve_features(texts, series, (0, 2, 3), ValueRange(-1e3, 100.0), silent)
+    features = resolve_features(texts, series, (0, 2, 3), ValueRange(-1e3, 100.0), silent)
     assert series.reads == 3
-    assert found[0] == found[3]
-    assert 0 < found[0].threshold < 100
-    assert found[1:3] == (Segmentation(3.0), Everything())
+    assert features[0] == features[3]
+    assert 0 < features[0].threshold < 100
+    assert features[1:3] == (Segmentation(3.0), Everything())
     resolve_features(["all", "isosurface:3"], series, (0, 2, 3), ValueRange(0.0, 1.0), silent)
     assert series.reads == 3
 
 
-def test_masks_are_opened_with_the_shape_of_the_series():
+def test_masks_are_opened_with_the_shape_of_the_series() -> None:
     asked = []
 
     def open_mask(path, shape):

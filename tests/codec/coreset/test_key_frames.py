@@ -8,12 +8,12 @@ import pytest
 from fhash_codec.coreset.key_frames import (
     KeyTimes,
     gram_matrix,
-    lattice_stride,
     optimal_steps,
     segment_costs,
     select_key_frames,
     strictly_monotonic,
     time_axis,
+    vertex_stride,
 )
 from fhash_codec.progress import silent
 from fhash_formats.errors import InputError, RegionError
@@ -64,7 +64,7 @@ def interpolation_error(array, times, keys):
         ("auto:2", 6, (0, 5)),
     ],
 )
-def test_what_a_spec_names(spec, steps, expected):
+def test_what_a_spec_names(spec, steps, expected) -> None:
     assert pick(spec, series_of(steps)) == expected
 
 
@@ -86,7 +86,7 @@ def test_what_a_spec_names(spec, steps, expected):
         ("1,1", "ascend without repeats"),
     ],
 )
-def test_what_a_spec_may_not_be(spec, message):
+def test_what_a_spec_may_not_be(spec, message) -> None:
     with pytest.raises(InputError, match=message) as caught:
         pick(spec, series_of(5))
     assert "\n" not in str(caught.value)
@@ -96,7 +96,7 @@ def test_what_a_spec_may_not_be(spec, message):
 @pytest.mark.parametrize(
     "times", [np.arange(8.0), UNEVEN, -UNEVEN, UNEVEN * 1e-300, UNEVEN * 1e300, 1e9 + UNEVEN]
 )
-def test_auto_is_the_best_of_all_subsets(count, times):
+def test_auto_is_the_best_of_all_subsets(count, times) -> None:
     series = series_of(8, seed=count)
     chosen = pick(f"auto:{count}", series, times)
     subsets = [(0, *inner, 7) for inner in itertools.combinations(range(1, 7), count - 2)]
@@ -107,12 +107,12 @@ def test_auto_is_the_best_of_all_subsets(count, times):
 
 @pytest.mark.parametrize("scale", [1.0, 1e-200, 1e200])
 @pytest.mark.parametrize("offset", [0.0, 1e6])
-def test_auto_does_not_depend_on_scale_or_offset(scale, offset):
+def test_auto_does_not_depend_on_scale_or_offset(scale, offset) -> None:
     series = series_of(9, seed=4)
     assert pick("auto:4", ArraySeries((series.values + offset) * scale)) == pick("auto:4", series)
 
 
-def test_auto_finds_the_kinks_of_a_piecewise_linear_series():
+def test_auto_finds_the_kinks_of_a_piecewise_linear_series() -> None:
     times = np.array([0.0, 1, 3, 4, 7, 8, 9, 12])
     a, b = np.random.default_rng(0).random((2, 3, 4, 5))
     array = np.stack([a * np.interp(t, [0, 4, 9, 12], [0, 1, -1, 3]) + b for t in times])
@@ -120,7 +120,7 @@ def test_auto_finds_the_kinks_of_a_piecewise_linear_series():
     assert pick("auto:4", ArraySeries(array[::-1]), times[::-1]) == (0, 1, 4, 7)
 
 
-def test_auto_bears_missing_values_and_integers():
+def test_auto_bears_missing_values_and_integers() -> None:
     array = np.random.default_rng(0).integers(0, 100, (6, 2, 3, 4))
     assert len(pick("auto:3", ArraySeries(array.astype(np.uint8)))) == 3
     holed = array.astype(np.float32)
@@ -129,12 +129,12 @@ def test_auto_bears_missing_values_and_integers():
     assert pick("auto:2", ArraySeries(np.full((3, 1, 1, 2), np.nan))) == (0, 2)
 
 
-def test_auto_needs_times_that_go_one_way():
+def test_auto_needs_times_that_go_one_way() -> None:
     with pytest.raises(InputError, match="step numbers"):
         pick("auto:2", series_of(4), np.array([0.0, 1, 1, 2]))
 
 
-def test_costs_of_segments_are_the_definition():
+def test_costs_of_segments_are_the_definition() -> None:
     series = series_of(8, seed=7)
     frames = list(series.values.reshape(8, -1))
     unit = np.stack(frames) * 2.0 ** -np.frexp(np.abs(frames).max())[1]
@@ -150,8 +150,8 @@ def test_costs_of_segments_are_the_definition():
     ("shape", "limit", "stride"),
     [((4, 4, 4), 64, 1), ((4, 4, 4), 63, 2), ((1, 1, 1000), 100, 10), ((64,) * 3, 2**16, 2)],
 )
-def test_the_lattice_is_the_finest_that_fits(shape, limit, stride):
-    assert lattice_stride(shape, limit) == stride
+def test_the_lattice_is_the_finest_that_fits(shape, limit, stride) -> None:
+    assert vertex_stride(shape, limit) == stride
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_the_lattice_is_the_finest_that_fits(shape, limit, stride):
         ([np.inf, np.inf], False),
     ],
 )
-def test_strictly_monotonic(times, expected):
+def test_strictly_monotonic(times, expected) -> None:
     times = np.array(times, dtype=float)
     assert strictly_monotonic(times) is expected
     np.testing.assert_array_equal(time_axis(times), times if expected else np.arange(times.size))
@@ -178,7 +178,7 @@ def test_strictly_monotonic(times, expected):
     ids=["up", "down", "back", "late"],
 )
 @pytest.mark.parametrize("key_frames", [(0, 7), (0, 2, 3, 7), (1, 4, 5), tuple(range(8)), (3,)])
-def test_key_index_is_whole_at_key_frames_and_linear_in_time_between(times, key_frames):
+def test_key_index_is_whole_at_key_frames_and_linear_in_time_between(times, key_frames) -> None:
     keys = KeyTimes(times=times, key_frames=key_frames)
     assert [keys.key_index(step) for step in key_frames] == list(range(len(key_frames)))
     steps = np.linspace(0, 7, 141)
@@ -194,7 +194,7 @@ def test_key_index_is_whole_at_key_frames_and_linear_in_time_between(times, key_
             )
 
 
-def test_steps_beyond_the_end_keys_clamp_and_a_single_key_is_everywhere():
+def test_steps_beyond_the_end_keys_clamp_and_a_single_key_is_everywhere() -> None:
     keys = KeyTimes(times=UNEVEN, key_frames=(2, 5))
     assert [keys.key_index(step) for step in (0, 1.5, 2, 5, 6.5, 7)] == [0, 0, 0, 1, 1, 1]
     assert [KeyTimes(times=UNEVEN, key_frames=(4,)).key_index(step) for step in (0, 3.3, 7)] == [
@@ -206,7 +206,7 @@ def test_steps_beyond_the_end_keys_clamp_and_a_single_key_is_everywhere():
 
 
 @pytest.mark.parametrize("times", [UNEVEN, UNEVEN[::-1].copy(), -UNEVEN])
-def test_step_of_time_inverts_the_times(times):
+def test_step_of_time_inverts_the_times(times) -> None:
     keys = KeyTimes(times=times, key_frames=(0, 7))
     assert [keys.step_of_time(time) for time in times] == list(range(8))
     assert keys.step_of_time((times[2] + times[3]) / 2) == pytest.approx(2.5)
@@ -224,7 +224,9 @@ CLOSE = {
 
 @pytest.mark.parametrize("times", CLOSE.values(), ids=CLOSE)
 @pytest.mark.parametrize("sign", [1, -1])
-def test_between_steps_the_key_index_is_even_however_close_or_far_the_times_are(times, sign):
+def test_between_steps_the_key_index_is_even_however_close_or_far_the_times_are(
+    times, sign
+) -> None:
     every = KeyTimes(times=sign * times, key_frames=(0, 1, 2, 3))
     steps = np.linspace(0, 3, 25)
     np.testing.assert_array_equal(every.key_indices(steps), steps)
@@ -234,13 +236,13 @@ def test_between_steps_the_key_index_is_even_however_close_or_far_the_times_are(
     assert (np.diff(few.key_indices(steps)) >= 0).all()
 
 
-def test_times_whose_difference_overflows_have_a_middle():
+def test_times_whose_difference_overflows_have_a_middle() -> None:
     ends = KeyTimes(times=1.7e308 * np.array([-1.0, 0.0, 1.0]), key_frames=(0, 2))
     assert ends.key_index(1) == 0.5
     assert KeyTimes(times=1.7e308 * np.array([-1.0, 1.0]), key_frames=(0, 1)).step_of_time(0) == 0.5
 
 
-def test_what_lies_outside_is_refused():
+def test_what_lies_outside_is_refused() -> None:
     keys = KeyTimes(times=UNEVEN[::-1].copy(), key_frames=(0, 7))
     for time in (-0.1, 10.5, np.nan, np.inf):
         with pytest.raises(RegionError, match=r"outside 0\.\.10"):

@@ -13,8 +13,9 @@ from fhash_codec.coreset.occupancy import (
 )
 
 SHAPES = [
-    (1, 1, 1), (1, 1, 2), (2, 1, 1), (1, 2, 1), (1, 1, 3), (1, 1, 9), (9, 1, 1), (1, 9, 1), (2, 2, 2), (1, 2, 5), (3, 1, 2), (2, 3, 5),
-    (7, 11, 13), (1, 17, 4), (17, 1, 3), (5, 64, 2), (8, 8, 16), (1, 1, 100), (31, 2, 1), (4, 33, 16),
+    (1, 1, 1), (1, 1, 2), (2, 1, 1), (1, 2, 1), (1, 1, 3), (1, 1, 9), (9, 1, 1), (1, 9, 1),
+    (2, 2, 2), (1, 2, 5), (3, 1, 2), (2, 3, 5), (7, 11, 13), (1, 17, 4), (17, 1, 3), (5, 64, 2),
+    (8, 8, 16), (1, 1, 100), (31, 2, 1), (4, 33, 16),
 ]  # fmt: skip
 
 
@@ -41,7 +42,7 @@ def random_mask(shape, seed=0):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_bits_lie_where_the_definition_says(shape):
+def test_bits_lie_where_the_definition_says(shape) -> None:
     mask, vertices = random_mask(shape), np.indices(shape)
     index = morton_index(*vertices, shape)
     assert index.ravel().tolist() == [
@@ -53,7 +54,7 @@ def test_bits_lie_where_the_definition_says(shape):
 
 
 @pytest.mark.parametrize("shape", [*SHAPES, (25, 125, 125)])
-def test_unpack_inverts_pack_and_the_index_is_injective(shape):
+def test_unpack_inverts_pack_and_the_index_is_injective(shape) -> None:
     mask = random_mask(shape, 1)
     bits = pack(mask)
     assert (bits.dtype, bits.shape) == (np.uint8, (packed_bytes(shape),))
@@ -62,23 +63,23 @@ def test_unpack_inverts_pack_and_the_index_is_injective(shape):
     assert np.unpackbits(bits).sum() == mask.sum()
 
 
-def test_pack_takes_views():
-    whole = random_mask((6, 9, 12))
-    view = whole[1:6, 2:9:2, ::-1]
+def test_pack_takes_views() -> None:
+    mask = random_mask((6, 9, 12))
+    view = mask[1:6, 2:9:2, ::-1]
     np.testing.assert_array_equal(pack(view), pack(np.ascontiguousarray(view)))
 
 
-def test_thin_boxes_do_not_pay_for_the_thick_ones():
+def test_thin_boxes_do_not_pay_for_the_thick_ones() -> None:
     assert packed_bytes((25, 125, 125)) == 65_536
     assert packed_bytes((1, 1, 1)) == 1
     assert packed_bytes((1, 1024, 1024)) == 131_072
 
 
-def test_bit_order_goes_x_y_z_and_passes_over_an_axis_that_has_run_out():
+def test_bit_order_goes_x_y_z_and_passes_over_an_axis_that_has_run_out() -> None:
     assert bit_order((2, 4, 16)) == [(2, 0), (1, 0), (0, 0), (2, 1), (1, 1), (2, 2), (2, 3)]
 
 
-def test_between_key_frames_either_occupies():
+def test_between_key_frames_either_occupies() -> None:
     a, b = random_mask((5, 6, 7), 1), random_mask((5, 6, 7), 2)
     np.testing.assert_array_equal(unpack(between(pack(a), pack(b)), (5, 6, 7)), a | b)
     np.testing.assert_array_equal(between(pack(a), pack(a)), pack(a))

@@ -12,7 +12,7 @@ from fhash_formats.series import ArraySeries
 @pytest.mark.parametrize(
     "dtype", [np.uint8, np.int32, np.uint64, np.float16, np.float32, np.float64]
 )
-def test_range_and_mean_are_numpys(dtype):
+def test_range_and_mean_are_numpys(dtype) -> None:
     array = (np.random.default_rng(0).random((3, 4, 5, 6)) * 100).astype(dtype)
     seen = scan(ArraySeries(array), silent)
     assert (seen.value_range.low, seen.value_range.high) == (array.min(), array.max())
@@ -21,7 +21,7 @@ def test_range_and_mean_are_numpys(dtype):
     assert seen.finite(0, (4, 5, 6)) is None
 
 
-def test_missing_values_are_left_out_and_known_by_step():
+def test_missing_values_are_left_out_and_known_by_step() -> None:
     array = np.random.default_rng(1).random((5, 3, 4, 5)).astype(np.float32)
     array[1, 0, 0, 0], array[1, 2, 3, 4], array[3, 1, 1] = np.nan, np.inf, -np.inf
     seen = scan(ArraySeries(array), silent)
@@ -38,7 +38,7 @@ def test_missing_values_are_left_out_and_known_by_step():
         np.testing.assert_array_equal(finite[step], True if mask is None else mask)
 
 
-def test_a_mask_that_stays_is_kept_once():
+def test_a_mask_that_stays_is_kept_once() -> None:
     array = np.zeros((4, 2, 3, 3))
     array[:, 0] = np.nan
     array[3, 1] = np.nan
@@ -51,18 +51,18 @@ def test_a_mask_that_stays_is_kept_once():
 @pytest.mark.parametrize(
     ("low", "high"), [(1e8, 1e8 + 1e-3), (-1.7e308, 1.7e308), (5e-324, 1e-322)]
 )
-def test_extreme_ranges_are_exact(low, high):
+def test_extreme_ranges_are_exact(low, high) -> None:
     seen = scan(ArraySeries(np.array([low, high, low, high]).reshape(2, 1, 1, 2)), silent)
     assert (seen.value_range.low, seen.value_range.high) == (low, high)
     assert low <= seen.mean <= high
 
 
-def test_no_finite_value_at_all_is_refused():
+def test_no_finite_value_at_all_is_refused() -> None:
     with pytest.raises(InputError, match="no finite value"):
         scan(ArraySeries(np.full((2, 2, 2, 2), np.nan)), silent)
 
 
-def test_progress_counts_the_steps():
+def test_progress_counts_the_steps() -> None:
     calls = []
     scan(ArraySeries(np.zeros((3, 1, 1, 1))), lambda *call: calls.append(call))
     assert calls == [("scanning", 1, 3, ""), ("scanning", 2, 3, ""), ("scanning", 3, 3, "")]

@@ -1,4 +1,4 @@
-"""The comparison picture: colours are exact at their control points, and every vertex is where it belongs."""
+"""The comparison picture: exact colours at control points, and every vertex in its place."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ def added(errors, original, decoded, mask=None):
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int16, np.uint64])
 @pytest.mark.parametrize("masked", [False, True])
-def test_errors_are_those_of_plain_numpy(dtype, masked):
+def test_errors_are_those_of_plain_numpy(dtype, masked) -> None:
     rng = np.random.default_rng(1)
     original = (rng.random((3, 4, 5, 6)) * 1000).astype(dtype)
     decoded = original.astype(np.float64) + rng.standard_normal(original.shape)
@@ -38,26 +38,26 @@ def test_errors_are_those_of_plain_numpy(dtype, masked):
     assert errors.max_abs_error == pytest.approx(np.abs(difference).max(), rel=1e-12)
     assert errors.psnr == pytest.approx(20 * math.log10(1000 / errors.rmse), rel=1e-12)
     for step, figures in enumerate(errors.steps):
-        one = (decoded - original.astype(np.float64))[step][mask[step]]
+        errors_of_step = (decoded - original.astype(np.float64))[step][mask[step]]
         assert figures.step == step
-        assert figures.rmse == pytest.approx(math.sqrt(np.mean(one**2)), rel=1e-12)
-        assert figures.max_abs_error == pytest.approx(np.abs(one).max(), rel=1e-12)
+        assert figures.rmse == pytest.approx(math.sqrt(np.mean(errors_of_step**2)), rel=1e-12)
+        assert figures.max_abs_error == pytest.approx(np.abs(errors_of_step).max(), rel=1e-12)
 
 
-def test_values_that_are_not_finite_do_not_count():
+def test_values_that_are_not_finite_do_not_count() -> None:
     original, decoded = frames()
     original[0, 0, 0, :3] = np.nan, np.inf, -np.inf
     decoded[0, 0, 0, 0] = np.nan
     errors = added(Errors(1.0), original, decoded)
-    known = np.isfinite(original)
-    assert errors.count == known.sum() == original.size - 3
+    finite = np.isfinite(original)
+    assert errors.count == finite.sum() == original.size - 3
     assert errors.rmse == pytest.approx(
-        math.sqrt(np.mean((original - decoded)[known] ** 2)), rel=1e-12
+        math.sqrt(np.mean((original - decoded)[finite] ** 2)), rel=1e-12
     )
 
 
 @pytest.mark.parametrize("factor", [2.0**-1040, 2.0**-900, 2.0**900, 2.0**1023])
-def test_figures_scale_with_the_data_however_huge_or_tiny(factor):
+def test_figures_scale_with_the_data_however_huge_or_tiny(factor) -> None:
     original, decoded = frames()
     plain = added(Errors(1.0), original, decoded)
     scaled = added(Errors(factor), original * factor, decoded * factor)
@@ -67,7 +67,7 @@ def test_figures_scale_with_the_data_however_huge_or_tiny(factor):
     assert scaled.max_abs_error == pytest.approx(plain.max_abs_error * factor, rel=1e-6, abs=0)
 
 
-def test_the_psnr_of_denormals_does_not_come_from_their_rounding():
+def test_the_psnr_of_denormals_does_not_come_from_their_rounding() -> None:
     original = 5e-324 * np.arange(1000.0).reshape(1, 10, 100)
     decoded = original.copy()
     decoded[0, 0, :7] += 5e-324
@@ -78,7 +78,7 @@ def test_the_psnr_of_denormals_does_not_come_from_their_rounding():
     assert errors.steps[0].psnr == errors.psnr
 
 
-def test_a_range_that_overflows_leaves_only_psnr_unknown():
+def test_a_range_that_overflows_leaves_only_psnr_unknown() -> None:
     original = np.array([-1.7e308, 1.7e308, 0.0]).reshape(1, 1, 3)
     errors = Errors(math.inf)
     errors.add(0, original, original + np.array([1e300, 0, -1e300]))
@@ -90,16 +90,16 @@ def test_a_range_that_overflows_leaves_only_psnr_unknown():
 @pytest.mark.parametrize(
     ("data_range", "rmse"), [(0.0, 1.0), (1.0, 0.0), (1.0, None), (math.inf, 1.0)]
 )
-def test_psnr_is_none_where_it_has_no_finite_value(data_range, rmse):
+def test_psnr_is_none_where_it_has_no_finite_value(data_range, rmse) -> None:
     assert psnr(data_range, rmse) is None
 
 
-def test_psnr_of_extreme_ratios():
+def test_psnr_of_extreme_ratios() -> None:
     assert psnr(1e308, 1e-308) == pytest.approx(20 * 616)
     assert psnr(10.0, 1.0) == pytest.approx(20.0)
 
 
-def test_a_frame_of_which_nothing_counts_has_no_figures():
+def test_a_frame_of_which_nothing_counts_has_no_figures() -> None:
     original, decoded = frames(1)
     errors = Errors(1.0)
     figures = errors.add(4, original[0], decoded[0], np.zeros(original[0].shape, bool))
@@ -112,7 +112,7 @@ def test_a_frame_of_which_nothing_counts_has_no_figures():
     assert (errors.count, errors.psnr, errors.rmse, errors.max_abs_error) == (0, None, None, None)
 
 
-def test_wrong_frames_are_refused():
+def test_wrong_frames_are_refused() -> None:
     original, decoded = frames(1)
     with pytest.raises(InputError, match="one shape"):
         Errors(1.0).add(0, original[0], decoded[0, 1:])
@@ -125,7 +125,7 @@ def test_wrong_frames_are_refused():
         Errors(1.0).add(7, original[0], decoded[0])
 
 
-def test_quality_measures_the_coreset_and_the_domain():
+def test_quality_measures_the_coreset_and_the_domain() -> None:
     original, decoded = frames(4, (12, 13, 14), dtype=np.float32)
     outside = np.random.default_rng(3).random(original.shape) < 0.4
     outside[2] = True
@@ -135,14 +135,14 @@ def test_quality_measures_the_coreset_and_the_domain():
     quality = measure_quality(
         original.__getitem__, decoded.__getitem__, 4, 1.0, 0.5, lambda *call: calls.append(call)
     )
-    known = np.isfinite(original)
-    inside = known & ~outside
+    finite = np.isfinite(original)
+    inside = finite & ~outside
     filled = np.where(outside, np.float32(0.5), decoded)
     assert quality.rmse == pytest.approx(
         math.sqrt(np.mean((original - decoded)[inside].astype(float) ** 2)), rel=1e-5
     )
     assert quality.rmse_domain == pytest.approx(
-        math.sqrt(np.mean((original - filled)[known].astype(float) ** 2)), rel=1e-5
+        math.sqrt(np.mean((original - filled)[finite].astype(float) ** 2)), rel=1e-5
     )
     assert quality.psnr == pytest.approx(-20 * math.log10(quality.rmse))
     assert quality.psnr_domain == pytest.approx(-20 * math.log10(quality.rmse_domain))
@@ -150,7 +150,7 @@ def test_quality_measures_the_coreset_and_the_domain():
         np.abs(original - decoded)[inside].max(), rel=1e-5
     )
     assert quality.max_abs_error_domain == pytest.approx(
-        np.abs(original - filled)[known].max(), rel=1e-5
+        np.abs(original - filled)[finite].max(), rel=1e-5
     )
     assert 0.9 < quality.ssim < 1
     assert quality.ssim_window == {
@@ -179,14 +179,14 @@ def test_quality_measures_the_coreset_and_the_domain():
 
 
 @pytest.mark.parametrize(("data_range", "value"), [(0.0, 3.0), (math.inf, 1e308)])
-def test_quality_of_a_constant_or_overflowing_series_is_valid_json(data_range, value):
+def test_quality_of_a_constant_or_overflowing_series_is_valid_json(data_range, value) -> None:
     frame = np.full((3, 3, 3), value)
     quality = measure_quality(lambda _: frame, lambda _: frame, 2, data_range, 0.0)
     assert (quality.psnr, quality.rmse, quality.ssim) == (None, 0.0, None)
     json.dumps(quality.to_dict(), allow_nan=False)
 
 
-def test_quality_of_nothing_kept():
+def test_quality_of_nothing_kept() -> None:
     original, _ = frames(2)
     quality = measure_quality(
         original.__getitem__, lambda step: np.full_like(original[step], np.nan), 2, 1.0, 0.5
@@ -201,7 +201,7 @@ def test_quality_of_nothing_kept():
 
 
 @pytest.mark.parametrize("held", [1, 8])
-def test_steps_are_counted_in_order_whatever_is_held(monkeypatch, held):
+def test_steps_are_counted_in_order_whatever_is_held(monkeypatch, held) -> None:
     monkeypatch.setattr("fhash_codec.measure.metrics.FRAMES_HELD", held)
     original, decoded = frames(9)
     calls = []

@@ -11,8 +11,7 @@ import pytest
 from skimage import metrics
 
 from fhash_codec import native
-from fhash_codec.measure.metrics import ssim, ssim_steps
-from fhash_codec.paper import network
+from fhash_codec.measure.ssim import ssim, ssim_steps
 from fhash_formats.errors import InputError
 
 SHAPES = [
@@ -56,7 +55,7 @@ def similarity(a, b, data_range):
 
 @pytest.mark.parametrize("shape", [(11, 11, 11), (12, 64, 70), (25, 40, 33), (1, 60, 70)], ids=str)
 @pytest.mark.parametrize("offset", [0.0, 300.0])
-def test_agrees_with_scikit_image(shape, offset):
+def test_agrees_with_scikit_image(shape, offset) -> None:
     original, decoded = (field + offset for field in pair(shape))
     expected = metrics.structural_similarity(
         original.squeeze(),
@@ -71,7 +70,7 @@ def test_agrees_with_scikit_image(shape, offset):
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_only_long_axes_lose_their_margin(shape):
+def test_only_long_axes_lose_their_margin(shape) -> None:
     original, decoded = pair(shape)
     inner = tuple(slice(5, -5) if size >= 11 else slice(None) for size in shape)
     expected = similarity(original, decoded, 1.0)[inner]
@@ -81,7 +80,7 @@ def test_only_long_axes_lose_their_margin(shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_a_mask_counts_its_vertices_and_hides_the_rest(shape):
+def test_a_mask_counts_its_vertices_and_hides_the_rest(shape) -> None:
     original, decoded = pair(shape)
     mask = np.random.default_rng(4).random(shape) < 0.4
     mask.flat[0] = False
@@ -92,7 +91,7 @@ def test_a_mask_counts_its_vertices_and_hides_the_rest(shape):
     assert total == pytest.approx(expected.sum(), rel=1e-9, abs=1e-12)
 
 
-def test_a_mask_of_everything_is_no_mask():
+def test_a_mask_of_everything_is_no_mask() -> None:
     original, decoded = pair((12, 20, 13))
     assert ssim(original, decoded, 1.0, np.ones(original.shape, bool)) == ssim(
         original, decoded, 1.0
@@ -100,7 +99,7 @@ def test_a_mask_of_everything_is_no_mask():
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_vertices_that_are_not_finite_do_not_count(masked):
+def test_vertices_that_are_not_finite_do_not_count(masked) -> None:
     original, decoded = pair((6, 7, 40))
     bad = np.random.default_rng(5).random(original.shape) < 0.1
     mask = (
@@ -122,39 +121,39 @@ def test_vertices_that_are_not_finite_do_not_count(masked):
     assert total == pytest.approx(similarity(one, other, 1.0)[counts].sum(), rel=1e-9)
 
 
-def test_the_same_frame_is_similar_to_itself():
+def test_the_same_frame_is_similar_to_itself() -> None:
     original, _ = pair((13, 14, 15))
     total, count = ssim(original, original, 1.0)
     assert total == pytest.approx(count, rel=1e-12)
 
 
 @pytest.mark.parametrize("factor", [2.0**-1000, 2.0**1000])
-def test_no_scale_of_the_data_changes_it(factor):
+def test_no_scale_of_the_data_changes_it(factor) -> None:
     original, decoded = pair((12, 13, 14))
     total, count = ssim(original * factor, decoded * factor, factor)
     assert (total, count) == (pytest.approx(ssim(original, decoded, 1.0)[0], rel=1e-9), count)
 
 
-def test_number_types_and_threads_do_not_matter(monkeypatch):
+def test_number_types_and_threads_do_not_matter(monkeypatch) -> None:
     original, decoded = (np.rint(100 * field) for field in pair((34, 70, 40)))
     expected = ssim(original, decoded, 100.0, threads=1)
-    monkeypatch.setattr(network, "ITEMS_PER_THREAD", 1)
+    monkeypatch.setattr("fhash_formats.support.threads.ITEMS_PER_THREAD", 1)
     assert ssim(original, decoded, 100.0, threads=4) == expected
     assert ssim(original.astype(np.int16), decoded.astype(np.float32), 100.0) == expected
 
 
 @pytest.mark.parametrize("data_range", [0.0, math.inf])
-def test_a_range_without_meaning_has_no_ssim(data_range):
+def test_a_range_without_meaning_has_no_ssim(data_range) -> None:
     assert ssim(*pair((5, 5, 5)), data_range) == (0.0, 0)
 
 
-def test_frames_without_a_vertex_that_counts():
+def test_frames_without_a_vertex_that_counts() -> None:
     original, decoded = pair((5, 6, 7))
     assert ssim(original, decoded, 1.0, np.zeros(original.shape, bool)) == (0.0, 0)
     assert ssim(np.full_like(original, np.nan), decoded, 1.0) == (0.0, 0)
 
 
-def test_wrong_frames_are_refused():
+def test_wrong_frames_are_refused() -> None:
     original, decoded = pair((5, 6, 7))
     with pytest.raises(InputError, match="one shape"):
         ssim(original, decoded[1:], 1.0)
@@ -168,7 +167,9 @@ def test_wrong_frames_are_refused():
 @pytest.mark.parametrize("steps", [1, 2, 3, 7, 48, 1000])
 @pytest.mark.parametrize("vertices", [1, 1000, 2**20])
 @pytest.mark.parametrize("budget", [1, 2**21, 2**25])
-def test_measured_steps_are_even_within_budget_and_include_the_ends(steps, vertices, budget):
+def test_measured_steps_are_even_within_budget_and_include_the_ends(
+    steps, vertices, budget
+) -> None:
     chosen = ssim_steps(steps, vertices, budget)
     assert len(chosen) == max(1, min(steps, budget // vertices))
     assert len(chosen) == 1 or (chosen[0], chosen[-1]) == (0, steps - 1)
@@ -181,7 +182,7 @@ def test_measured_steps_are_even_within_budget_and_include_the_ends(steps, verti
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint8])
 @pytest.mark.parametrize("shape", [*SHAPES, (70, 40, 70)], ids=str)
 @pytest.mark.parametrize("holes", [False, True])
-def test_native_and_numpy_agree(monkeypatch, shape, dtype, holes):
+def test_native_and_numpy_agree(monkeypatch, shape, dtype, holes) -> None:
     original, decoded = ((field * 200 + 20).astype(dtype) for field in pair(shape))
     decoded = decoded.astype(np.float32 if dtype != np.float64 else np.float64)
     mask = np.random.default_rng(3).random(shape) < 0.8 if holes else None
@@ -196,7 +197,7 @@ def test_native_and_numpy_agree(monkeypatch, shape, dtype, holes):
 
 
 @pytest.mark.parametrize("choice", ["1", "0"])
-def test_a_decoded_value_that_is_not_finite_is_refused(monkeypatch, choice):
+def test_a_decoded_value_that_is_not_finite_is_refused(monkeypatch, choice) -> None:
     monkeypatch.setenv("FHASH_NATIVE", choice)
     original, decoded = pair((12, 13, 14))
     decoded[6, 6, 6] = np.inf
@@ -207,7 +208,7 @@ def test_a_decoded_value_that_is_not_finite_is_refused(monkeypatch, choice):
 MEMORY = """
 import resource
 import numpy as np
-from fhash_codec.ssim import _Frames
+from fhash_codec.measure.ssim import _Frames
 frame = np.zeros((16, 1200, 1200), np.float32)
 frame[3] = 1
 frames = _Frames(frame, frame, 1.0, None)
@@ -225,7 +226,7 @@ except MemoryError as error:
     sys.platform != "linux" or native.library() is None,
     reason="needs the native library and Linux's limits on memory",
 )
-def test_no_memory_for_a_tile_is_said_and_ends_no_process():
+def test_no_memory_for_a_tile_is_said_and_ends_no_process() -> None:
     done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "no memory to compare" in done.stdout

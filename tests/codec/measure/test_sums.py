@@ -28,7 +28,7 @@ def pair(size, dtype, *, missing=False):
 @pytest.mark.parametrize("missing", [False, True])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("size", SIZES)
-def test_range_and_sum_are_those_of_numpy(size, dtype, missing):
+def test_range_and_sum_are_those_of_numpy(size, dtype, missing) -> None:
     values, _ = pair(size, dtype, missing=missing)
     finite = values[np.isfinite(values)].astype(np.float64)
     count, low, high, total = range_and_sum(values, 0.5)
@@ -38,7 +38,7 @@ def test_range_and_sum_are_those_of_numpy(size, dtype, missing):
 
 
 @pytest.mark.parametrize("library", ["1", "0"])
-def test_zeros_have_no_sign_and_sums_may_be_infinite(monkeypatch, library):
+def test_zeros_have_no_sign_and_sums_may_be_infinite(monkeypatch, library) -> None:
     monkeypatch.setenv("FHASH_NATIVE", library)
     for values in ([0.0, -0.0], [-0.0, 0.0], [-0.0]):
         _, low, high, _ = range_and_sum(np.array(values))
@@ -62,7 +62,7 @@ def test_zeros_have_no_sign_and_sums_may_be_infinite(monkeypatch, library):
     ids=str,
 )
 @pytest.mark.parametrize("size", SIZES)
-def test_errors_are_those_of_numpy(size, dtypes, masked):
+def test_errors_are_those_of_numpy(size, dtypes, masked) -> None:
     original, decoded = (
         part.astype(dtype) for part, dtype in zip(pair(size, np.float64), dtypes, strict=True)
     )
@@ -78,7 +78,7 @@ def test_errors_are_those_of_numpy(size, dtypes, masked):
 @pytest.mark.parametrize("missing", [False, True])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("size", SIZES)
-def test_native_and_numpy_agree_bit_for_bit(monkeypatch, size, dtype, missing):
+def test_native_and_numpy_agree_bit_for_bit(monkeypatch, size, dtype, missing) -> None:
     original, decoded = pair(size, dtype, missing=missing)
     mask = np.random.default_rng(2).random(size) < 0.7
     found = []
@@ -100,7 +100,7 @@ def test_native_and_numpy_agree_bit_for_bit(monkeypatch, size, dtype, missing):
 
 @pytest.mark.parametrize("choice", ["1", "0"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_is_told(monkeypatch, choice, value):
+def test_what_is_not_finite_is_told(monkeypatch, choice, value) -> None:
     monkeypatch.setenv("FHASH_NATIVE", choice)
     original, decoded = pair(20_000, np.float32)
     decoded[-3] = value
@@ -112,7 +112,7 @@ def test_what_is_not_finite_is_told(monkeypatch, choice, value):
     assert squared_errors(original, decoded, None, 1.0)[0] == 19_999
 
 
-def test_arrays_need_not_be_contiguous():
+def test_arrays_need_not_be_contiguous() -> None:
     original, decoded = (part.reshape(10, 20, 25) for part in pair(5000, np.float32))
     mask = original > 0
     assert squared_errors(

@@ -7,15 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fhash_codec.measure.value_range import (
-    PIECE,
-    Mean,
-    ValueRange,
-    pieces,
-    position_index,
-    power_of_two,
-    unit_position,
-)
+from fhash_codec.measure.value_range import PIECE, Mean, ValueRange, pieces, power_of_two
 from fhash_formats.errors import InputError
 
 RANGES = [
@@ -33,10 +25,10 @@ RANGES = [
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
-def check_round_trip(values, low, high):
-    whole = ValueRange(low, high)
-    unit = whole.to_unit(values)
-    back = whole.from_unit(unit)
+def check_round_trip(values, low, high) -> None:
+    value_range = ValueRange(low, high)
+    unit = value_range.to_unit(values)
+    back = value_range.from_unit(unit)
     assert unit.dtype == np.float32
     assert back.dtype == np.float64
     assert ((unit >= 0) & (unit <= 1)).all()
@@ -47,72 +39,63 @@ def check_round_trip(values, low, high):
 
 
 @pytest.mark.parametrize(("low", "high"), RANGES)
-def test_error_law_and_exact_ends(low, high):
+def test_error_law_and_exact_ends(low, high) -> None:
     fractions = np.linspace(0, 1, 1001)
     values = np.clip(low * (1 - fractions) + high * fractions, low, high)
     check_round_trip(values, low, high)
-    whole = ValueRange(low, high)
-    np.testing.assert_array_equal(whole.to_unit([low, high]), [0, 1])
-    assert whole.from_unit(0.0) == low
-    assert (np.diff(whole.to_unit(np.sort(values))) >= 0).all()
+    value_range = ValueRange(low, high)
+    np.testing.assert_array_equal(value_range.to_unit([low, high]), [0, 1])
+    assert value_range.from_unit(0.0) == low
+    assert (np.diff(value_range.to_unit(np.sort(values))) >= 0).all()
 
 
 @given(st.lists(finite, min_size=1, max_size=20))
-def test_error_law_for_any_values(numbers):
+def test_error_law_for_any_values(numbers) -> None:
     check_round_trip(np.array(numbers), min(numbers), max(numbers))
 
 
 @pytest.mark.parametrize("level", [0.0, -3.5, 1.7e308, 5e-324])
-def test_a_constant_range_gives_zero_and_comes_back_exactly(level):
-    whole = ValueRange(level, level)
+def test_a_constant_range_gives_zero_and_comes_back_exactly(level) -> None:
+    value_range = ValueRange(level, level)
     np.testing.assert_array_equal(
-        whole.to_unit(np.full((2, 3), level)), np.zeros((2, 3), np.float32)
+        value_range.to_unit(np.full((2, 3), level)), np.zeros((2, 3), np.float32)
     )
-    np.testing.assert_array_equal(whole.from_unit([0.0, 0.3, 1.0]), [level] * 3)
+    np.testing.assert_array_equal(value_range.from_unit([0.0, 0.3, 1.0]), [level] * 3)
 
 
-def test_missing_values_become_nan_and_stay_so():
-    whole = ValueRange(-1.0, 1.0)
-    unit = whole.to_unit([np.nan, np.inf, -np.inf, 0.0, 7.0, -7.0])
+def test_missing_values_become_nan_and_stay_so() -> None:
+    value_range = ValueRange(-1.0, 1.0)
+    unit = value_range.to_unit([np.nan, np.inf, -np.inf, 0.0, 7.0, -7.0])
     np.testing.assert_array_equal(
         unit, np.array([np.nan, np.nan, np.nan, 0.5, 1.0, 0.0], np.float32)
     )
     np.testing.assert_array_equal(
-        whole.from_unit([np.nan, 0.5, 1.5, -0.5]), [np.nan, 0.0, 1.0, -1.0]
+        value_range.from_unit([np.nan, 0.5, 1.5, -0.5]), [np.nan, 0.0, 1.0, -1.0]
     )
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int64, np.uint64, np.float16, np.float32])
-def test_every_number_type(dtype):
+def test_every_number_type(dtype) -> None:
     values = np.array([[0, 1], [50, 100]], dtype=dtype)
     np.testing.assert_allclose(
         ValueRange(0.0, 100.0).to_unit(values), [[0, 0.01], [0.5, 1]], rtol=1e-7
     )
 
 
-def test_pieces_do_not_change_the_result():
+def test_pieces_do_not_change_the_result() -> None:
     values = np.linspace(0, 1, 2 * PIECE + 5)
     assert [part.size for part in pieces(values)] == [PIECE, PIECE, 5]
     np.testing.assert_array_equal(ValueRange(0.0, 1.0).to_unit(values), values.astype(np.float32))
 
 
 @pytest.mark.parametrize(("low", "high"), [(1.0, 0.0), (np.nan, 1.0), (0.0, np.inf)])
-def test_a_pair_that_is_no_range_is_refused(low, high):
+def test_a_pair_that_is_no_range_is_refused(low, high) -> None:
     with pytest.raises(InputError, match="lower first"):
         ValueRange(low, high)
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 17, 200])
-def test_positions_run_from_minus_one_to_one_and_back(size):
-    index = np.arange(size)
-    position = unit_position(index, size)
-    assert (position[0], position[-1]) == ((-1, 1) if size > 1 else (0, 0))
-    np.testing.assert_allclose(position, -position[::-1], atol=1e-15)
-    np.testing.assert_allclose(position_index(position, size), index, atol=1e-13)
-
-
 @given(st.floats(min_value=0, allow_infinity=False, allow_nan=False))
-def test_power_of_two_is_exact_and_its_reciprocal_is_too(peak):
+def test_power_of_two_is_exact_and_its_reciprocal_is_too(peak) -> None:
     scale = power_of_two(peak)
     assert scale * (1 / scale) == 1
     assert peak * scale / scale == peak
@@ -128,7 +111,7 @@ def test_power_of_two_is_exact_and_its_reciprocal_is_too(peak):
         ([[], [3]], 3.0),
     ],
 )
-def test_mean_neither_overflows_nor_drifts(parts, mean):
+def test_mean_neither_overflows_nor_drifts(parts, mean) -> None:
     total = Mean()
     for part in parts:
         total.add(np.array(part))

@@ -1,20 +1,25 @@
-"""Tables as stored numbers: what does not fit in their type is refused, and nothing becomes an infinity on the way."""
+"""Tables in a file: numbers that do not fit are refused, and coded components mean the same."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from math import prod
 
 import numpy as np
 import pytest
 
-from fhash_codec.coreset.boxes import box_size
+import fhash_codec
+from fhash_codec import EncodeConfig
 from fhash_codec.coreset.bricks import Coreset, build_coreset
 from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.scan import scan
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.storage import StoredTable, write_tables
+from fhash_codec.paper.storage import StoredTable, mix_components, table_chunk, write_tables
 from fhash_codec.progress import silent
-from fhash_formats.errors import InputError
+from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import ArraySeries
 
 
@@ -36,8 +41,8 @@ class Stored:
 
 
 def written(coreset: Coreset, kind: str, values: list[float]) -> np.ndarray:
-    """The coarsest table, as it is read back, of a model whose every level holds `values` and else 0."""
-    architecture = Architecture.for_box(box_size(coreset.box), 2, embedding_size=1)
+    """The coarsest table as it is read back, of a model with `values` first in every level."""
+    architecture = Architecture.for_box(coreset.box.shape, 2, embedding_size=1)
     fine = np.zeros((len(coreset.bricks), 1, prod(coreset.brick_shape)), np.float32)
     tables = [np.zeros((prod(level), 1), np.float32) for level in architecture.levels[1:]]
     for table in (fine, *tables):
@@ -49,18 +54,18 @@ def written(coreset: Coreset, kind: str, values: list[float]) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["float32", "float16", "uint8"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_not_finite_are_refused(coreset, kind, value):
+def test_numbers_that_are_not_finite_are_refused(coreset, kind, value) -> None:
     with pytest.raises(InputError, match="not finite"):
         written(coreset, kind, [0.5, value])
 
 
 @pytest.mark.parametrize("value", [65505.0, -65536.0, 1e9])
-def test_what_half_precision_does_not_hold_is_refused(coreset, value):
+def test_what_half_precision_does_not_hold_is_refused(coreset, value) -> None:
     with pytest.raises(InputError, match=r"more than float16 holds; use --tables float32"):
         written(coreset, "float16", [value])
 
 
-def test_a_range_that_eight_bits_cannot_give_back_is_refused(coreset):
+def test_a_range_that_eight_bits_cannot_give_back_is_refused(coreset) -> None:
     with pytest.raises(InputError, match=r"more than uint8 holds; use --tables float32"):
         written(coreset, "uint8", [-3e38, 3e38])
 
@@ -78,9 +83,102 @@ def test_a_range_that_eight_bits_cannot_give_back_is_refused(coreset):
         ("uint8", [0.0], 0.0),
     ],
 )
-def test_what_fits_comes_back_within_the_step_of_its_type(coreset, kind, values, within):
+def test_what_fits_comes_back_within_the_step_of_its_type(coreset, kind, values, within) -> None:
     back = written(coreset, kind, values).astype(np.float64)
     assert np.all(np.isfinite(back))
     exact = np.zeros(len(back), np.float32)
     exact[: len(values)] = values
     assert np.abs(back - exact.astype(np.float64)).max() <= within
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 1, 1, 2), (2, 300, 200, 100, 2), (9, 1, 1, 10**7, 4)])
+def test_chunks_are_one_time_node_of_bounded_size(shape) -> None:
+    chunk = table_chunk(shape, 4)
+    assert (chunk[0], chunk[-1]) == (1, shape[-1])
+    assert prod(chunk) * 4 <= 2 << 20
+    assert all(1 <= n <= length for n, length in zip(chunk, shape, strict=True))
+
+
+def decoded(path) -> np.ndarray:
+    with fhash_codec.open(path) as volume:
+        return volume[...]
+
+
+def rewritten(path, target, mixing) -> None:
+    """Write the same arrays, not coded, with other attributes of a component of level 1."""
+    with Container.open(path) as container, ContainerWriter(target) as writer:
+        for name, array in container.arrays.items():
+            attributes = mixing if name == "tables/level_1/component_2" else dict(array.attributes)
+            writer.add_whole(name, array.read(), attributes=attributes)
+        writer.commit(container.header)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A small file with coded tables of two components."""
+    path = tmp_path_factory.mktemp("small") / "a.fhz"
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 4, 5, 6)), indexing="ij")
+    field = (100 * (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z)).astype(np.float32)
+    config = EncodeConfig(profile="paper", epochs=2, width=16, tables="transform")
+    fhash_codec.encode(field, path, config)
+    return path
+
+
+def test_coded_or_not_the_components_mean_the_same(tmp_path, small) -> None:
+    with Container.open(small) as container:
+        mixing = dict(container.arrays["tables/level_1/component_2"].attributes)
+    rewritten(small, tmp_path / "a.fhz", mixing)
+    np.testing.assert_array_equal(decoded(tmp_path / "a.fhz"), decoded(small))
+
+
+@pytest.mark.parametrize(
+    "mixing",
+    [{}, {"mixing": 1.0}, {"mixing": [1.0]}, {"mixing": [1.0, "2"]}, {"mixing": [1.0, 2.0, 3.0]}],
+    ids=str,
+)
+def test_a_mixing_of_other_numbers_is_refused(tmp_path, small, mixing) -> None:
+    with pytest.raises(InputError, match="array tables/level_1/component_2 attribute mixing"):
+        rewritten(small, tmp_path / "a.fhz", mixing)
+
+
+def test_a_mixing_beyond_float32_is_damage(tmp_path, small) -> None:
+    rewritten(small, tmp_path / "a.fhz", {"mixing": [1e308, 0.0]})
+    with (
+        fhash_codec.open(tmp_path / "a.fhz") as volume,
+        pytest.raises(DamagedFileError, match="not finite"),
+    ):
+        volume.read(0)
+
+
+def test_mixing_adds_the_components_from_the_first_on() -> None:
+    random = np.random.default_rng(0)
+    components, mixing = (
+        [random.random((3, 4), dtype=np.float32) for _ in range(3)],
+        random.random((3, 3), dtype=np.float32),
+    )
+    expected = np.stack(
+        [(components[0] * m[0] + components[1] * m[1]) + components[2] * m[2] for m in mixing.T],
+        axis=-1,
+    )
+    np.testing.assert_array_equal(mix_components(components, mixing), expected)
+    assert mix_components(components, mixing).dtype == np.float32
+
+
+def test_coded_tables_are_read_alike_without_torch_and_without_native_code(tmp_path, small) -> None:
+    code = (
+        "import sys, numpy, fhash_codec\n"
+        "from fhash_formats import native\n"
+        "assert native.library() is None\n"
+        "with fhash_codec.open(sys.argv[1]) as volume:\n"
+        "    table = volume._model.network.tables[0]\n"
+        "    region = tuple(slice(0, n) for n in table.shape)\n"
+        "    numpy.savez(sys.argv[2], table.read(region), volume.read(1))\n"
+        "assert 'torch' not in sys.modules\n"
+    )
+    command = [sys.executable, "-c", code, str(small), str(tmp_path / "a.npz")]
+    subprocess.run(command, env={**os.environ, "FHASH_NATIVE": "0"}, check=True)
+    with np.load(tmp_path / "a.npz") as arrays, fhash_codec.open(small) as volume:
+        table = volume._model.network.tables[0]
+        region = tuple(slice(0, n) for n in table.shape)
+        np.testing.assert_array_equal(arrays["arr_0"], table.read(region))
+        np.testing.assert_array_equal(arrays["arr_1"], volume.read(1))

@@ -1,4 +1,4 @@
-"""A small series as a compact file, as one of a feature, and as a network's, for pictures."""
+"""A small series as a file, of all of it, of a feature and of a network, for pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, FhashWarning, Renderer, Volume, native
+from fhash_codec import EncodeConfig, FhashWarning, Renderer, Scene, Volume, native
+from fhash_codec.rendering.picture.image import Image
+from fhash_codec.rendering.task.arrays import Arrays
 
 SHAPE = (3, 20, 24, 28)
 
@@ -25,7 +27,7 @@ def blobs() -> np.ndarray:
 
 @pytest.fixture(params=["native", "portable"])
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Each way to compute: by the native library, and without it."""
+    """Both ways to compute: with the native library, and without it."""
     if request.param == "portable":
         monkeypatch.setenv("FHASH_NATIVE", "0")
     elif native.library() is None:
@@ -33,30 +35,79 @@ def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     return str(request.param)
 
 
+CONFIGS = {
+    "compact": EncodeConfig(effort=1),
+    "feature": EncodeConfig(effort=1, features=("interval:3:99",), dilation=0),
+    "paper": EncodeConfig(profile="paper", features=("interval:3:99",), epochs=15, width=16),
+}
+
+
+class Files(dict[str, Path]):
+    """Paths by kind of CONFIGS; a file is encoded when it is first asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder = folder
+
+    def __missing__(self, kind: str) -> Path:
+        path = self.folder / f"{kind}.fhz"
+        with warnings.catch_warnings():
+            # Coding without the native core gives a warning, since it is slow; this is little.
+            warnings.simplefilter("ignore", FhashWarning)
+            fhash_codec.encode(blobs(), path, CONFIGS[kind])
+        self[kind] = path
+        return path
+
+
 @pytest.fixture(scope="session")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Paths by kind: compact, feature, paper."""
-    folder = tmp_path_factory.mktemp("pictures")
-    configs = {
-        "compact": EncodeConfig(effort=1),
-        "feature": EncodeConfig(effort=1, features=("interval:3:99",), dilation=0),
-        "paper": EncodeConfig(profile="paper", features=("interval:3:99",), epochs=15, width=16),
-    }
-    with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", FhashWarning
-        )  # coding without the native core is slow, and here so little that it is not
-        for name, config in configs.items():
-            fhash_codec.encode(blobs(), folder / f"{name}.fhz", config)
-    return {name: folder / f"{name}.fhz" for name in configs}
+    return Files(tmp_path_factory.mktemp("pictures"))
 
 
 @pytest.fixture
 def volume(files: dict[str, Path]) -> Iterator[Volume]:
-    with fhash_codec.open(files["compact"]) as found:
-        yield found
+    """The compact file, opened."""
+    with fhash_codec.open(files["compact"]) as opened:
+        yield opened
 
 
 @pytest.fixture
 def renderer(volume: Volume) -> Renderer:
+    """A renderer of the compact file."""
     return Renderer(volume)
+
+
+@pytest.fixture
+def tensors() -> Arrays:
+    """torch's arrays on the processor: what marches on CUDA marches here too."""
+    import torch
+
+    from fhash_codec.rendering.task.torch_arrays import TorchArrays
+
+    return TorchArrays(torch.device("cpu"))
+
+
+class Drawing:
+    """Draws flat pictures that tell step, camera and size, and notes what it was asked for."""
+
+    def __init__(self) -> None:
+        self.scenes: list[Scene] = []
+        self.upcoming: list[Scene | None] = []
+
+    def __call__(self, scene: Scene, *, upcoming: Scene | None = None) -> Image:
+        self.scenes.append(scene)
+        self.upcoming.append(upcoming)
+        width, height = scene.size
+        rgba = np.ones((height, width, 4), dtype=np.float32)
+        rgba[..., 0] = (scene.step or 0) / 10
+        rgba[..., 1] = scene.camera.azimuth % 360 / 360
+        return Image(
+            rgba=rgba, counters={"rays": width * height}, scene=scene.to_dict(), seconds=0.5
+        )
+
+
+@pytest.fixture
+def drawing() -> type[Drawing]:
+    """The class that stands for a renderer."""
+    return Drawing

@@ -1,9 +1,7 @@
-"""Pictures of whole files: the function, what a renderer keeps, the counters."""
+"""Renderers: pictures of files, the frames that are kept, and the counters."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ import pytest
 import fhash_codec
 from fhash_codec import Renderer, Scene, Volume, native
 from fhash_codec.rendering import renderer as module
-from fhash_codec.rendering.scene.png_text import scene_in_png
+from fhash_codec.rendering.scene.scene import scene_in_png
 from fhash_codec.rendering.task.counters import COUNTERS, complete, rows
 from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import DamagedFileError, InputError
@@ -27,54 +25,30 @@ def scene(**parts: Any) -> Scene:
     return Scene.from_dict({**SMALL, **parts})
 
 
-def test_the_package_is_the_function(volume: Volume) -> None:
-    image = fhash_codec.rendering(volume, scene())
-    assert image.rgba.shape == (32, 40, 4)
-    assert image.rgba[..., 3].max() > 0.1
-    assert image.source == volume.path.name
-    assert image.seconds > 0
-    assert image._repr_png_().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "import fhash_codec; f = fhash_codec.rendering",
-        "import fhash_codec.rendering.scene.scene; f = fhash_codec.rendering",
-        "import fhash_codec.rendering.renderer; f = fhash_codec.rendering",
-        "from fhash_codec import render as f; import fhash_codec.rendering.scene.scene as s; s.Scene()",
-        "from fhash_codec import *; f = render; from fhash_codec.rendering.scene.scene import Scene",
-    ],
-)
-def test_the_package_is_the_function_whatever_was_imported_before(statement: str) -> None:
-    subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            f"{statement}; assert callable(f); import fhash_codec; assert fhash_codec.rendering is f",
-        ],
-        check=True,
-    )
-
-
 def test_a_picture_is_what_its_file_says(volume: Volume, tmp_path: Path) -> None:
-    wanted = scene(effects={"box": True, "colour_bar": True}, step=1)
-    image = fhash_codec.rendering(volume, wanted)
+    shown = scene(effects={"box": True, "colour_bar": True}, step=1)
+    image = fhash_codec.render(volume, shown)
     image.save(tmp_path / "view.png")
-    assert scene_in_png(tmp_path / "view.png") == wanted
-    again = fhash_codec.rendering(volume, scene_in_png(tmp_path / "view.png"))
+    assert scene_in_png(tmp_path / "view.png") == shown
+    again = fhash_codec.render(volume, scene_in_png(tmp_path / "view.png"))
     np.testing.assert_array_equal(again.rgba, image.rgba)
 
 
-def test_what_was_decoded_is_kept(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    decoded: list[float] = []
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The steps that renderers decode, in order."""
+    steps: list[float] = []
     original = module.decoded_frame
 
-    def counted(volume: Volume, step: float, *others: Any) -> Any:
-        decoded.append(step)
+    def noted(volume: Volume, step: float, *others: Any) -> Any:
+        steps.append(step)
         return original(volume, step, *others)
 
-    monkeypatch.setattr(module, "decoded_frame", counted)
+    monkeypatch.setattr(module, "decoded_frame", noted)
+    return steps
+
+
+def test_what_was_decoded_is_kept(renderer: Renderer, decoded: list[float]) -> None:
     first = renderer.render(scene())
     renderer.render(scene(camera={"azimuth": 40}))
     renderer.render(scene(step=2))
@@ -94,13 +68,13 @@ def test_what_comes_next_is_decoded_beside(volume: Volume, monkeypatch: pytest.M
     monkeypatch.setattr(module, "decoded_frame", counted)
     renderer, alone = Renderer(volume), Renderer(volume)
     shown = [scene(step=step) for step in (0, 1, 2)]
-    for each, following in zip(shown, [*shown[1:], None], strict=True):
+    for current, following in zip(shown, [*shown[1:], None], strict=True):
         np.testing.assert_array_equal(
-            renderer.render(each, upcoming=following).rgba, alone.render(each).rgba
+            renderer.render(current, upcoming=following).rgba, alone.render(current).rgba
         )
     assert [entry for entry in decoded if not entry[1]] == [(1, False), (2, False)]
     assert sorted(entry[0] for entry in decoded) == [0, 0, 1, 1, 2, 2]
-    # What nobody came for, what cannot be planned and what is not decoded at all do no harm.
+    # Prefetched frames that are not needed, and scenes without a plan or a frame, do no harm.
     renderer.render(shown[0], upcoming=scene(step=0.5))
     assert renderer.render(scene(step=1.5)).rgba.any()
     renderer.render(shown[0], upcoming=scene(step=99))
@@ -128,33 +102,35 @@ def test_a_failure_beside_is_that_of_its_own_picture(
         renderer.render(scene(step=1))
 
 
-def test_what_does_not_fit_is_not_kept(volume: Volume) -> None:
+def test_what_does_not_fit_is_not_kept(volume: Volume, decoded: list[float]) -> None:
     frame = int(np.prod(volume.shape[1:])) * 4
     small = Renderer(volume, memory=frame + 10)
-    for step in (0, 1, 2):
+    for step in (0, 1, 1, 2, 1):
         small.render(scene(step=step))
-    assert [key[0] for key in small._decoded] == [2]
+    assert decoded == [0, 1, 2, 1]
+    decoded.clear()
     none = Renderer(volume, memory=10)
-    assert none.render(scene()).rgba[..., 3].any()
-    assert not none._decoded
+    for _ in range(2):
+        assert none.render(scene()).rgba[..., 3].any()
+    assert decoded == [0, 0]
 
 
 def test_a_part_of_the_volume_makes_the_picture_of_all(volume: Volume) -> None:
     volume.chunks = (1, 4, 4, 4)
     close = scene(camera={"zoom": 6, "projection": "parallel", "view": "xy"})
     renderer = Renderer(volume)
-    frame = renderer._frame(renderer.plan(close), lambda *_: None).frame
-    assert frame.values.size < np.prod(volume.shape[1:])
-    part = renderer.render(close)
+    region = renderer.plan(close).region
+    assert np.prod([high - low for low, high in region]) < np.prod(volume.shape[1:])
+    cropped = renderer.render(close)
     full = Renderer(volume)
     full.render(scene())
-    np.testing.assert_allclose(full.render(close).rgba, part.rgba, atol=1e-5)
+    np.testing.assert_allclose(full.render(close).rgba, cropped.rgba, atol=1e-5)
 
 
 def test_nothing_in_the_picture_is_an_empty_picture(volume: Volume) -> None:
     away = scene(camera={"position": [100, 100, 100], "focal_point": [200, 200, 200]})
     for mode in ("cache", "arm"):
-        image = fhash_codec.rendering(
+        image = fhash_codec.render(
             volume, scene(camera=away.camera.to_dict(), march={"mode": mode})
         )
         assert not image.rgba.any()
@@ -176,7 +152,7 @@ def test_what_lies_outside_the_coreset_is_not_seen(files: dict[str, Path]) -> No
         frame = module.decoded_frame(volume, 0.0, 0, ((0, 20), (0, 24), (0, 28)), Units())
         assert np.isnan(frame.values).any()
         assert frame.first == tuple(low for low, _ in volume.box)
-        image = fhash_codec.rendering(volume, scene(transfer_function={"opacity": "opaque"}))
+        image = fhash_codec.render(volume, scene(transfer_function={"opacity": "opaque"}))
         assert 0 < (image.rgba[..., 3] > 0.5).mean() < 0.5
 
 

@@ -1,8 +1,13 @@
-"""A small valid container, and files made from it that are wrong in one way."""
+"""A small valid container, and the means to make files from it that are wrong in one way.
+
+Tests of this folder import the modules beside them; pytest's importlib mode puts no folder of
+tests on the path.
+"""
 
 from __future__ import annotations
 
 import struct
+import sys
 import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -12,8 +17,12 @@ import numpy as np
 import pytest
 
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.header import layer_shapes, occupancy_bytes
+from fhash_formats.container.expected_arrays import layer_shapes, occupancy_bytes
 from fhash_formats.container.layout import END, Member, comment, ending, local_header
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from sharded_files import random_values, write_sharded
 
 Parts = list[tuple[str, bytes]]
 """Name and data of each member."""
@@ -163,7 +172,7 @@ def _end(data: bytes) -> tuple[int, int, int]:
 
 
 class Samples:
-    """What the tests of this folder share."""
+    """Helpers that the tests of this folder share."""
 
     header = staticmethod(make_header)
     compact_header = staticmethod(make_compact_header)
@@ -187,3 +196,10 @@ def sample(tmp_path: Path) -> Path:
     header = make_header()
     write(path, header, make_arrays(header))
     return path
+
+
+@pytest.fixture
+def sharded_file(tmp_path: Path, samples: type[Samples]) -> tuple[Path, np.ndarray]:
+    """Two shards of 2 x 2 inner chunks of 2 x 3, of which the last is cut; file and values."""
+    values = random_values((7, 6))
+    return write_sharded(tmp_path / "a.fhz", samples, values, (2, 3), (4, 6)), values

@@ -1,35 +1,44 @@
-"""Chunks to bytes and back, and the one place where another codec is added."""
+"""Chunks to bytes and back; hostile chunks; the one place where another codec is added."""
 
 from __future__ import annotations
+
+import struct
 
 import numcodecs.zstd
 import numpy as np
 import pytest
+from hostile_files import frame, refused, replaced
 
 from fhash_formats.container import Container, ContainerWriter, coding
-from fhash_formats.container.coding import chunk_coder, crc32c, plain_codecs, zstd_content_size
+from fhash_formats.container.coding import (
+    PlainCoder,
+    chunk_coder,
+    crc32c,
+    plain_codecs,
+    zstd_content_size,
+)
 from fhash_formats.errors import DamagedFileError, MissingDependencyError
 
 
 @pytest.mark.parametrize("size", [0, 1, 255, 256, 257, 65535, 65536, 65791, 65792, 2**20])
-def test_content_size_of_what_zstd_writes(size):
+def test_content_size_of_what_zstd_writes(size) -> None:
     assert zstd_content_size(memoryview(numcodecs.zstd.compress(bytes(size), 3))) == size
 
 
-def test_crc32c_of_the_check_string():
+def test_crc32c_of_the_check_string() -> None:
     """RFC 3720, appendix B.4, and the usual check value."""
     assert crc32c(b"123456789") == 0xE3069283
     assert crc32c(memoryview(bytes(32))) == 0x8A9136AA
 
 
-def test_missing_crc_library_is_named(monkeypatch):
+def test_missing_crc_library_is_named(monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "google_crc32c", None)
     with pytest.raises(MissingDependencyError, match="pip install google-crc32c"):
         crc32c(b"")
 
 
 @pytest.mark.parametrize("dtype", ["int8", "uint16", "float16", "float64"])
-def test_decoding_gives_what_was_coded(dtype):
+def test_decoding_gives_what_was_coded(dtype) -> None:
     chunk = np.arange(24).reshape(2, 3, 4).astype(dtype)
     coder = chunk_coder(plain_codecs(chunk.dtype), chunk.dtype, chunk.shape)
     for given in (chunk, np.asfortranarray(chunk), chunk.astype(chunk.dtype.newbyteorder())):
@@ -39,7 +48,7 @@ def test_decoding_gives_what_was_coded(dtype):
         assert decoded.dtype.isnative
 
 
-def test_a_lack_of_memory_is_no_damage(monkeypatch):
+def test_a_lack_of_memory_is_no_damage(monkeypatch) -> None:
     chunk = np.arange(24, dtype=np.float32)
     coder = chunk_coder(plain_codecs(chunk.dtype), chunk.dtype, chunk.shape)
     data = memoryview(coder.encode(chunk))
@@ -68,7 +77,7 @@ class Negative:
         return -np.frombuffer(data, self.dtype).reshape(self.shape)
 
 
-def test_another_codec_is_added_in_one_place(tmp_path, samples, monkeypatch):
+def test_another_codec_is_added_in_one_place(tmp_path, samples, monkeypatch) -> None:
     monkeypatch.setitem(coding.ARRAY_CODECS, "test.negative", Negative)
     header = samples.header()
     values = np.arange(10, dtype=np.float32)
@@ -95,3 +104,60 @@ def test_a_tile_that_would_take_gigabytes_is_refused() -> None:
         DamagedFileError, match=r"tiles of 134,217,729 vertices; the limit is 134,217,728"
     ):
         chunk_coder(codecs, np.dtype(np.uint8), (1, 1, 1, (1 << 27) + 1))
+
+
+CHUNKS = {
+    "bomb": (
+        lambda right: numcodecs.zstd.compress(bytes(1 << 26), 1),
+        "zstd declares 67108864 bytes; the chunk has 32",
+    ),
+    "bomb of unknown size": (lambda right: frame(bytes(1 << 16)), "zstd declares None"),
+    "bomb that lies": (lambda right: frame(bytes(1 << 16), size=32), "zstd data are damaged"),
+    "two frames": (lambda right: numcodecs.zstd.compress(right, 1) * 2, "zstd data are damaged"),
+    "fewer bytes": (lambda right: frame(right[:16], size=32), "zstd data are damaged"),
+    "declares 2^63": (lambda right: frame(right, size=2**63), "zstd declares"),
+    "other content": (lambda right: right, "not a zstd frame"),
+    "empty": (lambda right: b"", "not a zstd frame"),
+    "header only": (
+        lambda right: frame(right, size=32)[:8],
+        "the header of the zstd frame is cut short",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CHUNKS)
+def test_chunk_data(sample, samples, case) -> None:
+    make, message = CHUNKS[case]
+    coded = make(np.arange(4, dtype="<f8").tobytes())
+    coded += struct.pack("<I", crc32c(coded))
+    data = replaced(sample, samples, "coords/time/c/0", coded)
+    refused(sample, data, f"member coords/time/c/0: {message}")
+
+
+def test_a_frame_cannot_declare_more_than_zstd_packs_into_its_bytes() -> None:
+    """Otherwise damage could pass for a lack of memory, or a lack of memory for damage."""
+    float64 = np.dtype("<f8")
+    most = PlainCoder(plain_codecs(float64)[:-1], float64, (2**17,))
+    assert not most.decode(memoryview(numcodecs.zstd.compress(bytes(2**20), 19))).any()
+    with pytest.raises(DamagedFileError, match="which 17 bytes cannot hold"):
+        PlainCoder(plain_codecs(float64)[:-1], float64, (2**40,)).decode(
+            memoryview(frame(b"abc"[:1], size=2**43))
+        )
+
+
+@pytest.mark.parametrize(
+    "coded", [b"", b"abc", b"abcd", numcodecs.zstd.compress(bytes(32), 1) + b"abcd"]
+)
+def test_chunk_without_its_crc(sample, samples, coded) -> None:
+    data = replaced(sample, samples, "coords/time/c/0", coded)
+    refused(sample, data, "member coords/time/c/0: .*CRC-32C")
+
+
+def test_frame_made_by_hand_is_read(sample, samples) -> None:
+    """The hostile frames above differ from this one only in what they are refused for."""
+    right = np.arange(4, dtype="<f8")
+    coded = frame(right.tobytes(), size=32)
+    coded += struct.pack("<I", crc32c(coded))
+    sample.write_bytes(replaced(sample, samples, "coords/time/c/0", coded))
+    with Container.open(sample) as container:
+        np.testing.assert_array_equal(container.arrays["coords/time"].read(), right)

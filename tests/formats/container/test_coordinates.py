@@ -1,4 +1,4 @@
-"""Positions in the header: every bit of them, or an array."""
+"""Positions in the header: every bit of them comes back, or they need an array."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from fhash_formats.container import Container, ContainerWriter, describe_coordinates
+from fhash_formats.container import (
+    Container,
+    ContainerWriter,
+    describe_coordinates,
+    validate_header,
+)
 from fhash_formats.container.coordinates import MAX_LISTED, MAX_RULED, describe_positions, positions
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import Coordinate, index_coordinate
@@ -45,39 +50,40 @@ ARRAYS = {
 
 
 def there_and_back(values):
-    """Whether the description, through JSON, gives every bit."""
-    found = describe_positions(values)
-    assert positions(json.loads(json.dumps(found)), values.size).tobytes() == values.tobytes()
-    return found
+    """The description of positions, which gives every bit of them, also through JSON."""
+    description = describe_positions(values)
+    restored = positions(json.loads(json.dumps(description)), values.size)
+    assert restored.tobytes() == values.tobytes()
+    return description
 
 
 @pytest.mark.parametrize("case", RULED)
-def test_rules(case):
+def test_rules(case) -> None:
     values, expected = RULED[case]
-    found = there_and_back(values)
-    assert "values" not in found
-    assert {key: found.get(key) for key in expected} == expected
-    assert len(json.dumps(found)) < 100
+    description = there_and_back(values)
+    assert "values" not in description
+    assert {key: description.get(key) for key in expected} == expected
+    assert len(json.dumps(description)) < 100
 
 
 @pytest.mark.parametrize("case", LISTED)
-def test_lists(case):
+def test_lists(case) -> None:
     values, dtype = LISTED[case]
-    found = there_and_back(values)
-    assert len(found["values"]) == values.size
-    assert found.get("dtype") == dtype
+    description = there_and_back(values)
+    assert len(description["values"]) == values.size
+    assert description.get("dtype") == dtype
 
 
 @pytest.mark.parametrize("case", ARRAYS)
-def test_what_needs_an_array(case):
+def test_what_needs_an_array(case) -> None:
     assert describe_positions(ARRAYS[case]) is None
 
 
-def test_random_positions_come_back():
+def test_random_positions_come_back() -> None:
     rng = np.random.default_rng(1)
     for _ in range(300):
         size = int(rng.integers(1, 100))
-        # As people write them: a start of few digits, steps of more.
+        # People write starts of few digits, and steps of more.
         start, step = (
             float(f"{rng.normal() * 10.0 ** rng.integers(-4, 5):.{rng.integers(1, most)}g}")
             for most in (6, 12)
@@ -88,7 +94,7 @@ def test_random_positions_come_back():
         there_and_back(values)
 
 
-def test_a_rule_that_leaves_float64_gives_infinities():
+def test_a_rule_that_leaves_float64_gives_infinities() -> None:
     assert positions({"start": 1e308, "step": 1e308}, 3)[1:].tolist() == [np.inf, np.inf]
 
 
@@ -113,7 +119,7 @@ def write(path, header, arrays=()):
         writer.commit(header)
 
 
-def test_coordinates_of_a_series_come_back(tmp_path, samples):
+def test_coordinates_of_a_series_come_back(tmp_path, samples) -> None:
     given = coords()
     header = {**samples.compact_header(), "coordinates": describe_coordinates(given)}
     assert sorted(header["coordinates"]) == ["time", "x", "z"]
@@ -125,15 +131,15 @@ def test_coordinates_of_a_series_come_back(tmp_path, samples):
     )
     with Container.open(tmp_path / "a.fhz") as container:
         for axis, stored in (("t", "time"), ("z", "z"), ("y", "y"), ("x", "x")):
-            found = container.coordinate(stored)
-            assert (found.name, dict(found.attributes)) == (
+            coordinate = container.coordinate(stored)
+            assert (coordinate.name, dict(coordinate.attributes)) == (
                 given[axis].name,
                 dict(given[axis].attributes),
             )
-            np.testing.assert_array_equal(found.values, given[axis].values)
+            np.testing.assert_array_equal(coordinate.values, given[axis].values)
 
 
-def test_an_axis_without_positions_is_refused(tmp_path, samples):
+def test_an_axis_without_positions_is_refused(tmp_path, samples) -> None:
     header = samples.compact_header()
     del header["coordinates"]["y"]
     with pytest.raises(InputError, match="array coords/y is missing"):
@@ -148,13 +154,13 @@ WRONG_ARRAYS = {
 
 
 @pytest.mark.parametrize("case", WRONG_ARRAYS)
-def test_an_array_beside_a_description_is_checked_as_well(tmp_path, samples, case):
+def test_an_array_beside_a_description_is_checked_as_well(tmp_path, samples, case) -> None:
     values, attributes, message = WRONG_ARRAYS[case]
     with pytest.raises(InputError, match=message):
         write(tmp_path / "a.fhz", samples.compact_header(), [("coords/time", values, attributes)])
 
 
-def test_the_paper_profile_has_arrays(sample, samples):
+def test_the_paper_profile_has_arrays(sample, samples) -> None:
     header = samples.header()
     with Container.open(sample) as container:
         np.testing.assert_array_equal(
@@ -183,9 +189,7 @@ def test_the_paper_profile_has_arrays(sample, samples):
         ({"attributes": []}, "x.attributes"),
     ],
 )
-def test_wrong_description_is_named(samples, description, key):
-    from fhash_formats.container import validate_header
-
+def test_wrong_description_is_named(samples, description, key) -> None:
     header = {**samples.compact_header(), "format": "fhash", "format_version": [1, 1]}
     validate_header(header)
     header["coordinates"] = {"x": description}
@@ -195,9 +199,7 @@ def test_wrong_description_is_named(samples, description, key):
         validate_header(header)
 
 
-def test_few_bytes_do_not_ask_for_much_memory(samples):
-    from fhash_formats.container import validate_header
-
+def test_few_bytes_do_not_ask_for_much_memory(samples) -> None:
     header = {**samples.compact_header(), "format": "fhash", "format_version": [1, 1]}
     header["domain"]["shape"][3] = MAX_RULED + 1
     with pytest.raises(DamagedFileError, match=r"coordinates[.]x .*an array for more than"):

@@ -1,10 +1,11 @@
-"""FORMAT.md: its examples are what the code accepts, and it names every key and array that the code asks for."""
+"""FORMAT.md: the code accepts its examples, and it names all keys, arrays and existing files."""
 
 from __future__ import annotations
 
 import json
 import re
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,17 +16,17 @@ from fhash_formats.container.coding import ARRAY_CODECS, PlainCoder, plain_codec
 from fhash_formats.container.header import FORMAT_VERSION
 from fhash_formats.container.sharding import sharding_codecs
 from fhash_formats.errors import DamagedFileError
+from fhash_formats.transform.tile.settings import TileSettings
 
 DOCUMENT = files("fhash_formats").joinpath("FORMAT.md").read_text(encoding="utf-8")
 
 
-def example(name):
-    found = re.findall(rf"^```json {name}\n(.*?)^```", DOCUMENT, re.MULTILINE | re.DOTALL)
-    assert len(found) == 1
-    return json.loads(found[0])
+def example(name: str) -> dict[str, Any]:
+    (text,) = re.findall(rf"^```json {name}\n(.*?)^```", DOCUMENT, re.MULTILINE | re.DOTALL)
+    return json.loads(text)
 
 
-def test_header_is_valid_and_can_be_written(tmp_path, samples):
+def test_header_is_valid_and_can_be_written(tmp_path, samples) -> None:
     header = example("header")
     validate_header(header)
     assert tuple(header["format_version"]) == FORMAT_VERSION
@@ -38,7 +39,7 @@ def test_header_is_valid_and_can_be_written(tmp_path, samples):
         assert re.sub("_[0-9]$", "_1", name) in DOCUMENT
 
 
-def test_compact_header_is_valid_and_can_be_written(tmp_path, samples):
+def test_compact_header_is_valid_and_can_be_written(tmp_path, samples) -> None:
     header = example("compact-header")
     validate_header(header)
     with ContainerWriter(tmp_path / "a.fhz") as writer:
@@ -59,7 +60,7 @@ def test_compact_header_is_valid_and_can_be_written(tmp_path, samples):
         assert f"`{name}`" in DOCUMENT
 
 
-def test_sharded_array_is_what_the_writer_writes(monkeypatch):
+def test_sharded_array_is_what_the_writer_writes(monkeypatch) -> None:
     monkeypatch.setitem(
         ARRAY_CODECS,
         "fhash.transform",
@@ -74,7 +75,7 @@ def test_sharded_array_is_what_the_writer_writes(monkeypatch):
     assert sharding_codecs(inner["chunk_shape"], inner["codecs"]) == values["codecs"]
 
 
-def test_no_key_of_the_example_can_be_left_out():
+def test_no_key_of_the_example_can_be_left_out() -> None:
     header = example("header")
     for key in header:
         with pytest.raises(DamagedFileError, match=key):
@@ -82,7 +83,7 @@ def test_no_key_of_the_example_can_be_left_out():
         assert f"| `{key}` |" in DOCUMENT
 
 
-def test_array_is_what_the_writer_writes():
+def test_array_is_what_the_writer_writes() -> None:
     values = example("array")
     metadata = ArrayMetadata.from_dict(values)
     assert metadata.to_dict() == values
@@ -90,6 +91,18 @@ def test_array_is_what_the_writer_writes():
     assert list(metadata.codecs) == plain_codecs(metadata.dtype)
 
 
-def test_every_data_type_is_named():
+def test_the_settings_of_the_example_are_those_of_a_tile() -> None:
+    settings = example("fhash.transform")
+    assert TileSettings.from_dict(settings).to_dict() == settings
+
+
+def test_every_file_that_is_named_exists() -> None:
+    named = re.findall(r"`((?:transform|native)/[^`]+)`", DOCUMENT)
+    assert named
+    for path in named:
+        assert files("fhash_formats").joinpath(path).is_file(), path
+
+
+def test_every_data_type_is_named() -> None:
     assert all(name in DOCUMENT for name in DTYPES)
     assert f"version {FORMAT_VERSION[0]}.{FORMAT_VERSION[1]}" in DOCUMENT.splitlines()[0]

@@ -1,11 +1,13 @@
-"""The writer: complete or absent, strict about what it is given, previewed as it will be."""
+"""The writer: complete or absent, strict about its arguments, previewed as it will be."""
 
 from __future__ import annotations
 
 import errno
+import tracemalloc
 
 import numpy as np
 import pytest
+from sharded_files import write_sharded
 
 from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.errors import InputError, OutputError, OutputExistsError
@@ -16,7 +18,7 @@ def fill(writer, samples, header):
         writer.add_whole(name, array)
 
 
-def test_preview_is_the_final_file(tmp_path, samples):
+def test_preview_is_the_final_file(tmp_path, samples) -> None:
     header = samples.header()
     path = tmp_path / "a.fhz"
     with ContainerWriter(path) as writer:
@@ -39,7 +41,7 @@ def test_preview_is_the_final_file(tmp_path, samples):
             np.testing.assert_array_equal(array.read(), before[3][name])
 
 
-def test_preview_needs_no_quality_and_writing_may_go_on(tmp_path, samples):
+def test_preview_needs_no_quality_and_writing_may_go_on(tmp_path, samples) -> None:
     header = samples.header()
     quality = header.pop("quality")
     with ContainerWriter(tmp_path / "a.fhz") as writer:
@@ -56,12 +58,12 @@ def test_preview_needs_no_quality_and_writing_may_go_on(tmp_path, samples):
 
 
 class Stop(BaseException):
-    """As KeyboardInterrupt, without pytest's own ideas about that."""
+    """A stand-in for KeyboardInterrupt, which pytest would take for its own."""
 
 
 @pytest.mark.parametrize("failure", [None, ValueError("x"), Stop()])
 @pytest.mark.parametrize("older", [None, b"an older output"])
-def test_leaving_without_commit_leaves_nothing(tmp_path, samples, failure, older):
+def test_leaving_without_commit_leaves_nothing(tmp_path, samples, failure, older) -> None:
     path = tmp_path / "a.fhz"
     if older is not None:
         path.write_bytes(older)
@@ -81,7 +83,7 @@ def test_leaving_without_commit_leaves_nothing(tmp_path, samples, failure, older
     assert older is None or path.read_bytes() == older
 
 
-def test_full_disk_is_an_output_error_and_leaves_nothing(tmp_path, samples, monkeypatch):
+def test_full_disk_is_an_output_error_and_leaves_nothing(tmp_path, samples, monkeypatch) -> None:
     class Full:
         closed = False
 
@@ -110,14 +112,14 @@ def test_full_disk_is_an_output_error_and_leaves_nothing(tmp_path, samples, monk
         assert list(tmp_path.iterdir()) == []
 
 
-def test_existing_output_needs_force(sample, samples):
+def test_existing_output_needs_force(sample, samples) -> None:
     header = samples.header()
     with pytest.raises(OutputExistsError, match="force"):
         samples.write(sample, header, samples.arrays(header))
     samples.write(sample, header, samples.arrays(header), force=True)
 
 
-def test_missing_folder(tmp_path, samples):
+def test_missing_folder(tmp_path, samples) -> None:
     with pytest.raises(OutputError, match="folder"):
         samples.write(tmp_path / "none" / "a.fhz", samples.header(), {})
 
@@ -128,6 +130,7 @@ GOOD = {
     "chunk_shape": (3,),
     "chunks": [np.zeros(3, "int16"), np.zeros(1, "int16")],
 }
+
 
 BAD_ARRAYS = {
     "too few chunks": ({"chunks": GOOD["chunks"][:1]}, r"chunk \(1,\) was not given"),
@@ -159,7 +162,7 @@ BAD_ARRAYS = {
 
 
 @pytest.mark.parametrize("case", BAD_ARRAYS)
-def test_what_does_not_fit_is_refused(tmp_path, samples, case):
+def test_what_does_not_fit_is_refused(tmp_path, samples, case) -> None:
     changes, message = BAD_ARRAYS[case]
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         fill(writer, samples, samples.header())
@@ -169,7 +172,7 @@ def test_what_does_not_fit_is_refused(tmp_path, samples, case):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_half_an_array_cannot_be_committed(tmp_path, samples):
+def test_half_an_array_cannot_be_committed(tmp_path, samples) -> None:
     header = samples.header()
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         fill(writer, samples, header)
@@ -179,7 +182,7 @@ def test_half_an_array_cannot_be_committed(tmp_path, samples):
             writer.commit(header)
 
 
-def test_header_must_fit_the_arrays(tmp_path, samples):
+def test_header_must_fit_the_arrays(tmp_path, samples) -> None:
     header = samples.header()
     with ContainerWriter(tmp_path / "a.fhz") as writer:
         fill(writer, samples, header)
@@ -196,3 +199,116 @@ def test_header_must_fit_the_arrays(tmp_path, samples):
             writer.commit(header)
         with pytest.raises(OutputError, match="already"):
             writer.add_whole("late", np.arange(3))
+
+
+def test_same_content_gives_same_bytes(tmp_path, samples) -> None:
+    header = samples.header()
+    for name in ("a.fhz", "b.fhz"):
+        samples.write(tmp_path / name, header, samples.arrays(header))
+        header = dict(reversed(header.items()))
+    assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
+
+
+def test_chunks_of_one_array_may_come_from_a_generator(tmp_path, samples) -> None:
+    header = samples.header()
+    arrays = samples.arrays(header)
+    table = arrays.pop("tables/level_1")
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        for name, array in arrays.items():
+            writer.add_whole(name, array)
+        chunks = (table[t : t + 1, z : z + 2] for t in range(2) for z in (0, 2))
+        writer.add_array(
+            "tables/level_1",
+            shape=table.shape,
+            dtype=">f2",
+            chunk_shape=(1, 2, 4, 6, 2),
+            chunks=chunks,
+        )
+        writer.commit(header)
+    with Container.open(tmp_path / "a.fhz") as container:
+        np.testing.assert_array_equal(container.arrays["tables/level_1"].read(), table)
+        assert container.arrays["tables/level_1"].dtype == np.dtype("float16")
+
+
+def test_no_more_than_one_shard_is_held(tmp_path, samples) -> None:
+    """While a shard is given, those before it are in the file."""
+    values = np.random.default_rng(0).integers(0, 256, (16, 1 << 16), dtype=np.uint8)
+
+    def chunks():
+        for i in range(16):
+            if i == 15:
+                assert tracemalloc.get_traced_memory()[0] - begun < 3 << 17
+            yield values[i : i + 1]
+
+    tracemalloc.start()
+    begun = tracemalloc.get_traced_memory()[0]
+    write_sharded(tmp_path / "a.fhz", samples, values, (1, 1 << 16), (2, 1 << 16), chunks=chunks())
+    tracemalloc.stop()
+
+
+def test_what_is_not_data_takes_few_bytes(tmp_path, samples) -> None:
+    """A series of usual size: everything but the members of the table within 4 kB."""
+    rng = np.random.default_rng(0)
+    header = samples.compact_header()
+    steps = 21
+    header["domain"]["shape"] = [steps, 64, 64, 128]
+    header["feature_bounding_box"] = [[0, 64], [0, 64], [0, 128]]
+    header["model"]["levels"] = [[steps, 64, 64, 128]]
+    header["coordinates"] = {
+        "time": {
+            "values": np.cumsum(rng.random(steps)).tolist(),
+            "attributes": {"units": "hours since 2000-01-01"},
+        },
+        **{
+            axis: {
+                "start": 0.1,
+                "step": 0.0771653543,
+                "dtype": "float32",
+                "attributes": {"units": "km"},
+            }
+            for axis in "zyx"
+        },
+    }
+    figures = [float(f"{v:.4e}") for v in rng.random(steps)]
+    header["quality"] = {
+        **dict.fromkeys(
+            (
+                "psnr",
+                "rmse",
+                "max_abs_error",
+                "ssim",
+                "psnr_domain",
+                "rmse_domain",
+                "max_abs_error_domain",
+            ),
+            0.123456,
+        ),
+        "ssim_window": {
+            "sigma": 1.5,
+            "window": 11,
+            "data_range": 4.0123456789,
+            "steps": list(range(steps)),
+        },
+        "per_step": dict.fromkeys(("psnr", "rmse", "max_abs_error"), figures),
+    }
+    header["history"] = {"seconds": [1.234] * 24, "epoch": list(range(24)), "psnr": [45.12] * 24}
+    header["config"] = {f"setting_{n}": 1.5 for n in range(16)}
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        tile = np.zeros((21, 32, 32, 64), dtype=np.float32)
+        settings = {
+            "shape": (steps, 64, 64, 128),
+            "chunk_shape": tile.shape,
+            "shard_shape": (steps, 64, 64, 128),
+        }
+        writer.add_sharded(
+            "tables/level_1",
+            dtype=tile.dtype,
+            chunks=[tile] * 8,
+            dimension_names=["t", "z", "y", "x"],
+            **settings,
+        )
+        size = writer.commit(header)
+    with Container.open(tmp_path / "a.fhz") as container:
+        table = container.arrays["tables/level_1"].nbytes_stored
+        assert container.overhead() == size - table
+    assert size - table <= 4096

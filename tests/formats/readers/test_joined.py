@@ -1,4 +1,4 @@
-"""Patterns of files: the natural order, one open file, times, and files that do not belong together."""
+"""Patterns of files: the natural order, one open file, times, and files that do not fit."""
 
 from __future__ import annotations
 

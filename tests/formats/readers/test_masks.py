@@ -25,7 +25,7 @@ def save(path: Path, values: np.ndarray) -> Path:
         zarr.create_array(path, shape=values.shape, dtype=values.dtype)[...] = values
     else:
         path = path.with_name(
-            f"m_{'x'.join(str(length) for length in reversed(values.shape))}_{values.dtype.name}.raw"
+            f"m_{'x'.join(map(str, reversed(values.shape)))}_{values.dtype.name}.raw"
         )
         path.write_bytes(values.tobytes())
     return path

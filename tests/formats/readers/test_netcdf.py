@@ -5,31 +5,21 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import xarray as xr
+from stored_series import (
+    VALUES,
+    frames,
+    save_netcdf,
+)
 
 from fhash_formats import open_series
 from fhash_formats.errors import InputError, MissingDependencyError
 
-VALUES = np.random.default_rng(0).normal(size=(4, 3, 5, 6)).astype(np.float32)
 DIMS = ("time", "lev", "lat", "lon")
-
-
-def save(path: Path, dataset: Any, **options: Any) -> Path:
-    dataset.to_netcdf(path, engine="h5netcdf", **options)
-    return path
-
-
-def frames(path: Path, **options: Any) -> np.ndarray:
-    with open_series(path, **options) as series:
-        stacked = np.stack(list(series.frames()))
-        assert stacked.shape == series.shape
-        assert stacked.dtype == series.dtype
-        return stacked
 
 
 @pytest.mark.parametrize("suffix", [".nc", ".nc4", ".cdf", ".netcdf", ".h5", ".data"])
@@ -54,7 +44,7 @@ def test_frames_coordinates_and_attributes(tmp_path: Path, suffix: str) -> None:
         },
         attrs={"Conventions": "CF-1.8"},
     )
-    path = save(tmp_path / f"a{suffix}", dataset)
+    path = save_netcdf(tmp_path / f"a{suffix}", dataset)
     with open_series(path) as series:
         assert (series.name, series.units, series.shape, series.dtype) == (
             "theta",
@@ -77,7 +67,7 @@ def test_frames_coordinates_and_attributes(tmp_path: Path, suffix: str) -> None:
 def test_times_stay_numbers_in_any_calendar(tmp_path: Path, calendar: str) -> None:
     numbers = np.array([0.25, 1.5, 400.125, 401.0])
     time = ("time", numbers, {"units": "days since 1850-01-01", "calendar": calendar})
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}, coords={"time": time}))
+    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}, coords={"time": time}))
     with open_series(path) as series:
         np.testing.assert_array_equal(series.coords["t"].values, numbers)
         assert series.coords["t"].attributes["calendar"] == calendar
@@ -87,14 +77,14 @@ def test_dates_become_the_numbers_that_are_stored(tmp_path: Path) -> None:
     dates = np.array(
         ["2020-01-01T00:00", "2020-01-01T06:00", "2020-01-02T00:00", "2020-02-01T00:00"], "M8[ns]"
     )
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}, coords={"time": dates}))
+    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}, coords={"time": dates}))
     with open_series(path) as series:
         np.testing.assert_array_equal(series.coords["t"].values, [0, 6, 24, 31 * 24])
         assert series.coords["t"].attributes["units"].startswith("hours since 2020-01-01")
 
 
 def test_a_variable_of_time_spans_stays_numbers(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"age": (DIMS, VALUES, {"units": "hours"})}))
+    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"age": (DIMS, VALUES, {"units": "hours"})}))
     np.testing.assert_array_equal(frames(path), VALUES)
 
 
@@ -154,7 +144,7 @@ def test_neighbours_of_a_fill_value_that_float64_does_not_tell_from_it_are_value
 def test_fill_values_of_floats(tmp_path: Path) -> None:
     values = VALUES.copy()
     values[0, 1, 2, 3] = np.nan
-    path = save(
+    path = save_netcdf(
         tmp_path / "a.nc", xr.Dataset({"v": (DIMS, values)}), encoding={"v": {"_FillValue": -1e30}}
     )
     got = frames(path)
@@ -164,109 +154,9 @@ def test_fill_values_of_floats(tmp_path: Path) -> None:
 
 def test_plain_integers_stay_integers(tmp_path: Path) -> None:
     values = np.arange(360, dtype=np.int16).reshape(VALUES.shape)
-    got = frames(save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, values)})))
+    got = frames(save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, values)})))
     assert got.dtype == np.int16
     np.testing.assert_array_equal(got, values)
-
-
-def roles(path: Path, sizes: str, **coords: Any) -> str:
-    """The axes found for a variable with the dimensions a, b, c, d of different lengths, as letters in file order."""
-    values = VALUES[tuple(slice(None) if at < len(sizes) else 0 for at in range(4))]
-    save(
-        path,
-        xr.Dataset(
-            {"v": (tuple(sizes), values)}, coords={name: coord for name, coord in coords.items()}
-        ),
-    )
-    with open_series(path) as series:
-        return "".join("tzyx"[series.shape.index(length)] for length in values.shape)
-
-
-def along(dimension: str, **attributes: str) -> tuple[str, np.ndarray, dict[str, str]]:
-    return dimension, np.arange(float(VALUES.shape["abcd".index(dimension)])), attributes
-
-
-@pytest.mark.parametrize(
-    ("coords", "expected"),
-    [
-        ({}, "tzyx"),
-        (
-            {
-                "a": along("a", axis="X"),
-                "b": along("b", axis="Y"),
-                "c": along("c", axis="Z"),
-                "d": along("d", axis="T"),
-            },
-            "xyzt",
-        ),
-        (
-            {
-                "a": along("a", standard_name="projection_x_coordinate"),
-                "b": along("b", standard_name="latitude"),
-                "c": along("c", standard_name="atmosphere_hybrid_height_coordinate"),
-                "d": along("d", standard_name="time"),
-            },
-            "xyzt",
-        ),
-        (
-            {
-                "a": along("a", units="degrees_east"),
-                "b": along("b", units="hours since 2000-01-01"),
-                "c": along("c", units="hPa"),
-            },
-            "xtzy",
-        ),
-        ({"a": along("a", positive="down"), "b": along("b", axis="T")}, None),
-        (
-            {
-                "a": along("a", positive="down"),
-                "b": along("b", axis="T"),
-                "c": along("c", axis="Y"),
-            },
-            "ztyx",
-        ),
-        (
-            {"when": along("d", axis="T"), "c": along("c", axis="Z"), "b": along("b", axis="Y")},
-            "xyzt",
-        ),
-    ],
-)
-def test_axes_by_cf_attributes(
-    tmp_path: Path, coords: dict[str, Any], expected: str | None
-) -> None:
-    if expected is None:
-        with pytest.raises(InputError, match=r"not clear.*--axes"):
-            roles(tmp_path / "a.nc", "abcd", **coords)
-    else:
-        assert roles(tmp_path / "a.nc", "abcd", **coords) == expected
-
-
-@pytest.mark.parametrize(
-    ("dims", "shape"),
-    [
-        (("time", "lat", "lon"), (4, 1, 3, 5)),
-        (("lev", "lat", "lon"), (1, 4, 3, 5)),
-        (("lon", "lat", "time_0"), (5, 1, 3, 4)),
-        (("time", "z", "x"), (4, 3, 1, 5)),
-        (("member", "south_north", "west_east"), (1, 4, 3, 5)),
-    ],
-)
-def test_three_dimensions_by_name(
-    tmp_path: Path, dims: tuple[str, ...], shape: tuple[int, ...]
-) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (dims, VALUES[:, :, :, 0])}))
-    with open_series(path) as series:
-        assert series.shape == shape
-
-
-def test_two_dimensions_of_one_meaning_are_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (("time", "lev", "height", "lon"), VALUES)}))
-    with pytest.raises(
-        InputError,
-        match=r"two dimensions of \(time=4, lev=3, height=5, lon=6\) mean the same axis.*--axes",
-    ):
-        open_series(path)
-    np.testing.assert_array_equal(frames(path, axes="t,z,y,x"), VALUES)
 
 
 def test_auxiliary_and_scalar_coordinates(tmp_path: Path) -> None:
@@ -279,7 +169,7 @@ def test_auxiliary_and_scalar_coordinates(tmp_path: Path) -> None:
             "area": (("lat", "lon"), np.ones((5, 6))),
         },
     )
-    with open_series(save(tmp_path / "a.nc", dataset)) as series:
+    with open_series(save_netcdf(tmp_path / "a.nc", dataset)) as series:
         assert series.shape == (1, 3, 5, 6)
         assert series.coords["z"].name == "pressure"
         np.testing.assert_array_equal(series.coords["z"].values, [1000, 500, 100])
@@ -296,18 +186,9 @@ def test_bounds_grid_mappings_and_coordinates_are_no_candidates(tmp_path: Path) 
             "lat": ("lat", np.arange(5.0), {"bounds": "lat_bounds"}),
         }
     )
-    path = save(tmp_path / "a.nc", dataset)
+    path = save_netcdf(tmp_path / "a.nc", dataset)
     assert open_series(path).name == "v"
     np.testing.assert_array_equal(frames(path, var="height3d")[0], VALUES[0])
-
-
-def test_several_variables_need_a_choice(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"u": (DIMS, VALUES), "w": (DIMS, VALUES * 2)}))
-    with pytest.raises(InputError, match=r"holds 2 variables: u \(4, 3, 5, 6\), w \(4, 3, 5, 6\)"):
-        open_series(path)
-    np.testing.assert_array_equal(frames(path, var="w"), VALUES * 2)
-    with pytest.raises(InputError, match="no variable 'ww'; it holds w"):
-        open_series(path, var="ww")
 
 
 def test_groups(tmp_path: Path) -> None:
@@ -331,18 +212,6 @@ def test_plain_hdf5_named_nc_keeps_the_order_of_its_axes(tmp_path: Path) -> None
         np.testing.assert_array_equal(series.coords["x"].values, np.arange(5) * 2)
         np.testing.assert_array_equal(series.coords["y"].values, np.arange(5))
         np.testing.assert_array_equal(series.read(1), VALUES[1, :, :, :5])
-
-
-def test_one_dimension_only(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": ("time", np.zeros(4))}))
-    with pytest.raises(InputError, match=r"no variable of 3 or 4 dimensions.*v: 1 dimensions"):
-        open_series(path)
-
-
-def test_boolean_variables_are_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES > 0)}))
-    with pytest.raises(InputError, match="boolean values"):
-        open_series(path)
 
 
 def test_classic_netcdf3(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -374,14 +243,14 @@ def test_cdf5_says_how_to_convert(tmp_path: Path) -> None:
 def test_missing_libraries_name_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
 ) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
+    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(MissingDependencyError, match=r"fhash\[formats\]"):
         open_series(path)
 
 
 def test_a_truncated_file_is_one_line(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
+    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
     os.truncate(path, path.stat().st_size // 2)
     with pytest.raises(InputError, match="cannot be read") as caught:
         open_series(path)
@@ -389,7 +258,7 @@ def test_a_truncated_file_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_file_that_changes_is_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
+    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}))
     with open_series(path) as series:
         series.read(0)
         os.utime(path, ns=(1, 1))
@@ -398,7 +267,7 @@ def test_a_file_that_changes_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_missing_filter_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = save(
+    path = save_netcdf(
         tmp_path / "a.nc", xr.Dataset({"v": (DIMS, VALUES)}), encoding={"v": {"zlib": True}}
     )
     monkeypatch.setattr(h5py.h5z, "filter_avail", lambda code: False)

@@ -1,4 +1,4 @@
-"""Zarr of both formats, in folders and ZIPs: arrays, groups, dimension names, what xarray writes; every refusal."""
+"""Zarr of both formats, in folders and ZIPs: groups, dimension names, chunks; every refusal."""
 
 from __future__ import annotations
 
@@ -13,64 +13,37 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from stored_series import (
+    VALUES,
+    create_zarr,
+    frames,
+    zipped,
+)
 
 from fhash_formats import open_series
 from fhash_formats.errors import InputError
 
-VALUES = np.random.default_rng(0).normal(size=(4, 3, 5, 6)).astype(np.float32)
 DIMS = ["time", "z", "y", "x"]
-
-
-def create(
-    path: Path, values: np.ndarray, *, name: str | None = None, zarr_format: int = 3, **options: Any
-) -> Any:
-    """An array at a path (or in the group there, if named)."""
-    where: Any = zarr.open_group(path, mode="a", zarr_format=zarr_format) if name else path
-    if name:
-        array = where.create_array(name, shape=values.shape, dtype=values.dtype, **options)
-    else:
-        array = zarr.create_array(
-            where, shape=values.shape, dtype=values.dtype, zarr_format=zarr_format, **options
-        )
-    array[...] = values
-    return array
-
-
-def frames(path: Path, **options: Any) -> np.ndarray:
-    with open_series(path, **options) as series:
-        stacked = np.stack(list(series.frames()))
-        assert stacked.shape == series.shape
-        assert stacked.dtype == series.dtype
-        assert series.dtype.isnative
-        return stacked
-
-
-def zipped(folder: Path, path: Path, *, inside: str = "") -> Path:
-    with zipfile.ZipFile(path, "w") as file:
-        for each in sorted(folder.rglob("*")):
-            if each.is_file():
-                file.write(each, inside + str(each.relative_to(folder)))
-    return path
 
 
 @pytest.mark.parametrize("zarr_format", [2, 3])
 @pytest.mark.parametrize("dtype", ["f4", ">f4", "f8", "f2", "u1", ">i2", "i8"])
 def test_an_array_of_every_type(tmp_path: Path, zarr_format: int, dtype: str) -> None:
     values = (VALUES * 50).astype(dtype)
-    create(tmp_path / "a.zarr", values, zarr_format=zarr_format, chunks=(2, 3, 2, 4))
+    create_zarr(tmp_path / "a.zarr", values, zarr_format=zarr_format, chunks=(2, 3, 2, 4))
     np.testing.assert_array_equal(frames(tmp_path / "a.zarr"), values)
     np.testing.assert_array_equal(frames(zipped(tmp_path / "a.zarr", tmp_path / "a.zip")), values)
 
 
 def test_shards(tmp_path: Path) -> None:
-    create(tmp_path / "a.zarr", VALUES, chunks=(1, 3, 5, 6), shards=(4, 3, 5, 6))
+    create_zarr(tmp_path / "a.zarr", VALUES, chunks=(1, 3, 5, 6), shards=(4, 3, 5, 6))
     np.testing.assert_array_equal(frames(tmp_path / "a.zarr"), VALUES)
 
 
 @pytest.mark.parametrize("inside", ["", "run.zarr/"])
 @pytest.mark.parametrize("zarr_format", [2, 3])
 def test_a_zipped_group(tmp_path: Path, inside: str, zarr_format: int) -> None:
-    create(tmp_path / "a.zarr", VALUES, name="v", zarr_format=zarr_format)
+    create_zarr(tmp_path / "a.zarr", VALUES, name="v", zarr_format=zarr_format)
     np.testing.assert_array_equal(
         frames(zipped(tmp_path / "a.zarr", tmp_path / "a.zarr.zip", inside=inside)), VALUES
     )
@@ -78,9 +51,9 @@ def test_a_zipped_group(tmp_path: Path, inside: str, zarr_format: int) -> None:
 
 def test_groups_and_choices(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
-    create(path, VALUES, name="gas/density")
-    create(path, VALUES * 2, name="pressure")
-    create(path, np.zeros((3, 4)), name="flat")
+    create_zarr(path, VALUES, name="gas/density")
+    create_zarr(path, VALUES * 2, name="pressure")
+    create_zarr(path, np.zeros((3, 4)), name="flat")
     with pytest.raises(
         InputError, match=r"holds 2 variables: gas/density \(4, 3, 5, 6\), pressure .*--var"
     ):
@@ -103,10 +76,10 @@ def test_dimension_names_give_axes_and_coordinates(tmp_path: Path, zarr_format: 
         if zarr_format == 3
         else {"attributes": {"_ARRAY_DIMENSIONS": DIMS[::-1]}}
     )
-    create(path, stored, name="v", zarr_format=zarr_format, **named)
+    create_zarr(path, stored, name="v", zarr_format=zarr_format, **named)
     times = np.array([2.0, 3.0, 30.0, 347921.1666])
-    create(path, times, name="time", zarr_format=zarr_format, attributes={"units": "hours"})
-    create(path, np.arange(6.0) * 3, name="x", zarr_format=zarr_format)
+    create_zarr(path, times, name="time", zarr_format=zarr_format, attributes={"units": "hours"})
+    create_zarr(path, np.arange(6.0) * 3, name="x", zarr_format=zarr_format)
     with open_series(path) as series:
         assert series.shape == VALUES.shape
         np.testing.assert_array_equal(series.coords["t"].values, times)
@@ -119,59 +92,21 @@ def test_dimension_names_give_axes_and_coordinates(tmp_path: Path, zarr_format: 
 
 def test_coordinates_by_cf_and_along_a_dimension_of_another_name(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
-    create(path, VALUES, name="v", dimension_names=["a", "b", "c", "d"])
-    create(path, np.arange(6.0), name="d", dimension_names=["d"], attributes={"axis": "T"})
-    create(
+    create_zarr(path, VALUES, name="v", dimension_names=["a", "b", "c", "d"])
+    create_zarr(path, np.arange(6.0), name="d", dimension_names=["d"], attributes={"axis": "T"})
+    create_zarr(
         path,
         np.arange(4.0),
         name="a",
         dimension_names=["a"],
         attributes={"standard_name": "longitude"},
     )
-    create(path, np.arange(3.0), name="b", dimension_names=["b"], attributes={"axis": "Y"})
-    create(path, np.arange(5.0) * 100, name="height", dimension_names=["c"])
+    create_zarr(path, np.arange(3.0), name="b", dimension_names=["b"], attributes={"axis": "Y"})
+    create_zarr(path, np.arange(5.0) * 100, name="height", dimension_names=["c"])
     with open_series(path) as series:
         assert series.shape == (6, 5, 3, 4)
         np.testing.assert_array_equal(series.coords["z"].values, np.arange(5) * 100)
         np.testing.assert_array_equal(series.read(4), VALUES[..., 4].transpose(2, 1, 0))
-
-
-def test_conventional_coordinates_where_dimensions_have_no_names(tmp_path: Path) -> None:
-    create(tmp_path / "a.zarr", VALUES, name="v")
-    create(tmp_path / "a.zarr", np.arange(4.0) * 5, name="time")
-    with open_series(tmp_path / "a.zarr") as series:
-        np.testing.assert_array_equal(series.coords["t"].values, [0, 5, 10, 15])
-    create(tmp_path / "b.zarr", VALUES.T, name="v")
-    create(tmp_path / "b.zarr", np.arange(4.0) * 5, name="time")
-    with pytest.raises(InputError, match=r"time has 4 values.*--axes"):
-        open_series(tmp_path / "b.zarr")
-
-
-@pytest.mark.parametrize("unit", ["s", "ns"])
-def test_dates_are_counted_from_the_first(tmp_path: Path, unit: str) -> None:
-    dates = np.array(
-        [
-            "2020-01-01T00:00:00",
-            "2020-01-01T06:00:00",
-            "2020-01-02T00:00:00",
-            "2020-01-03T00:00:00",
-        ],
-        f"M8[{unit}]",
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the type has no specification yet
-        create(tmp_path / "a.zarr", VALUES, name="v", dimension_names=DIMS)
-        create(tmp_path / "a.zarr", dates, name="time", dimension_names=["time"])
-    with open_series(tmp_path / "a.zarr") as series:
-        ticks = 1 if unit == "s" else 10**9
-        np.testing.assert_array_equal(
-            series.coords["t"].values, np.array([0, 6, 24, 48]) * 3600.0 * ticks
-        )
-        assert (
-            series.coords["t"]
-            .attributes["units"]
-            .startswith("seconds since 2020" if unit == "s" else "nanoseconds since 2020")
-        )
 
 
 ENCODINGS: list[dict[str, Any]] = [
@@ -214,26 +149,6 @@ def test_what_xarray_writes_is_read_as_xarray_reads_it(
         np.testing.assert_array_equal(series.coords["z"].values, [1.5, 2.5, 7.0])
 
 
-def test_zarrs_own_fill_value_hides_nothing_unless_xarray_wrote_it(tmp_path: Path) -> None:
-    values = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
-    create(tmp_path / "a.zarr", values, zarr_format=2, fill_value=0)
-    np.testing.assert_array_equal(frames(tmp_path / "a.zarr")[0], values)
-    create(
-        tmp_path / "b.zarr", values, zarr_format=3, fill_value=0, dimension_names=["z", "y", "x"]
-    )
-    np.testing.assert_array_equal(frames(tmp_path / "b.zarr")[0], values)
-    create(
-        tmp_path / "c.zarr",
-        values,
-        zarr_format=2,
-        fill_value=0,
-        attributes={"_ARRAY_DIMENSIONS": ["z", "y", "x"]},
-    )
-    np.testing.assert_array_equal(
-        frames(tmp_path / "c.zarr")[0], np.where(values == 0, np.nan, values.astype("f4"))
-    )
-
-
 def test_chunks_never_written_are_the_fill_value(tmp_path: Path) -> None:
     array = zarr.create_array(
         tmp_path / "a.zarr", shape=VALUES.shape, dtype="f4", chunks=(1, 3, 5, 6), fill_value=np.nan
@@ -244,25 +159,6 @@ def test_chunks_never_written_are_the_fill_value(tmp_path: Path) -> None:
     assert np.isnan(got[[0, 1, 3]]).all()
 
 
-@pytest.mark.parametrize(
-    ("array", "words"),
-    [
-        (np.zeros(3), "1 dimensions"),
-        (np.zeros((1, 2, 3, 4, 5)), "5 dimensions"),
-        (np.zeros((2, 2, 2), complex), "complex128"),
-        (np.zeros((2, 2, 2), bool), "boolean"),
-        (np.zeros((2, 0, 2)), "length 0"),
-    ],
-)
-@pytest.mark.parametrize("zarr_format", [2, 3])
-def test_unsuitable_arrays_are_described(
-    tmp_path: Path, array: np.ndarray, words: str, zarr_format: int
-) -> None:
-    create(tmp_path / "a.zarr", array, name="odd", zarr_format=zarr_format)
-    with pytest.raises(InputError, match=f"odd: .*{words}"):
-        open_series(tmp_path / "a.zarr")
-
-
 def test_empty_and_broken_hierarchies(tmp_path: Path) -> None:
     zarr.open_group(tmp_path / "a.zarr", mode="w")
     with pytest.raises(InputError, match="holds no array at all"):
@@ -270,7 +166,7 @@ def test_empty_and_broken_hierarchies(tmp_path: Path) -> None:
     (tmp_path / "b.zarr").mkdir()
     with pytest.raises(InputError, match="folder without zarr metadata"):
         open_series(tmp_path / "b.zarr")
-    create(tmp_path / "c.zarr", VALUES)
+    create_zarr(tmp_path / "c.zarr", VALUES)
     (tmp_path / "c.zarr" / "zarr.json").write_text('{"zarr_format": 3, "node_')
     with pytest.raises(InputError, match="cannot be read as zarr") as caught:
         open_series(tmp_path / "c.zarr")
@@ -288,8 +184,8 @@ def test_empty_and_broken_hierarchies(tmp_path: Path) -> None:
 @pytest.mark.parametrize("zarr_format", [2, 3])
 def test_neighbours_that_cannot_be_opened_bar_nothing(tmp_path: Path, zarr_format: int) -> None:
     path = tmp_path / "a.zarr"
-    create(path, VALUES, name="v", zarr_format=zarr_format)
-    create(path, VALUES, name="odd", zarr_format=zarr_format)
+    create_zarr(path, VALUES, name="v", zarr_format=zarr_format)
+    create_zarr(path, VALUES, name="odd", zarr_format=zarr_format)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # text has no specification yet
         zarr.open_group(path, mode="a").create_array("names", shape=(3,), dtype=str)
@@ -307,37 +203,21 @@ def test_neighbours_that_cannot_be_opened_bar_nothing(tmp_path: Path, zarr_forma
         open_series(path / "odd")
 
 
-def test_unsigned_values_stored_as_signed(tmp_path: Path) -> None:
-    values = np.array([0, 1, 127, 128, 254, 255], np.uint8).reshape(1, 2, 3)
-    attributes = {"_Unsigned": "true", "_FillValue": -1, "missing_value": 300}
-    create(tmp_path / "a.zarr", values.view(np.int8), attributes=attributes)
-    np.testing.assert_array_equal(
-        frames(tmp_path / "a.zarr")[0], np.where(values == 255, np.nan, values.astype("f4"))
-    )
-
-
 def test_a_packed_coordinate_is_unpacked_and_says_no_more_of_it(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
-    create(path, VALUES, name="v", dimension_names=DIMS)
+    create_zarr(path, VALUES, name="v", dimension_names=DIMS)
     packed = {"scale_factor": 0.5, "add_offset": 1.0, "_FillValue": -9, "units": "m"}
-    create(path, np.array([0, 2, 4], np.int16), name="z", dimension_names=["z"], attributes=packed)
+    create_zarr(
+        path, np.array([0, 2, 4], np.int16), name="z", dimension_names=["z"], attributes=packed
+    )
     with open_series(path) as series:
         np.testing.assert_array_equal(series.coords["z"].values, [1, 2, 3])
         assert series.coords["z"].attributes == {"units": "m"}
 
 
-def test_bad_packing_attributes_are_refused(tmp_path: Path) -> None:
-    create(tmp_path / "a.zarr", VALUES, attributes={"scale_factor": "two"})
-    with pytest.raises(InputError, match="scale_factor is 'two', not a number"):
-        open_series(tmp_path / "a.zarr")
-    create(tmp_path / "b.zarr", VALUES, attributes={"_FillValue": "?"})
-    with pytest.raises(InputError, match=r"fill value '\?' is not a number"):
-        open_series(tmp_path / "b.zarr")
-
-
 def test_the_folder_of_an_array_by_a_dot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    create(tmp_path / "a.zarr", VALUES, name="v", dimension_names=DIMS)
-    create(tmp_path / "a.zarr", np.arange(4.0) * 5, name="time", dimension_names=["time"])
+    create_zarr(tmp_path / "a.zarr", VALUES, name="v", dimension_names=DIMS)
+    create_zarr(tmp_path / "a.zarr", np.arange(4.0) * 5, name="time", dimension_names=["time"])
     monkeypatch.chdir(tmp_path / "a.zarr" / "v")
     for path in (".", "../v"):
         with open_series(path) as series:
@@ -346,7 +226,7 @@ def test_the_folder_of_an_array_by_a_dot(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_damaged_chunk_names_the_step(tmp_path: Path) -> None:
-    create(tmp_path / "a.zarr", VALUES, chunks=(1, 3, 5, 6))
+    create_zarr(tmp_path / "a.zarr", VALUES, chunks=(1, 3, 5, 6))
     (tmp_path / "a.zarr" / "c" / "2" / "0" / "0" / "0").write_bytes(b"nonsense")
     with open_series(tmp_path / "a.zarr") as series:
         np.testing.assert_array_equal(series.read(1), VALUES[1])
@@ -357,7 +237,7 @@ def test_a_damaged_chunk_names_the_step(tmp_path: Path) -> None:
 
 def test_a_hierarchy_that_changes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
-    create(path, VALUES, name="v", chunks=(1, 3, 5, 6))
+    create_zarr(path, VALUES, name="v", chunks=(1, 3, 5, 6))
     with open_series(path) as series:
         series.read(0)
         zarr.open_group(path, mode="a")["v"].resize((9, 3, 5, 6))
@@ -374,7 +254,7 @@ def test_chunks_that_change_are_noticed_by_the_check_of_the_whole(
     tmp_path: Path, change: str
 ) -> None:
     path = tmp_path / "a.zarr"
-    create(path, VALUES, name="v", chunks=(1, 3, 5, 6))
+    create_zarr(path, VALUES, name="v", chunks=(1, 3, 5, 6))
     with open_series(path, steps=slice(1, None)) as series:
         series.check()
         series.read(0)
@@ -399,7 +279,7 @@ def test_chunks_that_change_are_noticed_by_the_check_of_the_whole(
 
 def test_stale_consolidated_metadata_is_not_believed(tmp_path: Path) -> None:
     path = tmp_path / "a.zarr"
-    array = create(path, VALUES, name="v", zarr_format=2, chunks=(1, 3, 5, 6))
+    array = create_zarr(path, VALUES, name="v", zarr_format=2, chunks=(1, 3, 5, 6))
     zarr.consolidate_metadata(path)
     array.resize((5, 3, 5, 6))
     array[4] = 7

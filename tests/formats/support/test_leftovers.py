@@ -1,4 +1,4 @@
-"""What a killed writer left behind is cleared away by the next one, and nothing of a living writer is."""
+"""Leftovers of a killed writer are cleared away by the next one, those of a living one are kept."""
 
 from __future__ import annotations
 
@@ -82,9 +82,9 @@ def test_nothing_of_a_living_writer_is_touched(
     assert names(tmp_path) == sorted([kept[1].name, elsewhere.name, target.name])
 
 
-def test_a_process_that_nobody_has_buried_is_gone(tmp_path: Path) -> None:
+def test_a_process_that_nobody_has_waited_for_is_gone(tmp_path: Path) -> None:
     if not Path("/proc/self/stat").exists():
-        pytest.skip("only /proc tells")
+        pytest.skip("only /proc shows zombies")
     process = subprocess.Popen([sys.executable, "-c", ""], stdout=subprocess.PIPE)
     assert process.stdout is not None
     with process.stdout:

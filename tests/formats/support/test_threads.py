@@ -1,21 +1,30 @@
-"""Work in threads: order, failures, calls within calls, and processes that fork."""
+"""Work in threads: order, failures, shares, calls within calls, and processes that fork."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
+from collections.abc import Iterator, Sequence
 
 import pytest
 
 from fhash_formats.errors import InputError
 from fhash_formats.support import threads as parallel
-from fhash_formats.support.threads import in_threads, usable_threads
+from fhash_formats.support.threads import (
+    ITEMS_PER_THREAD,
+    SHARES_PER_THREAD,
+    in_threads,
+    map_ahead,
+    share_out,
+    thread_pool,
+    usable_threads,
+)
 
 
 def test_results_come_in_order_and_from_several_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "usable_threads", lambda: 3)
-    both = threading.Barrier(2, timeout=60)  # passes only where two threads meet
+    both = threading.Barrier(2, timeout=60)  # opens only when two threads wait
 
     def work(item: int) -> int:
         if item < 2:
@@ -25,7 +34,7 @@ def test_results_come_in_order_and_from_several_threads(monkeypatch: pytest.Monk
     assert list(in_threads(work, range(20))) == [item * item for item in range(20)]
 
 
-def test_the_threads_grow_with_what_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_pool_grows_with_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     for count in (2, 5, 3):
         monkeypatch.setattr(parallel, "usable_threads", lambda count=count: count)
         all_at_once = threading.Barrier(count, timeout=60)
@@ -34,10 +43,10 @@ def test_the_threads_grow_with_what_is_asked_for(monkeypatch: pytest.MonkeyPatch
 
 def test_calls_within_calls_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parallel, "usable_threads", lambda: 3)
-    found = in_threads(
+    sums = in_threads(
         lambda outer: sum(in_threads(lambda inner: outer * inner, range(30))), range(30)
     )
-    assert list(found) == [outer * sum(range(30)) for outer in range(30)]
+    assert list(sums) == [outer * sum(range(30)) for outer in range(30)]
 
 
 def test_the_first_failure_is_raised_and_the_rest_is_left() -> None:
@@ -67,6 +76,43 @@ def test_without_threads_the_callers_own_does_the_work(monkeypatch: pytest.Monke
     assert list(in_threads(abs, range(-4, 0))) == [4, 3, 2, 1]
 
 
+def test_the_number_of_threads_may_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "usable_threads", lambda: pytest.fail("was given"))
+    both = threading.Barrier(2, timeout=60)
+    assert len(list(in_threads(lambda _: both.wait(), range(2), 2))) == 2
+    callers: list[int] = []
+    assert (
+        list(in_threads(lambda n: callers.append(threading.get_ident()), range(9), 1)) == [None] * 9
+    )
+    assert set(callers) == {threading.get_ident()}
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+@pytest.mark.parametrize("count", [0, 1, 2 * ITEMS_PER_THREAD, 999])
+def test_shares_hold_each_item_once(count: int, threads: int) -> None:
+    shares: list[list[int]] = []
+    share_out(lambda share: shares.append(list(share)), range(count), threads)
+    assert sorted(item for share in shares for item in share) == list(range(count))
+    assert len(shares) <= SHARES_PER_THREAD * threads
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+
+
+def test_few_items_are_one_share_in_the_callers_thread() -> None:
+    calls: list[tuple[int, int]] = []
+    items = range(2 * ITEMS_PER_THREAD - 1)
+    share_out(lambda share: calls.append((len(share), threading.get_ident())), items, 8)
+    assert calls == [(len(items), threading.get_ident())]
+
+
+def test_a_failure_in_a_share_is_raised() -> None:
+    def work(share: Sequence[int]) -> None:
+        if 50 in share:
+            raise ValueError("fifty")
+
+    with pytest.raises(ValueError, match="fifty"):
+        share_out(work, range(100), 3)
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system has no fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_forked_process_has_threads_of_its_own() -> None:
@@ -83,6 +129,13 @@ def test_the_environment_says_how_many_threads(monkeypatch: pytest.MonkeyPatch) 
     assert usable_threads() >= 1
     monkeypatch.setenv("FHASH_THREADS", "3")
     assert usable_threads() == 3
+    assert usable_threads(5) == 5
+
+
+@pytest.mark.parametrize("threads", [0, -3])
+def test_no_threads_are_refused(threads: int) -> None:
+    with pytest.raises(InputError, match=f"threads is {threads}; at least 1 is needed"):
+        usable_threads(threads)
 
 
 @pytest.mark.parametrize("given", ["", "0", "-1", "2.5", "many", "99999999999", "\u00b2"])
@@ -90,3 +143,35 @@ def test_another_number_of_threads_is_refused(monkeypatch: pytest.MonkeyPatch, g
     monkeypatch.setenv("FHASH_THREADS", given)
     with pytest.raises(InputError, match=r"FHASH_THREADS is '.*'; allowed: 1 to 1024"):
         usable_threads()
+
+
+def test_few_items_are_read_ahead_and_results_come_in_order() -> None:
+    read: list[int] = []
+    yielded = 0
+
+    def items() -> Iterator[int]:
+        for item in range(50):
+            assert item - yielded < 4
+            read.append(item)
+            yield item
+
+    with thread_pool() as pool:
+        for number, result in enumerate(map_ahead(pool, lambda item: item * item, items(), 4)):
+            assert result == number * number
+            yielded += 1
+    assert read == list(range(50))
+
+
+def test_what_was_not_begun_is_left_out_after_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FHASH_THREADS", "1")
+    begun: list[int] = []
+
+    def work(item: int) -> int:
+        begun.append(item)
+        if item == 2:
+            raise ValueError("two")
+        return item
+
+    with thread_pool() as pool, pytest.raises(ValueError, match="two"):
+        list(map_ahead(pool, work, range(100), 8))
+    assert len(begun) < 100

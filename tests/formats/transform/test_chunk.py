@@ -1,4 +1,4 @@
-"""Chunks with settings of their own: the bound for every type and range, equal bytes of both engines, arguments."""
+"""Chunks with settings of their own: bounds for every type and range, equal bytes, refusals."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from fhash_formats import native
 from fhash_formats.errors import InputError
-from fhash_formats.transform.chunk import decode_chunk, encode_chunk
+from fhash_formats.transform.chunk import decode_chunk, encode_chunk, tile_shape
 
 FLOATS = ["f2", "f4", "f8", ">f4"]
 INTEGERS = ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", ">i2"]
@@ -25,15 +25,16 @@ def field(shape: tuple[int, ...], scale: float, dtype: npt.DTypeLike) -> npt.NDA
     return (wave * scale if np.dtype(dtype).kind != "u" else np.abs(wave) * scale).astype(dtype)
 
 
-def worst(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> float:
-    if one.dtype.kind == "f":
-        return float(np.abs(one.astype(np.float64) - other.astype(np.float64)).max(initial=0))
-    return max(
-        (abs(int(a) - int(b)) for a, b in zip(one.ravel(), other.ravel(), strict=True)), default=0
-    )
+def worst(values: npt.NDArray[Any], decoded: npt.NDArray[Any]) -> float:
+    """The largest difference; integers are compared as Python integers."""
+    if values.dtype.kind == "f":
+        return float(np.abs(values.astype(np.float64) - decoded.astype(np.float64)).max(initial=0))
+    pairs = zip(values.ravel(), decoded.ravel(), strict=True)
+    return max((abs(int(value) - int(other)) for value, other in pairs), default=0)
 
 
 def check(values: npt.NDArray[Any], error: float, **quality: float) -> bytes:
+    """The stream of an array, after its error, shape, type and missing values are checked."""
     data = encode_chunk(values, **quality)  # type: ignore[arg-type]
     decoded = decode_chunk(data, values.shape, values.dtype)
     assert (decoded.shape, decoded.dtype) == (values.shape, values.dtype)
@@ -51,8 +52,8 @@ def test_the_bound_holds(dtype: str, shape: tuple[int, ...]) -> None:
     for error in (0, 0.4, 1, 3.7):
         check(values, error, max_error=error)
     span = float(values.max()) - float(values.min())
-    for part in (1e-7, 0.01, 0.3):
-        check(values, part * span, max_error_rel=part)
+    for fraction in (1e-7, 0.01, 0.3):
+        check(values, fraction * span, max_error_rel=fraction)
 
 
 @pytest.mark.parametrize(
@@ -72,8 +73,8 @@ def test_the_bound_holds_at_the_ends_of_the_types(dtype: str, scale: float) -> N
     values.flat[0], values.flat[1] = 0.0, -0.0
     values.flat[2:5] = [np.nan, np.inf, -np.inf]
     span = float(np.ptp(values[np.isfinite(values)].astype(np.float64)))
-    for part in (1e-5, 0.01):
-        check(values, part * span, max_error_rel=part)
+    for fraction in (1e-5, 0.01):
+        check(values, fraction * span, max_error_rel=fraction)
 
 
 @pytest.mark.parametrize("dtype", INTEGERS)
@@ -116,7 +117,7 @@ def test_missing_values_take_no_part_in_range_or_bound() -> None:
 def test_a_smaller_step_is_a_smaller_error_and_more_bytes() -> None:
     values = field((4, 8, 16, 16), 1, "f4")
     data = [encode_chunk(values, step=step) for step in (0.2, 0.02)]
-    errors = [worst(values, decode_chunk(each, values.shape, "f4")) for each in data]
+    errors = [worst(values, decode_chunk(stream, values.shape, "f4")) for stream in data]
     assert errors[1] < 0.1 < errors[0] * 5
     assert 2 * len(data[0]) < len(data[1])
 
@@ -149,13 +150,13 @@ def test_both_engines_give_the_same_bytes(
     chunks[0][1, 2, 3:] = np.nan
     data = [encode_chunk(chunk, **quality) for chunk in chunks]  # type: ignore[arg-type]
     values = [
-        decode_chunk(each, chunk.shape, chunk.dtype)
-        for each, chunk in zip(data, chunks, strict=True)
+        decode_chunk(stream, chunk.shape, chunk.dtype)
+        for stream, chunk in zip(data, chunks, strict=True)
     ]
     monkeypatch.setenv("FHASH_NATIVE", "0")
     assert [encode_chunk(chunk, **quality) for chunk in chunks] == data  # type: ignore[arg-type]
-    for each, chunk, expected in zip(data, chunks, values, strict=True):
-        assert decode_chunk(each, chunk.shape, chunk.dtype).tobytes() == expected.tobytes()
+    for stream, chunk, expected in zip(data, chunks, values, strict=True):
+        assert decode_chunk(stream, chunk.shape, chunk.dtype).tobytes() == expected.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -186,5 +187,21 @@ def test_unsuitable_types_are_refused(dtype: str) -> None:
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8"])
 def test_zeros_without_loss_keep_their_signs(values: list[float], dtype: str) -> None:
     given = np.array(values, dtype)
-    found = decode_chunk(encode_chunk(given, max_error=0.0), given.shape, given.dtype)
-    assert found.tobytes() == given.tobytes()
+    decoded = decode_chunk(encode_chunk(given, max_error=0.0), given.shape, given.dtype)
+    assert decoded.tobytes() == given.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("shape", "tile"),
+    [
+        ((), (1, 1, 1, 1)),
+        ((5,), (1, 1, 1, 5)),
+        ((2, 3), (1, 1, 2, 3)),
+        ((2, 3, 4, 5), (2, 3, 4, 5)),
+        ((2, 3, 4, 5, 6), (6, 4, 5, 6)),
+    ],
+)
+def test_an_array_of_any_axes_is_a_tile_of_four(
+    shape: tuple[int, ...], tile: tuple[int, ...]
+) -> None:
+    assert tile_shape(shape) == tile

@@ -12,17 +12,15 @@ import numpy.typing as npt
 import pytest
 import xarray
 import zarr
+from specs import spec_of
 from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec
 
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.zarr_codec import TransformCodec
 
-WAVES = TransformSpec(
-    axes=(AxisTransform(kind="haar", depth=1), *(AxisTransform(kind="9/7", depth=1),) * 3)
-)
+WAVES = spec_of(("haar", "9/7", "9/7", "9/7"), 1, (2, 2, 2, 2))
 SHARED = TileSettings(transform=WAVES, step=0.05, center=0.0, low=-3.0, high=3.0)
 
 
@@ -125,9 +123,8 @@ def test_an_empty_configuration_reads_streams_with_their_own_settings(tmp_path: 
 def test_shared_settings_give_the_tile_that_containers_have(tmp_path: Path) -> None:
     values = field((2, 3, 8, 8))
     create(tmp_path / "a.zarr", values, values.shape, serializer=TransformCodec(settings=SHARED))
-    assert (tmp_path / "a.zarr" / "c" / "0" / "0" / "0" / "0").read_bytes() == encode_tile(
-        values, SHARED
-    ).data
+    stored = (tmp_path / "a.zarr" / "c" / "0" / "0" / "0" / "0").read_bytes()
+    assert stored == encode_tile(values, SHARED).data
 
 
 def test_padding_with_nan_leaves_the_relative_bound(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""VTK's XML grids, read back by their bytes: extents, places, times, and axes that are turned round."""
+"""VTK's XML grids, read back by their bytes: extents, places, times, descending axes."""
 
 from __future__ import annotations
 

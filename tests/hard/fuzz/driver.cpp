@@ -1,8 +1,10 @@
-// A coverage-guided fuzzer for compilers that count edges but have no fuzzer of their own (gcc: -fsanitize-coverage=trace-pc).
+// A coverage-guided fuzzer for compilers that count edges but have no fuzzer of their own, such as
+// gcc with -fsanitize-coverage=trace-pc.
 //
-// driver CORPUS CURRENT SECONDS SEED runs LLVMFuzzerTestOneInput on mutations of the files in the folder CORPUS. An input that reaches an edge,
-// or a number of times that an edge is passed, which none before it did is kept. Before each run the input stands in the file CURRENT, where
-// it is found after a crash. At the end one line on stdout: executions, edges, inputs kept.
+// driver CORPUS CURRENT SECONDS SEED runs LLVMFuzzerTestOneInput on the files in the folder CORPUS
+// and on mutations of them. A mutation is kept if it passes a new edge, or an edge a new number of
+// times. Before each run the input is written to the file CURRENT, where it is found after a crash.
+// At the end the driver prints one line: executions, edges, inputs kept.
 #include <fcntl.h>
 #include <sys/mman.h>
 #include <sys/time.h>
@@ -25,8 +27,10 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
 
 namespace {
 
-const std::size_t MAP = 1 << 18, LONGEST = 1 << 14;
-std::uint8_t passed[MAP], seen[MAP];  // how often an edge was passed in this run; which classes of that were seen before
+const std::size_t MAP = 1 << 18;      // places for edges
+const std::size_t MAX_SIZE = 1 << 14;  // bytes of an input
+std::uint8_t passed[MAP];  // how often this run passed an edge
+std::uint8_t seen[MAP];    // classes of these numbers in all runs, as bits
 std::uintptr_t before = 0;
 
 using Input = std::vector<std::uint8_t>;
@@ -34,13 +38,14 @@ std::mt19937_64 chance;
 
 std::size_t below(std::size_t n) { return n ? chance() % n : 0; }
 
-// 1, 2, 3, 4 to 7, 8 to 15, 16 to 31, 32 to 127, more.
+// The class of a number as one bit: 1, 2, 3, 4 to 7, 8 to 15, 16 to 31, 32 to 127, more; 0 for 0.
 std::uint8_t class_of(std::uint8_t n) {
     if (n < 4) return static_cast<std::uint8_t>(n ? 1 << (n - 1) : 0);
     return n < 8 ? 8 : n < 16 ? 16 : n < 32 ? 32 : n < 128 ? 64 : 128;
 }
 
-bool found_new() {
+// Adds this run to `seen`; whether it passed an edge a new number of times.
+bool is_new() {
     bool fresh = false;
     for (std::size_t word = 0; word < MAP; word += 8) {
         std::uint64_t any;
@@ -56,9 +61,38 @@ bool found_new() {
 }
 
 void mutate(Input& input, const std::vector<Input>& corpus) {
-    static const std::uint64_t numbers[] = {0, 1, 2, 7, 8, 15, 16, 31, 32, 63, 64, 127, 128, 255, 256, 4095, 4096, 32767, 32768, 65535, 65536,
-                                            0x7fffffff, 0x80000000, 0xffffffff, 0x7f800000, 0xff800000, 0x7fc00000, 0x7f7fffff,
-                                            0x7ff0000000000000, 0x7ff8000000000000, 0x7fffffffffffffff, 0xffffffffffffffff};
+    static const std::uint64_t numbers[] = {0,
+                                            1,
+                                            2,
+                                            7,
+                                            8,
+                                            15,
+                                            16,
+                                            31,
+                                            32,
+                                            63,
+                                            64,
+                                            127,
+                                            128,
+                                            255,
+                                            256,
+                                            4095,
+                                            4096,
+                                            32767,
+                                            32768,
+                                            65535,
+                                            65536,
+                                            0x7fffffff,
+                                            0x80000000,
+                                            0xffffffff,
+                                            0x7f800000,
+                                            0xff800000,
+                                            0x7fc00000,
+                                            0x7f7fffff,
+                                            0x7ff0000000000000,
+                                            0x7ff8000000000000,
+                                            0x7fffffffffffffff,
+                                            0xffffffffffffffff};
     for (std::size_t turns = std::size_t{1} << below(5); turns > 0; turns--) {
         const std::size_t at = below(input.size());
         switch (below(10)) {
@@ -69,54 +103,66 @@ void mutate(Input& input, const std::vector<Input>& corpus) {
                 if (!input.empty()) input[at] = static_cast<std::uint8_t>(chance());
                 break;
             case 2:
-                if (!input.empty()) input[at] = static_cast<std::uint8_t>(input[at] + below(71) - 35);
+                if (!input.empty())
+                    input[at] = static_cast<std::uint8_t>(input[at] + below(71) - 35);
                 break;
             case 3: {
                 const std::size_t width = std::size_t{1} << below(4);
                 const std::uint64_t value = numbers[below(sizeof numbers / sizeof *numbers)];
-                if (input.size() >= width) std::memcpy(input.data() + below(input.size() - width + 1), &value, width);
+                if (input.size() >= width)
+                    std::memcpy(input.data() + below(input.size() - width + 1), &value, width);
                 break;
             }
-            case 4: input.insert(input.begin() + static_cast<std::ptrdiff_t>(at), 1 + below(8), static_cast<std::uint8_t>(chance())); break;
+            case 4:
+                input.insert(input.begin() + static_cast<std::ptrdiff_t>(at), 1 + below(8),
+                             static_cast<std::uint8_t>(chance()));
+                break;
             case 5: {
                 const std::size_t end = std::min(input.size(), at + 1 + below(16));
-                input.erase(input.begin() + static_cast<std::ptrdiff_t>(at), input.begin() + static_cast<std::ptrdiff_t>(end));
+                input.erase(input.begin() + static_cast<std::ptrdiff_t>(at),
+                            input.begin() + static_cast<std::ptrdiff_t>(end));
                 break;
             }
             case 6:
                 input.resize(at);
                 break;
-            case 7: {  // the beginning of one, the end of another
+            case 7: {  // the beginning of this input and the end of another one
                 const Input& other = corpus[below(corpus.size())];
                 const std::size_t from = below(other.size());
                 input.resize(at);
-                input.insert(input.end(), other.begin() + static_cast<std::ptrdiff_t>(from), other.end());
+                input.insert(input.end(), other.begin() + static_cast<std::ptrdiff_t>(from),
+                             other.end());
                 break;
             }
             case 8: {
                 const Input& other = corpus[below(corpus.size())];
-                const std::size_t from = below(other.size()), n = std::min({other.size() - from, input.size() - at, 1 + below(32)});
-                std::copy_n(other.begin() + static_cast<std::ptrdiff_t>(from), n, input.begin() + static_cast<std::ptrdiff_t>(at));
+                const std::size_t from = below(other.size()),
+                                  n = std::min(
+                                      {other.size() - from, input.size() - at, 1 + below(32)});
+                std::copy_n(other.begin() + static_cast<std::ptrdiff_t>(from), n,
+                            input.begin() + static_cast<std::ptrdiff_t>(at));
                 break;
             }
             default:
-                for (std::size_t n = 1 + below(16); n > 0; n--) input.push_back(static_cast<std::uint8_t>(chance()));
+                for (std::size_t n = 1 + below(16); n > 0; n--)
+                    input.push_back(static_cast<std::uint8_t>(chance()));
         }
     }
-    if (input.size() > LONGEST) input.resize(LONGEST);
+    if (input.size() > MAX_SIZE) input.resize(MAX_SIZE);
 }
 
 }  // namespace
 
 extern "C" void __sanitizer_cov_trace_pc() {
-    const std::uintptr_t here = reinterpret_cast<std::uintptr_t>(__builtin_return_address(0)) * 0x9e3779b97f4a7c15u >> 40;
+    const std::uintptr_t here =
+        reinterpret_cast<std::uintptr_t>(__builtin_return_address(0)) * 0x9e3779b97f4a7c15u >> 40;
     std::uint8_t& count = passed[(here ^ before) % MAP];
     count = static_cast<std::uint8_t>(count + (count < 255));
     before = here >> 1;
 }
 
 int main(int count, char** arguments) {
-    if (count == 2) {  // one input, to see a crash again
+    if (count == 2) {  // one input, to repeat a crash
         std::ifstream file(arguments[1], std::ios::binary);
         const Input input{std::istreambuf_iterator<char>(file), {}};
         LLVMFuzzerTestOneInput(input.data(), input.size());
@@ -124,8 +170,9 @@ int main(int count, char** arguments) {
     }
     if (count != 5) return 2;
     const int file = open(arguments[2], O_RDWR | O_CREAT | O_TRUNC, 0600);
-    if (file < 0 || ftruncate(file, LONGEST + 8) != 0) return 2;
-    auto* const current = static_cast<std::uint8_t*>(mmap(nullptr, LONGEST + 8, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0));
+    if (file < 0 || ftruncate(file, MAX_SIZE + 8) != 0) return 2;
+    auto* const current = static_cast<std::uint8_t*>(
+        mmap(nullptr, MAX_SIZE + 8, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0));
     if (current == MAP_FAILED) return 2;
     chance.seed(std::strtoull(arguments[4], nullptr, 10));
 
@@ -138,32 +185,37 @@ int main(int count, char** arguments) {
         std::memset(passed, 0, MAP);
         before = 0;
         const itimerval patience = {{0, 0}, {20, 0}};
-        setitimer(ITIMER_PROF, &patience, nullptr);  // a hang ends as a crash; of processor time, since others may share the machine
+        // A hang ends as a crash. The limit is on processor time, since the machine may be shared.
+        setitimer(ITIMER_PROF, &patience, nullptr);
         const Input exact(input);
         LLVMFuzzerTestOneInput(exact.data(), exact.size());
         executions++;
-        return found_new();
+        return is_new();
     };
     std::vector<std::filesystem::path> files;
-    for (const auto& entry : std::filesystem::directory_iterator(arguments[1])) files.push_back(entry.path());
+    for (const auto& entry : std::filesystem::directory_iterator(arguments[1]))
+        files.push_back(entry.path());
     std::sort(files.begin(), files.end());
     for (const auto& path : files) {
         std::ifstream from(path, std::ios::binary);
         Input input{std::istreambuf_iterator<char>(from), {}};
-        if (input.size() > LONGEST) input.resize(LONGEST);
+        if (input.size() > MAX_SIZE) input.resize(MAX_SIZE);
         run(input);
         corpus.push_back(input);
     }
     if (corpus.empty()) return 2;
-    const auto end = std::chrono::steady_clock::now() + std::chrono::duration<double>(std::strtod(arguments[3], nullptr));
+    const auto end = std::chrono::steady_clock::now() +
+                     std::chrono::duration<double>(std::strtod(arguments[3], nullptr));
     while (std::chrono::steady_clock::now() < end) {
-        // Every second from what was found last.
+        // Every second input is a mutation of the inputs that were kept last.
         const std::size_t recent = std::min<std::size_t>(corpus.size(), 64);
-        Input input = corpus[chance() % 2 ? corpus.size() - 1 - below(recent) : below(corpus.size())];
+        Input input =
+            corpus[chance() % 2 ? corpus.size() - 1 - below(recent) : below(corpus.size())];
         mutate(input, corpus);
         if (run(input)) corpus.push_back(input);
     }
     const auto edges = MAP - static_cast<std::size_t>(std::count(seen, seen + MAP, 0));
-    std::printf("%llu %zu %zu\n", static_cast<unsigned long long>(executions), edges, corpus.size() - files.size());
+    std::printf("%llu %zu %zu\n", static_cast<unsigned long long>(executions), edges,
+                corpus.size() - files.size());
     return 0;
 }

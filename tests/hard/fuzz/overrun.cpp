@@ -1,7 +1,8 @@
-// An entry for one function only, with which a test sees that an overrun is found.
+// A target for one function only. A test plants an overrun in it, which the fuzzer must find.
 #include "reader.hpp"
 
-extern "C" std::int64_t fhash_dequantise_f32(const std::int32_t*, std::int64_t, double, double, double, double, float*);
+extern "C" std::int64_t fhash_dequantise_f32(const std::int32_t*, std::int64_t, double, double,
+                                             double, double, float*);
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
     Reader in(data, size);

@@ -1,4 +1,4 @@
-// Numbers from the bytes of one input; past its end everything is 0.
+// Numbers from the bytes of one input; behind its end all numbers are 0.
 #pragma once
 
 #include <cmath>
@@ -15,16 +15,18 @@ public:
         const std::uint16_t low = byte();
         return static_cast<std::uint16_t>(low | byte() << 8);
     }
-    // From low to high.
-    std::int64_t within(std::int64_t low, std::int64_t high) { return low + byte() % (high - low + 1); }
+    // A number from low to high.
+    std::int64_t within(std::int64_t low, std::int64_t high) {
+        return low + byte() % (high - low + 1);
+    }
     template <class T> T number() {
         std::uint8_t bytes[sizeof(T)];
-        for (std::uint8_t& one : bytes) one = byte();
+        for (std::uint8_t& each : bytes) each = byte();
         T value;
         std::memcpy(&value, bytes, sizeof value);
         return value;
     }
-    // A float that is finite, as Python lets through.
+    // A finite float, as Python passes them on.
     template <class T> T finite() {
         const T value = number<T>();
         return std::isfinite(value) ? value : T(0);
@@ -34,7 +36,7 @@ public:
         for (T& value : values) value = number<T>();
         return values;
     }
-    // In memory of its own, so that a byte read beyond the end is seen.
+    // The remaining bytes in memory of their own, so that reading beyond their end is seen.
     std::vector<std::uint8_t> rest() {
         std::vector<std::uint8_t> bytes(at, at + left);
         left = 0;

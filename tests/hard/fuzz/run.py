@@ -1,10 +1,12 @@
-"""The native code under address and undefined-behaviour sanitizers with a coverage-guided fuzzer.
+"""A coverage-guided fuzzer of the native code, under address and undefined-behaviour sanitizers.
 
     python tests/hard/fuzz/run.py --seconds 600
 
-builds into a temporary folder, runs one process per processor (or --processes), and prints one line: executions, edges, inputs that
-were kept, crashes. An input that crashes or hangs is saved, with what the sanitizers said, in the folder --crashes (default: a temporary
-one, which the output names). The exit code is 1 if there was any, 2 if nothing can be built. --repeat FILE runs one input alone.
+The script builds into a temporary folder, runs one process per processor (or --processes), and
+prints one line: executions, edges, inputs that were kept, crashes. An input that crashes or hangs
+is saved with the message of the sanitizers in the folder --crashes (by default a temporary folder,
+which the output names). The exit code is 1 if there was a crash, 2 if nothing can be built.
+--repeat FILE runs one input alone.
 """
 
 from __future__ import annotations
@@ -34,8 +36,9 @@ SOURCES = ("coder", "mask", "predict", "lifting", "head", "quantise", "values")
 CODEC_SOURCES = ("march_light",)
 """Files of CODEC that are always fuzzed."""
 MARCH = ("march", "march_bricks")
-"""Files of CODEC that are fuzzed on request, without optimisation: that takes the compiler a minute
-instead of ten.
+"""Files of CODEC that are fuzzed on request, without optimisation.
+
+The compiler takes one minute for them; with optimisation it takes ten.
 """
 SANITIZE = (
     "-fsanitize=address,undefined,float-cast-overflow",
@@ -43,7 +46,7 @@ SANITIZE = (
     "-fno-omit-frame-pointer",
     "-g",
 )
-# One build for one machine: functions chosen when a library is loaded run before the sanitizers are ready.
+# No target_clones: the functions that choose a clone run before the sanitizers are ready.
 FLAGS = ("-std=c++17", "-ffp-contract=off", "-Dtarget_clones(...)=", "-Wno-attributes")
 ENVIRONMENT = {
     "ASAN_OPTIONS": "detect_leaks=1:abort_on_error=0:exitcode=99",
@@ -52,12 +55,19 @@ ENVIRONMENT = {
 
 
 class CannotBuild(Exception):
-    """No compiler with these sanitizers."""
+    """There is no compiler with these sanitizers."""
 
 
 @dataclass
-class Found:
-    """What the fuzzers did together; edges: the most that one of them saw."""
+class Figures:
+    """The work of all processes of the fuzzer.
+
+    Attributes:
+        executions: inputs that were run.
+        edges: the most edges that one process passed.
+        kept: mutated inputs that were kept since they passed a new edge.
+        crashes: files of the inputs that crashed.
+    """
 
     executions: int = 0
     edges: int = 0
@@ -66,9 +76,13 @@ class Found:
 
 
 def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
-    """The fuzzer, compiled into a folder; raises CannotBuild, which says why.
+    """Compile the fuzzer into a folder and return its path; raises CannotBuild with the reason.
 
-    optimise: -O1 takes the compiler five times as long as -O0 and runs three times as fast. march: whether the marcher is fuzzed, too.
+    Args:
+        folder: where the fuzzer is built.
+        optimise: level of optimisation. -O1 compiles five times as long as -O0, and the fuzzer runs
+            three times as fast.
+        march: whether the marcher is fuzzed, too.
     """
     compiler = os.environ.get("CXX", "g++")
     if shutil.which(compiler.split()[0]) is None:
@@ -77,7 +91,7 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
     tracing, headers = ("-fsanitize-coverage=trace-pc",), f"-I{NATIVE}"
     jobs: list[tuple[Path, tuple[str, ...]]] = [(HERE / "driver.cpp", ("-fsanitize=address", "-g"))]
     if march:
-        # Lanes of vectors that are not wanted may hold what is no number.
+        # Unused lanes of vectors may hold NaN, so float-cast-overflow would report them.
         jobs += [
             (
                 CODEC / f"{name}.cpp",
@@ -116,39 +130,61 @@ def _compile(command: list[str]) -> None:
         )
 
 
-def prepare(folder: Path) -> dict[str, str]:
-    """Write setups and seeds into a folder; the environment that the fuzzer needs."""
+def prepare(folder: Path, every: int = 1) -> dict[str, str]:
+    """Write setups and seeds into a folder, and return the environment that the fuzzer needs.
+
+    With `every`, only every so many of the seeds of each kind are written.
+    """
     sys.path.insert(0, str(HERE))
     try:
         import seeds
     finally:
         sys.path.remove(str(HERE))
-    seeds.write_seeds(folder / "corpus", *seeds.write_setups(folder / "setups"))
+    seeds.write_seeds(folder / "corpus", *seeds.write_setups(folder / "setups"), every)
     return {**os.environ, **ENVIRONMENT, "FHASH_FUZZ_SETUPS": str(folder / "setups")}
 
 
 def fuzz(
-    folder: Path, crashes: Path, *, seconds: float, processes: int, seed: int = 0, **options: Any
-) -> Found:
-    """Build, with options of `build`, and run; raises CannotBuild."""
+    folder: Path,
+    crashes: Path,
+    *,
+    seconds: float,
+    processes: int,
+    seed: int = 0,
+    every: int = 1,
+    **options: Any,
+) -> Figures:
+    """Build the fuzzer and run it.
+
+    Args:
+        folder: where the fuzzer is built and its corpus lies.
+        crashes: where inputs that crash are saved.
+        seconds: how long each process runs after it has run all seeds.
+        processes: number of processes at the same time.
+        seed: seed of the mutations.
+        every: share of the seeds that are run: every so many of each kind.
+        **options: options of `build`.
+
+    Raises CannotBuild.
+    """
     binary = build(folder, **options)
-    environment = prepare(folder)
-    result = Found()
+    environment = prepare(folder, every)
+    result = Figures()
     with ThreadPoolExecutor(processes) as pool:
-        work = [
-            pool.submit(_one, folder, binary, environment, crashes, seconds, seed, number)
+        futures = [
+            pool.submit(_run_process, folder, binary, environment, crashes, seconds, seed, number)
             for number in range(processes)
         ]
-        for one in work:
-            found = one.result()
-            result.executions += found.executions
-            result.edges = max(result.edges, found.edges)
-            result.kept += found.kept
-            result.crashes += found.crashes
+        for future in futures:
+            figures = future.result()
+            result.executions += figures.executions
+            result.edges = max(result.edges, figures.edges)
+            result.kept += figures.kept
+            result.crashes += figures.crashes
     return result
 
 
-def _one(
+def _run_process(
     folder: Path,
     binary: Path,
     environment: dict[str, str],
@@ -156,9 +192,12 @@ def _one(
     seconds: float,
     seed: int,
     number: int,
-) -> Found:
-    """One process after the other, until the time is over: after a crash another one with another seed."""
-    result, end, turn = Found(), time.monotonic() + seconds, 0
+) -> Figures:
+    """Run one process after the other until the time is over.
+
+    After a crash, another process starts with another seed.
+    """
+    result, end, turn = Figures(), time.monotonic() + seconds, 0
     while (left := end - time.monotonic()) > 0:
         current = folder / f"current-{number}"
         command = [
@@ -189,7 +228,7 @@ def _one(
 
 
 def repeat(path: Path, march: bool) -> int:
-    """Run one input; the exit code of the fuzzer."""
+    """Run one input and return the exit code of the fuzzer."""
     with tempfile.TemporaryDirectory(prefix="fhash-fuzz-") as folder:
         binary = build(Path(folder), march=march)
         return subprocess.run([str(binary), str(path)], env=prepare(Path(folder))).returncode
@@ -211,7 +250,7 @@ def main() -> int:
     kept = options.crashes or Path(tempfile.mkdtemp(prefix="fhash-fuzz-crashes-"))
     with tempfile.TemporaryDirectory(prefix="fhash-fuzz-") as folder:
         try:
-            found = fuzz(
+            result = fuzz(
                 Path(folder),
                 kept,
                 seconds=options.seconds,
@@ -228,20 +267,21 @@ def main() -> int:
     figures = {
         "seconds": options.seconds,
         "processes": options.processes,
-        "executions": found.executions,
+        "executions": result.executions,
     }
     record(
         "the native code under sanitizers",
-        {**figures, "edges": found.edges, "crashes": len(found.crashes)},
+        {**figures, "edges": result.edges, "crashes": len(result.crashes)},
     )
     print(
-        f"{found.executions} executions, {found.edges} edges, {found.kept} inputs kept, {len(found.crashes)} crashes"
+        f"{result.executions} executions, {result.edges} edges, {result.kept} inputs kept, "
+        f"{len(result.crashes)} crashes"
     )
-    for path in found.crashes:
+    for path in result.crashes:
         print(f"{path}: {path.with_suffix('.txt').read_text(encoding='utf-8').splitlines()[1:2]}")
-    if not found.crashes and options.crashes is None:
+    if not result.crashes and options.crashes is None:
         kept.rmdir()
-    return 1 if found.crashes else 0
+    return 1 if result.crashes else 0
 
 
 if __name__ == "__main__":

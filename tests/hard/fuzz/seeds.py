@@ -1,8 +1,12 @@
-"""What the fuzzer begins from: setups that Python would call the native decoders with, and inputs made of the golden containers."""
+"""The start of the fuzzer: setups with which Python calls the native decoders, and first inputs.
+
+Some inputs are coded here, others are tiles of the golden containers.
+"""
 
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -21,12 +25,12 @@ from fhash_formats.transform.entropy.predict import _blank, encode_predicted
 from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
 from fhash_formats.transform.entropy.prior import prior_state
 from fhash_formats.transform.entropy.table import single_band
-from fhash_formats.transform.tile.sections import parts_of
+from fhash_formats.transform.tile.sections import parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
 
 GOLDENS = Path(__file__).parents[2] / "golden"
 CODER, MASK, PREDICTOR, TRANSFORMS, HEAD, VALUES, ENCODE, LIGHT, MARCH = range(9)
-"""First byte of an input, as targets.cpp has it."""
+"""First byte of an input, which chooses the target in targets.cpp."""
 
 SPECS: tuple[tuple[tuple[str, int], ...], ...] = (
     (("none", 0),) * 4,
@@ -55,7 +59,10 @@ PREDICTORS = (
 
 
 def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
-    """Write the file that setups.hpp reads; the bands as (shape, table) and the passes as (shape, Predictor) in its order."""
+    """Write the file that setups.hpp reads.
+
+    Returns the bands as (shape, table) and the passes as (shape, Predictor), in their order there.
+    """
     bands = [(shape, single_band(shape)) for shape in SHAPES]
     bands += [(shape, band_table(_spec(axes), shape)) for axes in SPECS for shape in SHAPES]
     bands += [
@@ -80,8 +87,8 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             file.write(struct.pack("<q", len(data)) + data)
 
         for state in (prior_state(), mask_prior_state(), _blank()):
-            for part in (state.slots, state.weights, state.simples):
-                put(part)
+            for array in (state.slots, state.weights, state.simples):
+                put(array)
         file.write(struct.pack("<q", len(bands)))
         for shape, table in bands:
             put(np.array(shape, np.int64))
@@ -89,24 +96,25 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
         file.write(struct.pack("<q", len(passes)))
         for shape, predictor in passes:
             rows, taps, _ = pass_arrays(predictor)
-            for part in (
-                np.array(shape, np.int64),
-                np.array(predictor.levels, np.int64),
-                rows,
-                taps,
-            ):
-                put(part)
+            levels = np.array(predictor.levels, np.int64)
+            for array in (np.array(shape, np.int64), levels, rows, taps):
+                put(array)
     return bands, passes
 
 
-def write_seeds(folder: Path, bands: list[Any], passes: list[Any]) -> int:
-    """Write the inputs, one file each; how many."""
+def write_seeds(folder: Path, bands: list[Any], passes: list[Any], every: int = 1) -> int:
+    """Write the inputs, one file each, and return their number.
+
+    With `every`, only every so many inputs of each target are written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    numbers = count()
+    numbers, turns = count(), Counter[int]()
     rng = np.random.default_rng(0)
 
     def put(target: int, *parts: bytes) -> None:
-        (folder / f"{next(numbers):04}").write_bytes(bytes([target]) + b"".join(parts))
+        turns[target] += 1
+        if (turns[target] - 1) % every == 0:
+            (folder / f"{next(numbers):04}").write_bytes(bytes([target]) + b"".join(parts))
 
     for number, (shape, table) in enumerate(bands):
         for scale in (0.5, 30.0, 1e8):
@@ -122,17 +130,15 @@ def write_seeds(folder: Path, bands: list[Any], passes: list[Any]) -> int:
                 weights,
                 encode_predicted(integers.astype(np.int32), None, predictor)[0],
             )
-    known = {
+    setup_of_bands = {
         (shape, table.tobytes()): number
         for number, (shape, table) in reversed(list(enumerate(bands)))
     }
     for stream, settings, shape in golden_streams():
-        data, found = (
-            coefficients_of(stream),
-            known.get((shape, band_table(settings.transform, shape).tobytes())),
-        )
-        if data and found is not None:
-            put(CODER, struct.pack("<H", found), data)
+        data = coefficients_of(stream)
+        setup = setup_of_bands.get((shape, band_table(settings.transform, shape).tobytes()))
+        if data and setup is not None:
+            put(CODER, struct.pack("<H", setup), data)
     for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (4, 8, 8, 24)):
         nothing = (np.zeros(shape, np.uint8),) * 2
         for density in (0.02, 0.5):
@@ -146,7 +152,7 @@ def write_seeds(folder: Path, bands: list[Any], passes: list[Any]) -> int:
 
 
 def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int, int]]]:
-    """Every coded tile of the goldens with its settings and shape."""
+    """Yield each coded tile of the goldens with its settings and shape."""
     for path in sorted(GOLDENS.glob("*.fhz")):
         with Container.open(path) as container:
             for array in container.arrays.values():
@@ -174,8 +180,8 @@ def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int,
 
 
 def coefficients_of(stream: bytes) -> bytes:
-    """The section of coded coefficients; nothing where there is none."""
-    parts = parts_of(stream)
+    """Return the section of coded coefficients of a tile; empty if there is none."""
+    parts = parse_stream(stream)
     return (
         bytes(parts.body) if parts.coded and not parts.predicted and parts.body is not None else b""
     )
@@ -193,6 +199,6 @@ def _orders() -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
 
 
 def _predictor(levels: tuple[int, ...], order: tuple[int, ...], reach: int) -> Predictor:
-    taps = sum(len(part.taps) for part in passes_of(levels, order, reach))  # type: ignore[arg-type]
+    taps = sum(len(a_pass.taps) for a_pass in passes_of(levels, order, reach))  # type: ignore[arg-type]
     weights = tuple(int(weight) for weight in np.random.default_rng(taps).integers(-600, 600, taps))
     return Predictor(step=1.0, origin=0.0, levels=levels, order=order, reach=reach, weights=weights)  # type: ignore[arg-type]

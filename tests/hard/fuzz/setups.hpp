@@ -1,5 +1,7 @@
-// What the targets share: with what a decoder is called besides hostile bytes (priors, tables of bands and passes, as Python makes them:
-// seeds.py writes the file), and arrays from few bytes.
+// What the targets share: setups and arrays from few bytes.
+//
+// A setup is what a decoder is called with besides hostile bytes: priors, tables of bands and of
+// passes. Python makes them; seeds.py writes the file that is read here.
 #pragma once
 
 #include <algorithm>
@@ -46,16 +48,16 @@ public:
             get(file, state->simples);
         }
         bands.resize(count(file));
-        for (Bands& one : bands) {
-            get(file, one.shape);
-            get(file, one.table);
+        for (Bands& setup : bands) {
+            get(file, setup.shape);
+            get(file, setup.table);
         }
         passes.resize(count(file));
-        for (Passes& one : passes) {
-            get(file, one.shape);
-            get(file, one.levels);
-            get(file, one.passes);
-            get(file, one.taps);
+        for (Passes& setup : passes) {
+            get(file, setup.shape);
+            get(file, setup.levels);
+            get(file, setup.passes);
+            get(file, setup.taps);
         }
         std::fclose(file);
     }
@@ -66,10 +68,11 @@ private:
         if (std::fread(&n, sizeof n, 1, file) != 1) std::exit(2);
         return static_cast<std::size_t>(n);
     }
-    // A number of bytes, then these.
+    // Reads a number of bytes, then as many bytes.
     template <class T> static void get(std::FILE* file, std::vector<T>& into) {
         into.resize(count(file) / sizeof(T));
-        if (!into.empty() && std::fread(into.data(), sizeof(T), into.size(), file) != into.size()) std::exit(2);
+        if (!into.empty() && std::fread(into.data(), sizeof(T), into.size(), file) != into.size())
+            std::exit(2);
     }
 };
 
@@ -78,7 +81,9 @@ inline const Setups& setups() {
     return loaded;
 }
 
-inline std::int64_t volume(const std::vector<std::int64_t>& shape) { return shape[0] * shape[1] * shape[2] * shape[3]; }
+inline std::int64_t volume(const std::vector<std::int64_t>& shape) {
+    return shape[0] * shape[1] * shape[2] * shape[3];
+}
 
 inline std::vector<std::int64_t> small_shape(Reader& in, std::int64_t most) {
     std::vector<std::int64_t> shape;
@@ -93,15 +98,17 @@ template <class T> std::vector<T> repeated(Reader& in, std::int64_t n) {
     return values;
 }
 
-// Never -2^31, which no coder gives.
+// Integers without -2^31, which no coder gives.
 inline std::vector<std::int32_t> integers(Reader& in, std::int64_t n) {
     std::vector<std::int32_t> values = repeated<std::int32_t>(in, n);
-    for (std::int32_t& value : values) value = std::max(value, -std::numeric_limits<std::int32_t>::max());
+    for (std::int32_t& value : values)
+        value = std::max(value, -std::numeric_limits<std::int32_t>::max());
     return values;
 }
 
-// Levels of a mask: below 32 and below 16; all 0 where it is not `informed`.
-inline void mask_levels(Reader& in, bool informed, std::vector<std::uint8_t>& level, std::vector<std::uint8_t>& other) {
+// Levels of a mask, below 32 and below 16; all 0 unless it is `informed`.
+inline void mask_levels(Reader& in, bool informed, std::vector<std::uint8_t>& level,
+                        std::vector<std::uint8_t>& other) {
     for (std::size_t i = 0; i < level.size() && informed; i++) {
         const std::uint8_t both = i % 4 ? static_cast<std::uint8_t>(level[i - 1] + 1) : in.byte();
         level[i] = both & 31;
@@ -110,7 +117,8 @@ inline void mask_levels(Reader& in, bool informed, std::vector<std::uint8_t>& le
 }
 
 inline std::vector<std::int16_t> tap_weights(Reader& in, const Passes& with) {
-    std::vector<std::int16_t> weights = in.numbers<std::int16_t>(static_cast<std::int64_t>(with.taps.size() / 5));
+    std::vector<std::int16_t> weights =
+        in.numbers<std::int16_t>(static_cast<std::int64_t>(with.taps.size() / 5));
     for (std::int16_t& weight : weights) weight = std::max<std::int16_t>(weight, -32767);
     return weights;
 }

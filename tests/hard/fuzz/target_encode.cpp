@@ -1,4 +1,4 @@
-// What the encoders write is decoded to what was coded, whatever it is; a difference ends the process.
+// The output of each encoder must decode to its input; a difference ends the process.
 #include <algorithm>
 #include <cmath>
 
@@ -8,20 +8,27 @@
 using std::int64_t;
 
 extern "C" {
-int64_t fhash_encode(std::int32_t*, const float*, double, const int64_t*, const std::int32_t*, int64_t, std::uint16_t*, int64_t, std::int32_t*,
-                     int64_t, std::uint16_t*, int64_t, int64_t, std::uint8_t*, int64_t);
-int64_t fhash_decode(std::int32_t*, const int64_t*, const std::int32_t*, int64_t, const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
+int64_t fhash_encode(std::int32_t*, const float*, double, const int64_t*, const std::int32_t*,
+                     int64_t, std::uint16_t*, int64_t, std::int32_t*, int64_t, std::uint16_t*,
+                     int64_t, int64_t, std::uint8_t*, int64_t);
+int64_t fhash_decode(std::int32_t*, const int64_t*, const std::int32_t*, int64_t,
+                     const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-int64_t fhash_encode_mask(const std::uint8_t*, const std::uint8_t*, const std::uint8_t*, const int64_t*, std::uint16_t*, int64_t, std::int32_t*,
-                          int64_t, std::uint16_t*, int64_t, int64_t, std::uint8_t*, int64_t);
-int64_t fhash_decode_mask(std::uint8_t*, const std::uint8_t*, const std::uint8_t*, const int64_t*, const std::uint16_t*, int64_t,
-                          const std::int32_t*, int64_t, const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-int64_t fhash_encode_predicted(std::int32_t*, const std::uint8_t*, const int64_t*, const int64_t*, const std::int32_t*, int64_t,
-                               const std::int32_t*, const std::int16_t*, const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
-                               const std::uint16_t*, int64_t, std::uint8_t*, int64_t);
-int64_t fhash_decode_predicted(std::int32_t*, const int64_t*, const int64_t*, const std::int32_t*, int64_t, const std::int32_t*,
-                               const std::int16_t*, const std::uint16_t*, int64_t, const std::int32_t*, int64_t, const std::uint16_t*, int64_t,
-                               const std::uint8_t*, int64_t);
+int64_t fhash_encode_mask(const std::uint8_t*, const std::uint8_t*, const std::uint8_t*,
+                          const int64_t*, std::uint16_t*, int64_t, std::int32_t*, int64_t,
+                          std::uint16_t*, int64_t, int64_t, std::uint8_t*, int64_t);
+int64_t fhash_decode_mask(std::uint8_t*, const std::uint8_t*, const std::uint8_t*, const int64_t*,
+                          const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
+                          const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
+int64_t fhash_encode_predicted(std::int32_t*, const std::uint8_t*, const int64_t*, const int64_t*,
+                               const std::int32_t*, int64_t, const std::int32_t*,
+                               const std::int16_t*, const std::uint16_t*, int64_t,
+                               const std::int32_t*, int64_t, const std::uint16_t*, int64_t,
+                               std::uint8_t*, int64_t);
+int64_t fhash_decode_predicted(std::int32_t*, const int64_t*, const int64_t*, const std::int32_t*,
+                               int64_t, const std::int32_t*, const std::int16_t*,
+                               const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
+                               const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
 }
 
 namespace {
@@ -32,7 +39,8 @@ void require(bool holds, const char* what) {
     std::abort();
 }
 
-// Call an encoder with little room and, where that is not enough, with what it asked for, in memory of exact length.
+// Calls an encoder with little room and, if that is not enough, with as much as it asked for. The
+// memory has exactly the length of the data.
 template <class F> std::vector<std::uint8_t> coded(std::size_t room, F encode) {
     std::vector<std::uint8_t> data(room);
     const int64_t size = encode(data);
@@ -48,46 +56,53 @@ template <class F> std::vector<std::uint8_t> coded(std::size_t room, F encode) {
 
 int64_t length(const std::vector<std::uint8_t>& data) { return static_cast<int64_t>(data.size()); }
 
-// Integers within +-most; mostly small ones, as coders see them.
+// Integers within +-most; mostly small ones, as coders get them.
 std::vector<std::int32_t> bounded(Reader& in, int64_t n, std::int32_t most) {
     const std::uint8_t shift = in.byte() % 32;
     std::vector<std::int32_t> values = integers(in, n);
-    for (std::int32_t& value : values) value = std::max(-most, std::min(most, value / (std::int32_t{1} << std::min<int>(shift, 30))));
+    for (std::int32_t& value : values)
+        value =
+            std::max(-most, std::min(most, value / (std::int32_t{1} << std::min<int>(shift, 30))));
     return values;
 }
 
-// Integers to bytes and back; with `scaled` the integers are chosen, and come back as they were.
-std::vector<std::int32_t> there_and_back(const Bands& with, std::vector<std::int32_t>& q, const std::vector<float>& scaled, double lambda,
+// Codes integers and decodes them. With `scaled`, the encoder chooses the integers; without, it
+// must not change them.
+std::vector<std::int32_t> there_and_back(const Bands& with, std::vector<std::int32_t>& q,
+                                         const std::vector<float>& scaled, double lambda,
                                          std::size_t room) {
     State state = setups().coder;
     const std::vector<std::int32_t> given = q;
     const int64_t bands = static_cast<int64_t>(with.table.size() / 29);
     const std::vector<std::uint8_t> data = coded(room, [&](std::vector<std::uint8_t>& into) {
         q = given;
-        return fhash_encode(q.data(), scaled.empty() ? nullptr : scaled.data(), lambda, with.shape.data(), with.table.data(), bands,
-                            state.slots.data(), static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
-                            static_cast<int64_t>(state.weights.size()), state.simples.data(), static_cast<int64_t>(state.simples.size() / 2), 0,
-                            into.data(), length(into));
+        return fhash_encode(q.data(), scaled.empty() ? nullptr : scaled.data(), lambda,
+                            with.shape.data(), with.table.data(), bands, state.slots.data(),
+                            static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
+                            static_cast<int64_t>(state.weights.size()), state.simples.data(),
+                            static_cast<int64_t>(state.simples.size() / 2), 0, into.data(),
+                            length(into));
     });
     require(!scaled.empty() || q == given, "integers that the encoder changed");
-    std::vector<std::int32_t> found(q.size(), 0);
-    const int64_t code = fhash_decode(found.data(), with.shape.data(), with.table.data(), bands, state.slots.data(),
-                                      static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
-                                      static_cast<int64_t>(state.weights.size()), state.simples.data(),
-                                      static_cast<int64_t>(state.simples.size() / 2), data.data(), length(data));
+    std::vector<std::int32_t> decoded(q.size(), 0);
+    const int64_t code = fhash_decode(
+        decoded.data(), with.shape.data(), with.table.data(), bands, state.slots.data(),
+        static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
+        static_cast<int64_t>(state.weights.size()), state.simples.data(),
+        static_cast<int64_t>(state.simples.size() / 2), data.data(), length(data));
     require(code == 0, "bytes of the encoder are refused");
-    return found;
+    return decoded;
 }
 
-// Where the bands of a table are; what is elsewhere counts as 0.
+// 1 for each vertex that a band of the table covers; integers elsewhere are coded as 0.
 const std::vector<std::int32_t>& inside(std::size_t number) {
-    static std::vector<std::vector<std::int32_t>> known(setups().bands.size());
-    if (known[number].empty()) {
+    static std::vector<std::vector<std::int32_t>> covered(setups().bands.size());
+    if (covered[number].empty()) {
         const Bands& with = setups().bands[number];
         std::vector<std::int32_t> ones(static_cast<std::size_t>(volume(with.shape)), 1);
-        known[number] = there_and_back(with, ones, {}, 0, 0);
+        covered[number] = there_and_back(with, ones, {}, 0, 0);
     }
-    return known[number];
+    return covered[number];
 }
 
 void of_integers(Reader& in) {
@@ -96,31 +111,39 @@ void of_integers(Reader& in) {
     const std::size_t room = 4U * in.byte();
     const bool choose = in.byte() & 1;
     const double lambda = choose ? std::ldexp(1.0, static_cast<int>(in.within(-20, 10))) : 0;
-    // A magnitude to choose is one that float32 tells from the next.
-    std::vector<std::int32_t> q = bounded(in, volume(with.shape), choose ? (1 << 23) - 1 : (1 << 30) - 1);
+    // Magnitudes to choose are exact in float32.
+    std::vector<std::int32_t> q =
+        bounded(in, volume(with.shape), choose ? (1 << 23) - 1 : (1 << 30) - 1);
     std::vector<float> scaled(choose ? q.size() : 0);
-    for (std::size_t i = 0; i < scaled.size(); i++) scaled[i] = static_cast<float>(q[i]) + static_cast<float>(static_cast<int>(i % 15) - 7) / 16;
-    const std::vector<std::int32_t> found = there_and_back(with, q, scaled, lambda, room);
-    for (std::size_t i = 0; i < q.size(); i++) require(found[i] == (inside(number)[i] ? q[i] : 0), "other integers");
+    for (std::size_t i = 0; i < scaled.size(); i++)
+        scaled[i] =
+            static_cast<float>(q[i]) + static_cast<float>(static_cast<int>(i % 15) - 7) / 16;
+    const std::vector<std::int32_t> decoded = there_and_back(with, q, scaled, lambda, room);
+    for (std::size_t i = 0; i < q.size(); i++)
+        require(decoded[i] == (inside(number)[i] ? q[i] : 0), "other integers");
 }
 
 void of_masks(Reader& in) {
     const std::vector<int64_t> shape = small_shape(in, 8);
     State state = setups().mask;
     const std::size_t n = static_cast<std::size_t>(volume(shape)), room = in.byte();
-    std::vector<std::uint8_t> level(n), other(n), mask = repeated<std::uint8_t>(in, volume(shape)), found(n);
+    std::vector<std::uint8_t> level(n), other(n), mask = repeated<std::uint8_t>(in, volume(shape)),
+                                                  decoded(n);
     mask_levels(in, in.byte() & 1, level, other);
     for (std::uint8_t& bit : mask) bit &= 1;
     const std::vector<std::uint8_t> data = coded(room, [&](std::vector<std::uint8_t>& into) {
-        return fhash_encode_mask(mask.data(), level.data(), other.data(), shape.data(), state.slots.data(),
-                                 static_cast<int64_t>(state.slots.size() / 4), state.weights.data(), static_cast<int64_t>(state.weights.size()),
-                                 state.simples.data(), static_cast<int64_t>(state.simples.size() / 2), 0, into.data(), length(into));
+        return fhash_encode_mask(
+            mask.data(), level.data(), other.data(), shape.data(), state.slots.data(),
+            static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
+            static_cast<int64_t>(state.weights.size()), state.simples.data(),
+            static_cast<int64_t>(state.simples.size() / 2), 0, into.data(), length(into));
     });
-    const int64_t code = fhash_decode_mask(found.data(), level.data(), other.data(), shape.data(), state.slots.data(),
-                                           static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
-                                           static_cast<int64_t>(state.weights.size()), state.simples.data(),
-                                           static_cast<int64_t>(state.simples.size() / 2), data.data(), length(data));
-    require(code == 0 && found == mask, "another mask");
+    const int64_t code = fhash_decode_mask(
+        decoded.data(), level.data(), other.data(), shape.data(), state.slots.data(),
+        static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
+        static_cast<int64_t>(state.weights.size()), state.simples.data(),
+        static_cast<int64_t>(state.simples.size() / 2), data.data(), length(data));
+    require(code == 0 && decoded == mask, "another mask");
 }
 
 void of_predicted(Reader& in) {
@@ -129,27 +152,31 @@ void of_predicted(Reader& in) {
     const std::vector<std::int16_t> weights = tap_weights(in, with);
     const bool all = in.byte() & 1;
     std::vector<std::int32_t> q = bounded(in, volume(with.shape), 1 << 27);
-    std::vector<std::uint8_t> care = repeated<std::uint8_t>(in, volume(with.shape));
-    for (std::uint8_t& one : care) one &= 1;
+    std::vector<std::uint8_t> counted = repeated<std::uint8_t>(in, volume(with.shape));
+    for (std::uint8_t& bit : counted) bit &= 1;
     const std::vector<std::int32_t> given = q;
     std::vector<std::uint8_t> data(static_cast<std::size_t>(40 * volume(with.shape) + 64));
     const int64_t passes = static_cast<int64_t>(with.passes.size() / 4);
     const int64_t size = fhash_encode_predicted(
-        q.data(), all ? nullptr : care.data(), with.shape.data(), with.levels.data(), with.passes.data(), passes, with.taps.data(),
-        weights.data(), blank.slots.data(), static_cast<int64_t>(blank.slots.size() / 4), blank.weights.data(),
-        static_cast<int64_t>(blank.weights.size()), blank.simples.data(), static_cast<int64_t>(blank.simples.size() / 2), data.data(),
-        length(data));
-    if (size == -1) return;  // a prediction out of bounds: Python takes other settings
+        q.data(), all ? nullptr : counted.data(), with.shape.data(), with.levels.data(),
+        with.passes.data(), passes, with.taps.data(), weights.data(), blank.slots.data(),
+        static_cast<int64_t>(blank.slots.size() / 4), blank.weights.data(),
+        static_cast<int64_t>(blank.weights.size()), blank.simples.data(),
+        static_cast<int64_t>(blank.simples.size() / 2), data.data(), length(data));
+    if (size == -1) return;  // a prediction out of bounds, for which Python takes other settings
     require(size >= 0 && size <= length(data), "more bytes than integers can take");
     data.resize(static_cast<std::size_t>(size));
     data.shrink_to_fit();
-    for (std::size_t i = 0; i < q.size(); i++) require(q[i] == given[i] || !(all || care[i]), "integers that matter were changed");
-    std::vector<std::int32_t> found(q.size(), 0);
+    for (std::size_t i = 0; i < q.size(); i++)
+        require(q[i] == given[i] || !(all || counted[i]), "integers that matter were changed");
+    std::vector<std::int32_t> decoded(q.size(), 0);
     const int64_t code = fhash_decode_predicted(
-        found.data(), with.shape.data(), with.levels.data(), with.passes.data(), passes, with.taps.data(), weights.data(), blank.slots.data(),
-        static_cast<int64_t>(blank.slots.size() / 4), blank.weights.data(), static_cast<int64_t>(blank.weights.size()), blank.simples.data(),
+        decoded.data(), with.shape.data(), with.levels.data(), with.passes.data(), passes,
+        with.taps.data(), weights.data(), blank.slots.data(),
+        static_cast<int64_t>(blank.slots.size() / 4), blank.weights.data(),
+        static_cast<int64_t>(blank.weights.size()), blank.simples.data(),
         static_cast<int64_t>(blank.simples.size() / 2), data.data(), length(data));
-    require(code == 0 && found == q, "other predicted integers");
+    require(code == 0 && decoded == q, "other predicted integers");
 }
 
 }  // namespace

@@ -1,5 +1,5 @@
-// The light that the volume takes away, with hostile values. The numbers of a table are finite, and
-// steps are as fhash_codec/rendering/task/light.py makes them.
+// The light that passes the volume, with hostile values. The numbers of a table are finite, and the
+// steps are those of fhash_codec/rendering/task/light.py.
 #include <algorithm>
 #include <cmath>
 
@@ -9,9 +9,10 @@
 using std::int64_t;
 
 extern "C" {
-int64_t fhash_march_extinction(const float*, const int64_t*, const float*, int64_t, double, double, int64_t, const int64_t*, int64_t, int64_t,
-                               float*, float*);
-int64_t fhash_march_sum(const float*, const int64_t*, const double*, int64_t, int64_t, int64_t, float*);
+int64_t fhash_march_extinction(const float*, const int64_t*, const float*, int64_t, double, double,
+                               int64_t, const int64_t*, int64_t, int64_t, float*, float*);
+int64_t fhash_march_sum(const float*, const int64_t*, const double*, int64_t, int64_t, int64_t,
+                        float*);
 }
 
 void light(Reader& in) {
@@ -24,18 +25,21 @@ void light(Reader& in) {
     const std::vector<float> values = repeated<float>(in, shape[0] * shape[1] * shape[2]);
     const int64_t entries = in.within(2, 40);
     std::vector<float> table = repeated<float>(in, entries + 1);
-    for (float& one : table) one = std::isfinite(one) ? std::min(std::fabs(one), 1e30F) : 0.0F;
+    for (float& entry : table)
+        entry = std::isfinite(entry) ? std::min(std::fabs(entry), 1e30F) : 0.0F;
     const double low = in.finite<double>(), scale = std::fabs(in.finite<double>());
-    std::vector<float> extinction(static_cast<std::size_t>(points[0] * points[1] * points[2])), scratch(static_cast<std::size_t>(shape[2]));
-    fhash_march_extinction(values.data(), shape, table.data(), entries, low, scale, cell, points, 0, points[0], extinction.data(),
-                           scratch.data());
+    std::vector<float> extinction(static_cast<std::size_t>(points[0] * points[1] * points[2])),
+        scratch(static_cast<std::size_t>(shape[2]));
+    fhash_march_extinction(values.data(), shape, table.data(), entries, low, scale, cell, points, 0,
+                           points[0], extinction.data(), scratch.data());
     double step[3];
-    for (double& one : step) one = std::remainder(in.finite<double>(), 16.0);
+    for (double& length : step) length = std::remainder(in.finite<double>(), 16.0);
     std::vector<float> sum(extinction.size());
     fhash_march_sum(extinction.data(), points, step, in.within(1, 60), 0, points[0], sum.data());
     for (std::size_t i = 0; i < sum.size(); i++) {
         if (extinction[i] >= 0 && sum[i] >= 0) continue;
-        std::fprintf(stderr, "extinctions of %g and a sum of %g\n", static_cast<double>(extinction[i]), static_cast<double>(sum[i]));
+        std::fprintf(stderr, "extinctions of %g and a sum of %g\n",
+                     static_cast<double>(extinction[i]), static_cast<double>(sum[i]));
         std::abort();
     }
 }

@@ -1,7 +1,8 @@
-// One entry per kind of function of the native library: hostile bytes become arguments as far as Python passes them unchecked.
+// A target for each kind of function of the native libraries: hostile bytes become the arguments
+// that Python passes on unchecked.
 //
-// The first byte of an input chooses the function. Arrays lie in memory of their own and of exact length, so that the address sanitizer sees
-// every step beyond them.
+// The first byte of an input chooses the target. Arrays lie in memory of their own and of exact
+// length, so that the address sanitizer sees every access beyond them.
 #include <algorithm>
 #include <cmath>
 
@@ -17,33 +18,44 @@ void march(Reader& in);  // target_march.cpp
 #endif
 
 extern "C" {
-int64_t fhash_decode(std::int32_t*, const int64_t*, const std::int32_t*, int64_t, const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
+int64_t fhash_decode(std::int32_t*, const int64_t*, const std::int32_t*, int64_t,
+                     const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-int64_t fhash_decode_mask(std::uint8_t*, const std::uint8_t*, const std::uint8_t*, const int64_t*, const std::uint16_t*, int64_t,
-                          const std::int32_t*, int64_t, const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
-int64_t fhash_decode_predicted(std::int32_t*, const int64_t*, const int64_t*, const std::int32_t*, int64_t, const std::int32_t*,
-                               const std::int16_t*, const std::uint16_t*, int64_t, const std::int32_t*, int64_t, const std::uint16_t*, int64_t,
-                               const std::uint8_t*, int64_t);
-int64_t fhash_transform_inverse_f32(const float*, float*, const int64_t*, const int64_t*, const int64_t*, const int64_t*, const float* const*,
+int64_t fhash_decode_mask(std::uint8_t*, const std::uint8_t*, const std::uint8_t*, const int64_t*,
+                          const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
+                          const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
+int64_t fhash_decode_predicted(std::int32_t*, const int64_t*, const int64_t*, const std::int32_t*,
+                               int64_t, const std::int32_t*, const std::int16_t*,
+                               const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
+                               const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
+int64_t fhash_transform_inverse_f32(const float*, float*, const int64_t*, const int64_t*,
+                                    const int64_t*, const int64_t*, const float* const*,
                                     const float*, const float*);
-int64_t fhash_transform_inverse_f64(const double*, double*, const int64_t*, const int64_t*, const int64_t*, const int64_t*,
-                                    const double* const*, const double*, const double*);
-int64_t fhash_transform_forward_f32(const float*, float*, const int64_t*, const int64_t*, const int64_t*, const int64_t*, const float* const*,
+int64_t fhash_transform_inverse_f64(const double*, double*, const int64_t*, const int64_t*,
+                                    const int64_t*, const int64_t*, const double* const*,
+                                    const double*, const double*);
+int64_t fhash_transform_forward_f32(const float*, float*, const int64_t*, const int64_t*,
+                                    const int64_t*, const int64_t*, const float* const*,
                                     const float*, const float*);
-int64_t fhash_transform_forward_f64(const double*, double*, const int64_t*, const int64_t*, const int64_t*, const int64_t*,
-                                    const double* const*, const double*, const double*);
-int64_t fhash_head_apply(const float*, int64_t, int64_t, int64_t, int64_t, int64_t, const int64_t*, const float*, const float*, const float*,
-                         float, float, float, float, float*);
-int64_t fhash_head_apply_cross(const float*, int64_t, int64_t, int64_t, int64_t, int64_t, const int64_t*, const float*, const float*,
-                               const float*, float, float, float, float, float*);
+int64_t fhash_transform_forward_f64(const double*, double*, const int64_t*, const int64_t*,
+                                    const int64_t*, const int64_t*, const double* const*,
+                                    const double*, const double*);
+int64_t fhash_head_apply(const float*, int64_t, int64_t, int64_t, int64_t, int64_t, const int64_t*,
+                         const float*, const float*, const float*, float, float, float, float,
+                         float*);
+int64_t fhash_head_apply_cross(const float*, int64_t, int64_t, int64_t, int64_t, int64_t,
+                               const int64_t*, const float*, const float*, const float*, float,
+                               float, float, float, float*);
 int64_t fhash_clip_f32(float*, int64_t, double, double, double);
 int64_t fhash_clip_f64(double*, int64_t, double, double, double);
 int64_t fhash_correct_f32_f32(const float*, const std::int32_t*, int64_t, double, float*);
 int64_t fhash_correct_f32_f64(const float*, const std::int32_t*, int64_t, double, double*);
 int64_t fhash_correct_f64_f32(const double*, const std::int32_t*, int64_t, double, float*);
 int64_t fhash_correct_f64_f64(const double*, const std::int32_t*, int64_t, double, double*);
-int64_t fhash_residual_f32_f32(const float*, const float*, const std::uint8_t*, int64_t, double, double, std::int32_t*);
-int64_t fhash_residual_f64_f64(const double*, const double*, const std::uint8_t*, int64_t, double, double, std::int32_t*);
+int64_t fhash_residual_f32_f32(const float*, const float*, const std::uint8_t*, int64_t, double,
+                               double, std::int32_t*);
+int64_t fhash_residual_f64_f64(const double*, const double*, const std::uint8_t*, int64_t, double,
+                               double, std::int32_t*);
 int64_t fhash_within_f32(const float*, const float*, const std::uint8_t*, int64_t, double);
 int64_t fhash_within_f64(const double*, const double*, const std::uint8_t*, int64_t, double);
 int64_t fhash_quantise_f32(const float*, int64_t, double, double, double, std::int32_t*, float*);
@@ -59,9 +71,12 @@ void decode_integers(Reader& in) {
     const State& prior = setups().coder;
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();
-    fhash_decode(q.data(), with.shape.data(), with.table.data(), static_cast<int64_t>(with.table.size() / 29), prior.slots.data(),
-                 static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(), static_cast<int64_t>(prior.weights.size()),
-                 prior.simples.data(), static_cast<int64_t>(prior.simples.size() / 2), data.data(), static_cast<int64_t>(data.size()));
+    fhash_decode(q.data(), with.shape.data(), with.table.data(),
+                 static_cast<int64_t>(with.table.size() / 29), prior.slots.data(),
+                 static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(),
+                 static_cast<int64_t>(prior.weights.size()), prior.simples.data(),
+                 static_cast<int64_t>(prior.simples.size() / 2), data.data(),
+                 static_cast<int64_t>(data.size()));
 }
 
 void decode_mask(Reader& in) {
@@ -72,9 +87,11 @@ void decode_mask(Reader& in) {
     const bool informed = in.byte() & 1;
     mask_levels(in, informed, level, other);
     const std::vector<std::uint8_t> data = in.rest();
-    fhash_decode_mask(mask.data(), level.data(), other.data(), shape.data(), prior.slots.data(), static_cast<int64_t>(prior.slots.size() / 4),
-                      prior.weights.data(), static_cast<int64_t>(prior.weights.size()), prior.simples.data(),
-                      static_cast<int64_t>(prior.simples.size() / 2), data.data(), static_cast<int64_t>(data.size()));
+    fhash_decode_mask(mask.data(), level.data(), other.data(), shape.data(), prior.slots.data(),
+                      static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(),
+                      static_cast<int64_t>(prior.weights.size()), prior.simples.data(),
+                      static_cast<int64_t>(prior.simples.size() / 2), data.data(),
+                      static_cast<int64_t>(data.size()));
 }
 
 void decode_predicted(Reader& in) {
@@ -83,13 +100,16 @@ void decode_predicted(Reader& in) {
     const std::vector<std::int16_t> weights = tap_weights(in, with);
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();
-    fhash_decode_predicted(q.data(), with.shape.data(), with.levels.data(), with.passes.data(), static_cast<int64_t>(with.passes.size() / 4),
-                           with.taps.data(), weights.data(), blank.slots.data(), static_cast<int64_t>(blank.slots.size() / 4),
-                           blank.weights.data(), static_cast<int64_t>(blank.weights.size()), blank.simples.data(),
-                           static_cast<int64_t>(blank.simples.size() / 2), data.data(), static_cast<int64_t>(data.size()));
+    fhash_decode_predicted(q.data(), with.shape.data(), with.levels.data(), with.passes.data(),
+                           static_cast<int64_t>(with.passes.size() / 4), with.taps.data(),
+                           weights.data(), blank.slots.data(),
+                           static_cast<int64_t>(blank.slots.size() / 4), blank.weights.data(),
+                           static_cast<int64_t>(blank.weights.size()), blank.simples.data(),
+                           static_cast<int64_t>(blank.simples.size() / 2), data.data(),
+                           static_cast<int64_t>(data.size()));
 }
 
-template <class T, class F> void transform(Reader& in, bool inverse, F function) {
+template <class T, class F> void transform(Reader& in, F function) {
     const std::vector<int64_t> shape = small_shape(in, 7);
     int64_t kinds[4], depths[4], ranks[4];
     std::vector<T> matrices[4];
@@ -108,50 +128,65 @@ template <class T, class F> void transform(Reader& in, bool inverse, F function)
         return values;
     };
     for (int axis = 0; axis < 4; axis++) {
-        // One more, as an empty array has an address in Python, too.
+        // At least one number, since an empty array has an address in Python, too.
         matrices[axis] = some(std::max<int64_t>(ranks[axis] * shape[axis], 1));
         pointers[axis] = kinds[axis] == 4 ? matrices[axis].data() : nullptr;
     }
-    (void)inverse;
-    const std::vector<T> tz = some(shape[0] * shape[1]), yx = some(shape[2] * shape[3]), values = some(volume(shape));
+    const std::vector<T> tz = some(shape[0] * shape[1]), yx = some(shape[2] * shape[3]),
+                         values = some(volume(shape));
     std::vector<T> out(values.size());
-    function(values.data(), out.data(), shape.data(), kinds, depths, ranks, pointers, tz.data(), yx.data());
+    function(values.data(), out.data(), shape.data(), kinds, depths, ranks, pointers, tz.data(),
+             yx.data());
 }
 
 void transform(Reader& in) {
     const std::uint8_t which = in.byte();
-    if (which & 1) transform<float>(in, which & 2, which & 2 ? fhash_transform_inverse_f32 : fhash_transform_forward_f32);
-    else transform<double>(in, which & 2, which & 2 ? fhash_transform_inverse_f64 : fhash_transform_forward_f64);
+    const bool inverse = which & 2;
+    if (which & 1)
+        transform<float>(in, inverse ? fhash_transform_inverse_f32 : fhash_transform_forward_f32);
+    else
+        transform<double>(in, inverse ? fhash_transform_inverse_f64 : fhash_transform_forward_f64);
 }
 
-// A positive half-precision number, as scales are stored.
+// A positive float16, as scales are stored.
 float scale_of(Reader& in) {
     const int bits = 1 + in.word() % 0x7bff;
     const int exponent = bits >> 10, fraction = bits & 1023;
-    return exponent ? std::ldexp(1024.0F + static_cast<float>(fraction), exponent - 25) : std::ldexp(static_cast<float>(fraction), -24);
+    return exponent ? std::ldexp(1024.0F + static_cast<float>(fraction), exponent - 25)
+                    : std::ldexp(static_cast<float>(fraction), -24);
 }
 
 void head(Reader& in) {
     const bool cross = in.byte() & 1;
     const int64_t hidden = cross ? 2 : in.within(1, 3);
     std::vector<int64_t> widths{28};
-    for (int64_t layer = 0; layer < hidden; layer++) widths.push_back(in.within(1, cross && layer == 0 ? 14 : 64));
+    for (int64_t layer = 0; layer < hidden; layer++)
+        widths.push_back(in.within(1, cross && layer == 0 ? 14 : 64));
     widths.push_back(1);
-    const std::vector<int64_t> shape = {in.within(1, 5), in.within(1, 4), in.within(1, 4), in.within(1, 140)};
-    const float sigma = std::ldexp(1.0F + static_cast<float>(in.byte()) / 256, static_cast<int>(in.within(-100, 99)));
+    const std::vector<int64_t> shape = {in.within(1, 5), in.within(1, 4), in.within(1, 4),
+                                        in.within(1, 140)};
+    const float sigma = std::ldexp(1.0F + static_cast<float>(in.byte()) / 256,
+                                   static_cast<int>(in.within(-100, 99)));
     float low = in.finite<float>(), high = in.finite<float>();
     if (low > high) std::swap(low, high);
     std::vector<float> weights, biases, scales;
     const std::vector<std::uint8_t> seed = in.numbers<std::uint8_t>(64);
     for (int64_t layer = 0; layer <= hidden; layer++) {
-        const int64_t inputs = cross && layer == 1 ? 9 * widths[1] : widths[static_cast<std::size_t>(layer)];
+        const int64_t inputs =
+            cross && layer == 1 ? 9 * widths[1] : widths[static_cast<std::size_t>(layer)];
         const int64_t outputs = widths[static_cast<std::size_t>(layer) + 1];
         const float unit = layer == hidden ? sigma : 128.0F, bias = scale_of(in);
         scales.push_back(scale_of(in) / (layer ? 128.0F : 512.0F) * unit);
-        for (int64_t i = 0; i < inputs * outputs; i++) weights.push_back(static_cast<float>(seed[static_cast<std::size_t>(i * 7 + layer) % 64] % 63 - 31));
-        for (int64_t i = 0; i < outputs; i++) biases.push_back(bias * static_cast<float>(seed[static_cast<std::size_t>(i + layer) % 64] % 255 - 127) * unit);
+        for (int64_t i = 0; i < inputs * outputs; i++)
+            weights.push_back(
+                static_cast<float>(seed[static_cast<std::size_t>(i * 7 + layer) % 64] % 63 - 31));
+        for (int64_t i = 0; i < outputs; i++)
+            biases.push_back(
+                bias *
+                static_cast<float>(seed[static_cast<std::size_t>(i + layer) % 64] % 255 - 127) *
+                unit);
     }
-    // As Head computes them.
+    // The same computation as in NeighbourHead.
     const float span = high - low;
     float unit = span > 0 ? 1024.0F / span : 0.0F;
     if (!std::isfinite(unit)) unit = 0.0F;
@@ -159,8 +194,9 @@ void head(Reader& in) {
     const std::vector<float> some = in.numbers<float>(32);
     for (std::size_t i = 0; i < values.size(); i++) values[i] = some[(i * i / 5) % some.size()];
     const auto function = cross ? fhash_head_apply_cross : fhash_head_apply;
-    function(values.data(), shape[0], shape[1], shape[2], shape[3], hidden + 1, widths.data(), weights.data(), biases.data(), scales.data(),
-             low, high, 0.5F / sigma, unit, out.data());
+    function(values.data(), shape[0], shape[1], shape[2], shape[3], hidden + 1, widths.data(),
+             weights.data(), biases.data(), scales.data(), low, high, 0.5F / sigma, unit,
+             out.data());
 }
 
 void values(Reader& in) {
@@ -169,7 +205,8 @@ void values(Reader& in) {
     const std::size_t count = static_cast<std::size_t>(n);
     const double a = in.finite<double>(), b = in.finite<double>(), c = in.finite<double>();
     std::vector<float> one = repeated<float>(in, n), other = repeated<float>(in, n), narrow(count);
-    std::vector<double> first = repeated<double>(in, n), second = repeated<double>(in, n), wide(count);
+    std::vector<double> first = repeated<double>(in, n), second = repeated<double>(in, n),
+                        wide(count);
     std::vector<std::int32_t> whole = integers(in, n), result(count);
     const std::vector<std::uint8_t> counts = repeated<std::uint8_t>(in, n);
     const std::uint8_t* const chosen = which & 64 ? counts.data() : nullptr;
@@ -186,12 +223,20 @@ void values(Reader& in) {
             fhash_correct_f64_f32(first.data(), whole.data(), n, a, narrow.data());
             fhash_correct_f64_f64(first.data(), whole.data(), n, a, wide.data());
             break;
-        case 3: fhash_residual_f32_f32(one.data(), other.data(), chosen, n, a, 1073741823.0, result.data()); break;
-        case 4: fhash_residual_f64_f64(first.data(), second.data(), chosen, n, a, 1073741823.0, result.data()); break;
+        case 3:
+            fhash_residual_f32_f32(one.data(), other.data(), chosen, n, a, 1073741823.0,
+                                   result.data());
+            break;
+        case 4:
+            fhash_residual_f64_f64(first.data(), second.data(), chosen, n, a, 1073741823.0,
+                                   result.data());
+            break;
         case 5: fhash_within_f32(one.data(), other.data(), chosen, n, a); break;
         case 6: fhash_within_f64(first.data(), second.data(), chosen, n, a); break;
         case 7: fhash_quantise_f32(one.data(), n, a, 0.5, 1e9, result.data(), narrow.data()); break;
-        case 8: fhash_quantise_f64(first.data(), n, a, 0.5, 1e9, result.data(), narrow.data()); break;
+        case 8:
+            fhash_quantise_f64(first.data(), n, a, 0.5, 1e9, result.data(), narrow.data());
+            break;
         default:
             fhash_dequantise_f32(whole.data(), n, a, b, c, a, narrow.data());
             fhash_dequantise_f64(whole.data(), n, a, b, c, a, wide.data());

@@ -1,8 +1,10 @@
-"""Packed values, as xarray writes them to zarr arrays: fill values and scaling by the CF conventions (1.11, sections 2.5.1 and 8.1).
+"""Packed values, as xarray writes them to zarr arrays, by the CF conventions.
 
-xarray is not needed for it: value = stored * scale_factor + add_offset, and NaN where stored equals `_FillValue` or `missing_value`.
-The type of the result follows xarray: float64 where there is a scale or an offset (JSON numbers have no narrower type), for fill values
-alone float32 if that holds every stored integer (up to 16 bits) and float64 otherwise; floats keep their type.
+CF 1.11, sections 2.5.1 and 8.1: value = stored * scale_factor + add_offset, and NaN where stored
+equals `_FillValue` or `missing_value`. xarray is not needed for it. The type of the result follows
+xarray: float64 with a scale or an offset (JSON numbers have no narrower type). With fill values
+alone it is float32 if that holds every stored integer (up to 16 bits), float64 otherwise; floats
+keep their type.
 """
 
 from __future__ import annotations
@@ -22,7 +24,11 @@ from fhash_formats.errors import InputError
 
 @dataclass(frozen=True, kw_only=True)
 class Packing:
-    """How to undo the packing of an array: stored type, type of the values, fill values, scale and offset (None: none)."""
+    """The packing of an array.
+
+    It has the stored type, the type of the values, the fill values, the scale and the offset (None:
+    none).
+    """
 
     stored: np.dtype[Any]
     dtype: np.dtype[Any]
@@ -53,9 +59,10 @@ class Packing:
 def packing(
     source: str, dtype: np.dtype[Any], attributes: Mapping[str, Any], fill_value: Any = None
 ) -> Packing:
-    """The packing that an array's attributes describe; `fill_value` is one more fill value, from zarr's own metadata.
+    """The packing that an array's attributes describe.
 
-    Raises InputError where an attribute is not a number.
+    fill_value: a further fill value, from zarr's own metadata. Raises InputError for an attribute
+    that is not a number.
     """
     stored = dtype.newbyteorder("=")
     if stored.kind == "i" and str(attributes.get("_Unsigned", "")).lower() == "true":
@@ -87,9 +94,10 @@ def packing(
 
 
 def _fill(source: str, value: Any, stored: np.dtype[Any]) -> Any:
-    """A fill value as the stored type has it, or None if that type cannot hold it and so never does.
+    """A fill value in the stored type; None if that type cannot hold it, so that it never occurs.
 
-    xarray writes the fill value of a float array of zarr format 3 as base64 of a little-endian float64; others write a number or "NaN".
+    xarray writes the fill value of a float array of zarr format 3 as base64 of a little-endian
+    float64; others write a number or "NaN".
     """
     if isinstance(value, str):
         try:
@@ -105,13 +113,13 @@ def _fill(source: str, value: Any, stored: np.dtype[Any]) -> Any:
         return stored.type(value)
     if not math.isfinite(value) or value != int(value):
         return None
-    whole = int(value)
+    integer = int(value)
     limits = np.iinfo(stored)
-    if whole < 0 and stored.kind == "u":
-        whole += 2 ** (
+    if integer < 0 and stored.kind == "u":
+        integer += 2 ** (
             8 * stored.itemsize
         )  # the fill value of an _Unsigned array is written signed
-    return stored.type(whole) if limits.min <= whole <= limits.max else None
+    return stored.type(integer) if limits.min <= integer <= limits.max else None
 
 
 def _number(source: str, name: str, value: Any) -> float | None:

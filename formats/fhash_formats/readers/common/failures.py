@@ -1,4 +1,4 @@
-"""How a reader reports trouble: one line of what a library said, and a source that changes under it."""
+"""Errors of readers: a library's message on one line, and a source that changes while read."""
 
 from __future__ import annotations
 
@@ -16,17 +16,20 @@ LONGEST_MESSAGE = 240
 
 
 def condense(error: BaseException) -> str:
-    """A library's message on one line, cut at a length that a terminal can show; the type's name where it says nothing."""
+    """A library's message on one line, cut to a length that a terminal shows.
+
+    The name of the error's type stands for an empty message.
+    """
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= LONGEST_MESSAGE else text[: LONGEST_MESSAGE - 3] + "..."
 
 
 @contextmanager
 def refusing(what: str) -> Iterator[None]:
-    """Turn whatever a library raises on damaged or unsuitable data into an InputError "what: message".
+    """Turn any error of a library on damaged or unsuitable data into an InputError "what: message".
 
-    The catch is wide on purpose: on the same broken file h5py raises OSError, RuntimeError or KeyError, and zarr whatever its codecs do.
-    Errors of this project and a lack of memory pass.
+    The catch is wide on purpose: on the same broken file h5py raises OSError, RuntimeError or
+    KeyError, and zarr whatever its codecs raise. Errors of this project and a lack of memory pass.
     """
     try:
         yield
@@ -38,7 +41,10 @@ def refusing(what: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Stamp:
-    """Size, time of change and identity of a file when it was opened: readers check it around every frame."""
+    """Size, time of change and identity of a file when it was opened.
+
+    Readers check it around every frame.
+    """
 
     path: Path
     size: int
@@ -53,7 +59,7 @@ class Stamp:
         return cls(path, found.st_size, found.st_mtime_ns, found.st_ino)
 
     def check(self) -> None:
-        """Raise InputError if the file is no longer the one that was opened, so that frames of two states are never mixed."""
+        """Raise InputError if the file has changed, so that frames of two states never mix."""
         now = Stamp.of(self.path)
         if now != self:
             grown = (
@@ -62,15 +68,16 @@ class Stamp:
                 else "same size, written again"
             )
             raise InputError(
-                f"{self.path} changed while it was being read ({grown}); wait until it is complete and start again"
+                f"{self.path} changed while it was being read ({grown}); wait until it is complete"
+                " and start again"
             )
 
 
 @dataclass(frozen=True)
 class FolderStamp:
-    """What is below a folder: number of files, their bytes, and a digest of their names, sizes, times and identities.
+    """Content of a folder: number of files, their bytes, and a digest of names, sizes and times.
 
-    One look at every file, which is too dear around every frame: `Series.check` is for it.
+    It looks at every file, which is too slow around every frame: `Series.check` uses it.
     """
 
     path: Path
@@ -94,20 +101,21 @@ class FolderStamp:
                         continue
                     state = os.stat(entry.path)
                     files, size = files + 1, size + state.st_size
-                    digest.update(
-                        f"{entry.path}\0{state.st_size} {state.st_mtime_ns} {state.st_ino}\0".encode(
-                            errors="surrogateescape"
-                        )
-                    )
+                    figures = f"{state.st_size} {state.st_mtime_ns} {state.st_ino}"
+                    digest.update(f"{entry.path}\0{figures}\0".encode(errors="surrogateescape"))
         return cls(path, files, size, digest.digest())
 
     def check(self) -> None:
-        """Raise InputError if anything in the folder is no longer what it was when the folder was opened."""
+        """Raise InputError if anything in the folder has changed since it was opened."""
         now = FolderStamp.of(self.path)
         if now != self:
             what = "something in it was written again"
             if (now.files, now.size) != (self.files, self.size):
-                what = f"{self.files} files and {self.size} bytes before, {now.files} and {now.size} now"
+                what = (
+                    f"{self.files} files and {self.size} bytes before,"
+                    f" {now.files} and {now.size} now"
+                )
             raise InputError(
-                f"{self.path} changed while it was being read ({what}); wait until it is complete and start again"
+                f"{self.path} changed while it was being read ({what}); wait until it is complete"
+                " and start again"
             )

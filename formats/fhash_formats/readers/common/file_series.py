@@ -1,4 +1,4 @@
-"""A series in a file: whatever the order of the file's dimensions, frames come out as (z, y, x), one at a time."""
+"""A series in a file: frames come out as (z, y, x), whatever the order of the file's dimensions."""
 
 from __future__ import annotations
 
@@ -16,29 +16,41 @@ from fhash_formats.series import AXES, Coordinate, Series, check_values, index_c
 from fhash_formats.support.attributes import plain_text
 
 SLAB_BYTES = 64 * 2**20
-"""The most that is kept of a file between frames. A chunk that spans many steps would be decompressed again for each of them; with this
-much, chunks of several frames of 128^3 float64 are decompressed once, and memory stays small beside the encoder's own."""
+"""Bytes of a file that are kept between frames, at most.
+
+A chunk that spans many steps would be decompressed again for each of them. With this limit, chunks
+of several frames of 128^3 float64 are decompressed once, and memory stays small beside the
+encoder's own.
+"""
 
 Fetch = Callable[[tuple[slice, ...]], npt.NDArray[Any]]
 
 
 def native(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The type of the frames of stored values: native byte order, booleans as the numbers 0 and 1."""
+    """Type of the frames of stored values: native byte order, booleans as the numbers 0 and 1."""
     return np.dtype(np.uint8) if dtype.kind == "b" else dtype.newbyteorder("=")
 
 
 class FileSeries(Series):
-    """A series whose frames are fetched from a file as slices in the file's own order of dimensions.
+    """A series whose frames are fetched from a file as slices in the file's own order of
+    dimensions.
 
-    Arguments: `shape` and `axes` in the file's order; `fetch(slices)` returns a fresh array of the file's dimensions, in physical values
-    of type `dtype` (any byte order); `chunks` is the shape of a stored chunk, None without chunks: as many steps of one chunk as fit
-    SLAB_BYTES are fetched at once and kept until the next fetch, a frame alone otherwise; `stamp` is checked before and after every
-    fetch; `beside` are files that hold values of it, other than `source`, and are checked likewise; `folder` is the stamp of all its
-    files, which `check` alone looks at. Raises InputError for a shape or type that cannot be a series.
+    Args:
+        shape, axes: lengths and axes of the dimensions, in the file's order.
+        dtype: type of the physical values, in any byte order.
+        fetch: `fetch(slices)` returns a fresh array of the file's dimensions.
+        chunks: shape of a stored chunk, None without chunks. As many steps of one chunk as fit
+            SLAB_BYTES are fetched at once and kept until the next fetch; without chunks, one frame
+            at a time.
+        stamp: checked before and after every fetch.
+        beside: further files that hold values, checked likewise.
+        folder: stamp of all files, which `check` alone looks at.
+
+    Raises InputError for a shape or type that cannot be a series.
 
     Attributes:
-        given: the axes whose coordinate the file gives.
-        stamps: of all that it is read from when it was opened.
+        given: axes whose coordinate the file gives.
+        stamps: stamps of everything that is read, from when it was opened.
     """
 
     def __init__(
@@ -121,7 +133,8 @@ class FileSeries(Series):
         expected = {**dict(zip(AXES, self.shape, strict=True)), "t": stop - start}
         if values.shape != tuple(expected[axis] for axis in self._axes):
             raise InputError(
-                f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed while it was being read"
+                f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed"
+                " while it was being read"
             )
         present = [axis for axis in AXES if axis in self._axes]
         ordered = values.transpose([self._axes.index(axis) for axis in present])
@@ -133,7 +146,10 @@ class FileSeries(Series):
 def _steps_of_a_chunk(
     axes: Sequence[str], shape: Sequence[int], chunks: Sequence[int] | None
 ) -> int:
-    """Steps in one chunk; without chunks one, or all where time is not the slowest dimension."""
+    """Steps in one chunk.
+
+    Without chunks it is 1, or all steps where time is not the slowest dimension.
+    """
     if "t" not in axes:
         return 1
     place = axes.index("t")

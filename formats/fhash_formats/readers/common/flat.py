@@ -1,4 +1,4 @@
-"""Arrays whose values lie in a file one after the other, without chunks or compression: .npy and raw."""
+"""Arrays whose values lie in a file one after the other, without chunks: .npy and raw."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError
 
 BLOCK_BYTES = 8 * 2**20
-"""The most that is read at once where the wanted values are scattered, as with time fastest."""
+"""Bytes read at once where the requested values are scattered, as with time fastest."""
 
 SHORTEST_RUN = 16 * 2**10
-"""Bytes below which a run is not worth a read of its own."""
+"""Bytes below which a run of values is not worth a read of its own."""
 
 
 class FlatArray:
-    """An array of `shape` (slowest dimension first) and `dtype` that starts at byte `offset` of a file.
+    """An array of `shape` (slowest dimension first) and `dtype` from byte `offset` of a file on.
 
-    Read with seek and read and not through a memory map, which would kill the process if the file were cut meanwhile.
+    It is read with seek and read: a memory map would kill the process if the file were cut
+    meanwhile.
     """
 
     def __init__(
@@ -31,11 +32,14 @@ class FlatArray:
 
     @property
     def end(self) -> int:
-        """The byte after the last value: what the size of the file should be."""
+        """The byte after the last value, which is the expected size of the file."""
         return self.offset + prod(self.shape) * self.dtype.itemsize
 
     def read(self, ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """The values in the ranges, of which at most one is not the whole dimension; raises InputError where the file ends too early."""
+        """Values in ranges, of which at most one is not the whole dimension.
+
+        Raises InputError where the file ends too early.
+        """
         parts = [
             place
             for place, (part, length) in enumerate(zip(ranges, self.shape, strict=True))
@@ -50,7 +54,7 @@ class FlatArray:
         return result.reshape(*self.shape[:place], part.stop - part.start, *self.shape[place + 1 :])
 
     def _fill(self, file: BinaryIO, result: npt.NDArray[Any], stride: int, first: int) -> None:
-        """Each row of the result from `first` in each `stride` values of the file."""
+        """Fill each row of the result from `first` on in each `stride` values of the file."""
         rows, run = result.shape
         item = self.dtype.itemsize
         if rows == 1 or run * item >= SHORTEST_RUN or stride * item > BLOCK_BYTES:

@@ -1,4 +1,4 @@
-"""What an HDF5 file holds: its datasets, which of them are coordinates, and whether they can be read here."""
+"""Datasets of an HDF5 file: which are coordinates, and whether they can be read here."""
 
 from __future__ import annotations
 
@@ -32,10 +32,11 @@ FILTER_NAMES = {
 
 
 def datasets(root: Any) -> Iterator[tuple[str, Any]]:
-    """Every dataset under a group with its full name (no leading slash), each once, in the order of names.
+    """Every dataset under a group with its full name (no leading slash), once, in the order of
+    names.
 
-    Soft and external links are followed where they lead somewhere (visititems would pass them by); an object reached a second time,
-    by a hard link or by a cycle of groups, is passed over.
+    Soft and external links are followed where they lead somewhere (visititems would skip them). An
+    object reached a second time, by a hard link or by a cycle of groups, is skipped.
     """
     import h5py
 
@@ -52,7 +53,8 @@ def datasets(root: Any) -> Iterator[tuple[str, Any]]:
         elif isinstance(node, h5py.Group):
             for name in sorted(node, reverse=True):
                 child = _follow(node, name)
-                # what a link leads to comes last, so that an object goes by its own name and not by the link's
+                # what a link leads to comes last, so that an object goes by its own name and not by
+                # the link's
                 place = (
                     len(waiting) if isinstance(node.get(name, getlink=True), h5py.HardLink) else 0
                 )
@@ -68,19 +70,22 @@ def _follow(group: Any, name: str) -> Any:
 
 
 def own_name(file: Any, tree: Mapping[str, Any], name: str) -> str:
-    """The name under which `datasets` lists an object that the user called by another of its names; the given name if there is none."""
+    """The name under which `datasets` lists an object that the user called by another of its names.
+
+    It is the given name where there is none.
+    """
     import h5py
 
     other = _follow(file, name)
     return (
-        next((known for known, dataset in tree.items() if dataset == other), name)
+        next((listed for listed, dataset in tree.items() if dataset == other), name)
         if isinstance(other, h5py.Dataset)
         else name
     )
 
 
 def variables(tree: Mapping[str, Any]) -> list[Variable]:
-    """The datasets that hold something, as Variables; dimension scales and the bounds of others are auxiliary."""
+    """Datasets that hold values, as Variables; dimension scales and bounds are auxiliary."""
     bounds = set()
     for name, dataset in tree.items():
         if isinstance(dataset.attrs.get("bounds"), str | bytes):
@@ -99,8 +104,11 @@ def variables(tree: Mapping[str, Any]) -> list[Variable]:
 
 
 def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
-    """The datasets directly in a group that may be coordinates, by lower-case name: 1-D numbers, or one number alone."""
-    found = {}
+    """Datasets directly in a group that may be coordinates, by lower-case name.
+
+    They are 1-D numbers, or one number alone.
+    """
+    coordinates = {}
     for path, dataset in tree.items():
         place, _, name = path.rpartition("/")
         if (
@@ -109,8 +117,8 @@ def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
             and len(dataset.shape) < 2
             and usable(dataset.dtype)
         ):
-            found[name.lower()] = column(path, dataset)
-    return found
+            coordinates[name.lower()] = column(path, dataset)
+    return coordinates
 
 
 def column(path: str, dataset: Any) -> Column:
@@ -121,14 +129,15 @@ def column(path: str, dataset: Any) -> Column:
 
 
 def sibling(path: str, name: str) -> str:
-    """The full name of another dataset in the same group."""
+    """Full name of another dataset in the same group."""
     return f"{path.rpartition('/')[0]}/{name}".lstrip("/")
 
 
 def require_filters(source: str, name: str, dataset: Any) -> None:
-    """See to it that the filters of a dataset can be undone, with hdf5plugin if need be.
+    """Check that the filters of a dataset can be undone, with hdf5plugin if need be.
 
-    Raises MissingDependencyError that names the filter and what to install, or InputError where no plug-in known here has it.
+    Raises MissingDependencyError that names the filter and what to install, or InputError where no
+    plug-in known here has it.
     """
     import h5py
 
@@ -144,16 +153,21 @@ def require_filters(source: str, name: str, dataset: Any) -> None:
             importlib.import_module("hdf5plugin")
         except ImportError as error:
             raise MissingDependencyError(
-                f"{source}: {name} is compressed with the HDF5 filter {label}, which needs hdf5plugin; pip install 'fhash[formats]'"
+                f"{source}: {name} is compressed with the HDF5 filter {label}, which needs"
+                " hdf5plugin; pip install 'fhash[formats]'"
             ) from error
         if not h5py.h5z.filter_avail(code):
             raise InputError(
-                f"{source}: {name} is compressed with the HDF5 filter {label}, which neither h5py nor hdf5plugin has"
+                f"{source}: {name} is compressed with the HDF5 filter {label}, which neither h5py"
+                " nor hdf5plugin has"
             )
 
 
 def require_sources(source: str, path: Path, name: str, dataset: Any) -> None:
-    """Raise InputError if a virtual dataset draws on a file that is not there: HDF5 would silently give fill values for it."""
+    """Raise InputError if a virtual dataset refers to a file that is missing.
+
+    HDF5 would silently give fill values for it.
+    """
     if not dataset.is_virtual:
         return
     for mapped in dataset.virtual_sources():
@@ -170,7 +184,10 @@ def require_sources(source: str, path: Path, name: str, dataset: Any) -> None:
 
 
 def files_beside(path: Path, dataset: Any) -> list[Path]:
-    """The other files from which a dataset draws its values: that of an external link, raw ones, those behind a virtual dataset."""
+    """The other files that hold values of a dataset.
+
+    They are those of an external link, raw files, and those behind a virtual dataset.
+    """
     names = [] if Path(dataset.file.filename) == path else [dataset.file.filename]
     names += [name for name, _, _ in dataset.external or ()]
     if dataset.is_virtual:
@@ -180,6 +197,6 @@ def files_beside(path: Path, dataset: Any) -> list[Path]:
     # HDF5 looks for a relative name beside the file, then in the current folder
     return list(
         dict.fromkeys(
-            found for name in names for found in (path.parent / name, Path(name)) if found.exists()
+            files for name in names for files in (path.parent / name, Path(name)) if files.exists()
         )
     )

@@ -27,7 +27,10 @@ TIME_UNITS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """A stored 1-D array (or scalar, length 1) that may be a coordinate; `read` gives its values, `along` is its dimension's name."""
+    """A stored 1-D array (or scalar, length 1) that may be a coordinate.
+
+    `read` gives its values, `along` is the name of its dimension.
+    """
 
     name: str
     length: int
@@ -39,9 +42,11 @@ class Column:
 def coordinate(
     source: str, name: str, values: npt.NDArray[Any], attributes: Mapping[str, Any]
 ) -> Coordinate:
-    """A Coordinate of stored values: numbers as they are, dates as numbers since the first of them with `units` and `calendar`.
+    """A Coordinate of stored values.
 
-    Raises InputError where float64 cannot tell two stored values apart, or where a date is missing.
+    Numbers stay as they are; dates become numbers since the first of them, with `units` and
+    `calendar`. Raises InputError where float64 cannot tell two stored values apart, or where a date
+    is missing.
     """
     stored = np.atleast_1d(values)
     extra: dict[str, Any] = {}
@@ -49,9 +54,11 @@ def coordinate(
         unit = np.datetime_data(stored.dtype)[0]
         if unit not in TIME_UNITS or np.isnat(stored).any():
             raise InputError(
-                f"{source}: coordinate {name} holds dates that cannot be counted ({stored.dtype}, or one is missing)"
+                f"{source}: coordinate {name} holds dates that cannot be counted ({stored.dtype},"
+                " or one is missing)"
             )
-        # since the first date, and not since 1970: nanoseconds since then exceed what float64 can hold
+        # since the first date, and not since 1970: nanoseconds since then exceed what float64 can
+        # hold
         extra = {
             "units": f"{TIME_UNITS[unit]} since {stored[0]}",
             "calendar": "proleptic_gregorian",
@@ -60,7 +67,8 @@ def coordinate(
     numbers = stored.astype(np.float64)
     if stored.dtype.kind in "iu" and np.unique(numbers).size != np.unique(stored).size:
         raise InputError(
-            f"{source}: coordinate {name} has values that 64-bit floats cannot tell apart, from {stored[0]} to {stored[-1]}"
+            f"{source}: coordinate {name} has values that 64-bit floats cannot tell apart, from"
+            f" {stored[0]} to {stored[-1]}"
         )
     return Coordinate(
         name=name.rsplit("/", 1)[-1],
@@ -83,20 +91,22 @@ def beside(
     certain: bool,
     tied: Collection[str] = (),
 ) -> dict[str, Coordinate]:
-    """Coordinates by conventional name for the axes of an array, from the nearest place first (its group, then the root).
+    """Coordinates by conventional name for the axes of an array, from the nearest place first.
 
-    Only a column of the axis's length counts; a length alone is never taken for a meaning. An axis that the array lacks has length 1.
-    Axes in `tied` are passed over: the file itself says what belongs to them.
-    If the order of the axes was only assumed (not `certain`) and such a column has the length of *another* dimension, the assumption
-    is wrong: raises InputError that asks for --axes.
+    Places are its group, then the root. A column counts only if it has the axis's length; a length
+    alone is never taken for a meaning. An axis that the array lacks has length 1. Axes in `tied`
+    are skipped: the file itself says what belongs to them.
+
+    If the order of the axes was only assumed (not `certain`) and such a column has the length of
+    *another* dimension, the assumption is wrong: raises InputError that asks for --axes.
     """
     lengths = dict(zip(axes, shape, strict=True))
-    found: dict[str, Coordinate] = {}
+    coords: dict[str, Coordinate] = {}
     for axis in (axis for axis in AXES if axis not in tied):
         columns = [place[name] for place in places for name in NAMES[axis].split() if name in place]
         fitting = [column for column in columns if column.length == lengths.get(axis, 1)]
         if fitting:
-            found[axis] = coordinate(
+            coords[axis] = coordinate(
                 source, fitting[0].name, fitting[0].read(), fitting[0].attributes
             )
         elif columns and not certain and columns[0].length in shape and columns[0].length > 1:
@@ -104,8 +114,11 @@ def beside(
             assumed = (
                 f"axis {axis} of length {lengths[axis]}" if axis in lengths else f"no axis {axis}"
             )
-            wrong = f"{column.name} has {column.length} values, but read as ({','.join(axes)}) the array {tuple(shape)} has {assumed}"
+            wrong = (
+                f"{column.name} has {column.length} values, but read as ({','.join(axes)})"
+                f" the array {tuple(shape)} has {assumed}"
+            )
             raise InputError(
                 f"{source}: {wrong}; say what its dimensions are with --axes, such as t,z,y,x"
             )
-    return found
+    return coords

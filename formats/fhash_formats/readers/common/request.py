@@ -1,4 +1,4 @@
-"""What a caller may say about an input beyond its path: variable, meaning of the axes, layout of raw bytes."""
+"""A caller's wishes about an input beyond its path: variable, axes, layout of raw bytes."""
 
 from __future__ import annotations
 
@@ -23,17 +23,24 @@ ENDIANS: dict[str, Literal["<", ">"]] = {"little": "<", "big": ">"}
 
 
 def parse_dtype(text: str) -> np.dtype[Any]:
-    """The number type of a long or short name ("float32", "f4"), in native byte order; raises InputError for any other."""
+    """The number type of a long or short name ("float32", "f4"), in native byte order.
+
+    Raises InputError for any other name.
+    """
     short = DTYPES.get(text.lower(), text.lower())
     if short not in DTYPES.values():
         raise InputError(
-            f"'{text}' is not a number type; allowed: {', '.join(DTYPES)} or short, such as f4 and u1"
+            f"'{text}' is not a number type; allowed: {', '.join(DTYPES)} or short, such as f4 and"
+            " u1"
         )
     return np.dtype(short)
 
 
 def parse_shape(text: str) -> dict[str, int]:
-    """Lengths by axis from text such as "x=64,y=64,z=32,t=10", in the order given; raises InputError where it is not of that form."""
+    """Lengths by axis from text such as "x=64,y=64,z=32,t=10", in the order given.
+
+    Raises InputError for text of another form.
+    """
     shape: dict[str, int] = {}
     for part in text.split(","):
         axis, equals, length = (word.strip() for word in part.partition("="))
@@ -45,30 +52,36 @@ def parse_shape(text: str) -> dict[str, int]:
             or axis in shape
         ):
             raise InputError(
-                f"shape '{text}': cannot use '{part.strip()}'; write each axis once, such as x=64,y=64,z=32,t=10"
+                f"shape '{text}': cannot use '{part.strip()}'; write each axis once, such as"
+                " x=64,y=64,z=32,t=10"
             )
         shape[axis] = int(length)
     return shape
 
 
 def parse_axes(text: str) -> tuple[str, ...]:
-    """The axis of each dimension of the file from text such as "t,z,y,x", in any case; raises InputError where it is not of that form."""
+    """The axis of each dimension of the file from text such as "t,z,y,x", in any case.
+
+    Raises InputError for text of another form.
+    """
     letters = tuple(word.strip().lower() for word in text.split(","))
     if not set(letters) <= set(AXES) or len(set(letters)) != len(letters):
         raise InputError(
-            f"axes '{text}': name the file's dimensions in their order, each once, by t, z, y and x, such as t,z,y,x"
+            f"axes '{text}': name the file's dimensions in their order, each once, by t, z, y and"
+            " x, such as t,z,y,x"
         )
     return letters
 
 
 @dataclass(frozen=True)
 class RawLayout:
-    """What the bytes of a headerless file mean; what is None is taken from the file's name.
+    """Layout of a headerless file; the file's name replaces what is None.
 
     Attributes:
-        shape: lengths by axis, for at least three of t, z, y, x; axes left out have length 1. x is the fastest in the file, then y, z, t.
+        shape: lengths by axis, for at least three of t, z, y, x; axes left out have length 1. x is
+            the fastest in the file, then y, z, t.
         dtype: a key or value of DTYPES.
-        endian: "little" (where None and the name says nothing) or "big".
+        endian: "little" (also where neither this nor the name says) or "big".
 
     Raises InputError for a value that is not allowed.
     """
@@ -81,7 +94,8 @@ class RawLayout:
         if self.shape is not None:
             if not set(self.shape) <= set(AXES) or len(self.shape) < 3:
                 raise InputError(
-                    f"raw shape names {', '.join(self.shape) or 'no axis'}; name three or four of t, z, y, x, as in x=64,y=64,z=32"
+                    f"raw shape names {', '.join(self.shape) or 'no axis'}; name three or four of"
+                    " t, z, y, x, as in x=64,y=64,z=32"
                 )
             for axis, length in self.shape.items():
                 if length < 1:
@@ -94,9 +108,10 @@ class RawLayout:
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """What to take from a file: the variable's name, the axes of its dimensions, the layout of raw bytes; None where not said.
+    """A request to a reader: name of the variable, axes of its dimensions, layout of raw bytes.
 
-    `booleans` lets boolean arrays through (for masks), as the numbers 0 and 1.
+    None stands for what was not said. `booleans` lets boolean arrays through (for masks), as the
+    numbers 0 and 1.
     """
 
     var: str | None = None
@@ -105,8 +120,9 @@ class Request:
     booleans: bool = False
 
     def refuse_var(self, source: str) -> None:
-        """Raise InputError if a variable was asked of a format that has none."""
+        """Raise InputError if a variable was named for a format that has none."""
         if self.var is not None:
             raise InputError(
-                f"{source}: --var {self.var} cannot be used, this format holds one array without a name"
+                f"{source}: --var {self.var} cannot be used, this format holds one array without a"
+                " name"
             )

@@ -1,4 +1,4 @@
-"""Which array of a file is meant: the only suitable one, or the one that was asked for."""
+"""The choice of an array of a file: the only suitable one, or the one that was named."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class Variable:
     """One array of a file.
 
     Attributes:
-        name: full, "group/density".
-        shape: in the file's order.
-        dtype: of the values.
+        name: full name, "group/density".
+        shape: lengths in the file's order.
+        dtype: type of the values.
         auxiliary: it only describes others (coordinates, bounds).
         error: why a library cannot open it, "" if it can.
         handle: whatever the reader needs to find it again.
@@ -60,9 +60,15 @@ class Variable:
         if self.error:
             return f"what cannot be opened: {self.error}"
         if self.dtype.kind == "b" and not booleans:
-            return "boolean values; a mask is given with --feature mask:FILE, values are integers or floats"
+            return (
+                "boolean values; a mask is given with --feature mask:FILE,"
+                " values are integers or floats"
+            )
         if self.dtype.kind not in "iufb" or self.dtype.itemsize > 8:
-            return f"values of type {kind_of(self.dtype)}; integers and floats up to 64 bits can be read"
+            return (
+                f"values of type {kind_of(self.dtype)};"
+                " integers and floats up to 64 bits can be read"
+            )
         if len(self.shape) not in (3, 4):
             return f"{len(self.shape)} dimensions {self.shape}; 3 or 4 can be read"
         if 0 in self.shape:
@@ -73,29 +79,32 @@ class Variable:
 def choose(
     source: str, variables: Sequence[Variable], var: str | None, *, booleans: bool = False
 ) -> Variable:
-    """The variable named `var` (full name, or its last part where only one has it), or the only suitable one.
+    """The variable named `var`, or the only suitable one.
 
-    Raises InputError: no such name, an unsuitable one, several to choose from, or none.
+    `var` is a full name, or its last part where only one variable has it. Raises InputError for no
+    such name, an unsuitable one, several to choose from, or none.
     """
-    suitable = [each for each in variables if not each.problem(booleans)]
-    candidates = [each for each in suitable if not each.auxiliary]
+    suitable = [variable for variable in variables if not variable.problem(booleans)]
+    candidates = [variable for variable in suitable if not variable.auxiliary]
     if var is not None:
         return _named(source, variables, candidates or suitable, var, booleans)
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
         raise InputError(
-            f"{source} holds {len(candidates)} variables: {_listed(candidates)}; choose one with --var"
+            f"{source} holds {len(candidates)} variables: {_listed(candidates)}; choose one with"
+            " --var"
         )
     if not variables:
         raise InputError(f"{source} holds no array at all")
-    found = "; ".join(
-        f"{each.name}: {each.problem(booleans) or 'a coordinate or its bounds'}"
-        for each in variables[:MAX_LISTED]
+    problems = "; ".join(
+        f"{variable.name}: {variable.problem(booleans) or 'a coordinate or its bounds'}"
+        for variable in variables[:MAX_LISTED]
     )
     rest = f"; and {len(variables) - MAX_LISTED} more" if len(variables) > MAX_LISTED else ""
     raise InputError(
-        f"{source} holds no variable of 3 or 4 dimensions with integer or float values; found {found}{rest}"
+        f"{source} holds no variable of 3 or 4 dimensions with integer or float values; found"
+        f" {problems}{rest}"
     )
 
 
@@ -106,21 +115,26 @@ def _named(
     var: str,
     booleans: bool,
 ) -> Variable:
-    wanted = var.strip("/")
-    found = [each for each in variables if each.name == wanted]
-    found = found or [each for each in variables if each.name.rsplit("/", 1)[-1] == wanted]
-    if len(found) > 1:
+    name = var.strip("/")
+    named = [variable for variable in variables if variable.name == name]
+    named = named or [
+        variable for variable in variables if variable.name.rsplit("/", 1)[-1] == name
+    ]
+    if len(named) > 1:
         raise InputError(
-            f"{source}: --var {var} means {len(found)} variables: {_listed(found)}; give the whole name"
+            f"{source}: --var {var} means {len(named)} variables: {_listed(named)}; give the whole"
+            " name"
         )
-    if found:
-        problem = found[0].problem(booleans)
+    if named:
+        problem = named[0].problem(booleans)
         if problem:
-            raise InputError(f"{source}: variable {found[0].name} has {problem}")
-        return found[0]
+            raise InputError(f"{source}: variable {named[0].name} has {problem}")
+        return named[0]
     nearest = sorted(
         candidates,
-        key=lambda each: -difflib.SequenceMatcher(None, wanted.lower(), each.name.lower()).ratio(),
+        key=lambda variable: (
+            -difflib.SequenceMatcher(None, name.lower(), variable.name.lower()).ratio()
+        ),
     )
     raise InputError(
         f"{source} has no variable '{var}'; "
@@ -129,7 +143,7 @@ def _named(
 
 
 def _listed(variables: Sequence[Variable]) -> str:
-    text = ", ".join(str(each) for each in variables[:MAX_LISTED])
+    text = ", ".join(str(variable) for variable in variables[:MAX_LISTED])
     return (
         text if len(variables) <= MAX_LISTED else f"{text} and {len(variables) - MAX_LISTED} more"
     )

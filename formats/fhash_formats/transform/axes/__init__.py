@@ -1,1 +1,1 @@
-"""The transform along each axis, and the bands that it leaves."""
+"""The transform along each axis of a tile, and the bands of its coefficients."""

@@ -1,11 +1,14 @@
-"""The data's own basis along an axis (Karhunen-Loeve), quantised so that it can be stored in a few hundred bytes.
+"""The data's own basis along an axis (Karhunen-Loeve), quantised to fit into a few hundred bytes.
 
-Each vector is held as integers in its DCT domain, at its own scale 2^(e / 2). The decoder turns them into the synthesis matrix S (n, r)
-with its own cosine and sums in a stated order, so every machine gets the same bits; a tile is then S c, with no orthonormalisation. The
-encoder's analysis is the least-squares inverse of that same S, so what the quantisation of S costs shows up in c and not as an error.
+Each vector is stored as integers in its DCT domain, at its own scale 2^(e / 2). The decoder turns
+them into the synthesis matrix S (n, r) with its own cosine and with sums in a stated order, so
+every machine gets the same bits. A tile is then S c, without orthonormalisation. The encoder's
+analysis is the least-squares inverse of that same S: the quantisation of S changes c and adds no
+error.
 
-A packed basis: n and r as 16-bit little-endian; the scale exponents, from MAX_EXPONENT downwards, in unary (a one for each vector, a zero
-for each step down), most significant bit first, padded with zeros to a byte; the integers (r, n) as one coded block.
+A packed basis is n and r as 16-bit little-endian numbers, then the scale exponents, then the
+integers (r, n) as one coded block. The exponents count down from MAX_EXPONENT in unary: a one for
+each vector, a zero for each step down, most significant bit first, padded with zeros to a byte.
 """
 
 from __future__ import annotations
@@ -21,24 +24,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.entropy.coder import decode_block, encode_block
 
 __all__ = ["MAX_EXPONENT", "MAX_LENGTH", "Basis", "fit_basis"]
 
 MAX_LENGTH = 512
-"""Longest axis with a basis of its own."""
+"""Longest axis, in vertices, that may have a basis of its own."""
 MAX_EXPONENT = 24
 """Largest scale exponent: integers up to 2^12."""
 
 _SQRT_HALF = 0.7071067811865476
-_LEAST_NEW = 0.3  # of a vector's length that must be new, or it adds noise and no information
+"""Square root of 1/2."""
+_MIN_NEW = 0.3
+"""Smallest share of a vector's length outside the span of the vectors before it.
+
+A vector below that adds noise and no information.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Basis:
-    """A quantised synthesis matrix.
+    """A quantised synthesis matrix. Raises InputError for integers or exponents out of range.
 
-    integers: int32 (r, n), DCT coefficients of each vector, largest first, at most 2^(e / 2) + 1 in size and no row all zero.
-    exponents: e of each row, MAX_EXPONENT down to 0, never rising. Raises InputError.
+    Attributes:
+        integers: DCT coefficients of the vectors, int32 (r, n), the vector of the largest amplitude
+            first. At most 1.5 * 2^(e / 2) + 1 in size; no row is all zero.
+        exponents: e of each row, MAX_EXPONENT at most and 0 at least, never rising.
     """
 
     integers: NDArray[np.int32]
@@ -50,7 +61,8 @@ class Basis:
         rank, n = self.integers.shape
         if not 1 <= n <= MAX_LENGTH or rank > n or len(self.exponents) != rank:
             raise InputError(
-                f"a basis has at most n vectors of length n, n at most {MAX_LENGTH}, not {rank} of {n} with {len(self.exponents)} exponents"
+                f"a basis has at most n vectors of length n, n at most {MAX_LENGTH}, "
+                f"not {rank} of {n} with {len(self.exponents)} exponents"
             )
         falling = [MAX_EXPONENT, *self.exponents, 0]
         if any(before < after for before, after in pairwise(falling)):
@@ -79,7 +91,10 @@ class Basis:
 
     @cached_property
     def synthesis(self) -> NDArray[np.float32]:
-        """S, float32 (n, r): the vectors are its columns, about 1 long. The same bits on every machine."""
+        """S, float32 (n, r). Its columns are the vectors, of about unit length.
+
+        Every machine computes the same bits.
+        """
         vectors = np.zeros((self.rank, self.n), np.float64)
         for k, row in enumerate(_dct(self.n)):
             vectors += self.integers[:, k : k + 1].astype(np.float64) * row
@@ -90,8 +105,10 @@ class Basis:
 
     @cached_property
     def analysis(self) -> NDArray[np.float64]:
-        """(S^T S)^-1 S^T, float64 (r, n): the least-squares coefficients of a column. For the encoder; raises InputError where S is
-        singular."""
+        """(S^T S)^-1 S^T, float64 (r, n), which gives the least-squares coefficients of a column.
+
+        Only the encoder needs it. Raises InputError where S is singular.
+        """
         wide = self.synthesis.astype(np.float64)
         gram = np.zeros((self.rank, self.rank))
         for row in wide:
@@ -101,11 +118,7 @@ class Basis:
         return result
 
     def to_bytes(self) -> bytes:
-        """The packed basis; see the module."""
-        from fhash_formats.transform.entropy.coder import (
-            encode_block,  # here, because the coder's bands are made from a spec, and a spec from this
-        )
-
+        """The packed basis; the module's docstring describes its bytes."""
         bits: list[int] = []
         level = MAX_EXPONENT
         for exponent in self.exponents:
@@ -120,18 +133,20 @@ class Basis:
 
     @classmethod
     def from_bytes(cls, data: bytes, n: int | None = None) -> Basis:
-        """The inverse of `to_bytes`. n: the length it must have, if given. Raises DamagedFileError."""
-        from fhash_formats.transform.entropy.coder import decode_block  # see to_bytes
+        """The inverse of `to_bytes`. Raises DamagedFileError.
 
+        n: the length that the basis must have; None for any.
+        """
         if len(data) < 4:
             raise DamagedFileError(f"a packed basis has at least 4 bytes, not {len(data)}")
         length, rank = struct.unpack("<HH", data[:4])
         if not 1 <= length <= MAX_LENGTH or rank > length or n not in (None, length):
             raise DamagedFileError(
-                f"a packed basis of {rank} vectors of length {length} where {n or f'at most {MAX_LENGTH}'} is wanted"
+                f"a packed basis has {rank} vectors of length {length} "
+                f"where {n or f'at most {MAX_LENGTH}'} is needed"
             )
-        exponents, used = _read_exponents(data[4:], rank)
-        rest = data[4 + used :]
+        exponents, size = _read_exponents(data[4:], rank)
+        rest = data[4 + size :]
         if not rank and rest:
             raise DamagedFileError("a packed basis has bytes after its end")
         integers = (
@@ -156,12 +171,18 @@ class Basis:
 
 
 def fit_basis(gram: NDArray[np.float64], step: float) -> Basis:
-    """The basis of data whose columns have the Gram matrix `gram`.
+    """Fit the basis of data from the Gram matrix of its columns.
 
-    gram: float64 (n, n), the sum over all columns v of v v^T (a sum, not a mean). step: the quantiser's step in data units, > 0. A vector
-    whose total amplitude, the root of its eigenvalue, is below the step is dropped; the others get a scale of amplitude / step, to half
-    an octave and at most 2^12, so that quantising a vector costs no more than quantising its coefficients. For the encoder. Raises
-    InputError.
+    A vector is dropped where its total amplitude, the root of its eigenvalue, is below the step.
+    The others get a scale of amplitude / step, to half an octave and at most 2^12. Quantising a
+    vector then costs no more than quantising its coefficients. For the encoder.
+
+    Args:
+        gram: float64 (n, n), the sum (not the mean) over all columns v of v v^T.
+        step: quantiser step in data units, > 0.
+
+    Raises InputError for a matrix that is not square, too large or not finite, and for another
+    step.
     """
     if gram.ndim != 2 or gram.shape[0] != gram.shape[1] or not 1 <= len(gram) <= MAX_LENGTH:
         raise InputError(
@@ -174,21 +195,21 @@ def fit_basis(gram: NDArray[np.float64], step: float) -> Basis:
     spectra = vectors[:, ::-1].T @ np.array(_dct(len(gram))).T
     rows: list[NDArray[np.int32]] = []
     exponents: list[int] = []
-    found = np.zeros((0, len(gram)))
+    span = np.zeros((0, len(gram)))  # orthonormal basis of the rows so far
     for amplitude, spectrum in zip(amplitudes.tolist(), spectra, strict=True):
         if amplitude < step:
             break
         exponent = min(MAX_EXPONENT, round(2 * math.log2(amplitude / step)))
         sign = 1.0 if spectrum[np.argmax(np.abs(spectrum))] > 0 else -1.0
         row = np.rint(spectrum * (sign / _shrink(exponent))).astype(np.int32)
-        new = row.astype(np.float64)
-        length = math.sqrt(new @ new)
-        for _ in range(2):
-            new = new - (found @ new) @ found
-        left = math.sqrt(new @ new)
-        if length == 0 or left < _LEAST_NEW * length:
+        rest = row.astype(np.float64)
+        length = math.sqrt(rest @ rest)
+        for _ in range(2):  # Gram-Schmidt, repeated against rounding
+            rest = rest - (span @ rest) @ span
+        rest_length = math.sqrt(rest @ rest)
+        if length == 0 or rest_length < _MIN_NEW * length:
             continue
-        found = np.vstack([found, new / left])
+        span = np.vstack([span, rest / rest_length])
         rows.append(row)
         exponents.append(exponent)
     return Basis(
@@ -197,40 +218,46 @@ def fit_basis(gram: NDArray[np.float64], step: float) -> Basis:
 
 
 def _shrink(exponent: int) -> float:
-    """2^(-exponent / 2), from exact powers of two and one constant."""
+    """2^(-exponent / 2), computed from exact powers of two and one constant."""
     return math.ldexp(_SQRT_HALF if exponent % 2 else 1.0, -(exponent // 2))
 
 
 def _read_exponents(data: bytes, rank: int) -> tuple[tuple[int, ...], int]:
-    """The exponents at the start of `data`, and the bytes they took."""
+    """The exponents at the start of `data`, and the number of their bytes."""
     room = (rank + MAX_EXPONENT + 7) // 8
     bits = np.unpackbits(np.frombuffer(data[:room], np.uint8)).tolist()
     exponents: list[int] = []
-    level, at = MAX_EXPONENT, 0
+    level, position = MAX_EXPONENT, 0
     while len(exponents) < rank:
-        if at == len(bits) or level < 0:
+        if position == len(bits) or level < 0:
             raise DamagedFileError("the exponents of a packed basis are cut or out of range")
-        if bits[at]:
+        if bits[position]:
             exponents.append(level)
         else:
             level -= 1
-        at += 1
-    used = (at + 7) // 8
-    if any(bits[at : 8 * used]):
+        position += 1
+    size = (position + 7) // 8
+    if any(bits[position : 8 * size]):
         raise DamagedFileError("the exponents of a packed basis are not padded with zeros")
-    return tuple(exponents), used
+    return tuple(exponents), size
 
 
 @lru_cache(maxsize=32)
 def _dct(n: int) -> tuple[NDArray[np.float64], ...]:
-    """The rows k of the orthonormal DCT-II of length n, c_k cos(pi (2 i + 1) k / 2 n), with + - * / and sqrt only."""
-    table = np.array([_cosine(m, n) for m in range(4 * n)])
-    places = 2 * np.arange(n, dtype=np.int64) + 1
-    return tuple(table[places * k % (4 * n)] * math.sqrt((2.0 if k else 1.0) / n) for k in range(n))
+    """The rows k of the orthonormal DCT-II of length n: c_k cos(pi (2 i + 1) k / 2 n).
+
+    Computed with + - * / and sqrt only, so that every machine gets the same bits.
+    """
+    cosines = np.array([_cosine(m, n) for m in range(4 * n)])
+    odd = 2 * np.arange(n, dtype=np.int64) + 1
+    return tuple(cosines[odd * k % (4 * n)] * math.sqrt((2.0 if k else 1.0) / n) for k in range(n))
 
 
 def _cosine(m: int, n: int) -> float:
-    """cos(pi m / 2 n) for 0 <= m < 4 n, to about 1e-16: folded into an eighth of the circle, then the Taylor series in float64."""
+    """cos(pi m / 2 n) for 0 <= m < 4 n, to about 1e-16.
+
+    The angle is folded into an eighth of the circle; there the Taylor series is summed in float64.
+    """
     if m > 2 * n:
         m = 4 * n - m
     if m > n:
@@ -245,7 +272,10 @@ def _cosine(m: int, n: int) -> float:
 
 
 def _solve(gram: NDArray[np.float64], right: NDArray[Any]) -> NDArray[np.float64]:
-    """gram^-1 right for a symmetric positive definite matrix, by elimination in a fixed order."""
+    """gram^-1 right, for a symmetric positive definite matrix, by elimination in a fixed order.
+
+    Raises InputError where the matrix is nearly singular.
+    """
     left, result = gram.copy(), right.astype(np.float64)
     for k in range(len(left)):
         if not left[k, k] > 1e-9 * gram[k, k]:

@@ -1,8 +1,10 @@
 """The transform of a tile, forward and inverse, at full or reduced resolution.
 
-Forward: along t, then z, then y and x (spec.py), then each coefficient is multiplied by the norm of its synthesis vector (weights.py).
-The norm is two factors, of (t, z) and of (y, x), each computed in float64 and rounded once to the working type; the inverse multiplies by
-their reciprocals, rounded once, and undoes the rest in the opposite order. The native library and the portable twin give the same bits.
+The forward transform goes along t, then z, then y and x (spec.py). Then each coefficient is
+multiplied by the norm of its synthesis vector (weights.py). The norm is a product of two factors,
+one of (t, z) and one of (y, x), each computed in float64 and rounded once to the working type. The
+inverse multiplies by their reciprocals, rounded once, and undoes the rest in the opposite order.
+The native library and the portable twin give the same bits.
 """
 
 from __future__ import annotations
@@ -36,7 +38,15 @@ Values = NDArray[Any]
 
 @dataclass(frozen=True, kw_only=True)
 class _Plan:
-    """One run over a tile: what goes along each axis, and the factors of (t, z) and (y, x)."""
+    """The arguments of one run over a tile.
+
+    Attributes:
+        kinds: kind of each axis.
+        depths: number of levels of each axis.
+        matrices: matrix of each axis with a basis, None for the others.
+        scale_tz: factors (t, z).
+        scale_yx: factors (y, x).
+    """
 
     kinds: tuple[str, ...]
     depths: tuple[int, ...]
@@ -45,37 +55,38 @@ class _Plan:
     scale_yx: Values
 
     def run(self, values: Values, inverse: bool) -> Values:
+        """The transformed values. Raises MemoryError."""
         library = native.library()
-        if library is None:
-            with np.errstate(all="ignore"):
-                return (inverse_tile if inverse else forward_tile)(
-                    values, self.kinds, self.depths, self.matrices, self.scale_tz, self.scale_yx
-                )
+        if library is not None:
+            return self._run_native(library, values, inverse)
+        transform = inverse_tile if inverse else forward_tile
+        with np.errstate(all="ignore"):
+            return transform(
+                values, self.kinds, self.depths, self.matrices, self.scale_tz, self.scale_yx
+            )
+
+    def _run_native(self, library: ctypes.CDLL, values: Values, inverse: bool) -> Values:
         direction, width = "inverse" if inverse else "forward", values.dtype.itemsize * 8
         function = getattr(library, f"fhash_transform_{direction}_f{width}")
         result = np.empty(values.shape, values.dtype)
-        rank = 1 if inverse else 0
-        ranks = [0 if matrix is None else matrix.shape[rank] for matrix in self.matrices]
-        # Along x the library takes the transpose, whose rows lie along the results.
-        held = [
-            None if m is None else np.ascontiguousarray(m.T if axis == 3 else m)
-            for axis, m in enumerate(self.matrices)
+        rank_axis = 1 if inverse else 0
+        ranks = [0 if matrix is None else matrix.shape[rank_axis] for matrix in self.matrices]
+        # Along x the library takes the transpose, so that its rows lie along the results.
+        matrices = [
+            None if matrix is None else np.ascontiguousarray(matrix.T if axis == 3 else matrix)
+            for axis, matrix in enumerate(self.matrices)
         ]
-        pointers = (ctypes.c_void_p * 4)(*(None if m is None else m.ctypes.data for m in held))
-        shape, kinds = (
-            (ctypes.c_int64 * 4)(*values.shape),
-            (ctypes.c_int64 * 4)(*(KIND_NUMBERS[kind] for kind in self.kinds)),
-        )
-        scales = (ctypes.c_void_p(array.ctypes.data) for array in (self.scale_tz, self.scale_yx))
-        ends = (ctypes.c_void_p(array.ctypes.data) for array in (values, result))
+        four = ctypes.c_int64 * 4
         code = function(
-            *ends,
-            shape,
-            kinds,
-            (ctypes.c_int64 * 4)(*self.depths),
-            (ctypes.c_int64 * 4)(*ranks),
-            pointers,
-            *scales,
+            ctypes.c_void_p(values.ctypes.data),
+            ctypes.c_void_p(result.ctypes.data),
+            four(*values.shape),
+            four(*(KIND_NUMBERS[kind] for kind in self.kinds)),
+            four(*self.depths),
+            four(*ranks),
+            (ctypes.c_void_p * 4)(*(None if m is None else m.ctypes.data for m in matrices)),
+            ctypes.c_void_p(self.scale_tz.ctypes.data),
+            ctypes.c_void_p(self.scale_yx.ctypes.data),
         )
         if code == -2:
             raise MemoryError("no memory for the transform of a tile")
@@ -84,10 +95,16 @@ class _Plan:
 
 
 class Transform:
-    """The transform of tiles of one shape and type; build it once and use it for every tile, from any thread.
+    """The transform of tiles of one shape and type.
 
-    spec: what goes along each axis. shape: (t, z, y, x), each at least 1; along an axis with a basis, its length. dtype: float32 or
-    float64, the type of values, coefficients and arithmetic. Raises InputError.
+    Build it once and use it for every tile, from any thread.
+
+    Args:
+        spec: the transform of each axis.
+        shape: (t, z, y, x), each at least 1; along an axis with a basis, the length of the basis.
+        dtype: type of values, coefficients and arithmetic, float32 or float64.
+
+    Raises InputError for another shape or type.
     """
 
     def __init__(
@@ -115,32 +132,27 @@ class Transform:
             y, x, *self.shape[2:]
         )
 
-    @property
-    def weights(self) -> NDArray[np.float64]:
-        """The norm of each coefficient's synthesis vector, float64 of the tile's shape; for looking at, not for the way to and back."""
-        tz, yx = self.norms
-        return tz[:, :, None, None] * yx
-
-    def lod_shape(self, lod: int) -> tuple[int, ...]:
-        """Shape of `inverse(..., lod)`: t, and ceil(n / 2^lod) along z, y, x."""
-        _check_lod(lod)
-        return (self.shape[0], *((n + (1 << lod) - 1) >> lod for n in self.shape[1:]))
-
     def forward(self, values: Values) -> Values:
-        """Coefficients of a tile: a fresh array of the same shape and type, low bands first; entries beyond a basis's rank are 0.
+        """Coefficients of a tile: a new array of the same shape and type, low bands first.
 
-        Raises InputError for another shape or type.
+        Entries beyond a basis's rank are 0. Raises InputError for another shape or type.
         """
         return self._forward_plan.run(self._checked(values), inverse=False)
 
     def inverse(self, coefficients: Values, lod: int = 0) -> Values:
-        """Values of a tile from its coefficients: a fresh array of the same type.
+        """Values of a tile from its coefficients: a new array of the same type.
 
-        lod: 0 gives the tile; n gives ceil(length / 2^n) vertices along z, y and x and all along t, at every 2^n-th vertex, and a
-        constant stays that constant. Along an axis with a wavelet that is the low band n levels down; a Haar low band is the mean of its
-        2^n vertices, so it stands between them, up to (2^n - 1) / 2 off. For the levels that an axis lacks, and with a basis or nothing,
-        the values are filtered by (1/4, 1/2, 1/4), clamped at the ends, and every second is kept. Raises InputError for another shape or
-        type, or lod outside 0 to MAX_LOD.
+        Args:
+            coefficients: what `forward` gives, of the same shape and type.
+            lod: level of detail. 0 gives the tile. n gives ceil(length / 2^n) vertices along z, y
+                and x and all along t, at every 2^n-th vertex; a constant stays that constant.
+
+        Along an axis with a wavelet, the reduced values are the low band n levels down. A Haar low
+        band is the mean of its 2^n vertices and stands between them, up to (2^n - 1) / 2 off. For
+        levels beyond an axis's depth, and along an axis with a basis or without a transform, the
+        values are filtered by (1/4, 1/2, 1/4), clamped at the ends, and every second one is kept.
+
+        Raises InputError for another shape or type, or lod outside 0 to MAX_LOD.
         """
         _check_lod(lod)
         checked = self._checked(coefficients)
@@ -167,10 +179,14 @@ class Transform:
         )
 
     def _inverse_plan(self, lod: int) -> _Plan:
-        """The inverse of the first bands of z, y, x: what is left of each wavelet after `lod` levels, its gain on a constant taken out."""
-        stopped = (0, *(min(lod, axis.depth) for axis in self.spec.axes[1:]))
+        """The inverse of the bands that `lod` needs: the deepest levels of each wavelet along z, y,
+        x.
+
+        The gain on a constant of the `lod` levels that are left out is divided out.
+        """
+        left_out = (0, *(min(lod, axis.depth) for axis in self.spec.axes[1:]))
         depths = tuple(
-            axis.depth - levels for axis, levels in zip(self.spec.axes, stopped, strict=True)
+            axis.depth - levels for axis, levels in zip(self.spec.axes, left_out, strict=True)
         )
         kinds = tuple(
             "none" if axis.wavelet and depth == 0 else axis.kind
@@ -179,7 +195,7 @@ class Transform:
         t, z, y, x = self._bands(lod)
         gains = [
             _gain(axis.kind, n, levels)
-            for axis, n, levels in zip(self.spec.axes, self.shape, stopped, strict=True)
+            for axis, n, levels in zip(self.spec.axes, self.shape, left_out, strict=True)
         ]
         bases = [axis.basis for axis in self.spec.axes]
         return _Plan(
@@ -205,7 +221,8 @@ class Transform:
     def _checked(self, values: Values) -> Values:
         if values.shape != self.shape or values.dtype != self.dtype:
             raise InputError(
-                f"this transform takes {self.dtype} of shape {self.shape}, not {values.dtype} of {values.shape}"
+                f"this transform takes {self.dtype} of shape {self.shape}, "
+                f"not {values.dtype} of {values.shape}"
             )
         return np.ascontiguousarray(values)
 
@@ -216,7 +233,11 @@ def _check_lod(lod: int) -> None:
 
 
 def _gain(kind: str, n: int, levels: int) -> float:
-    """What `levels` low bands make of a constant 1 (1 but for 9/7, whose lifting leaves out the scaling; none where a length is 1)."""
+    """The value of a constant 1 in the low band after `levels` levels.
+
+    It differs from 1 for 9/7 only, whose lifting leaves out the scaling by K. A level on a length
+    of 1 changes nothing.
+    """
     gain = 1.0
     for m in band_lengths(n, levels)[:levels]:
         gain *= float(forward_axis(np.ones(min(m, 2)), 0, kind)[0])
@@ -224,7 +245,7 @@ def _gain(kind: str, n: int, levels: int) -> float:
 
 
 def _halved(values: Values, axis: int) -> Values:
-    """Every second entry along an axis after the filter (1/4, 1/2, 1/4), clamped at the ends."""
+    """Every second value along an axis after the filter (1/4, 1/2, 1/4), clamped at the ends."""
     moved = np.moveaxis(values, axis, 0)
     before, after = (
         np.concatenate([moved[:1], moved])[:-1][0::2],

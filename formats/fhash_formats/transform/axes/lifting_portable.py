@@ -1,6 +1,7 @@
-"""The transform of one tile in numpy: the twin of native/lifting.cpp, operation by operation, so that both give the same bits.
+"""The transform of one tile in numpy: the twin of native/lifting.cpp, with the same bits.
 
-Only elementwise + - * on whole arrays, in the order written here; sums over an axis run through it in ascending order.
+The twin does the same operations in the same order: elementwise + - * on whole arrays as written
+here, and sums over an axis in ascending order.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ __all__ = ["KIND_NUMBERS", "forward_axis", "forward_tile", "inverse_axis", "inve
 Values = NDArray[Any]
 
 KIND_NUMBERS = {"none": 0, "haar": 1, "5/3": 2, "9/7": 3, "klt": 4}
-"""Numbers of the kinds across the border to the native library."""
+"""Numbers of the kinds in calls of the native library."""
 
-_BLOCK = 1 << 15  # numbers of a matrix product that are worked on at once, to stay in the cache
+_BLOCK = 1 << 15
+"""Values of a matrix product that are computed at once, to stay in the cache."""
 
 _STEPS: dict[str, tuple[tuple[bool, float], ...]] = {
     "5/3": ((True, -0.5), (False, 0.25)),
@@ -29,7 +31,10 @@ _STEPS: dict[str, tuple[tuple[bool, float], ...]] = {
         (False, 0.443506852043971),
     ),
 }
-"""(whether the odd half changes, factor) of each lifting step. 9/7: Daubechies and Sweldens 1998, without the last scaling by K."""
+"""Lifting steps of each wavelet: (whether the odd half changes, factor).
+
+9/7: Daubechies and Sweldens 1998, without the final scaling by K.
+"""
 
 
 def forward_tile(
@@ -40,7 +45,16 @@ def forward_tile(
     scale_tz: Values,
     scale_yx: Values,
 ) -> Values:
-    """Coefficients of a tile (t, z, y, x): along t, then z, then y and x, then times scale_tz (t, z), then times scale_yx (y, x)."""
+    """Coefficients of a tile: transformed along t, then z, then y and x, then scaled.
+
+    Args:
+        values: the tile (t, z, y, x).
+        kinds: kind of each axis.
+        depths: number of levels of each axis.
+        matrices: analysis matrix of each axis with a basis, None for the others.
+        scale_tz: factors (t, z), applied first.
+        scale_yx: factors (y, x).
+    """
     result = values.copy()
     for axis in (0, 1):
         result = _forward_packet(result, axis, kinds[axis], depths[axis], matrices[axis])
@@ -64,7 +78,11 @@ def inverse_tile(
     scale_tz: Values,
     scale_yx: Values,
 ) -> Values:
-    """Values of a tile: the steps of `forward_tile` undone in the opposite order; the scales are the reciprocals."""
+    """Values of a tile: the steps of `forward_tile` undone in the opposite order.
+
+    The arguments are those of `forward_tile`, except that the matrices are the synthesis matrices
+    and the scales the reciprocals.
+    """
     result = (coefficients * scale_tz[:, :, None, None]) * scale_yx
     if _coupled(kinds, depths):
         sizes = [result.shape[2:]]
@@ -82,7 +100,10 @@ def inverse_tile(
 
 
 def forward_axis(values: Values, axis: int, kind: str) -> Values:
-    """One level of a wavelet along an axis of any array: the low band, then the high band, without norms. A length of 1 stays."""
+    """One level of a wavelet along an axis of any array: the low band, then the high band.
+
+    Norms are not applied. An axis of length 1 stays as it is.
+    """
     moved = np.moveaxis(values, axis, 0)
     even, odd = moved[0::2].copy(), moved[1::2].copy()
     if len(odd) == 0:
@@ -115,7 +136,7 @@ def inverse_axis(bands: Values, axis: int, kind: str) -> Values:
 
 
 def _lift(even: Values, odd: Values, changes_odd: bool, factor: float) -> None:
-    """One lifting step in place; beyond its ends the whole row is mirrored about its first and last number."""
+    """One lifting step in place; the row is mirrored about its first and its last number."""
     if changes_odd:
         odd += odd.dtype.type(factor) * (
             even[: len(odd)] + np.concatenate([even[1:], even[-1:]])[: len(odd)]
@@ -128,12 +149,14 @@ def _lift(even: Values, odd: Values, changes_odd: bool, factor: float) -> None:
 
 
 def _coupled(kinds: Sequence[str], depths: Sequence[int]) -> bool:
+    """Whether y and x form a pyramid, as in `TransformSpec.coupled`."""
     return kinds[2] == kinds[3] and kinds[2] in ("haar", "5/3", "9/7") and depths[2] == depths[3]
 
 
 def _forward_packet(
     values: Values, axis: int, kind: str, depth: int, matrix: Values | None
 ) -> Values:
+    """The transform of one axis on its own, in place unless it has a matrix."""
     if matrix is not None:
         return _product(matrix, values, axis)
     moved = np.moveaxis(values, axis, 0)
@@ -147,6 +170,7 @@ def _forward_packet(
 def _inverse_packet(
     values: Values, axis: int, kind: str, depth: int, matrix: Values | None
 ) -> Values:
+    """The inverse of `_forward_packet`, in place unless the axis has a matrix."""
     if matrix is not None:
         return _product(matrix, values, axis)
     moved = np.moveaxis(values, axis, 0)
@@ -159,18 +183,21 @@ def _inverse_packet(
 
 
 def _product(matrix: Values, values: Values, axis: int) -> Values:
-    """matrix (m, k) times the first k entries along an axis of length n; entries m to n of the result are 0."""
+    """matrix (m, k) times the first k entries along an axis of length n.
+
+    Entries m to n of the result are 0.
+    """
     moved = np.moveaxis(values, axis, 0)
-    made, taken = matrix.shape
-    columns = moved.reshape(len(moved), -1)[:taken]
+    rows, terms = matrix.shape
+    columns = moved.reshape(len(moved), -1)[:terms]
     result = np.zeros((len(moved), columns.shape[1]), values.dtype)
     width = max(64, _BLOCK // len(moved))
-    for start in range(0, columns.shape[1] if taken else 0, width):
+    for start in range(0, columns.shape[1] if terms else 0, width):
         block = columns[:, start : start + width]
         total = matrix[:, :1] * block[0]
         term = np.empty_like(total)
-        for k in range(1, taken):
+        for k in range(1, terms):
             np.multiply(matrix[:, k : k + 1], block[k], out=term)
             total += term
-        result[:made, start : start + width] = total
+        result[:rows, start : start + width] = total
     return np.moveaxis(result.reshape(moved.shape), 0, axis)

@@ -1,9 +1,10 @@
-"""Which transform goes along each axis of a tile, and how that is written in a codec's configuration.
+"""The transform of each axis of a tile, and its form in a codec's configuration.
 
-A wavelet of depth d splits an axis d times into a low and a high band, (n + 1) // 2 and n // 2 long; the low band stands first and is
-split on. A level on a length of 1 is the identity. y and x with the same wavelet and depth are coupled: each level goes along y, then x,
-of the low-low quadrant only (a dyadic pyramid in the plane). Otherwise each axis is transformed along its whole length on its own
-(packets).
+A wavelet of depth d splits an axis d times into a low and a high band, (n + 1) // 2 and n // 2
+long. The low band stands first and is the one that is split again. A level on a length of 1 is the
+identity. y and x with the same wavelet and depth are coupled: each level goes along y, then along
+x, of the low-low quadrant only (a dyadic pyramid in the plane). Otherwise each axis is transformed
+along its whole length on its own (packets).
 """
 
 from __future__ import annotations
@@ -20,21 +21,30 @@ from fhash_formats.transform.axes.basis import Basis
 __all__ = ["AXES", "KINDS", "MAX_DEPTH", "WAVELETS", "AxisTransform", "TransformSpec"]
 
 AXES = ("t", "z", "y", "x")
+"""Names of the axes, in order."""
 KINDS = ("none", "haar", "5/3", "9/7", "klt")
-"""Nothing; Haar with the mean of a pair as its low band; LeGall 5/3; Cohen-Daubechies-Feauveau 9/7; the data's own basis
-(Karhunen-Loeve)."""
+"""Kinds of transforms.
+
+No transform; Haar, with the mean of a pair as its low band; LeGall 5/3; Cohen-Daubechies-Feauveau
+9/7; the data's own basis (Karhunen-Loeve).
+"""
 WAVELETS = ("haar", "5/3", "9/7")
+"""Kinds that split an axis into bands."""
 MAX_DEPTH = 10
 """Most levels of a wavelet."""
 
-_LONGEST_TEXT = 1 << 21
+_MAX_TEXT = 1 << 21
+"""Most characters of a packed basis in base64."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AxisTransform:
-    """The transform along one axis.
+    """The transform along one axis. Raises InputError for values that do not fit together.
 
-    kind: one of KINDS. depth: levels, 1 to MAX_DEPTH for a wavelet and 0 for the others. basis: of a "klt" only. Raises InputError.
+    Attributes:
+        kind: one of KINDS.
+        depth: number of levels, 1 to MAX_DEPTH for a wavelet and 0 for the others.
+        basis: the basis of "klt"; None for the other kinds.
     """
 
     kind: str
@@ -46,10 +56,10 @@ class AxisTransform:
             raise InputError(f"unknown transform {self.kind!r:.40}: choose from {', '.join(KINDS)}")
         if isinstance(self.depth, bool) or not isinstance(self.depth, int):
             raise InputError(f"the depth of a transform is a whole number, not {self.depth!r:.40}")
-        least, most = (1, MAX_DEPTH) if self.wavelet else (0, 0)
-        if not least <= self.depth <= most:
+        shallowest, deepest = (1, MAX_DEPTH) if self.wavelet else (0, 0)
+        if not shallowest <= self.depth <= deepest:
             raise InputError(
-                f"the depth of {self.kind!r} is {least} to {most}, not {self.depth!r:.40}"
+                f"the depth of {self.kind!r} is {shallowest} to {deepest}, not {self.depth!r:.40}"
             )
         if (self.kind == "klt") != isinstance(self.basis, Basis):
             raise InputError("'klt' needs a basis, and nothing else takes one")
@@ -60,7 +70,7 @@ class AxisTransform:
         return self.kind in WAVELETS
 
     def to_json(self) -> Any:
-        """`"none"`, `[kind, depth]` or `{"klt": base64 of the packed basis}`."""
+        """The JSON value: `"none"`, `[kind, depth]` or `{"klt": base64 of the packed basis}`."""
         if self.basis is not None:
             return {"klt": base64.b64encode(self.basis.to_bytes()).decode("ascii")}
         return [self.kind, self.depth] if self.wavelet else self.kind
@@ -81,7 +91,11 @@ class AxisTransform:
 
 @dataclass(frozen=True, kw_only=True)
 class TransformSpec:
-    """The transforms along (t, z, y, x). Raises InputError unless there are four."""
+    """The transforms along (t, z, y, x). Raises InputError unless there are four.
+
+    Attributes:
+        axes: the transform of each axis.
+    """
 
     axes: tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
 
@@ -100,12 +114,19 @@ class TransformSpec:
         return y.wavelet and (y.kind, y.depth) == (x.kind, x.depth)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values, for example `{"t": ["haar", 2], "z": "none", "y": ["9/7", 4], "x": ["9/7", 4]}`."""
+        """JSON values by axis.
+
+        For example `{"t": ["haar", 2], "z": "none", "y": ["9/7", 4], "x": ["9/7", 4]}`.
+        """
         return {name: axis.to_json() for name, axis in zip(AXES, self.axes, strict=True)}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TransformSpec:
-        """The inverse of `to_dict`. Raises InputError, naming the key, for a missing, unknown or bad one."""
+        """The inverse of `to_dict`.
+
+        Raises InputError for a missing or unknown key and for a bad value; the message names the
+        key.
+        """
         if not isinstance(values, Mapping):
             raise InputError(
                 f"a transform is a mapping with the keys {', '.join(AXES)}, not {values!r:.60}"
@@ -127,8 +148,8 @@ def _axis(key: str, value: Any) -> AxisTransform:
 
 
 def _basis_from_text(text: str) -> Basis:
-    if len(text) > _LONGEST_TEXT:
-        raise InputError(f"a packed basis has at most {_LONGEST_TEXT} characters, not {len(text)}")
+    if len(text) > _MAX_TEXT:
+        raise InputError(f"a packed basis has at most {_MAX_TEXT} characters, not {len(text)}")
     try:
         return Basis.from_bytes(base64.b64decode(text.encode("ascii"), validate=True))
     except (binascii.Error, UnicodeEncodeError) as error:

@@ -1,8 +1,10 @@
-"""The exact L2 norms of the synthesis vectors, by which coefficients are multiplied so that one quantiser's step serves all of them.
+"""The exact L2 norms of the synthesis vectors.
 
-All in float64 with sums in a fixed order. A vector of the tile is a product of one vector per axis (in a coupled plane, per band), and so
-is its norm. Axes of up to LONGEST_EXACT vertices have their own norm at each place, with what the mirrored ends do; longer ones the norm
-of each band's interior.
+Coefficients are multiplied by these norms, so that one quantiser step serves all of them. All norms
+are float64, with sums in a fixed order. A synthesis vector of the tile is a product of one vector
+per axis (in a coupled plane, per band), and its norm is the product of their norms. An axis of up
+to MAX_EXACT vertices has its own norm at each position, which includes the effect of the mirrored
+ends. On a longer axis each band has the norm of its interior.
 """
 
 from __future__ import annotations
@@ -15,15 +17,16 @@ from numpy.typing import NDArray
 from fhash_formats.transform.axes.lifting_portable import inverse_axis
 from fhash_formats.transform.axes.spec import AxisTransform
 
-__all__ = ["LONGEST_EXACT", "axis_norms", "band_lengths", "plane_norms"]
+__all__ = ["MAX_EXACT", "axis_norms", "band_lengths", "plane_norms"]
 
-LONGEST_EXACT = 512
+MAX_EXACT = 512
+"""Longest axis, in vertices, whose norms are computed at each position."""
 
 Norms = NDArray[np.float64]
 
 
 def band_lengths(n: int, depth: int) -> list[int]:
-    """Lengths of the low band after 0 to `depth` levels."""
+    """Lengths of the low band of `n` vertices after 0 to `depth` levels."""
     lengths = [n]
     for _ in range(depth):
         lengths.append((lengths[-1] + 1) // 2)
@@ -31,7 +34,7 @@ def band_lengths(n: int, depth: int) -> list[int]:
 
 
 def axis_norms(axis: AxisTransform, n: int) -> Norms:
-    """Norms along one axis on its own, float64 (n,); entries beyond a basis's rank have 1."""
+    """Norms along an axis that is transformed on its own, float64 (n,); 1 beyond a basis's rank."""
     norms = np.ones(n)
     if axis.basis is not None:
         total = np.zeros(axis.basis.rank)
@@ -47,7 +50,7 @@ def axis_norms(axis: AxisTransform, n: int) -> Norms:
 
 
 def plane_norms(y: AxisTransform, x: AxisTransform, rows: int, columns: int) -> Norms:
-    """Norms in the plane, float64 (rows, columns)."""
+    """Norms in the plane of y and x, float64 (rows, columns)."""
     if not y.wavelet or (y.kind, y.depth) != (x.kind, x.depth):
         return axis_norms(y, rows)[:, None] * axis_norms(x, columns)
     ys, xs = band_lengths(rows, y.depth), band_lengths(columns, x.depth)
@@ -68,17 +71,20 @@ def plane_norms(y: AxisTransform, x: AxisTransform, rows: int, columns: int) -> 
 
 @lru_cache(maxsize=128)
 def _level_norms(kind: str, depth: int, n: int) -> tuple[list[Norms], list[Norms]]:
-    """Norms of the low and of the high band after 0 to `depth` levels; the high band of level 0 is empty."""
+    """Norms of the low band and of the high band after 0 to `depth` levels.
+
+    The high band of level 0 is empty.
+    """
     low, high = [np.ones(n)], [np.ones(0)]
     lengths = band_lengths(n, depth)
     for level in range(1, depth + 1):
         m = lengths[level]
-        if n <= LONGEST_EXACT:
+        if n <= MAX_EXACT:
             norms = _synthesis_norms(kind, lengths[: level + 1], np.eye(lengths[level - 1]))
             low.append(norms[:m])
             high.append(norms[m:])
         else:
-            # 32 entries in the band: a vector from its middle does not reach the ends.
+            # With 32 entries in the band, the vector of a middle entry does not reach the ends.
             interior = band_lengths(32 << level, level)
             impulses = np.zeros((interior[level - 1], 2))
             impulses[16, 0] = impulses[interior[level] + 16, 1] = 1.0
@@ -89,7 +95,10 @@ def _level_norms(kind: str, depth: int, n: int) -> tuple[list[Norms], list[Norms
 
 
 def _synthesis_norms(kind: str, lengths: list[int], bands: NDArray[np.float64]) -> Norms:
-    """Norms of the columns that `bands` (both bands of the deepest level) become."""
+    """Norms of the columns that the inverse makes of `bands`, both bands of the deepest level.
+
+    lengths: of the low band after each level.
+    """
     values = inverse_axis(bands, 0, kind)
     for n in lengths[-3::-1]:
         padded = np.zeros((n, values.shape[1]))

@@ -1,7 +1,8 @@
-"""Integers to bytes and back by the adaptive coder (native/coder.cpp), native or portable with the same bytes.
+"""Integers to bytes and back by the adaptive coder, native (native/coder.cpp) or portable.
 
-The coder adapts while it works. It begins from a *prior*: estimates and mixing weights that were learned from other series (prior.py), so
-that small tiles need not learn from nothing. The prior is part of the format.
+Both write the same bytes. The coder adapts while it works. It begins from a *prior*: estimates and
+mixing weights that were learned from other series (prior.py), so that small tiles need not learn
+from nothing. The prior is part of the format.
 """
 
 from __future__ import annotations
@@ -32,14 +33,23 @@ __all__ = [
 ]
 
 MAX_INTEGER = 2**30 - 1
-"""Largest magnitude that is coded."""
+"""Largest magnitude of an integer."""
+
+NO_MEMORY = -2
+"""Code that a native function returns where it had no memory; twin of `NO_MEMORY` in guard.hpp."""
 
 Integers = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Encoded:
-    """data: the bytes. integers: what they decode to, which rate-distortion optimisation may have changed."""
+    """Coded integers.
+
+    Attributes:
+        data: the bytes.
+        integers: what the bytes decode to; other than the integers given where the rate-distortion
+            optimisation changed some.
+    """
 
     data: bytes
     integers: Integers
@@ -53,12 +63,18 @@ def encode_integers(
     weight: float = 0.0,
     state: State | None = None,
 ) -> Encoded:
-    """Code int32 integers (t, z, y, x) in the bands of a table; all outside the bands count as 0.
+    """Code integers in the bands of a table; integers outside the bands count as 0.
 
-    scaled: coefficients / step, float32: then each magnitude is chosen anew among the nearest, one less and zero, by squared error in
-    steps plus `weight` per bit. state: to begin from and to leave behind, instead of the prior.
+    Args:
+        integers: int32 (t, z, y, x), magnitudes up to MAX_INTEGER.
+        table: the bands.
+        scaled: coefficients / quantiser step, float32, same shape. With it each magnitude is chosen
+            anew, from the nearest one, one less and zero: the one with the least squared error, in
+            steps, plus `weight` per bit.
+        weight: squared steps that a bit is worth.
+        state: state to begin from, which is adapted in place; None begins from the prior.
     """
-    kept = state is not None
+    keep = state is not None
     state = prior_state() if state is None else state
     given = np.ascontiguousarray(integers, dtype=np.int32)
     library = native.library()
@@ -66,33 +82,37 @@ def encode_integers(
         from fhash_formats.transform.entropy import coder_portable
 
         integers = given.copy()
-        data = coder_portable.encode(
-            integers, table, scaled, weight, state.copy() if not kept else state
-        )
+        adapted = state if keep else state.copy()
+        data = coder_portable.encode(integers, table, scaled, weight, adapted)
         return Encoded(data=data, integers=integers)
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
     capacity = max(4096, given.size // 2)
     while True:
         buffer = np.empty(capacity, dtype=np.uint8)
-        integers = given if chosen is None else given.copy()  # only chosen integers are written
+        # The native coder writes to its integers only where it chooses them.
+        integers = given if chosen is None else given.copy()
         size = library.fhash_encode(
             _pointer(integers),
             _pointer(chosen),
-            ctypes.c_double(weight),
+            weight,
             (ctypes.c_int64 * 4)(*integers.shape),
-            *array_arguments(table, table.shape[0]),
+            *array_arguments(table),
             *state_arguments(state),
-            ctypes.c_int64(kept),
-            *array_arguments(buffer, capacity),
+            keep,
+            *array_arguments(buffer),
         )
         if checked(size) <= capacity:
             return Encoded(data=buffer[:size].tobytes(), integers=integers)
-        # Once more with the same integers: those chosen would be coded otherwise, as rows that became empty are told apart.
+        # Retry with the original integers. Coding the chosen ones would give other bytes, because
+        # rows that became empty are signalled differently.
         capacity = size
 
 
 def decode_integers(data: bytes | memoryview, shape: tuple[int, ...], table: Table) -> Integers:
-    """The integers (t, z, y, x) of a shape; raises DamagedFileError for bytes that no encoder writes, as far as that shows."""
+    """The integers (t, z, y, x) of a shape, int32.
+
+    Raises DamagedFileError for bytes that no encoder writes, as far as the decoder can tell.
+    """
     integers = np.zeros(shape, dtype=np.int32)
     library = native.library()
     if library is None:
@@ -104,9 +124,9 @@ def decode_integers(data: bytes | memoryview, shape: tuple[int, ...], table: Tab
     code = library.fhash_decode(
         _pointer(integers),
         (ctypes.c_int64 * 4)(*shape),
-        *array_arguments(table, table.shape[0]),
+        *array_arguments(table),
         *state_arguments(prior_state()),
-        *array_arguments(source, source.size),
+        *array_arguments(source),
     )
     if checked(code) < 0:
         raise DamagedFileError("the coded integers are damaged")
@@ -119,41 +139,41 @@ def encode_block(integers: Integers) -> bytes:
 
 
 def decode_block(data: bytes | memoryview, shape: tuple[int, ...]) -> Integers:
-    """What `encode_block` coded; raises DamagedFileError for any other bytes."""
+    """The block that `encode_block` coded; raises DamagedFileError for any other bytes."""
     if prod(shape) == 0:
         if len(data):
             raise DamagedFileError("bytes where nothing is coded")
         return np.zeros(shape, dtype=np.int32)
     integers = decode_integers(data, shape, single_band(shape))
-    # Small blocks carry no digest: they must be what the encoder would write.
-    if np.abs(integers.astype(np.int64)).max(initial=0) > MAX_INTEGER or encode_block(
-        integers
-    ) != bytes(data):
+    # Small blocks carry no digest: their bytes must be those that the encoder would write.
+    largest = np.abs(integers.astype(np.int64)).max(initial=0)
+    if largest > MAX_INTEGER or encode_block(integers) != bytes(data):
         raise DamagedFileError("the coded integers are damaged")
     return integers
 
 
 def checked(code: int) -> int:
-    """What a native function returned; raises MemoryError where that is that it had no memory."""
-    if code == -2:
+    """The code that a native function returned; raises MemoryError where it is NO_MEMORY."""
+    if code == NO_MEMORY:
         raise MemoryError("no memory for the work of a native function")
     return code
 
 
 def _pointer(array: npt.NDArray[Any] | None) -> ctypes.c_void_p:
-    # It holds the array, too: threads that make a state at once get one each, and of all but one nothing else would.
+    # The pointer object also keeps the array alive. When threads build the prior at the same time,
+    # only one of their copies is cached, and nothing else refers to the others.
     return ctypes.c_void_p(None) if array is None else array.ctypes.data_as(ctypes.c_void_p)
 
 
-def array_arguments(array: npt.NDArray[Any], count: int) -> tuple[ctypes.c_void_p, ctypes.c_int64]:
-    """An array and its length as the native functions take them."""
-    return _pointer(array), ctypes.c_int64(count)
+def array_arguments(array: npt.NDArray[Any]) -> tuple[ctypes.c_void_p, int]:
+    """An array and its length along the first axis, as the native functions take them."""
+    return _pointer(array), len(array)
 
 
 def state_arguments(state: State) -> list[Any]:
-    """The arrays of a state as the native functions take them."""
+    """The arrays of a state, each with its length, as the native functions take them."""
     return [
-        part
-        for array in (state.slots, state.weights, state.simples)
-        for part in array_arguments(array, array.shape[0])
+        *array_arguments(state.slots),
+        *array_arguments(state.weights),
+        *array_arguments(state.simples),
     ]

@@ -1,20 +1,38 @@
-"""The adaptive coder without the native library: native/coder.cpp step by step, with the same bytes. Its comments say what is done and why.
+"""The adaptive coder of integers without the native library: twin of native/coder.cpp.
 
-One source runs in two ways. Where numba can be imported it is compiled, and the sequences are arrays; elsewhere it is plain Python, and
-they are lists, so that each number is a Python integer: faster to reach than numpy's, and never too large.
+It follows that file step by step and gives the same bytes. The comments there give the reasons.
+mixing_portable.py says how it runs with numba and without.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError
+from fhash_formats.transform.entropy.mixing_portable import (
+    ARRAYS,
+    LEARNING_RATE,
+    LISTS,
+    SLOW_LIMIT,
+    Memory,
+    Sequence,
+    Stream,
+    Tables,
+    code_bit,
+    code_simple,
+    compiled,
+    finish,
+    keep_memory,
+    learn,
+    log16,
+    memory_of,
+    mix,
+    start_range,
+)
 from fhash_formats.transform.entropy.prior import (
     DECISIONS,
     KINDS,
@@ -24,67 +42,106 @@ from fhash_formats.transform.entropy.prior import (
     SIZES,
     State,
 )
+from fhash_formats.transform.entropy.table import (
+    BAND,
+    COLUMNS,
+    HIGH,
+    KIND,
+    LOW,
+    REFERENCE_COLUMNS,
+    REFERENCE_COUNT,
+    REFERENCES,
+    SHIFT,
+)
 
 __all__ = ["decode", "encode"]
 
-STRETCH_MAX = 2816
-CONTEXTS, SIGN_CONTEXTS, UNARY = 6, 3, 14
-SLOW_LIMIT, SIGN_LIMIT, FAST_LIMIT, SIMPLE_LIMIT, LEARNING_RATE = 400, 255, 20, 60, 6
+CONTEXTS = 6
+"""Estimates that are mixed for a decision about a magnitude."""
+SIGN_CONTEXTS = 3
+"""Estimates that are mixed for a sign."""
+UNARY = 14
+"""Magnitudes from this one on are coded by an escape code."""
+SIGN_LIMIT = 255
+"""Observations after which the slow rate of an estimate of a sign stays."""
 MAX_MAGNITUDE = 4095
+"""Largest magnitude that contexts see."""
 PADDING = 2
-LEFT, LEFT2, ABOVE, DIAGONAL, ABOVE2, BEFORE, AROUND, BEFORE2, REFERENCE = (
-    184,
-    20,
-    184,
-    61,
-    41,
-    102,
-    20,
-    31,
-    62,
-)
+"""Zeros at both ends of a row of magnitudes."""
+
+LEFT = 184
+"""Weight of the left neighbour in the expected magnitude; this and the next ones in 1/1024."""
+LEFT2 = 20
+"""Weight of the second left neighbour."""
+ABOVE = 184
+"""Weight of the neighbour above."""
+DIAGONAL = 61
+"""Weight of each neighbour beside the one above."""
+ABOVE2 = 41
+"""Weight of the second neighbour above."""
+BEFORE = 102
+"""Weight of the vertex one step before, and of the one in the layer below."""
+AROUND = 20
+"""Weight of each vertex around those two, and of the sum around a vertex of a reference."""
+BEFORE2 = 31
+"""Weight of the vertex two steps before, and of the one two layers below."""
+REFERENCE = 62
+"""Weight of the vertex of a reference."""
+
 STARTS = tuple(sum(SIZES[:i]) * DECISIONS for i in range(CONTEXTS))
+"""First slot of each estimate of a magnitude."""
 SIGN_STARTS = tuple(sum(SIZES) * DECISIONS + sum(SIGN_SIZES[:i]) for i in range(SIGN_CONTEXTS))
-SECOND = KINDS * DECISIONS * LANES
-SIGNS = SECOND + 64 * DECISIONS * LANES
+"""First slot of each estimate of a sign."""
+BY_KIND = KINDS * LANES
+"""Weights of one decision in the sets that are chosen by the kind of the band."""
+BY_LEVEL = 64 * LANES
+"""Weights of one decision in the sets that are chosen by the expected magnitude."""
+SECOND = DECISIONS * BY_KIND
+"""First weight of the sets that are chosen by the expected magnitude."""
+SIGNS = SECOND + DECISIONS * BY_LEVEL
+"""First weight of the signs."""
 ROWS = LEVELS * 64
+"""First simple estimate of empty rows, after those of the escape code."""
 EMPTIES = ROWS + 8
-ENCODE, DECODE, CHOOSE = 0, 1, 2
+"""First simple estimate of empty bands."""
 
-Sequence = Any
-"""A list of integers, or an integer array where compiled."""
+ENCODE = 0
+"""Mode of a run that encodes."""
+DECODE = 1
+"""Mode of a run that decodes."""
+CHOOSE = 2
+"""Mode of a run that encodes magnitudes which it chooses by rate and distortion."""
 
-
-class Tables(NamedTuple):
-    """The functions that are looked up."""
-
-    stretch: Sequence
-    squash: Sequence
-    cost: Sequence
-    log: Sequence
-    rate: Sequence
-    small: Sequence
-
-
-class Memory(NamedTuple):
-    """The state, field by field."""
-
-    slow: Sequence
-    fast: Sequence
-    count: Sequence
-    weights: Sequence
-    chance: Sequence
-    seen: Sequence
+SIZE = COLUMNS
+"""First of four columns that follow those of the table: lengths of the band along t, z, y, x."""
+FIRST_ROW = COLUMNS + 4
+"""Column: where the rows of the band begin in `Work.filled`."""
+FIRST_MAGNITUDE = COLUMNS + 5
+"""Column: where the magnitudes of the band begin in `Work.magnitudes`."""
 
 
 class Work(NamedTuple):
-    """What a run writes to: the range (low, high, value, position); magnitudes and filled rows of all bands, the first of them a row of
-    zeros; sums over a row's neighbours; and predictions, the second set of them for choices."""
+    """Sequences that a run writes to.
 
-    span: Sequence
+    Attributes:
+        any: by band, whether it has an integer other than 0.
+        magnitudes: of all bands, with PADDING zeros at both ends of each row, after a row of zeros
+            that stands for rows that do not exist.
+        filled: by row of all bands, whether it has an integer other than 0.
+        expected: by vertex of a row, the sum over its neighbours for the expected magnitude, but
+            those to the left.
+        plane, before, below: by vertex, sums over the rows above, the step before, the layer below.
+        around: by reference and vertex, sums around the vertex of the reference.
+        rows: by reference, where the row begins that stands for this row, or -1.
+        row_y: by reference, the index of that row along y.
+        context: of each estimate.
+        where, inputs: of a decision, for `mix` and `learn`.
+        other_where, other_inputs: the same for magnitudes that are only tried.
+    """
+
+    any: Sequence
     magnitudes: Sequence
     filled: Sequence
-    any: Sequence
     expected: Sequence
     plane: Sequence
     before: Sequence
@@ -106,130 +163,60 @@ def encode(
     weight: float,
     state: State,
 ) -> bytes:
-    """Code integers (t, z, y, x), in C order; with `scaled` they are chosen anew in place. The state is left as it has become."""
-    compiled = _compiled()
+    """Code integers (t, z, y, x), in C order, and adapt the state.
+
+    With `scaled` the integers are chosen anew, in place.
+    """
+    engine = _engine()
     real = (np.zeros(0) if scaled is None else np.asarray(scaled, dtype=np.float64)).ravel()
-    q: Sequence = integers.reshape(-1) if compiled else integers.ravel().tolist()
-    memory = _memory(state, compiled is not None)
     mode = ENCODE if scaled is None else CHOOSE
-    out = _start(
-        compiled,
-        mode,
-        q,
-        real if compiled else real.tolist(),
-        weight / 2048,
-        integers.shape,
-        table,
-        memory,
-        b"",
-    )[1]
-    if not compiled and mode == CHOOSE:
-        integers[:] = np.array(q, dtype=np.int32).reshape(integers.shape)
-    state.slots[:, 0], state.slots[:, 1], state.slots[:, 2] = memory.slow, memory.fast, memory.count
-    state.weights[:] = memory.weights
-    state.simples[:, 0], state.simples[:, 1] = memory.chance, memory.seen
+    memory = memory_of(state, engine is not None)
+    q: Sequence
+    if engine is None:
+        q = integers.ravel().tolist()
+        out = _start(engine, mode, q, real.tolist(), weight, integers.shape, table, memory, b"")[1]
+        if mode == CHOOSE:
+            integers[:] = np.array(q, dtype=np.int32).reshape(integers.shape)
+    else:
+        q = integers.reshape(-1)
+        out = _start(engine, mode, q, real, weight, integers.shape, table, memory, b"")[1]
+    keep_memory(memory, state)
     return bytes(out)
 
 
 def decode(
     integers: npt.NDArray[np.int32], table: npt.NDArray[np.int32], data: bytes, state: State
 ) -> None:
-    """Decode into integers (t, z, y, x), which are zeros in C order. Raises DamagedFileError for bytes that no encoder writes."""
-    compiled = _compiled()
-    q: Sequence = integers.reshape(-1) if compiled else [0] * integers.size
-    real: Sequence = np.zeros(0) if compiled else []
-    code = _start(
-        compiled,
-        DECODE,
-        q,
-        real,
-        0.0,
-        integers.shape,
-        table,
-        _memory(state, compiled is not None),
-        data,
-    )[0]
+    """Decode into integers (t, z, y, x), which are zeros in C order.
+
+    Raises DamagedFileError for bytes that no encoder writes.
+    """
+    engine = _engine()
+    q: Sequence = [0] * integers.size if engine is None else integers.reshape(-1)
+    real: Sequence = [] if engine is None else np.zeros(0)
+    memory = memory_of(state, engine is not None)
+    code = _start(engine, DECODE, q, real, 0.0, integers.shape, table, memory, data)[0]
     if code < 0:
         raise DamagedFileError("the coded integers are damaged")
-    if not compiled:
+    if engine is None:
         integers[:] = np.array(q, dtype=np.int32).reshape(integers.shape)
 
 
-def _tables() -> dict[str, npt.NDArray[np.int64]]:
-    """The values before they are rounded down are nowhere near a whole number (a test sees to it), so every machine has the same."""
-    p, logits, small = (
-        (np.arange(65536) + 0.5) / 65536,
-        np.arange(-STRETCH_MAX, STRETCH_MAX + 1),
-        [3, 5, 7, 10, 15, 23, 37],
-    )
-    tables = {
-        "stretch": np.clip(np.floor(np.log(p / (1 - p)) * 256 + 0.5), -STRETCH_MAX, STRETCH_MAX),
-        "squash": np.clip(np.floor(65536 / (1 + np.exp(-logits / 256)) + 0.5), 1, 65535),
-        "cost": np.floor(-np.log2(np.maximum(np.arange(65537), 1) / 65536) * 2048 + 0.5),
-        "log": np.floor(np.log2(np.maximum(np.arange(4096), 1)) * 16 + 0.5),
-        "rate": 655360 // (10 * np.arange(SLOW_LIMIT + 1) + 16),
-        "small": np.array(
-            [v if v < 3 else 2 + sum(v >= bound for bound in small) for v in range(38)]
-        ),
-    }
-    return {name: values.astype(np.int64) for name, values in tables.items()}
-
-
-_ARRAYS = Tables(**_tables())
-_LISTS = Tables(*(values.tolist() for values in _ARRAYS))
-_LOCK = threading.Lock()
-_RUN: list[Callable[..., Any] | None] = []
-
-
-def _compiled() -> Callable[..., Any] | None:
+def _engine() -> Callable[..., Any] | None:
     """`_run` compiled, or None where numba cannot be imported."""
-    with _LOCK:
-        if not _RUN:
-            try:
-                _RUN.append(_compile(import_module("numba"), import_module("numba.extending")))
-            except ImportError:
-                _RUN.append(None)
-    return _RUN[0]
-
-
-def _compile(numba: Any, extending: Any) -> Callable[..., Any]:
-    parts: tuple[Callable[..., Any], ...] = (
-        _code,
-        _chance,
-        _finish,
-        _log16,
-        _small,
-        _mix,
-        _learn,
-        _context_mix,
-        _choose,
+    helpers = (
+        *(_small, _sign, _context_mix, _choose, _add_centre, _add_neighbour, _prepare),
+        *(_any_nonzero, _find_references, _code_escape),
     )
-    for part in (*parts, _add_centre, _add_neighbour, _prepare, _sign):
-        extending.register_jitable(part)
-    try:
-        run: Callable[..., Any] = numba.njit(cache=True, nogil=True)(_run)
-    except RuntimeError:  # nowhere to keep the compiled code
-        run = numba.njit(nogil=True)(_run)
-    return run
-
-
-def _memory(state: State, arrays: bool) -> Memory:
-    columns: list[npt.NDArray[Any]] = [
-        state.slots[:, 0],
-        state.slots[:, 1],
-        state.slots[:, 2],
-        state.weights,
-    ]
-    columns += [state.simples[:, 0], state.simples[:, 1]]
-    return Memory(*(column.astype(np.int64) if arrays else column.tolist() for column in columns))
+    return compiled(_run, helpers)
 
 
 def _start(
-    compiled: Callable[..., Any] | None,
+    engine: Callable[..., Any] | None,
     mode: int,
     q: Sequence,
     scaled: Sequence,
-    price: float,
+    weight: float,
     shape: tuple[int, ...],
     table: npt.NDArray[np.int32],
     memory: Memory,
@@ -237,148 +224,49 @@ def _start(
 ) -> tuple[int, list[int]]:
     """Make room for the bands and run."""
     bands = table.astype(np.int64)
-    sizes = bands[:, 4:8] - bands[:, :4]
+    sizes = bands[:, HIGH : HIGH + 4] - bands[:, LOW : LOW + 4]
     width = int(sizes[:, 3].max(initial=0)) + 2 * PADDING
     rows = sizes[:, 0] * sizes[:, 1] * sizes[:, 2]
-    # After the columns of the table: where the band's magnitudes and its rows begin.
-    first = np.cumsum([width, *(rows * (sizes[:, 3] + 2 * PADDING))])
-    bands = np.column_stack([bands, first[:-1], np.cumsum([0, *rows])[:-1]])
-    lengths = [
-        4,
-        int(first[-1]),
-        int(rows.sum()),
-        len(bands),
-        width,
-        width,
-        width,
-        width,
-        4 * width,
-        4,
-        4,
-        CONTEXTS,
-        CONTEXTS,
-        LANES,
-    ]
-    lengths += [CONTEXTS, LANES]
-    if compiled is None:
-        work = Work(*([0] * length for length in lengths))
-        return _run(mode, q, scaled, price, shape, bands.tolist(), memory, _LISTS, work, data)
-    work = Work(*(np.zeros(length, dtype=np.int64) for length in lengths))
-    source = np.frombuffer(data, dtype=np.uint8).astype(np.int64)
-    code, out = compiled(mode, q, scaled, price, shape, bands, memory, _ARRAYS, work, source)
+    first_row = np.cumsum([0, *rows])
+    first_magnitude = np.cumsum([width, *(rows * (sizes[:, 3] + 2 * PADDING))])
+    bands = np.column_stack([bands, sizes, first_row[:-1], first_magnitude[:-1]])
+    lengths = {
+        "any": len(bands),
+        "magnitudes": int(first_magnitude[-1]),
+        "filled": int(first_row[-1]),
+        **dict.fromkeys(("expected", "plane", "before", "below"), width),
+        "around": REFERENCE_COUNT * width,
+        **dict.fromkeys(("rows", "row_y"), REFERENCE_COUNT),
+        **dict.fromkeys(("context", "where", "other_where"), CONTEXTS),
+        **dict.fromkeys(("inputs", "other_inputs"), LANES),
+    }
+    price = weight / 2048  # squared steps that 1/2048 bit is worth
+    if engine is None:
+        work = Work(**{name: [0] * length for name, length in lengths.items()})
+        span: Sequence = [0] * 4
+        return _run(mode, q, scaled, price, shape, bands.tolist(), memory, LISTS, work, span, data)
+    work = Work(**{name: np.zeros(length, dtype=np.int64) for name, length in lengths.items()})
+    span, source = np.zeros(4, np.int64), np.frombuffer(data, dtype=np.uint8).astype(np.int64)
+    code, out = engine(mode, q, scaled, price, shape, bands, memory, ARRAYS, work, span, source)
     return code, out
 
 
-def _code(bit: int, p: int, decoding: bool, span: Sequence, data: Sequence, out: Sequence) -> int:
-    low, high = span[0], span[1]
-    middle = low + (((high - low) * p) >> 16)
-    if decoding:
-        bit = 1 if span[2] <= middle else 0
-    if bit:
-        high = middle
-    else:
-        low = middle + 1
-    while ((low ^ high) & 0xFF000000) == 0:
-        if decoding:
-            at = span[3]
-            span[2] = ((span[2] << 8) & 0xFFFFFFFF) | (data[at] if at < len(data) else 0)
-            span[3] = at + 1
-        else:
-            out.append(high >> 24)
-        low = (low << 8) & 0xFFFFFFFF
-        high = ((high << 8) & 0xFFFFFFFF) | 255
-    span[0], span[1] = low, high
-    return bit
-
-
-def _chance(
-    bit: int,
-    at: int,
-    decoding: bool,
-    memory: Memory,
-    rate: Sequence,
-    span: Sequence,
-    data: Sequence,
-    out: Sequence,
-) -> int:
-    p, seen = memory.chance[at], memory.seen[at]
-    bit = _code(bit, min(max(p, 32), 65504), decoding, span, data, out)
-    memory.chance[at] = p + ((((65535 if bit else 0) - p) * rate[seen]) >> 16)
-    if seen < SIMPLE_LIMIT:
-        memory.seen[at] = seen + 1
-    return bit
-
-
-def _log16(v: int, log: Sequence) -> int:
-    shift = 0
-    while (v >> shift) >= 4096:
-        shift += 1
-    return int(log[v >> shift]) + 16 * shift
-
-
 def _small(v: int, small: Sequence) -> int:
+    """The class, 0 to 11, of a magnitude or of a sum of some."""
     if v < 37:
         return int(small[v])
     return 9 if v <= 64 else 10 if v <= 140 else 11
 
 
-def _mix(
-    n: int,
-    where: Sequence,
-    inputs: Sequence,
-    first: int,
-    second: int,
-    memory: Memory,
-    tables: Tables,
-) -> int:
-    """The probability of a 1; `second` is negative where there is one set of weights."""
-    weights, dot = memory.weights, 0
-    for i in range(n):
-        at = where[i]
-        slow, fast, seen = (
-            tables.stretch[memory.slow[at]],
-            tables.stretch[memory.fast[at]],
-            memory.count[at] + 1,
-        )
-        if seen <= 12:
-            # Rounded towards 0.
-            slow = slow * seen // 13 if slow >= 0 else -(-slow * seen // 13)
-            fast = fast * seen // 13 if fast >= 0 else -(-fast * seen // 13)
-        inputs[2 * i], inputs[2 * i + 1] = slow, fast
-        w, v = weights[first + 2 * i], weights[first + 2 * i + 1]
-        if second >= 0:
-            w, v = w + weights[second + 2 * i], v + weights[second + 2 * i + 1]
-        dot += ((w * slow) >> 2) + ((v * fast) >> 2)
-    return int(tables.squash[min(max(dot >> 12, -STRETCH_MAX), STRETCH_MAX) + STRETCH_MAX])
+def _sign(v: int) -> int:
+    return 2 if v > 0 else 0 if v < 0 else 1
 
 
-def _learn(
-    n: int,
-    where: Sequence,
-    inputs: Sequence,
-    first: int,
-    second: int,
-    p: int,
-    bit: int,
-    limit: int,
-    memory: Memory,
-    rate: Sequence,
-) -> None:
-    weights = memory.weights
-    target = 65535 if bit else 0
-    error = ((target - p) * LEARNING_RATE) >> 4
-    for i in range(2 * n):
-        step = (error * inputs[i] + 32768) >> 16
-        weights[first + i] = min(max(weights[first + i] + step, -32767), 32767)
-        if second >= 0:
-            weights[second + i] = min(max(weights[second + i] + step, -32767), 32767)
-    for i in range(n):
-        at = where[i]
-        slow, fast, seen = memory.slow[at], memory.fast[at], memory.count[at]
-        memory.slow[at] = slow + (((target - slow) * rate[seen]) >> 16)
-        memory.fast[at] = fast + (((target - fast) * rate[min(seen, FAST_LIMIT)]) >> 16)
-        if seen < limit:
-            memory.count[at] = seen + 1
+def _any_nonzero(q: Sequence, begin: int, n: int) -> int:
+    for at in range(begin, begin + n):
+        if q[at] != 0:
+            return 1
+    return 0
 
 
 def _context_mix(
@@ -391,9 +279,10 @@ def _context_mix(
     memory: Memory,
     tables: Tables,
 ) -> int:
+    """Probability of a 1 in decision k: 0 is the zero flag, any other asks "more than k"."""
     for i in range(CONTEXTS):
         where[i] = STARTS[i] + context[i] * DECISIONS + k
-    return _mix(CONTEXTS, where, inputs, first, second, memory, tables)
+    return mix(CONTEXTS, where, inputs, first, second, memory, tables)
 
 
 def _choose(
@@ -406,12 +295,12 @@ def _choose(
     tables: Tables,
     work: Work,
 ) -> int:
+    """The magnitude next to `s` that costs least: the nearest one, one less, or zero."""
     s = s if s < 1e9 else 1e9
     nearest = int(s + 0.5)
     if nearest == 0 or nearest >= UNARY:
         return nearest
     cost, where, inputs, context = tables.cost, work.other_where, work.other_inputs, work.context
-    by_kind, by_level = KINDS * LANES, 64 * LANES  # weights of a decision
     zero = s * s + price * cost[p]
     other_than_zero = price * (cost[65536 - p] + 2048)
     stop = _context_mix(
@@ -419,8 +308,8 @@ def _choose(
         where,
         inputs,
         context,
-        first + nearest * by_kind,
-        second + nearest * by_level,
+        first + nearest * BY_KIND,
+        second + nearest * BY_LEVEL,
         memory,
         tables,
     )
@@ -428,7 +317,7 @@ def _choose(
         return 0 if zero <= (s - 1) * (s - 1) + price * cost[65536 - stop] + other_than_zero else 1
     k = nearest - 1
     before = _context_mix(
-        k, where, inputs, context, first + k * by_kind, second + k * by_level, memory, tables
+        k, where, inputs, context, first + k * BY_KIND, second + k * BY_LEVEL, memory, tables
     )
     same = (s - nearest) * (s - nearest) + price * (cost[before] + cost[65536 - stop])
     less = (s - nearest + 1) * (s - nearest + 1) + price * cost[65536 - before]
@@ -438,6 +327,7 @@ def _choose(
 
 
 def _add_centre(sums: Sequence, row: int, n: int, work: Work) -> None:
+    """Add the row one step before or one layer below."""
     m = work.magnitudes
     for x in range(n):
         sides = m[row + x - 1] + m[row + x + 1]
@@ -446,6 +336,7 @@ def _add_centre(sums: Sequence, row: int, n: int, work: Work) -> None:
 
 
 def _add_neighbour(sums: Sequence, row: int, n: int, work: Work) -> None:
+    """Add a row beside that one."""
     m = work.magnitudes
     for x in range(n):
         work.expected[x] += AROUND * m[row + x]
@@ -455,8 +346,20 @@ def _add_neighbour(sums: Sequence, row: int, n: int, work: Work) -> None:
 def _prepare(
     t: int, z: int, y: int, r: int, band: Sequence, table: Sequence, work: Work, width: int
 ) -> int:
-    """What is known of a row beforehand, into the sums of `work`; the weight of the neighbours that exist."""
-    n1, n2, n = band[5] - band[1], band[6] - band[2], band[7] - band[3]
+    """Sum over the neighbours of a row that are coded before it, into the sums of `work`.
+
+    Args:
+        t, z, y: indices of the row within its band.
+        r: number of the row within its band.
+        band: row of the table.
+        table: all bands.
+        work: sequences of the run.
+        width: length of `work.expected`.
+
+    Returns:
+        Sum of the weights of the neighbours that exist, those to the left included.
+    """
+    n1, n2, n = band[SIZE + 1], band[SIZE + 2], band[SIZE + 3]
     m, filled, expected, plane, before, below = (
         work.magnitudes,
         work.filled,
@@ -465,9 +368,10 @@ def _prepare(
         work.before,
         work.below,
     )
+    # Strides along y, z and t: of magnitudes (m2, m1, m0) and of rows (1, r1, r0).
     m2 = n + 2 * PADDING
     m1, m0, r1, r0 = m2 * n2, m2 * n2 * n1, n2, n1 * n2
-    f, row = band[30] + r, band[29] + r * m2 + PADDING
+    f, row = band[FIRST_ROW] + r, band[FIRST_MAGNITUDE] + r * m2 + PADDING
     for x in range(n):
         expected[x] = plane[x] = before[x] = below[x] = 0
     weight = LEFT + LEFT2
@@ -514,8 +418,9 @@ def _prepare(
         if filled[f - 2 * r1]:
             for x in range(n):
                 expected[x] += BEFORE2 * m[row - 2 * m1 + x]
-    for k in range(4):
-        number, shift = band[9 + 5 * k], band[13 + 5 * k]
+    for k in range(REFERENCE_COUNT):
+        reference = REFERENCES + k * REFERENCE_COLUMNS
+        number, shift = band[reference + BAND], band[reference + SHIFT + 3]
         if number >= 0:
             weight += REFERENCE + 2 * AROUND
         base = work.rows[k]
@@ -524,15 +429,55 @@ def _prepare(
                 work.around[k * width + x] = 0
             continue
         other = table[number]
-        last, stride = other[7] - other[3] - 1, other[7] - other[3] + 2 * PADDING
+        last, stride = other[SIZE + 3] - 1, other[SIZE + 3] + 2 * PADDING
         up = base - stride if work.row_y[k] > 0 else PADDING
-        down = base + stride if work.row_y[k] + 1 < other[6] - other[2] else PADDING
+        down = base + stride if work.row_y[k] + 1 < other[SIZE + 2] else PADDING
         for x in range(n):
             i = min(x >> shift, last)
             total = 2 * m[base + i] + m[base + i - 1] + m[base + i + 1] + m[up + i] + m[down + i]
             work.around[k * width + x] = total
             expected[x] += REFERENCE * m[base + i] + AROUND * total
     return weight
+
+
+def _find_references(t: int, z: int, y: int, band: Sequence, table: Sequence, work: Work) -> int:
+    """Find the row of each reference for this row; whether the row of the parent is filled."""
+    parent_filled = 0
+    for k in range(REFERENCE_COUNT):
+        reference = REFERENCES + k * REFERENCE_COLUMNS
+        number = band[reference + BAND]
+        work.rows[k] = -1
+        if number < 0 or not work.any[number]:
+            continue
+        other = table[number]
+        other_t = min(t >> band[reference + SHIFT], other[SIZE] - 1)
+        other_z = min(z >> band[reference + SHIFT + 1], other[SIZE + 1] - 1)
+        other_y = min(y >> band[reference + SHIFT + 2], other[SIZE + 2] - 1)
+        row = (other_t * other[SIZE + 1] + other_z) * other[SIZE + 2] + other_y
+        stride = other[SIZE + 3] + 2 * PADDING
+        work.row_y[k] = other_y
+        work.rows[k] = other[FIRST_MAGNITUDE] + row * stride + PADDING
+        if k == 0:
+            parent_filled = work.filled[other[FIRST_ROW] + row]
+    return parent_filled
+
+
+def _code_escape(magnitude: int, level: int, stream: Stream, memory: Memory, rate: Sequence) -> int:
+    """Code a magnitude from UNARY on as an Exp-Golomb number; -1 for one that no encoder writes."""
+    escape, rest, bits, j = level * 64, 0, 0, 0
+    if not stream.decoding:
+        rest = magnitude - UNARY + 1
+        while (rest >> bits) > 1:
+            bits += 1
+    while code_simple(1 if j < bits else 0, escape + min(j, 20), stream, memory, rate):
+        j += 1
+        if j > 30:
+            return -1
+    v = 1
+    for i in range(j - 1, -1, -1):
+        at = escape + 21 + min(j, 19) * 2 + (1 if i != j - 1 else 0)
+        v = (v << 1) | code_simple((rest >> i) & 1, at, stream, memory, rate)
+    return min(v + UNARY - 1, 0x7FFFFFFF)
 
 
 def _run(
@@ -545,132 +490,88 @@ def _run(
     memory: Memory,
     tables: Tables,
     work: Work,
+    span: Sequence,
     data: Sequence,
 ) -> tuple[int, list[int]]:
-    """0 or -1, and the bytes."""
+    """Code all bands: 0, or -1 for bytes that no encoder writes; and the bytes."""
     decoding = mode == DECODE
     out = [0 for _ in range(0)]
-    log, rate, small = tables.log, tables.rate, tables.small
-    span, m, where, inputs, context, width = (
-        work.span,
-        work.magnitudes,
-        work.where,
-        work.inputs,
-        work.context,
-        len(work.expected),
-    )
-    span[1] = 0xFFFFFFFF
-    if decoding:
-        for i in range(4):
-            span[2] = (span[2] << 8) | (data[i] if i < len(data) else 0)
-        span[3] = 4
+    stream = Stream(decoding, span, data, out)
+    rate, log, small = tables.rate, tables.log, tables.small
+    m, where, inputs = work.magnitudes, work.where, work.inputs
+    context, width = work.context, len(work.expected)
+    start_range(stream)
     s2 = shape[3]
     s1 = s2 * shape[2]
     s0 = s1 * shape[1]
 
     for number in range(len(table)):
         band = table[number]
-        n0, n1, n2, n3, kind = (
-            band[4] - band[0],
-            band[5] - band[1],
-            band[6] - band[2],
-            band[7] - band[3],
-            band[8],
-        )
-        origin = band[0] * s0 + band[1] * s1 + band[2] * s2 + band[3]
+        n0, n1, n2, n3 = band[SIZE], band[SIZE + 1], band[SIZE + 2], band[SIZE + 3]
+        kind = band[KIND]
+        origin = band[LOW] * s0 + band[LOW + 1] * s1 + band[LOW + 2] * s2 + band[LOW + 3]
         some = 0
         if not decoding:
             for r in range(n0 * n1 * n2):
                 begin = origin + r // n2 // n1 * s0 + r // n2 % n1 * s1 + r % n2 * s2
-                for at in range(begin, begin + n3):
-                    if q[at] != 0:
-                        some = 1
-                        break
+                some = _any_nonzero(q, begin, n3)
                 if some:
                     break
-        some = _chance(some, EMPTIES + kind, decoding, memory, rate, span, data, out)
+        some = code_simple(some, EMPTIES + kind, stream, memory, rate)
         work.any[number] = some
         if not some:
             continue
+        # Strides along y, z and t: of magnitudes (m2, m1, m0) and of rows (1, r1, r0).
         r1, r0, m2 = n2, n1 * n2, n3 + 2 * PADDING
         m1, m0 = m2 * n2, m2 * n2 * n1
 
         for r in range(n0 * n1 * n2):
             t, z, y = r // n2 // n1, r // n2 % n1, r % n2
             begin = origin + t * s0 + z * s1 + y * s2
-            row, f = band[29] + r * m2 + PADDING, band[30] + r
+            row, f = band[FIRST_MAGNITUDE] + r * m2 + PADDING, band[FIRST_ROW] + r
 
-            # The row of each reference that stands for this row.
-            parent_filled = 0
-            for k in range(4):
-                to = band[9 + 5 * k]
-                work.rows[k] = -1
-                if to < 0 or not work.any[to]:
-                    continue
-                other = table[to]
-                rt, rz = (
-                    min(t >> band[10 + 5 * k], other[4] - other[0] - 1),
-                    min(z >> band[11 + 5 * k], other[5] - other[1] - 1),
-                )
-                ry = min(y >> band[12 + 5 * k], other[6] - other[2] - 1)
-                to_row = (rt * (other[5] - other[1]) + rz) * (other[6] - other[2]) + ry
-                work.row_y[k] = ry
-                work.rows[k] = other[29] + to_row * (other[7] - other[3] + 2 * PADDING) + PADDING
-                if k == 0:
-                    parent_filled = work.filled[other[30] + to_row]
-            known = (
+            parent_filled = _find_references(t, z, y, band, table, work)
+            filled_beside = (
                 (y > 0 and work.filled[f - 1])
                 or (z > 0 and work.filled[f - r1])
                 or (t > 0 and work.filled[f - r0])
             )
-            if not (known or parent_filled):
-                some = 0
-                if not decoding:
-                    for at in range(begin, begin + n3):
-                        if q[at] != 0:
-                            some = 1
-                            break
-                at = (
-                    ROWS
-                    + (2 if n3 > 24 else 0)
-                    + (1 if y > 1 and work.filled[f - 2] else 0)
-                    + (4 if r == 0 else 0)
-                )
-                if not _chance(some, at, decoding, memory, rate, span, data, out):
+            if not (filled_beside or parent_filled):
+                some = 0 if decoding else _any_nonzero(q, begin, n3)
+                at = ROWS + (2 if n3 > 24 else 0) + (4 if r == 0 else 0)
+                at += 1 if y > 1 and work.filled[f - 2] else 0
+                if not code_simple(some, at, stream, memory, rate):
                     continue
 
-            offset = 160 - _log16(_prepare(t, z, y, r, band, table, work, width), log)
+            offset = 160 - log16(_prepare(t, z, y, r, band, table, work, width), log)
             above = row - m2 if y > 0 else PADDING
             under = row - m1 if z > 0 else PADDING
             back = row - m0 if t > 0 else PADDING
 
             for x in range(n3):
                 left, left2 = m[row + x - 1], m[row + x - 2]
-                mu = work.expected[x] + LEFT * left + LEFT2 * left2
-                level = min(max((_log16(mu, log) + offset) // 4 + 1, 0), LEVELS - 1) if mu else 0
+                expected = work.expected[x] + LEFT * left + LEFT2 * left2
+                level = 0
+                if expected:
+                    level = min(max((log16(expected, log) + offset) // 4 + 1, 0), LEVELS - 1)
                 coarse = min(level // 2, 63)
-                near, before, below = (
-                    work.plane[x] + 2 * left + left2,
-                    work.before[x],
-                    work.below[x],
-                )
+                near = work.plane[x] + 2 * left + left2
+                before, below = work.before[x], work.below[x]
                 parent = _small(work.around[x], small)
-                beside = (
-                    (min(left, 2) * 3 + min(m[above + x], 2)) * 3 + min(m[above + x - 1], 2)
-                ) * 3 + min(m[above + x + 1], 2)
+                beside = (min(left, 2) * 3 + min(m[above + x], 2)) * 3 + min(m[above + x - 1], 2)
+                beside = beside * 3 + min(m[above + x + 1], 2)
                 others = (min(parent, 6) * 7 + min(_small(work.around[width + x], small), 6)) * 7
                 others = (others + min(_small(work.around[2 * width + x], small), 6)) * 7
+                sides = _small(before, small) * 12 + _small(below, small)
+                both = _small((near + before + below) // 2, small)
                 context[0] = level
                 context[1] = kind * 64 + coarse
                 context[2] = (beside * 3 + min(m[back + x], 2)) * 3 + min(m[under + x], 2)
-                context[3] = (_small(near, small) * 12 + _small(before, small)) * 12 + _small(
-                    below, small
-                )
+                context[3] = _small(near, small) * 144 + sides
                 context[4] = others + min(_small(work.around[3 * width + x], small), 6)
-                context[5] = (
-                    _small((near + before + below) // 2, small) * 12 + parent
-                ) * KINDS + kind
+                context[5] = (both * 12 + parent) * KINDS + kind
 
+                # The zero flag.
                 first, second = kind * LANES, SECOND + coarse * LANES
                 p = _context_mix(0, where, inputs, context, first, second, memory, tables)
                 at = begin + x
@@ -680,94 +581,84 @@ def _run(
                     value = -best if scaled[at] < 0 else best
                     q[at] = value
                 magnitude = abs(value)
-                zero = _code(1 if magnitude == 0 else 0, p, decoding, span, data, out)
-                _learn(CONTEXTS, where, inputs, first, second, p, zero, SLOW_LIMIT, memory, rate)
+                zero = code_bit(1 if magnitude == 0 else 0, p, stream)
+                learn(
+                    CONTEXTS,
+                    where,
+                    inputs,
+                    first,
+                    second,
+                    p,
+                    zero,
+                    SLOW_LIMIT,
+                    LEARNING_RATE,
+                    memory,
+                    rate,
+                )
                 if zero:
                     continue
                 work.filled[f] = 1
 
+                # The sign: 0 for negative neighbours, 1 for zeros and none, 2 for positive ones.
                 left_sign = _sign(q[at - 1]) if x > 0 else 1
                 left2_sign = _sign(q[at - 2]) if x > 1 else 1
                 y_sign = _sign(q[at - s2]) if y > 0 else 1
                 y2_sign = _sign(q[at - 2 * s2]) if y > 1 else 1
                 z_sign = _sign(q[at - s1]) if z > 0 else 1
                 t_sign = _sign(q[at - s0]) if t > 0 else 1
+                sides = (left_sign * 3 + left2_sign) * 9 + y_sign * 3 + y2_sign
                 where[0] = SIGN_STARTS[0] + kind * 27 + (left_sign * 3 + y_sign) * 3 + t_sign
-                where[1] = (
-                    SIGN_STARTS[1]
-                    + kind * 81
-                    + ((left_sign * 3 + left2_sign) * 3 + y_sign) * 3
-                    + y2_sign
-                )
+                where[1] = SIGN_STARTS[1] + kind * 81 + sides
                 where[2] = SIGN_STARTS[2] + kind * 27 + (t_sign * 3 + z_sign) * 3 + left_sign
-                weights = SIGNS + kind * LANES
-                p = _mix(SIGN_CONTEXTS, where, inputs, weights, -1, memory, tables)
-                negative = _code(1 if value < 0 else 0, p, decoding, span, data, out)
-                _learn(
-                    SIGN_CONTEXTS, where, inputs, weights, -1, p, negative, SIGN_LIMIT, memory, rate
+                signs = SIGNS + kind * LANES
+                p = mix(SIGN_CONTEXTS, where, inputs, signs, -1, memory, tables)
+                negative = code_bit(1 if value < 0 else 0, p, stream)
+                learn(
+                    SIGN_CONTEXTS,
+                    where,
+                    inputs,
+                    signs,
+                    -1,
+                    p,
+                    negative,
+                    SIGN_LIMIT,
+                    LEARNING_RATE,
+                    memory,
+                    rate,
                 )
 
+                # The magnitude.
                 k = 1
                 while k < UNARY:
-                    first += KINDS * LANES
-                    second += 64 * LANES
+                    first += BY_KIND
+                    second += BY_LEVEL
                     p = _context_mix(k, where, inputs, context, first, second, memory, tables)
-                    more = _code(1 if magnitude > k else 0, p, decoding, span, data, out)
-                    _learn(
-                        CONTEXTS, where, inputs, first, second, p, more, SLOW_LIMIT, memory, rate
+                    more = code_bit(1 if magnitude > k else 0, p, stream)
+                    learn(
+                        CONTEXTS,
+                        where,
+                        inputs,
+                        first,
+                        second,
+                        p,
+                        more,
+                        SLOW_LIMIT,
+                        LEARNING_RATE,
+                        memory,
+                        rate,
                     )
                     if not more:
                         break
                     k += 1
                 if k == UNARY:
-                    escape, rest, bits, j = level * 64, 0, 0, 0
-                    if not decoding:
-                        rest = magnitude - UNARY + 1
-                        while (rest >> bits) > 1:
-                            bits += 1
-                    while _chance(
-                        1 if j < bits else 0,
-                        escape + min(j, 20),
-                        decoding,
-                        memory,
-                        rate,
-                        span,
-                        data,
-                        out,
-                    ):
-                        j += 1
-                        if j > 30:
-                            return -1, out
-                    v = 1
-                    for i in range(j - 1, -1, -1):
-                        place = escape + 21 + min(j, 19) * 2 + (1 if i != j - 1 else 0)
-                        v = (v << 1) | _chance(
-                            (rest >> i) & 1, place, decoding, memory, rate, span, data, out
-                        )
-                    k = min(v + UNARY - 1, 0x7FFFFFFF)
+                    k = _code_escape(magnitude, level, stream, memory, rate)
+                    if k < 0:
+                        return -1, out
                 if decoding:
                     magnitude = k
                     q[at] = -k if negative else k
                 m[row + x] = min(magnitude, MAX_MAGNITUDE)
 
     if not decoding:
-        _finish(span, out)
+        finish(stream)
     return 0, out
-
-
-def _finish(span: Sequence, out: Sequence) -> None:
-    # The fewest bytes that name a number from low to high; the decoder reads zeros past the end.
-    low, high = span[0], span[1]
-    for keep in range(5):
-        v = high & ~(0xFFFFFFFF >> (8 * keep)) & 0xFFFFFFFF if keep else 0
-        if v < low:
-            continue
-        for i in range(keep):
-            out.append((v >> (24 - 8 * i)) & 255)
-        break
-    while len(out) > 0 and out[-1] == 0:
-        out.pop()
-
-
-def _sign(v: int) -> int:
-    return 2 if v > 0 else 0 if v < 0 else 1

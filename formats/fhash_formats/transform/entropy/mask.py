@@ -1,8 +1,10 @@
-"""Masks to bytes and back by an adaptive coder (native/mask.cpp), native or portable with the same bytes.
+"""Masks to bytes and back by an adaptive coder, native (native/mask.cpp) or portable.
 
-A mask says which vertices of a tile are occupied. Its coder looks at the bits around a vertex that are known already, and at the levels of
-the vertex and its neighbours (mask_levels.py), which tell how likely it is. It begins from a prior (`mask_prior.bin`), learned from other
-series than those that are coded, which is part of the format as that of the coefficients is.
+Both write the same bytes. A mask says which vertices of a tile are occupied. Its coder predicts
+each bit from the bits around the vertex that are already coded, and from the levels of the vertex
+and its neighbours (mask_levels.py), which tell how likely the vertex is occupied. It begins from a
+prior (`mask_prior.bin`) that was learned from other series. Like the prior of the coefficients, it
+is part of the format.
 """
 
 from __future__ import annotations
@@ -24,18 +26,25 @@ __all__ = ["blank_mask_state", "decode_mask", "encode_mask", "mask_prior_state",
 
 Mask = npt.NDArray[np.bool_]
 
-LEVELS, CONTEXTS, NEAR = 32, 10, 16
+LEVELS = 32
+"""Levels of a vertex; each has a set of mixing weights."""
+CONTEXTS = 10
+"""Estimates that are mixed for a bit."""
+NEAR = 16
+"""Patterns of the four nearest bits; each has a set of mixing weights."""
 SIZES = (512, 1024, 4096, 2048, 2048, 1920, 2592, 4096, 4096, 2048)
-"""Contexts of a bit, for each of the ten estimates that are mixed."""
+"""Contexts of each estimate."""
 LANES = 2 * CONTEXTS
+"""Weights of a set."""
 SIMPLES = 30
-"""Flags of segments: by the state around, by the levels, by how many segments are around."""
+"""Simple estimates, those of the flags of segments: by the state around, the levels, and the number
+of segments around."""
 
 _FILE = Path(__file__).with_name("mask_prior.bin")
 
 
 def blank_mask_state() -> State:
-    """Nothing known: even odds, and weights that take the estimates at their word."""
+    """A state that has learned nothing: even odds, and weights that believe the estimates."""
     return State.even(
         slots=sum(SIZES), weights=[(LEVELS * LANES, 3277), (NEAR * LANES, 0)], simples=SIMPLES
     )
@@ -43,7 +52,7 @@ def blank_mask_state() -> State:
 
 @cache
 def mask_prior_state() -> State:
-    """The prior; its arrays are read-only."""
+    """The prior of masks; its arrays are read-only."""
     return unpack_state(zlib.decompress(_FILE.read_bytes()), blank_mask_state()).frozen()
 
 
@@ -53,27 +62,30 @@ def pack_mask_prior(state: State) -> bytes:
 
 
 def encode_mask(mask: Mask, levels: tuple[Levels, Levels], *, state: State | None = None) -> bytes:
-    """Code a mask (t, z, y, x), bool, at least one vertex. levels: 0 to 31 and 0 to 15 of each vertex, from `MaskLevels`, both uint8.
+    """Code a mask.
 
-    state: to begin from and to leave behind, instead of the prior.
+    Args:
+        mask: bool (t, z, y, x), at least one vertex.
+        levels: two levels of each vertex, 0 to 31 and 0 to 15, uint8, from `MaskLevels.levels`.
+        state: state to begin from, which is adapted in place; None begins from the prior.
     """
-    kept = state is not None
+    keep = state is not None
     state = mask_prior_state() if state is None else state
     library = native.library()
     if library is None:
         from fhash_formats.transform.entropy import mask_portable
 
-        return mask_portable.encode(mask, levels, state if kept else state.copy())
-    bits, first, second = (np.ascontiguousarray(part, dtype=np.uint8) for part in (mask, *levels))
+        return mask_portable.encode(mask, levels, state if keep else state.copy())
+    bits, first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in (mask, *levels))
     capacity = max(4096, mask.size // 8)
     while True:
         buffer = np.empty(capacity, dtype=np.uint8)
         size = library.fhash_encode_mask(
-            *(ctypes.c_void_p(part.ctypes.data) for part in (bits, first, second)),
+            *(array.ctypes.data for array in (bits, first, second)),
             (ctypes.c_int64 * 4)(*mask.shape),
             *state_arguments(state),
-            ctypes.c_int64(kept),
-            *array_arguments(buffer, capacity),
+            keep,
+            *array_arguments(buffer),
         )
         if checked(size) <= capacity:
             return buffer[:size].tobytes()
@@ -81,7 +93,10 @@ def encode_mask(mask: Mask, levels: tuple[Levels, Levels], *, state: State | Non
 
 
 def decode_mask(data: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask:
-    """The mask (t, z, y, x) that `encode_mask` coded with the same levels. Any other bytes give some mask: a digest must tell."""
+    """The mask, bool (t, z, y, x), that `encode_mask` coded with the same levels.
+
+    Any other bytes give some mask: the caller must check a digest.
+    """
     shape = levels[0].shape
     library = native.library()
     if library is None:
@@ -89,13 +104,13 @@ def decode_mask(data: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask
 
         return mask_portable.decode(bytes(data), levels, mask_prior_state().copy())
     mask = np.empty(shape, dtype=np.uint8)
-    first, second = (np.ascontiguousarray(part, dtype=np.uint8) for part in levels)
+    first, second = (np.ascontiguousarray(array, dtype=np.uint8) for array in levels)
     source = np.frombuffer(data, dtype=np.uint8)
     code = library.fhash_decode_mask(
-        *(ctypes.c_void_p(part.ctypes.data) for part in (mask, first, second)),
+        *(array.ctypes.data for array in (mask, first, second)),
         (ctypes.c_int64 * 4)(*shape),
         *state_arguments(mask_prior_state()),
-        *array_arguments(source, source.size),
+        *array_arguments(source),
     )
     checked(code)
     return mask.view(np.bool_)

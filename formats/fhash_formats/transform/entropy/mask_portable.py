@@ -1,30 +1,34 @@
-"""The coder of masks without the native library: native/mask.cpp step by step, with the same bytes. Its comments say what is done and why.
+"""The coder of masks without the native library: twin of native/mask.cpp.
 
-Compiled where numba can be imported, plain Python elsewhere, as the coder of integers is (coder_portable.py), whose parts it takes.
+It follows that file step by step and gives the same bytes. The comments there give the reasons.
+mixing_portable.py says how it runs with numba and without.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.entropy import coder_portable
-from fhash_formats.transform.entropy.coder_portable import (
-    _ARRAYS,
-    _LISTS,
+from fhash_formats.transform.entropy.mixing_portable import (
+    ARRAYS,
+    LISTS,
+    SLOW_LIMIT,
     Memory,
     Sequence,
+    Stream,
     Tables,
-    _chance,
-    _code,
-    _finish,
-    _memory,
-    _mix,
+    code_bit,
+    code_simple,
+    compiled,
+    finish,
+    keep_memory,
+    learn,
+    memory_of,
+    mix,
+    start_range,
 )
 from fhash_formats.transform.entropy.prior import State
 
@@ -33,71 +37,113 @@ __all__ = ["decode", "encode"]
 Mask = npt.NDArray[np.bool_]
 Levels = npt.NDArray[np.uint8]
 
-CONTEXTS, LEVELS, EVEN, SEGMENT, NEAR, PADDING, NOTHING, QUIET, LIMIT, RATE, FAST = (
-    10,
-    32,
-    16,
-    16,
-    16,
-    2,
-    3,
-    12,
-    400,
-    2,
-    20,
-)
-SIZES = (512, 1024, 4096, 2048, 2048, 1920, 2592, 4096, 4096, 2048)
-STARTS = tuple(sum(SIZES[:i]) for i in range(CONTEXTS))
+CONTEXTS = 10
+"""Estimates that are mixed for a bit."""
 LANES = 2 * CONTEXTS
+"""Weights of a set."""
+LEVELS = 32
+"""Levels of a vertex."""
+EVEN = 16
+"""Level from which on a vertex is more likely occupied than not."""
+SEGMENT = 16
+"""Vertices of a row that share a flag."""
+NEAR = 16
+"""Patterns of the four nearest bits; each has a set of weights."""
+PADDING = 2
+"""Zeros at both ends of a row of bits."""
+ZEROS = 0
+"""State of a segment whose bits are all 0."""
+ONES = 1
+"""State of a segment whose bits are all 1."""
+MIXED = 2
+"""State of a segment that has both."""
+NOTHING = 3
+"""State of a segment that does not exist."""
+QUIET = 12
+"""Number of levels, counted from the end that agrees with a flag, in which a segment has one."""
+LEARNING_RATE = 2
+"""Rate at which the mixing weights learn, in 1/16."""
+SIZES = (512, 1024, 4096, 2048, 2048, 1920, 2592, 4096, 4096, 2048)
+"""Contexts of each estimate."""
+STARTS = tuple(sum(SIZES[:i]) for i in range(CONTEXTS))
+"""First slot of each estimate."""
+
+
+class Rows(NamedTuple):
+    """Places where the rows around a row begin.
+
+    Rows of bits (in `Work.marks`) are `row` itself, `north` and `north2` before it along y, `below`
+    and `below2` along z, `back` and `back2` along t. A suffix moves on: `_n` and `_s` by -1 and +1
+    along y, `_b` and `_f` by -1 and +1 along z. Rows of levels are `at` for the row itself, and the
+    next ones along y (`south`), z (`front`) and t (`later`).
+    """
+
+    row: int
+    north: int
+    north2: int
+    below: int
+    below2: int
+    below_n: int
+    below_s: int
+    back: int
+    back2: int
+    back_n: int
+    back_s: int
+    back_b: int
+    back_f: int
+    at: int
+    south: int
+    front: int
+    later: int
+
+
+class Work(NamedTuple):
+    """Sequences of a run.
+
+    Attributes:
+        bits: the mask, which is written in decoding.
+        level: first level of each vertex, 0 to 31.
+        other: second level of each vertex, 0 to 15.
+        marks: what `_mark` returns for each vertex, with PADDING zeros at both ends of each row,
+            after a row of zeros that stands for rows that do not exist.
+        states: state of each segment; one that does not exist is at the start of each row.
+        where, inputs: of a decision, for `mix` and `learn`.
+    """
+
+    bits: Sequence
+    level: Sequence
+    other: Sequence
+    marks: Sequence
+    states: Sequence
+    where: Sequence
+    inputs: Sequence
 
 
 def encode(mask: Mask, levels: tuple[Levels, Levels], state: State) -> bytes:
-    """Code a mask (t, z, y, x). The state is left as it has become."""
-    compiled = _compiled()
-    memory = _memory(state, compiled is not None)
-    out = _start(compiled, False, mask.astype(np.int64).ravel(), levels, memory, b"")[1]
-    state.slots[:, 0], state.slots[:, 1], state.slots[:, 2] = memory.slow, memory.fast, memory.count
-    state.weights[:] = memory.weights
-    state.simples[:, 0], state.simples[:, 1] = memory.chance, memory.seen
+    """Code a mask (t, z, y, x), and adapt the state."""
+    engine = _engine()
+    memory = memory_of(state, engine is not None)
+    out = _start(engine, False, mask.astype(np.int64).ravel(), levels, memory, b"")[1]
+    keep_memory(memory, state)
     return bytes(out)
 
 
 def decode(data: bytes, levels: tuple[Levels, Levels], state: State) -> Mask:
     """The mask that was coded; any other bytes give some mask."""
-    compiled = _compiled()
-    bits = _start(
-        compiled,
-        True,
-        np.zeros(levels[0].size, np.int64),
-        levels,
-        _memory(state, compiled is not None),
-        data,
-    )[0]
+    engine = _engine()
+    memory = memory_of(state, engine is not None)
+    bits = _start(engine, True, np.zeros(levels[0].size, np.int64), levels, memory, data)[0]
     return np.array(bits, dtype=np.uint8).reshape(levels[0].shape).view(np.bool_)
 
 
-_LOCK = threading.Lock()
-_RUN: list[Callable[..., Any] | None] = []
-
-
-def _compiled() -> Callable[..., Any] | None:
+def _engine() -> Callable[..., Any] | None:
     """`_run` compiled, or None where numba cannot be imported."""
-    # First the parts that both coders have.
-    if coder_portable._compiled() is None:
-        return None
-    with _LOCK:
-        if not _RUN:
-            numba, extending = import_module("numba"), import_module("numba.extending")
-            extending.register_jitable(_learn)
-            try:
-                _RUN.append(numba.njit(cache=True, nogil=True)(_run))
-            except RuntimeError:  # nowhere to keep the compiled code
-                _RUN.append(numba.njit(nogil=True)(_run))
-    return _RUN[0]
+    helpers = (_rows_around, _mark, _common_state, _code_flag, _code_segment)
+    return compiled(_run, helpers)
 
 
 def _start(
-    compiled: Callable[..., Any] | None,
+    engine: Callable[..., Any] | None,
     decoding: bool,
     bits: npt.NDArray[np.int64],
     levels: tuple[Levels, Levels],
@@ -107,49 +153,208 @@ def _start(
     """Make room and run: the bits, and the bytes."""
     n0, n1, n2, n3 = shape = levels[0].shape
     rows, segments = n0 * n1 * n2, -(-n3 // SEGMENT)
-    # The first row stands for those that do not exist.
-    known, states = (
-        np.zeros((rows + 1) * (n3 + 2 * PADDING), np.int64),
-        np.full(rows * (segments + 1), NOTHING, np.int64),
-    )
     first, second = (level.astype(np.int64).ravel() for level in levels)
-    source = np.frombuffer(data, dtype=np.uint8).astype(np.int64)
-    span, where, inputs = (
-        np.zeros(4, np.int64),
-        np.zeros(CONTEXTS, np.int64),
-        np.zeros(LANES, np.int64),
+    marks = np.zeros((rows + 1) * (n3 + 2 * PADDING), np.int64)
+    states = np.full(rows * (segments + 1), NOTHING, np.int64)
+    where, inputs = np.zeros(CONTEXTS, np.int64), np.zeros(LANES, np.int64)
+    work = Work(bits, first, second, marks, states, where, inputs)
+    if engine is None:
+        work = Work(*(sequence.tolist() for sequence in work))
+        return work.bits, _run(decoding, shape, memory, LISTS, work, [0] * 4, data)
+    span, source = np.zeros(4, np.int64), np.frombuffer(data, dtype=np.uint8).astype(np.int64)
+    return work.bits, engine(decoding, shape, memory, ARRAYS, work, span, source)
+
+
+def _rows_around(t: int, z: int, y: int, r: int, shape: tuple[int, int, int, int]) -> Rows:
+    """The rows around the row (t, z, y), whose number is r."""
+    n0, n1, n2, n3 = shape
+    m2 = n3 + 2 * PADDING
+    m1 = m2 * n2
+    m0 = m1 * n1
+    row, at = (r + 1) * m2 + PADDING, r * n3
+    return Rows(
+        row,
+        row - m2 if y > 0 else PADDING,
+        row - 2 * m2 if y > 1 else PADDING,
+        row - m1 if z > 0 else PADDING,
+        row - 2 * m1 if z > 1 else PADDING,
+        row - m1 - m2 if z > 0 and y > 0 else PADDING,
+        row - m1 + m2 if z > 0 and y + 1 < n2 else PADDING,
+        row - m0 if t > 0 else PADDING,
+        row - 2 * m0 if t > 1 else PADDING,
+        row - m0 - m2 if t > 0 and y > 0 else PADDING,
+        row - m0 + m2 if t > 0 and y + 1 < n2 else PADDING,
+        row - m0 - m1 if t > 0 and z > 0 else PADDING,
+        row - m0 + m1 if t > 0 and z + 1 < n1 else PADDING,
+        at,
+        at + n3 if y + 1 < n2 else at,
+        at + n3 * n2 if z + 1 < n1 else at,
+        at + n3 * n2 * n1 if t + 1 < n0 else at,
     )
-    work: list[Sequence] = [bits, first, second, known, states, source, span, where, inputs]
-    if compiled is None:
-        work = [part.tolist() for part in work]
-    out = (compiled or _run)(decoding, shape, memory, _ARRAYS if compiled else _LISTS, *work)
-    return work[0], out
 
 
-def _learn(
-    where: Sequence,
-    inputs: Sequence,
-    first: int,
-    second: int,
-    p: int,
-    bit: int,
+def _mark(bit: int, level: int) -> int:
+    """The bit, and above it 1 for a 0 that the level spoke against, 2 for such a 1, else 0."""
+    if level < EVEN:
+        return 5 if bit == 1 else 0
+    return 1 if bit == 1 else 2
+
+
+def _common_state(
+    g: int, t: int, z: int, y: int, shape: tuple[int, int, int, int], states: Sequence
+) -> tuple[int, int]:
+    """State that all segments around segment g have, as far as they exist; and how many exist.
+
+    The state is MIXED where they differ and NOTHING where none exists.
+    """
+    segments = (shape[3] + SEGMENT - 1) // SEGMENT
+    g2 = segments + 1
+    g1 = g2 * shape[2]
+    g0 = g1 * shape[1]
+    same, around = NOTHING, 0
+    for k in range(4):
+        near = NOTHING
+        if k == 0:
+            near = states[g - 1]
+        elif k == 1 and y > 0:
+            near = states[g - g2]
+        elif k == 2 and z > 0:
+            near = states[g - g1]
+        elif k == 3 and t > 0:
+            near = states[g - g0]
+        if near == NOTHING:
+            continue
+        around += 1
+        same = near if same in (NOTHING, near) else MIXED
+    return same, around
+
+
+def _code_flag(
+    x0: int,
+    x1: int,
+    same: int,
+    around: int,
+    informed: int,
+    rows: Rows,
+    stream: Stream,
     memory: Memory,
     rate: Sequence,
-) -> None:
-    weights = memory.weights
-    target = 65535 if bit else 0
-    error = ((target - p) * RATE) >> 4
-    for i in range(LANES):
-        step = (error * inputs[i] + 32768) >> 16
-        weights[first + i] = min(max(weights[first + i] + step, -32767), 32767)
-        weights[second + i] = min(max(weights[second + i] + step, -32767), 32767)
-    for i in range(CONTEXTS):
-        at = where[i]
-        slow, fast, seen = memory.slow[at], memory.fast[at], memory.count[at]
-        memory.slow[at] = slow + (((target - slow) * rate[seen]) >> 16)
-        memory.fast[at] = fast + (((target - fast) * rate[min(seen, FAST)]) >> 16)
-        if seen < LIMIT:
-            memory.count[at] = seen + 1
+    work: Work,
+) -> int:
+    """Code by a flag, if it may have one, whether a segment is uniform; its state, or NOTHING.
+
+    Args:
+        x0, x1: first vertex of the segment, and one past its last.
+        same, around: what `_common_state` returned.
+        informed: whether any level of the mask is above 0.
+        rows: the rows around.
+        stream, memory, rate, work: of the run.
+    """
+    bits, level, at, row = work.bits, work.level, rows.at, rows.row
+    low, high = LEVELS - 1, 0
+    for x in range(x0, x1):
+        low = min(low, level[at + x])
+        high = max(high, level[at + x])
+    if same == NOTHING:
+        same = ZEROS if informed == 0 or high < 4 else ONES if low > LEVELS - 5 else MIXED
+    if same == MIXED:
+        return NOTHING
+    away = 0 if informed == 0 else LEVELS - 1 - low if same == ONES else high
+    if away >= QUIET:
+        return NOTHING
+    uniform = 1
+    if not stream.decoding:
+        for x in range(x0, x1):
+            if bits[at + x] != same:
+                uniform = 0
+                break
+    flag = (same * 3 + away // 4) * 5 + around
+    if not code_simple(uniform, flag, stream, memory, rate):
+        return NOTHING
+    for x in range(x0, x1):
+        bits[at + x] = same
+        work.marks[row + x] = _mark(same, level[at + x])
+    return same
+
+
+def _code_segment(
+    x0: int,
+    x1: int,
+    n3: int,
+    rows: Rows,
+    stream: Stream,
+    memory: Memory,
+    tables: Tables,
+    work: Work,
+) -> int:
+    """Code the vertices x0 to x1 - 1 of a row, bit by bit; the state of the segment.
+
+    Bits are named as in native/mask.cpp: w, n, p and b are before the vertex along x, y, z and t; a
+    second letter moves on along y (n, s), x (w, e) or z (p, f); the 2 is for two vertices before.
+    """
+    bits, level, marks = work.bits, work.level, work.marks
+    where, inputs = work.where, work.inputs
+    row, north, below, back, at = rows.row, rows.north, rows.below, rows.back, rows.at
+    ones = 0
+    for x in range(x0, x1):
+        a = level[at + x]
+        ahead = level[at + x + 1] if x + 1 < n3 else a
+        half = a >> 1
+        w, n, p, b = (
+            marks[row + x - 1] & 1,
+            marks[north + x] & 1,
+            marks[below + x] & 1,
+            marks[back + x] & 1,
+        )
+        nw, ne = marks[north + x - 1] & 1, marks[north + x + 1] & 1
+        pw, pe = marks[below + x - 1] & 1, marks[below + x + 1] & 1
+        pn, ps = marks[rows.below_n + x] & 1, marks[rows.below_s + x] & 1
+        bw, be = marks[back + x - 1] & 1, marks[back + x + 1] & 1
+        bn, bs = marks[rows.back_n + x] & 1, marks[rows.back_s + x] & 1
+        bp, bf = marks[rows.back_b + x] & 1, marks[rows.back_f + x] & 1
+        w2, n2 = marks[row + x - 2] & 1, marks[rows.north2 + x] & 1
+        p2, b2 = marks[rows.below2 + x] & 1, marks[rows.back2 + x] & 1
+        nearest = w | n << 1 | p << 2 | b << 3
+        before = b | be << 1 | bw << 2 | bs << 3 | bn << 4 | bf << 5 | bp << 6
+        sums = ((w + n + nw + ne) * 6 + p + pw + pe + ps + pn) * 8 + b + bw + be + bs + bn + bf + bp
+        against = (a * 3 + (marks[row + x - 1] >> 1)) * 3 + (marks[north + x] >> 1)
+        south, front, later = (
+            level[rows.south + x] >> 2,
+            level[rows.front + x] >> 2,
+            level[rows.later + x] >> 2,
+        )
+        plane = w2 << 4 | nw << 5 | ne << 6 | n2 << 7 | pe << 8 | ps << 9 | be << 10 | bs << 11
+        second = w2 << 4 | n2 << 5 | p2 << 6 | b2 << 7 | be << 8 | bs << 9 | bf << 10 | pe << 11
+        where[0] = a * NEAR + nearest
+        where[1] = STARTS[1] + (a * 16 + work.other[at + x]) * 2 + w
+        where[2] = STARTS[2] + (nearest | plane)
+        where[3] = STARTS[3] + ((half * 8 + (ahead >> 2)) * 8 + south) * 2 + w
+        where[4] = STARTS[4] + ((half * 8 + front) * 8 + later) * 2 + p
+        where[5] = STARTS[5] + sums * 8 + (a >> 2)
+        where[6] = STARTS[6] + (against * 3 + (marks[below + x] >> 1)) * 3 + (marks[back + x] >> 1)
+        where[7] = STARTS[7] + ((a >> 3) << 10 | before | w << 7 | n << 8 | p << 9)
+        where[8] = STARTS[8] + (nearest | second)
+        where[9] = STARTS[9] + (half << 7 | before)
+        first, second = a * LANES, (LEVELS + nearest) * LANES
+        p = mix(CONTEXTS, where, inputs, first, second, memory, tables)
+        bit = code_bit(bits[at + x], p, stream)
+        learn(
+            CONTEXTS,
+            where,
+            inputs,
+            first,
+            second,
+            p,
+            bit,
+            SLOW_LIMIT,
+            LEARNING_RATE,
+            memory,
+            tables.rate,
+        )
+        bits[at + x] = bit
+        marks[row + x] = _mark(bit, a)
+        ones += bit
+    return ZEROS if ones == 0 else ONES if ones == x1 - x0 else MIXED
 
 
 def _run(
@@ -157,198 +362,35 @@ def _run(
     shape: tuple[int, int, int, int],
     memory: Memory,
     tables: Tables,
-    bits: Sequence,
-    level: Sequence,
-    other: Sequence,
-    known: Sequence,
-    states: Sequence,
-    data: Sequence,
+    work: Work,
     span: Sequence,
-    where: Sequence,
-    inputs: Sequence,
+    data: Sequence,
 ) -> list[int]:
+    """Code the mask; the bytes."""
     out = [0 for _ in range(0)]
-    rate = tables.rate
+    stream = Stream(decoding, span, data, out)
     n0, n1, n2, n3 = shape
-    span[1] = 0xFFFFFFFF
-    if decoding:
-        for i in range(4):
-            span[2] = (span[2] << 8) | (data[i] if i < len(data) else 0)
-        span[3] = 4
+    start_range(stream)
     segments = (n3 + SEGMENT - 1) // SEGMENT
-    m2, g2 = n3 + 2 * PADDING, segments + 1
-    m1, g1 = m2 * n2, g2 * n2
-    m0, g0 = m1 * n1, g1 * n1
-    s1 = n3 * n2
-    s0 = s1 * n1
     informed = 0
-    for i in range(len(level)):
-        if level[i] != 0:
+    for i in range(len(work.level)):
+        if work.level[i] != 0:
             informed = 1
             break
 
     for r in range(n0 * n1 * n2):
         t, z, y = r // n2 // n1, r // n2 % n1, r % n2
-        at, row, g = r * n3, (r + 1) * m2 + PADDING, r * g2 + 1
-        north = row - m2 if y > 0 else PADDING
-        north2 = row - 2 * m2 if y > 1 else PADDING
-        below = row - m1 if z > 0 else PADDING
-        below2 = row - 2 * m1 if z > 1 else PADDING
-        below_n = row - m1 - m2 if z > 0 and y > 0 else PADDING
-        below_s = row - m1 + m2 if z > 0 and y + 1 < n2 else PADDING
-        back = row - m0 if t > 0 else PADDING
-        back2 = row - 2 * m0 if t > 1 else PADDING
-        back_n = row - m0 - m2 if t > 0 and y > 0 else PADDING
-        back_s = row - m0 + m2 if t > 0 and y + 1 < n2 else PADDING
-        back_b = row - m0 - m1 if t > 0 and z > 0 else PADDING
-        back_f = row - m0 + m1 if t > 0 and z + 1 < n1 else PADDING
-        south = at + n3 if y + 1 < n2 else at
-        front = at + s1 if z + 1 < n1 else at
-        later = at + s0 if t + 1 < n0 else at
-
+        rows = _rows_around(t, z, y, r, shape)
         for s in range(segments):
+            g = r * (segments + 1) + 1 + s
             x0, x1 = s * SEGMENT, min((s + 1) * SEGMENT, n3)
-            low, high = LEVELS - 1, 0
-            for x in range(x0, x1):
-                low = min(low, level[at + x])
-                high = max(high, level[at + x])
-            same, around = NOTHING, 0
-            for k in range(4):
-                near = NOTHING
-                if k == 0:
-                    near = states[g + s - 1]
-                elif k == 1 and y > 0:
-                    near = states[g + s - g2]
-                elif k == 2 and z > 0:
-                    near = states[g + s - g1]
-                elif k == 3 and t > 0:
-                    near = states[g + s - g0]
-                if near == NOTHING:
-                    continue
-                around += 1
-                same = near if same in (NOTHING, near) else 2
-            if same == NOTHING:
-                same = 0 if informed == 0 or high < 4 else 1 if low > LEVELS - 5 else 2
-            if same < 2:
-                away = 0 if informed == 0 else LEVELS - 1 - low if same == 1 else high
-                if away < QUIET:
-                    uniform = 1
-                    if not decoding:
-                        for x in range(x0, x1):
-                            if bits[at + x] != same:
-                                uniform = 0
-                                break
-                    if _chance(
-                        uniform,
-                        (same * 3 + away // 4) * 5 + around,
-                        decoding,
-                        memory,
-                        rate,
-                        span,
-                        data,
-                        out,
-                    ):
-                        for x in range(x0, x1):
-                            bits[at + x] = same
-                            if level[at + x] < EVEN:
-                                known[row + x] = 5 if same == 1 else 0
-                            else:
-                                known[row + x] = 1 if same == 1 else 2
-                        states[g + s] = same
-                        continue
-            ones = 0
-            for x in range(x0, x1):
-                a = level[at + x]
-                ahead = level[at + x + 1] if x + 1 < n3 else a
-                half = a >> 1
-                w, n, p, b = (
-                    known[row + x - 1] & 1,
-                    known[north + x] & 1,
-                    known[below + x] & 1,
-                    known[back + x] & 1,
-                )
-                nw, ne = known[north + x - 1] & 1, known[north + x + 1] & 1
-                pw, pe, ps, pn = (
-                    known[below + x - 1] & 1,
-                    known[below + x + 1] & 1,
-                    known[below_s + x] & 1,
-                    known[below_n + x] & 1,
-                )
-                bw, be, bs, bn = (
-                    known[back + x - 1] & 1,
-                    known[back + x + 1] & 1,
-                    known[back_s + x] & 1,
-                    known[back_n + x] & 1,
-                )
-                bf, bp = known[back_f + x] & 1, known[back_b + x] & 1
-                w2, above2, p2, b2 = (
-                    known[row + x - 2] & 1,
-                    known[north2 + x] & 1,
-                    known[below2 + x] & 1,
-                    known[back2 + x] & 1,
-                )
-                nearest = w | n << 1 | p << 2 | b << 3
-                before = b | be << 1 | bw << 2 | bs << 3 | bn << 4 | bf << 5 | bp << 6
-                sums = (
-                    ((w + n + nw + ne) * 6 + p + pw + pe + ps + pn) * 8
-                    + b
-                    + bw
-                    + be
-                    + bs
-                    + bn
-                    + bf
-                    + bp
-                )
-                against = (a * 3 + (known[row + x - 1] >> 1)) * 3 + (known[north + x] >> 1)
-                where[0] = a * NEAR + nearest
-                where[1] = STARTS[1] + (a * 16 + other[at + x]) * 2 + w
-                where[2] = STARTS[2] + (
-                    nearest
-                    | w2 << 4
-                    | nw << 5
-                    | ne << 6
-                    | above2 << 7
-                    | pe << 8
-                    | ps << 9
-                    | be << 10
-                    | bs << 11
-                )
-                where[3] = (
-                    STARTS[3] + ((half * 8 + (ahead >> 2)) * 8 + (level[south + x] >> 2)) * 2 + w
-                )
-                where[4] = (
-                    STARTS[4]
-                    + ((half * 8 + (level[front + x] >> 2)) * 8 + (level[later + x] >> 2)) * 2
-                    + p
-                )
-                where[5] = STARTS[5] + sums * 8 + (a >> 2)
-                where[6] = (
-                    STARTS[6] + (against * 3 + (known[below + x] >> 1)) * 3 + (known[back + x] >> 1)
-                )
-                where[7] = STARTS[7] + ((a >> 3) << 10 | before | w << 7 | n << 8 | p << 9)
-                where[8] = STARTS[8] + (
-                    nearest
-                    | w2 << 4
-                    | above2 << 5
-                    | p2 << 6
-                    | b2 << 7
-                    | be << 8
-                    | bs << 9
-                    | bf << 10
-                    | pe << 11
-                )
-                where[9] = STARTS[9] + (half << 7 | before)
-                first, second = a * LANES, (LEVELS + nearest) * LANES
-                probability = _mix(CONTEXTS, where, inputs, first, second, memory, tables)
-                bit = _code(bits[at + x], probability, decoding, span, data, out)
-                _learn(where, inputs, first, second, probability, bit, memory, rate)
-                bits[at + x] = bit
-                if a < EVEN:
-                    known[row + x] = 5 if bit == 1 else 0
-                else:
-                    known[row + x] = 1 if bit == 1 else 2
-                ones += bit
-            states[g + s] = 0 if ones == 0 else 1 if ones == x1 - x0 else 2
+            same, around = _common_state(g, t, z, y, shape, work.states)
+            state = _code_flag(
+                x0, x1, same, around, informed, rows, stream, memory, tables.rate, work
+            )
+            if state == NOTHING:
+                state = _code_segment(x0, x1, n3, rows, stream, memory, tables, work)
+            work.states[g] = state
     if not decoding:
-        _finish(span, out)
+        finish(stream)
     return out

@@ -1,8 +1,10 @@
-"""How the integers of a tile are predicted from each other: lattices, passes, taps and their trained weights.
+"""Predictor of the integers of a tile from each other: lattices, passes, taps and trained weights.
 
-A tile is coded on ever finer lattices. `levels` says how often each axis is halved at first; then, from the coarsest level on and in the
-given order of the axes, a pass doubles the resolution along one axis. A vertex of a pass lies between two known ones; its prediction is
-their mean, the base, plus a weighted sum of how other known vertices, the taps, differ from it. The weights are trained by the encoder.
+A tile is coded on ever finer lattices. The first lattice halves each axis as often as `levels`
+says. Then, from the coarsest level on and in the given order of the axes, each pass doubles the
+resolution along one axis. A vertex of a pass lies between two known vertices. Its prediction is
+their mean, the *base*, plus a weighted sum of the differences of other known vertices, the *taps*,
+from the base. The encoder trains the weights.
 """
 
 from __future__ import annotations
@@ -33,17 +35,36 @@ __all__ = [
 ]
 
 CLASSES = 16
-"""Kinds of passes that statistics tell apart: 0 the last one, then backwards; all of the first belong to the last kind."""
-WEIGHT_UNIT, MAX_WEIGHT = 4096, 32767
-MAX_LEVELS, MAX_REACH = 8, 2
+"""Kinds of passes, each with statistics of its own.
+
+Kind 0 is the last pass, 1 the one before, and so on; the earliest passes share kind CLASSES - 2,
+and the first lattice has kind CLASSES - 1.
+"""
+WEIGHT_UNIT = 4096
+"""Weight of a tap that counts in full."""
+MAX_WEIGHT = 32767
+"""Largest magnitude of a weight."""
+MAX_LEVELS = 8
+"""Most halvings along an axis."""
+MAX_REACH = 2
+"""Largest reach of the taps."""
 
 Tap = tuple[int, int, int, int, int]
-"""1 if among the vertices of the pass itself, else 0; then offsets along t, z, y, x in that lattice."""
+"""A vertex that a prediction uses: the lattice, then offsets along t, z, y, x in that lattice.
+
+The lattice is 1 for the vertices of the pass itself and 0 for the lattice known before the pass.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pass:
-    """axis: along which it refines, -1 for the first lattice. kind: 0 to 15. taps: what is looked at besides the base."""
+    """A pass over a tile.
+
+    Attributes:
+        axis: axis along which it doubles the resolution, -1 for the first lattice.
+        kind: 0 to CLASSES - 1.
+        taps: the vertices that it uses besides those of the base.
+    """
 
     axis: int
     kind: int
@@ -52,14 +73,18 @@ class Pass:
 
 @dataclass(frozen=True, kw_only=True)
 class Predictor:
-    """Settings of the predicted way to code a tile. Raises InputError for those that do not fit together.
+    """Settings with which a tile is coded by prediction.
+
+    Raises InputError for settings that do not fit together.
 
     Attributes:
-        step: distance of neighbouring values, > 0, in units of the values: twice the bound, nearly.
-        origin: the value of the integer 0.
-        levels: halvings along t, z, y, x, 0 to 8. order: of the axes within a level.
-        reach: 0 to 2, how many taps.
-        weights: of all taps of all passes, in 1/4096.
+        step: distance of neighbouring values, above 0, in units of the values: nearly twice the
+            bound on the error.
+        origin: value of the integer 0.
+        levels: halvings along t, z, y, x, 0 to MAX_LEVELS.
+        order: order of the axes within a level.
+        reach: 0 to MAX_REACH; a larger reach has more taps.
+        weights: weight of each tap of each pass, in 1/WEIGHT_UNIT.
     """
 
     step: float
@@ -80,11 +105,12 @@ class Predictor:
                 raise InputError(f"predictor: {name} is {value!r:.40}; a finite number is needed")
         if self.step <= 0:
             raise InputError(f"predictor: step is {self.step}; it must be above 0")
-        if not _whole(self.levels, 4, 0, MAX_LEVELS):
+        if not _are_integers(self.levels, 4, 0, MAX_LEVELS):
             raise InputError(
-                f"predictor: levels are {self.levels!r:.60}; four whole numbers from 0 to {MAX_LEVELS} are needed"
+                f"predictor: levels are {self.levels!r:.60}; "
+                f"four whole numbers from 0 to {MAX_LEVELS} are needed"
             )
-        if not _whole(self.order, 4, 0, 3) or sorted(self.order) != [0, 1, 2, 3]:
+        if not _is_order(self.order):
             raise InputError(
                 f"predictor: order is {self.order!r:.60}; 0, 1, 2, 3 in some order are needed"
             )
@@ -92,8 +118,8 @@ class Predictor:
             raise InputError(
                 f"predictor: reach is {self.reach!r:.40}; 0 to {MAX_REACH} is possible"
             )
-        count = sum(len(part.taps) for part in self.passes)
-        if not _whole(self.weights, count, -MAX_WEIGHT, MAX_WEIGHT):
+        count = sum(len(a_pass.taps) for a_pass in self.passes)
+        if not _are_integers(self.weights, count, -MAX_WEIGHT, MAX_WEIGHT):
             raise InputError(f"predictor: {count} weights within +-{MAX_WEIGHT} are needed")
 
     @property
@@ -102,7 +128,7 @@ class Predictor:
         return passes_of(self.levels, self.order, self.reach)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values."""
+        """JSON values; the weights are coded as a block, in base64."""
         packed = encode_block(np.array(self.weights, dtype=np.int32).reshape(1, 1, 1, -1))
         return {
             "step": self.step,
@@ -115,7 +141,10 @@ class Predictor:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Predictor:
-        """The inverse of `to_dict`. Raises InputError, naming the key, or DamagedFileError for anything else."""
+        """The inverse of `to_dict`.
+
+        Raises InputError, naming the key, or DamagedFileError for anything else.
+        """
         keys = ("step", "origin", "levels", "order", "reach", "weights")
         if not isinstance(values, Mapping):
             raise InputError(
@@ -124,17 +153,15 @@ class Predictor:
         for key in (*values, *keys):
             if key not in keys or key not in values:
                 raise InputError(
-                    f"predictor: {'unknown' if key not in keys else 'missing'} key {key!r:.40}; the keys are {', '.join(keys)}"
+                    f"predictor: {'unknown' if key not in keys else 'missing'} key {key!r:.40}; "
+                    f"the keys are {', '.join(keys)}"
                 )
         levels, order = (
             tuple(values[key]) if isinstance(values[key], list | tuple) else ()
             for key in ("levels", "order")
         )
-        if (
-            not _whole(levels, 4, 0, MAX_LEVELS)
-            or not _whole(order, 4, 0, 3)
-            or sorted(order) != [0, 1, 2, 3]
-        ):
+        # The number of weights follows from these three, so they are checked before the weights.
+        if not _are_integers(levels, 4, 0, MAX_LEVELS) or not _is_order(order):
             raise InputError(
                 f"predictor: levels {levels!r:.60} and order {order!r:.60} are no such lists"
             )
@@ -142,7 +169,8 @@ class Predictor:
             raise InputError(
                 f"predictor: reach is {values['reach']!r:.40}; 0 to {MAX_REACH} is possible"
             )
-        count = sum(len(part.taps) for part in passes_of(levels, order, values["reach"]))
+        passes = passes_of(levels, order, values["reach"])
+        count = sum(len(a_pass.taps) for a_pass in passes)
         try:
             block = decode_block(
                 base64.b64decode(values["weights"], validate=True), (1, 1, 1, count)
@@ -165,25 +193,31 @@ class Predictor:
 def passes_of(
     levels: tuple[int, int, int, int], order: tuple[int, int, int, int], reach: int
 ) -> tuple[Pass, ...]:
-    """The passes of a predictor: the coarsest lattice, then level by level along the axes in this order."""
+    """The passes of a predictor: the first lattice, then each level along the axes in order."""
     axes = [axis for level in range(max(levels), 0, -1) for axis in order if levels[axis] >= level]
-    parts = [Pass(axis=-1, kind=CLASSES - 1, taps=_first_taps())]
-    parts += [
+    first = Pass(axis=-1, kind=CLASSES - 1, taps=_first_taps())
+    others = (
         Pass(axis=axis, kind=min(len(axes) - 1 - i, CLASSES - 2), taps=_taps(axis, reach))
         for i, axis in enumerate(axes)
-    ]
-    return tuple(parts)
+    )
+    return (first, *others)
 
 
 def pass_arrays(
     predictor: Predictor,
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], npt.NDArray[np.int16]]:
-    """Passes (n, 4) of (axis, kind, first tap, taps), all taps (m, 5) and their weights (m,)."""
+    """The passes as the native coder takes them.
+
+    Returns:
+        Passes, int32 (n, 4): axis, kind, number of the first tap, number of taps.
+        Taps of all passes, int32 (m, 5), see `Tap`.
+        Weights of the taps, int16 (m,).
+    """
     rows: list[tuple[int, ...]] = []
     taps: list[Tap] = []
-    for part in predictor.passes:
-        rows.append((part.axis, part.kind, len(taps), len(part.taps)))
-        taps += part.taps
+    for a_pass in predictor.passes:
+        rows.append((a_pass.axis, a_pass.kind, len(taps), len(a_pass.taps)))
+        taps += a_pass.taps
     return (
         np.array(rows, dtype=np.int32),
         np.array(taps, dtype=np.int32),
@@ -191,26 +225,29 @@ def pass_arrays(
     )
 
 
-def _tap(own: int, **offsets: int) -> Tap:
-    return (own, *(offsets.get(name, 0) for name in "tzyx"))  # type: ignore[return-value]
-
-
-def _at(own: int, *pairs: tuple[int, int]) -> Tap:
-    return _tap(own, **{"tzyx"[axis]: offset for axis, offset in pairs})
+def _at(lattice: int, *moves: tuple[int, int]) -> Tap:
+    """The tap of a lattice at these moves, each an axis and an offset along it."""
+    offsets = dict(moves)
+    t, z, y, x = (offsets.get(axis, 0) for axis in range(4))
+    return (lattice, t, z, y, x)
 
 
 @lru_cache(maxsize=1)
 def _first_taps() -> tuple[Tap, ...]:
-    """Of the coarsest lattice, all of whose vertices before this one are known."""
+    """Taps of the first lattice; all its vertices before this one are known."""
     taps = [_at(1, (axis, -1)) for axis in range(4)]
-    taps += [_at(1, (one, -1), (two, -1)) for one, two in combinations(range(4), 2)]
+    taps += [_at(1, (a, -1), (b, -1)) for a, b in combinations(range(4), 2)]
     taps += [_at(1, (axis, -2)) for axis in range(4)]
-    taps += [_at(1, (one, -1), (two, 1)) for one, two in combinations(range(4), 2)]
+    taps += [_at(1, (a, -1), (b, 1)) for a, b in combinations(range(4), 2)]
     return tuple(taps)
 
 
 def _taps(axis: int, reach: int) -> tuple[Tap, ...]:
-    """Of a pass along an axis: known vertices at 0 and 1 are beside the vertex; those of the pass are known in C order."""
+    """Taps of a pass along an axis.
+
+    Vertices 0 and 1 of the known lattice lie beside the vertex. Vertices of the pass itself are
+    known if they come before it in C order.
+    """
     others = [other for other in range(4) if other != axis]
     taps = [_at(0, (axis, 1)), _at(0, (axis, -1)), _at(0, (axis, 2))]
     taps += [
@@ -226,18 +263,23 @@ def _taps(axis: int, reach: int) -> tuple[Tap, ...]:
             *combinations(others, 2),
             *((min(axis, other), max(axis, other)) for other in others),
         ]
-        taps += [_at(1, (one, -1), (two, side)) for one, two in pairs for side in (-1, 1)]
+        taps += [_at(1, (first, -1), (second, side)) for first, second in pairs for side in (-1, 1)]
     if reach > 1:
         sides = [(near, a, b) for near in (0, 1) for a in (-1, 1) for b in (-1, 1)]
         taps += [
-            _at(0, (axis, near), (one, a), (two, b))
-            for one, two in combinations(others, 2)
+            _at(0, (axis, near), (first, a), (second, b))
+            for first, second in combinations(others, 2)
             for near, a, b in sides
         ]
     return tuple(taps)
 
 
-def _whole(values: Any, count: int, low: int, high: int) -> bool:
+def _is_order(values: Any) -> bool:
+    return _are_integers(values, 4, 0, 3) and sorted(values) == [0, 1, 2, 3]
+
+
+def _are_integers(values: Any, count: int, low: int, high: int) -> bool:
+    """Whether `values` is a tuple of so many ints from `low` to `high`."""
     return (
         isinstance(values, tuple)
         and len(values) == count

@@ -1,8 +1,9 @@
-"""What the coder believes before it has seen anything: `prior.bin`, learned from series other than the one that is coded.
+"""State of an adaptive coder, and the prior with which the coder of integers begins.
 
-The file is part of the format: changing it makes existing streams unreadable, so another prior would be another file and another number in
-the stream. It holds, deflated: for each slot of the coder its probability as a logit in 8 bits and how far to trust it, the mixing
-weights, and the simple estimates.
+The prior (`prior.bin`) was learned from series other than those that are coded. The file is part
+of the format: changing it makes existing streams unreadable, so another prior would be another file
+and another number in the stream. It holds, deflated: for each slot of the coder its probability as
+a logit in 8 bits and how far to trust it, the mixing weights, and the simple estimates.
 """
 
 from __future__ import annotations
@@ -18,22 +19,38 @@ import numpy.typing as npt
 
 __all__ = ["State", "blank_state", "pack_prior", "pack_state", "prior_state", "unpack_state"]
 
-DECISIONS, LANES, KINDS, LEVELS = 16, 12, 64, 128
+DECISIONS = 16
+"""Decisions of a magnitude, each with estimates and weights of its own."""
+LANES = 12
+"""Weights of a set: two per estimate."""
+KINDS = 64
+"""Kinds of bands."""
+LEVELS = 128
+"""Levels of the expected magnitude."""
 SIZES = (LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS)
 """Contexts of a decision, for each of the six estimates that are mixed."""
 SIGN_SIZES = (KINDS * 27, KINDS * 81, KINDS * 27)
+"""Contexts of a sign, for each of the three estimates that are mixed."""
 SLOTS = sum(SIZES) * DECISIONS + sum(SIGN_SIZES)
-WEIGHTS = (KINDS * DECISIONS + 64 * DECISIONS + KINDS) * LANES
+"""Estimates that are mixed."""
 SIMPLES = LEVELS * 64 + 8 + KINDS
+"""Simple estimates: of the escape code, of empty rows and of empty bands."""
 TRUST = 12
-"""Highest count in the prior: little, so that a tile soon follows its own statistics."""
+"""Highest count in the prior; it is low, so that a tile soon follows its own statistics."""
 
 _FILE = Path(__file__).with_name("prior.bin")
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """What adapts: slots uint16 (n, 4) of (slow, fast, count, 0), weights int32, simples uint16 (n, 2) of (probability, count)."""
+    """Estimates and weights that a coder adapts.
+
+    Attributes:
+        slots: uint16 (n, 4), the estimates that are mixed: probability by a slow and by a fast
+            rate, number of observations, 0. Probabilities are in 1/65536.
+        weights: int32 (n,), of the mixing.
+        simples: uint16 (n, 2), estimates that are used alone: probability, number of observations.
+    """
 
     slots: npt.NDArray[np.uint16]
     weights: npt.NDArray[np.int32]
@@ -41,7 +58,13 @@ class State:
 
     @classmethod
     def even(cls, *, slots: int, weights: Sequence[tuple[int, int]], simples: int) -> State:
-        """Nothing known: so many slots and simple estimates of even odds, and runs of (how many, equal to what) weights."""
+        """A state of even odds.
+
+        Args:
+            slots: number of slots.
+            weights: runs of equal weights, each as its length and its value.
+            simples: number of simple estimates.
+        """
         counts, values = zip(*weights, strict=True)
         state = cls(
             slots=np.zeros((slots, 4), dtype=np.uint16),
@@ -52,20 +75,20 @@ class State:
         return state
 
     def copy(self) -> State:
-        """Arrays of its own."""
+        """A state with copies of the arrays."""
         return State(
             slots=self.slots.copy(), weights=self.weights.copy(), simples=self.simples.copy()
         )
 
     def frozen(self) -> State:
-        """This state, its arrays read-only from now on."""
+        """This state, after making its arrays read-only."""
         for array in (self.slots, self.weights, self.simples):
             array.setflags(write=False)
         return self
 
 
 def blank_state() -> State:
-    """Nothing known: even odds, and weights that take the estimates at their word."""
+    """A state that has learned nothing: even odds, and weights that believe the estimates."""
     weights = [
         (KINDS * DECISIONS * LANES, 4423),
         (64 * DECISIONS * LANES, 0),
@@ -76,25 +99,25 @@ def blank_state() -> State:
 
 @cache
 def prior_state() -> State:
-    """The prior; its arrays are read-only."""
+    """The prior of integers; its arrays are read-only."""
     state = unpack_state(zlib.decompress(_FILE.read_bytes()), blank_state())
-    state.slots[:] = _turned(state.slots, back=False)
+    state.slots[:] = _reordered(state.slots, for_file=False)
     return state.frozen()
 
 
 def unpack_state(data: bytes, state: State) -> State:
-    """`state`, its arrays filled with what `pack_state` made of one of the same sizes."""
+    """`state`, after filling its arrays from bytes of `pack_state` for the same sizes."""
     slots, weights, simples = len(state.slots), len(state.weights), len(state.simples)
-    parts = np.split(
-        np.frombuffer(data, dtype=np.uint8),
-        np.cumsum([slots, slots, 2 * weights, 2 * simples, simples]),
+    lengths = [slots, slots, 2 * weights, 2 * simples, simples]
+    logits, counts, mixing, chances, seen, _ = np.split(
+        np.frombuffer(data, dtype=np.uint8), np.cumsum(lengths)
     )
-    # Whole numbers only, so that every machine has the same: 128 is even odds.
-    state.slots[:, 0] = state.slots[:, 1] = _PROBABILITIES[parts[0]]
-    state.slots[:, 2] = parts[1]
-    state.weights[:] = parts[2].view("<i2")
-    state.simples[:, 0] = parts[3].view("<u2")
-    state.simples[:, 1] = parts[4]
+    # Table look-ups of whole numbers, so that every machine has the same; 128 is even odds.
+    state.slots[:, 0] = state.slots[:, 1] = _PROBABILITIES[logits]
+    state.slots[:, 2] = counts
+    state.weights[:] = mixing.view("<i2")
+    state.simples[:, 0] = chances.view("<u2")
+    state.simples[:, 1] = seen
     return state
 
 
@@ -110,40 +133,39 @@ _PROBABILITIES = _probabilities()
 
 def pack_prior(state: State) -> bytes:
     """A learned state as the bytes of `prior.bin`."""
-    turned = State(
-        slots=_turned(state.slots, back=True), weights=state.weights, simples=state.simples
-    )
-    return zlib.compress(pack_state(turned), 9)
+    slots = _reordered(state.slots, for_file=True)
+    in_file = State(slots=slots, weights=state.weights, simples=state.simples)
+    return zlib.compress(pack_state(in_file), 9)
 
 
-def _turned(slots: npt.NDArray[np.uint16], *, back: bool) -> npt.NDArray[np.uint16]:
-    """Slots in the coder's order, those of a context together, from the order of the file, those of a decision together; or back."""
+def _reordered(slots: npt.NDArray[np.uint16], *, for_file: bool) -> npt.NDArray[np.uint16]:
+    """Slots from the order of the file into that of the coder, or back with `for_file`.
+
+    The file keeps the slots of a decision together, the coder those of a context.
+    """
     result, at = slots.copy(), 0
     for size in SIZES:
         end = at + size * DECISIONS
-        lengths = (size, DECISIONS) if back else (DECISIONS, size)
+        lengths = (size, DECISIONS) if for_file else (DECISIONS, size)
         result[at:end] = slots[at:end].reshape(*lengths, 4).swapaxes(0, 1).reshape(-1, 4)
         at = end
     return result
 
 
 def pack_state(state: State) -> bytes:
-    """A learned state as bytes, not deflated: rounded, and with little trust."""
-    order = np.searchsorted(_PROBABILITIES, state.slots[:, 0]).clip(1, 255)
-    below, above = (
-        _PROBABILITIES[order - 1].astype(np.int32),
-        _PROBABILITIES[order].astype(np.int32),
-    )
-    steps = np.where(
-        state.slots[:, 0] - below < above - state.slots[:, 0], order - 1, order
-    ).astype(np.uint8)
+    """A learned state as bytes, not deflated: probabilities rounded, counts at most TRUST."""
+    slow = state.slots[:, 0]
+    upper = np.searchsorted(_PROBABILITIES, slow).clip(1, 255)
+    below = _PROBABILITIES[upper - 1].astype(np.int32)
+    above = _PROBABILITIES[upper].astype(np.int32)
+    logits = np.where(slow - below < above - slow, upper - 1, upper).astype(np.uint8)
     counts = np.minimum(state.slots[:, 2], TRUST).astype(np.uint8)
-    steps[counts == 0] = 128
-    parts = [
-        steps,
+    logits[counts == 0] = 128
+    sections = [
+        logits,
         counts,
         state.weights.astype("<i2"),
         state.simples[:, 0].astype("<u2"),
         np.minimum(state.simples[:, 1], TRUST).astype(np.uint8),
     ]
-    return b"".join(part.tobytes() for part in parts)
+    return b"".join(section.tobytes() for section in sections)

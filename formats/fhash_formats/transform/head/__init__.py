@@ -1,1 +1,1 @@
-"""The trained correction of decoded values."""
+"""The trained head: a small network that corrects each decoded value from its neighbours."""

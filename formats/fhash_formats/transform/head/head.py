@@ -1,14 +1,19 @@
-"""The trained neighbourhood head: a small network that corrects each decoded voxel from its neighbours, with the same bits everywhere.
+"""The trained neighbourhood head: a small network that corrects each decoded value.
 
-A voxel c has 26 neighbours n (head_portable.STEPS; indices clamped to the tile), a clip range [low, high] and an error sigma.
-Features: log2(1 + |n - c| / (2 sigma)) with the sign of n - c, the place of c in the range, and log2(1 + (c - low) / (2 sigma)),
-the logarithm linear between powers of two. Hidden layers are leaky (slope 1/8). The last output times sigma is added to c and clipped.
-Features are kept as integers of 1/512, activations of 1/128, both of at most 4095 units, and weights are integers times a scale per layer.
+Every machine computes the same bits.
 
-The second of two hidden layers may take the first one's outputs at a cross of nine voxels: the voxel itself and those before and after
-it along t, z, y, x (head_portable.CROSS; indices clamped to the tile). Such a head sees a step farther, and it weighs what it sees there.
+A voxel c has 26 neighbours n (inputs.OFFSETS; indices clamped to the tile), a clip range [low,
+high] and an error sigma. The inputs are log2(1 + |n - c| / (2 sigma)) with the sign of n - c for
+each neighbour, the position of c in the range, and log2(1 + (c - low) / (2 sigma)). The logarithm
+is linear between powers of two. Hidden layers are leaky (slope 1/8). The last output times sigma is
+added to c, and the sum is clipped. Inputs are kept as integers of 1/512, activations of 1/128, both
+of at most 4095 units. Weights are integers times a scale per layer.
 
-The head pays on fronts and plateaus, which a linear transform smears; on noise it gains little.
+The second of two hidden layers may take the first one's outputs at a cross of nine voxels: the
+voxel itself and the ones before and after it along t, z, y, x (inputs.CROSS; indices clamped to the
+tile). Such a head sees a step farther, and learns how to weigh what it sees there.
+
+The head pays on fronts and plateaus, which a linear transform smears. On noise it gains little.
 """
 
 from __future__ import annotations
@@ -26,7 +31,7 @@ import numpy.typing as npt
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.head.head_portable import apply_cross, apply_network
-from fhash_formats.transform.head.inputs import CROSS, FEATURES
+from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.head.weights import (
     MAX_WEIGHT,
     best_spread,
@@ -48,37 +53,48 @@ __all__ = [
 MAX_HIDDEN = 3
 """Most hidden layers."""
 MAX_WIDTH = 64
-"""Most outputs of a hidden layer; sums stay exact in float32 up to it."""
+"""Most outputs of a hidden layer; up to that, sums stay exact in float32."""
 MAX_CROSS_WIDTH = 14
-"""Most outputs of the first layer before a cross; sums of nine times as many stay exact."""
+"""Most outputs of the first layer before a cross; sums over nine times as many stay exact."""
 MAX_BIAS = 127
 """Largest magnitude of a quantised bias (8 bits)."""
 
-_FEATURE_UNIT = 512.0
+_INPUT_UNIT = 512.0
+"""Integer steps of an input in 1."""
 _ACTIVATION_UNIT = 128.0
-_SIGMA_RANGE = (2.0**-100, 2.0**100)  # its inverse is an ordinary float32 as well
-
-_CROSSED = 0x82  # in place of the number of hidden layers: two, the second over the cross
+"""Integer steps of an activation in 1."""
+_SIGMA_RANGE = (2.0**-100, 2.0**100)
+"""Least and greatest sigma; the inverse is an ordinary float32 as well."""
+_CROSSED = 0x82
+"""First byte of a packed head with a cross, in place of the number of its hidden layers (two)."""
+_MAX_WEIGHT_BYTES = 3
+"""Bytes that a weight takes at most (22 bits), which bounds the work on hostile bytes."""
 
 Floats = npt.NDArray[np.float32]
 
 
 def layer_inputs(hidden: Sequence[int], cross: bool) -> list[int]:
-    """How many inputs each layer has, the last one included."""
-    return [
-        FEATURES,
-        *(
-            width * len(CROSS) if cross and number == 0 else width
-            for number, width in enumerate(hidden)
-        ),
-    ]
+    """The number of inputs of each layer, the last one included.
+
+    Args:
+        hidden: widths of the hidden layers.
+        cross: whether the second layer sees the first one's outputs over the cross.
+    """
+    inputs = [INPUTS, *hidden]
+    if cross and hidden:
+        inputs[1] *= len(CROSS)
+    return inputs
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layer:
     """One layer: outputs = weight_scale * weights @ inputs + bias_scale * biases.
 
-    weights: int8 (out, in), at most MAX_WEIGHT either way; biases: int8 (out,), at most MAX_BIAS; both scales positive float16 values.
+    Attributes:
+        weights: int8 (out, in), at most MAX_WEIGHT either way.
+        biases: int8 (out,), at most MAX_BIAS either way.
+        weight_scale: a positive float16 value.
+        bias_scale: a positive float16 value.
     """
 
     weights: npt.NDArray[np.int8]
@@ -88,6 +104,11 @@ class Layer:
 
 
 class _Constants(NamedTuple):
+    """The network in float32 for inputs and activations in integer steps.
+
+    The fields are the arguments of `apply_network` after the decoded values.
+    """
+
     weights: list[Floats]
     scales: list[np.float32]
     biases: list[Floats]
@@ -99,12 +120,15 @@ class _Constants(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NeighbourHead:
-    """A trained head. sigma, low, high: float32 values in data units; sigma > 0 is the decoded RMS error, [low, high] the clip range.
+    """A trained head. Raises InputError for layers that do not fit together or bad constants.
 
-    cross: whether the second of two hidden layers sees the first one's outputs at the nine voxels of the cross; its weights are
-    (out, 9 * in), the nine of each input together.
-
-    Raises InputError for layers that do not fit together and constants out of range.
+    Attributes:
+        layers: the layers of the network, one output in the last.
+        sigma: RMS error of the decoded values, > 0, a float32 value in data units.
+        low: lower end of the clip range, a float32 value in data units.
+        high: upper end of the clip range, likewise.
+        cross: whether the second of two hidden layers sees the first one's outputs over the cross.
+            Its weights are (out, 9 * in), the nine of each input together.
     """
 
     layers: tuple[Layer, ...]
@@ -120,49 +144,26 @@ class NeighbourHead:
             )
         if self.cross and len(self.layers) != 3:
             raise InputError(f"a head with a cross has 2 hidden layers, not {len(self.layers) - 1}")
-        for number, (layer, inputs) in enumerate(
-            zip(self.layers, layer_inputs(self.hidden, self.cross), strict=True)
-        ):
-            width = len(layer.biases)
-            allowed = (
-                1
-                if number == len(self.layers) - 1
-                else MAX_CROSS_WIDTH
-                if self.cross and number == 0
-                else MAX_WIDTH
-            )
-            if not 1 <= width <= allowed:
-                raise InputError(
-                    f"layer {number} of a head has {width} outputs, 1 to {allowed} are allowed"
-                )
-            if layer.weights.shape != (width, inputs) or layer.biases.shape != (width,):
-                raise InputError(
-                    f"layer {number} of a head has weights {layer.weights.shape} where {(width, inputs)} is needed"
-                )
-            for name, values, most in (
-                ("weights", layer.weights, MAX_WEIGHT),
-                ("biases", layer.biases, MAX_BIAS),
-            ):
-                if values.dtype != np.int8 or int(np.abs(values.astype(np.int16)).max()) > most:
-                    raise InputError(
-                        f"the {name} of layer {number} of a head must be int8 of at most {most} either way"
-                    )
-            for scale in (layer.weight_scale, layer.bias_scale):
-                if not (np.isfinite(scale) and scale > 0 and float(np.float16(scale)) == scale):
-                    raise InputError(
-                        f"layer {number} of a head has scale {scale}: a positive float16 value is needed"
-                    )
-        if any(
-            not np.isfinite(value) or float(np.float32(value)) != value
-            for value in (self.sigma, self.low, self.high)
-        ):
+        inputs = layer_inputs(self.hidden, self.cross)
+        for number, layer in enumerate(self.layers):
+            _check_layer(number, layer, inputs[number], self._most_outputs(number))
+        constants = (self.sigma, self.low, self.high)
+        if any(not np.isfinite(value) or float(np.float32(value)) != value for value in constants):
             raise InputError(
-                f"a head's sigma, low and high must be finite float32 values, not {self.sigma}, {self.low}, {self.high}"
+                "a head's sigma, low and high must be finite float32 values, "
+                f"not {self.sigma}, {self.low}, {self.high}"
             )
         if not _SIGMA_RANGE[0] <= self.sigma <= _SIGMA_RANGE[1] or self.low > self.high:
             raise InputError(
-                f"a head needs sigma in {_SIGMA_RANGE} and low <= high, not {self.sigma}, {self.low}, {self.high}"
+                f"a head needs sigma in {_SIGMA_RANGE} and low <= high, "
+                f"not {self.sigma}, {self.low}, {self.high}"
             )
+
+    def _most_outputs(self, number: int) -> int:
+        """Most outputs of a layer."""
+        if number == len(self.layers) - 1:
+            return 1
+        return MAX_CROSS_WIDTH if self.cross and number == 0 else MAX_WIDTH
 
     @property
     def hidden(self) -> tuple[int, ...]:
@@ -174,8 +175,8 @@ class NeighbourHead:
         sigma, low, high = np.float32(self.sigma), np.float32(self.low), np.float32(self.high)
         weights, scales, biases = [], [], []
         for number, layer in enumerate(self.layers):
-            # Exact products of few bits, but for the one with sigma.
-            unit_in = _FEATURE_UNIT if number == 0 else _ACTIVATION_UNIT
+            # All products are exact, of few bits, except the one with sigma.
+            unit_in = _INPUT_UNIT if number == 0 else _ACTIVATION_UNIT
             scale, bias = (
                 np.float32(layer.weight_scale / unit_in),
                 np.float32(layer.bias_scale) * layer.biases.astype(np.float32),
@@ -193,37 +194,43 @@ class NeighbourHead:
         return _Constants(weights, scales, biases, low, high, np.float32(0.5) / sigma, unit)
 
     def apply(self, decoded: Floats) -> Floats:
-        """The decoded tile (t, z, y, x), float32 in data units, with each value corrected and within [low, high]; a new array.
+        """The decoded values, each corrected and clipped to [low, high]; a new array.
 
-        NaN counts as low. Raises InputError for another dtype or rank.
+        decoded: the tile (t, z, y, x), float32 in data units; NaN counts as low. Raises InputError
+        for another dtype or rank.
         """
         if decoded.dtype != np.float32 or decoded.ndim != 4:
             raise InputError(
-                f"a head takes a float32 tile (t, z, y, x), not {decoded.dtype} of shape {decoded.shape}"
+                f"a head takes a float32 tile (t, z, y, x), "
+                f"not {decoded.dtype} of shape {decoded.shape}"
             )
         if decoded.size == 0:
             return decoded.copy()
         library = native.library()
-        constants = self._constants
         if library is None:
-            return (apply_cross if self.cross else apply_network)(decoded, *constants)
-        source = np.ascontiguousarray(decoded)
+            return (apply_cross if self.cross else apply_network)(decoded, *self._constants)
+        return self._apply_native(library, np.ascontiguousarray(decoded))
+
+    def _apply_native(self, library: ctypes.CDLL, source: Floats) -> Floats:
+        constants = self._constants
         out = np.empty(source.shape, dtype=np.float32)
         weights = np.concatenate([weight.ravel() for weight in constants.weights])
         biases = np.concatenate(constants.biases)
         scales = np.array(constants.scales, dtype=np.float32)
-        widths = np.array([FEATURES, *self.hidden, 1], dtype=np.int64)
-        sizes = (ctypes.c_int64(size) for size in (*source.shape, len(self.layers)))
-        pointers = (
-            ctypes.c_void_p(array.ctypes.data) for array in (widths, weights, biases, scales)
-        )
-        numbers = (ctypes.c_float(float(value)) for value in constants[3:])
+        widths = np.array([INPUTS, *self.hidden, 1], dtype=np.int64)
         function = library.fhash_head_apply_cross if self.cross else library.fhash_head_apply
         code = function(
             ctypes.c_void_p(source.ctypes.data),
-            *sizes,
-            *pointers,
-            *numbers,
+            *(ctypes.c_int64(length) for length in source.shape),
+            ctypes.c_int64(len(self.layers)),
+            ctypes.c_void_p(widths.ctypes.data),
+            ctypes.c_void_p(weights.ctypes.data),
+            ctypes.c_void_p(biases.ctypes.data),
+            ctypes.c_void_p(scales.ctypes.data),
+            ctypes.c_float(float(constants.low)),
+            ctypes.c_float(float(constants.high)),
+            ctypes.c_float(float(constants.inverse)),
+            ctypes.c_float(float(constants.unit)),
             ctypes.c_void_p(out.ctypes.data),
         )
         if code != 0:
@@ -233,41 +240,46 @@ class NeighbourHead:
         return out
 
     def to_bytes(self) -> bytes:
-        """The head as bytes, all little-endian; `from_bytes` is the inverse.
+        """The packed head; `from_bytes` is the inverse. All numbers are little-endian.
 
-        u8 number of hidden layers, or 0x82 for two and a cross between them, u8 width of each; float32 sigma, low, high; per layer
-        float16 scales of weights and biases, u8 spread; the biases of all layers as int8; then the weights of all layers, row by row, in
-        one number (head_weights.py).
+        First u8 the number of hidden layers, or 0x82 for two and a cross between them, and u8 the
+        width of each; float32 sigma, low, high; per layer float16 the scales of weights and biases,
+        and u8 the spread; then the biases of all layers as int8; then the weights of all layers,
+        row by row, in one big integer (weights.py).
         """
         spreads = [best_spread(layer.weights.ravel().tolist()) for layer in self.layers]
-        parts = [
+        fields = [
             bytes([_CROSSED if self.cross else len(self.hidden), *self.hidden]),
             struct.pack("<3f", self.sigma, self.low, self.high),
         ]
         for layer, spread in zip(self.layers, spreads, strict=True):
-            parts.append(struct.pack("<eeB", layer.weight_scale, layer.bias_scale, spread))
-        parts += [layer.biases.tobytes() for layer in self.layers]
+            fields.append(struct.pack("<eeB", layer.weight_scale, layer.bias_scale, spread))
+        fields += [layer.biases.tobytes() for layer in self.layers]
         state = 1
         for layer, spread in reversed(list(zip(self.layers, spreads, strict=True))):
             state = encode_weights(state, layer.weights.ravel().tolist(), spread)
-        parts.append(state.to_bytes((state.bit_length() + 7) // 8, "little"))
-        return b"".join(parts)
+        fields.append(state.to_bytes((state.bit_length() + 7) // 8, "little"))
+        return b"".join(fields)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> NeighbourHead:
-        """The head that `to_bytes` wrote. Raises DamagedFileError for anything else, another spelling of it included."""
+        """The head that `to_bytes` packed.
+
+        Raises DamagedFileError for all other bytes, also for another code of the same head.
+        """
         try:
             head = cls._read(data)
         except (struct.error, ValueError, IndexError) as error:
             raise DamagedFileError(f"a damaged neighbourhood head: {error}") from error
         if head.to_bytes() != data:
             raise DamagedFileError(
-                "a damaged neighbourhood head: its bytes are not those of the head that they describe"
+                "a damaged neighbourhood head: packing it again gives other bytes"
             )
         return head
 
     @classmethod
     def _read(cls, data: bytes) -> NeighbourHead:
+        """The head in some bytes. Raises ValueError, IndexError or struct.error for others."""
         cross = data[0] == _CROSSED
         count = 2 if cross else data[0]
         if not 1 <= count <= MAX_HIDDEN:
@@ -281,19 +293,19 @@ class NeighbourHead:
             raise ValueError(f"layers of widths {widths}")
         inputs = layer_inputs(widths[:-1], cross)
         sigma, low, high = struct.unpack_from("<3f", data, 1 + count)
-        at = 13 + count
-        scales = [struct.unpack_from("<eeB", data, at + 5 * layer) for layer in range(count + 1)]
-        at += 5 * (count + 1)
+        position = 13 + count
+        scales = [
+            struct.unpack_from("<eeB", data, position + 5 * layer) for layer in range(count + 1)
+        ]
+        position += 5 * (count + 1)
         biases = []
         for width in widths:
-            biases.append(np.frombuffer(data, dtype=np.int8, count=width, offset=at))
-            at += width
-        size = sum(first * second for first, second in zip(inputs, widths, strict=True))
-        if (
-            len(data) - at > 3 * size + 1
-        ):  # no weight takes more than 22 bits: bounds the work on hostile bytes
+            biases.append(np.frombuffer(data, dtype=np.int8, count=width, offset=position))
+            position += width
+        weight_count = sum(rows * columns for rows, columns in zip(inputs, widths, strict=True))
+        if len(data) - position > _MAX_WEIGHT_BYTES * weight_count + 1:
             raise ValueError(f"{len(data)} bytes are too many")
-        state = int.from_bytes(data[at:], "little")
+        state = int.from_bytes(data[position:], "little")
         layers = []
         for (weight_scale, bias_scale, spread), columns, bias in zip(
             scales, inputs, biases, strict=True
@@ -306,3 +318,31 @@ class NeighbourHead:
         if state != 1:
             raise ValueError("its weights do not end where their code ends")
         return cls(layers=tuple(layers), sigma=sigma, low=low, high=high, cross=cross)
+
+
+def _check_layer(number: int, layer: Layer, inputs: int, most_outputs: int) -> None:
+    """Raises InputError for a layer with other shapes, or with numbers out of range."""
+    width = len(layer.biases)
+    if not 1 <= width <= most_outputs:
+        raise InputError(
+            f"layer {number} of a head has {width} outputs, 1 to {most_outputs} are allowed"
+        )
+    if layer.weights.shape != (width, inputs) or layer.biases.shape != (width,):
+        raise InputError(
+            f"layer {number} of a head has weights {layer.weights.shape} "
+            f"where {(width, inputs)} is needed"
+        )
+    for name, values, largest in (
+        ("weights", layer.weights, MAX_WEIGHT),
+        ("biases", layer.biases, MAX_BIAS),
+    ):
+        if values.dtype != np.int8 or int(np.abs(values.astype(np.int16)).max()) > largest:
+            raise InputError(
+                f"the {name} of layer {number} of a head must be int8 of at most {largest} "
+                "either way"
+            )
+    for scale in (layer.weight_scale, layer.bias_scale):
+        if not (np.isfinite(scale) and scale > 0 and float(np.float16(scale)) == scale):
+            raise InputError(
+                f"layer {number} of a head has scale {scale}: a positive float16 value is needed"
+            )

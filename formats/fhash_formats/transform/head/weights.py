@@ -1,6 +1,7 @@
-"""The code of a head's quantised weights: one big whole number, by asymmetric numeral systems with the frequencies of a fixed family.
+"""The code of a head's quantised weights: one big integer, by asymmetric numeral systems.
 
-A weight w of a layer with spread s has frequency 1 + floor(2**16 s**4 / (s**2 + w**2)**2), in integers: flat for large s, narrow for small.
+The frequencies are those of a fixed family. A weight w of a layer with spread s has the frequency
+1 + floor(2**16 s**4 / (s**2 + w**2)**2), in integers: flat for a large s, narrow for a small one.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ MAX_WEIGHT = 31
 
 @lru_cache(maxsize=256)
 def _model(spread: int) -> tuple[list[int], list[int]]:
-    """The frequencies of the weights -MAX_WEIGHT to MAX_WEIGHT, and their running sums from 0 to the total."""
+    """The frequencies of the weights -MAX_WEIGHT to MAX_WEIGHT, and their running sums.
+
+    The sums begin with 0 and end with the total.
+    """
     square = spread * spread
     frequencies = [
         1 + (square * square << 16) // (square + weight * weight) ** 2
@@ -31,37 +35,42 @@ def _model(spread: int) -> tuple[list[int], list[int]]:
 
 def best_spread(weights: Sequence[int]) -> int:
     """The spread in 1 to 255 whose frequencies code the weights in the fewest bits."""
-    numbers = sorted(Counter(weights).items())
+    counts = sorted(Counter(weights).items())
 
     def bits(spread: int) -> float:
         frequencies, starts = _model(spread)
         return sum(
-            number * log2(starts[-1] / frequencies[weight + MAX_WEIGHT])
-            for weight, number in numbers
+            count * log2(starts[-1] / frequencies[weight + MAX_WEIGHT]) for weight, count in counts
         )
 
     return min(range(1, 256), key=bits)
 
 
 def encode_weights(state: int, weights: Sequence[int], spread: int) -> int:
-    """The state with the weights put in front; `decode_weights` takes them out again, first one first."""
+    """The state with the weights pushed onto it; `decode_weights` pops them in order.
+
+    state: the integer that holds everything coded so far.
+    """
     frequencies, starts = _model(spread)
     for weight in reversed(weights):
         index = weight + MAX_WEIGHT
-        turns, rest = divmod(state, frequencies[index])
-        state = turns * starts[-1] + starts[index] + rest
+        quotient, rest = divmod(state, frequencies[index])
+        state = quotient * starts[-1] + starts[index] + rest
     return state
 
 
 def decode_weights(state: int, count: int, spread: int) -> tuple[int, list[int]]:
-    """The state after `count` weights, and the weights. Raises ValueError for spread 0."""
+    """The state after its first `count` weights are popped, and the weights.
+
+    Raises ValueError for spread 0.
+    """
     if spread < 1:
         raise ValueError("a spread of 0")
     frequencies, starts = _model(spread)
     weights = []
     for _ in range(count):
-        turns, place = divmod(state, starts[-1])
-        index = bisect_right(starts, place) - 1
-        state = turns * frequencies[index] + place - starts[index]
+        quotient, rest = divmod(state, starts[-1])
+        index = bisect_right(starts, rest) - 1
+        state = quotient * frequencies[index] + rest - starts[index]
         weights.append(index - MAX_WEIGHT)
     return state, weights

@@ -1,1 +1,1 @@
-"""One tile to bytes, and back."""
+"""One tile to bytes and back: settings, sections of the stream, encoder, decoder."""

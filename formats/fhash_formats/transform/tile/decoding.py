@@ -1,6 +1,7 @@
-"""The bytes of a tile to values: decode, undo the transform, correct, bound; and what the encoder shares of it.
+"""The bytes of a tile to values: decode, undo the transform, correct, clip.
 
-The encoder computes the same values by the same operations in the same order, so that it knows what every decoder gets.
+The encoder calls the same functions in the same order, so it knows the values that every decoder
+gets.
 """
 
 from __future__ import annotations
@@ -23,33 +24,37 @@ from fhash_formats.transform.entropy.table import single_band
 from fhash_formats.transform.tile.sections import (
     EXACT,
     Shape,
-    exact_values,
-    little,
-    no_levels,
-    parts_of,
-    restored,
-    settings_from,
+    TileStream,
+    little_endian,
+    parse_stream,
+    restore_missing,
+    unpack_exact,
     unpack_mask,
+    unpack_settings,
+    zero_levels,
 )
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.elementwise import cast, clip_shifted, corrected
 from fhash_formats.transform.values.quantise import dequantise
 
 __all__ = [
+    "blank_unoccupied",
     "decode_tile",
     "decode_tile_mask",
     "linear_values",
-    "outside",
     "predicted_values",
     "transform_for",
 ]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int32]
+Decoded = tuple[Values, Mask | None]
+"""Values in the type of the source, and which are occupied; None for a stream without a mask."""
 
 
 def transform_for(settings: TileSettings, shape: Shape) -> Transform:
-    """The transform of a tile, kept for tiles of the same shape."""
+    """The transform of a tile; the same object for tiles of the same settings and shape."""
     return _transform(settings.transform, shape, settings.dtype.name)
 
 
@@ -67,8 +72,15 @@ def decode_tile(
 ) -> Values:
     """The values (t, z, y, x) of a stream, in the type of the source.
 
-    settings: those shared by all tiles, unless the stream has its own. lod: every 2^lod-th vertex along z, y, x, low-passed, without head,
-    residual, missing values and mask. Raises DamagedFileError for bytes that no encoder writes.
+    Args:
+        data: the stream.
+        shape: shape of the tile.
+        dtype: type of the source.
+        settings: settings that all tiles share; a stream's own settings replace them.
+        lod: level of detail. n gives every 2^n-th vertex along z, y, x, low-passed, without head,
+            residual, missing values and mask.
+
+    Raises DamagedFileError for bytes that no encoder writes.
     """
     return _decode(data, shape, dtype, settings, lod)[0]
 
@@ -79,7 +91,10 @@ def decode_tile_mask(
     dtype: npt.DTypeLike,
     settings: TileSettings | None = None,
 ) -> tuple[Values, Mask]:
-    """The values of a stream as `decode_tile` gives them, and which are occupied: all, where the stream has no mask."""
+    """The values of a stream as `decode_tile` gives them, and which of them are occupied.
+
+    All values are occupied where the stream has no mask.
+    """
     values, mask = _decode(data, shape, dtype, settings, 0)
     return values, np.ones(shape, bool) if mask is None else mask
 
@@ -90,72 +105,108 @@ def _decode(
     dtype: npt.DTypeLike,
     settings: TileSettings | None,
     lod: int,
-) -> tuple[Values, Mask | None]:
+) -> Decoded:
     kind = np.dtype(dtype)
-    parts = parts_of(data)
-    if parts.settings is not None:
-        settings = settings_from(parts.settings)
-    missing = b"" if parts.missing is None else bytes(parts.missing)
-    if parts.flags & EXACT:
-        assert parts.body is not None
-        values = exact_values(parts.body, shape, kind)
-        mask = None if parts.mask is None else unpack_mask(parts.mask, no_levels(shape))
-        return values[_every(lod)] if lod else values, mask
+    stream = parse_stream(data)
+    if stream.settings is not None:
+        settings = unpack_settings(stream.settings)
+    if stream.flags & EXACT:
+        return _decode_exact(stream, shape, kind, lod)
     if settings is None:
         raise DamagedFileError("a coded tile has no settings")
     largest = _check_numbers(settings, kind)
-    if parts.body is None:
-        result = cast(np.full(_lod_shape(shape, lod), settings.center), kind)
-        if lod:
-            return result, None
-        mask = np.zeros(shape, bool) if parts.masked else None
-        return restored(outside(result, mask, settings), missing), mask
-    predictor = settings.predictor
-    transform = None
-    if not parts.predicted:
-        # Before anything is decoded: the bands of what does not fit would lie beyond the tile.
-        try:
-            transform = transform_for(settings, shape)
-        except InputError as error:
-            raise DamagedFileError(
-                f"the settings of a coded tile do not fit its shape: {error}"
-            ) from error
-        integers = decode_integers(parts.body, shape, band_table(settings.transform, shape))
-    elif predictor is not None:
-        integers = decode_predicted(parts.body, shape, predictor)
+    if stream.body is None:
+        values = cast(np.full(_lod_shape(shape, lod), settings.center), kind)
+        mask = np.zeros(shape, bool) if stream.masked else None
+    elif stream.predicted:
+        values, mask = _decode_predicted(stream, stream.body, shape, kind, settings, lod)
     else:
-        raise DamagedFileError("a coded tile is by prediction, of which its settings know nothing")
-    crc = zlib.crc32(little(integers))
-    residual = None
-    if parts.residual is not None:
-        residual = decode_integers(parts.residual, shape, single_band(shape))
-        crc = zlib.crc32(little(residual), crc)
-    if crc != parts.digest:
-        raise DamagedFileError("the decoded integers of a tile differ from their digest")
-    if transform is None:
-        assert predictor is not None
-        found = predicted_values(integers, predictor, settings)
-        if lod:
-            return cast(found[_every(lod)], kind), None
-        mask = None if parts.mask is None else _mask_of(parts.mask, found, settings)
-        return restored(outside(cast(found, kind), mask, settings), missing), mask
+        values, mask = _decode_transformed(stream, stream.body, shape, kind, settings, lod, largest)
     if lod:
-        coarse = transform.inverse(
-            dequantise(integers, settings.step, settings.offsets, settings.dtype), lod=lod
-        )
-        return cast(_shifted(coarse, settings), kind), None
+        return values, None
+    missing = b"" if stream.missing is None else bytes(stream.missing)
+    return restore_missing(blank_unoccupied(values, mask, settings), missing), mask
+
+
+def _decode_exact(stream: TileStream, shape: Shape, kind: np.dtype[Any], lod: int) -> Decoded:
+    """The values and mask of a tile that is stored without loss."""
+    assert stream.body is not None, "an exact stream has a body"
+    values = unpack_exact(stream.body, shape, kind)
+    mask = None if stream.mask is None else unpack_mask(stream.mask, zero_levels(shape))
+    return values[_every(lod)] if lod else values, mask
+
+
+def _decode_predicted(
+    stream: TileStream,
+    body: memoryview,
+    shape: Shape,
+    kind: np.dtype[Any],
+    settings: TileSettings,
+    lod: int,
+) -> Decoded:
+    """The values and mask of a tile that is coded by prediction."""
+    if settings.predictor is None:
+        raise DamagedFileError("a tile is coded by prediction, but its settings have no predictor")
+    integers = decode_predicted(body, shape, settings.predictor)
+    _check_digest(stream, integers, None)
+    values = predicted_values(integers, settings.predictor, settings)
+    if lod:
+        return cast(values[_every(lod)], kind), None
+    mask = None if stream.mask is None else _unpack_mask(stream.mask, values, settings)
+    return cast(values, kind), mask
+
+
+def _decode_transformed(
+    stream: TileStream,
+    body: memoryview,
+    shape: Shape,
+    kind: np.dtype[Any],
+    settings: TileSettings,
+    lod: int,
+    largest: float,
+) -> Decoded:
+    """The values and mask of a tile that is coded by transform.
+
+    largest: the largest number of the type of the source and of the working type.
+    """
+    # Built before anything is decoded: the bands of a spec that does not fit lie beyond the tile.
+    try:
+        transform = transform_for(settings, shape)
+    except InputError as error:
+        raise DamagedFileError(
+            f"the settings of a coded tile do not fit its shape: {error}"
+        ) from error
+    integers = decode_integers(body, shape, band_table(settings.transform, shape))
+    residual = None
+    if stream.residual is not None:
+        residual = decode_integers(stream.residual, shape, single_band(shape))
+    _check_digest(stream, integers, residual)
+    if lod:
+        return cast(linear_values(integers, transform, settings, lod), kind), None
     linear = linear_values(integers, transform, settings)
-    mask = None if parts.mask is None else _mask_of(parts.mask, linear, settings)
+    mask = None if stream.mask is None else _unpack_mask(stream.mask, linear, settings)
     base = linear if settings.head is None else settings.head.apply(linear)
-    found = corrected(base, residual, settings.quantum, kind)
-    # Only with a residual can values leave the range.
-    if residual is not None and settings.quantum * 2.0**31 > largest / 2 and np.isinf(found).any():
+    values = corrected(base, residual, settings.quantum, kind)
+    # Without a residual the values are within the range, and finite.
+    if residual is not None and settings.quantum * 2.0**31 > largest / 2 and np.isinf(values).any():
         raise DamagedFileError(f"a residual of a coded tile is beyond {kind}")
-    return restored(outside(found, mask, settings), missing), mask
+    return values, mask
+
+
+def _check_digest(stream: TileStream, integers: Integers, residual: Integers | None) -> None:
+    """Raises DamagedFileError where the digest is that of other integers."""
+    crc = zlib.crc32(little_endian(integers))
+    if residual is not None:
+        crc = zlib.crc32(little_endian(residual), crc)
+    if crc != stream.digest:
+        raise DamagedFileError("the decoded integers of a tile differ from their digest")
 
 
 def _check_numbers(settings: TileSettings, kind: np.dtype[Any]) -> float:
-    """Refuse settings that make infinities of finite values in the type of the source or in the working type; the largest such number."""
+    """The largest number of the type of the source and of the working type.
+
+    Raises DamagedFileError for settings that turn finite values into infinities in either type.
+    """
     types = [settings.dtype] if kind.kind != "f" else [settings.dtype, kind]
     largest = min(float(np.finfo(name).max) for name in types)
     if (
@@ -167,46 +218,50 @@ def _check_numbers(settings: TileSettings, kind: np.dtype[Any]) -> float:
 
 
 def linear_values(
-    integers: npt.NDArray[np.int32], transform: Transform, settings: TileSettings
+    integers: Integers, transform: Transform, settings: TileSettings, lod: int = 0
 ) -> Values:
-    """Decoded values in the working type, before head and residual."""
-    return _shifted(
-        transform.inverse(dequantise(integers, settings.step, settings.offsets, settings.dtype)),
-        settings,
-    )
+    """Values before head and residual, in the working type, clipped to the range.
+
+    Args:
+        integers: the quantised coefficients.
+        transform: the transform of the tile.
+        settings: settings of the tile.
+        lod: level of detail, as in `decode_tile`.
+    """
+    coefficients = dequantise(integers, settings.step, settings.offsets, settings.dtype)
+    values = transform.inverse(coefficients, lod)
+    return clip_shifted(values, settings.center, settings.low, settings.high)
 
 
 def predicted_values(
-    integers: npt.NDArray[np.int32], predictor: Predictor, settings: TileSettings
+    integers: Integers, predictor: Predictor, settings: TileSettings
 ) -> npt.NDArray[np.float64]:
-    """Values by prediction, within the range."""
+    """Values of a tile that is coded by prediction, clipped to the range."""
     values = values_of(integers, predictor)
     return np.clip(values, settings.low, settings.high, out=values)
 
 
-def _shifted(values: Values, settings: TileSettings) -> Values:
-    """Values about the centre, within the range, in place."""
-    return clip_shifted(values, settings.center, settings.low, settings.high)
-
-
-def outside(decoded: Values, occupied: Mask | None, settings: TileSettings) -> Values:
-    """Decoded values with NaN, or the centre for whole numbers, where a mask says that nothing is; in place."""
+def blank_unoccupied(decoded: Values, occupied: Mask | None, settings: TileSettings) -> Values:
+    """Decoded values with NaN, or for integers the centre, wherever a mask has no bit; in place."""
     if occupied is not None:
-        nothing = np.array(np.nan) if decoded.dtype.kind == "f" else np.array(settings.center)
-        decoded[~occupied] = cast(nothing, decoded.dtype)
+        blank = np.array(np.nan) if decoded.dtype.kind == "f" else np.array(settings.center)
+        decoded[~occupied] = cast(blank, decoded.dtype)
     return decoded
 
 
-def _mask_of(packed: bytes | memoryview, linear: Values, settings: TileSettings) -> Mask:
+def _unpack_mask(packed: bytes | memoryview, linear: Values, settings: TileSettings) -> Mask:
+    """The mask in a section, decoded by means of the decoded values."""
     if settings.mask is None:
-        raise DamagedFileError("a coded tile has a mask, of which its settings know nothing")
+        raise DamagedFileError("a coded tile has a mask, but its settings have no mask levels")
     with np.errstate(over="ignore"):
         return unpack_mask(packed, settings.mask.levels(linear.astype(settings.dtype, copy=False)))
 
 
 def _every(lod: int) -> tuple[slice, ...]:
+    """Slices of every 2^lod-th vertex along z, y, x."""
     return (slice(None), *[slice(None, None, 1 << lod)] * 3)
 
 
 def _lod_shape(shape: Shape, lod: int) -> tuple[int, ...]:
+    """Shape of a tile at a level of detail."""
     return (shape[0], *(-(-n // (1 << lod)) for n in shape[1:]))

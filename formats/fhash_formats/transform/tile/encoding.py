@@ -1,6 +1,7 @@
-"""One tile to bytes: transform, quantise, code, correct, bound. The way back is in decoding.py, the bytes are described in sections.py.
+"""One tile to bytes: fill, transform, quantise, code, correct, bound.
 
-Encoding and decoding compute the same values by the same operations in the same order, so that the encoder knows what every decoder gets.
+decoding.py is the way back, and sections.py describes the bytes. The encoder computes the decoded
+values by the same operations in the same order as a decoder, so it knows what every decoder gets.
 """
 
 from __future__ import annotations
@@ -12,25 +13,24 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.transform.axes.bands import band_table
+from fhash_formats.transform.axes.lifting import Transform
 from fhash_formats.transform.entropy.coder import MAX_INTEGER, encode_integers
 from fhash_formats.transform.entropy.predict import encode_predicted, integers_of
 from fhash_formats.transform.entropy.predictor import Predictor
 from fhash_formats.transform.tile.decoding import (
-    decode_tile,
-    decode_tile_mask,
+    blank_unoccupied,
     linear_values,
-    outside,
     predicted_values,
     transform_for,
 )
-from fhash_formats.transform.tile.filling import filled as filled_in
+from fhash_formats.transform.tile.filling import filled
 from fhash_formats.transform.tile.sections import (
     Shape,
-    assembled,
-    exact_bytes,
+    build_exact_stream,
+    build_stream,
     pack_mask,
     pack_missing,
-    restored,
+    restore_missing,
 )
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.elementwise import (
@@ -43,24 +43,56 @@ from fhash_formats.transform.values.elementwise import (
 )
 from fhash_formats.transform.values.quantise import dequantise, quantise
 
-__all__ = [
-    "CodedTile",
-    "Shape",
-    "decode_tile",
-    "decode_tile_mask",
-    "encode_tile",
-    "exact_tile",
-    "transform_for",
-    "within",
-]
+__all__ = ["CodedTile", "Coding", "encode_tile", "exact_tile"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int32]
+
+_END_MARGIN = 1e-4
+"""Values within this share of the range from one of its ends count as lying at that end."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coding:
+    """Options of the encoder: how hard it works, and what it keeps. A decoder needs none of them.
+
+    Attributes:
+        weight: squared quantiser steps that a bit is worth in rate-distortion optimisation; 0 for
+            none.
+        error: bound on |decoded - value| at every counted value, in units of the values. It is kept
+            strictly; a tile that cannot keep it is stored without loss. None for no bound.
+        rounds: how often the values that are free to change are replaced by their decoded values.
+        passes: 2 codes the integers that the optimisation chose once more; 1 does not.
+        filled: whether the values that are not counted are a good filling already, such as repeated
+            border values. Otherwise the encoder looks for a better one.
+        density: how thoroughly it looks; see `filling.filled`.
+        keep_missing: whether values that are not finite come back as they were.
+        own_settings: whether the stream holds the settings.
+    """
+
+    weight: float = 0.0
+    error: float | None = None
+    rounds: int = 0
+    passes: int = 1
+    filled: bool = False
+    density: int = 1
+    keep_missing: bool = True
+    own_settings: bool = False
+
+
+_DEFAULT_CODING = Coding()
 
 
 @dataclass(frozen=True, kw_only=True)
 class CodedTile:
-    """data: the stream. decoded: what it decodes to, in the type of the source. nonzero: coefficients that are not 0."""
+    """A coded tile.
+
+    Attributes:
+        data: the stream.
+        decoded: the values that the stream decodes to, in the type of the source.
+        nonzero: number of coded integers that are not 0.
+    """
 
     data: bytes
     decoded: Values
@@ -70,138 +102,25 @@ class CodedTile:
 def encode_tile(
     values: Values,
     settings: TileSettings,
+    coding: Coding = _DEFAULT_CODING,
     *,
-    care: Mask | None = None,
-    weight: float = 0.0,
-    error: float | None = None,
-    rounds: int = 0,
-    passes: int = 1,
-    own: bool = False,
-    keep_missing: bool = True,
-    filled: bool = False,
-    density: int = 1,
+    in_coreset: Mask | None = None,
 ) -> CodedTile:
-    """Code values (t, z, y, x) of any real type.
+    """Code the values of a tile.
 
-    care: what counts (bool, same shape; None is all). Values that are not finite never count. weight: squared steps that a bit is worth to
-    the rate-distortion optimisation, 0 for none. error: a bound on |decoded - value| wherever it counts, in units of the values: kept
-    strictly, exactly stored if need be. rounds: projections of what does not count. passes: 2 codes the chosen integers once more.
-    own: put the settings into the stream. keep_missing: bring back values that are not finite as they were. filled: values that
-    do not count are sensible already (a border that was repeated), so that nothing better is looked for; else density says how
-    thoroughly (see `filling.filled`).
+    Args:
+        values: the tile (t, z, y, x), of any real type.
+        settings: transform, step, range and so on.
+        coding: options of the encoder.
+        in_coreset: the values that count, of the same shape; None for all. Values that are not
+            finite never count.
     """
-    values = np.ascontiguousarray(values)
-    finite = None if all_finite(values) else np.isfinite(values)
-    counts = finite if care is None else care if finite is None else finite & care
-    if counts is not None and counts.all():
-        counts = None  # all does
-    missing = b"" if finite is None or not keep_missing else pack_missing(values, finite)
-    occupied = (
-        None if settings.mask is None else np.ones(values.shape, bool) if counts is None else counts
-    )
-    if not values.size or (counts is not None and not counts.any()):
-        decoded = outside(
-            cast(np.full(values.shape, settings.center), values.dtype), occupied, settings
-        )
-        data = assembled(
-            settings if own else None, missing, b"", None, None, None if occupied is None else b""
-        )
-        return CodedTile(data=data, decoded=restored(decoded, missing), nonzero=0)
-    if settings.predictor is not None and error is not None:
-        return _predicted_tile(values, settings, settings.predictor, counts, error, missing, own)
-    transform = transform_for(settings, values.shape)
-    table = band_table(settings.transform, values.shape)
-    target = (values if finite is None else np.where(finite, values, values.dtype.type(0))).astype(
-        settings.dtype
-    )
-    target -= settings.dtype.type(settings.center)
-    if counts is not None and not (filled and finite is None):
-        target = filled_in(
-            target,
-            counts,
-            np.ones(values.shape, bool) if finite is None else finite,
-            transform,
-            settings,
-            density,
-        )
-    coefficients = transform.forward(target)
-    for _ in range(rounds):
-        integers, scaled = quantise(coefficients, settings.step)
-        if weight > 0:
-            integers = encode_integers(integers, table, scaled=scaled, weight=weight).integers
-        rebuilt = transform.inverse(
-            dequantise(integers, settings.step, settings.offsets, settings.dtype)
-        )
-        # What lies at an end of the range may decode to anything beyond it.
-        margin = (settings.high - settings.low) * 1e-4
-        if not free_values(
-            target,
-            rebuilt,
-            counts,
-            settings.low - settings.center + margin,
-            settings.high - settings.center - margin,
-        ):
-            break
-        coefficients = transform.forward(target)
-    integers, scaled = quantise(coefficients, settings.step)
-    coded = encode_integers(integers, table, scaled=scaled if weight > 0 else None, weight=weight)
-    if passes > 1 and weight > 0:
-        coded = encode_integers(coded.integers, table)
-    linear = linear_values(coded.integers, transform, settings)
-    mask = (
-        None
-        if occupied is None or settings.mask is None
-        else pack_mask(occupied, settings.mask.levels(linear))
-    )
-    base = linear if settings.head is None else settings.head.apply(linear)
-    residual = None
-    if error is not None:
-        found = residual_of(values, base, counts, settings.quantum, MAX_INTEGER)
-        if found is None:
-            return exact_tile(values, settings if own else None, occupied)
-        residual = found[0] if found[1] else None
-    decoded = corrected(base, residual, settings.quantum, values.dtype)
-    if error is not None and not within(values, decoded, error, counts):
-        return exact_tile(values, settings if own else None, occupied)
-    data = assembled(settings if own else None, missing, coded.data, coded.integers, residual, mask)
-    decoded = restored(outside(decoded, occupied, settings), missing)
-    return CodedTile(data=data, decoded=decoded, nonzero=int(np.count_nonzero(coded.integers)))
-
-
-def _predicted_tile(
-    values: Values,
-    settings: TileSettings,
-    predictor: Predictor,
-    counts: Mask | None,
-    error: float,
-    missing: bytes,
-    own: bool,
-) -> CodedTile:
-    """Code by prediction; exactly where that cannot keep the bound."""
-    occupied = (
-        None if settings.mask is None else np.ones(values.shape, bool) if counts is None else counts
-    )
-    integers = integers_of(values, counts, predictor)
-    if integers is None:
-        return exact_tile(values, settings if own else None, occupied)
-    coded, integers = encode_predicted(integers, counts, predictor)
-    linear = predicted_values(integers, predictor, settings)
-    decoded = cast(linear, values.dtype)
-    if not within(values, decoded, error, counts):
-        return exact_tile(values, settings if own else None, occupied)
-    mask = (
-        None
-        if occupied is None or settings.mask is None
-        else pack_mask(occupied, settings.mask.levels(linear.astype(settings.dtype)))
-    )
-    data = assembled(
-        settings if own else None, missing, coded, integers, None, mask, predicted=True
-    )
-    return CodedTile(
-        data=data,
-        decoded=restored(outside(decoded, occupied, settings), missing),
-        nonzero=int(np.count_nonzero(integers)),
-    )
+    task = _task(values, settings, coding, in_coreset)
+    if not task.values.size or (task.counted is not None and not task.counted.any()):
+        return _empty_tile(task)
+    if settings.predictor is not None and coding.error is not None:
+        return _predicted_tile(task, settings.predictor, coding.error)
+    return _transformed_tile(task)
 
 
 def exact_tile(
@@ -209,10 +128,191 @@ def exact_tile(
 ) -> CodedTile:
     """A tile stored without loss: its bytes, those of equal weight together, deflated.
 
-    occupied: the mask, for a stream with one; outside of it stands NaN, or 0 for whole numbers.
+    Args:
+        values: the tile (t, z, y, x), of any real type.
+        settings: settings to put into the stream; None for none.
+        occupied: the mask, for a stream with one. Values outside of it become NaN, or 0 for
+            integers.
     """
     if occupied is not None:
-        values = np.where(
-            occupied, values, values.dtype.type(np.nan if values.dtype.kind == "f" else 0)
+        blank = values.dtype.type(np.nan if values.dtype.kind == "f" else 0)
+        values = np.where(occupied, values, blank)
+    data = build_exact_stream(values, settings, occupied)
+    return CodedTile(data=data, decoded=values.copy(), nonzero=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Task:
+    """A tile to code.
+
+    Attributes:
+        values: the tile, in C order.
+        settings: its settings.
+        coding: options of the encoder.
+        finite: where the values are finite; None where all are.
+        counted: where they are finite and in the coreset; None where all are.
+        missing: the section of missing values.
+    """
+
+    values: Values
+    settings: TileSettings
+    coding: Coding
+    finite: Mask | None
+    counted: Mask | None
+    missing: bytes
+
+    @property
+    def shape(self) -> Shape:
+        """Shape of the tile."""
+        t, z, y, x = self.values.shape
+        return t, z, y, x
+
+    @property
+    def own_settings(self) -> TileSettings | None:
+        """The settings to put into the stream, if any."""
+        return self.settings if self.coding.own_settings else None
+
+    @property
+    def occupied(self) -> Mask | None:
+        """The mask of the stream; None for a stream without one."""
+        if self.settings.mask is None:
+            return None
+        return np.ones(self.values.shape, bool) if self.counted is None else self.counted
+
+    def mask_section(self, linear: Values) -> bytes | None:
+        """The section of the mask. linear: decoded values before head and residual."""
+        occupied = self.occupied
+        if occupied is None or self.settings.mask is None:
+            return None
+        return pack_mask(
+            occupied, self.settings.mask.levels(linear.astype(self.settings.dtype, copy=False))
         )
-    return CodedTile(data=exact_bytes(values, settings, occupied), decoded=values.copy(), nonzero=0)
+
+    def exact(self) -> CodedTile:
+        """The tile stored without loss."""
+        return exact_tile(self.values, self.own_settings, self.occupied)
+
+    def coded(self, data: bytes, decoded: Values, nonzero: int) -> CodedTile:
+        """The coded tile, with unoccupied and missing values as a decoder gives them.
+
+        decoded: decoded values in the type of the source; changed in place.
+        """
+        decoded = blank_unoccupied(decoded, self.occupied, self.settings)
+        decoded = restore_missing(decoded, self.missing)
+        return CodedTile(data=data, decoded=decoded, nonzero=nonzero)
+
+
+def _task(values: Values, settings: TileSettings, coding: Coding, in_coreset: Mask | None) -> _Task:
+    values = np.ascontiguousarray(values)
+    finite = None if all_finite(values) else np.isfinite(values)
+    counted = finite if in_coreset is None else in_coreset
+    if in_coreset is not None and finite is not None:
+        counted = finite & in_coreset
+    if counted is not None and counted.all():
+        counted = None
+    missing = b"" if finite is None or not coding.keep_missing else pack_missing(values, finite)
+    return _Task(
+        values=values,
+        settings=settings,
+        coding=coding,
+        finite=finite,
+        counted=counted,
+        missing=missing,
+    )
+
+
+def _empty_tile(task: _Task) -> CodedTile:
+    """A tile in which no value counts."""
+    mask = None if task.occupied is None else b""
+    data = build_stream(task.own_settings, task.missing, b"", None, None, mask)
+    center = np.full(task.values.shape, task.settings.center)
+    return task.coded(data, cast(center, task.values.dtype), 0)
+
+
+def _predicted_tile(task: _Task, predictor: Predictor, error: float) -> CodedTile:
+    """A tile coded by prediction; stored without loss where that cannot keep the bound."""
+    integers = integers_of(task.values, task.counted, predictor)
+    if integers is None:
+        return task.exact()
+    data, integers = encode_predicted(integers, task.counted, predictor)
+    linear = predicted_values(integers, predictor, task.settings)
+    decoded = cast(linear, task.values.dtype)
+    if not within(task.values, decoded, error, task.counted):
+        return task.exact()
+    mask = task.mask_section(linear)
+    stream = build_stream(
+        task.own_settings, task.missing, data, integers, None, mask, predicted=True
+    )
+    return task.coded(stream, decoded, int(np.count_nonzero(integers)))
+
+
+def _transformed_tile(task: _Task) -> CodedTile:
+    """A tile coded by transform; stored without loss where that cannot keep the bound."""
+    settings, error = task.settings, task.coding.error
+    transform = transform_for(settings, task.shape)
+    target = _target(task, transform)
+    coefficients = _free_coefficients(task, transform, target)
+    data, integers = _code(coefficients, task)
+    linear = linear_values(integers, transform, settings)
+    mask = task.mask_section(linear)
+    base = linear if settings.head is None else settings.head.apply(linear)
+    residual = None
+    if error is not None:
+        result = residual_of(task.values, base, task.counted, settings.quantum, MAX_INTEGER)
+        if result is None:
+            return task.exact()
+        residual = result[0] if result[1] else None
+    decoded = corrected(base, residual, settings.quantum, task.values.dtype)
+    if error is not None and not within(task.values, decoded, error, task.counted):
+        return task.exact()
+    stream = build_stream(task.own_settings, task.missing, data, integers, residual, mask)
+    return task.coded(stream, decoded, int(np.count_nonzero(integers)))
+
+
+def _target(task: _Task, transform: Transform) -> Values:
+    """The values to transform: about the centre, in the working type, filled where not counted."""
+    values, settings = task.values, task.settings
+    finite = values
+    if task.finite is not None:
+        finite = np.where(task.finite, values, values.dtype.type(0))
+    target: Values = finite.astype(settings.dtype)
+    target -= settings.dtype.type(settings.center)
+    if task.counted is None or (task.coding.filled and task.finite is None):
+        return target
+    present = np.ones(values.shape, bool) if task.finite is None else task.finite
+    return filled(target, task.counted, present, transform, settings, task.coding.density)
+
+
+def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Values:
+    """The coefficients of the target after `Coding.rounds` replacements of its free values.
+
+    Free values are those that do not count, and those at an end of the range that decode to values
+    beyond it, since the decoder clips them. `target` is changed in place.
+    """
+    settings, weight = task.settings, task.coding.weight
+    margin = (settings.high - settings.low) * _END_MARGIN
+    low = settings.low - settings.center + margin
+    high = settings.high - settings.center - margin
+    coefficients = transform.forward(target)
+    for _ in range(task.coding.rounds):
+        integers, scaled = quantise(coefficients, settings.step)
+        if weight > 0:
+            table = band_table(settings.transform, task.shape)
+            integers = encode_integers(integers, table, scaled=scaled, weight=weight).integers
+        rebuilt = transform.inverse(
+            dequantise(integers, settings.step, settings.offsets, settings.dtype)
+        )
+        if not free_values(target, rebuilt, task.counted, low, high):
+            break
+        coefficients = transform.forward(target)
+    return coefficients
+
+
+def _code(coefficients: Values, task: _Task) -> tuple[bytes, Integers]:
+    """The coded coefficients, and the integers that they decode to."""
+    table, weight = band_table(task.settings.transform, task.shape), task.coding.weight
+    integers, scaled = quantise(coefficients, task.settings.step)
+    coded = encode_integers(integers, table, scaled=scaled if weight > 0 else None, weight=weight)
+    if task.coding.passes > 1 and weight > 0:
+        coded = encode_integers(coded.integers, table)
+    return coded.data, coded.integers

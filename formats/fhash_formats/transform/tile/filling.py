@@ -1,7 +1,8 @@
-"""What stands where values do not count: whatever takes few coefficients and leaves the values that count as they are.
+"""Fill values for vertices that do not count: cheap to code, with the counted values unchanged.
 
-Of all such tiles the one of fewest large coefficients is looked for, as in compressed sensing: coefficients below a threshold become 0,
-what counts is put back, and the threshold falls. A step goes on in the direction of the one before (Nesterov), which reaches further.
+The search looks for the tile with the fewest large coefficients, as in compressed sensing.
+Coefficients below a threshold become 0, the counted values are put back, and the threshold falls.
+Each step goes on in the direction of the step before (Nesterov), which reaches farther.
 """
 
 from __future__ import annotations
@@ -22,79 +23,94 @@ __all__ = ["filled"]
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
-HIGHEST, LOWEST = 64.0, 0.4
-"""Thresholds, in quantiser steps."""
+HIGHEST = 64.0
+"""First threshold, in quantiser steps."""
+LOWEST = 0.4
+"""The search ends when the threshold is at or below this many quantiser steps."""
 NEARBY = 16.0
-"""The first threshold where what is there is a good filling already."""
+"""First threshold, in quantiser steps, where the present values are a good filling already."""
 RATIOS = {1: 0.5, 2: 0.7071067811865476, 4: 0.8408964152537145, 8: 0.9170040432046712}
-"""From one threshold to the next, by how many there are to the factor of two: constants, so that every machine has the same."""
+"""Ratio of a threshold to the one before it, by the number of thresholds per factor of two.
+
+The ratios are constants, so that every machine has the same ones.
+"""
 MOMENTUM = 0.8
+"""Share of the last change that is added to the next guess."""
 FEW_BITS = 64
-"""Of the magnitudes of a tile, of which more thresholds could not save many."""
+"""Tiles whose magnitudes have fewer bits in all are not searched with more thresholds."""
 
 
 def filled(
     target: Values,
-    counts: Mask,
+    counted: Mask,
     finite: Mask,
     transform: Transform,
     settings: TileSettings,
     density: int = 1,
 ) -> Values:
-    """`target` (t, z, y, x) with other values where it does not count.
+    """`target` (t, z, y, x) with fill values where it is not counted.
 
-    finite: where it has values. density: 1, 2, 4 or 8 thresholds to each factor of two; 0 goes on from a filling that was made for other
-    settings, by a few thresholds. Begins with the values that are there, because they
-    often go on from what counts, or with the mean of what counts: with that which takes fewer bits. Where the values that are there
-    take fewer bytes, they stay.
+    The search starts from the present values, which often continue the counted ones, or from the
+    mean of the counted values, whichever takes fewer bits. The present values stay where they take
+    no more bytes than the result.
+
+    Args:
+        target: the tile, in the working type.
+        counted: the values to keep.
+        finite: where the tile has present values.
+        transform: the transform of the tile.
+        settings: settings of the tile; the step is the one the fill values are made for.
+        density: 1, 2, 4 or 8 thresholds per factor of two. 0 goes on from a filling that was made
+            for other settings, by a few thresholds.
     """
     # A running sum has one order on every machine, a mean has not.
     mean = settings.dtype.type(
-        np.cumsum(target[counts], dtype=np.float64)[-1] / np.count_nonzero(counts)
+        np.cumsum(target[counted], dtype=np.float64)[-1] / np.count_nonzero(counted)
     )
-    t, z, y, x = target.shape
+    present = np.where(finite, target, mean)
     if density == 0:
-        return _settled(np.where(finite, target, mean), counts, transform, settings, 1, NEARBY)
-    own = np.where(finite, target, mean)
-    starts = (own, np.where(counts, target, mean))
-    settled = [_settled(start, counts, transform, settings, 1) for start in starts]
-    bits = [_bits(values, transform, settings) for values in settled]
+        return _search(present, counted, transform, settings, 1, NEARBY)
+    starts = (present, np.where(counted, target, mean))
+    results = [_search(start, counted, transform, settings, 1) for start in starts]
+    bits = [_bits(values, transform, settings) for values in results]
     better = bits.index(min(bits))
-    enough = density == 1 or bits[better] < FEW_BITS
-    found = (
-        settled[better]
-        if enough
-        else _settled(starts[better], counts, transform, settings, density)
-    )
-    # Bits are a rough measure: smooth values of many bits may be coded in few.
-    table = band_table(settings.transform, (t, z, y, x))
-    sizes = [
-        len(encode_integers(quantise(transform.forward(values), settings.step)[0], table).data)
-        for values in (own, found)
-    ]
-    return own if sizes[0] <= sizes[1] else found
+    result = results[better]
+    if density > 1 and bits[better] >= FEW_BITS:
+        result = _search(starts[better], counted, transform, settings, density)
+    # Bits are a rough measure: smooth values of many bits may be coded in few bytes.
+    if _size(present, transform, settings) <= _size(result, transform, settings):
+        return present
+    return result
 
 
 def _bits(values: Values, transform: Transform, settings: TileSettings) -> int:
-    """Of all magnitudes together."""
+    """Bits of the magnitudes of all quantised coefficients."""
     integers = quantise(transform.forward(values), settings.step)[0]
     return int(np.frexp(integers.astype(np.float32))[1].sum(dtype=np.int64))
 
 
-def _settled(
+def _size(values: Values, transform: Transform, settings: TileSettings) -> int:
+    """Bytes of the coded coefficients."""
+    table = band_table(settings.transform, values.shape)
+    integers = quantise(transform.forward(values), settings.step)[0]
+    return len(encode_integers(integers, table).data)
+
+
+def _search(
     start: Values,
-    counts: Mask,
+    counted: Mask,
     transform: Transform,
     settings: TileSettings,
     density: int,
     threshold: float = HIGHEST,
 ) -> Values:
+    """The values where the search ends; `density` as in `filled`, `threshold` the first one."""
     kind = settings.dtype.type
-    now, guess = start, start
+    current, guess = start, start
     while threshold > LOWEST:
         coefficients = transform.forward(guess)
         coefficients[np.abs(coefficients) < kind(threshold * settings.step)] = 0
-        before, now = now, np.where(counts, start, transform.inverse(coefficients))
-        guess = now + kind(MOMENTUM) * (now - before)
+        before, current = current, np.where(counted, start, transform.inverse(coefficients))
+        guess = current + kind(MOMENTUM) * (current - before)
         threshold *= RATIOS[density]
-    return now
+    return current

@@ -1,16 +1,24 @@
-"""The bytes of a coded tile: flags, sections, and what they hold beside the coded values: settings, digests, missing values, masks.
+"""The bytes of a coded tile: flags, a digest, and sections.
 
-A stream is a byte of flags, the CRC-32 of the decoded integers (coefficients, then residual, as little-endian int32; left out if nothing is
-coded), and sections, each behind its length (LEB128): own settings, missing, coefficients, residual, exact. What is not finite in the
-source, and what the caller does not care for, may decode to anything; the former comes back as it was by the section `missing`: the
-CRC-32 of its marks as little-endian int32 (0 for what is finite, 1 NaN, 2 and 3 infinity and its negative), and the coded marks.
+A stream is a byte of flags, the CRC-32 of the decoded integers, and sections, each behind its
+length (LEB128). The CRC-32 is over the coefficients, then the residual, as little-endian int32; a
+stream without coded integers has none. The sections are, in this order and each only if the flags
+say so: the tile's own settings, missing values, coefficients or exact values, residual, mask.
 
-Where the settings ask for a mask, what the caller does not care for decodes to NaN (the centre, for whole numbers), and what is occupied is
-known from the last section: nothing if all is, else the lower 16 bits of the CRC-32 of the mask, packed, and the coded mask (mask.py).
-Such a stream has another number, so that a reader that knows no masks refuses it.
+Two kinds of values may decode to anything: those that are not finite in the source, and those
+outside the coreset. The section of missing values brings the former back. It is the CRC-32 of its
+marks as little-endian int32, then the coded marks: 0 for a finite value, 1 for NaN, 2 for infinity,
+3 for negative infinity.
 
-Where the settings have a predictor and a bound is asked for, the coefficients are integers coded by prediction (predict.py) and there is
-no residual: the values are origin + step * integer in float64, within the range. These streams have numbers of their own, too.
+Where the settings ask for a mask, values that are not occupied decode to NaN (integers to the
+centre). The last section is the mask: nothing if all values are occupied, otherwise the lower 16
+bits of the CRC-32 of the packed mask, then the coded mask (mask.py). Such a stream has another
+format number, so that a reader without masks refuses it.
+
+Where the settings have a predictor and a bound is asked for, the section of coefficients holds
+integers coded by prediction (predict.py), and there is no residual. The values are
+origin + step * integer in float64, clipped to the range. These streams have format numbers of their
+own, too.
 """
 
 from __future__ import annotations
@@ -41,38 +49,70 @@ __all__ = [
     "PREDICTED",
     "PREDICTED_MASKED",
     "RESIDUAL",
-    "Parts",
     "Shape",
-    "assembled",
-    "exact_bytes",
-    "exact_values",
-    "little",
-    "no_levels",
+    "TileStream",
+    "build_exact_stream",
+    "build_stream",
+    "little_endian",
     "pack_mask",
     "pack_missing",
-    "parts_of",
-    "restored",
+    "parse_stream",
+    "restore_missing",
     "section",
-    "settings_from",
+    "unpack_exact",
     "unpack_mask",
+    "unpack_settings",
+    "zero_levels",
 ]
 
 Shape = tuple[int, int, int, int]
+"""Lengths of a tile along (t, z, y, x)."""
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int32]
 
-OWN, MISSING, RESIDUAL, EXACT, EMPTY = 1, 2, 4, 8, 16
-FORMAT, MASKED, PREDICTED, PREDICTED_MASKED = 1 << 5, 2 << 5, 3 << 5, 4 << 5
-"""The upper three bits of the flags are the number of the stream format, 1 or with a mask 2; by prediction 3, or with a mask 4."""
+OWN = 1
+"""Flag of a stream with settings of its own."""
+MISSING = 2
+"""Flag of a stream with missing values."""
+RESIDUAL = 4
+"""Flag of a stream with a residual."""
+EXACT = 8
+"""Flag of a stream that stores the values without loss."""
+EMPTY = 16
+"""Flag of a stream without any coded values."""
+FORMAT = 1 << 5
+"""Format number of a stream coded by transform; the upper three bits of the flags."""
+MASKED = 2 << 5
+"""Format number of a stream coded by transform, with a mask."""
+PREDICTED = 3 << 5
+"""Format number of a stream coded by prediction."""
+PREDICTED_MASKED = 4 << 5
+"""Format number of a stream coded by prediction, with a mask."""
+
+_NUMBER = 0xE0
+"""Bits of the flags that hold the format number."""
+_MAX_SETTINGS = 1 << 22
+"""Most bytes of a tile's own settings, inflated."""
+_MISSING_VALUES = (np.nan, np.inf, -np.inf)
+"""Values with the marks 1, 2 and 3."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parts:
-    """A stream taken apart.
+class TileStream:
+    """The flags and sections of a stream. A section is None where the flags say that there is none.
 
-    flags: the first byte; masked, predicted: what its number says; coded: whether `body` is coded integers, else exact values or nothing.
-    digest: CRC-32 of the integers, 0 where none are coded. The rest are the sections, None where the flags say that there is none: own
-    settings, missing, coefficients or exact values, residual, mask.
+    Attributes:
+        flags: the first byte.
+        masked: whether the format number says that there is a mask.
+        predicted: whether the format number says that the integers are coded by prediction.
+        coded: whether `body` holds coded integers; otherwise it holds exact values or is None.
+        digest: CRC-32 of the integers; 0 where none are coded.
+        settings: the tile's own settings.
+        missing: missing values.
+        body: coefficients, predicted integers or exact values.
+        residual: the residual.
+        mask: the mask.
     """
 
     flags: int
@@ -87,37 +127,44 @@ class Parts:
     mask: memoryview | None = None
 
     def sections(self) -> list[bytes]:
-        """Those that there are, in their order."""
+        """The sections of the stream, in order."""
         return [
-            bytes(part)
-            for part in (self.settings, self.missing, self.body, self.residual, self.mask)
-            if part is not None
+            bytes(data)
+            for data in (self.settings, self.missing, self.body, self.residual, self.mask)
+            if data is not None
         ]
 
 
-def assembled(
+def build_stream(
     settings: TileSettings | None,
     missing: bytes,
     coefficients: bytes,
-    integers: npt.NDArray[np.int32] | None,
-    residual: npt.NDArray[np.int32] | None,
+    integers: Integers | None,
+    residual: Integers | None,
     mask: bytes | None,
     predicted: bool = False,
 ) -> bytes:
     """The stream of a tile.
 
-    settings: its own, or None. missing, mask: sections. coefficients: coded, and the integers that they are; None where nothing is coded.
+    Args:
+        settings: the tile's own settings; None for none.
+        missing: section of missing values; empty for none.
+        coefficients: section of coded coefficients or predicted integers.
+        integers: the integers that `coefficients` decodes to; None where nothing is coded.
+        residual: residual in quanta; None for none.
+        mask: section of the mask; None for a stream without one.
+        predicted: whether the integers are coded by prediction.
     """
     numbers = (PREDICTED, PREDICTED_MASKED) if predicted else (FORMAT, MASKED)
     flags = numbers[mask is not None] | (OWN if settings else 0) | (MISSING if missing else 0)
-    sections = [*_own(settings), *([missing] if missing else [])]
+    sections = [*_pack_settings(settings), *([missing] if missing else [])]
     if integers is None:
         return bytes([flags | EMPTY]) + b"".join(map(section, sections))
-    crc = zlib.crc32(little(integers))
+    crc = zlib.crc32(little_endian(integers))
     sections.append(coefficients)
     if residual is not None:
         flags |= RESIDUAL
-        crc = zlib.crc32(little(residual), crc)
+        crc = zlib.crc32(little_endian(residual), crc)
         sections.append(encode_integers(residual, single_band(residual.shape)).data)
     if mask is not None:
         sections.append(mask)
@@ -125,34 +172,33 @@ def assembled(
 
 
 def section(data: bytes) -> bytes:
-    """A section behind its length."""
-    size, head = len(data), bytearray()
+    """A section with its length (LEB128) in front."""
+    size, length = len(data), bytearray()
     while True:
-        head.append(size & 127 | (128 if size > 127 else 0))
+        length.append(size & 127 | (128 if size > 127 else 0))
         size >>= 7
         if not size:
-            return bytes(head) + data
+            return bytes(length) + data
 
 
-def parts_of(data: bytes | memoryview) -> Parts:
-    """A stream taken apart; raises DamagedFileError where flags contradict each other, or other sections are there than they say.
+def parse_stream(data: bytes | memoryview) -> TileStream:
+    """The flags and sections of a stream.
 
-    All of that is known before anything is decoded, which may take long.
+    Raises DamagedFileError where flags contradict each other or the sections are not those of the
+    flags. All of that is checked before anything is decoded, which may take long.
     """
     data = memoryview(data)
     if not len(data):
         raise DamagedFileError("a coded tile is empty")
     flags = data[0]
-    number = flags & 0xE0
+    number = flags & _NUMBER
     if number not in (FORMAT, MASKED, PREDICTED, PREDICTED_MASKED):
         raise DamagedFileError(
             f"a coded tile begins with {flags:#04x}, which is no known stream format"
         )
-    masked, predicted, coded = (
-        number in (MASKED, PREDICTED_MASKED),
-        number in (PREDICTED, PREDICTED_MASKED),
-        not flags & (EXACT | EMPTY),
-    )
+    masked = number in (MASKED, PREDICTED_MASKED)
+    predicted = number in (PREDICTED, PREDICTED_MASKED)
+    coded = not flags & (EXACT | EMPTY)
     if predicted and flags & (EXACT | EMPTY | RESIDUAL):
         raise DamagedFileError("a coded tile is by prediction and something else as well")
     if coded and len(data) < 5:
@@ -171,45 +217,46 @@ def parts_of(data: bytes | memoryview) -> Parts:
         raise DamagedFileError(
             f"a coded tile has {len(sections)} sections; its flags say {len(names)}"
         )
-    found = dict(zip(names, sections, strict=True))
-    if flags & MISSING and not len(found["missing"]):
+    by_name = dict(zip(names, sections, strict=True))
+    if flags & MISSING and not len(by_name["missing"]):
         raise DamagedFileError("a coded tile has lost its missing values")
     digest = int.from_bytes(data[1:5], "little") if coded else 0
-    return Parts(
-        flags=flags, masked=masked, predicted=predicted, coded=coded, digest=digest, **found
+    return TileStream(
+        flags=flags, masked=masked, predicted=predicted, coded=coded, digest=digest, **by_name
     )
 
 
 def _sections(data: memoryview) -> Iterator[memoryview]:
-    """The sections one after the other; DamagedFileError where one reaches beyond the end."""
-    at = 0
-    while at < len(data):
+    """The sections in order. Raises DamagedFileError where one reaches beyond the end."""
+    position = 0
+    while position < len(data):
         size = shift = 0
         while True:
-            if at >= len(data) or shift > 35:
+            if position >= len(data) or shift > 35:
                 raise DamagedFileError("a coded tile is cut short")
-            size |= (data[at] & 127) << shift
+            size |= (data[position] & 127) << shift
             shift += 7
-            at += 1
-            if not data[at - 1] & 128:
+            position += 1
+            if not data[position - 1] & 128:
                 break
-        if size > len(data) - at:
+        if size > len(data) - position:
             raise DamagedFileError("a coded tile is cut short")
-        yield data[at : at + size]
-        at += size
+        yield data[position : position + size]
+        position += size
 
 
-def _own(settings: TileSettings | None) -> list[bytes]:
+def _pack_settings(settings: TileSettings | None) -> list[bytes]:
+    """The section of a tile's own settings, if there are any: JSON, deflated."""
     if settings is None:
         return []
     return [zlib.compress(json.dumps(settings.to_dict(), separators=(",", ":")).encode("ascii"), 9)]
 
 
-def settings_from(data: bytes | memoryview) -> TileSettings:
-    """A tile's own settings; raises DamagedFileError."""
+def unpack_settings(data: bytes | memoryview) -> TileSettings:
+    """The settings in a section. Raises DamagedFileError."""
     try:
         inflate = zlib.decompressobj()
-        text = inflate.decompress(data, 1 << 22)
+        text = inflate.decompress(data, _MAX_SETTINGS)
         if not inflate.eof or inflate.unused_data:
             raise DamagedFileError("the settings of a coded tile are damaged")
         return TileSettings.from_dict(json.loads(text))
@@ -217,36 +264,41 @@ def settings_from(data: bytes | memoryview) -> TileSettings:
         raise DamagedFileError(f"the settings of a coded tile are damaged: {error}") from error
 
 
-def little(integers: npt.NDArray[np.int32]) -> memoryview:
-    """Integers as the digest takes them."""
+def little_endian(integers: Integers) -> memoryview:
+    """The bytes of integers over which digests are computed: little-endian int32."""
     return np.ascontiguousarray(integers, dtype="<i4").data.cast("B")
 
 
-def exact_bytes(values: Values, settings: TileSettings | None, occupied: Mask | None) -> bytes:
-    """The stream of a tile stored without loss: the bytes of equal weight together, deflated."""
+def build_exact_stream(
+    values: Values, settings: TileSettings | None, occupied: Mask | None
+) -> bytes:
+    """The stream of a tile stored without loss: bytes of equal weight together, deflated.
+
+    Args:
+        values: the tile (t, z, y, x).
+        settings: the tile's own settings; None for none.
+        occupied: the mask; None for a stream without one.
+    """
     flags = (FORMAT if occupied is None else MASKED) | EXACT | (OWN if settings else 0)
     plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
     planes = plain.view(np.uint8).reshape(-1, plain.dtype.itemsize).T
-    body = zlib.compress(planes.tobytes(), 6)
-    sections = [
-        *_own(settings),
-        body,
-        *([] if occupied is None else [pack_mask(occupied, no_levels(values.shape))]),
-    ]
+    sections = [*_pack_settings(settings), zlib.compress(planes.tobytes(), 6)]
+    if occupied is not None:
+        sections.append(pack_mask(occupied, zero_levels(values.shape)))
     return bytes([flags]) + b"".join(map(section, sections))
 
 
-def exact_values(data: bytes | memoryview, shape: Shape, dtype: np.dtype[Any]) -> Values:
-    """The values of such a section; raises DamagedFileError."""
-    count = int(np.prod(shape)) * dtype.itemsize
+def unpack_exact(data: bytes | memoryview, shape: Shape, dtype: np.dtype[Any]) -> Values:
+    """The values in a section of exact values. Raises DamagedFileError."""
+    size = int(np.prod(shape)) * dtype.itemsize
     try:
         inflate = zlib.decompressobj()
-        plain = inflate.decompress(data, count)
+        plain = inflate.decompress(data, size)
         if inflate.unconsumed_tail:
             inflate.decompress(inflate.unconsumed_tail, 1)
     except zlib.error as error:
         raise DamagedFileError(f"a coded tile is damaged: {error}") from error
-    if len(plain) != count or not inflate.eof or inflate.unused_data:
+    if len(plain) != size or not inflate.eof or inflate.unused_data:
         raise DamagedFileError("a coded tile is damaged: it holds another number of values")
     planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
     return (
@@ -257,28 +309,28 @@ def exact_values(data: bytes | memoryview, shape: Shape, dtype: np.dtype[Any]) -
     )
 
 
-_MISSING_VALUES = (np.nan, np.inf, -np.inf)
-
-
 def pack_missing(values: Values, finite: Mask) -> bytes:
-    """The section of values that are not finite."""
+    """The section of missing values. finite: where the values are finite."""
     marks = np.where(finite, 0, np.where(np.isnan(values), 1, np.where(values > 0, 2, 3))).astype(
         np.int32
     )
     return (
-        zlib.crc32(little(marks)).to_bytes(4, "little")
+        zlib.crc32(little_endian(marks)).to_bytes(4, "little")
         + encode_integers(marks, single_band(values.shape)).data
     )
 
 
-def restored(decoded: Values, missing: bytes) -> Values:
-    """Decoded values with what is missing put in, in place; `missing` is empty where nothing is. Raises DamagedFileError."""
+def restore_missing(decoded: Values, missing: bytes) -> Values:
+    """Put the missing values of a section into decoded values, in place.
+
+    missing: the section; empty where nothing is missing. Raises DamagedFileError.
+    """
     if missing:
         if decoded.dtype.kind != "f":
             raise DamagedFileError("a coded tile of integers has missing values")
         marks = decode_integers(missing[4:], decoded.shape, single_band(decoded.shape))
         if (
-            zlib.crc32(little(marks)).to_bytes(4, "little") != missing[:4]
+            zlib.crc32(little_endian(marks)).to_bytes(4, "little") != missing[:4]
             or marks.min() < 0
             or marks.max() > 3
         ):
@@ -288,19 +340,24 @@ def restored(decoded: Values, missing: bytes) -> Values:
     return decoded
 
 
-def no_levels(shape: tuple[int, ...]) -> tuple[Levels, Levels]:
-    """Where nothing is known of how likely a mask is."""
+def zero_levels(shape: tuple[int, ...]) -> tuple[Levels, Levels]:
+    """Levels of a mask that no decoded values say anything about."""
     return np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
 
 
 def pack_mask(occupied: Mask, levels: tuple[Levels, Levels]) -> bytes:
-    """The section of a mask; empty where all is occupied."""
-    # The coder reads zeros past the end: one zero is as good as no byte.
-    return b"" if occupied.all() else _digest(occupied) + (encode_mask(occupied, levels) or b"\0")
+    """The section of a mask; empty where all values are occupied.
+
+    levels: how likely each value is occupied (`MaskLevels.levels`).
+    """
+    if occupied.all():
+        return b""
+    # The decoder reads zeros past the end, so one zero stands for an empty code.
+    return _digest(occupied) + (encode_mask(occupied, levels) or b"\0")
 
 
 def unpack_mask(packed: bytes | memoryview, levels: tuple[Levels, Levels]) -> Mask:
-    """The mask of a section; raises DamagedFileError."""
+    """The mask in a section. Raises DamagedFileError."""
     if not len(packed):
         return np.ones(levels[0].shape, bool)
     mask = decode_mask(packed[2:], levels)
@@ -310,4 +367,5 @@ def unpack_mask(packed: bytes | memoryview, levels: tuple[Levels, Levels]) -> Ma
 
 
 def _digest(mask: Mask) -> bytes:
+    """The lower 16 bits of the CRC-32 of a mask."""
     return (zlib.crc32(np.packbits(mask).data) & 0xFFFF).to_bytes(2, "little")

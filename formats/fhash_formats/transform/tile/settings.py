@@ -1,4 +1,7 @@
-"""What tiles are coded with: the transform, the step, the range, the trained head. Shared by all tiles of an array or a tile's own."""
+"""Settings with which tiles are coded: transform, step, range, trained head.
+
+All tiles of an array share their settings, or a tile has its own.
+"""
 
 from __future__ import annotations
 
@@ -20,21 +23,32 @@ from fhash_formats.transform.values.quantise import OFFSET_UNIT
 
 __all__ = ["TileSettings"]
 
+_REQUIRED = frozenset({"transform", "step", "center", "range"})
+"""Keys of settings that have no default."""
+_KEYS = _REQUIRED | {"offsets", "double", "quantum", "head", "mask", "predictor"}
+"""All keys of settings."""
+_LISTS = "range is [low, high] and offsets are three whole numbers"
+"""Message for a range or offsets that are no lists."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TileSettings:
-    """Settings of a tile; raises InputError for values that are not allowed.
+    """Settings of a tile. Raises InputError for values that are not allowed.
 
     Attributes:
         transform: kinds, depths and bases along (t, z, y, x).
-        step: of the quantiser, in units of the values; 0 only where nothing is coded but the residual.
-        center: value that stands for zero; low, high: the range to which decoded values are clipped.
-        offsets: reconstruction offsets for magnitudes of 1, 2 and more, in 1/128 step.
-        double: whether arithmetic is in float64 instead of float32.
-        quantum: step of the residual that keeps a bound, in units of the values; 0 where there is none.
-        head: the trained correction, None for none.
-        mask: what decoded values say of the occupancy, which then stands in every tile; None for tiles without one.
-        predictor: of tiles that are coded by prediction instead of the transform; None where none is.
+        step: quantiser step, in units of the values; > 0.
+        center: value that is coded as zero, in units of the values.
+        low: lower end of the range to which decoded values are clipped.
+        high: upper end of that range.
+        offsets: reconstruction offsets of magnitudes 1, 2 and more, in 1/128 step.
+        double: whether the arithmetic is in float64; otherwise it is in float32.
+        quantum: step of the residual that keeps a bound, in units of the values; 0 without bound.
+        head: the trained correction; None for none.
+        mask: likelihood of the occupancy by decoded values; every tile then has a mask. None for
+            tiles without masks.
+        predictor: predictor of tiles that are coded by prediction instead of the transform; None
+            where no tile is.
     """
 
     transform: TransformSpec
@@ -51,49 +65,43 @@ class TileSettings:
 
     def __post_init__(self) -> None:
         for name in ("step", "center", "low", "high", "quantum"):
-            value = getattr(self, name)
-            if (
-                isinstance(value, bool)
-                or not isinstance(value, int | float)
-                or not math.isfinite(value)
-            ):
-                raise InputError(f"{name} is {value!r:.40}; a finite number is needed")
+            _check_finite(name, getattr(self, name))
         if not (self.step > 0 and self.quantum >= 0 and self.low <= self.high):
             raise InputError(
-                f"step {self.step}, quantum {self.quantum}, range {self.low} to {self.high} do not fit together"
+                f"step {self.step}, quantum {self.quantum}, range {self.low} to {self.high} "
+                "do not fit together"
             )
-        if not (
-            self.double
-            or float(np.finfo(np.float32).tiny) < self.step < float(np.finfo(np.float32).max)
-        ):
+        smallest, largest = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+        if not (self.double or smallest < self.step < largest):
             raise InputError(f"step {self.step} is not for float32")
         if len(self.offsets) != 3 or not all(
-            type(o) is int and abs(o) <= OFFSET_UNIT for o in self.offsets
+            type(offset) is int and abs(offset) <= OFFSET_UNIT for offset in self.offsets
         ):
             raise InputError(
-                f"offsets are {self.offsets!r:.60}; three whole numbers within +-{OFFSET_UNIT} are needed"
+                f"offsets are {self.offsets!r:.60}; "
+                f"three whole numbers within +-{OFFSET_UNIT} are needed"
             )
         if self.head is not None and self.double:
             raise InputError("a head works in float32 only")
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """The working type."""
+        """The type of the arithmetic."""
         return np.dtype(np.float64 if self.double else np.float32)
 
     @property
     def features(self) -> tuple[str, ...]:
-        """What a reader must know beside the codec itself, by the names that containers require features by."""
+        """Features that a reader must support besides the codec, by their names in containers."""
         cross = self.head is not None and self.head.cross
         used = {
             "cross": cross,
             "mask": self.mask is not None,
             "predictor": self.predictor is not None,
         }
-        return tuple(name for name, wanted in used.items() if wanted)
+        return tuple(name for name, is_used in used.items() if is_used)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON values, without those that are the default."""
+        """JSON values, without the settings that have their default."""
         result: dict[str, Any] = {
             "transform": self.transform.to_dict(),
             "step": self.step,
@@ -116,51 +124,53 @@ class TileSettings:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> TileSettings:
-        """From `to_dict`'s values; raises InputError or DamagedFileError for anything else."""
-        known = {
-            "transform",
-            "step",
-            "center",
-            "range",
-            "offsets",
-            "double",
-            "quantum",
-            "head",
-            "mask",
-            "predictor",
-        }
-        unknown = sorted(str(key)[:40] for key in set(values) - known)
+        """The inverse of `to_dict`. Raises InputError or DamagedFileError for anything else."""
+        unknown = sorted(str(key)[:40] for key in set(values) - _KEYS)
         if unknown:
-            raise InputError(f"unknown setting {unknown[0]!a}; known: {', '.join(sorted(known))}")
-        missing = sorted({"transform", "step", "center", "range"} - set(values))
+            raise InputError(f"unknown setting {unknown[0]!a}; known: {', '.join(sorted(_KEYS))}")
+        missing = sorted(_REQUIRED - set(values))
         if missing:
             raise InputError(f"setting {missing[0]} is missing")
-        span, offsets = values["range"], values.get("offsets", [0, 0, 0])
-        if (
-            not isinstance(span, list | tuple)
-            or len(span) != 2
-            or not isinstance(offsets, list | tuple)
-        ):
-            raise InputError("range is [low, high] and offsets are three whole numbers")
-        if not isinstance(values.get("double", False), bool):
+        low, high = _range(values["range"])
+        offsets = values.get("offsets", [0, 0, 0])
+        if not isinstance(offsets, list | tuple):
+            raise InputError(_LISTS)
+        double = values.get("double", False)
+        if not isinstance(double, bool):
             raise InputError("double is true or false")
-        head = values.get("head")
-        try:
-            packed = None if head is None else base64.b64decode(head, validate=True)
-        except (binascii.Error, TypeError, ValueError) as error:
-            raise DamagedFileError("the head is not base64") from error
+        head = _unpack_head(values.get("head"))
+        mask, predictor = values.get("mask"), values.get("predictor")
         return cls(
             transform=TransformSpec.from_dict(values["transform"]),
             step=values["step"],
             center=values["center"],
-            low=span[0],
-            high=span[1],
+            low=low,
+            high=high,
             offsets=tuple(offsets),
-            double=values.get("double", False),
+            double=double,
             quantum=values.get("quantum", 0.0),
-            head=None if packed is None else NeighbourHead.from_bytes(packed),
-            mask=None if values.get("mask") is None else MaskLevels.from_dict(values["mask"]),
-            predictor=None
-            if values.get("predictor") is None
-            else Predictor.from_dict(values["predictor"]),
+            head=None if head is None else NeighbourHead.from_bytes(head),
+            mask=None if mask is None else MaskLevels.from_dict(mask),
+            predictor=None if predictor is None else Predictor.from_dict(predictor),
         )
+
+
+def _check_finite(name: str, value: Any) -> None:
+    """Raises InputError unless a setting is a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{name} is {value!r:.40}; a finite number is needed")
+
+
+def _range(values: Any) -> tuple[Any, Any]:
+    """The ends of a range; `TileSettings` checks that they are numbers. Raises InputError."""
+    if not isinstance(values, list | tuple) or len(values) != 2:
+        raise InputError(_LISTS)
+    return values[0], values[1]
+
+
+def _unpack_head(text: Any) -> bytes | None:
+    """The bytes of a head in base64. Raises DamagedFileError."""
+    try:
+        return None if text is None else base64.b64decode(text, validate=True)
+    except (binascii.Error, TypeError, ValueError) as error:
+        raise DamagedFileError("the head is not base64") from error

@@ -1,1 +1,1 @@
-"""Transforms element by element: quantising and comparing."""
+"""Operations on each value of a tile by itself: quantising, comparing, casting."""

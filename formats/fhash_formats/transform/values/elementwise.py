@@ -1,7 +1,9 @@
-"""Passes over the values of a tile, element by element: bounds, residuals, casts. Native for float32 and float64, else portable.
+"""Passes over the values of a tile: error bounds, residuals, casts.
 
-Tiles are large and these passes simple, so they wait for memory: the native ones go over it once, the portable ones piece by piece, so that
-what they compute on the way stays in the cache. Both give the same bits.
+Passes over float32 and float64 are native, all others are portable.
+Tiles are large and these passes are simple, so memory sets their speed. A native pass runs over the
+memory once. A portable pass works in pieces, so that its intermediate results stay in the cache.
+Both give the same bits.
 """
 
 from __future__ import annotations
@@ -31,105 +33,129 @@ Mask = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int32]
 
 PIECE = 1 << 14
-_NAMES = {np.dtype(np.float32): "f32", np.dtype(np.float64): "f64"}
+"""Values that a portable pass works on at once."""
+_NATIVE_TYPES = {np.dtype(np.float32): "f32", np.dtype(np.float64): "f64"}
+"""Types with native passes, and their names in the library."""
 
 
 def all_finite(values: Values) -> bool:
-    """Whether no value of any real type is NaN or infinite."""
+    """Whether no value, of any real type, is NaN or infinite."""
     if values.dtype.kind != "f":
         return True
     flat = values.reshape(-1)
     return all(bool(np.isfinite(flat[piece]).all()) for piece in pieces(flat.size))
 
 
-def within(values: Values, decoded: Values, error: float, counts: Mask | None = None) -> bool:
-    """Whether |decoded - value| <= error wherever it counts, without rounding in favour of the answer."""
+def within(values: Values, decoded: Values, error: float, counted: Mask | None = None) -> bool:
+    """Whether |decoded - value| <= error at every counted value.
+
+    Rounding in the comparison never turns a no into a yes.
+
+    Args:
+        values: values of any real type.
+        decoded: their decoded values, of the same shape and type.
+        error: the bound, in units of the values.
+        counted: the values that are compared; None for all.
+    """
     function = _native("within", values.dtype) if values.dtype == decoded.dtype else None
     if function is not None:
         return bool(
             function(
-                *_pointers(values, decoded, counts),
+                *_pointers(values, decoded, counted),
                 ctypes.c_int64(values.size),
                 ctypes.c_double(error),
             )
         )
-    one, other, marks = (
-        values.reshape(-1),
-        decoded.reshape(-1),
-        None if counts is None else counts.reshape(-1),
-    )
-    near = _near_whole if values.dtype.kind in "iu" and values.dtype.itemsize == 8 else _near
-    for piece in pieces(one.size):
-        found = near(one[piece], other[piece], error)
-        if not bool(np.all(found if marks is None else found | ~marks[piece])):
+    flat_values, flat_decoded, flat_counted = _flat(values, decoded, counted)
+    wide_integers = values.dtype.kind in "iu" and values.dtype.itemsize == 8
+    is_near = _near_integers if wide_integers else _near
+    for piece in pieces(values.size):
+        near = is_near(flat_values[piece], flat_decoded[piece], error)
+        if flat_counted is not None:
+            near |= ~flat_counted[piece]
+        if not bool(np.all(near)):
             return False
     return True
 
 
-def _near(one: Values, other: Values, error: float) -> Mask:
+def _near(values: Values, decoded: Values, error: float) -> Mask:
+    """`within` value by value, for types that float64 holds exactly."""
     with np.errstate(all="ignore"):
-        difference = np.abs(one.astype(np.float64) - other.astype(np.float64))
-        # A difference of float64 numbers is rounded: the next one up is surely not too small.
-        found: Mask = (
-            (one == other)
+        difference = np.abs(values.astype(np.float64) - decoded.astype(np.float64))
+        # A difference of float64 numbers is rounded; the next larger number is not too small.
+        near: Mask = (
+            (values == decoded)
             | (np.nextafter(difference, np.inf) <= error)
-            | ((one.dtype.itemsize < 8) & (difference <= error))
+            | ((values.dtype.itemsize < 8) & (difference <= error))
         )
-    return found
+    return near
 
 
-def _near_whole(one: Values, other: Values, error: float) -> Mask:
-    most = 0 if error < 0 else np.iinfo(np.uint64).max if error >= 2.0**64 else int(error)
-    # A signed difference may go round, and as an unsigned number it is right again.
-    found: Mask = np.where(one > other, one - other, other - one).astype(np.uint64) <= np.uint64(
-        most
-    )
-    return found
+def _near_integers(values: Values, decoded: Values, error: float) -> Mask:
+    """`within` value by value, for integers of 64 bits."""
+    limit = 0 if error < 0 else np.iinfo(np.uint64).max if error >= 2.0**64 else int(error)
+    # A signed difference may overflow; read as an unsigned number it is right again.
+    difference = np.where(values > decoded, values - decoded, decoded - values).astype(np.uint64)
+    near: Mask = difference <= np.uint64(limit)
+    return near
 
 
 def residual_of(
-    values: Values, base: Values, counts: Mask | None, quantum: float, largest: int
+    values: Values, base: Values, counted: Mask | None, quantum: float, largest: int
 ) -> tuple[Integers, int] | None:
-    """Whole quanta to add to `base` where the error is too large, and how many are not 0; None where one would be above `largest`.
+    """The residual, and how many of its integers are not 0.
 
-    values: of any real type. base: float32 or float64. counts: where the error matters; None for everywhere.
+    The residual of a value is the number of quanta to add to `base` where |value - base| exceeds
+    half a quantum, and 0 elsewhere. The result is None where an integer would exceed `largest`.
+
+    Args:
+        values: values of any real type.
+        base: decoded values without a residual, float32 or float64, of the same shape.
+        counted: the values that need the residual; None for all.
+        quantum: step of the residual, in units of the values.
+        largest: largest magnitude of an integer.
     """
-    result = np.zeros(values.shape, np.int32)
+    residual = np.zeros(values.shape, np.int32)
     function = _native("residual", values.dtype, base.dtype)
     if function is not None:
-        numbers = (ctypes.c_double(quantum), ctypes.c_double(largest))
-        found = int(
+        nonzero = int(
             function(
-                *_pointers(values, base, counts),
+                *_pointers(values, base, counted),
                 ctypes.c_int64(values.size),
-                *numbers,
-                *_pointers(result),
+                ctypes.c_double(quantum),
+                ctypes.c_double(largest),
+                *_pointers(residual),
             )
         )
-        return None if found < 0 else (result, found)
-    one, other, marks, out = (
-        values.reshape(-1),
-        base.reshape(-1),
-        None if counts is None else counts.reshape(-1),
-        result.reshape(-1),
-    )
-    found = 0
-    for piece in pieces(one.size):
+        return None if nonzero < 0 else (residual, nonzero)
+    flat_values, flat_base, flat_counted = _flat(values, base, counted)
+    flat_residual = residual.reshape(-1)
+    nonzero = 0
+    for piece in pieces(values.size):
         with np.errstate(all="ignore"):
-            rest = one[piece].astype(np.float64) - other[piece].astype(np.float64)
-            rest = rest if marks is None else np.where(marks[piece], rest, 0.0)
-            whole = np.where(np.abs(rest) > quantum / 2, np.rint(rest / quantum), 0.0)
-        if not bool(np.all(np.abs(whole) <= largest)):
+            error = flat_values[piece].astype(np.float64) - flat_base[piece].astype(np.float64)
+            error = error if flat_counted is None else np.where(flat_counted[piece], error, 0.0)
+            quanta = np.where(np.abs(error) > quantum / 2, np.rint(error / quantum), 0.0)
+        if not bool(np.all(np.abs(quanta) <= largest)):
             return None
-        out[piece] = whole
-        found += int(np.count_nonzero(out[piece]))
-    return result, found
+        flat_residual[piece] = quanta
+        nonzero += int(np.count_nonzero(flat_residual[piece]))
+    return residual, nonzero
 
 
 def corrected(
     base: Values, residual: Integers | None, quantum: float, dtype: np.dtype[Any]
 ) -> Values:
-    """`base` plus so many quanta, in float64, and from there to a type; may be `base` itself where nothing is to be done."""
+    """`base` plus its residual, computed in float64 and cast to `dtype`.
+
+    The result may be `base` itself where there is no residual and nothing to cast.
+
+    Args:
+        base: decoded values, float32 or float64.
+        residual: quanta to add, of the same shape; None for none.
+        quantum: step of the residual, in units of the values.
+        dtype: type of the result.
+    """
     if residual is None:
         return base if base.dtype == dtype else cast(base, dtype)
     function = _native("correct", base.dtype, dtype)
@@ -142,40 +168,52 @@ def corrected(
             *_pointers(result),
         )
         return result
-    flat, whole, out = base.reshape(-1), residual.reshape(-1), result.reshape(-1)
-    for piece in pieces(flat.size):
+    flat_base, flat_residual, flat_result = (
+        base.reshape(-1),
+        residual.reshape(-1),
+        result.reshape(-1),
+    )
+    for piece in pieces(base.size):
         with np.errstate(all="ignore"):
-            out[piece] = _cast(
-                flat[piece].astype(np.float64) + whole[piece] * np.float64(quantum), dtype
+            flat_result[piece] = _cast_piece(
+                flat_base[piece].astype(np.float64) + flat_residual[piece] * np.float64(quantum),
+                dtype,
             )
     return result
 
 
 def cast(values: Values, dtype: np.dtype[Any]) -> Values:
-    """Floating values as another type, rounded and clipped to whole numbers where it has only these; a new array."""
+    """Floating-point values in another type, as a new array.
+
+    For an integer type they are rounded and clipped to its range.
+    """
     if dtype.kind == "f":
         with np.errstate(over="ignore"):
             return values.astype(dtype)
     result = np.empty(values.shape, dtype)
-    flat, out = values.reshape(-1), result.reshape(-1)
-    for piece in pieces(flat.size):
-        out[piece] = _cast(flat[piece], dtype)
+    flat_values, flat_result = values.reshape(-1), result.reshape(-1)
+    for piece in pieces(values.size):
+        flat_result[piece] = _cast_piece(flat_values[piece], dtype)
     return result
 
 
-def _cast(values: Values, dtype: np.dtype[Any]) -> Values:
+def _cast_piece(values: Values, dtype: np.dtype[Any]) -> Values:
+    """`cast` of one piece."""
     if dtype.kind == "f":
         with np.errstate(over="ignore"):
             return values.astype(dtype)
     limits = np.iinfo(dtype)
-    # float64 cannot hold the largest 64-bit integers; the number below them is inside.
+    # float64 cannot hold the largest 64-bit integers; the number below them is in the range.
     low, high = float(limits.min), float(limits.max)
     high = high if int(high) <= limits.max else float(np.nextafter(high, 0.0))
     return np.clip(np.rint(np.nan_to_num(values.astype(np.float64))), low, high).astype(dtype)
 
 
 def clip_shifted(values: Values, center: float, low: float, high: float) -> Values:
-    """values + center within [low, high], each first rounded to the type of the values, in place; NaN stays."""
+    """values + center, clipped to [low, high], in place; NaN stays.
+
+    `center`, `low` and `high` are first rounded to the type of the values.
+    """
     function = _native("clip", values.dtype)
     if function is not None and values.flags.c_contiguous:
         function(
@@ -191,44 +229,64 @@ def clip_shifted(values: Values, center: float, low: float, high: float) -> Valu
 
 
 def free_values(
-    target: Values, rebuilt: Values, counts: Mask | None, low: float, high: float
+    target: Values, rebuilt: Values, counted: Mask | None, low: float, high: float
 ) -> int:
-    """Put `rebuilt` into `target` wherever it may be anything, and count where that is.
+    """Copy `rebuilt` into `target` wherever a value is free, and return how many are free.
 
-    That is what does not count, and what lies at or beyond `low` or `high` and was rebuilt still farther out.
+    A value is free where it is not counted, and where it lies at or beyond `low` or `high` and its
+    rebuilt value lies still farther out: the decoder clips it.
+
+    Args:
+        target: values to code, C-contiguous; changed in place.
+        rebuilt: what they decode to, of the same shape and type.
+        counted: the values that must be kept; None for all.
+        low: lower end of the range.
+        high: upper end of the range.
     """
     assert target.flags.c_contiguous, "it is changed in place"
     function = _native("free", target.dtype)
     if function is not None:
-        numbers = (ctypes.c_int64(target.size), ctypes.c_double(low), ctypes.c_double(high))
-        return int(function(*_pointers(target, rebuilt, counts), *numbers))
-    kind, one, other = target.dtype.type, target.reshape(-1), rebuilt.reshape(-1)
-    marks, found = None if counts is None else counts.reshape(-1), 0
-    for piece in pieces(one.size):
-        value, new = one[piece], other[piece]
+        return int(
+            function(
+                *_pointers(target, rebuilt, counted),
+                ctypes.c_int64(target.size),
+                ctypes.c_double(low),
+                ctypes.c_double(high),
+            )
+        )
+    kind = target.dtype.type
+    flat_target, flat_rebuilt, flat_counted = _flat(target, rebuilt, counted)
+    total = 0
+    for piece in pieces(target.size):
+        value, new = flat_target[piece], flat_rebuilt[piece]
         free = ((value <= kind(low)) & (new < value)) | ((value >= kind(high)) & (new > value))
-        free = free if marks is None else free | ~marks[piece]
+        free = free if flat_counted is None else free | ~flat_counted[piece]
         value[free] = new[free]
-        found += int(np.count_nonzero(free))
-    return found
+        total += int(np.count_nonzero(free))
+    return total
 
 
 def pieces(size: int) -> Iterator[slice]:
-    """Parts of a flat array, small enough for the cache."""
-    return (slice(at, at + PIECE) for at in range(0, size, PIECE))
+    """Slices that split a flat array of `size` values into pieces small enough for the cache."""
+    return (slice(start, start + PIECE) for start in range(0, size, PIECE))
+
+
+def _flat(values: Values, others: Values, mask: Mask | None) -> tuple[Values, Values, Mask | None]:
+    """Three arrays of one shape as flat views."""
+    return values.reshape(-1), others.reshape(-1), None if mask is None else mask.reshape(-1)
 
 
 def _native(name: str, *types: np.dtype[Any]) -> Any:
-    """The native function for arrays of these types, None where there is none."""
+    """The native function for arrays of these types; None where there is none."""
     library = native.library()
-    if library is None or not all(kind in _NAMES for kind in types):
+    if library is None or not all(kind in _NATIVE_TYPES for kind in types):
         return None
-    function = getattr(library, "_".join(["fhash", name, *(_NAMES[kind] for kind in types)]))
+    function = getattr(library, "_".join(["fhash", name, *(_NATIVE_TYPES[kind] for kind in types)]))
     return function
 
 
 def _pointers(*arrays: Values | None) -> list[ctypes.c_void_p]:
-    """Each holds its array, or a copy of it in C order."""
+    """Pointers to C-ordered arrays; each keeps its array, or the C-ordered copy of it, alive."""
     return [
         ctypes.c_void_p(None)
         if array is None

@@ -1,4 +1,7 @@
-"""Coefficients to integers and back: a uniform quantiser with a dead zone, and reconstruction points that the encoder measures."""
+"""Coefficients to integers and back.
+
+The quantiser is uniform with a dead zone; the encoder measures the reconstruction points.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,14 @@ from fhash_formats import native
 __all__ = ["OFFSET_UNIT", "ROUNDING", "dequantise", "quantise"]
 
 OFFSET_UNIT = 128
-"""Reconstruction offsets are whole numbers of this part of a step."""
+"""Units in a quantiser step, for reconstruction offsets."""
 ROUNDING = 0.4
-"""Magnitudes are rounded down after this is added (half would be plain rounding): near zero, a smaller number costs fewer bits."""
+"""Number added to |c| / step before rounding down.
+
+Plain rounding adds 0.5. Less makes smaller integers near zero, which take fewer bits.
+"""
 LARGEST = 1_000_000_000.0
+"""Largest magnitude of an integer; larger ones are clipped."""
 
 Values = npt.NDArray[Any]
 
@@ -24,7 +31,13 @@ Values = npt.NDArray[Any]
 def quantise(
     coefficients: Values, step: float, rounding: float = ROUNDING
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-    """Integers int32, sign(c) floor(|c| / step + rounding), and c / step as float32; magnitudes stop at 1e9."""
+    """The integers sign(c) floor(|c| / step + rounding), int32, and c / step, float32.
+
+    Args:
+        coefficients: coefficients c, float32 or float64.
+        step: quantiser step, in units of the coefficients.
+        rounding: fraction of a step added before rounding down.
+    """
     width, scale = coefficients.dtype.itemsize * 8, 1.0 / step
     library = native.library()
     if library is None:
@@ -35,10 +48,8 @@ def quantise(
             magnitude < kind(LARGEST), magnitude + kind(rounding), kind(LARGEST)
         ).astype(np.int32)
         return np.where(exact < 0, -magnitude, magnitude), exact.astype(np.float32)
-    integers, scaled = (
-        np.empty(coefficients.shape, np.int32),
-        np.empty(coefficients.shape, np.float32),
-    )
+    integers = np.empty(coefficients.shape, np.int32)
+    scaled = np.empty(coefficients.shape, np.float32)
     source = np.ascontiguousarray(coefficients)
     getattr(library, f"fhash_quantise_f{width}")(
         ctypes.c_void_p(source.ctypes.data),
@@ -56,7 +67,14 @@ def dequantise(
     offsets: tuple[int, int, int],
     dtype: npt.DTypeLike,
 ) -> Values:
-    """sign(q) (|q| + offset / OFFSET_UNIT) step in a floating type; offsets for |q| of 1, 2 and more; 0 for 0."""
+    """The coefficients sign(q) (|q| + offset / OFFSET_UNIT) step of integers q; 0 for 0.
+
+    Args:
+        integers: integers q.
+        step: quantiser step, in units of the coefficients.
+        offsets: offset for |q| = 1, for |q| = 2, and for larger ones, in 1/OFFSET_UNIT step.
+        dtype: type of the coefficients, float32 or float64.
+    """
     kind: np.dtype[Any] = np.dtype(dtype)
     one, two, more = (offset / OFFSET_UNIT for offset in offsets)
     library = native.library()

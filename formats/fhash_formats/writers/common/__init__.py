@@ -1,1 +1,1 @@
-"""What several writers share."""
+"""Parts that several writers share."""

@@ -1,10 +1,13 @@
-"""Writing through the HDF5 library so that neither a full disk nor Ctrl-C damages the file or the process.
+"""Writing through the HDF5 library so that neither a full disk nor Ctrl-C does damage.
 
-HDF5 (seen with 2.0.0 under h5py 3.16) does not survive a failed write: on a full disk h5py raises, and the process crashes
-with a segmentation fault when the library closes the file at exit. So HDF5 writes through a Python file that keeps the first
-failure to itself, drops what comes after it, and lets the writer raise it where that is safe.
-A Python file in turn is where Ctrl-C would be delivered, inside HDF5's call: seen to be swallowed by h5py while it releases
-an object, which left a file with a hole that looked complete. So Python's signal handlers wait until the call has returned.
+HDF5 (seen with 2.0.0 under h5py 3.16) does not survive a failed write: on a full disk h5py raises,
+and the process crashes with a segmentation fault when the library closes the file at exit. So HDF5
+writes through a Python file that keeps the first failure to itself, drops all later writes, and
+lets the writer raise the failure where that is safe.
+
+Ctrl-C, in turn, would be delivered in that Python file, inside HDF5's call. h5py was seen to
+swallow it while it released an object, which left a file with a hole that looked complete. So
+Python's signal handlers wait until the call has returned.
 """
 
 from __future__ import annotations
@@ -19,14 +22,14 @@ from fhash_formats.support.interrupts import signals_held
 
 
 class HeldFile(io.FileIO):
-    """A binary file, new and writable, that never fails while it is written; `check` raises what went wrong."""
+    """A new, writable binary file whose writes never fail; `check` raises the first failure."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "x+")
         self.failure: Exception | None = None
 
     def write(self, data: Any, /) -> int:
-        """All of `data`, or nothing more once something failed."""
+        """Write all of `data`, or nothing once a write has failed."""
         view = memoryview(data).cast("B")
         length = len(view)
         try:
@@ -37,7 +40,7 @@ class HeldFile(io.FileIO):
         return length
 
     def truncate(self, size: int | None = None, /) -> int:
-        """Set the length, unless something failed."""
+        """Set the length, unless a write has failed."""
         try:
             if self.failure is None:
                 return super().truncate(size)
@@ -47,7 +50,10 @@ class HeldFile(io.FileIO):
 
     @contextmanager
     def calling(self) -> Iterator[None]:
-        """A block that calls HDF5: signals wait until it ends, then the first failure of the file is raised."""
+        """A block that calls HDF5.
+
+        Signals wait until the block ends; then the first failure of the file is raised.
+        """
         with signals_held():
             try:
                 yield
@@ -64,7 +70,10 @@ class HeldFile(io.FileIO):
 
 @contextmanager
 def held_hdf5(path: Path, opening: Callable[[HeldFile], Any]) -> Iterator[tuple[HeldFile, Any]]:
-    """A new file at `path` and what `opening` (h5py, h5netcdf) makes of it, which is closed before the file in every case."""
+    """A new file at `path`, and the object that `opening` (h5py, h5netcdf) makes of it.
+
+    The object is closed before the file in every case.
+    """
     root = None
     with HeldFile(path) as file:
         try:

@@ -1,4 +1,7 @@
-"""Names and attributes as HDF5, NetCDF and Zarr can hold them, without what would change the meaning of the values."""
+"""Names and attributes in the forms that HDF5, NetCDF and Zarr can hold.
+
+Attributes that would change the meaning of the values are left out.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,11 @@ from fhash_formats.support.attributes import PACKING, PLUMBING, REFERENCES, json
 from fhash_formats.writers.common.region import Region
 
 DROPPED = PACKING | PLUMBING | REFERENCES | {""}
-"""The values are physical, the other variables of the source are not in the output, and no format has an attribute without a name."""
+"""Attributes that are left out.
+
+Values are physical, so packing no longer holds; other variables of the source are not in the
+output; no format has an attribute without a name.
+"""
 
 # HDF5 keeps an attribute of at most 64 KiB in the header; text is not bound by it.
 ATTRIBUTE_BYTES = 32 * 2**10
@@ -24,7 +31,10 @@ def printable(text: str, instead: str = "_") -> str:
 
 
 def safe_name(name: str) -> str:
-    """A name that HDF5, NetCDF and Zarr take as one name: no slash, no control character, not only dots, no leading "__"."""
+    """A name that HDF5, NetCDF and Zarr take as one name.
+
+    It has no slash, no control character, more than dots, and no leading "__".
+    """
     safe = printable(name).replace("/", "_").replace("\\", "_").strip()
     if safe.startswith("__"):
         safe = "_" + safe.lstrip("_")
@@ -32,7 +42,7 @@ def safe_name(name: str) -> str:
 
 
 def safe_names(region: Region) -> tuple[str, dict[str, str]]:
-    """The name of the variable and those of its coordinates by axis, all different."""
+    """Names of the variable and of its coordinates by axis, all different."""
     variable = safe_name(region.name)
     used = {variable}
     names = {}
@@ -48,7 +58,10 @@ def safe_names(region: Region) -> tuple[str, dict[str, str]]:
 
 
 def variable_attributes(region: Region) -> dict[str, Any]:
-    """The attributes of the values, JSON values: the region's own, its units, and its name where it had to be changed."""
+    """Attributes of the values, as JSON values.
+
+    They are the region's own, its units, and its name where that had to be changed.
+    """
     kept = json_attributes(region.attributes, without=DROPPED)
     if region.units:
         kept["units"] = region.units
@@ -58,12 +71,18 @@ def variable_attributes(region: Region) -> dict[str, Any]:
 
 
 def coordinate_attributes(axis: str, coordinate: Coordinate) -> dict[str, Any]:
-    """The attributes of a coordinate, JSON values, with the CF attribute `axis` ("T", "Z", "Y", "X") where it has none."""
+    """Attributes of a coordinate, as JSON values.
+
+    The CF attribute `axis` ("T", "Z", "Y", "X") is added where it is missing.
+    """
     return {"axis": axis.upper(), **json_attributes(coordinate.attributes, without=DROPPED)}
 
 
 def hdf5_value(value: Any) -> Any:
-    """A JSON value as an attribute of HDF5 and NetCDF: text, a number, a list of one kind of them, or else JSON text."""
+    """A JSON value as an attribute of HDF5 and NetCDF.
+
+    It is text, a number, a list of one kind of them, or else JSON text.
+    """
     if isinstance(value, str):
         return value.replace("\0", "")
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""What a writer is told about the values before the first of them comes."""
+"""Description of the values that a writer gets, known before the first of them comes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ class Region:
     """A decoded part of a time-varying volume, without its values.
 
     Attributes:
-        name: of the variable, e.g. "density".
-        units: of the values, "" where unknown.
-        dtype: of the frames, an integer or float of at most 64 bits; kept in the native byte order.
+        name: name of the variable, such as "density".
+        units: units of the values, "" where unknown.
+        dtype: type of the frames, an integer or float of at most 64 bits; kept in the native byte
+            order.
         shape: (t, z, y, x), every length at least 1.
-        coords: a Coordinate for each of "t", "z", "y", "x", already cut to the region, as long as the axis.
-        attributes: of the variable, JSON values.
+        coords: a Coordinate for each of "t", "z", "y", "x", cut to the region and as long as the
+            axis.
+        attributes: attributes of the variable, JSON values.
 
     Raises:
         InputError: one of these does not hold.

@@ -1,9 +1,10 @@
-"""The contract of a writer: one small file per format makes one `Writer`, and `registry` lists them.
+"""The contract of a writer: each format is one `Writer`, and `registry` lists them.
 
-A writer never sees more than one frame. `open` writes what comes before the values and gives a function that is called
-with (step, frame) once per step, in order; when the block ends it writes what comes after them. It writes to temporary
-paths and cleans nothing up: `atomic` turns them into outputs, or removes them if anything fails.
-Frames arrive checked: (z, y, x), C-contiguous, of `region.dtype`, as many as the region has steps.
+A writer sees one frame at a time. `open` writes what precedes the values and gives a function that
+is called with (step, frame) once per step, in order; at the end of the block it writes what follows
+the values. It writes to temporary paths and cleans nothing up: `support.atomic` turns them into
+outputs, or removes them if anything fails. Frames arrive checked: (z, y, x), C-contiguous, of
+`region.dtype`, as many as the region has steps.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ class Writer:
     """One format.
 
     Attributes:
-        name: for messages.
-        suffixes: of the outputs it writes, lower case with the dot.
-        outputs: (path, region) -> every path that is going to be written, in the order in which they take their names;
-            raises InputError where the format cannot hold the region.
-        open: (region, outputs, temporaries) -> context manager giving the function that takes the frames; the
-            temporaries stand for the outputs one by one.
+        name: name for messages.
+        suffixes: suffixes of its outputs, lower case with the dot.
+        outputs: (path, region) -> every path that will be written, in the order in which they take
+            their names; raises InputError where the format cannot hold the region.
+        open: (region, outputs, temporaries) -> context manager that gives the function for the
+            frames; the temporaries stand for the outputs one by one.
         directory: whether the output is a directory.
         module: optional library that must be installed, "" for none.
     """
@@ -50,26 +51,33 @@ class Writer:
 
 
 def one_output(path: Path, region: Region) -> list[Path]:
-    """The outputs of a format that writes just the path it is given."""
+    """The outputs of a format that writes only the path it is given."""
     return [path]
 
 
 def little_endian(dtype: np.dtype[Any], *, half: bool = False) -> np.dtype[Any]:
-    """The type in which values are stored: little-endian; float16 becomes float32, exactly, unless the format has `half`."""
+    """The type in which values are stored: little-endian.
+
+    float16 becomes float32, exactly, unless the format has half precision (`half`).
+    """
     stored = np.dtype(np.float32) if dtype == np.float16 and not half else dtype
     return stored.newbyteorder("<")
 
 
 def write_frame(handle: BinaryIO, frame: Frame, dtype: np.dtype[Any]) -> None:
-    """The values of a frame (z, y, x), x fastest, in `dtype`; converted one z at a time, so that no second frame is made."""
+    """Write the values of a frame (z, y, x) in `dtype`, x fastest.
+
+    They are converted one z at a time, so that there is no second frame in memory.
+    """
     for plane in frame:
         handle.write(np.ascontiguousarray(plane, dtype=dtype).data)
 
 
 def chunk_shape(region: Region) -> tuple[int, int, int, int]:
-    """Chunks (1, z, y, x): one frame, or where a frame is above 16 MiB equal slabs of it along z, then y, then x.
+    """Shape of chunks (1, z, y, x).
 
-    One step is read with one access, and no reader has to hold a huge chunk for a small region.
+    A chunk is one frame; frames above 16 MiB are cut into equal slabs along z, then y, then x. So
+    one access reads one step, and no reader has to hold a huge chunk for a small region.
     """
     z, y, x = slab_shape(region.shape[1:], region.dtype.itemsize, CHUNK_BYTES)
     return 1, z, y, x

@@ -76,7 +76,7 @@ def test_an_axis_in_other_units_is_drawn_in_the_proportions_of_its_vertices() ->
     for same in (in_units("degrees"), in_units("")):
         np.testing.assert_array_equal(same.spacing, [0.25, -0.75, 100.0])
         assert same.scale == (1, 1, 1)
-    # Of three different units that of x counts.
+    # If all three units differ, that of x counts.
     np.testing.assert_allclose(in_units("m", x="s").spacing, [0.25, -0.25, 0.25])
     given = in_units("m", scale=(1, 2, 0.01))
     np.testing.assert_allclose(given.spacing, [0.25, -1.5, 1.0])

@@ -85,11 +85,11 @@ def test_without_a_feature_the_background_is_clear(feature: str) -> None:
     rng = np.random.default_rng(0)
     values = np.concatenate([rng.normal(4, 0.1, 9000), rng.uniform(0, 10, 1000)])
     counts, edges = np.histogram(values, 256, RANGE)
-    found = at("auto", [0, 3.9, 4, 4.1, 7, 10], features=(feature,), histogram=(edges, counts))
-    assert found[2] == 0
-    assert found[0] > found[1]
-    assert BACKGROUND >= found[5] >= found[4] > found[3]
-    assert found[5] == pytest.approx(BACKGROUND, rel=0.1)
+    opacities = at("auto", [0, 3.9, 4, 4.1, 7, 10], features=(feature,), histogram=(edges, counts))
+    assert opacities[2] == 0
+    assert opacities[0] > opacities[1]
+    assert BACKGROUND >= opacities[5] >= opacities[4] > opacities[3]
+    assert opacities[5] == pytest.approx(BACKGROUND, rel=0.1)
     assert at("auto", [0, 10], features=(feature,)) == [0, BACKGROUND]
 
 
@@ -132,10 +132,10 @@ def test_the_background_is_clear_however_small_or_large_the_values_are(scale: fl
     reach = 15 * scale
     edges = np.linspace(-1.0, 1.0, 17) * reach
     with np.errstate(all="raise", under="ignore"):
-        found = at(
+        opacities = at(
             "auto",
             [-reach, 0.06 * reach, reach],
             value_range=(-reach, reach),
             histogram=(edges, counts),
         )
-    assert found == pytest.approx([BACKGROUND, 0, BACKGROUND], rel=0.1, abs=0.01)
+    assert opacities == pytest.approx([BACKGROUND, 0, BACKGROUND], rel=0.1, abs=0.01)

@@ -59,7 +59,7 @@ def test_what_a_preset_may_leave_out(tmp_path: Path) -> None:
     )
 
 
-# Of vtkPiecewiseFunction 9.7, from 0 to 1, at these places.
+# Opacities of vtkPiecewiseFunction 9.7 from 0 to 1, at these places.
 PLACES = [0.1, 0.25, 0.4, 0.45, 0.49, 0.5, 0.51, 0.6, 0.9]
 CURVES = {
     (0.7, 0.0): [0.07143, 0.17857, 0.28571, 0.32143, 0.35, 0.35714, 0.36429, 0.42857, 0.83333],

@@ -45,13 +45,13 @@ def test_opacity_of_one_is_capped_and_finite() -> None:
 
 
 def test_points_are_in_data_units_and_hold_beyond_the_ends() -> None:
-    found = made({"opacity": [[2, 0.5], [4, 0]], "unit_distance": 3.0, "density": 2.0})
-    np.testing.assert_allclose(found.opacity([-9, 2, 3, 4, 99]), [0.5, 0.5, 0.25, 0, 0])
+    function = made({"opacity": [[2, 0.5], [4, 0]], "unit_distance": 3.0, "density": 2.0})
+    np.testing.assert_allclose(function.opacity([-9, 2, 3, 4, 99]), [0.5, 0.5, 0.25, 0, 0])
     np.testing.assert_allclose(
-        found.extinction([2, 3, 9]), [2 * np.log(2) / 3, -2 * np.log(0.75) / 3, 0]
+        function.extinction([2, 3, 9]), [2 * np.log(2) / 3, -2 * np.log(0.75) / 3, 0]
     )
-    assert found.extinction(np.nan) == 0
-    assert np.all(np.isfinite(found.colour([np.nan, np.inf, -np.inf])))
+    assert function.extinction(np.nan) == 0
+    assert np.all(np.isfinite(function.colour([np.nan, np.inf, -np.inf])))
 
 
 def test_the_unit_distance_is_a_vertex_spacing_unless_said() -> None:
@@ -90,9 +90,9 @@ def test_presets_of_paraview(
             }
         )
     )
-    found = made({"colours": str(path), **spec})
-    assert tuple(found.colours.positions) == ends
-    np.testing.assert_allclose(found.points, [[ends[0], 0], [ends[1], 0.5]])
+    function = made({"colours": str(path), **spec})
+    assert tuple(function.colours.positions) == ends
+    np.testing.assert_allclose(function.points, [[ends[0], 0], [ends[1], 0.5]])
     assert len(made({"colours": str(path), **spec, "opacity": "opaque"}).points) == 1
 
 
@@ -103,8 +103,8 @@ def test_presets_of_paraview(
 def test_a_table_is_the_function_and_the_marker_of_visible_values(
     opacity: Any, density: float
 ) -> None:
-    found = made({"opacity": opacity, "density": density})
-    low, high, colours, extinctions = found.table()
+    function = made({"opacity": opacity, "density": density})
+    low, high, colours, extinctions = function.table()
     assert (colours.shape, colours.dtype, extinctions.shape, extinctions.dtype) == (
         (4096, 3),
         np.float32,
@@ -114,26 +114,26 @@ def test_a_table_is_the_function_and_the_marker_of_visible_values(
     inside = VALUES[(VALUES >= 0) & (VALUES <= 10)]
     place = (inside - low) / (high - low) * 4095
     tabled = np.interp(place, np.arange(4096), 1 - np.exp(-extinctions))
-    # Towards opacity 1 the extinction of the last entry rises without bound, so the entries beside a point may differ.
-    away = np.min(np.abs(inside[:, None] - found.points[:, 0]), axis=1) > (high - low) / 4095
+    # Towards opacity 1 the extinction rises without bound: entries beside a point may differ.
+    away = np.min(np.abs(inside[:, None] - function.points[:, 0]), axis=1) > (high - low) / 4095
     np.testing.assert_allclose(
-        tabled[away], (1 - np.exp(-found.extinction(inside)))[away], rtol=0, atol=0.02
+        tabled[away], (1 - np.exp(-function.extinction(inside)))[away], rtol=0, atol=0.02
     )
-    shown = found.extinction(inside) > 0
+    shown = function.extinction(inside) > 0
     mixed = np.stack(
         [np.interp(place, np.arange(4096), colours[:, channel]) for channel in range(3)], axis=-1
     )
-    np.testing.assert_allclose(mixed[shown], found.colour(inside)[shown], rtol=0, atol=2e-3)
-    assert np.all(found.visible(inside, inside)[tabled > 0])
+    np.testing.assert_allclose(mixed[shown], function.colour(inside)[shown], rtol=0, atol=2e-3)
+    assert np.all(function.visible(inside, inside)[tabled > 0])
 
 
 def test_visible_is_a_query_by_range() -> None:
-    found = made({"opacity": [[1, 0], [2, 0.5], [3, 0], [6, 0], [7, 0.5], [8, 0]]})
+    function = made({"opacity": [[1, 0], [2, 0.5], [3, 0], [6, 0], [7, 0.5], [8, 0]]})
     rng = np.random.default_rng(3)
     ends = np.sort(rng.uniform(-1, 11, (3000, 2)))
     low, high = ends.T.copy()
     high[:1000] = low[:1000]
-    entry = (found.span[1] - found.span[0]) / 4095
+    entry = (function.span[1] - function.span[0]) / 4095
     truth = np.array(
         [np.any(((a < 3) & (b > 1)) | ((a < 8) & (b > 6))) for a, b in zip(low, high, strict=True)]
     )
@@ -143,27 +143,27 @@ def test_visible_is_a_query_by_range() -> None:
             for a, b in zip(low, high, strict=True)
         ]
     )
-    np.testing.assert_array_equal(found.visible(low, high), wider)
+    np.testing.assert_array_equal(function.visible(low, high), wider)
     assert 100 < truth.sum() < 2900
     assert not np.any(truth & ~wider)
 
 
 def test_visible_beyond_the_ends_and_of_nothing() -> None:
-    found = made({"opacity": [[2, 0.5], [4, 0]]})
-    assert found.visible([-5, 5, 3.9], [-4, 6, 8]).tolist() == [True, False, True]
-    assert found.visible([np.nan, np.inf, 3, 0], [1, -np.inf, 2, np.nan]).tolist() == [False] * 4
-    assert found.visible(np.zeros((2, 3)), np.ones((2, 3))).shape == (2, 3)
+    function = made({"opacity": [[2, 0.5], [4, 0]]})
+    assert function.visible([-5, 5, 3.9], [-4, 6, 8]).tolist() == [True, False, True]
+    assert function.visible([np.nan, np.inf, 3, 0], [1, -np.inf, 2, np.nan]).tolist() == [False] * 4
+    assert function.visible(np.zeros((2, 3)), np.ones((2, 3))).shape == (2, 3)
     assert bool(made({"opacity": "opaque"}).visible(1e30, 1e31))
 
 
 def test_a_narrow_range_gets_the_whole_table() -> None:
-    found = made({"opacity": [[0, 0], [5, 0], [5.0005, 1], [5.001, 0], [10, 0]]})
-    assert found.span == (5.0, 5.001)
-    assert found.table()[3].max() > 5
+    function = made({"opacity": [[0, 0], [5, 0], [5.0005, 1], [5.001, 0], [10, 0]]})
+    assert function.span == (5.0, 5.001)
+    assert function.table()[3].max() > 5
 
 
 def test_a_peak_that_a_table_misses_is_told() -> None:
-    found = made(
+    function = made(
         {
             "opacity": [
                 [1, 0],
@@ -178,7 +178,7 @@ def test_a_peak_that_a_table_misses_is_told() -> None:
         }
     )
     with pytest.warns(FhashWarning, match="peak of the opacity is narrower"):
-        found.table(64)
+        function.table(64)
 
 
 @pytest.mark.parametrize(
@@ -209,18 +209,18 @@ def test_words_that_make_no_function(spec: dict[str, Any], message: str) -> None
 
 
 def test_nothing_is_allowed_where_it_is_asked_for() -> None:
-    found = made({"nothing": True})
-    assert not found.visible(-1e9, 1e9)
-    assert found.table()[3].max() == 0
+    function = made({"nothing": True})
+    assert not function.visible(-1e9, 1e9)
+    assert function.table()[3].max() == 0
 
 
 def test_a_constant_series_and_json() -> None:
-    found = made({"opacity": "opaque"}, value_range=(3.0, 3.0))
-    low, high, *_ = found.table()
+    function = made({"opacity": "opaque"}, value_range=(3.0, 3.0))
+    low, high, *_ = function.table()
     assert low < high
-    assert bool(found.visible(3.0, 3.0))
-    assert np.all(found.extinction([3.0]) == OPAQUE)
-    assert json.loads(json.dumps(found.to_dict()))["opacity"] == [[3.0, 1.0]]
+    assert bool(function.visible(3.0, 3.0))
+    assert np.all(function.extinction([3.0]) == OPAQUE)
+    assert json.loads(json.dumps(function.to_dict()))["opacity"] == [[3.0, 1.0]]
     assert made({}, value_range=(3.0, 3.0), features=("isosurface:3",)).visible(3.0, 3.0)
 
 
@@ -231,25 +231,25 @@ LARGEST = float(np.finfo(np.float64).max)
 @pytest.mark.parametrize("opacity", ["auto", "linear", "opaque"])
 def test_a_constant_at_the_end_of_float64_has_a_table(value: float, opacity: str) -> None:
     with np.errstate(all="raise", under="ignore"):
-        found = made(
+        function = made(
             {"opacity": opacity},
             value_range=(value, value),
             features=("isosurface:" + repr(value),),
         )
-        low, high, colours, extinctions = found.table()
+        low, high, colours, extinctions = function.table()
     assert -LARGEST <= low < high <= LARGEST
     assert np.isfinite(colours).all()
     assert np.isfinite(extinctions).all()
-    assert bool(found.visible(value, value))
+    assert bool(function.visible(value, value))
 
 
 @pytest.mark.parametrize("reach", [LARGEST, 1e300, 1.0])
 def test_a_range_whose_width_overflows_is_drawn_like_any_other(reach: float) -> None:
     features = ("interval:-inf:" + repr(reach / 2),)
     with np.errstate(all="raise", under="ignore"):
-        found = made({}, value_range=(-reach, reach), features=features)
-        opacities = found.opacity(reach * np.array([-1, -0.5, 0.4, 0.425, 0.5, 1]))
-        found.table()
+        function = made({}, value_range=(-reach, reach), features=features)
+        opacities = function.opacity(reach * np.array([-1, -0.5, 0.4, 0.425, 0.5, 1]))
+        function.table()
         linear = made({"opacity": "linear"}, value_range=(-reach, reach)).opacity(
             reach * np.array([-1, -0.5, 0, 1])
         )

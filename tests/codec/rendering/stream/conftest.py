@@ -23,16 +23,6 @@ from fhash_formats.series import Coordinate
 
 
 @pytest.fixture
-def tensors() -> Arrays:
-    """torch's arrays on the processor: what marches on CUDA marches here, too."""
-    import torch
-
-    from fhash_codec.rendering.task.torch_arrays import TorchArrays
-
-    return TorchArrays(torch.device("cpu"))
-
-
-@pytest.fixture
 def frame_task() -> Callable[..., tuple[FrameField, Task]]:
     """A function that gives a field of values and a task of 8 x 8 parallel rays along z.
 

@@ -1,4 +1,4 @@
-"""What streamed rays have seen: events joined front to back and lit."""
+"""The picture of streamed rays: events joined front to back and lit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where streamed rays cross isosurfaces."""
+"""Crossings of streamed rays with isosurfaces."""
 
 from __future__ import annotations
 

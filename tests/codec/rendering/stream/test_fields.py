@@ -1,4 +1,4 @@
-"""Where streamed samples get their values from: a decoded frame, or the model itself."""
+"""Fields of streamed samples: a decoded frame, or the model itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a marcher is given."""
+"""Frames and extinctions, as a marcher is given them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bands of a transformed tile: what they cover, and what they may look at."""
+"""The bands of a transformed tile: the coefficients they cover and the bands they refer to."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from itertools import product
 
 import numpy as np
 import pytest
+from specs import mixes_and_depths, spec_of
 
 from fhash_formats.transform.axes.bands import band_table
-from fhash_formats.transform.axes.basis import fit_basis
-from fhash_formats.transform.axes.spec import WAVELETS, AxisTransform, TransformSpec
+from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.entropy.prior import KINDS
-from fhash_formats.transform.entropy.table import COLUMNS, Table, single_band
+from fhash_formats.transform.entropy.table import COLUMNS, Table
 
 SHAPES = [
     (1, 1, 1, 1),
@@ -35,21 +35,6 @@ MIXES = [
 ]
 
 
-def spec_of(
-    kinds: tuple[str, ...], depth: int, shape: tuple[int, ...], step: float = 1.0
-) -> TransformSpec:
-    """Bases drop the weakest vectors; a huge step drops them all."""
-    axes = []
-    for kind, n in zip(kinds, shape, strict=True):
-        if kind == "klt":
-            columns = np.cumsum(np.random.default_rng(n).standard_normal((n, 4 * n)), axis=0)
-            axes.append(AxisTransform(kind=kind, basis=fit_basis(columns @ columns.T, step)))
-        else:
-            axes.append(AxisTransform(kind=kind, depth=depth if kind in WAVELETS else 0))
-    t, z, y, x = axes
-    return TransformSpec(axes=(t, z, y, x))
-
-
 def box(row: Table) -> tuple[slice, ...]:
     return tuple(slice(int(low), int(high)) for low, high in zip(row[:4], row[4:8], strict=True))
 
@@ -60,7 +45,7 @@ CASES = [
         shape,
         id=f"{'-'.join(kinds)}-{depth}-{'x'.join(map(str, shape))}",
     )
-    for kinds, depth, shape in product(MIXES, (1, 2, 10), SHAPES)
+    for (kinds, depth), shape in product(mixes_and_depths(MIXES, (1, 2, 10)), SHAPES)
 ]
 
 
@@ -81,13 +66,14 @@ def test_each_coefficient_is_in_one_band(spec: TransformSpec, shape: tuple[int, 
 
 
 @pytest.mark.parametrize(("spec", "shape"), CASES)
-def test_references_point_back_to_what_lies_there(
+def test_references_point_back_to_bands_that_lie_alike(
     spec: TransformSpec, shape: tuple[int, ...]
 ) -> None:
     table = band_table(spec, shape)
     sizes = table[:, 4:8] - table[:, :4]
     for number, row in enumerate(table):
-        # Which axes each reference keeps: parent and sibling (t, z), before along t (z, y, x), before along z (t, y, x).
+        # Axes along which each reference stays in place: the parent and the sibling along t and
+        # z, the band before along t along z, y, x, the band before along z along t, y, x.
         for reference, same in zip(
             row[9:].reshape(4, 5), ([0, 1], [1, 2, 3], [0, 2, 3], [0, 1]), strict=True
         ):
@@ -105,7 +91,7 @@ def test_references_point_back_to_what_lies_there(
                     np.arange(sizes[number, axis]) >> shifts[axis], sizes[to, axis] - 1
                 )
                 assert places.min() >= 0
-                # The band that is referred to is as long, or half as long, up to the odd one at its end.
+                # The other band is as long, or half as long, except for an odd end.
                 if axis in same or shifts[axis]:
                     assert (sizes[number, axis] - 1) >> shifts[axis] <= sizes[to, axis]
 
@@ -133,7 +119,7 @@ def test_kinds_tell_levels_and_orientations_apart() -> None:
         assert row[8] % 4 == 2 * (row[0] > 0) + (row[1] > 0)
 
 
-def test_a_basis_of_rank_0_leaves_no_band() -> None:
+def test_a_basis_of_rank_0_has_no_band() -> None:
     shape = (3, 4, 5, 6)
     spec = spec_of(("none", "klt", "9/7", "9/7"), 1, shape, 1e9)
     assert spec.axes[1].basis is not None
@@ -149,10 +135,3 @@ def test_a_table_is_made_once_and_read_only() -> None:
     assert table.flags.c_contiguous
     with pytest.raises(ValueError, match="read-only"):
         table[0, 0] = 1
-
-
-def test_integers_that_were_not_transformed_are_one_band() -> None:
-    table = single_band((2, 3, 4, 5))
-    assert table.shape == (1, COLUMNS)
-    assert list(table[0, :9]) == [0, 0, 0, 0, 2, 3, 4, 5, 0]
-    assert list(table[0, 9::5]) == [-1] * 4

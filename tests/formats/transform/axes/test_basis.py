@@ -25,7 +25,8 @@ def test_analysis_and_synthesis_lose_less_than_the_step(n: int, step: float) -> 
     assert 0 < basis.rank <= n
     assert basis.synthesis.shape == (n, basis.rank)
     again = basis.synthesis.astype(np.float64) @ (basis.analysis @ columns)
-    # Each dropped vector had a total amplitude below the step; each kept one is off by at most about a step per entry.
+    # Each dropped vector had a total amplitude below the step; each kept one is off by at most
+    # about a step per entry.
     assert np.sum((again - columns) ** 2) < 2 * n * n * step**2
     assert np.allclose(basis.analysis @ basis.synthesis, np.eye(basis.rank), atol=1e-10)
 

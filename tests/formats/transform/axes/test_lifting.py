@@ -1,4 +1,4 @@
-"""The transform's laws: reconstruction, equal bits of both engines, reduced resolution, white noise, and fixed bits."""
+"""The transform's laws: reconstruction, reduced resolution, fixed bits, and refusals."""
 
 from __future__ import annotations
 
@@ -10,60 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from specs import MIXES, SHAPES, TYPES, axis_of, mixes_and_depths, noise, spec_of
 
-from fhash_formats import native
 from fhash_formats.errors import InputError
-from fhash_formats.transform.axes.basis import fit_basis
 from fhash_formats.transform.axes.lifting import MAX_LOD, Transform
-from fhash_formats.transform.axes.spec import KINDS, WAVELETS, AxisTransform, TransformSpec
-
-SHAPES = [
-    (1, 1, 1, 1),
-    (2, 3, 5, 7),
-    (4, 9, 17, 33),
-    (16, 1, 2, 64),
-    (3, 8, 64, 65),
-    (1, 2, 1, 40),
-    (2, 2, 40, 1),
-    (7, 13, 31, 29),
-]
-MIXES = [
-    ("haar", "5/3", "9/7", "9/7"),
-    ("9/7", "haar", "5/3", "5/3"),
-    ("5/3", "9/7", "haar", "haar"),
-    ("klt", "none", "9/7", "5/3"),
-    ("none", "klt", "haar", "klt"),
-    ("klt", "klt", "klt", "klt"),
-    ("none", "none", "none", "none"),
-    ("9/7", "5/3", "klt", "9/7"),
-]
-TYPES = [np.float32, np.float64]
-
-
-def axis_of(kind: str, depth: int, n: int, step: float = 1e-4) -> AxisTransform:
-    if kind == "klt":
-        columns = np.cumsum(np.random.default_rng(n).standard_normal((n, 2 * n + 9)), axis=0)
-        return AxisTransform(kind=kind, basis=fit_basis(columns @ columns.T, step))
-    return AxisTransform(kind=kind, depth=depth if kind in WAVELETS else 0)
-
-
-def spec_of(
-    kinds: tuple[str, ...], depths: tuple[int, ...], shape: tuple[int, ...], step: float = 1e-4
-) -> TransformSpec:
-    t, z, y, x = (
-        axis_of(kind, depth, n, step) for kind, depth, n in zip(kinds, depths, shape, strict=True)
-    )
-    return TransformSpec(axes=(t, z, y, x))
-
-
-def noise(shape: tuple[int, ...], dtype: Any, seed: int = 0) -> NDArray[Any]:
-    return np.random.default_rng(seed).standard_normal(shape).astype(dtype)
+from fhash_formats.transform.axes.spec import KINDS, AxisTransform, TransformSpec
 
 
 @pytest.mark.parametrize("dtype", TYPES)
-@pytest.mark.parametrize("depth", [1, 3, 7])
-@pytest.mark.parametrize("kinds", MIXES)
+@pytest.mark.parametrize(("kinds", "depth"), mixes_and_depths(MIXES, [1, 3, 7]))
 @pytest.mark.parametrize("shape", SHAPES)
 def test_there_and_back(
     shape: tuple[int, ...], kinds: tuple[str, ...], depth: int, dtype: Any
@@ -75,31 +30,6 @@ def test_there_and_back(
     assert coefficients.shape == again.shape == shape
     assert coefficients.dtype == again.dtype == dtype
     assert np.abs(again - values).max() < (5e-5 if dtype is np.float32 else 2e-12)
-
-
-@pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
-@pytest.mark.parametrize("dtype", TYPES)
-@pytest.mark.parametrize("depths", [(1, 1, 1, 1), (2, 3, 4, 4), (2, 1, 3, 5)])
-@pytest.mark.parametrize("kinds", MIXES)
-@pytest.mark.parametrize("shape", SHAPES)
-def test_both_engines_give_the_same_bits(
-    shape: tuple[int, ...],
-    kinds: tuple[str, ...],
-    depths: tuple[int, ...],
-    dtype: Any,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    spec = spec_of(kinds, depths, shape, step=2.0)
-    values = noise(shape, dtype, 1) * dtype(100)
-    results = []
-    for setting in ("1", "0"):
-        monkeypatch.setenv("FHASH_NATIVE", setting)
-        transform = Transform(spec, shape, dtype)
-        coefficients = transform.forward(values)
-        results.append([coefficients, *(transform.inverse(values, lod) for lod in (0, 1, 2, 5))])
-    for one, other in zip(*results, strict=True):
-        assert one.shape == other.shape
-        assert one.tobytes() == other.tobytes()
 
 
 @settings(deadline=None, max_examples=60)
@@ -117,41 +47,16 @@ def test_any_mix_comes_back(
     assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-10
 
 
-@pytest.mark.parametrize("kinds", MIXES)
-@pytest.mark.parametrize("shape", [(2, 3, 5, 7), (3, 8, 16, 12)])
-def test_norms_are_those_of_the_synthesis_vectors(
-    shape: tuple[int, ...], kinds: tuple[str, ...]
-) -> None:
-    transform = Transform(spec_of(kinds, (1, 2, 3, 3), shape), shape, np.float64)
-    places = np.random.default_rng(2).choice(int(np.prod(shape)), 25, replace=False)
-    for place in places:
-        impulse = np.zeros(shape)
-        impulse.flat[place] = 1.0
-        assert np.sqrt(np.sum(transform.inverse(impulse) ** 2)) == pytest.approx(1.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("kinds", [("haar",) * 4, ("9/7",) * 4])
-def test_white_noise_in_the_coefficients_is_as_large_in_the_values(kinds: tuple[str, ...]) -> None:
-    shape = (8, 16, 32, 32)
-    transform = Transform(spec_of(kinds, (2, 2, 3, 3), shape), shape, np.float64)
-    assert np.var(transform.inverse(noise(shape, np.float64))) == pytest.approx(1.0, rel=0.05)
-    band = np.zeros(shape)
-    band[4:, :4, 16:, :16] = noise((4, 4, 16, 16), np.float64)
-    assert np.sum(transform.inverse(band) ** 2) / band[4:, :4, 16:, :16].size == pytest.approx(
-        1.0, rel=0.15
-    )
-
-
 def test_a_coupled_plane_splits_only_the_low_low_quadrant() -> None:
     shape = (1, 1, 16, 16)
     values = noise(shape, np.float64)
-    one, two = (
+    shallow, deep = (
         Transform(
             spec_of(("none", "none", "9/7", "9/7"), (0, 0, depth, depth), shape), shape, np.float64
         )
         for depth in (1, 2)
     )
-    first, second = one.forward(values), two.forward(values)
+    first, second = shallow.forward(values), deep.forward(values)
     assert np.array_equal(first[:, :, 8:, :], second[:, :, 8:, :])
     assert np.array_equal(first[:, :, :, 8:], second[:, :, :, 8:])
     packet = Transform(
@@ -182,11 +87,7 @@ def test_a_constant_stays_itself_at_every_resolution(
     coefficients = transform.forward(np.full(shape, 3.25, dtype))
     for lod in range(MAX_LOD + 1):
         reduced = transform.inverse(coefficients, lod)
-        assert (
-            reduced.shape
-            == transform.lod_shape(lod)
-            == (shape[0], *(-(-n // 2**lod) for n in shape[1:]))
-        )
+        assert reduced.shape == (shape[0], *(-(-n // 2**lod) for n in shape[1:]))
         assert reduced.dtype == dtype
         assert np.abs(reduced - 3.25).max() < (3e-5 if dtype is np.float32 else 1e-12)
 
@@ -240,28 +141,21 @@ def test_entries_beyond_the_rank_are_zero() -> None:
 def test_a_basis_of_rank_0_gives_zeros(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FHASH_NATIVE", setting)
     shape = (2, 3, 4, 5)
-    none, empty = (
-        AxisTransform(kind="none"),
-        (AxisTransform(kind="klt", basis=fit_basis(np.zeros((n, n)), 1.0)) for n in (3, 5)),
-    )
-    z, x = empty
+    none = AxisTransform(kind="none")
+    z, x = axis_of("klt", 0, 3, step=1e9), axis_of("klt", 0, 5, step=1e9)
     transform = Transform(TransformSpec(axes=(none, z, none, x)), shape)
     assert not transform.forward(noise(shape, np.float32)).any()
     assert not transform.inverse(noise(shape, np.float32)).any()
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1500), (600, 1, 2, 3), (1, 1, 700, 530)])
-def test_long_axes_come_back_and_have_the_norms_of_the_inside(shape: tuple[int, ...]) -> None:
+def test_long_axes_come_back(shape: tuple[int, ...]) -> None:
     transform = Transform(spec_of(("9/7",) * 4, (4,) * 4, shape), shape, np.float64)
     values = noise(shape, np.float64)
     assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-11
-    middle = tuple(n * 3 // 4 if n > 512 else 0 for n in shape)  # inside the finest high band
-    impulse = np.zeros(shape)
-    impulse[middle] = 1.0
-    assert np.sum(transform.inverse(impulse) ** 2) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_the_input_is_left_alone_and_may_lie_anyhow() -> None:
+def test_the_input_is_unchanged_and_may_have_any_strides() -> None:
     shape = (3, 4, 6, 8)
     transform = Transform(spec_of(("haar", "klt", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
     values = noise(shape, np.float32)
@@ -283,8 +177,8 @@ def test_threads_share_a_transform() -> None:
         together = list(pool.map(lambda tile: transform.inverse(transform.forward(tile), 1), tiles))
     fresh = Transform(transform.spec, shape)
     assert all(
-        np.array_equal(one, fresh.inverse(fresh.forward(tile), 1))
-        for one, tile in zip(together, tiles, strict=True)
+        np.array_equal(result, fresh.inverse(fresh.forward(tile), 1))
+        for result, tile in zip(together, tiles, strict=True)
     )
 
 
@@ -296,30 +190,8 @@ def test_hostile_coefficients_raise_nothing(setting: str, monkeypatch: pytest.Mo
     transform = Transform(spec_of(("haar", "none", "9/7", "9/7"), (1, 0, 2, 2), shape), shape)
     coefficients = np.full(shape, np.float32(3e38))
     coefficients[0, 0, 0, :3] = np.nan, np.inf, -np.inf
-    for lod in (0, 1, 3):
-        assert transform.inverse(coefficients, lod).shape == transform.lod_shape(lod)
-
-
-@pytest.mark.parametrize("setting", ["1", "0"])
-def test_the_bits_of_the_transform_are_fixed(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file written today must decode to the same bits for ever, so these digests may not change within a format version."""
-    monkeypatch.setenv("FHASH_NATIVE", setting)
-    shape = (3, 5, 13, 18)
-    integers = (np.arange(np.prod(shape), dtype=np.int64) * 7919 % 1009 - 504).reshape(shape)
-    digests = {}
-    for kinds in (("haar", "5/3", "9/7", "9/7"), ("9/7", "none", "haar", "5/3")):
-        for dtype in TYPES:
-            transform = Transform(spec_of(kinds, (1, 2, 2, 2), shape), shape, dtype)
-            digest = hashlib.sha256(transform.forward(integers.astype(dtype)).tobytes())
-            for lod in (0, 1, 3):
-                digest.update(transform.inverse(integers.astype(dtype), lod).tobytes())
-            digests[kinds[0], np.dtype(dtype).name] = digest.hexdigest()[:16]
-    assert digests == {
-        ("haar", "float32"): "133040732743fa0a",
-        ("haar", "float64"): "8ca439a2a86d2789",
-        ("9/7", "float32"): "ea64a3b5d62271cf",
-        ("9/7", "float64"): "07f0e9ae04a1cccc",
-    }
+    for lod, reduced in ((0, shape), (1, (2, 2, 4, 4)), (3, (2, 1, 1, 1))):
+        assert transform.inverse(coefficients, lod).shape == reduced
 
 
 @pytest.mark.parametrize(
@@ -349,3 +221,25 @@ def test_other_arrays_are_refused() -> None:
         transform.forward(np.zeros((1, 1, 2, 2)))
     with pytest.raises(InputError, match="float32 of shape"):
         transform.inverse(np.zeros((1, 1, 2, 3), np.float32))
+
+
+@pytest.mark.parametrize("setting", ["1", "0"])
+def test_the_bits_of_the_transform_are_fixed(setting: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file must decode to the same bits for ever: the digests hold for the format version."""
+    monkeypatch.setenv("FHASH_NATIVE", setting)
+    shape = (3, 5, 13, 18)
+    integers = (np.arange(np.prod(shape), dtype=np.int64) * 7919 % 1009 - 504).reshape(shape)
+    digests = {}
+    for kinds in (("haar", "5/3", "9/7", "9/7"), ("9/7", "none", "haar", "5/3")):
+        for dtype in TYPES:
+            transform = Transform(spec_of(kinds, (1, 2, 2, 2), shape), shape, dtype)
+            digest = hashlib.sha256(transform.forward(integers.astype(dtype)).tobytes())
+            for lod in (0, 1, 3):
+                digest.update(transform.inverse(integers.astype(dtype), lod).tobytes())
+            digests[kinds[0], np.dtype(dtype).name] = digest.hexdigest()[:16]
+    assert digests == {
+        ("haar", "float32"): "133040732743fa0a",
+        ("haar", "float64"): "8ca439a2a86d2789",
+        ("9/7", "float32"): "ea64a3b5d62271cf",
+        ("9/7", "float64"): "07f0e9ae04a1cccc",
+    }

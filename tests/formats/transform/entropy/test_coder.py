@@ -15,7 +15,7 @@ from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.basis import fit_basis
 from fhash_formats.transform.axes.spec import WAVELETS, AxisTransform, TransformSpec
-from fhash_formats.transform.entropy import coder_portable, prior
+from fhash_formats.transform.entropy import mixing_portable, prior
 from fhash_formats.transform.entropy.coder import (
     MAX_INTEGER,
     Encoded,
@@ -44,8 +44,8 @@ def use(engine: str, patch: pytest.MonkeyPatch) -> None:
         return
     patch.setenv("FHASH_NATIVE", "0")
     if engine == "plain":
-        patch.setattr(coder_portable, "_RUN", [None])
-    elif coder_portable._compiled() is None:
+        patch.setattr(mixing_portable, "_numba", lambda: None)
+    elif mixing_portable._numba() is None:
         pytest.skip("numba is not installed")
 
 
@@ -431,11 +431,13 @@ def before_rounding() -> dict[str, NDArray[np.float64]]:
     p = (np.arange(65536) + 0.5) / 65536
     stretch = np.log(p / (1 - p)) * 256
     return {
-        "stretch": stretch[np.abs(stretch) < coder_portable.STRETCH_MAX + 1] + 0.5,
+        "stretch": stretch[np.abs(stretch) < mixing_portable.STRETCH_MAX + 1] + 0.5,
         "squash": 65536
         / (
             1
-            + np.exp(-np.arange(-coder_portable.STRETCH_MAX, coder_portable.STRETCH_MAX + 1) / 256)
+            + np.exp(
+                -np.arange(-mixing_portable.STRETCH_MAX, mixing_portable.STRETCH_MAX + 1) / 256
+            )
         )
         + 0.5,
         "cost": -np.log2(np.arange(1, 65537) / 65536) * 2048 + 0.5,
@@ -458,14 +460,14 @@ def test_the_tables_are_those_values_rounded() -> None:
     }
     for name, rule in rounded.items():
         assert np.array_equal(
-            getattr(coder_portable._ARRAYS, name)[-len(before_rounding()[name]) :],
+            getattr(mixing_portable.ARRAYS, name)[-len(before_rounding()[name]) :],
             rule(before_rounding()[name]),
         )
     assert np.array_equal(
         prior._PROBABILITIES, np.clip(np.floor(before_rounding()["probabilities"]), 1, 65535)
     )
     assert (
-        coder_portable._ARRAYS.stretch.min()
-        == -coder_portable._ARRAYS.stretch.max()
-        == -coder_portable.STRETCH_MAX
+        mixing_portable.ARRAYS.stretch.min()
+        == -mixing_portable.ARRAYS.stretch.max()
+        == -mixing_portable.STRETCH_MAX
     )

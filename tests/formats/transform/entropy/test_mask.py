@@ -14,7 +14,7 @@ import pytest
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.entropy import coder_portable
+from fhash_formats.transform.entropy import mixing_portable
 from fhash_formats.transform.entropy.mask import (
     decode_mask,
     encode_mask,
@@ -22,13 +22,8 @@ from fhash_formats.transform.entropy.mask import (
     pack_mask_prior,
 )
 from fhash_formats.transform.entropy.mask_levels import BOUNDS, MAX_SCORE, MaskLevels
-from fhash_formats.transform.tile.encoding import (
-    CodedTile,
-    decode_tile,
-    decode_tile_mask,
-    encode_tile,
-    exact_tile,
-)
+from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
+from fhash_formats.transform.tile.encoding import CodedTile, Coding, encode_tile, exact_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
 SHAPES = [
@@ -52,8 +47,8 @@ def form(request: pytest.FixtureRequest) -> Iterator[str]:
         elif native.library() is None:
             pytest.skip("the native library was not built here")
         if request.param == "plain":
-            patch.setattr(coder_portable, "_RUN", [None])
-        elif request.param == "compiled" and coder_portable._compiled() is None:
+            patch.setattr(mixing_portable, "_numba", lambda: None)
+        elif request.param == "compiled" and mixing_portable._numba() is None:
             pytest.skip("numba cannot be imported here")
         yield request.param
 
@@ -235,7 +230,7 @@ def tile(dtype: str = "f4") -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
 @pytest.mark.parametrize("own", [False, True])
 def test_a_tile_says_what_is_occupied(dtype: str, options: dict[str, Any], own: bool) -> None:
     values, care = tile(dtype)
-    coded = encode_tile(values, SETTINGS, care=care, own=own, **options)
+    coded = encode_tile(values, SETTINGS, Coding(own_settings=own, **options), in_coreset=care)
     settings = None if own else SETTINGS
     decoded, mask = decode_tile_mask(coded.data, SHAPE, dtype, settings)
     np.testing.assert_array_equal(mask, care)
@@ -252,7 +247,7 @@ def test_a_tile_says_what_is_occupied(dtype: str, options: dict[str, Any], own: 
 
 
 def coded_with(occupied: npt.NDArray[np.bool_] | None) -> CodedTile:
-    return encode_tile(tile()[0], SETTINGS, care=occupied)
+    return encode_tile(tile()[0], SETTINGS, in_coreset=occupied)
 
 
 def test_all_or_nothing_costs_next_to_nothing() -> None:
@@ -278,12 +273,15 @@ def test_what_is_not_finite_is_not_occupied_and_comes_back() -> None:
     values, care = tile()
     values[0, 0, :3], values[1, 2, 5, 6:9] = np.nan, [np.inf, -np.inf, np.nan]
     for options in ({}, {"error": 0.5}):
-        coded = encode_tile(values, SETTINGS, care=care, **options)
+        coded = encode_tile(values, SETTINGS, Coding(**options), in_coreset=care)
         decoded, mask = decode_tile_mask(coded.data, SHAPE, "f4", SETTINGS)
         np.testing.assert_array_equal(mask, care & np.isfinite(values))
         np.testing.assert_array_equal(decoded[~np.isfinite(values)], values[~np.isfinite(values)])
     dropped = decode_tile(
-        encode_tile(values, SETTINGS, care=care, keep_missing=False).data, SHAPE, "f4", SETTINGS
+        encode_tile(values, SETTINGS, Coding(keep_missing=False), in_coreset=care).data,
+        SHAPE,
+        "f4",
+        SETTINGS,
     )
     np.testing.assert_array_equal(np.isnan(dropped), ~(care & np.isfinite(values)))
 
@@ -304,7 +302,7 @@ def test_less_detail_needs_no_mask() -> None:
 
 
 def test_a_mask_needs_settings_that_know_of_it() -> None:
-    with pytest.raises(DamagedFileError, match="know nothing"):
+    with pytest.raises(DamagedFileError, match="no mask levels"):
         decode_tile(coded_with(tile()[1]).data, SHAPE, "f4", replace(SETTINGS, mask=None))
 
 
@@ -315,9 +313,11 @@ def test_damage_to_a_tile_with_a_mask_is_found(name: str) -> None:
     part = tuple(slice(0, n) for n in small)
     values, care = values[part].copy(), care[part]
     data = {
-        "mask": encode_tile(values, SETTINGS, care=care, own=True).data,
+        "mask": encode_tile(values, SETTINGS, Coding(own_settings=True), in_coreset=care).data,
         "exact": exact_tile(values, occupied=care).data,
-        "empty": encode_tile(values, SETTINGS, care=np.zeros(small, bool), own=True).data,
+        "empty": encode_tile(
+            values, SETTINGS, Coding(own_settings=True), in_coreset=np.zeros(small, bool)
+        ).data,
     }[name]
     sound, mask = decode_tile_mask(data, small, "f4")
     damaged = [data[:n] for n in range(len(data))] + [data + b"\0", data + b"\x01a"]

@@ -14,7 +14,7 @@ from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.entropy import predict
 from fhash_formats.transform.entropy.coder import state_arguments
 from fhash_formats.transform.entropy.predict import (
-    LARGEST,
+    MAX_PREDICTED_INTEGER,
     decode_predicted,
     encode_predicted,
     integers_of,
@@ -70,7 +70,9 @@ def test_what_was_coded_comes_back(shape, levels, order, reach):
 
 @pytest.mark.parametrize("scale", [0.0, 1.0, 1e4, 3e7])
 def test_from_nothing_to_the_largest(scale):
-    integers = np.clip(_smooth((3, 5, 6, 21), scale), -LARGEST, LARGEST).astype(np.int32)
+    integers = np.clip(
+        _smooth((3, 5, 6, 21), scale), -MAX_PREDICTED_INTEGER, MAX_PREDICTED_INTEGER
+    ).astype(np.int32)
     predictor = _predictor()
     np.testing.assert_array_equal(
         decode_predicted(encode_predicted(integers, None, predictor)[0], integers.shape, predictor),
@@ -80,7 +82,7 @@ def test_from_nothing_to_the_largest(scale):
 
 def test_both_ends_of_the_numbers():
     integers = np.random.default_rng(1).choice(
-        np.array([-LARGEST, 0, LARGEST], dtype=np.int32), (3, 5, 6, 7)
+        np.array([-MAX_PREDICTED_INTEGER, 0, MAX_PREDICTED_INTEGER], dtype=np.int32), (3, 5, 6, 7)
     )
     predictor = replace(
         _predictor(),
@@ -157,7 +159,7 @@ def test_hostile_bytes_end_the_same_way_everywhere(monkeypatch):
             monkeypatch.setenv("FHASH_NATIVE", setting)
             try:
                 integers = decode_predicted(data, shape, predictor)
-                assert np.abs(integers.astype(np.int64)).max() <= LARGEST
+                assert np.abs(integers.astype(np.int64)).max() <= MAX_PREDICTED_INTEGER
                 ends.append(integers.tobytes())
             except DamagedFileError:
                 ends.append(b"damaged")

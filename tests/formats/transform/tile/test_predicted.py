@@ -1,29 +1,34 @@
-"""Tiles that are coded by prediction: the bound, what is missing, levels of detail, masks and hostile bytes."""
+"""Tiles coded by prediction: bound, missing values, levels of detail, masks, hostile bytes."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 import pytest
+from specs import spec_of
 
 from fhash_formats.errors import DamagedFileError
-from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.entropy.predictor import Predictor, passes_of
-from fhash_formats.transform.tile.encoding import decode_tile, decode_tile_mask, encode_tile
+from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
+from fhash_formats.transform.tile.encoding import Coding, encode_tile
+from fhash_formats.transform.tile.sections import EXACT
 from fhash_formats.transform.tile.settings import TileSettings
 
-NONE = AxisTransform(kind="none")
+Values = npt.NDArray[Any]
+
 SHAPE = (3, 5, 9, 14)
-EXACT = 8
 
 
-def _settings(values, error, **more):
+def _settings(values: Values, error: float, **more: Any) -> TileSettings:
     finite = values[np.isfinite(values)].astype(np.float64)
-    whole = values.dtype.kind in "iu"
-    rounding = 0.0 if whole else float(np.finfo(values.dtype).eps) / 2 * np.abs(finite).max()
-    step = 2.0 * int(error) + 1.0 if whole else 2 * float(error * (1 - 1e-6) - rounding)
+    integers = values.dtype.kind in "iu"
+    rounding = 0.0 if integers else float(np.finfo(values.dtype).eps) / 2 * np.abs(finite).max()
+    step = 2.0 * int(error) + 1.0 if integers else 2 * float(error * (1 - 1e-6) - rounding)
     levels, order = (1, 2, 2, 2), (0, 3, 2, 1)
-    count = sum(len(part.taps) for part in passes_of(levels, order, 1))
+    count = sum(len(step.taps) for step in passes_of(levels, order, 1))
     weights = tuple(np.random.default_rng(0).integers(-200, 200, count).tolist())
     predictor = Predictor(
         step=step,
@@ -34,7 +39,7 @@ def _settings(values, error, **more):
         weights=weights,
     )
     return TileSettings(
-        transform=TransformSpec(axes=(NONE,) * 4),
+        transform=spec_of(("none",) * 4, 0, SHAPE),
         step=step,
         center=predictor.origin,
         low=float(finite.min()),
@@ -46,13 +51,13 @@ def _settings(values, error, **more):
     )
 
 
-def _values(dtype="float32", shape=SHAPE):
-    axes = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
+def _values(dtype: str = "float32") -> Values:
+    axes = np.meshgrid(*(np.arange(n) for n in SHAPE), indexing="ij")
     values = (
         60
         + 25 * np.sin(axes[3] / 3 + axes[0])
         + 20 * np.cos(axes[2] / 4)
-        + np.random.default_rng(1).normal(0, 3, shape)
+        + np.random.default_rng(1).normal(0, 3, SHAPE)
     )
     return np.clip(values, 1, 120).astype(dtype)
 
@@ -74,10 +79,10 @@ def _values(dtype="float32", shape=SHAPE):
     ],
 )
 @pytest.mark.parametrize("error", [0.5, 2.0, 7.3])
-def test_the_bound_is_kept_in_every_type(dtype, error):
+def test_the_bound_is_kept_in_every_type(dtype: str, error: float) -> None:
     values = _values(dtype)
     settings = _settings(values, error)
-    coded = encode_tile(values, settings, error=error)
+    coded = encode_tile(values, settings, Coding(error=error))
     assert not coded.data[0] & EXACT
     decoded = decode_tile(coded.data, SHAPE, dtype, settings)
     assert decoded.dtype == values.dtype
@@ -86,51 +91,55 @@ def test_the_bound_is_kept_in_every_type(dtype, error):
     assert len(coded.data) < values.size
 
 
-def test_numbers_that_float64_cannot_hold_are_stored_exactly():
+def test_numbers_that_float64_cannot_hold_are_stored_exactly() -> None:
     values = (np.int64(2**62) + np.arange(np.prod(SHAPE)).reshape(SHAPE)).astype(np.int64)
-    coded = encode_tile(values, _settings(values, 1.0), error=1.0)
+    coded = encode_tile(values, _settings(values, 1.0), Coding(error=1.0))
     assert coded.data[0] & EXACT
     np.testing.assert_array_equal(
         decode_tile(coded.data, SHAPE, "int64", _settings(values, 1.0)), values
     )
 
 
-def test_a_constant_tile():
+def test_a_constant_tile_takes_few_bytes() -> None:
     values = np.full(SHAPE, 7.25, dtype=np.float32)
     settings = _settings(values, 0.1)
-    coded = encode_tile(values, settings, error=0.1)
+    coded = encode_tile(values, settings, Coding(error=0.1))
     assert len(coded.data) < 30
     assert np.abs(decode_tile(coded.data, SHAPE, "float32", settings) - values).max() <= 0.1
 
 
-def test_missing_values_come_back():
+def test_missing_values_come_back() -> None:
     values = _values()
     values[1, 2, 3, 4:9] = np.nan
     values[0, 0, 0, 0], values[2, 1, 0, 3] = np.inf, -np.inf
     settings = _settings(values, 1.0)
-    decoded = decode_tile(encode_tile(values, settings, error=1.0).data, SHAPE, "float32", settings)
+    decoded = decode_tile(
+        encode_tile(values, settings, Coding(error=1.0)).data, SHAPE, "float32", settings
+    )
     finite = np.isfinite(values)
     np.testing.assert_array_equal(decoded[~finite], values[~finite])
     assert np.abs(decoded[finite] - values[finite]).max() <= 1.0
 
 
-def test_with_its_own_settings_and_a_mask():
+def test_a_stream_with_its_own_settings_and_a_mask() -> None:
     values = _values()
-    care = np.random.default_rng(5).random(SHAPE) < 0.4
+    in_coreset = np.random.default_rng(5).random(SHAPE) < 0.4
     settings = _settings(values, 0.5, mask=MaskLevels())
-    coded = encode_tile(values, settings, care=care, error=0.5, own=True)
+    coded = encode_tile(
+        values, settings, Coding(error=0.5, own_settings=True), in_coreset=in_coreset
+    )
     decoded, mask = decode_tile_mask(coded.data, SHAPE, "float32")
-    np.testing.assert_array_equal(mask, care)
-    assert np.isnan(decoded[~care]).all()
-    assert np.abs(decoded - values)[care].max() <= 0.5
+    np.testing.assert_array_equal(mask, in_coreset)
+    assert np.isnan(decoded[~in_coreset]).all()
+    assert np.abs(decoded - values)[in_coreset].max() <= 0.5
     assert TileSettings.from_dict(settings.to_dict()) == settings
 
 
 @pytest.mark.parametrize("lod", [1, 2])
-def test_a_level_of_detail_is_every_other_vertex(lod):
+def test_a_level_of_detail_is_every_other_vertex(lod: int) -> None:
     values = _values()
     settings = _settings(values, 0.5)
-    data = encode_tile(values, settings, error=0.5).data
+    data = encode_tile(values, settings, Coding(error=0.5)).data
     every = slice(None, None, 1 << lod)
     np.testing.assert_array_equal(
         decode_tile(data, SHAPE, "float32", settings, lod=lod),
@@ -138,10 +147,10 @@ def test_a_level_of_detail_is_every_other_vertex(lod):
     )
 
 
-def test_every_flipped_or_cut_byte_is_noticed():
+def test_every_flipped_or_cut_byte_is_noticed() -> None:
     values = _values()
     settings = _settings(values, 2.0)
-    data = encode_tile(values, settings, error=2.0).data
+    data = encode_tile(values, settings, Coding(error=2.0)).data
     generator = np.random.default_rng(6)
     for at in (*range(8), *generator.integers(8, len(data), 30).tolist()):
         for changed in (
@@ -152,10 +161,10 @@ def test_every_flipped_or_cut_byte_is_noticed():
                 decode_tile(changed, SHAPE, "float32", settings)
 
 
-def test_settings_without_a_predictor_are_refused():
+def test_settings_without_a_predictor_are_refused() -> None:
     values = _values()
     settings = _settings(values, 2.0)
-    data = encode_tile(values, settings, error=2.0).data
+    data = encode_tile(values, settings, Coding(error=2.0)).data
     other = TileSettings(transform=settings.transform, step=1.0, center=0.0, low=0.0, high=1.0)
     with pytest.raises(DamagedFileError, match="prediction"):
         decode_tile(data, SHAPE, "float32", other)

@@ -1,8 +1,9 @@
-"""Passes over values: the native ones and the portable ones give the same bits, wherever they are hard to get right."""
+"""Passes over values: native and portable ones give the same bits, also for difficult values."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -31,10 +32,10 @@ def values(dtype: npt.DTypeLike, seed: int = 0, special: bool = True) -> Values:
     rng, kind = np.random.default_rng(seed), np.dtype(dtype)
     if kind.kind != "f":
         limits = np.iinfo(kind)
-        found = rng.integers(limits.min, limits.max, SHAPE, dtype=kind, endpoint=True)
-        found.flat[:3] = limits.min, limits.max, 0
-        return found
-    found = rng.normal(0, 2, SHAPE).astype(kind)
+        integers = rng.integers(limits.min, limits.max, SHAPE, dtype=kind, endpoint=True)
+        integers.flat[:3] = limits.min, limits.max, 0
+        return integers
+    result = rng.normal(0, 2, SHAPE).astype(kind)
     if special:
         limits_of = np.finfo(kind)
         hard = [
@@ -51,50 +52,50 @@ def values(dtype: npt.DTypeLike, seed: int = 0, special: bool = True) -> Values:
             2.5,
             -0.5,
         ]
-        found.reshape(-1)[100 : 100 + 144] = np.repeat(np.array(hard, kind), 12)
-        found.reshape(-1)[300:312] = np.array(hard, kind)
-    return found
+        result.reshape(-1)[100 : 100 + 144] = np.repeat(np.array(hard, kind), 12)
+        result.reshape(-1)[300:312] = np.array(hard, kind)
+    return result
 
 
 def both(function: Callable[[], Any], patch: pytest.MonkeyPatch) -> Any:
-    """The result, which the native and the portable pass must agree on."""
+    """The result of the native pass, asserted to equal that of the portable given bit by bit."""
     if native.library() is None:
         pytest.skip("the native library is not built or not wanted")
-    one = function()
+    native_result = function()
     with patch.context() as portable:
         portable.setenv("FHASH_NATIVE", "0")
-        other = function()
-    assert _bytes(one) == _bytes(other)
-    return one
+        portable_result = function()
+    assert _bytes(native_result) == _bytes(portable_result)
+    return native_result
 
 
 def _bytes(result: Any) -> Any:
     if isinstance(result, tuple):
-        return [_bytes(part) for part in result]
+        return [_bytes(member) for member in result]
     return (
         (result.dtype, result.shape, result.tobytes()) if isinstance(result, np.ndarray) else result
     )
 
 
-def marks(seed: int = 3) -> npt.NDArray[np.bool_]:
+def mask(seed: int = 3) -> npt.NDArray[np.bool_]:
     return np.random.default_rng(seed).random(SHAPE) < 0.7
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
-@pytest.mark.parametrize("counts", [None, marks()])
-def test_bounds(dtype: str, counts: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = values(dtype, special=False)
+@pytest.mark.parametrize("counted", [None, mask()])
+def test_bounds(dtype: str, counted: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = values(dtype, special=False)
     step = np.dtype(dtype).type(0.25)
-    other = one + step
-    error = float(np.abs(one.astype("f8") - other.astype("f8")).max())
-    assert both(lambda: within(one, other, np.nextafter(error, 1), counts), monkeypatch)
-    assert not both(lambda: within(one, other, 0.24, counts), monkeypatch)
+    other = given + step
+    error = float(np.abs(given.astype("f8") - other.astype("f8")).max())
+    assert both(lambda: within(given, other, np.nextafter(error, 1), counted), monkeypatch)
+    assert not both(lambda: within(given, other, 0.24, counted), monkeypatch)
     at = (1, 4, 6, 310)
     for bad in (np.nan, np.inf):
-        other = one.copy()
+        other = given.copy()
         other[at] = bad
-        expected = counts is not None and not counts[at]
-        assert both(lambda other=other: within(one, other, 1.0, counts), monkeypatch) == expected  # type: ignore[misc]
+        expected = counted is not None and not counted[at]
+        assert both(partial(within, given, other, 1.0, counted), monkeypatch) == expected
     special = values(dtype)
     assert not both(lambda: within(special, special, 0.0), monkeypatch)  # NaN is near nothing
     plain = np.where(np.isnan(special), 0, special).astype(dtype)
@@ -102,33 +103,43 @@ def test_bounds(dtype: str, counts: Any, monkeypatch: pytest.MonkeyPatch) -> Non
     assert both(lambda: within(plain, plain[::-1].copy(), float("inf")), monkeypatch)
 
 
+def test_within_is_strict_to_the_last_bit() -> None:
+    values = np.array([2**63 - 1, 0, -(2**63)])
+    assert within(values, np.array([-(2**63), 0, -(2**63)]), float(2**64))
+    assert not within(values, np.array([-(2**63), 0, -(2**63)]), float(2**63))
+    assert within(np.array([5]), np.array([8]), 3.0)
+    assert not within(np.array([5]), np.array([8]), 2.999)
+    assert not within(np.array([1.0]), np.array([np.nan]), 1e300)
+    assert not within(np.array([0.1]), np.array([0.4]), 0.3)
+
+
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
 @pytest.mark.parametrize("base", ["f4", "f8"])
 @pytest.mark.parametrize("quantum", [0.5, 0.1, 3.0, 1e-3])
-@pytest.mark.parametrize("counts", [None, marks()])
+@pytest.mark.parametrize("counted", [None, mask()])
 def test_residuals(
-    dtype: str, base: str, quantum: float, counts: Any, monkeypatch: pytest.MonkeyPatch
+    dtype: str, base: str, quantum: float, counted: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one, other = values(dtype, 1, special=False), values(base, 2, special=False)
+    given, other = values(dtype, 1, special=False), values(base, 2, special=False)
     # Halves are rounded to even, and an error of half a quantum is none.
-    one[0, 0, 0, :40] = np.arange(40) * np.dtype(dtype).type(quantum / 2)
+    given[0, 0, 0, :40] = np.arange(40) * np.dtype(dtype).type(quantum / 2)
     other[0, 0, 0, :40] = 0
-    found = both(lambda: residual_of(one, other, counts, quantum, LARGEST), monkeypatch)
-    assert found is not None
-    assert found[1] == np.count_nonzero(found[0]) > 0
+    result = both(lambda: residual_of(given, other, counted, quantum, LARGEST), monkeypatch)
+    assert result is not None
+    assert result[1] == np.count_nonzero(result[0]) > 0
     for out in ("f4", "f8", "f2", "i2"):
-        both(lambda out=out: corrected(other, found[0], quantum, np.dtype(out)), monkeypatch)  # type: ignore[misc]
-    rest = one.astype("f8") - corrected(other, found[0], quantum, np.dtype("f8"))
-    assert np.abs(rest if counts is None else rest[counts]).max() <= quantum / 2 * (1 + 1e-9)
+        both(partial(corrected, other, result[0], quantum, np.dtype(out)), monkeypatch)
+    rest = given.astype("f8") - corrected(other, result[0], quantum, np.dtype("f8"))
+    assert np.abs(rest if counted is None else rest[counted]).max() <= quantum / 2 * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
-def test_residuals_that_do_not_fit(dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    one, zeros = values(dtype), np.zeros(SHAPE, dtype)
-    assert both(lambda: residual_of(one, zeros, None, 0.5, LARGEST), monkeypatch) is None
-    counts = np.isfinite(one) & (np.abs(one) < 1e3)
-    assert both(lambda: residual_of(one, zeros, counts, 0.5, LARGEST), monkeypatch)[1] > 0
-    assert both(lambda: residual_of(one, zeros, counts, 0.0, LARGEST), monkeypatch) is None
+def test_residuals_beyond_the_largest_integer(dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    given, zeros = values(dtype), np.zeros(SHAPE, dtype)
+    assert both(lambda: residual_of(given, zeros, None, 0.5, LARGEST), monkeypatch) is None
+    counted = np.isfinite(given) & (np.abs(given) < 1e3)
+    assert both(lambda: residual_of(given, zeros, counted, 0.5, LARGEST), monkeypatch)[1] > 0
+    assert both(lambda: residual_of(given, zeros, counted, 0.0, LARGEST), monkeypatch) is None
     last = np.zeros(SHAPE, dtype)
     last[-1, -1, -1, -1] = 1000
     assert both(lambda: residual_of(last, zeros, None, 1.0, 999), monkeypatch) is None
@@ -137,15 +148,15 @@ def test_residuals_that_do_not_fit(dtype: str, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("dtype", TYPES)
 def test_every_type_has_residuals_and_bounds(dtype: str) -> None:
-    one = values(dtype, special=False)
-    base = one.astype("f8") * (1 - 1e-3) + 0.3
-    found = residual_of(one, base, None, 2.0 ** (np.dtype(dtype).itemsize * 4), LARGEST)
-    assert found is not None
-    decoded = corrected(base, found[0], 2.0 ** (np.dtype(dtype).itemsize * 4), np.dtype(dtype))
+    given = values(dtype, special=False)
+    base = given.astype("f8") * (1 - 1e-3) + 0.3
+    result = residual_of(given, base, None, 2.0 ** (np.dtype(dtype).itemsize * 4), LARGEST)
+    assert result is not None
+    decoded = corrected(base, result[0], 2.0 ** (np.dtype(dtype).itemsize * 4), np.dtype(dtype))
     assert decoded.dtype == dtype
-    assert within(one, decoded, 2.0**64)
-    assert within(one, one, 0.0)
-    assert not within(one, one[::-1].copy(), 0.0)
+    assert within(given, decoded, 2.0**64)
+    assert within(given, given, 0.0)
+    assert not within(given, given[::-1].copy(), 0.0)
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
@@ -159,30 +170,32 @@ def test_clipping(
 ) -> None:
     with np.errstate(over="ignore"):
         clipped = both(lambda: clip_shifted(values(dtype), center, low, high), monkeypatch)
-        known = clipped[~np.isnan(clipped)]
-        assert known.min() >= np.dtype(dtype).type(low)
-        assert known.max() <= np.dtype(dtype).type(high)
+        numbers = clipped[~np.isnan(clipped)]
+        assert numbers.min() >= np.dtype(dtype).type(low)
+        assert numbers.max() <= np.dtype(dtype).type(high)
     assert np.isnan(clipped).sum() == np.isnan(values(dtype)).sum()
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
-@pytest.mark.parametrize("counts", [None, marks()])
-def test_what_is_free(dtype: str, counts: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("counted", [None, mask()])
+def test_free_values_are_replaced_and_counted(
+    dtype: str, counted: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rebuilt = values(dtype, 5)
 
     def run() -> tuple[int, Values]:
         target = values(dtype, 4)
-        return free_values(target, rebuilt, counts, -1.0, 1.5), target
+        return free_values(target, rebuilt, counted, -1.0, 1.5), target
 
-    found, target = both(run, monkeypatch)
+    total, target = both(run, monkeypatch)
     before = values(dtype, 4)
     free = ((before <= -1) & (rebuilt < before)) | ((before >= 1.5) & (rebuilt > before))
-    free = free if counts is None else free | ~counts
-    assert found == free.sum() > 0
+    free = free if counted is None else free | ~counted
+    assert total == free.sum() > 0
     assert np.array_equal(target, np.where(free, rebuilt, before), equal_nan=True)
 
 
-def test_nothing_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
     none = np.zeros((0, 1, 2, 3), np.float32)
     assert both(lambda: within(none, none, 0.0), monkeypatch)
     assert both(lambda: residual_of(none, none, None, 1.0, LARGEST), monkeypatch)[1] == 0
@@ -200,10 +213,10 @@ def test_nothing_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_finite() -> None:
     assert all_finite(np.arange(5))
     for bad in (np.nan, np.inf, -np.inf):
-        one = np.zeros(3 * elementwise.PIECE + 5, np.float32)
-        assert all_finite(one)
-        one[-1] = bad
-        assert not all_finite(one)
+        given = np.zeros(3 * elementwise.PIECE + 5, np.float32)
+        assert all_finite(given)
+        given[-1] = bad
+        assert not all_finite(given)
 
 
 def test_casts_stay_in_the_type() -> None:
@@ -214,9 +227,9 @@ def test_casts_stay_in_the_type() -> None:
 
 
 def test_arrays_that_are_not_in_order() -> None:
-    one = values("f4", special=False)
-    turned = np.asfortranarray(one)
-    assert within(turned, one, 0.0)
-    found = residual_of(turned, one + np.float32(1), None, 0.5, LARGEST)
-    assert found is not None
-    assert (found[0] == -2).all()
+    given = values("f4", special=False)
+    turned = np.asfortranarray(given)
+    assert within(turned, given, 0.0)
+    result = residual_of(turned, given + np.float32(1), None, 0.5, LARGEST)
+    assert result is not None
+    assert (result[0] == -2).all()

@@ -1,20 +1,18 @@
-"""Names and attributes in files; even spacing; chunks; signals."""
+"""Names and attributes in the forms that files can hold."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
-import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
+from labelled_region import COORDS, DATA, labelled_region
 
+from fhash_formats import save_region
 from fhash_formats.series import Coordinate
-from fhash_formats.support.interrupts import signals_held
 from fhash_formats.writers.common.labels import (
     coordinate_attributes,
     hdf5_value,
@@ -23,8 +21,6 @@ from fhash_formats.writers.common.labels import (
     variable_attributes,
 )
 from fhash_formats.writers.common.region import Region
-from fhash_formats.writers.common.spacing import even_spacing
-from fhash_formats.writers.common.writer import CHUNK_BYTES, chunk_shape
 
 
 def region(
@@ -33,7 +29,6 @@ def region(
     names: str = "tzyx",
     **changes: Any,
 ) -> Region:
-    # One value that is shared: a test of chunks needs long axes and no memory.
     coords = {
         axis: Coordinate(name=name, values=np.zeros(n))
         for axis, name, n in zip("tzyx", names, shape, strict=True)
@@ -187,8 +182,6 @@ def test_attributes_are_json_and_what_cannot_be_is_left_out() -> None:
     ],
 )
 def test_attributes_of_hdf5(tmp_path: Path, value: Any, expected: Any) -> None:
-    import h5py
-
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.attrs["a"] = hdf5_value(value)
         read = file.attrs["a"]
@@ -196,92 +189,31 @@ def test_attributes_of_hdf5(tmp_path: Path, value: Any, expected: Any) -> None:
 
 
 def test_a_long_list_fits_into_hdf5(tmp_path: Path) -> None:
-    import h5py
-
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.attrs["a"] = hdf5_value(list(range(20000)))
         assert json.loads(file.attrs["a"]) == list(range(20000))
 
 
-@pytest.mark.parametrize(
-    ("values", "step"),
-    [
-        ([3.0], 1.0),
-        ([0, 0.5, 1], 0.5),
-        ([1, 0.5, 0], -0.5),
-        (np.linspace(-7.3, 11.1, 1001), 18.4 / 1000),
-        (np.linspace(50, 60, 101).astype("f4"), 0.1),  # as a file that keeps float32 would give it
-        ([0, 1, 3], None),
-        ([0, 1, 2.00001], None),
-        ([0, 1, 1.0000001 * 2], 1.0000001),
-        ([2, 2], None),
-        ([0, 1, 0], None),
-        ([0, np.nan, 2], None),
-        ([0, np.inf], None),
-        ([np.nan], None),
-    ],
-)
-def test_even_spacing(values: Any, step: float | None) -> None:
-    found = even_spacing(np.asarray(values, dtype=np.float64))
-    assert found == (None if step is None else pytest.approx(step, rel=1e-6))
+@pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr"])
+def test_names_that_a_file_cannot_hold(tmp_path: Path, suffix: str) -> None:
+    import xarray
 
-
-@pytest.mark.parametrize("dtype", ["u1", "f4", "f8"])
-@pytest.mark.parametrize(
-    "shape",
-    [
-        (1, 1, 1, 1),
-        (100, 64, 64, 64),
-        (3, 256, 256, 256),
-        (2, 3, 5000, 5000),
-        (1, 1, 1, 10**8),
-        (1, 7, 1, 3 * 10**7),
-    ],
-)
-def test_chunks_are_bounded_and_never_span_steps(
-    shape: tuple[int, int, int, int], dtype: str
-) -> None:
-    made = region((1, 1, 1, 1), dtype)
-    object.__setattr__(made, "shape", shape)
-    chunk = chunk_shape(made)
-    assert chunk[0] == 1
-    assert all(1 <= part <= whole for part, whole in zip(chunk, (1, *shape[1:]), strict=True))
-    size = int(np.prod(chunk)) * made.dtype.itemsize
-    assert size <= CHUNK_BYTES
-    frame = int(np.prod(shape[1:])) * made.dtype.itemsize
-    assert size == frame if frame <= CHUNK_BYTES else size > CHUNK_BYTES / 4
-
-
-def test_a_signal_waits_until_the_block_has_ended() -> None:
-    done = []
-
-    def block() -> None:
-        with signals_held():
-            signal.raise_signal(signal.SIGINT)
-            done.append("block")
-
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt):
-        block()
-    assert done == ["block"]
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_signals_are_left_alone_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Callable[..., Any] | int | None] = []
-
-    def block() -> None:
-        with signals_held():
-            seen.append(signal.getsignal(signal.SIGINT))
-
-    thread = threading.Thread(target=block)  # only the main thread may set a handler
-    thread.start()
-    thread.join()
-    assert seen == [signal.getsignal(signal.SIGINT)]
-    ignored = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        block()
-        os.kill(os.getpid(), signal.SIGINT)
-        assert seen[1] == signal.getsignal(signal.SIGINT) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, ignored)
+    coords = {
+        axis: Coordinate(name="gas/density", values=coordinate.values)
+        for axis, coordinate in COORDS.items()
+    }
+    (path,) = save_region(
+        tmp_path / f"out{suffix}",
+        labelled_region(name="gas/density", coords=coords, attributes={}),
+        DATA,
+    )
+    if suffix == ".h5":
+        with h5py.File(path) as file:
+            assert sorted(file) == ["gas_density", *(f"gas_density_{n}" for n in (2, 3, 4, 5))]
+            np.testing.assert_array_equal(file["gas_density"], DATA)
+            assert file["gas_density"].attrs["long_name"] == "gas/density"
+        return
+    with xarray.open_dataset(path, engine="zarr" if suffix == ".zarr" else "h5netcdf") as data:
+        assert data["gas_density"].dims == tuple(f"gas_density_{n}" for n in (2, 3, 4, 5))
+        np.testing.assert_array_equal(data["gas_density"].values, DATA)
+        assert data["gas_density"].attrs == {"units": "K", "long_name": "gas/density"}

@@ -1,0 +1,169 @@
+"""Training samples of the neighbourhood head: voxels drawn from decoded tiles. numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.transform.head.head_portable import centre_inputs, clip, compress
+from fhash_formats.transform.head.inputs import INPUTS, OFFSETS
+
+__all__ = ["BATCH_VOXELS", "Batches", "ErrorRange", "Pair", "Voxels", "batches", "draw"]
+
+Floats = npt.NDArray[np.float32]
+
+BATCH_VOXELS = 4096
+"""Voxels of a training batch."""
+PIECE_VOXELS = 1 << 16
+"""Voxels whose inputs are computed at once."""
+
+
+class Pair(NamedTuple):
+    """A decoded tile (t, z, y, x) with its original."""
+
+    decoded: Floats
+    original: npt.NDArray[Any]
+    counted: npt.NDArray[np.bool_] | None
+    """Mask of the voxels that count; None if all count."""
+
+
+class Voxels(NamedTuple):
+    """Voxels drawn from one tile."""
+
+    places: npt.NDArray[np.int64]
+    """Coordinates (4, n)."""
+    values: Floats
+    """Clipped decoded values (n,)."""
+    originals: npt.NDArray[Any]
+    """Original values (n,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorRange:
+    """Range of the values, and the error of the decoded values in it."""
+
+    low: np.float32
+    high: np.float32
+    sigma: np.float32
+    """Root of the mean squared error."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Batches:
+    """Batches of n voxels."""
+
+    inputs: npt.NDArray[np.int16]
+    """Inputs of the network (batches, INPUTS, voxels looked at, n)."""
+    targets: npt.NDArray[Any]
+    """Original minus decoded values (batches, n), in units of sigma."""
+    lowest: npt.NDArray[Any]
+    """Lowest useful output (batches, n), in units of sigma: a lower one is clipped."""
+    highest: npt.NDArray[Any]
+    """Highest useful output (batches, n), in units of sigma."""
+
+
+def draw(
+    pairs: Sequence[Pair],
+    samples: int,
+    random: np.random.Generator,
+    low: np.float32,
+    high: np.float32,
+) -> list[Voxels]:
+    """Draw voxels that count, from each tile according to its number of them."""
+    counts = np.array(
+        [
+            pair.original.size if pair.counted is None else np.count_nonzero(pair.counted)
+            for pair in pairs
+        ],
+        dtype=np.int64,
+    )
+    if counts.sum() == 0:
+        raise InputError("a head cannot be trained: no voxel counts")
+    ends = np.rint(np.cumsum(counts) / counts.sum() * samples).astype(np.int64)
+    drawn = []
+    for pair, number in zip(pairs, np.diff(ends, prepend=0), strict=True):
+        among = pair.original.size if pair.counted is None else np.flatnonzero(pair.counted)
+        chosen = np.sort(random.choice(among, number)) if number else np.empty(0, np.int64)
+        places = np.stack(np.unravel_index(chosen, pair.original.shape))
+        values = clip(pair.decoded.ravel()[chosen], low, high)
+        drawn.append(Voxels(places, values, pair.original.ravel()[chosen]))
+    return drawn
+
+
+def batches(
+    pairs: Sequence[Pair],
+    drawn: Sequence[Voxels],
+    offsets: Sequence[tuple[int, ...]],
+    random: np.random.Generator,
+    value_range: ErrorRange,
+) -> Batches:
+    """Return the drawn voxels in random order, as the network sees them.
+
+    offsets: places, relative to a voxel, of the voxels whose inputs are computed.
+    """
+    low, high, sigma = value_range.low, value_range.high, value_range.sigma
+    values = np.concatenate([voxels.values for voxels in drawn])
+    originals = np.concatenate([voxels.originals for voxels in drawn])
+    order = random.permutation(len(values))
+    count = len(values) // BATCH_VOXELS
+    inputs = np.empty((count, INPUTS, len(offsets), BATCH_VOXELS), dtype=np.int16)
+    first = 0
+    for pair, voxels in zip(pairs, drawn, strict=True):
+        for piece in _inputs(pair.decoded, voxels.places, offsets, value_range):
+            batch, slot = np.divmod(order[first : first + piece.shape[2]], BATCH_VOXELS)
+            inputs[batch, :, :, slot] = piece.transpose(2, 0, 1)
+            first += piece.shape[2]
+
+    def batched(unordered: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        shuffled = np.empty_like(unordered)
+        shuffled[order] = unordered
+        return (shuffled / sigma).reshape(count, BATCH_VOXELS)
+
+    return Batches(
+        inputs=inputs,
+        targets=batched(originals - values),
+        lowest=batched(low - values),
+        highest=batched(high - values),
+    )
+
+
+def _inputs(
+    decoded: Floats,
+    places: npt.NDArray[np.int64],
+    offsets: Sequence[tuple[int, ...]],
+    value_range: ErrorRange,
+) -> Iterator[npt.NDArray[np.int16]]:
+    """Yield the inputs of voxels of a tile, (INPUTS, offsets, n), some voxels at a time.
+
+    They are the inputs that the head itself computes, for the voxels at each offset.
+
+    places: coordinates (4, n) of the voxels.
+    """
+    low, high = value_range.low, value_range.high
+    inverse, span = np.float32(0.5) / value_range.sigma, high - low
+    unit = np.float32(1024) / span if span > 0 else np.float32(0)
+    padded = np.pad(clip(decoded, low, high), ((1, 1), (2, 2), (2, 2), (2, 2)), mode="edge")
+    flat, strides = padded.ravel(), np.array(padded.strides) // padded.itemsize
+    origin = int(strides @ np.array((1, 2, 2, 2)))
+    last = np.array(decoded.shape)[:, None] - 1
+    piece = PIECE_VOXELS // len(offsets)
+    for start in range(0, places.shape[1], piece):
+        voxels = places[:, start : start + piece]
+        at = np.stack(
+            [
+                origin + strides @ np.clip(voxels + np.array(offset)[:, None], 0, last)
+                for offset in offsets
+            ]
+        )
+        centre = flat[at]
+        inputs = np.empty((INPUTS, *at.shape), dtype=np.int16)
+        for number, offset in enumerate(OFFSETS):
+            neighbour = flat[at + int(strides @ np.array(offset))]
+            inputs[number] = compress((neighbour - centre) * inverse)
+        inputs[-2:] = centre_inputs(centre, low, inverse, unit)
+        yield inputs

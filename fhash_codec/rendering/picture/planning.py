@@ -1,0 +1,348 @@
+"""Planning a picture: what a scene asks of a volume, decided before the first ray."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.coreset.boxes import Box
+from fhash_codec.rendering.camera.camera import Grid, Rays
+from fhash_codec.rendering.camera.view import part_in_view, pixel_vertices
+from fhash_codec.rendering.colour.colours import parse_colour
+from fhash_codec.rendering.colour.opacity import Histogram
+from fhash_codec.rendering.colour.transfer_function import TransferFunction
+from fhash_codec.rendering.picture.explain import reasons
+from fhash_codec.rendering.picture.plan import Plan
+from fhash_codec.rendering.scene.scene import (
+    AmbientOcclusion,
+    Effects,
+    Marching,
+    Scene,
+    Shading,
+    Shadows,
+)
+from fhash_codec.rendering.task.task import Lighting, Surface, Table, Task
+from fhash_codec.rendering.task.units import Units
+from fhash_codec.volume import MAX_LOD, Volume
+from fhash_formats.errors import FhashWarning, InputError
+
+__all__ = ["parse_background", "plan_at", "plan_picture"]
+
+Floats = npt.NDArray[np.float64]
+
+LONG_RAY = 10**5
+"""Samples of a ray above which a warning is given: a picture of usual size then takes minutes."""
+MAX_RAY_SAMPLES = 10**8
+"""Most samples of a ray: more would take days, and Ctrl-C cannot stop a ray being marched."""
+MAX_RAYS = 2**26
+"""Most rays of a picture: more would not fit in the memory of most machines."""
+SHOULDER = (-0.7, 1.0, 1.0)
+"""Default direction towards the light of shadows: components right, up and towards the camera."""
+
+
+def plan_picture(
+    volume: Volume, scene: Scene, *, histogram: Callable[[], Histogram] | None = None
+) -> Plan:
+    """Plan the picture of a scene.
+
+    Args:
+        volume: an open container.
+        scene: what to show; not an evolution.
+        histogram: counts the values of the series; called only if the opacity depends on them.
+
+    Raises InputError for what cannot be drawn, RegionError for a time outside the series.
+    """
+    _check(scene)
+    step = _step_of(volume, scene)
+    grid = Grid.of(volume.coords, scene.scale)
+    rays = Rays.of(scene.camera, grid, scene.size)
+    function = _function(volume, scene, grid, histogram)
+    lod, why_lod = _level(volume, scene, rays)
+    shadows, occlusion = _secondary_light(scene)
+    lamp = _lamp(rays, scene.effects.shading, shadows)
+    units = Units.of(volume)
+    task = _task(scene, rays, function, units, lamp, lod)
+    _check_ray_length(task)
+    mode = _mode(scene.march)
+    # Light comes from all of the volume, whether it is in view or not.
+    domain: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
+    lit = shadows is not None or occlusion is not None
+    plan = Plan(
+        scene=scene,
+        task=task,
+        step=step,
+        time=_time_of(volume, step),
+        mode=mode,
+        lod=lod,
+        why_lod=why_lod,
+        region=domain if lit else part_in_view(rays, volume),
+        function=function,
+        units=units,
+        shadows=shadows,
+        occlusion=occlusion,
+        lamp=lamp,
+    )
+    return replace(plan, reasons=tuple(reasons(plan, volume)))
+
+
+def plan_at(plan: Plan, volume: Volume, scene: Scene) -> Plan:
+    """Move a plan to the time of a scene that differs from the plan's scene only in its time."""
+    step = _step_of(volume, scene)
+    moved = replace(plan, scene=scene, step=step, time=_time_of(volume, step))
+    return replace(moved, reasons=tuple(reasons(moved, volume)))
+
+
+def parse_background(name: str) -> None:
+    """Raise InputError for a background that is neither a colour nor 'transparent'."""
+    if name != "transparent":
+        parse_colour(name)
+
+
+def _check(scene: Scene) -> None:
+    """Raise InputError for a scene that asks for too much, for nothing or for a contradiction."""
+    effects, nothing = scene.effects, scene.transfer_function.nothing
+    width, height = scene.size
+    if width * height * effects.antialiasing**2 > MAX_RAYS:
+        raise InputError(
+            f"size {width} x {height} with {effects.antialiasing**2} rays for each pixel are more "
+            f"than {MAX_RAYS:,} rays; take a smaller picture"
+        )
+    if scene.evolution is not None:
+        raise InputError(
+            "the scene is an evolution, of several pictures; leave 'evolution' out for one of them"
+        )
+    parse_background(scene.background)
+    if nothing and not effects.isosurfaces:
+        raise InputError(
+            "the scene shows nothing: 'nothing' leaves the volume out and there is no isosurface"
+        )
+    if effects.maximum_intensity and nothing:
+        raise InputError(
+            "maximum_intensity shows the volume, which 'nothing' leaves out; take one of them"
+        )
+
+
+def _step_of(volume: Volume, scene: Scene) -> float:
+    """The step of a scene, fractional between two; InputError or RegionError outside the series."""
+    if scene.time is not None:
+        return volume.step_of_time(scene.time)
+    step = 0.0 if scene.step is None else scene.step
+    last = volume.shape[0] - 1
+    if not 0 <= step <= last:
+        raise InputError(f"step {step:g} is outside the series, which has steps 0 to {last}")
+    return step
+
+
+def _time_of(volume: Volume, step: float) -> float:
+    """The physical time of a step, linear between two steps."""
+    times = volume.coords["t"].values
+    return float(np.interp(step, np.arange(len(times)), times))
+
+
+def _function(
+    volume: Volume, scene: Scene, grid: Grid, histogram: Callable[[], Histogram] | None
+) -> TransferFunction:
+    """The transfer function of a scene; the series is counted only if the function needs it."""
+    spec = scene.transfer_function
+    features = tuple(str(text) for text in volume.container.header.get("features", ()))
+    value_range = (volume.value_range.low, volume.value_range.high)
+
+    def function_of(counted: Histogram | None) -> TransferFunction:
+        """The function with a histogram, or without one."""
+        return TransferFunction.of(
+            spec,
+            value_range=value_range,
+            spacing=grid.vertex_spacing,
+            features=features,
+            histogram=counted,
+        )
+
+    without = function_of(None)
+    if histogram is None or spec.opacity != "auto" or spec.nothing:
+        return without
+    (low, high), scale = value_range, volume.value_range.scale
+    if not low < high:
+        return without
+    # Whether the opacity depends on a histogram at all is tried with a made-up one of one bin.
+    edges = np.linspace(low * scale, high * scale, 9) / scale
+    probe = function_of((edges, np.array([0, 0, 0, 0, 1, 0, 0, 0], dtype=np.int64)))
+    if np.array_equal(without.points, probe.points):
+        return without
+    return function_of(histogram())
+
+
+def _level(volume: Volume, scene: Scene, rays: Rays) -> tuple[int, str]:
+    """The level of detail, and why it is that one."""
+    lod = scene.march.lod
+    if lod is not None:
+        if lod > 0:
+            volume.lod_vertices(lod)  # raises for a level that the volume does not have
+        if lod > 0 and volume.profile != "compact":
+            raise InputError(
+                f"{volume.path}: a file of the profile {volume.profile} has no levels of detail; "
+                "leave 'lod' out"
+            )
+        return lod, "as the scene says"
+    if volume.profile != "compact":
+        return 0, f"files of the profile {volume.profile} have but one"
+    across = pixel_vertices(rays)
+    by_pixel = math.floor(math.log2(across)) if across >= 2 else 0
+    by_box = min(
+        (int(high - low - 1).bit_length() - 1 for low, high in volume.box if high - low > 1),
+        default=0,
+    )
+    return (
+        max(0, min(by_pixel, by_box, MAX_LOD)),
+        f"the nearest pixel is {across:.3g} vertices wide",
+    )
+
+
+def _secondary_light(scene: Scene) -> tuple[Shadows | None, AmbientOcclusion | None]:
+    """The shadows and the ambient occlusion of a scene, None where they would change nothing."""
+    effects = scene.effects
+    if effects.maximum_intensity or scene.transfer_function.nothing:
+        # Only the volume takes light away, and only from what is drawn of it or in it.
+        return None, None
+    shadows, occlusion = effects.shadows, effects.ambient_occlusion
+    return (
+        shadows if shadows and shadows.strength > 0 else None,
+        occlusion if occlusion and occlusion.strength > 0 else None,
+    )
+
+
+def _lamp(rays: Rays, shading: Shading | None, shadows: Shadows | None) -> Floats | None:
+    """The unit vector (x, y, z) towards the light, in the coordinates.
+
+    None for the camera's light: it lies behind the camera, and its shadows cannot be seen.
+    """
+    light = shading.light if shading is not None and shading.light is not None else None
+    if shadows is not None and shadows.light is not None:
+        if light is not None and light != shadows.light:
+            raise InputError(
+                "shading and shadows name different lights; there is one lamp: "
+                "leave 'light' out of one of them"
+            )
+        light = shadows.light
+    if light is not None:
+        direction = np.array(light)
+        largest = float(np.abs(direction).max())
+        if not largest > 0:
+            raise InputError("light has no length; give a direction such as 1, 1, 2")
+        # Scaled first, since the squares of the largest numbers are beyond float64.
+        direction = direction / largest
+        return np.asarray(direction / np.linalg.norm(direction), dtype=np.float64)
+    return None if shadows is None else _shoulder_lamp(rays)
+
+
+def _shoulder_lamp(rays: Rays) -> Floats:
+    """The unit vector (x, y, z) towards the default light of shadows, beside the camera."""
+    spacing = rays.grid.spacing
+    right, up, away = (
+        axis / np.linalg.norm(axis)
+        for axis in (rays.right * spacing, rays.up * spacing, -rays.forward * spacing)
+    )
+    lamp = SHOULDER[0] * right + SHOULDER[1] * up + SHOULDER[2] * away
+    return np.asarray(lamp / np.linalg.norm(lamp), dtype=np.float64)
+
+
+def _task(
+    scene: Scene,
+    rays: Rays,
+    function: TransferFunction,
+    units: Units,
+    lamp: Floats | None,
+    lod: int,
+) -> Task:
+    """The task of a marcher, without the light that is computed from a frame."""
+    effects, march = scene.effects, scene.march
+    table = None if scene.transfer_function.nothing else _table(function, units)
+    shading = _shading(effects)
+    return Task(
+        rays=rays,
+        step=march.step * (1 << lod) * rays.grid.vertex_spacing,
+        threshold=march.threshold,
+        table=table,
+        lighting=None if shading is None else _lighting(shading, lamp),
+        shaded=effects.shading is not None and table is not None and not effects.maximum_intensity,
+        surfaces=_surfaces(effects, function, units),
+        maximum=effects.maximum_intensity,
+        depth="depth" in effects.buffers,
+        normal="normal" in effects.buffers,
+        antialiasing=effects.antialiasing,
+        jitter=effects.jitter,
+        skipping=march.skipping,
+    )
+
+
+def _shading(effects: Effects) -> Shading | None:
+    """The shading of what is lit, None if nothing is; isosurfaces are always lit."""
+    if effects.isosurfaces:
+        return effects.shading or Shading()
+    return None if effects.maximum_intensity else effects.shading
+
+
+def _table(function: TransferFunction, units: Units) -> Table:
+    """The table of a transfer function in marched units."""
+    low, high, colours, extinctions = function.table()
+    ends = units.to([low, high])
+    return Table(low=float(ends[0]), high=float(ends[1]), colours=colours, extinctions=extinctions)
+
+
+def _surfaces(effects: Effects, function: TransferFunction, units: Units) -> tuple[Surface, ...]:
+    """The visible isosurfaces in marched units; without a colour they take the value's."""
+    return tuple(
+        Surface(
+            value=float(units.to(surface.value)),
+            colour=np.array(
+                parse_colour(surface.colour)
+                if surface.colour is not None
+                else function.colour(surface.value)
+            ),
+            opacity=surface.opacity,
+        )
+        for surface in effects.isosurfaces
+        if surface.opacity > 0
+    )
+
+
+def _lighting(shading: Shading, lamp: Floats | None) -> Lighting:
+    return Lighting(
+        ambient=shading.ambient,
+        diffuse=shading.diffuse,
+        specular=shading.specular,
+        specular_power=shading.specular_power,
+        lamp=lamp,
+        central=shading.gradient == "central",
+    )
+
+
+def _check_ray_length(task: Task) -> None:
+    """Warn of rays of more than LONG_RAY samples; raise InputError above MAX_RAY_SAMPLES."""
+    grid = task.rays.grid
+    diagonal = float(np.linalg.norm(np.diff(grid.bounds, axis=1)[:, 0] * grid.spacing))
+    samples = diagonal / task.step
+    if not samples > LONG_RAY:
+        return
+    line = (
+        f"a ray takes up to {samples:.3g} samples, since the axes are of very different lengths or "
+        "the step is short; stretch the axes with 'scale', or take a longer 'step'"
+    )
+    if samples > MAX_RAY_SAMPLES:
+        raise InputError(f"{line}; at most {MAX_RAY_SAMPLES:.0e} are taken")
+    warnings.warn(line, FhashWarning, stacklevel=3)
+
+
+def _mode(march: Marching) -> str:
+    """The way to march; raises InputError for one that the device cannot take."""
+    if march.mode == "auto":
+        return "arm" if march.device == "cuda" else "cache"
+    if march.mode == "cache" and march.device == "cuda":
+        raise InputError(
+            "march 'cache' computes on the CPU; take 'arm' or 'stream' for device 'cuda'"
+        )
+    return march.mode

@@ -1,0 +1,75 @@
+"""Points between vertices: which of them have a value, given the coreset around them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.coreset.boxes import Box
+
+Positions = npt.NDArray[np.float64]
+"""Positions (n,) of points along one axis."""
+
+Mask = npt.NDArray[np.bool_]
+
+
+def interpolable(
+    box: Box,
+    steps: Positions,
+    keys: Positions,
+    space: Sequence[Positions],
+    occupancy: Callable[[float, Box], Mask],
+) -> Mask:
+    """Mask (n,) of the points whose cell vertices of weight above 0 are all in the coreset.
+
+    box: the feature bounding box; points outside it have no value.
+    steps, keys: times of the points, in steps and as key indices.
+    space: positions z, y and x of the points, in vertices of the domain.
+    occupancy: the vertices (z, y, x) of a region of the domain that are in the coreset at a step.
+    """
+    inside: Mask = np.all(
+        [
+            (position >= first) & (position <= end - 1)
+            for position, (first, end) in zip(space, box, strict=True)
+        ],
+        axis=0,
+    )
+    for step, group in _groups_of_one_occupancy(steps, keys):
+        chosen = np.flatnonzero(inside & group)
+        if chosen.size:
+            inside[chosen] = _cells_occupied([p[chosen] for p in space], step, occupancy)
+    return inside
+
+
+def _groups_of_one_occupancy(steps: Positions, keys: Positions) -> Iterator[tuple[float, Mask]]:
+    """Points between the same steps and the same key frames: a step of theirs, and their mask."""
+    between = np.stack([np.floor(steps), np.ceil(steps), np.floor(keys), np.ceil(keys)])
+    _, first, group = np.unique(between, axis=1, return_index=True, return_inverse=True)
+    for number, point in enumerate(first):
+        yield steps[point], group == number
+
+
+def _cells_occupied(
+    space: Sequence[Positions], step: float, occupancy: Callable[[float, Box], Mask]
+) -> Mask:
+    """Mask (n,) of the points whose cell is in the coreset.
+
+    On a face of a cell the lower and the upper vertex are the same: vertices without weight do not
+    matter.
+    """
+    lower = [np.floor(position).astype(np.int64) for position in space]
+    upper = [np.ceil(position).astype(np.int64) for position in space]
+    region = Box.of(
+        (int(low.min()), int(high.max()) + 1) for low, high in zip(lower, upper, strict=True)
+    )
+    occupied = occupancy(step, region)
+    complete = np.ones(space[0].shape, dtype=bool)
+    for corner in np.ndindex(2, 2, 2):
+        vertex = tuple(
+            (high if is_upper else low) - first
+            for is_upper, low, high, first in zip(corner, lower, upper, region.first, strict=True)
+        )
+        complete &= occupied[vertex]
+    return complete

@@ -1,0 +1,156 @@
+"""The arrays that a valid header asks for, and checks that a container has them.
+
+FORMAT.md lists the arrays of each profile in its section "Arrays". Arrays of other names are
+allowed and ignored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from math import prod
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.container.array import ArrayMetadata
+from fhash_formats.container.coding import TRANSFORM
+from fhash_formats.container.header import CODED, COMPACT, PAPER, POSITIONS, TRANSFORM_FEATURE
+from fhash_formats.container.record import Record
+from fhash_formats.errors import DamagedFileError
+
+Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
+"""Name, shape and allowed number types of an array."""
+
+
+def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]) -> None:
+    """Check that the arrays are those that a valid header asks for.
+
+    Raises DamagedFileError that names the first array that is missing or does not fit.
+    """
+    for name, shape, dtypes in _required_arrays(header):
+        if name not in arrays:
+            raise DamagedFileError(f"array {name} is missing")
+        _check_array(name, arrays[name], shape, dtypes)
+        if name.startswith("tables/"):
+            _check_table_attributes(name, arrays[name], header["model"])
+    _check_array_features(header["required_features"], arrays)
+    for name, shape, dtypes in _optional_arrays(header):
+        if name in arrays:
+            _check_array(name, arrays[name], shape, dtypes)
+    for axis in POSITIONS:
+        name = f"coords/{axis}"
+        if name in arrays and "name" in arrays[name].attributes:
+            Record(arrays[name].attributes, f"array {name} attribute ").text("name")
+
+
+def check_key_frames(header: Mapping[str, Any], key_frames: npt.NDArray[np.int64]) -> None:
+    """Raise DamagedFileError unless the key frames increase within the steps of the domain."""
+    steps = header["domain"]["shape"][0]
+    if key_frames[0] < 0 or key_frames[-1] >= steps or np.any(key_frames[1:] <= key_frames[:-1]):
+        raise DamagedFileError(f"array key_frames does not increase within 0..{steps - 1}")
+
+
+def occupancy_bytes(box: Sequence[Sequence[int]]) -> int:
+    """Bytes of the occupancy of one key frame, in ragged Morton order over the feature box.
+
+    Each axis of the box is filled up to a power of two, and each vertex has one bit.
+    """
+    return -(-prod(1 << (high - low - 1).bit_length() for low, high in box) // 8)
+
+
+def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
+    """(outputs, inputs) of each layer of the paper's network, from the header's `model`."""
+    widths = [
+        len(model["levels"]) * model["embedding_size"],
+        *[model["width"]] * model["hidden_layers"],
+        1,
+    ]
+    return [(outputs, inputs) for inputs, outputs in pairwise(widths)]
+
+
+def _required_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
+    """Yield the arrays that a valid header asks for; levels count from 1, as in FORMAT.md."""
+    model = header["model"]
+    compact = model["profile"] == COMPACT
+    described = header.get("coordinates", {}) if compact else {}
+    for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
+        if axis not in described:
+            yield f"coords/{axis}", (length,), ("float64",)
+    key_frames = model["levels"][0][0]
+    if not compact or key_frames < header["domain"]["shape"][0]:
+        yield "key_frames", (key_frames,), ("int64",)
+    if compact:
+        yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
+        return
+    for number, level in enumerate(model["levels"], start=1):
+        if model["tables"] == CODED:
+            for component in range(1, model["embedding_size"] + 1):
+                yield f"tables/level_{number}/component_{component}", tuple(level), ("float32",)
+        else:
+            yield f"tables/level_{number}", (*level, model["embedding_size"]), (model["tables"],)
+    for number, (outputs, inputs) in enumerate(layer_shapes(model), start=1):
+        yield f"mlp/weight_{number}", (outputs, inputs), ("float32",)
+        yield f"mlp/bias_{number}", (outputs,), ("float32",)
+    yield (
+        "occupancy/bits",
+        (key_frames, occupancy_bytes(header["feature_bounding_box"])),
+        ("uint8",),
+    )
+
+
+def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
+    """Yield the arrays that may be left out, and are checked where they are there."""
+    model, steps = header["model"], header["domain"]["shape"][0]
+    for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
+        yield f"coords/{axis}", (length,), ("float64",)
+    if model["profile"] == COMPACT:
+        key_frames, *box = model["levels"][0]
+        yield "key_frames", (key_frames,), ("int64",)
+        yield (
+            "occupancy/bits",
+            (key_frames, occupancy_bytes(header["feature_bounding_box"])),
+            ("uint8",),
+        )
+        yield "occupancy/mask", (key_frames, *box), ("uint8",)
+    yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
+
+
+def _check_array(
+    name: str, array: ArrayMetadata, shape: tuple[int, ...], dtypes: tuple[str, ...]
+) -> None:
+    if array.shape != shape or array.dtype.name not in dtypes:
+        raise DamagedFileError(
+            f"array {name} is {array.dtype.name} {array.shape}; "
+            f"the header asks for {' or '.join(dtypes)} {shape}"
+        )
+
+
+def _check_table_attributes(name: str, table: ArrayMetadata, model: Mapping[str, Any]) -> None:
+    """Check the attributes without which the numbers of a table mean nothing."""
+    attributes = Record(table.attributes, f"array {name} attribute ")
+    if table.dtype == np.uint8 and model["profile"] == PAPER:
+        attributes.number("offset")
+        attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
+    if model["tables"] == CODED:
+        attributes.numbers("mixing", model["embedding_size"])
+
+
+def _check_array_features(
+    required_features: Sequence[str], arrays: Mapping[str, ArrayMetadata]
+) -> None:
+    """Check that the header requires every feature that a reader of the arrays must know."""
+    if TRANSFORM_FEATURE not in required_features:
+        for name, array in arrays.items():
+            if array.sharding is not None or array.codecs[0]["name"] == TRANSFORM:
+                raise DamagedFileError(
+                    f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, "
+                    "which the header does not require"
+                )
+    for name, array in arrays.items():
+        for feature in array.coder.features:
+            if feature not in required_features:
+                raise DamagedFileError(
+                    f"array {name} has the feature {feature}, which the header does not require"
+                )

@@ -1,0 +1,76 @@
+"""Options of a scene: each sets its place, over a scene that a file gives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+import fhash_codec
+from fhash_cli.scene_options import PLACES, SceneOptions
+from fhash_codec.rendering.scene.scene import Scene
+from fhash_formats.errors import InputError
+
+VOLUME = cast(fhash_codec.Volume, SimpleNamespace(shape=(5, 2, 3, 4)))
+
+
+def scene(
+    file: str | None = None,
+    places: dict[str, object] | None = None,
+    effects: tuple[str, ...] = (),
+    isosurfaces: tuple[str, ...] = (),
+    settings: tuple[str, ...] = (),
+) -> Scene:
+    options = SceneOptions(
+        file=file,
+        places=places or {},
+        effects=effects,
+        isosurfaces=isosurfaces,
+        settings=settings,
+    )
+    return options.scene(VOLUME)
+
+
+def test_without_options_it_is_the_default_scene() -> None:
+    assert scene() == Scene()
+
+
+@pytest.mark.parametrize("place", sorted(set(PLACES.values()) - {"step"}))
+def test_every_option_sets_a_place_that_a_scene_has(place: str) -> None:
+    with pytest.raises(InputError) as refused:
+        scene(places={place: object()})
+    assert place.split(".")[-1] in str(refused.value)
+    assert "did you mean" not in str(refused.value)
+
+
+def test_a_negative_step_counts_from_the_end() -> None:
+    assert scene(places={"step": -1.0}).step == 4
+
+
+def test_options_replace_parts_of_the_scene_of_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "scene.json"
+    file.write_text(json.dumps({"time": 2.0, "camera": {"view": "xy", "zoom": 3.0}}))
+    changed = scene(file=str(file), places={"step": 1.0, "camera.zoom": 2.0})
+    assert (changed.step, changed.time) == (1.0, None)
+    assert (changed.camera.view, changed.camera.zoom) == ("xy", 2.0)
+
+
+def test_effects_surfaces_and_settings_add_up() -> None:
+    shown = scene(
+        effects=("ambient-occlusion", "shading"),
+        isosurfaces=("1.5,orange,0.5", "2"),
+        settings=("effects.shading.ambient=0.3",),
+    )
+    assert shown.effects.ambient_occlusion is not None
+    assert shown.effects.shading is not None
+    assert shown.effects.shading.ambient == 0.3
+    surfaces = shown.effects.isosurfaces
+    assert [(surface.value, surface.opacity) for surface in surfaces] == [(1.5, 0.5), (2.0, 1.0)]
+
+
+def test_an_unknown_effect_names_the_nearest() -> None:
+    with pytest.raises(InputError, match="did you mean 'shadows'"):
+        scene(effects=("shadow",))

@@ -1,0 +1,82 @@
+"""Steps, vertices and coordinates that `--t`, `--roi` and `--box` select."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_cli.selection import coordinates, region_of, region_of_box, steps_of
+from fhash_formats.errors import RegionError
+from fhash_formats.series import Coordinate
+
+COORDINATE = Coordinate(name="x", values=np.array([1.0, 2.0, 4.0, 8.0]))
+VOLUME = cast(
+    fhash_codec.Volume,
+    SimpleNamespace(shape=(4, 4, 4, 4), coords=dict.fromkeys("tzyx", COORDINATE)),
+)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "steps"),
+    [(None, [0, 1, 2, 3]), (slice(-1, None), [3]), (slice(1, 4, 2), [1, 3]), (slice(0, 1), [0])],
+)
+def test_steps_are_those_of_a_python_slice(chosen: slice | None, steps: list[float]) -> None:
+    assert steps_of(VOLUME, chosen) == steps
+
+
+@pytest.mark.parametrize("chosen", [slice(0, 5), slice(2, 2), slice(-5, None)])
+def test_steps_outside_the_series_are_refused_not_clipped(chosen: slice) -> None:
+    with pytest.raises(RegionError, match="the series has steps 0 to 3"):
+        steps_of(VOLUME, chosen)
+
+
+def test_a_region_fills_left_out_ends_with_those_of_the_domain() -> None:
+    assert region_of(VOLUME, None) == ((0, 4), (0, 4), (0, 4))
+    assert region_of(VOLUME, [(1, None), (None, -1), (0, 2)]) == ((1, 4), (0, 3), (0, 2))
+    with pytest.raises(RegionError, match="along y"):
+        region_of(VOLUME, [(None, None), (3, 5), (None, None)])
+
+
+def test_coordinates_of_steps_between_two_are_interpolated() -> None:
+    cut = coordinates(VOLUME, [0.5, 2.0], (range(0, 4, 2), range(1), range(2, 4)))
+    assert cut["t"].values.tolist() == [1.5, 4.0]
+    assert cut["z"].values.tolist() == [1.0, 4.0]
+    assert cut["x"].values.tolist() == [4.0, 8.0]
+
+
+@pytest.mark.parametrize(
+    ("positions", "box", "expected"),
+    [
+        ([0.0, 5.0, 1.0, 6.0], (0.5, 2.0), (2, 3)),
+        ([0.0, 5.0, 1.0, 6.0], (0.0, 6.0), (0, 4)),
+        ([0.0, 5.0, 1.0, 6.0], (0.0, 1.0), None),
+        ([0.0, 1.0, 1.0, 2.0], (1.0, 1.0), (1, 3)),
+        ([3.0, 2.0, 1.0, 0.0], (1.0, 2.0), (1, 3)),
+    ],
+)
+def test_a_box_never_gives_vertices_outside_it(
+    positions: list[float], box: tuple[float, float], expected: tuple[int, int] | None
+) -> None:
+    coordinate = Coordinate(name="x", values=np.array(positions))
+    volume = cast(
+        fhash_codec.Volume,
+        SimpleNamespace(coords={"x": coordinate, "y": coordinate, "z": coordinate}),
+    )
+    if expected is None:
+        with pytest.raises(RegionError, match=r"neither ascend nor descend.*--roi"):
+            region_of_box(volume, [(None, None), (None, None), box])
+    else:
+        assert region_of_box(volume, [(None, None), (None, None), box])[2] == expected
+
+
+def test_a_box_outside_by_little_says_by_how_much() -> None:
+    coordinate = Coordinate(name="x", values=347921.0 + np.arange(3) / 1000)
+    volume = cast(fhash_codec.Volume, SimpleNamespace(coords=dict.fromkeys("zyx", coordinate)))
+    with pytest.raises(
+        RegionError, match=r"347921:347921\.003; the domain has positions 347921 to 347921\.002"
+    ):
+        region_of_box(volume, [(347921.0, 347921.003), (None, None), (None, None)])

@@ -1,0 +1,58 @@
+"""`fhash bench train`: figures of every engine, and unsuitable requests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count, pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_codec import EncodeConfig
+from fhash_codec.bench import train
+from fhash_codec.bench.train import TURNS, bench_train
+from fhash_codec.config import ENGINES
+from fhash_formats.errors import InputError
+from fhash_formats.series import ArraySeries
+
+CONFIG = EncodeConfig(profile="paper", width=4)
+
+
+@pytest.fixture
+def series(field: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPatch) -> ArraySeries:
+    """A small series, and a clock that advances by a millisecond whenever it is read."""
+    ticks = count()
+    clock = SimpleNamespace(perf_counter=lambda: next(ticks) / 1000)
+    monkeypatch.setattr(train, "time", clock)
+    monkeypatch.setattr(train, "INFER_SECONDS", 0.003)
+    return ArraySeries(field())
+
+
+def test_every_engine_is_measured_in_turns(series: ArraySeries) -> None:
+    calls: list[tuple[Any, ...]] = []
+    report = bench_train(series, CONFIG, seconds=0.01, progress=lambda *words: calls.append(words))
+    assert [entry["engine"] for entry in report["engines"]] == list(ENGINES)
+    measured = [words for words in calls if words[0] == "measuring"]
+    assert [words[3] for words in measured] == list(ENGINES) * TURNS
+    assert all(later[1] == before[1] + 1 for before, later in pairwise(measured))
+    naive = next(entry for entry in report["engines"] if entry["engine"] == "naive")
+    assert (naive["train_ratio"], naive["infer_ratio"]) == (1.0, 1.0)
+    for entry in report["engines"]:
+        assert entry["train_msamples_s"] > 0
+        assert entry["infer_msamples_s"] > 0
+        assert entry["epochs"] > 0
+        assert np.isfinite(entry["psnr"])
+    assert 0 < report["batch_samples"] <= report["samples"] == series.values.size
+
+
+def test_there_is_no_ratio_without_the_naive_engine(series: ArraySeries) -> None:
+    (entry,) = bench_train(series, CONFIG, engines=("slab",), seconds=0.01)["engines"]
+    assert (entry["train_ratio"], entry["infer_ratio"]) == (None, None)
+
+
+@pytest.mark.parametrize("request_", [{"seconds": 0.0}, {"engines": ()}, {"engines": ("fast",)}])
+def test_unsuitable_requests_are_refused(series: ArraySeries, request_: dict[str, Any]) -> None:
+    with pytest.raises(InputError):
+        bench_train(series, CONFIG, **request_)

@@ -1,0 +1,67 @@
+"""Choice of the head: it stays only where the file gets smaller by it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import fhash_codec
+from fhash_codec import EncodeConfig
+from fhash_codec.compact.choices.head import (
+    EFFORTS,
+    GAIN_BY_WIDTHS,
+    Budget,
+    Effort,
+    _best_widths,
+)
+
+
+def fronts() -> npt.NDArray[np.float32]:
+    """Return two plateaus with a travelling, slanted and curved border.
+
+    A wavelet smears it, and a head sharpens it.
+    """
+    t, z, y, x = np.meshgrid(
+        np.arange(5), np.arange(12), np.arange(40), np.arange(40), indexing="ij"
+    )
+    distance = x + 0.6 * y - 2 * t + 4 * np.sin(z / 5 + t / 4) - 26
+    return (1 / (1 + np.exp(-2 * distance))).astype(np.float32)
+
+
+def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Prediction would be smaller still.
+    monkeypatch.setattr(
+        "fhash_codec.compact.choices.predictor.best_predictor", lambda *_, **__: None
+    )
+    budget = Budget(updates=200, samples=40_000)
+    monkeypatch.setattr("fhash_codec.compact.choices.head.TRIAL_BUDGET", budget)
+    monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget))
+    source, sizes = fronts(), {}
+    for effort in (4, 5):
+        config = EncodeConfig(effort=effort, max_error=0.01)
+        figures = fhash_codec.encode(source, tmp_path / "a.fhz", config, force=True)
+        with fhash_codec.open(tmp_path / "a.fhz") as volume:
+            assert np.abs(volume[...].astype(np.float64) - source).max() <= 0.01
+            assert (volume.info["model"]["head"] is not None) == (effort == 5)
+        sizes[effort] = figures["bytes"]
+    assert sizes[5] < 0.97 * sizes[4]
+
+
+def test_a_small_file_gets_no_head_and_a_large_one_a_large_head() -> None:
+    def widths(size: float, gain: float = 0.5, effort: int = 9) -> tuple[int, int] | None:
+        return _best_widths(size, gain, 4.5, effort)
+
+    assert widths(1_000) is None
+    chosen = [widths(size) for size in (1e4, 3e4, 1e5, 3e5, 1e6)]
+    ranks = [list(GAIN_BY_WIDTHS).index(each) for each in chosen if each is not None]
+    assert ranks == sorted(ranks)
+    assert len(set(ranks)) > 2
+    # Weights cost decoding time, whatever the size of the file: a small gain pays for few of them.
+    assert widths(1e9, gain=3.0) == (14, 24)
+    assert widths(1e9, gain=3.0, effort=5) == (12, 12)
+    assert widths(1e6, gain=0.01) is None

@@ -1,0 +1,187 @@
+"""Reads of a compact file: regions, samples, gradients and levels of detail agree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import fhash_codec
+from fhash_codec import EncodeConfig, InputError, RegionError
+
+Series = npt.NDArray[Any]
+Field = Callable[..., Series]
+Feature = tuple[Series, Path]
+"""A series, and a container of it with vertices outside the coreset."""
+
+
+def record_decoded_tiles(
+    monkeypatch: pytest.MonkeyPatch, table: Any
+) -> list[tuple[int, int, int, int]]:
+    """Return a list that takes up the index of each tile of a table that is decoded."""
+    decode, indices = type(table)._decode, []
+
+    def recorded(array: Any, index: Any, *rest: Any) -> Any:
+        if array.name == table.name:
+            indices.append(index)
+        return decode(array, index, *rest)
+
+    monkeypatch.setattr(type(table), "_decode", recorded)
+    return indices
+
+
+def test_a_region_of_a_feature_reads_its_tiles_alone(feature: Feature) -> None:
+    """Mask and values come from the same bytes: those of the tiles that the region touches."""
+    with fhash_codec.open(feature[1]) as volume:
+        table = volume.container.arrays["tables/level_1"]
+        before = volume.container.bytes_read
+        (z, _), (y, _), (x, _) = volume.box
+        region = ((z, z + 3), (y, y + 4), (x, x + 7))
+        values = volume.read(2, region)
+        read = volume.container.bytes_read - before
+        assert read < table.nbytes_stored / 4
+        np.testing.assert_array_equal(
+            volume.occupancy(2)[tuple(slice(*span) for span in region)], np.isfinite(values)
+        )
+
+
+@pytest.mark.parametrize(
+    "index",
+    [np.s_[3], np.s_[1:4, 2:7, 3:11, 5:17], np.s_[:, 8, ::-2, 19], np.s_[4, 3:5, 4:6, 7:9]],
+    ids=str,
+)
+def test_a_region_is_that_slice_of_the_series_bit_for_bit(feature: Feature, index: Any) -> None:
+    with fhash_codec.open(feature[1]) as volume:
+        series = volume[...]
+    with fhash_codec.open(feature[1]) as volume:
+        np.testing.assert_array_equal(volume[index], series[index])
+
+
+def test_a_small_region_decodes_the_tiles_that_it_touches(
+    feature: Feature, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with fhash_codec.open(feature[1]) as volume:
+        table = volume.container.arrays["tables/level_1"]
+        indices = record_decoded_tiles(monkeypatch, table)
+        volume.read(2, tuple((low, low + 3) for low, _ in volume.box))
+        assert indices == [(1, 0, 0, 0)]
+        volume.read(2)
+        assert len(set(indices)) == math.prod(table.grid[1:])
+
+
+def test_samples_at_vertices_are_what_is_read(feature: Feature) -> None:
+    z, y, x = np.meshgrid(range(9), range(12), range(20), indexing="ij")
+    with fhash_codec.open(feature[1]) as volume:
+        for t in (0, 1, 4):
+            np.testing.assert_array_equal(volume.sample(t=t, z=z, y=y, x=x), volume.read(t))
+        np.testing.assert_allclose(
+            volume.sample(t=2.25, z=z, y=y, x=x), volume.read(2.25), rtol=1e-6, atol=1e-5
+        )
+        between = 0.75 * volume.read(2).astype(np.float64) + 0.25 * volume.read(3)
+        both = np.isfinite(between)
+        np.testing.assert_allclose(volume.read(2.25)[both], between[both], rtol=1e-6, atol=1e-5)
+
+
+def test_gradients_are_differences_of_the_vertices(feature: Feature) -> None:
+    random = np.random.default_rng(0)
+    with fhash_codec.open(feature[1]) as volume:
+        cells = [random.integers(0, n - 1, 300) for n in volume.shape]
+        for axis, name in enumerate("tzyx"):
+            at = {other: cell + 0.0 for other, cell in zip("tzyx", cells, strict=True)}
+            ends = [
+                volume.sample(**{**at, name: cells[axis] + side}).astype(np.float64)
+                for side in (0.0, 1.0)
+            ]
+            _, gradient = volume.sample(**{**at, name: cells[axis] + 0.4}, gradient=True)
+            # Between steps a vertex counts that counts at either of them. What it decodes to at
+            # the other step is open.
+            finite = np.isfinite(gradient[:, axis]) & np.isfinite(ends[0]) & np.isfinite(ends[1])
+            assert finite.sum() > 30
+            np.testing.assert_allclose(
+                gradient[finite, axis], (ends[1] - ends[0])[finite], rtol=1e-5, atol=1e-4
+            )
+
+
+def test_levels_of_detail_are_subsampled_and_near(
+    tmp_path: Path, field: Field, feature: Feature
+) -> None:
+    source = field((3, 16, 24, 32))
+    fhash_codec.encode(source, tmp_path / "a.fhz", EncodeConfig(effort=2, tile="3x8x8x16"))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        np.testing.assert_array_equal(volume.read_lod(1, 0), volume.read(1))
+        for lod in (1, 2):
+            coarse = volume.read_lod(1, lod)
+            every = source[1, :: 1 << lod, :: 1 << lod, :: 1 << lod]
+            assert coarse.shape == every.shape
+            assert np.sqrt(((coarse - every) ** 2).mean()) < 0.1 * np.ptp(source)
+        assert volume.read_lod(0, 10).shape == (1, 1, 1)
+        for lod in (-1, 11, 1.5):
+            with pytest.raises(InputError, match="allowed: 0 to 10"):
+                volume.read_lod(0, lod)
+        with pytest.raises(InputError, match="between two"):
+            volume.read_lod(0.5, 1)
+        with pytest.raises(RegionError):
+            volume.read_lod(3, 1)
+    with fhash_codec.open(feature[1]) as volume:
+        every = tuple(slice(low, high, 2) for low, high in volume.box)
+        np.testing.assert_array_equal(
+            np.isfinite(volume.read_lod(2, 1)), volume.occupancy(2)[every]
+        )
+
+
+@pytest.mark.parametrize("lod", [0, 1, 2, 3])
+@pytest.mark.parametrize(
+    "region",
+    [
+        ((0, 9), (0, 12), (0, 20)),
+        ((2, 9), (3, 9), (7, 19)),
+        ((8, 9), (8, 10), (15, 17)),
+        ((0, 1), (0, 1), (0, 1)),
+    ],
+)
+def test_a_region_of_a_level_of_detail_is_that_part_of_the_level(
+    feature: Feature, lod: int, region: tuple[tuple[int, int], ...]
+) -> None:
+    with fhash_codec.open(feature[1]) as volume:
+        level = np.full(volume.shape[1:], -1.0, np.float32)
+        level[tuple(slice(low, high, 1 << lod) for low, high in volume.box)] = volume.read_lod(
+            3, lod
+        )
+        vertices = [
+            [n for n in range(low, high) if first <= n < end and (n - first) % (1 << lod) == 0]
+            for (low, high), (first, end) in zip(region, volume.box, strict=True)
+        ]
+        if not all(vertices):
+            with pytest.raises(RegionError, match=f"holds no vertex of level of detail {lod}"):
+                volume.read_lod(3, lod, region)
+            return
+        assert [list(axis) for axis in volume.lod_vertices(lod, region)] == vertices
+        np.testing.assert_array_equal(volume.read_lod(3, lod, region), level[np.ix_(*vertices)])
+
+
+def test_a_region_of_a_level_of_detail_decodes_the_tiles_that_it_touches(
+    feature: Feature, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with fhash_codec.open(feature[1]) as volume:
+        table = volume.container.arrays["tables/level_1"]
+        indices = record_decoded_tiles(monkeypatch, table)
+        (z, _), (y, _), (x, _) = volume.box
+        volume.read_lod(2, 1, ((z + 4, z + 7), (y, y + 5), (x + 8, x + 9)))
+        assert set(indices) == {(1, 1, 0, 1)}
+        with pytest.raises(RegionError, match="region 3:3 of axis y is empty"):
+            volume.read_lod(2, 1, ((0, 1), (3, 3), (0, 1)))
+        with pytest.raises(RegionError, match="outside 0:9"):
+            volume.lod_vertices(1, ((0, 10), (0, 1), (0, 1)))
+
+
+def test_a_paper_file_has_no_levels_of_detail(encoded: tuple[Series, Path]) -> None:
+    with (
+        fhash_codec.open(encoded[1]) as volume,
+        pytest.raises(InputError, match="paper has no levels of detail"),
+    ):
+        volume.read_lod(0, 1)

@@ -1,0 +1,104 @@
+"""Stages of planning: what each leaves as it is, and what the gains of a file say of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import fhash_codec
+from fhash_codec import EncodeConfig
+from fhash_codec.compact.attempt import GainLog, PlanTask
+from fhash_codec.compact.choices.head import EFFORTS, Budget, Effort
+from fhash_codec.compact.goal import goal_of
+from fhash_codec.compact.stages import (
+    choose_step,
+    choose_tiles,
+    fill_tiles,
+    first_guess,
+    first_settings,
+    try_head,
+    try_predictor,
+)
+from fhash_codec.compact.tiles.blocks import Blocks
+from fhash_codec.coreset.selection import select_features
+from fhash_codec.progress import silent
+from fhash_formats.series import ArraySeries
+
+Field = Callable[..., npt.NDArray[Any]]
+
+
+def test_the_stages_follow_each_other_and_leave_out_what_does_not_apply(field: Field) -> None:
+    series = ArraySeries(field((4, 8, 12, 16)))
+    config = EncodeConfig(effort=2, psnr=45.0)
+    selection = select_features(series, config, silent)
+    value_range = selection.scanned.value_range
+    with ThreadPoolExecutor(2) as workers:
+        task = PlanTask(
+            blocks=Blocks(series, selection.extent, series.shape),
+            value_range=value_range,
+            features=selection.features,
+            config=config,
+            goal=goal_of(config, value_range, 1, 0),
+            fixed_tile=(4, 8, 6, 8),
+            workers=workers,
+            gains=GainLog(100),
+        )
+        tiled = task.blocks.retile((4, 8, 6, 8))
+        guess = first_guess(task, tiled, first_settings(task, tiled))
+        attempt = choose_tiles(task, guess)
+        assert attempt.sample.blocks.tile == (4, 8, 6, 8)
+        filled = fill_tiles(task, attempt)
+        assert filled.sample is attempt.sample  # all vertices count
+        attempt = choose_step(task, filled)
+        assert attempt.outcome.psnr(task.goal.data_range) == pytest.approx(45.0, abs=0.3)
+        assert attempt.outcome in attempt.tried
+        # Effort 2 trains no head, and a PSNR has no predictor.
+        assert try_head(task, attempt) is attempt
+        assert try_predictor(task, attempt) is attempt
+    assert [entry["what"] for entry in task.gains.entries] == ["start", "transform by trial"]
+    assert task.gains.entries[1]["bytes"] == attempt.outcome.size + 100
+
+
+def test_under_a_bound_a_predictor_is_tried(tmp_path: Path, field: Field) -> None:
+    figures = fhash_codec.encode(
+        field((4, 8, 12, 16)), tmp_path / "a.fhz", EncodeConfig(effort=2, max_error_rel=1e-3)
+    )
+    stages = [gain["what"] for gain in figures["gains"]]
+    assert stages[:2] == ["start", "transform by trial"]
+    assert stages[2] in ("prediction", "prediction (left out)")
+    assert stages[3:] == ["all tiles"]
+
+
+def test_more_effort_is_no_larger_and_keeps_the_promise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field: Field
+) -> None:
+    budget = Budget(updates=200, samples=40_000)
+    monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget))
+    source = field((4, 12, 16, 16))
+    reports = [
+        fhash_codec.encode(source, tmp_path / f"{n}.fhz", EncodeConfig(effort=n, psnr=45.0))
+        for n in (1, 3, 5)
+    ]
+    assert all(figures["psnr"] >= 45 for figures in reports)
+    sizes = [figures["bytes"] for figures in reports]
+    # The header says more where more was done.
+    assert sizes[1] < sizes[0]
+    assert sizes[2] < 1.15 * sizes[1]
+    assert [gain["what"] for gain in reports[0]["gains"]] == ["all tiles"]
+    assert any(gain["what"].startswith("head") for gain in reports[2]["gains"])
+
+
+def test_a_coreset_of_integers_is_filled_anew_for_all_tiles(tmp_path: Path, field: Field) -> None:
+    """Rounded fill values would cost more than those that they were rounded from."""
+    source = np.rint(field((3, 6, 10, 12))).astype(np.int16)
+    config = EncodeConfig(effort=2, psnr=45.0, features=("interval:0:400",))
+    fhash_codec.encode(source, tmp_path / "a.fhz", config)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert volume[...].dtype.kind == "f"  # NaN outside the coreset
+        assert volume.verify() == len(volume.info["arrays"])

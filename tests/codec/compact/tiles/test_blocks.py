@@ -1,0 +1,57 @@
+"""Tiles of a series: together they are the box, whether it is in memory or read by layers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fhash_codec.compact.tiles.blocks import Blocks, Tile
+from fhash_codec.config import EncodeConfig
+from fhash_codec.coreset.selection import select_features
+from fhash_codec.progress import silent
+from fhash_formats.series import ArraySeries
+
+SHAPE = (5, 6, 7, 8)
+VALUES = np.random.default_rng(0).normal(size=SHAPE).astype(np.float32)
+
+
+def blocks_of(tile: tuple[int, int, int, int], features: tuple[str, ...] = ("all",)) -> Blocks:
+    series = ArraySeries(VALUES)
+    config = EncodeConfig(features=features, dilation=0)
+    return Blocks(series, select_features(series, config, silent).extent, tile)
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_tiles_make_up_the_box_and_repeat_its_border(
+    monkeypatch: pytest.MonkeyPatch, in_memory: bool
+) -> None:
+    if not in_memory:
+        monkeypatch.setattr("fhash_codec.compact.tiles.blocks.MAX_BYTES_IN_MEMORY", 1)
+    blocks = blocks_of((2, 4, 7, 5))
+    assert blocks.in_memory == in_memory
+    assert blocks.complete
+    padded = np.pad(VALUES, [(0, 1), (0, 2), (0, 0), (0, 2)], mode="edge")
+    inside = np.pad(np.ones(SHAPE, bool), [(0, 1), (0, 2), (0, 0), (0, 2)])
+    for index in blocks.indices():
+        span = tuple(slice(i * n, (i + 1) * n) for i, n in zip(index, blocks.tile, strict=True))
+        tile = blocks.read(index)
+        np.testing.assert_array_equal(tile.values, padded[span])
+        if inside[span].all():
+            assert tile.counted is None
+        else:
+            np.testing.assert_array_equal(tile.counted, inside[span])
+        assert tile.counted_vertices == np.count_nonzero(inside[span])
+
+
+def test_vertices_outside_the_coreset_do_not_count() -> None:
+    blocks = blocks_of(SHAPE, ("interval:0:10",))
+    tile = blocks.read((0, 0, 0, 0))
+    assert not blocks.complete
+    np.testing.assert_array_equal(tile.counted, tile.values >= 0)
+    other = blocks.retile((1, 6, 7, 8))
+    np.testing.assert_array_equal(other.read((3, 0, 0, 0)).counted, tile.counted[3:4])
+
+
+def test_a_tile_is_empty_where_no_vertex_counts() -> None:
+    assert Tile(VALUES, np.zeros(SHAPE, bool)).is_empty
+    assert not Tile(VALUES, None).is_empty

@@ -1,0 +1,54 @@
+"""Size and error of coded tiles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fhash_codec.compact.choices.transform import usual_transform
+from fhash_codec.compact.tiles.blocks import Tile
+from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome, code, total
+from fhash_formats.transform.tile.settings import TileSettings
+
+SHAPE = (2, 8, 12, 16)
+VALUES = np.random.default_rng(0).normal(size=SHAPE).cumsum(axis=3).astype(np.float32)
+SETTINGS = TileSettings(
+    transform=usual_transform(SHAPE),
+    step=0.5,
+    center=0.0,
+    low=float(VALUES.min()),
+    high=float(VALUES.max()),
+    offsets=OFFSETS,
+)
+
+
+def test_the_outcome_is_that_of_the_decoded_values() -> None:
+    counted = np.random.default_rng(1).random(SHAPE) < 0.7
+    coded, outcome = code(Tile(VALUES, counted), SETTINGS, Coding())
+    errors = (coded.decoded.astype(np.float64) - VALUES)[counted]
+    assert outcome.size == len(coded.data)
+    assert outcome.count == errors.size
+    assert outcome.squares == pytest.approx((errors**2).sum())
+    assert outcome.max_error == pytest.approx(np.abs(errors).max())
+    expected = 10 * math.log10(9.0 / (errors**2).mean())
+    assert outcome.psnr(3.0) == pytest.approx(expected)
+
+
+def test_an_exact_tile_has_no_error() -> None:
+    coded, outcome = code(Tile(VALUES, None), replace(SETTINGS, double=True), Coding(exact=True))
+    np.testing.assert_array_equal(coded.decoded, VALUES)
+    assert (outcome.squares, outcome.max_error, outcome.count) == (0.0, 0.0, VALUES.size)
+    assert outcome.psnr(1.0) == math.inf
+
+
+def test_outcomes_add_up_by_their_weights() -> None:
+    first = Outcome(size=3, squares=1.0, count=10, max_error=0.5, nonzero=2)
+    second = Outcome(size=5, squares=2.0, count=20, max_error=0.1, nonzero=1)
+    assert total([first, second], [2, 3]) == Outcome(
+        size=21, squares=8.0, count=80, max_error=0.5, nonzero=7
+    )
+    assert total([first]) == first
+    assert total([]).size == 0

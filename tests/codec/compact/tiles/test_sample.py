@@ -1,0 +1,121 @@
+"""Samples of tiles: whom each tile stands for, and what coding them says of all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fhash_codec.compact.choices.transform import usual_transform
+from fhash_codec.compact.tiles.blocks import Index, Tile
+from fhash_codec.compact.tiles.coding import OFFSETS, Coding
+from fhash_codec.compact.tiles.sample import Sample, spread_order, strata
+from fhash_formats.transform.tile.settings import TileSettings
+
+
+class Row:
+    """A row of tiles; all values of a tile are its number."""
+
+    complete, in_memory, tile = True, True, (1, 1, 10, 100)
+
+    def __init__(self, tiles: int) -> None:
+        self.tiles = tiles
+        self.shape = (1, 1, 10 * tiles, 100)
+
+    def indices(self) -> Iterator[Index]:
+        return iter([(0, 0, number, 0) for number in range(self.tiles)])
+
+    def read(self, index: Index) -> Tile:
+        return Tile(np.full(self.tile, index[2], np.float32), None)
+
+
+SETTINGS = TileSettings(
+    transform=usual_transform(Row.tile), step=1.0, center=0.0, low=0.0, high=16.0
+)
+
+
+def test_a_wider_sample_has_more_tiles_of_the_same_series() -> None:
+    with ThreadPoolExecutor(1) as workers:
+        narrow = Sample(Row(16), 4_000, workers)
+        wide = narrow.wider(8_000)
+        assert (len(narrow.tiles), narrow.weights) == (4, [4] * 4)
+        assert (len(wide.tiles), wide.weights) == (8, [2] * 8)
+        complete = Sample(Row(8), 8_000, workers)
+        assert complete.complete
+        assert complete.wider(16_000) is complete
+
+
+def test_an_expensive_tile_stands_for_itself_and_a_cheap_one_for_many() -> None:
+    """The sample must have the one tile in which everything happens, and count it once."""
+    costs = [1.0] * 16
+    costs[11] = 400.0
+    with ThreadPoolExecutor(1) as workers:
+        sample = Sample(Row(16), 4_000, workers, costs)
+        numbers = [int(tile.values[0, 0, 0, 0]) for tile in sample.tiles]
+        assert dict(zip(numbers, sample.weights, strict=True))[11] == 1
+        assert sum(sample.weights) == 16
+        assert sample.counted == 16_000
+        assert sample.run(SETTINGS, Coding()).count == 16_000
+
+
+@pytest.mark.parametrize("max_tiles", [1, 3, 7, 40])
+def test_strata_cover_all_tiles(max_tiles: int) -> None:
+    costs = np.random.default_rng(max_tiles).gamma(0.3, 100.0, 40).tolist()
+    chosen = strata(costs, max_tiles)
+    assert len(chosen) <= max_tiles
+    assert sum(weight for _, weight in chosen) == 40
+    assert [tile for tile, _ in chosen] == sorted({tile for tile, _ in chosen})
+    estimate = sum(costs[tile] * weight for tile, weight in chosen)
+    assert max_tiles < 7 or abs(estimate / sum(costs) - 1) < 0.25
+    assert [weight for _, weight in strata([0.0] * 40, 4)] == [10] * 4
+
+
+def test_each_beginning_of_the_order_is_spread_evenly() -> None:
+    order = spread_order(100)
+    assert sorted(order) == list(range(100))
+    for count in (5, 20, 50):
+        gaps = np.diff([-1, *sorted(order[:count]), 100])
+        assert gaps.max() <= 3 * 100 / count
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_all_tiles_of_the_series_come_in_order(in_memory: bool) -> None:
+    row = Row(40)
+    row.in_memory = in_memory
+    with ThreadPoolExecutor(3) as workers:
+        sample = Sample(row, 4_000, workers)
+        firsts = list(sample.map_all(lambda tile: int(tile.values.flat[0])))
+    assert firsts == list(range(40))
+
+
+class HalfCounts(Row):
+    """Tiles of noise of which the first half along x counts."""
+
+    complete = False
+
+    def read(self, index: Index) -> Tile:
+        values = np.random.default_rng(index[2]).random(self.tile).astype(np.float32)
+        return Tile(values, np.indices(self.tile)[3] < 50)
+
+
+FILL_SETTINGS = replace(SETTINGS, step=0.05, center=0.5, high=1.0, offsets=OFFSETS)
+
+
+def test_all_trials_at_once_are_what_each_gives_alone() -> None:
+    with ThreadPoolExecutor(3) as workers:
+        sample = Sample(HalfCounts(4), 10**7, workers)
+        trials = [(replace(FILL_SETTINGS, step=step), Coding(filled=True)) for step in (0.02, 0.1)]
+        assert sample.run_all(trials) == [sample.run(*trial) for trial in trials]
+        assert sample.run_all([]) == []
+
+
+def test_every_filling_begins_with_the_source() -> None:
+    with ThreadPoolExecutor(2) as workers:
+        sample = Sample(HalfCounts(4), 10**7, workers)
+        once = sample.filled(FILL_SETTINGS, 2)
+        twice = sample.filled(FILL_SETTINGS, 1).filled(FILL_SETTINGS, 2)
+    for first, second in zip(once.tiles, twice.tiles, strict=True):
+        np.testing.assert_array_equal(first.values, second.values)

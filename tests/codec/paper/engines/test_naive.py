@@ -1,0 +1,32 @@
+"""The naive engine: its errors are those of its values, on the coreset alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.engines.naive import NaiveEngine
+
+
+def test_errors_are_those_of_the_values_at_the_samples(noise_coreset, in_coreset) -> None:
+    coreset = noise_coreset((3, 6, 10, 20))
+    architecture = Architecture.for_box(coreset.box.shape, 3, width=8)
+    engine = NaiveEngine(
+        architecture,
+        coreset,
+        np.full(10, 0.01),
+        seed=1,
+        device=torch.device("cpu"),
+        dtype=torch.float64,
+    )
+    bricks, mask = np.arange(len(coreset.bricks)), in_coreset(coreset)
+    for _ in range(3):
+        values = engine.infer(bricks).numpy()[mask]
+        expected = float(np.square(values - coreset.values).sum())
+        assert engine.squared_error(bricks) == pytest.approx(expected, rel=1e-10)
+        assert float(engine.train(bricks)) == pytest.approx(expected, rel=1e-10)
+    assert engine.squared_error(bricks) < expected
+    outside = np.moveaxis(engine.parameters().fine.numpy(), 1, -1)[~mask]
+    assert not outside.any()

@@ -1,0 +1,119 @@
+"""The slab engine trains and evaluates what the naive one in float64 does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.engines.naive import NaiveEngine
+from fhash_codec.paper.engines.slab import SlabEngine
+
+CPU = torch.device("cpu")
+CASES = [
+    pytest.param((4, 7, 16, 30), {"embedding_size": 2, "hidden_layers": 1}, id="plain"),
+    pytest.param(
+        (1, 17, 16, 16),
+        {"embedding_size": 1, "hidden_layers": 0, "fold": 3},
+        id="one key frame, linear readout",
+    ),
+    pytest.param(
+        (3, 1, 33, 2), {"embedding_size": 3, "hidden_layers": 2}, id="thin axes, two hidden layers"
+    ),
+    pytest.param((2, 5, 1, 1), {"embedding_size": 2, "hidden_layers": 1}, id="a column"),
+    pytest.param((2, 1, 1, 1), {"embedding_size": 2, "hidden_layers": 1}, id="one voxel"),
+    pytest.param(
+        (3, 30, 40, 50),
+        {"embedding_size": 2, "hidden_layers": 1, "low": 0.9999},
+        id="a few vertices far apart",
+    ),
+]
+
+
+@pytest.fixture
+def engines_of(noise_coreset):
+    """A function of a shape and settings: coreset, slab engine, and the oracle in float64."""
+
+    def make(shape, settings):
+        coreset = noise_coreset(shape, settings.get("low", 0.3))
+        settings = {name: value for name, value in settings.items() if name != "low"}
+        architecture = Architecture.for_box(coreset.box.shape, shape[0], width=16, **settings)
+        rates = np.full(201, 0.01)
+        slab = SlabEngine(architecture, coreset, rates, seed=7, device=CPU)
+        oracle = NaiveEngine(architecture, coreset, rates, seed=7, device=CPU, dtype=torch.float64)
+        return coreset, slab, oracle
+
+    return make
+
+
+@pytest.mark.parametrize(("shape", "settings"), CASES)
+def test_slab_equals_the_oracle_before_training(in_coreset, engines_of, shape, settings) -> None:
+    coreset, slab, oracle = engines_of(shape, settings)
+    bricks = np.arange(len(coreset.bricks))
+    mask = in_coreset(coreset)
+    np.testing.assert_allclose(
+        slab.infer(bricks).numpy()[mask], oracle.infer(bricks).numpy()[mask], atol=2e-7
+    )
+    assert slab.squared_error(bricks) == pytest.approx(oracle.squared_error(bricks), rel=1e-5)
+
+
+@pytest.mark.parametrize(("shape", "settings"), CASES)
+def test_slab_trains_like_a_dense_adam_though_it_visits_few_bricks_a_step(
+    engines_of, shape, settings
+) -> None:
+    coreset, slab, oracle = engines_of(shape, settings)
+    bricks, random = len(coreset.bricks), np.random.default_rng(1)
+    for _ in range(40):
+        chosen = random.permutation(bricks)[: max(1, bricks // 3)]
+        error = float(slab.train(chosen))
+        assert error == pytest.approx(float(oracle.train(chosen)), rel=1e-3, abs=1e-6)
+    ours, theirs = slab.parameters(), oracle.parameters()
+    # Median and count, not maximum: near a ReLU's kink float32 may take the other side, in
+    # torch's own Adam as well.
+    for a, b in (
+        (ours.fine, theirs.fine),
+        (ours.coarse, theirs.coarse),
+        (ours.network, theirs.network),
+    ):
+        if not a.numel():
+            continue
+        # What no sample moved is 0 in ours and still at its start in the oracle's.
+        apart = (a - b)[a != 0].abs()
+        # A thousandth of one Adam step, after 40 of them.
+        assert float(apart.median()) < 1e-3 * 0.01
+        assert float((apart > 1e-3).double().mean()) < 0.01
+
+
+def test_gradients_equal_those_of_autograd_in_float64(engines_of) -> None:
+    coreset, slab, oracle = engines_of((4, 9, 12, 20), {"embedding_size": 2, "hidden_layers": 2})
+    bricks = np.arange(len(coreset.bricks))
+    slab.train(bricks)
+    oracle.train(bricks)
+    tables = torch.cat([table.grad.flatten() for table in list(oracle.model.tables)[1:]])
+    parts = [tables[slab.upsampling.used]]
+    for weight, bias in zip(oracle.model.weights, oracle.model.biases, strict=True):
+        parts.append(torch.column_stack([weight.grad, bias.grad]))
+    expected = torch.cat([part.flatten() for part in parts]).float()
+    apart = (slab.gradient - expected).abs() / expected.abs().max()
+    assert float(apart.median()) < 1e-7
+    assert float((apart > 1e-5).double().mean()) < 0.001
+
+
+def test_embeddings_that_no_sample_moved_are_stored_as_zero(in_coreset, engines_of) -> None:
+    coreset, slab, _ = engines_of((3, 9, 20, 35), {"embedding_size": 2, "hidden_layers": 1})
+    slab.train(np.arange(len(coreset.bricks)))
+    fine = slab.parameters().fine.numpy()
+    mask = in_coreset(coreset)
+    outside = np.moveaxis(fine, 1, -1)[~mask]
+    # A negative zero would cost bytes.
+    assert not outside.any()
+    assert not np.signbit(outside).any()
+    assert (np.moveaxis(fine, 1, -1)[mask] != 0).all()
+
+
+def test_training_holds_only_what_the_bricks_reach_of_the_coarse_tables(engines_of) -> None:
+    _, slab, oracle = engines_of((3, 30, 40, 50), {"low": 0.9999})
+    coarse = sum(len(table) * 2 for table in list(oracle.model.tables)[1:])
+    assert 0 < len(slab.upsampling.used) < 0.6 * coarse
+    assert slab.parameters().coarse.numel() == coarse

@@ -1,0 +1,93 @@
+"""Coding trained tables with one step: the loss is as reported, and less than the gain."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec import QualityError
+from fhash_codec.paper.tables.step import MAX_LOSS
+from fhash_formats.container import Container
+
+
+def decoded(path) -> np.ndarray:
+    with fhash_codec.open(path) as volume:
+        return volume[...]
+
+
+def test_the_loss_is_within_its_limit_and_what_is_said(pair) -> None:
+    (exact, _), (coded, path) = pair["exact"], pair["coded"]
+    loss = exact["psnr"] - coded["psnr"]
+    assert exact["tables_loss_db"] is None
+    assert coded["tables_loss_db"] <= MAX_LOSS + 1e-4
+    if len(coded["key_frames"]) == 5:
+        assert coded["tables_loss_db"] == pytest.approx(loss, abs=2e-4)
+    else:
+        # Steps between key frames are wrong by more, which coding does not change.
+        assert loss <= MAX_LOSS
+    with fhash_codec.open(path) as volume:
+        assert volume.info["model"]["tables_loss_db"] == coded["tables_loss_db"]
+        assert volume.info["model"]["tables"] == "transform"
+        assert volume.info["required_features"] == ["transform"]
+        assert coded["bytes"] < 0.75 * exact["bytes"]
+        assert volume.verify() == len(volume.info["arrays"])
+    with fhash_codec.open(path) as volume, fhash_codec.open(pair["exact"][1]) as other:
+        for t in (0, 1.5, 4):
+            np.testing.assert_array_equal(volume.occupancy(t), other.occupancy(t))
+
+
+def test_a_promise_is_kept_and_no_more(waves, coded_config, tmp_path) -> None:
+    source = waves()
+    free = fhash_codec.encode(source, tmp_path / "a.fhz", replace(coded_config, epochs=10))
+    wanted = free["psnr"] - 6.0
+    figures = fhash_codec.encode(
+        source, tmp_path / "b.fhz", replace(coded_config, epochs=10, psnr=wanted)
+    )
+    assert wanted <= figures["psnr"] < wanted + 0.5
+    assert figures["bytes"] < 0.97 * free["bytes"]
+    assert figures["tables_loss_db"] == pytest.approx(6.0, abs=0.6)
+    with pytest.raises(QualityError) as missed:
+        fhash_codec.encode(source, tmp_path / "c.fhz", replace(coded_config, epochs=1, psnr=150.0))
+    # Out of reach anyway: then only the usual loss is taken.
+    assert missed.value.figures["tables_loss_db"] <= MAX_LOSS + 1e-4
+
+
+@pytest.mark.parametrize(
+    "shape", [(1, 1, 1, 1), (3, 1, 1, 1), (1, 1, 1, 7), (2, 2, 2, 2), (7, 3, 5, 11)]
+)
+def test_every_shape_comes_back(coded_config, tmp_path, shape) -> None:
+    source = np.random.default_rng(0).random(shape, dtype=np.float32)
+    figures = fhash_codec.encode(source, tmp_path / "a.fhz", coded_config)
+    back = decoded(tmp_path / "a.fhz")
+    assert back.shape == shape
+    assert np.isfinite(back).all()
+    assert figures["max_abs_error"] == pytest.approx(np.abs(back - source).max(), rel=1e-5)
+
+
+def test_a_constant_series_comes_back_exactly(coded_config, tmp_path) -> None:
+    figures = fhash_codec.encode(np.full((3, 4, 5, 6), 7.25), tmp_path / "a.fhz", coded_config)
+    assert (decoded(tmp_path / "a.fhz") == 7.25).all()
+    assert figures["rmse"] == 0
+
+
+def test_the_same_input_gives_the_same_bytes(waves, coded_config, tmp_path) -> None:
+    for name in ("a.fhz", "b.fhz"):
+        fhash_codec.encode(
+            waves((3, 6, 7, 8)), tmp_path / name, replace(coded_config, epochs=2, timings=False)
+        )
+    assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
+
+
+def test_other_readers_see_what_is_needed(pair) -> None:
+    with Container.open(pair["coded"][1]) as container:
+        json.dumps(container.header)
+        size = container.header["model"]["embedding_size"]
+        names = [name for name in container.arrays if name.startswith("tables/")]
+        assert len(names) == size * len(container.header["model"]["levels"])
+        assert container.arrays["tables/level_1/component_1"].shape == tuple(
+            container.header["model"]["levels"][0]
+        )

@@ -1,0 +1,103 @@
+"""Networks refuse parts that do not fit; their layers equal the formula in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fhash_codec.paper.network import COLUMNS, MAX_GRADIENT_SAMPLES, ArrayTable, DenseLayers
+from fhash_codec.paper.points import sample_points
+from fhash_codec.paper.regions import decode_region
+from fhash_formats.errors import DamagedFileError, InputError
+
+
+def test_a_network_whose_parts_do_not_fit_is_refused(networks) -> None:
+    net = networks.random((4, 5, 6), 2, 2, 2, 1)
+    weight, bias = net.layers[0]
+    cases = [
+        ({"tables": net.tables[:-1]}, "tables for"),
+        ({"tables": [net.tables[1], *net.tables[1:]]}, "table of level 1 has shape"),
+        ({"tables": [*net.tables[:2], net.tables[0]]}, "table of level 3 has shape"),
+        ({"embedding_size": 3}, "table of level 1 has shape"),
+        ({"key_frames": 0}, "at least 1"),
+        ({"layers": net.layers[:1]}, "one output"),
+        ({"layers": ()}, "one output"),
+        ({"layers": ((weight[:, 1:], bias), net.layers[1])}, "layer 1 has weight"),
+        ({"layers": ((weight, bias[1:]), net.layers[1])}, "layer 1 has weight"),
+        ({"layers": (net.layers[0], net.layers[0])}, "layer 2 has weight"),
+        ({"layers": ((weight * np.float32(np.nan), bias), net.layers[1])}, "not finite"),
+    ]
+    for change, message in cases:
+        with pytest.raises(InputError, match=message):
+            replace(net, **change)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_table_that_is_not_finite_is_refused_not_decoded(networks, bad) -> None:
+    """Messages count levels from 1, as the arrays of the file do."""
+    net = networks.random((4, 5, 6), 2, 2, 2, 1)
+    net.tables[1].values[0, 0, 0, 0, 1] = bad
+    with pytest.raises(DamagedFileError, match="level 2 holds"):
+        decode_region(net, 0, networks.box(net))
+    with pytest.raises(DamagedFileError, match="level 2 holds"):
+        sample_points(net, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+def test_weights_that_overflow_give_no_warning(networks, gradient) -> None:
+    """Hostile files may hold such weights."""
+    net = networks.random((2, 3, 4), 2, 2, 2, 2)
+    huge = np.float32(3e38)
+    mixed = tuple((np.where(weight > 0, huge, -huge), bias) for weight, bias in net.layers)
+    positive = tuple((np.full_like(weight, huge), bias) for weight, bias in net.layers)
+    tables = [ArrayTable(np.abs(table.values) + 1) for table in net.tables]
+    points = np.full((4, 3), 0.5)
+    for hostile in (replace(net, layers=mixed), replace(net, layers=positive, tables=tables)):
+        result = sample_points(hostile, *points, gradient=gradient)
+        frame = decode_region(hostile, 0.5, ((0, 2), (0, 3), (0, 4)))
+    values = result[0] if gradient else result
+    assert not np.isfinite(values).any()
+    assert not np.isfinite(frame).any()
+
+
+@pytest.mark.parametrize("samples", [1, COLUMNS, COLUMNS + 1, 2 * MAX_GRADIENT_SAMPLES + 7])
+@pytest.mark.parametrize("hidden_layers", [0, 1, 2])
+def test_dense_layers_equal_the_formula_for_any_number_of_samples(
+    networks, samples, hidden_layers
+) -> None:
+    net = networks.random((4, 5, 6), 2, 2, 2, hidden_layers)
+    layers = DenseLayers(net, samples)
+    assert layers.inputs.shape[1] % COLUMNS == 0
+    inputs = np.random.default_rng(1).standard_normal((net.inputs, samples), dtype=np.float32)
+    layers.inputs[:-1, :samples] = inputs
+    value, size = inputs.astype(np.float64), np.abs(inputs.astype(np.float64))
+    for number, (weight, bias) in enumerate(net.layers):
+        value = weight @ (np.maximum(value, 0) if number else value) + bias[:, None]
+        size = np.abs(weight) @ size + np.abs(bias)[:, None]
+    # A sum of m float32 products is within m rounding steps of the sum of their magnitudes.
+    steps = sum(weight.shape[1] + 2 for weight, _ in net.layers)
+    bound = steps * np.finfo(np.float32).eps * size[0]
+    assert (np.abs(layers.run()[:samples] - value[0]) <= bound).all()
+
+
+@pytest.mark.parametrize("hidden_layers", [0, 1, 2])
+def test_the_gradient_of_dense_layers_is_that_of_differences(networks, hidden_layers) -> None:
+    net = networks.random((4, 5, 6), 2, 2, 2, hidden_layers)
+    samples, step = 100, 1e-2
+    inputs = np.random.default_rng(1).standard_normal((net.inputs, samples), dtype=np.float32)
+    layers = DenseLayers(net, samples)
+    layers.inputs[:-1, :samples] = inputs
+    layers.run()
+    gradient = layers.gradient()[:, :samples].copy()
+    assert gradient.shape == (net.inputs, samples)
+    for number in range(net.inputs):
+        values = []
+        for shift in (step, -step):
+            layers.inputs[number, :samples] = inputs[number] + np.float32(shift)
+            values.append(layers.run()[:samples].copy())
+        layers.inputs[number, :samples] = inputs[number]
+        difference = (values[0] - values[1]) / (2 * step)
+        # Kinks of ReLUs may lie between the two points: count, do not take the maximum.
+        assert np.isclose(gradient[number], difference, atol=1e-3, rtol=1e-3).mean() > 0.9

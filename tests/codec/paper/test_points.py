@@ -1,0 +1,244 @@
+"""Values and derivatives between vertices, against the 16-corner formula and the paper's model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from math import prod
+
+import numpy as np
+import pytest
+import torch
+
+from fhash_codec.paper import points
+from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.fhash import FHash
+from fhash_codec.paper.levels import level_resolutions
+from fhash_codec.paper.network import ArrayTable, Network
+from fhash_codec.paper.points import input_slopes, sample_points
+from fhash_codec.paper.regions import decode_region
+from fhash_formats.errors import InputError, RegionError
+
+
+def test_values_match_the_sixteen_corner_formula(networks, network) -> None:
+    for key_index in networks.key_indices(network):
+        vertices = networks.vertices(network, key_index)
+        np.testing.assert_allclose(
+            sample_points(network, *vertices),
+            networks.reference(network, vertices),
+            rtol=1e-5,
+            atol=1e-5,
+        )
+    scattered = networks.points(network, 500)
+    np.testing.assert_allclose(
+        sample_points(network, *scattered),
+        networks.reference(network, scattered),
+        rtol=1e-5,
+        atol=1e-5,
+    )
+
+
+def test_values_and_gradients_are_those_of_the_papers_model_by_autograd(networks, network) -> None:
+    sizes = (network.key_frames, *network.box_size)
+    architecture = Architecture(
+        levels=network.levels,
+        embedding_size=network.embedding_size,
+        hidden_layers=len(network.layers) - 1,
+        width=16,
+        box_size=network.box_size,
+        key_frames=network.key_frames,
+    )
+    tables = [
+        torch.from_numpy(table.values.reshape(-1, network.embedding_size)).double()
+        for table in network.tables
+    ]
+    layers = [
+        (torch.from_numpy(weight).double(), torch.from_numpy(bias).double())
+        for weight, bias in network.layers
+    ]
+    model = FHash(architecture, tables, layers)
+    scattered = networks.points(network, 300)
+    leaf = torch.from_numpy(np.stack(scattered, axis=1)).requires_grad_()
+    expected = model(leaf)
+    (slopes_expected,) = torch.autograd.grad(expected.sum(), leaf)
+    values, slopes = sample_points(network, *scattered, gradient=True)
+    np.testing.assert_allclose(values, expected.detach().numpy(), rtol=1e-5, atol=1e-5)
+    for axis in np.flatnonzero(np.array(sizes) > 1):
+        exact = slopes_expected[:, axis].numpy()
+        close = np.isclose(slopes[:, axis], exact, rtol=1e-4, atol=1e-4)
+        # Near a ReLU's kink float32 may take the other side.
+        assert close.mean() > 0.98
+
+
+def test_gradients_match_central_differences(networks, network) -> None:
+    scattered = networks.points(network, 400, seed=2)
+    values, slopes = sample_points(network, *scattered, gradient=True)
+    np.testing.assert_array_equal(values, sample_points(network, *scattered))
+    assert slopes.shape == (400, 4)
+    step = 1e-5
+    for axis, size in enumerate((network.key_frames, *network.box_size)):
+        if size == 1:
+            assert not slopes[:, axis].any()
+            continue
+        after, before = [list(scattered) for _ in range(2)]
+        after[axis] = np.minimum(scattered[axis] + step, size - 1)
+        before[axis] = np.maximum(scattered[axis] - step, 0)
+        difference = networks.reference(network, after) - networks.reference(network, before)
+        expected = difference / (after[axis] - before[axis])
+        close = np.abs(slopes[:, axis] - expected) <= 1e-4 * (1 + np.abs(expected))
+        # A few differences straddle the kink of a ReLU or the border of a cell.
+        assert close.mean() > 0.97
+
+
+@pytest.mark.parametrize(
+    "shape", [((5, 9, 17), 6, 2), ((1, 12, 2), 1, 3), ((7, 1, 10), 3, 2)], ids=str
+)
+def test_a_linear_field_and_its_gradient_are_reproduced(networks, shape) -> None:
+    box, key_frames, fold = shape
+    levels = level_resolutions(box, key_frames, fold)
+    sizes, slope = np.array((key_frames, *box)), np.array([0.5, -0.25, 0.125, 0.375])
+    tables = []
+    for level in levels:
+        corners = np.stack(
+            np.meshgrid(
+                *(np.linspace(0, s - 1, r) for s, r in zip(sizes, level, strict=True)),
+                indexing="ij",
+            ),
+            axis=-1,
+        )
+        tables.append(ArrayTable((corners @ slope)[..., None].astype(np.float32)))
+    readout = (np.full((1, len(levels)), 1 / len(levels), np.float32), np.array([2.0], np.float32))
+    net = Network(
+        levels=levels,
+        embedding_size=1,
+        tables=tables,
+        layers=(readout,),
+        box_size=box,
+        key_frames=key_frames,
+    )
+    # Cell borders and both ends too: the derivative is one-sided there, never missing.
+    scattered = [
+        np.concatenate([p, [0, s - 1, s // 2]])
+        for p, s in zip(networks.points(net, 200), sizes, strict=True)
+    ]
+    values, slopes = sample_points(net, *scattered, gradient=True)
+    np.testing.assert_allclose(values, 2 + slope @ np.array(scattered), atol=1e-5)
+    np.testing.assert_allclose(
+        slopes, np.broadcast_to(np.where(sizes > 1, slope, 0), slopes.shape), atol=1e-5
+    )
+    middle = 0.5 * (key_frames - 1)
+    frame = decode_region(net, middle, networks.box(net))
+    np.testing.assert_allclose(
+        frame.ravel(), 2 + slope @ np.array(networks.vertices(net, middle)), atol=1e-5
+    )
+
+
+def test_the_derivative_on_a_border_is_that_of_the_cell_after_it() -> None:
+    table = np.array([0, 1, 3, 7], np.float32).reshape(1, 1, 1, 4, 1)
+    readout = (np.ones((1, 1), np.float32), np.zeros(1, np.float32))
+    net = Network(
+        levels=((1, 1, 1, 4),),
+        embedding_size=1,
+        tables=[ArrayTable(table)],
+        layers=(readout,),
+        box_size=(1, 1, 4),
+        key_frames=1,
+    )
+    values, slopes = sample_points(net, 0, 0, 0, [0.0, 1.0, 2.0, 3.0], gradient=True)
+    assert values.tolist() == [0, 1, 3, 7]
+    assert slopes[:, 3].tolist() == [1, 2, 4, 4]
+
+
+def test_half_precision_tables_give_the_values_of_their_float32_numbers(networks) -> None:
+    half = networks.random((5, 12, 21), 4, 2, 2, 1, dtype=np.float16)
+    full = replace(
+        half, tables=[ArrayTable(table.values.astype(np.float32)) for table in half.tables]
+    )
+    scattered = networks.points(half, 50)
+    np.testing.assert_array_equal(sample_points(half, *scattered), sample_points(full, *scattered))
+
+
+def test_points_far_apart_are_read_apart_and_come_out_alike(networks, monkeypatch) -> None:
+    net = networks.random((40, 40, 40), 6, 2, 2, 1)
+    scattered = [
+        np.concatenate([p[:5] * 0.1, p[5:] * 0.1 + 0.9 * (s - 1)])
+        for p, s in zip(networks.points(net, 10), (6, 40, 40, 40), strict=True)
+    ]
+    together = sample_points(net, *scattered, gradient=True)
+    monkeypatch.setattr(points, "SMALL_READ", 2**12)
+    recording = networks.recording(net)
+    apart = sample_points(recording, *scattered, gradient=True)
+    for one, other in zip(together, apart, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+    regions = recording.tables[0].regions
+    assert len(regions) > 1
+    assert sum(prod(b - a for a, b in region[:4]) for region in regions) <= 2 * 2**12
+    many = networks.points(net, 20_000)
+    np.testing.assert_allclose(
+        sample_points(net, *many, threads=4), networks.reference(net, many), rtol=1e-5, atol=1e-5
+    )
+
+
+def test_points_may_be_none_or_share_a_coordinate(networks) -> None:
+    net = networks.random((3, 4, 5), 2, 2, 2, 1)
+    assert sample_points(net, [], [], [], []).shape == (0,)
+    assert sample_points(net, [], [], [], [], gradient=True)[1].shape == (0, 4)
+    np.testing.assert_array_equal(
+        sample_points(net, 0.5, 1.0, [0, 1.5], 2.0),
+        sample_points(net, [0.5] * 2, [1, 1], [0, 1.5], [2, 2]),
+    )
+
+
+@pytest.mark.parametrize("key_index", [-0.1, 3.1, float("nan"), float("inf")])
+def test_a_key_index_outside_is_refused(networks, key_index) -> None:
+    with pytest.raises(RegionError, match="key_index"):
+        sample_points(networks.random((4, 5, 6), 4, 2, 1, 0), key_index, 0, 0, 0)
+
+
+def test_wrong_arguments_are_refused(networks) -> None:
+    net = networks.random((4, 5, 6), 1, 2, 1, 0)
+    with pytest.raises(RegionError, match=r"point 1: x 5\.5 is outside 0\.\.5"):
+        sample_points(net, 0, 0, 0, [1, 5.5])
+    with pytest.raises(RegionError, match="point 0: y nan"):
+        sample_points(net, 0, 0, float("nan"), 0)
+    with pytest.raises(InputError, match="one length"):
+        sample_points(net, [0, 0, 0], 0, 0, [1, 2])
+    with pytest.raises(InputError, match="one length"):
+        sample_points(net, np.zeros((2, 2)), 0, 0, 0)
+
+
+def test_slopes_by_the_inputs_are_differences() -> None:
+    architecture = Architecture.for_box((4, 6, 9), 3, width=8)
+    random = np.random.default_rng(0)
+    tables = [
+        random.standard_normal((*level, 2)).astype(np.float32) for level in architecture.levels
+    ]
+    layers = tuple(
+        (random.standard_normal((n, m)).astype(np.float32) / 4, random.random(n, dtype=np.float32))
+        for m, n in pairwise([architecture.inputs, 8, 1])
+    )
+
+    def network() -> Network:
+        return Network(
+            levels=architecture.levels,
+            embedding_size=2,
+            tables=[ArrayTable(table) for table in tables],
+            layers=layers,
+            box_size=architecture.box_size,
+            key_frames=3,
+        )
+
+    vertices = np.array([[0, 1, 2, 2], [3, 0, 1, 2], [5, 4, 0, 1], [8, 0, 3, 7]], dtype=np.float64)
+    slopes = input_slopes(network(), vertices)
+    assert slopes.shape == (architecture.inputs, 4)
+    for number, table in enumerate(tables):
+        for e in range(2):
+            # A shift of the whole level shifts every interpolated embedding by as much.
+            values = []
+            for shift in (1e-3, -1e-3):
+                table[..., e] += np.float32(shift)
+                values.append(sample_points(network(), *vertices))
+                table[..., e] -= np.float32(shift)
+            difference = np.subtract(*values) / 2e-3
+            close = np.isclose(slopes[2 * number + e], difference, atol=5e-3, rtol=0.02)
+            assert close.sum() >= 3  # a kink of the network may lie between

@@ -1,0 +1,130 @@
+"""Animations: their scenes from pictures' numbers, their words and files."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_codec import Volume
+from fhash_codec.rendering.animation.animation import Animation, Key
+from fhash_codec.rendering.scene.scene import (
+    Camera,
+    Scene,
+)
+from fhash_formats.errors import (
+    InputError,
+    RegionError,
+)
+
+SMALL = Scene(size=(20, 14))
+
+
+def test_steps_pass_evenly_and_once(volume: Volume) -> None:
+    animation = Animation.parse("steps", volume)
+    scenes = animation.scenes(SMALL, volume)
+    assert [scene.step for scene in scenes] == [0, 1, 2, 3, 4]
+    assert {scene.camera for scene in scenes} == {SMALL.camera}
+    assert animation.rate == 8
+    between = Animation.parse("steps=4:1", volume)
+    assert [
+        scene.step for scene in dataclasses.replace(between, frames=7).scenes(SMALL, volume)
+    ] == [4, 3.5, 3, 2.5, 2, 1.5, 1]
+
+
+def test_times_pass_evenly(volume: Volume) -> None:
+    scenes = dataclasses.replace(Animation.parse("time=0:8", volume), frames=5).scenes(
+        dataclasses.replace(SMALL, step=3.0), volume
+    )
+    assert [(scene.step, scene.time) for scene in scenes] == [
+        (None, 0),
+        (None, 2),
+        (None, 4),
+        (None, 6),
+        (None, 8),
+    ]
+
+
+def test_a_whole_turn_ends_before_it_begins_again(volume: Volume) -> None:
+    animation = dataclasses.replace(Animation.parse("orbit", volume), frames=8)
+    scene = dataclasses.replace(SMALL, camera=Camera(azimuth=10), step=2.0)
+    scenes = animation.scenes(scene, volume)
+    assert [each.camera.azimuth for each in scenes] == [10 + 45 * number for number in range(8)]
+    assert {each.step for each in scenes} == {2.0}
+    half = dataclasses.replace(Animation.parse("orbit=180", volume), frames=3).scenes(scene, volume)
+    assert [each.camera.azimuth for each in half] == [10, 100, 190]
+
+
+def test_time_and_orbit_together(volume: Volume) -> None:
+    scenes = dataclasses.replace(Animation.parse("steps,orbit=90", volume), frames=3).scenes(
+        SMALL, volume
+    )
+    assert [(scene.step, scene.camera.azimuth) for scene in scenes] == [(0, 0), (2, 45), (4, 90)]
+
+
+def test_a_file_says_what_the_words_say(volume: Volume, tmp_path: Path) -> None:
+    toml = tmp_path / "animation.toml"
+    toml.write_text(
+        "steps = [0, 4]\norbit = 90\nframes = 3\n"
+        '[[keys]]\ncamera = {view = "xy"}\n'
+        '[[keys]]\ncamera = {view = "xy", zoom = 4}\n'
+    )
+    animation = Animation.parse(str(toml), volume)
+    scenes = animation.scenes(SMALL, volume)
+    assert [scene.camera.azimuth for scene in scenes] == [0, 45, 90]
+    np.testing.assert_allclose([scene.camera.zoom for scene in scenes], [1, 2, 4])
+    assert Animation.from_dict(animation.to_dict()) == animation
+    other = tmp_path / "scene.json"
+    other.write_text('{"camera": {"view": "yz"}, "background": "#102030", "size": [999, 9]}')
+    keyed = Key(scene=str(other), step=1.0).over(SMALL)
+    assert (keyed.camera.view, keyed.background, keyed.size, keyed.step) == (
+        "yz",
+        "#102030",
+        SMALL.size,
+        1.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("steps=3", "malformed"),
+        ("orbit=left", "malformed"),
+        ("nowhere.toml", "no such animation"),
+    ],
+)
+def test_words_that_mean_nothing(words: str, part: str, volume: Volume) -> None:
+    with pytest.raises(InputError, match=part):
+        Animation.parse(words, volume)
+
+
+@pytest.mark.parametrize(
+    ("values", "part"),
+    [
+        ({"steps": [0, 1], "times": [0, 1]}, "exclude"),
+        ({"frame": 3}, "did you mean 'frames'"),
+        ({"keys": [{"at": 0.5}, {"at": 0.5}]}, "ascend"),
+        ({"keys": [{"at": 0.5}, {}]}, "ascend"),
+        ({"keys": [{"camra": {}}]}, "did you mean 'camera'"),
+        ({"steps": [0, 1], "keys": [{"step": 1}, {}]}, "not by both"),
+        ({"frames": 0}, "allowed"),
+    ],
+)
+def test_animations_that_are_none(values: dict[str, Any], part: str) -> None:
+    with pytest.raises(InputError, match=part):
+        Animation.from_dict(values)
+
+
+def test_nothing_changes_and_steps_outside_are_refused(volume: Volume) -> None:
+    with pytest.raises(InputError, match="nothing changes"):
+        Animation(frames=4).scenes(SMALL, volume)
+    for animation in (
+        Animation(steps=(0, 5)),
+        Animation(times=(-1, 2)),
+        Animation(keys=(Key(step=9.0), Key())),
+    ):
+        with pytest.raises(RegionError):
+            animation.scenes(SMALL, volume)

@@ -1,0 +1,74 @@
+"""The reasons of a plan, in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from fhash_codec import Scene, Volume
+from fhash_codec.rendering.picture.planning import plan_at, plan_picture
+
+TOPICS = [
+    "picture",
+    "proportions",
+    "time",
+    "march",
+    "value",
+    "gradient",
+    "secondary rays",
+    "level of detail",
+    "region",
+    "bricks",
+    "rays end",
+    "step",
+]
+
+
+def lines(volume: Volume, **scene: Any) -> dict[str, str]:
+    return plan_picture(volume, Scene.from_dict(scene)).to_dict()
+
+
+def test_every_plan_has_the_same_topics(volume: Volume) -> None:
+    assert list(lines(volume)) == TOPICS
+    more = lines(volume, effects={"buffers": ["depth"], "box": True, "time_label": True})
+    assert list(more) == [*TOPICS, "buffers", "around"]
+    assert more["buffers"] == "depth"
+    assert more["around"] == "box, time_label: drawn afterwards"
+
+
+@pytest.mark.parametrize(
+    ("scene", "topic", "words"),
+    [
+        ({"size": [30, 20], "effects": {"antialiasing": 2}}, "picture", "30 x 20, perspective, 4 "),
+        ({"scale": [1, 2, 3]}, "proportions", "stretched by 1, 2, 3: as the scene says"),
+        ({"step": 0.5}, "time", "step 0.5, between two: both are decoded"),
+        ({"march": {"mode": "stream"}}, "march", "one sample of each ray in a pass"),
+        ({"march": {"mode": "arm"}}, "march", "as many samples as rays in a pass"),
+        ({"march": {"mode": "arm", "samples_per_pass": 5000}}, "march", "5,000 samples in a pass"),
+        ({"effects": {"maximum_intensity": True}}, "value", "the largest along each ray"),
+        ({"effects": {"isosurfaces": [{"value": 5}]}}, "value", "can be seen, and 1 surface(s)"),
+        ({"effects": {"isosurfaces": [{"value": 5}]}}, "gradient", "on surfaces, for shading"),
+        ({"effects": {"shading": True}}, "gradient", "where a sample has opacity, for shading"),
+        ({"effects": {"shadows": True}}, "secondary rays", "shadows on a grid of 2 vertices"),
+        ({"effects": {"ambient_occlusion": True}}, "secondary rays", "within 8 vertices"),
+        ({"effects": {"shadows": True}}, "region", "(all: light comes from everywhere)"),
+        ({"march": {"lod": 1}}, "level of detail", "1: as the scene says"),
+        ({"march": {"skipping": False}}, "bricks", "all are marched: skipping is off"),
+        ({"march": {"threshold": 0}}, "rays end", "behind the volume"),
+    ],
+)
+def test_a_line_says_what_the_scene_asks_for(
+    volume: Volume, scene: dict[str, Any], topic: str, words: str
+) -> None:
+    assert words in lines(volume, **scene)[topic]
+    assert all("\n" not in line for line in lines(volume, **scene).values())
+
+
+def test_a_plan_moved_in_time_says_so(volume: Volume) -> None:
+    plan = plan_picture(volume, Scene())
+    moved = plan_at(plan, volume, Scene(time=1.5))
+    assert (moved.step, moved.time) == (1.5, 1.5)
+    assert moved.task is plan.task
+    changed = {topic for topic in TOPICS if moved.to_dict()[topic] != plan.to_dict()[topic]}
+    assert changed == {"time"}

@@ -1,0 +1,226 @@
+"""Plans: what a scene asks of a volume, and that it asks for no more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fhash_codec
+from fhash_codec import Scene, Volume
+from fhash_codec.rendering.camera.camera import Grid
+from fhash_codec.rendering.colour.opacity import Histogram
+from fhash_codec.rendering.picture.plan import Plan
+from fhash_codec.rendering.picture.planning import MAX_RAYS, plan_picture
+from fhash_codec.rendering.task.units import Units
+from fhash_formats.errors import FhashWarning, InputError, RegionError
+
+
+def plan(volume: Volume, **scene: Any) -> Plan:
+    return plan_picture(volume, Scene.from_dict(scene))
+
+
+def test_what_no_effect_asks_for_is_not_in_the_task(volume: Volume) -> None:
+    planned = plan(volume)
+    task = planned.task
+    assert task.lighting is None
+    assert task.light is None
+    assert not planned.lights
+    on = [task.shaded, task.surfaces, task.maximum, task.depth, task.normal, task.jitter]
+    assert not any(on)
+    assert planned.to_dict()["gradient"] == "none: no effect asks for it"
+    assert planned.to_dict()["secondary rays"] == "none: no effect asks for them"
+
+
+def test_each_effect_changes_its_own_part_of_the_task(volume: Volume) -> None:
+    shaded = plan(volume, effects={"shading": {"light": [0, 0, 2]}}).task
+    assert shaded.shaded
+    np.testing.assert_allclose(shaded.lighting.lamp, [0, 0, 1])  # type: ignore[union-attr]
+    assert plan(volume, effects={"shading": True}).task.lighting.lamp is None  # type: ignore[union-attr]
+    surfaces = plan(
+        volume,
+        effects={
+            "isosurfaces": [{"value": 4, "colour": "red"}, {"value": 5}, {"value": 6, "opacity": 0}]
+        },
+    )
+    assert [surface.value for surface in surfaces.task.surfaces] == [4, 5]
+    np.testing.assert_allclose(surfaces.task.surfaces[0].colour, [1, 0, 0])
+    np.testing.assert_allclose(surfaces.task.surfaces[1].colour, surfaces.function.colour(5))
+    assert not surfaces.task.shaded
+    assert plan(volume, effects={"buffers": ["normal"]}).task.normal
+    assert plan(volume, effects={"shadows": {"strength": 0}}).shadows is None
+
+
+def test_shadows_light_the_volume_from_over_the_shoulder(volume: Volume) -> None:
+    planned = plan(volume, effects={"shading": True, "shadows": True})
+    rays, spacing = planned.task.rays, planned.task.rays.grid.spacing
+    assert planned.lamp is not None
+    assert planned.lamp @ (rays.forward * spacing) < 0
+    assert planned.lamp @ (rays.up * spacing) > 0
+    assert planned.lamp @ (rays.right * spacing) < 0
+    assert planned.task.lighting.lamp is planned.lamp  # type: ignore[union-attr]
+
+
+def test_the_step_is_in_spacings_of_what_is_marched(volume: Volume) -> None:
+    fine, coarse = (plan(volume, march={"lod": lod, "step": 0.25}) for lod in (0, 2))
+    assert (
+        coarse.task.step
+        == pytest.approx(4 * fine.task.step)
+        == pytest.approx(Grid.of(volume.coords).vertex_spacing)
+    )
+
+
+def test_far_away_the_level_of_detail_is_coarse(volume: Volume) -> None:
+    assert plan(volume).lod == 0
+    assert plan(volume, size=[8, 8]).lod == 1
+    assert plan(volume, size=[4, 4]).lod == 2
+    assert plan(volume, size=[8, 8], march={"lod": 0}).lod == 0
+
+
+def test_a_network_has_no_levels_of_detail(files: dict[str, Path]) -> None:
+    with fhash_codec.open(files["paper"]) as network:
+        assert plan(network, size=[4, 4]).lod == 0
+        with pytest.raises(InputError, match="no levels of detail"):
+            plan(network, march={"lod": 1})
+
+
+def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]) -> None:
+    asked = []
+
+    def histogram() -> Histogram:
+        asked.append(1)
+        return np.linspace(0, 10, 11), np.arange(10)
+
+    for name, scene, expected in (
+        ("compact", {}, 1),
+        ("compact", {"transfer_function": {"opacity": "linear"}}, 0),
+        ("feature", {}, 0),
+    ):
+        with fhash_codec.open(files[name]) as opened:
+            asked.clear()
+            plan_picture(opened, Scene.from_dict(scene), histogram=histogram)
+            assert len(asked) == expected
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        ({"step": 2.5}, "outside the series"),
+        ({"size": [16384, 16384]}, f"more than {MAX_RAYS:,} rays"),
+        ({"size": [4096, 4096], "effects": {"antialiasing": 8}}, "smaller picture"),
+        ({"transfer_function": {"nothing": True}}, "shows nothing"),
+        (
+            {
+                "transfer_function": {"nothing": True},
+                "effects": {"maximum_intensity": True, "isosurfaces": [{"value": 1}]},
+            },
+            "take one",
+        ),
+        ({"transfer_function": {"opacity": [[0, 0], [9, 0]]}}, "shows nothing"),
+        ({"transfer_function": {"density": 0}}, "shows nothing"),
+        ({"background": "wite"}, "did you mean 'white'"),
+        ({"effects": {"shading": {"light": [0, 0, 0]}}}, "no length"),
+        (
+            {"effects": {"shading": {"light": [0, 0, 1]}, "shadows": {"light": [0, 1, 1]}}},
+            "one lamp",
+        ),
+        ({"march": {"mode": "cache", "device": "cuda"}}, "computes on the CPU"),
+        ({"march": {"device": "gpu"}}, "allowed: auto, cpu, cuda"),
+        ({"camera": {"position": [1, 1, 1], "focal_point": [1, 1, 1]}}, "are the same"),
+        ({"camera": {"view_up": [0, 0, 0]}}, "no length"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(volume: Volume, scene: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        plan(volume, **scene)
+
+
+def test_a_time_outside_is_refused(volume: Volume) -> None:
+    with pytest.raises(RegionError):
+        plan(volume, time=1e9)
+    assert plan(volume, time=1.5).step == 1.5
+
+
+@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
+def test_wide_values_keep_their_range_in_single_precision(tmp_path: Path) -> None:
+    field = 101325 + 1e-3 * np.random.default_rng(1).random((1, 6, 7, 8))
+    fhash_codec.encode(field, tmp_path / "wide.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "wide.fhz") as wide:
+        assert wide.dtype == np.float64
+        units = Units.of(wide)
+        marched = units.to(wide.read(0)).astype(np.float32)
+        assert np.abs(marched).max() <= 2
+        assert np.ptp(marched) > 0.5
+        table = plan(wide).task.table
+        assert table is not None
+        assert -2 <= table.low < table.high <= 2
+
+
+@pytest.mark.filterwarnings("ignore::fhash_codec.FhashWarning")
+@pytest.mark.parametrize("mode", ["stream", "arm", "portable"])
+def test_single_precision_with_a_large_offset_is_marched_without_it(
+    tmp_path: Path, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    z, y, x = np.meshgrid(*map(np.arange, (6, 7, 8)), indexing="ij")
+    field = (1e8 + 100 * np.sin(x / 3) * np.cos(y / 2) * z / 5).astype(np.float32)[None]
+    fhash_codec.encode(field, tmp_path / "far.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "far.fhz") as far:
+        assert np.abs(Units.of(far).to(far.read(0))).max() <= 2
+        shown = fhash_codec.render(far, Scene.from_dict({"size": [32, 32]}))
+        if mode == "portable":
+            monkeypatch.setenv("FHASH_NATIVE", "0")
+        other = fhash_codec.render(
+            far,
+            Scene.from_dict(
+                {"size": [32, 32], "march": {"mode": "cache" if mode == "portable" else mode}}
+            ),
+        )
+    np.testing.assert_allclose(other.rgba, shown.rgba, atol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_ordinary_single_precision_stays_what_it_is(tmp_path: Path, dtype: type) -> None:
+    field = np.linspace(200, 300, 5 * 6 * 7).reshape(1, 5, 6, 7).astype(dtype)
+    fhash_codec.encode(field, tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1))
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert (Units.of(volume) == Units()) is (dtype is np.float32)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("value", [0.0, 5.0, 1e-320, -1.7976931348623157e308])
+def test_constant_values_have_a_table_that_single_precision_holds(
+    tmp_path: Path, value: float
+) -> None:
+    fhash_codec.encode(
+        np.full((1, 5, 6, 7), value), tmp_path / "a.fhz", fhash_codec.EncodeConfig(effort=1)
+    )
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        table = plan(volume).task.table
+        assert table is not None
+        assert np.float32(table.low) < np.float32(table.high)
+        assert np.isfinite(
+            fhash_codec.render(volume, Scene.from_dict({"size": [16, 16]})).rgba
+        ).all()
+
+
+def test_a_picture_that_would_take_ages_is_told(volume: Volume) -> None:
+    for scene in ({"scale": [1e6, 1, 1e-6]}, {"march": {"step": 1e-5}}):
+        with pytest.warns(FhashWarning, match="a ray takes up to .* samples"):
+            plan(volume, **scene)
+
+
+def test_a_picture_that_would_never_end_is_refused(volume: Volume) -> None:
+    with pytest.raises(
+        InputError, match=r"a ray takes up to .* samples, .*at most 1e\+08 are taken"
+    ):
+        plan(volume, scale=[1e5, 1, 1e-5], march={"step": 1e-6})
+
+
+def test_axes_between_whose_vertices_no_ray_can_be_placed_are_refused(volume: Volume) -> None:
+    with pytest.raises(
+        InputError,
+        match=r"no ray can be placed that finely, at most 1e\+14 times; stretch the axes",
+    ):
+        plan(volume, scale=[8e29, 2.4e29, 1e-30])

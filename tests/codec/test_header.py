@@ -1,0 +1,52 @@
+"""A header's figures and histories: brief, and never better than they are."""
+
+from __future__ import annotations
+
+from fhash_codec.header import brief_history, brief_quality, history_points
+
+
+def test_figures_in_a_file_are_brief_and_never_better_than_they_are() -> None:
+    steps = [
+        {"step": 0, "psnr": 45.129876, "rmse": 0.00123456789, "max_abs_error": 0.25},
+        dict.fromkeys(("psnr", "rmse", "max_abs_error")),
+    ]
+    quality = {
+        "psnr": 44.9999999,
+        "rmse": 1.23456701,
+        "max_abs_error": 0.1234561,
+        "ssim": None,
+        "ssim_window": {"window": 11},
+    }
+    assert brief_quality({**quality, "per_step": steps}) == {
+        "psnr": 44.9999,
+        "rmse": 1.23457,
+        "max_abs_error": 0.123457,
+        "ssim": None,
+        "ssim_window": {"window": 11},
+        "per_step": {
+            "psnr": [45.129, None],
+            "rmse": [0.0012346, None],
+            "max_abs_error": [0.25, None],
+        },
+    }
+
+
+def test_history_in_a_file_is_brief() -> None:
+    points = [{"seconds": n * 0.12345, "epoch": n, "psnr": 40.123} for n in range(1, 101)]
+    brief = brief_history(points, timings=True)
+    assert len(brief) == 24
+    assert brief[-1] == {"seconds": 12.345, "epoch": 100, "psnr": 40.12}
+    assert brief_history(points[:2], timings=False) == [
+        {"epoch": 1, "psnr": 40.12},
+        {"epoch": 2, "psnr": 40.12},
+    ]
+    assert brief_history([], timings=True) == []
+    expected = [
+        {"seconds": None, "epoch": 1, "psnr": 2.5},
+        {"seconds": None, "epoch": 2, "psnr": 3},
+    ]
+    assert (
+        history_points({"epoch": [1, 2], "psnr": [2.5, 3]})
+        == history_points([{"epoch": 1, "psnr": 2.5}, {"epoch": 2, "psnr": 3}])
+        == expected
+    )

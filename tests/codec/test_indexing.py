@@ -1,0 +1,46 @@
+"""Indices of a volume, beside numpy's own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fhash_codec.indexing import expand_index, index_ranges
+
+SHAPE = (3, 4, 1, 5)
+ENDS = st.none() | st.integers(-7, 7)
+PARTS = st.tuples(
+    *(
+        st.integers(-length, length - 1)
+        | st.builds(slice, ENDS, ENDS, st.none() | st.sampled_from([1, 2, 3, -1, -2]))
+        for length in SHAPE
+    )
+)
+
+
+@given(parts=PARTS, count=st.integers(0, 4), ellipsis=st.none() | st.integers(0, 4))
+def test_an_index_names_the_positions_that_numpy_takes(
+    parts: tuple[Any, ...], count: int, ellipsis: int | None
+) -> None:
+    index = parts[:count]
+    if ellipsis is not None and ellipsis <= count:
+        # The parts behind `...` belong to the last axes.
+        behind = parts[4 - (count - ellipsis) :]
+        index = (*parts[:ellipsis], ..., *behind)
+    vertices = np.moveaxis(np.indices(SHAPE), 0, -1)
+    expanded = expand_index(index)
+    positions = index_ranges(expanded, SHAPE)
+    assert len(expanded) == len(positions) == 4
+    grid = np.stack(np.meshgrid(*positions, indexing="ij"), axis=-1)
+    expected = vertices[(*index, slice(None)) if ... in index else (*index, ...)]
+    np.testing.assert_array_equal(grid.reshape(expected.shape), expected)
+
+
+@pytest.mark.parametrize("index", [(0,) * 5, (..., ...), None, [0], True, 1.0, "t"], ids=repr)
+def test_other_indices_are_refused(index: Any) -> None:
+    with pytest.raises(IndexError, match="a volume"):
+        expand_index(index)

@@ -1,0 +1,49 @@
+"""Adam's own steps, and its steps without a gradient in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from fhash_codec.training.adam import BETA1, BETA2, EPSILON, adam_step, catch_up
+
+
+def test_a_step_is_that_of_torch() -> None:
+    random = torch.Generator().manual_seed(0)
+    ours = torch.randn(100, generator=random, dtype=torch.float64)
+    theirs = torch.nn.Parameter(ours.clone())
+    adam = torch.optim.Adam([theirs], lr=0.01, betas=(BETA1, BETA2), eps=EPSILON, fused=True)
+    mean, square = torch.zeros_like(ours), torch.zeros_like(ours)
+    for step in range(1, 6):
+        gradient = torch.randn(100, generator=random, dtype=torch.float64)
+        adam_step(ours, gradient, mean, square, step, 0.01)
+        theirs.grad = gradient
+        adam.step()
+    torch.testing.assert_close(ours, theirs.detach(), rtol=1e-10, atol=1e-12)
+
+
+def test_catching_up_equals_stepping_without_gradient() -> None:
+    rates = 0.01 * (0.5 + 0.5 * np.cos(np.linspace(0, np.pi, 400)))
+    visited = np.array([0, 1, 5, 100, 250, 299])
+    for scale in (1e-2, 1e-6, 1e-9):
+        m, v = 0.3 * scale, scale**2
+        effect = catch_up(visited, 299, rates)
+        for number, first in enumerate(visited):
+            mean, square, moved = m, v, 0.0
+            for step in range(first + 1, 300) if first else ():
+                mean, square = BETA1 * mean, BETA2 * square
+                moved -= (
+                    rates[step]
+                    * mean
+                    / (1 - BETA1**step)
+                    / ((square / (1 - BETA2**step)) ** 0.5 + EPSILON)
+                )
+            ours = -float(effect.factor[number]) * m / (v**0.5 + float(effect.epsilon[number]))
+            # The one approximation shows only where sqrt(v) is near eps within Adam's first steps,
+            # while its correction still moves.
+            assert ours == pytest.approx(
+                moved, rel=0.05 if scale < 1e-8 and first < 100 else 2e-3, abs=1e-12
+            )
+            assert effect.mean_decay[number] == pytest.approx(mean / m, rel=1e-5, abs=1e-37)
+            assert effect.square_decay[number] == pytest.approx(square / v, rel=1e-5)

@@ -1,0 +1,202 @@
+"""Arrays of an open container, read region by region, by us and by the zarr library."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import product
+
+import numpy as np
+import pytest
+import zarr
+
+from fhash_formats.container import Container, ContainerWriter
+from fhash_formats.container.array import DTYPES
+from fhash_formats.errors import DamagedFileError, RegionError
+
+
+def values_of(dtype, shape):
+    rng = np.random.default_rng(1)
+    if np.dtype(dtype).kind == "f":
+        values = rng.standard_normal(shape).astype(dtype)
+        values.reshape(-1)[-3:] = [np.nan, np.inf, -0.0][-values.size :]
+        return values
+    limits = np.iinfo(dtype)
+    return rng.integers(limits.min, limits.max, shape, dtype=dtype, endpoint=True)
+
+
+SHAPES = {
+    "line": ((7,), (3,)),
+    "one": ((1,), (1,)),
+    "plane": ((5, 4), (2, 4)),
+    "larger": ((2, 3), (4, 5)),
+    "five": ((2, 3, 4, 5, 2), (1, 2, 3, 4, 2)),
+}
+
+
+@pytest.fixture
+def everything(tmp_path, samples):
+    """A container with an extra array for each type and chunking, and the values of all arrays."""
+    header = samples.header()
+    arrays = samples.arrays(header)
+    path = tmp_path / "all.fhz"
+    with ContainerWriter(path) as writer:
+        for name, array in arrays.items():
+            writer.add_whole(name, array)
+        for dtype, (name, (shape, chunk)) in product(DTYPES, SHAPES.items()):
+            arrays[f"extra/{name}/{dtype}"] = array = values_of(dtype, shape)
+            names = [f"axis_{n}" for n in range(len(shape))]
+            writer.add_whole(
+                f"extra/{name}/{dtype}",
+                array,
+                chunk_shape=chunk,
+                dimension_names=names,
+                attributes={"of": name},
+            )
+        writer.commit(header)
+    return path, arrays
+
+
+def test_every_type_and_chunking_reads_equal(everything) -> None:
+    path, arrays = everything
+    with Container.open(path) as container:
+        assert list(container.arrays) == list(arrays)
+        assert container.verify() == len(arrays)
+        for name, array in arrays.items():
+            stored = container.arrays[name]
+            assert stored.read().tobytes() == array.tobytes()
+            assert (stored.shape, stored.dtype) == (array.shape, array.dtype)
+        assert container.arrays["extra/five/int8"].attributes == {"of": "five"}
+        assert container.arrays["extra/line/int8"].dimension_names == ("axis_0",)
+        assert container.arrays["key_frames"].dimension_names is None
+
+
+def test_zarr_library_reads_every_array_equal(everything) -> None:
+    path, arrays = everything
+    store = zarr.storage.ZipStore(path, read_only=True)
+    group = zarr.open_group(store, mode="r")
+    for name, array in arrays.items():
+        read = group[name]
+        assert read.dtype == array.dtype
+        assert read[...].tobytes() == array.tobytes()
+    assert group["extra/five/int8"].attrs.asdict() == {"of": "five"}
+    assert group["extra/plane/int8"].metadata.dimension_names == ("axis_0", "axis_1")
+    assert group.attrs["fhash"]["format_version"] == [1, 1]
+    assert {name for name, _ in group["extra"].groups()} == set(SHAPES)
+    store.close()
+
+
+def regions(shape, count):
+    rng = np.random.default_rng(2)
+    for _ in range(count):
+        ends = [sorted(rng.integers(0, n + 1, 2)) for n in shape]
+        yield tuple(slice(int(a), int(b)) for a, b in ends)
+
+
+def test_region_is_the_same_part_of_the_whole(everything) -> None:
+    path, arrays = everything
+    with Container.open(path) as container:
+        for name in (
+            "extra/five/float64",
+            "extra/larger/uint16",
+            "extra/line/int8",
+            "tables/level_1",
+        ):
+            for region in regions(arrays[name].shape, 60):
+                np.testing.assert_array_equal(
+                    container.arrays[name].read(region), arrays[name][region]
+                )
+
+
+@pytest.mark.parametrize(
+    "part", [slice(-1, 2), slice(0, 8), slice(3, 2), slice(0, 7, 2), slice(0, 7, -1), slice(8, 8)]
+)
+def test_region_outside_is_refused(everything, part) -> None:
+    path, _ = everything
+    with Container.open(path) as container, pytest.raises(RegionError, match="axis 0"):
+        container.arrays["extra/line/int8"].read((part,))
+
+
+def test_region_of_other_axes_is_refused(sample) -> None:
+    with Container.open(sample) as container, pytest.raises(RegionError, match="2 axes"):
+        container.arrays["key_frames"].read((slice(0, 1), slice(0, 1)))
+
+
+def test_open_ends_of_slices_are_the_array_ends(sample, samples) -> None:
+    with Container.open(sample) as container:
+        np.testing.assert_array_equal(
+            container.arrays["coords/x"].read((slice(2, None),)),
+            samples.arrays(samples.header())["coords/x"][2:],
+        )
+
+
+def test_region_touches_only_its_chunks_and_once(sample, monkeypatch) -> None:
+    with Container.open(sample) as container:
+        reads = []
+        read = container._source.read
+        monkeypatch.setattr(
+            container._source,
+            "read",
+            lambda offset, size: reads.append(offset) or read(offset, size),
+        )
+        table = container.arrays["tables/level_1"]
+        region = (slice(0, 1), slice(1, 3), slice(0, 3), slice(0, 6), slice(0, 2))
+        table.read(region)
+        assert sorted(reads) == sorted(
+            table.chunks[index].offset for index in [(0, 0, 0, 0, 0), (0, 1, 0, 0, 0)]
+        )
+        table.read(region)
+        assert len(reads) == 2
+
+
+def test_result_is_the_callers_own(sample) -> None:
+    with Container.open(sample) as container:
+        table = container.arrays["tables/level_2"]
+        everything = tuple(slice(0, n) for n in table.shape)
+        table.read(everything)[:] = 0
+        assert np.all(table.read(everything) != 0)
+
+
+def test_threads_read_what_one_reads(everything) -> None:
+    path, arrays = everything
+    table = arrays["extra/five/float64"]
+    with Container.open(path, cache_bytes=1000) as container, ThreadPoolExecutor(8) as pool:
+        asked = list(regions(table.shape, 300))
+        for region, read in zip(
+            asked, pool.map(container.arrays["extra/five/float64"].read, asked), strict=True
+        ):
+            np.testing.assert_array_equal(read, table[region])
+
+
+def test_damaged_chunk_is_named_and_the_rest_can_be_read(sample) -> None:
+    with Container.open(sample) as container:
+        member = container.arrays["mlp/weight_1"].chunks[0, 0]
+    damaged = bytearray(sample.read_bytes())
+    damaged[member.end - 1] ^= 1
+    sample.write_bytes(damaged)
+    with Container.open(sample) as container:
+        container.arrays["mlp/bias_1"].read()
+        with pytest.raises(DamagedFileError, match="member mlp/weight_1/c/0/0"):
+            container.arrays["mlp/weight_1"].read()
+        with pytest.raises(DamagedFileError, match="member mlp/weight_1/c/0/0"):
+            container.verify()
+
+
+def test_disk_error_while_reading(sample, monkeypatch) -> None:
+    def fail(offset, size):
+        raise OSError(5, "Input/output error")
+
+    with Container.open(sample) as container:
+        monkeypatch.setattr(container._source, "read", fail)
+        with pytest.raises(DamagedFileError, match="cannot be read: Input/output error"):
+            container.arrays["mlp/weight_1"].read()
+
+
+def test_what_does_not_fit_in_memory_is_not_called_damaged(sample, monkeypatch) -> None:
+    """Or a sound file might be thrown away."""
+    with Container.open(sample) as container:
+        array = container.arrays["mlp/weight_1"]
+        monkeypatch.setattr(
+            array, "_decode", lambda index, lod: (_ for _ in ()).throw(MemoryError())
+        )
+        with pytest.raises(MemoryError):
+            array.read()

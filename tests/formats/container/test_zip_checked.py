@@ -1,0 +1,192 @@
+"""ZIP files made to do harm, with all checksums right: refused before much is allocated."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+import zlib
+
+import pytest
+from hostile_files import FLAGS, FULL_SIZE, METHOD, OFFSET, ROOT, SIZE, read_everything, refused
+
+from fhash_formats.container.layout import Member, comment, deflated, ending, local_header
+from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+
+ENTRIES = {
+    "deflated to nothing less": (METHOD, "<H", 8, "deflated and"),
+    "packed otherwise": (METHOD, "<H", 14, "ZIP method 14"),
+    "encrypted": (FLAGS, "<H", 1, "encrypted"),
+    "data descriptor": (FLAGS, "<H", 8, "does not allow"),
+    "utf-8 names": (FLAGS, "<H", 0x800, "does not allow"),
+    "sizes differ": (SIZE, "<I", 5, "equal sizes"),
+    "huge": (FULL_SIZE, "<I", 0xFFFFFFFF, "equal sizes"),
+    "another date": (14, "<H", 0x5000, "does not allow"),
+    "link": (38, "<I", 0o120777 << 16, "does not allow"),
+    "extra field": (30, "<H", 4, "does not allow"),
+    "comment of a member": (32, "<H", 1, "does not allow"),
+    "another disk": (34, "<H", 1, "does not allow"),
+    "offset outside": (OFFSET, "<I", 0x7FFFFFFF, "overlaps another or leaves a gap"),
+    "zip64 offset without its field": (OFFSET, "<I", 0xFFFFFFFF, "does not allow|overlaps"),
+    "longer name": (28, "<H", 0xFFFF, "not allowed"),
+    "no mark": (0, "<I", 0, "without its mark"),
+}
+
+
+@pytest.mark.parametrize("case", ENTRIES)
+def test_directory_entry(sample, samples, case) -> None:
+    at, form, value, message = ENTRIES[case]
+    data = bytearray(samples.pack(samples.unpack(sample.read_bytes())))
+    struct.pack_into(form, data, samples.directory_at(bytes(data)) + at, value)
+    refused(sample, samples.reseal(bytes(data)), message)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../evil",
+        "a/../../evil",
+        "/etc/evil",
+        "a\\evil",
+        "folder/",
+        "a//b",
+        ".",
+        "C:evil",
+        "a b",
+        "a\nb",
+        ".hidden",
+        "",
+    ],
+)
+def test_member_names(sample, samples, name) -> None:
+    parts = samples.unpack(sample.read_bytes())
+    refused(sample, samples.pack([(name, b"x"), *parts]), "not allowed")
+
+
+def test_name_beyond_ascii(sample, samples) -> None:
+    parts = [("coordx", b""), *samples.unpack(sample.read_bytes())]
+    refused(
+        sample,
+        samples.reseal(samples.pack(parts).replace(b"coordx", "coor\u00e9".encode())),
+        "not allowed",
+    )
+
+
+def test_duplicate_member(sample, samples) -> None:
+    parts = samples.unpack(sample.read_bytes())
+    refused(sample, samples.pack([*parts, parts[-1]]), "twice")
+
+
+def test_overlapping_members(sample, samples) -> None:
+    """The second entry points at the first member, as in a quoted-overlap ZIP bomb."""
+    data = bytearray(sample.read_bytes())
+    second = data.index(b"PK\x01\x02", samples.directory_at(bytes(data)) + 4)
+    struct.pack_into("<I", data, second + OFFSET, 0)
+    refused(sample, samples.reseal(bytes(data)), "overlaps")
+
+
+def test_hidden_bytes_between_members_and_directory(sample, samples) -> None:
+    data = sample.read_bytes()
+    at = samples.directory_at(data)
+    longer = bytearray(data[:at] + b"hidden" + data[at:])
+    struct.pack_into("<I", longer, len(longer) - 79 - 6, at + 6)
+    refused(sample, samples.reseal(bytes(longer)), "are declared")
+
+
+def test_local_header_that_differs(sample) -> None:
+    data = bytearray(sample.read_bytes())
+    data[8] ^= 8
+    refused(sample, bytes(data), "header differs")
+
+
+DEFLATED = {
+    "bomb": (lambda data: deflated(bytes(15 << 20)), 15 << 20, "not valid JSON|JSON"),
+    "more than declared": (lambda data: deflated(bytes(1 << 26)), 1 << 20, "does not inflate"),
+    "less than declared": (lambda data: deflated(data), 1 << 20, "does not inflate"),
+    "beyond the limit": (lambda data: deflated(data), (16 << 20) + 1, "the limit is 16777216"),
+    "cut": (lambda data: deflated(data)[:-3], None, "does not inflate"),
+    "with a tail": (lambda data: deflated(data) + b"tail", None, "does not inflate"),
+    "no deflate": (lambda data: b"\xff" * 40, None, "deflated data are damaged"),
+}
+
+
+@pytest.mark.parametrize("case", DEFLATED)
+def test_deflated_metadata(sample, samples, case) -> None:
+    make, declared, message = DEFLATED[case]
+    parts = samples.unpack(sample.read_bytes())
+    members, chunks, position = [], [], 0
+    for name, data in parts:
+        stored = make(data) if name == ROOT else data
+        full = None if name != ROOT else declared or len(data)
+        # The CRC is right where the content is what is declared.
+        crc = zlib.crc32(bytes(15 << 20) if case == "bomb" and name == ROOT else data)
+        member = Member(name=name, offset=position, size=len(stored), crc=crc, full_size=full)
+        members.append(member)
+        chunks += [local_header(member), stored]
+        position = member.end
+    container = b"".join([*chunks, ending(members)])
+    sample.write_bytes(container)
+    tracemalloc.start()
+    with pytest.raises(DamagedFileError, match=message):
+        read_everything(sample)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # Metadata may be as large as they declare, up to the limit, and are held as bytes, as text and
+    # as values at most.
+    assert peak < 4 * (declared or len(container)) + (4 << 20)
+
+
+def test_chunks_are_never_deflated(sample, samples) -> None:
+    parts = samples.unpack(sample.read_bytes())
+    name = next(name for name, _ in parts if not name.endswith(ROOT))
+    members, chunks, position = [], [], 0
+    for other, content in parts:
+        packed = deflated(content) if other == name else content
+        full = len(content) if other == name else None
+        member = Member(
+            name=other, offset=position, size=len(packed), crc=zlib.crc32(content), full_size=full
+        )
+        members.append(member)
+        chunks += [local_header(member), packed]
+        position = member.end
+    refused(sample, b"".join([*chunks, ending(members)]), "only metadata may be")
+
+
+def test_version_1_has_nothing_deflated(sample, samples) -> None:
+    data = sample.read_bytes()
+    start = samples.directory_at(data)
+    directory = data[start : -len(comment(b""))]
+    refused(sample, data[:start] + directory + comment(directory, 1), "from layout version 2 on")
+    stored = samples.pack(samples.unpack(data))
+    start = samples.directory_at(stored)
+    directory = stored[start : -len(comment(b""))]
+    sample.write_bytes(stored[:start] + directory + comment(directory, 1))
+    read_everything(sample)
+
+
+@pytest.mark.parametrize(
+    ("field", "form", "value", "message"),
+    [
+        (8, "<H", 3, "contradicts"),
+        (10, "<H", 3, "contradicts|entries"),
+        (12, "<I", 2**31, "limit"),
+        (16, "<I", 1, "it ends at"),
+        (10, "<H", 65535, "ZIP64"),
+    ],
+)
+def test_end_record(sample, samples, field, form, value, message) -> None:
+    data = bytearray(sample.read_bytes())
+    struct.pack_into(form, data, len(data) - 79 - 22 + field, value)
+    # The end record no longer leads to the directory, so the digest is made right by hand.
+    start = samples.directory_at(sample.read_bytes())
+    directory = bytes(data[start:-79])
+    refused(sample, bytes(data[:start]) + directory + comment(directory), message)
+
+
+def test_newer_layout(sample) -> None:
+    data = sample.read_bytes()
+    refused(
+        sample,
+        data.replace(b"fhash 2 sha256", b"fhash 3 sha256"),
+        "newer fhash layout 3; this version reads up to 2; upgrade",
+        UnsupportedFileError,
+    )

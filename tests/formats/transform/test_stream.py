@@ -1,0 +1,70 @@
+"""The coder of containers: chunks of fewer axes, masks, and configurations that are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from tiles import SETTINGS, SHAPE, same, wave
+
+from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
+from fhash_formats.transform.entropy.mask_levels import MaskLevels
+from fhash_formats.transform.stream import TransformCoder
+from fhash_formats.transform.tile.encoding import Coding, encode_tile
+from fhash_formats.transform.tile.settings import TileSettings
+
+FLOAT = np.dtype(np.float32)
+
+
+def coder(settings: TileSettings | None, shape: tuple[int, ...] = SHAPE) -> TransformCoder:
+    configuration = {} if settings is None else settings.to_dict()
+    return TransformCoder([{"configuration": configuration}], FLOAT, shape)
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3, 4])
+def test_a_chunk_of_fewer_axes_comes_back(axes: int) -> None:
+    values = wave()[(0,) * (4 - axes)]
+    shared = coder(SETTINGS, values.shape)
+    decoded = shared.decode(memoryview(shared.encode(values)))
+    assert decoded.shape == values.shape
+    assert np.abs(decoded - values).max() <= 0.4
+
+
+def test_a_reduced_chunk_has_every_second_vertex_of_space() -> None:
+    shared = coder(SETTINGS)
+    assert shared.decode(memoryview(shared.encode(wave())), lod=1).shape == (2, 2, 4, 5)
+
+
+def test_without_shared_settings_each_stream_has_its_own() -> None:
+    coded = encode_tile(wave(), SETTINGS, Coding(own_settings=True))
+    assert same(coder(None).decode(memoryview(coded.data)), coded.decoded)
+    with pytest.raises(InputError, match="only decodes"):
+        coder(None).encode(wave())
+
+
+def test_the_mask_comes_with_the_values() -> None:
+    settings, occupied = replace(SETTINGS, mask=MaskLevels()), wave() > 0.5
+    masked = coder(settings)
+    assert masked.masked
+    assert masked.features == ("mask",)
+    coded = encode_tile(wave(), settings, in_coreset=occupied)
+    values, mask = masked.decode_masked(memoryview(coded.data))
+    assert same(values, coded.decoded)
+    assert np.array_equal(mask, occupied)
+
+
+@pytest.mark.parametrize(
+    ("codecs", "shape", "error", "message"),
+    [
+        ([{}, {}], SHAPE, UnsupportedFileError, "between the codecs"),
+        ([{}], (1, *SHAPE), DamagedFileError, "at most 4 axes"),
+        ([{"configuration": {"transform": 3}}], SHAPE, DamagedFileError, "fhash.transform"),
+    ],
+)
+def test_other_configurations_are_refused(
+    codecs: list[dict[str, Any]], shape: tuple[int, ...], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        TransformCoder(codecs, FLOAT, shape)

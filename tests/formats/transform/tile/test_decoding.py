@@ -1,0 +1,134 @@
+"""The decoder of tiles: levels of detail, damage, and hostile settings and numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from specs import spec_of
+from tiles import SETTINGS, SHAPE, SPEC, same, streams, wave
+
+from fhash_formats.errors import DamagedFileError, FhashError, InputError
+from fhash_formats.transform.axes.bands import band_table
+from fhash_formats.transform.axes.basis import Basis
+from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.entropy.coder import encode_integers
+from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform.tile.decoding import decode_tile
+from fhash_formats.transform.tile.encoding import encode_tile
+from fhash_formats.transform.tile.sections import build_stream
+from fhash_formats.transform.tile.settings import TileSettings
+
+
+def test_reduced_resolution_is_the_low_band() -> None:
+    coded = encode_tile(np.full(SHAPE, 2.25, np.float32), SETTINGS)
+    coarse = decode_tile(coded.data, SHAPE, np.float32, SETTINGS, lod=1)
+    assert coarse.shape == (2, 2, 4, 5)
+    assert np.abs(coarse - 2.25).max() < 0.1
+
+
+@pytest.mark.parametrize("name", list(streams()))
+def test_damage_is_an_error_or_changes_nothing(name: str) -> None:
+    values, data = streams()[name]
+    sound = decode_tile(data, values.shape, values.dtype)
+    damaged = [data[:n] for n in range(len(data))] + [data + b"\0", data + b"\x01a"]
+    damaged += [
+        data[:n] + bytes([data[n] ^ 1 << bit]) + data[n + 1 :]
+        for n in range(len(data))
+        for bit in range(8)
+    ]
+    refused = 0
+    for other in damaged:
+        try:
+            assert same(decode_tile(other, values.shape, values.dtype), sound)
+        except DamagedFileError:
+            refused += 1
+    assert refused > 0.95 * len(damaged)
+
+
+def test_shared_settings_are_needed() -> None:
+    with pytest.raises(FhashError, match="no settings"):
+        decode_tile(encode_tile(wave(), SETTINGS).data, SHAPE, np.float32)
+
+
+PLAIN = spec_of(("none",) * 4, 0, SHAPE)
+BEYOND: dict[str, tuple[dict[str, Any], str]] = {
+    "range beyond the type": (
+        {"step": 1e299, "low": -1e300, "high": 1e300, "double": True},
+        "float32",
+    ),
+    "range beyond the arithmetic": ({"step": 1e38, "low": -1e300, "high": 1e300}, "float64"),
+    "centre beyond the type": ({"center": 1e300, "high": 1e301, "double": True}, "float32"),
+    "centre beyond the arithmetic": ({"center": 1e300, "high": 1e301}, "float64"),
+    "residual beyond the type": ({"quantum": 1e300}, "float32"),
+    "residual beyond everything": ({"quantum": 1e308}, "float64"),
+    "range beyond half precision": ({"low": -1e5}, "float16"),
+}
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+@pytest.mark.parametrize("case", BEYOND)
+def test_numbers_that_end_in_infinities_are_damage(
+    case: str, native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Infinities of the source are missing values; only hostile numbers decode to others."""
+    changes, dtype = BEYOND[case]
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    settings = TileSettings(
+        **{
+            "transform": PLAIN,
+            "step": 1.0,
+            "center": 0.0,
+            "low": -9.0,
+            "high": 9.0,
+            "quantum": 0.1,
+            **changes,
+        }
+    )
+    integers = np.full(SHAPE, 100, np.int32)
+    coded = encode_integers(integers, single_band(SHAPE)).data
+    for residual in (None, integers) if "residual" not in case else (integers,):
+        data = build_stream(None, b"", coded, integers, residual, None)
+        with pytest.raises(DamagedFileError, match="beyond"):
+            decode_tile(data, SHAPE, dtype, settings)
+    if "residual" not in case:
+        with pytest.raises(DamagedFileError, match="beyond"):
+            decode_tile(build_stream(None, b"", b"", None, None, None), SHAPE, dtype, settings)
+
+
+@pytest.mark.parametrize("native", ["0", "1"])
+def test_a_transform_that_overflows_gives_no_warning(
+    native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    settings = replace(SETTINGS, step=3e38, quantum=0.0)
+    integers = np.full(SHAPE, 1000, np.int32)
+    data = build_stream(
+        None, b"", encode_integers(integers, band_table(SPEC, SHAPE)).data, integers, None, None
+    )
+    assert not np.isinf(decode_tile(data, SHAPE, np.float32, settings)).any()
+
+
+@pytest.mark.parametrize("axis", range(4))
+@pytest.mark.parametrize("native", ["0", "1"])
+def test_a_basis_longer_than_the_tile_is_damage_before_anything_is_decoded(
+    axis: int, native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its bands would lie beyond the tile, and a decoder would write behind its array."""
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    n = SHAPE[axis] + 3
+    basis = Basis(integers=np.eye(n, dtype=np.int32), exponents=(0,) * n)
+    axes = [AxisTransform(kind="none")] * 4
+    axes[axis] = AxisTransform(kind="klt", basis=basis)
+    t, z, y, x = axes
+    settings = replace(SETTINGS, transform=TransformSpec(axes=(t, z, y, x)), quantum=0.0)
+    integers = np.zeros(SHAPE, np.int32)
+    for coded in (b"", bytes(range(40))):
+        with pytest.raises(DamagedFileError, match="do not fit its shape"):
+            decode_tile(
+                build_stream(None, b"", coded, integers, None, None), SHAPE, np.float32, settings
+            )
+    with pytest.raises(InputError, match="basis along"):
+        band_table(settings.transform, SHAPE)
