@@ -85,12 +85,8 @@ WITHOUT_MIRROR: dict[str, str] = {
     "fhash_codec.rendering.picture.plan": "a record: picture/test_planning.py, test_explain.py",
     "fhash_codec.selftest.checks.properties": "a list of checks: selftest/test_runner.py",
     "fhash_formats.transform.entropy.coder_portable": "held against the C++: test_coder.py",
-    "fhash_formats.transform.entropy.mask_levels": "levels of coded masks: test_mask.py",
     "fhash_formats.transform.entropy.mask_portable": "held against the C++: test_mask.py",
-    "fhash_formats.transform.entropy.mixing_portable": "held against the C++: test_coder.py",
     "fhash_formats.transform.entropy.predict_portable": "held against the C++: test_predict.py",
-    "fhash_formats.transform.entropy.predictor": "predictors of coded tiles: test_predict.py",
-    "fhash_formats.transform.entropy.prior": "learned states of the coder: test_coder.py",
 }
 """Modules without a test file of their own, and where their behaviour is tested instead."""
 

@@ -34,7 +34,7 @@ def listing(folder: Path) -> Listing:
     }
 
 
-def moments(count: int, most: int = 6) -> list[int]:
+def moments(count: int, most: int = 4) -> list[int]:
     """Return which of `count` operations to disturb.
 
     All of them in the long set, else at most `most`, evenly spread from the first to the last.

@@ -201,36 +201,13 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
 
     All tiles are empty.
     """
-    documents = documents_of(parts)
+    document = documents_of(parts).get("tables/level_1", {})
     root = json.loads(dict(parts)[DOCUMENT])
     header = root["attributes"]["fhash"]
     if header["model"]["profile"] != "compact":
         return values_changed(chance, parts)
     kind = chance.choice(list(DTYPES))
-    room, chunk = (
-        (1 << chance.choice((20, 24, 28, 30, 31))) // np.dtype(kind).itemsize,
-        [1, 1, 1, 1],
-    )
-    for axis in chance.sample(range(4), 4):
-        chunk[axis] = 1 << chance.randrange(21)
-        while prod(chunk) > room:
-            chunk[axis] //= 2
-    counts = [chance.choice((1, 1, 1, 2)) for _ in range(4)]
-    shape = [
-        min(1 << 20, n * count - chance.choice((0, 0, n // 3)))
-        for n, count in zip(chunk, counts, strict=True)
-    ]
-    shape = [max(n, 1) for n in shape]
-    domain = [max(n, chance.choice((1, n, 2**20))) for n in shape]
-    domain[0] = shape[0]
-    header["domain"]["shape"] = domain
-    header["feature_bounding_box"] = [[0, n] for n in shape[1:]]
-    header["model"]["levels"] = [shape]
-    header["model"]["tables"] = kind
-    header["coordinates"] = {name: {} for name in ("time", "z", "y", "x")}
-    header["required_features"] = ["transform", "mask", "predictor", "cross"]
-    document = documents["tables/level_1"]
-    shard = [n * count for n, count in zip(chunk, counts, strict=True)]
+    shape, chunk, shard = _giant_shapes(chance, header, kind)
     configuration = document["codecs"][0]["configuration"]
     document.update(shape=shape, data_type=kind, fill_value=0)
     document["chunk_grid"]["configuration"]["chunk_shape"] = shard
@@ -246,8 +223,48 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
     elif chance.random() < 0.5:
         configuration["codecs"][0]["configuration"]["transform"] = plain
     sharding = Sharding(shard_shape=tuple(shard), chunk_shape=tuple(chunk), codecs=())
-    flags = chance.choice((FORMAT, MASKED)) | EMPTY
-    stream = bytes([flags])
+    stream = _empty_stream(chance)
+    present = sharding.present((0, 0, 0, 0), shape)
+    chunks = [with_crc(stream)] * int(present.sum())
+    new = {f"tables/level_1/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)}
+    kept = [
+        (name, data)
+        for name, data in parts
+        if not name.startswith(("missing/", "occupancy/", "tables/level_1/c"))
+    ]
+    shards = ("tables/level_1/c/0/0/0/0", shard_of(sharding, present, chunks))
+    return [*replaced(kept, new), shards]
+
+
+def _giant_shapes(
+    chance: random.Random, header: dict[str, Any], kind: str
+) -> tuple[list[int], list[int], list[int]]:
+    """Declare a giant volume in a header, and return the shapes of the box, a tile and a shard."""
+    room = (1 << chance.choice((20, 24, 28, 30, 31))) // np.dtype(kind).itemsize
+    chunk = [1, 1, 1, 1]
+    for axis in chance.sample(range(4), 4):
+        chunk[axis] = 1 << chance.randrange(21)
+        while prod(chunk) > room:
+            chunk[axis] //= 2
+    counts = [chance.choice((1, 1, 1, 2)) for _ in range(4)]
+    shape = [
+        max(1, min(1 << 20, n * count - chance.choice((0, 0, n // 3))))
+        for n, count in zip(chunk, counts, strict=True)
+    ]
+    domain = [max(n, chance.choice((1, n, 2**20))) for n in shape]
+    domain[0] = shape[0]
+    header["domain"]["shape"] = domain
+    header["feature_bounding_box"] = [[0, n] for n in shape[1:]]
+    header["model"]["levels"] = [shape]
+    header["model"]["tables"] = kind
+    header["coordinates"] = {name: {} for name in ("time", "z", "y", "x")}
+    header["required_features"] = ["transform", "mask", "predictor", "cross"]
+    return shape, chunk, [n * count for n, count in zip(chunk, counts, strict=True)]
+
+
+def _empty_stream(chance: random.Random) -> bytes:
+    """Return the stream of a tile without values: flagged as empty, or with empty sections."""
+    stream = bytes([chance.choice((FORMAT, MASKED)) | EMPTY])
     if chance.random() < 0.5:
         sections = [b""] * chance.choice((1, 2, 3))
         stream = (
@@ -255,19 +272,7 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
             + zlib.crc32(b"").to_bytes(4, "little")
             + b"".join(map(section, sections))
         )
-    present = sharding.present((0, 0, 0, 0), shape)
-    chunks = [with_crc(stream)] * int(present.sum())
-    new = {
-        "tables/level_1/c/0/0/0/0": shard_of(sharding, present, chunks),
-        f"tables/level_1/{DOCUMENT}": dumped(document),
-        DOCUMENT: dumped(root),
-    }
-    kept = [
-        (name, data)
-        for name, data in parts
-        if not name.startswith(("missing/", "occupancy/", "tables/level_1/c"))
-    ]
-    return [*replaced(kept, new), ("tables/level_1/c/0/0/0/0", new["tables/level_1/c/0/0/0/0"])]
+    return stream
 
 
 KINDS: dict[str, Callable[[random.Random, Parts], Parts]] = {

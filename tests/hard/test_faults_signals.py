@@ -87,7 +87,7 @@ def test_a_signal_at_each_stage_leaves_the_older_output(
 @pytest.mark.parametrize("name", COMMITTED)
 def test_a_signal_at_any_operation_leaves_one_of_the_two_outputs(bench: Bench, name: str) -> None:
     count = bench.operations(name)
-    for turn, place in enumerate(moments(count, 6)):
+    for turn, place in enumerate(moments(count)):
         before = bench.old(name)
         ended = bench.run(name, ("at_operation", bench.out, place, -SIGNALS[turn % len(SIGNALS)]))
         now = bench.now()
@@ -100,5 +100,5 @@ def test_a_signal_at_any_operation_leaves_one_of_the_two_outputs(bench: Bench, n
         assert kept in (before, bench.new(name)), place
     record(
         "a signal at an operation",
-        {"command": name, "operations": count, "signals": len(moments(count, 6))},
+        {"command": name, "operations": count, "signals": len(moments(count))},
     )

@@ -60,89 +60,71 @@ bool is_new() {
     return fresh;
 }
 
+// Numbers at the ends of types, infinities and NaN; their low bytes are written.
+const std::uint64_t HARD_NUMBERS[] = {
+    0,          1,          2,          7,          8,          15,
+    16,         31,         32,         63,         64,         127,
+    128,        255,        256,        4095,       4096,       32767,
+    32768,      65535,      65536,      0x7fffffff, 0x80000000, 0xffffffff,
+    0x7f800000, 0xff800000, 0x7fc00000, 0x7f7fffff,
+    0x7ff0000000000000, 0x7ff8000000000000, 0x7fffffffffffffff, 0xffffffffffffffff};
+
+void write_hard_number(Input& input) {
+    const std::size_t width = std::size_t{1} << below(4);
+    const std::uint64_t value = HARD_NUMBERS[below(sizeof HARD_NUMBERS / sizeof *HARD_NUMBERS)];
+    if (input.size() >= width)
+        std::memcpy(input.data() + below(input.size() - width + 1), &value, width);
+}
+
+// Inserts or removes some bytes.
+void resize_at(Input& input, std::ptrdiff_t at, bool larger) {
+    if (larger) {
+        input.insert(input.begin() + at, 1 + below(8), static_cast<std::uint8_t>(chance()));
+        return;
+    }
+    const std::size_t end = std::min(input.size(), static_cast<std::size_t>(at) + 1 + below(16));
+    input.erase(input.begin() + at, input.begin() + static_cast<std::ptrdiff_t>(end));
+}
+
+// Continues the input with the end of another one, or copies a few bytes of it.
+void splice_at(Input& input, std::size_t at, const std::vector<Input>& corpus, bool to_the_end) {
+    const Input& other = corpus[below(corpus.size())];
+    const std::size_t from = below(other.size());
+    const auto start = other.begin() + static_cast<std::ptrdiff_t>(from);
+    if (to_the_end) {
+        input.resize(at);
+        input.insert(input.end(), start, other.end());
+        return;
+    }
+    const std::size_t n = std::min({other.size() - from, input.size() - at, 1 + below(32)});
+    std::copy_n(start, n, input.begin() + static_cast<std::ptrdiff_t>(at));
+}
+
+void change_byte(std::uint8_t& byte, std::size_t kind) {
+    if (kind == 0)
+        byte ^= static_cast<std::uint8_t>(1 << below(8));
+    else if (kind == 1)
+        byte = static_cast<std::uint8_t>(chance());
+    else
+        byte = static_cast<std::uint8_t>(byte + below(71) - 35);
+}
+
 void mutate(Input& input, const std::vector<Input>& corpus) {
-    static const std::uint64_t numbers[] = {0,
-                                            1,
-                                            2,
-                                            7,
-                                            8,
-                                            15,
-                                            16,
-                                            31,
-                                            32,
-                                            63,
-                                            64,
-                                            127,
-                                            128,
-                                            255,
-                                            256,
-                                            4095,
-                                            4096,
-                                            32767,
-                                            32768,
-                                            65535,
-                                            65536,
-                                            0x7fffffff,
-                                            0x80000000,
-                                            0xffffffff,
-                                            0x7f800000,
-                                            0xff800000,
-                                            0x7fc00000,
-                                            0x7f7fffff,
-                                            0x7ff0000000000000,
-                                            0x7ff8000000000000,
-                                            0x7fffffffffffffff,
-                                            0xffffffffffffffff};
     for (std::size_t turns = std::size_t{1} << below(5); turns > 0; turns--) {
         const std::size_t at = below(input.size());
-        switch (below(10)) {
+        const std::size_t kind = below(10);
+        switch (kind) {
             case 0:
-                if (!input.empty()) input[at] ^= static_cast<std::uint8_t>(1 << below(8));
-                break;
             case 1:
-                if (!input.empty()) input[at] = static_cast<std::uint8_t>(chance());
-                break;
             case 2:
-                if (!input.empty())
-                    input[at] = static_cast<std::uint8_t>(input[at] + below(71) - 35);
+                if (!input.empty()) change_byte(input[at], kind);
                 break;
-            case 3: {
-                const std::size_t width = std::size_t{1} << below(4);
-                const std::uint64_t value = numbers[below(sizeof numbers / sizeof *numbers)];
-                if (input.size() >= width)
-                    std::memcpy(input.data() + below(input.size() - width + 1), &value, width);
-                break;
-            }
+            case 3: write_hard_number(input); break;
             case 4:
-                input.insert(input.begin() + static_cast<std::ptrdiff_t>(at), 1 + below(8),
-                             static_cast<std::uint8_t>(chance()));
-                break;
-            case 5: {
-                const std::size_t end = std::min(input.size(), at + 1 + below(16));
-                input.erase(input.begin() + static_cast<std::ptrdiff_t>(at),
-                            input.begin() + static_cast<std::ptrdiff_t>(end));
-                break;
-            }
-            case 6:
-                input.resize(at);
-                break;
-            case 7: {  // the beginning of this input and the end of another one
-                const Input& other = corpus[below(corpus.size())];
-                const std::size_t from = below(other.size());
-                input.resize(at);
-                input.insert(input.end(), other.begin() + static_cast<std::ptrdiff_t>(from),
-                             other.end());
-                break;
-            }
-            case 8: {
-                const Input& other = corpus[below(corpus.size())];
-                const std::size_t from = below(other.size()),
-                                  n = std::min(
-                                      {other.size() - from, input.size() - at, 1 + below(32)});
-                std::copy_n(other.begin() + static_cast<std::ptrdiff_t>(from), n,
-                            input.begin() + static_cast<std::ptrdiff_t>(at));
-                break;
-            }
+            case 5: resize_at(input, static_cast<std::ptrdiff_t>(at), kind == 4); break;
+            case 6: input.resize(at); break;
+            case 7:
+            case 8: splice_at(input, at, corpus, kind == 7); break;
             default:
                 for (std::size_t n = 1 + below(16); n > 0; n--)
                     input.push_back(static_cast<std::uint8_t>(chance()));

@@ -1,4 +1,4 @@
-"""Table of bands that the coder takes; its columns have the same names in native/coder.cpp."""
+"""Table of bands that the coder takes; native/coder_contexts.hpp names the same columns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells of a frame in which something can be seen."""
+"""The visible cells of a frame."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def noise(shape, share_missing=0.0):
     return values
 
 
-def test_limits_lie_around_what_is_seen():
+def test_limits_lie_around_what_is_seen() -> None:
     values = np.linspace(0, 1, 64).reshape(4, 4, 4)
     bricks = bricks_of(values)
     steps = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 2.0, 3.0]
@@ -62,7 +62,7 @@ def test_limits_lie_around_what_is_seen():
 
 @pytest.mark.parametrize("shape", [(9, 9, 9), (17, 20, 23), (1, 22, 30), (6, 1, 40), (2, 2, 2)])
 @pytest.mark.parametrize("missing", [0.0, 0.2])
-def test_a_bit_is_set_where_values_of_the_cell_reach_what_is_seen(shape, missing):
+def test_a_bit_is_set_where_values_of_the_cell_reach_what_is_seen(shape, missing) -> None:
     library = native.library()
     if library is None:
         pytest.skip("no native library")
@@ -106,7 +106,7 @@ def test_a_bit_is_set_where_values_of_the_cell_reach_what_is_seen(shape, missing
         np.testing.assert_array_equal(bits.astype(bool), exact)
 
 
-def test_where_most_cells_are_seen_they_are_not_looked_for():
+def test_where_most_cells_are_seen_they_are_not_looked_for() -> None:
     library = native.library()
     if library is None:
         pytest.skip("no native library")

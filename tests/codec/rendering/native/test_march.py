@@ -109,7 +109,7 @@ def lit(colour, slope, along, lighting):
 
 
 def places_of(task, shape):
-    """Pixel, number, place and length of each sample of each ray; directions of the rays."""
+    """Pixels, places, lengths and directions of the samples of all rays, number by number."""
     origin, along = (
         np.array(np.broadcast_to(part.reshape(-1, 3), (np.prod(task.rays.size), 3)))
         for part in task.rays.pixels()
@@ -151,7 +151,7 @@ def pictured(values, task):
 
 
 @pytest.mark.parametrize("missing", [False, True])
-def test_a_volume_is_lit_by_central_differences(path, missing):
+def test_a_volume_is_lit_by_central_differences(path, missing) -> None:
     values = waves()
     if missing:
         values[4:7, 5:9, 3:12] = np.nan
@@ -164,7 +164,7 @@ def test_a_volume_is_lit_by_central_differences(path, missing):
     assert found.counters == cell.counters
 
 
-def test_a_sphere_is_lit_by_central_differences(path):
+def test_a_sphere_is_lit_by_central_differences(path) -> None:
     axis = np.linspace(-1, 1, 21)
     values = np.sqrt(sum(part**2 for part in np.meshgrid(axis, axis, axis))).astype(np.float32)
     surface = Surface(value=0.5, colour=np.array([1.0, 0.5, 0.25]), opacity=1.0)
@@ -195,7 +195,7 @@ CASES = {
 
 @pytest.mark.parametrize("shape", [(14, 17, 22), (1, 30, 30), (30, 30, 1)])
 @pytest.mark.parametrize("case", CASES)
-def test_all_paths_make_one_picture(path, case, shape):
+def test_all_paths_make_one_picture(path, case, shape) -> None:
     values = waves(shape)
     more = {
         "extinctions": np.concatenate([np.zeros(40), np.linspace(0, 0.4, 60)]),
@@ -213,7 +213,7 @@ def test_all_paths_make_one_picture(path, case, shape):
             np.testing.assert_array_equal(np.isfinite(found.depth), np.isfinite(quickest.depth))
 
 
-def test_all_paths_make_one_picture_in_a_grid_of_light(path):
+def test_all_paths_make_one_picture_in_a_grid_of_light(path) -> None:
     values = waves()
     for shaded in (False, True):
         task = task_of(values.shape, np.linspace(0, 0.4, 100), shaded=shaded)
@@ -228,7 +228,7 @@ def test_all_paths_make_one_picture_in_a_grid_of_light(path):
 
 
 @pytest.mark.parametrize("step", [0.3, 0.5, 1.9])
-def test_samples_of_a_narrow_interval_lie_in_cells_where_it_is(path, step):
+def test_samples_of_a_narrow_interval_lie_in_cells_where_it_is(path, step) -> None:
     values = waves((40, 41, 43))
     task = task_of(values.shape, [0.0] * 50 + [0.5] * 2 + [0.0] * 50, size=(50, 40), step=step)
     found, everything = (
@@ -249,7 +249,7 @@ def test_samples_of_a_narrow_interval_lie_in_cells_where_it_is(path, step):
 
 @pytest.mark.parametrize("step", [0.3, 0.5, 0.9, 2.5, 3.9, 7.0])
 @pytest.mark.parametrize("jitter", [False, True])
-def test_no_surface_is_lost_by_skipping(path, step, jitter):
+def test_no_surface_is_lost_by_skipping(path, step, jitter) -> None:
     values = waves((27, 30, 38), pace=2.0)
     samples = []
     for camera in (Camera(azimuth=20.0, elevation=10.0), Camera(view="xy", projection="parallel")):

@@ -1,63 +1,72 @@
-"""Light on a sample: Phong's model against closed forms, and shares between points of a grid."""
+"""The light on a sample."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+from dataclasses import replace
 
+import numpy as np
+import pytest
+
+from fhash_codec.rendering.stream.fields import FrameField
 from fhash_codec.rendering.stream.phong import LightAt, Phong
 from fhash_codec.rendering.task.arrays import NUMPY
-from fhash_codec.rendering.task.task import LightGrid, Lighting
+from fhash_codec.rendering.task.task import LightGrid, Lighting, Task
 
-ALONG = np.array([[0.0, 0.0, 1.0]])
-GREY = np.full((1, 3), 0.5)
+FrameTask = Callable[..., tuple[FrameField, Task]]
+
+COLOUR = np.array([[0.5, 0.25, 1.0]])
+ALONG = np.array([[0.0, 0.0, -1.0]])
 FULL = np.ones(1)
 
 
-def lit(slope: tuple[float, float, float], lamp: np.ndarray | None = None) -> float:
-    """The first channel of a grey sample that is lit along z, with a gradient."""
-    lighting = Lighting(ambient=0.2, diffuse=0.7, specular=0.3, specular_power=2.0, lamp=lamp)
-    phong = Phong(arrays=NUMPY, lighting=lighting, lamp=lamp, scale=np.ones(3), floor=1e-9)
-    return float(phong(GREY, np.array([slope]), ALONG, FULL, FULL)[0, 0])
+@pytest.fixture
+def phong(frame_task: FrameTask) -> Phong:
+    """Phong's model with a lamp above, for values 0..1."""
+    values = np.broadcast_to(np.linspace(0, 1, 9)[:, None, None], (9, 7, 7))
+    field, task = frame_task(values, fog=1.0)
+    lighting = Lighting(
+        ambient=0.25, diffuse=0.5, specular=0.125, specular_power=3.0, lamp=np.array([0, 0, 1.0])
+    )
+    found = Phong.of(replace(task, lighting=lighting), field)
+    assert found is not None
+    return found
 
 
-def test_a_surface_that_faces_the_eye_has_all_its_light() -> None:
-    np.testing.assert_allclose(lit((0.0, 0.0, -5.0)), 0.5 * 0.9 + 0.3, rtol=1e-12)
-    # Two-sided: a gradient that points away counts as well.
-    assert lit((0.0, 0.0, 5.0)) == lit((0.0, 0.0, -5.0))
+def test_a_task_without_lighting_has_no_model(frame_task: FrameTask) -> None:
+    field, task = frame_task(np.zeros((5, 5, 5)), fog=1.0)
+    assert Phong.of(task, field) is None
 
 
-def test_a_surface_seen_from_its_edge_has_ambient_light_alone() -> None:
-    np.testing.assert_allclose(lit((3.0, 0.0, 0.0)), 0.5 * 0.2, rtol=1e-12)
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("angle", [0.0, 0.5, 1.2])
+def test_light_follows_the_angle_to_the_gradient_on_both_sides(
+    phong: Phong, side: float, angle: float
+) -> None:
+    slope = side * np.array([[np.sin(angle), 0.0, np.cos(angle)]])
+    cosine = np.cos(angle)
+    exact = COLOUR * (0.25 + 0.5 * cosine) + 0.125 * cosine**3
+    np.testing.assert_allclose(phong(COLOUR, slope, ALONG, FULL, FULL), exact, rtol=1e-6)
 
 
-def test_without_a_gradient_there_is_ambient_light_alone() -> None:
-    np.testing.assert_allclose(lit((0.0, 0.0, 0.0)), 0.5 * 0.2, rtol=1e-12)
+def test_without_a_gradient_only_the_ambient_light_is_left(phong: Phong) -> None:
+    none = np.zeros((1, 3))
+    np.testing.assert_allclose(phong(COLOUR, none, ALONG, FULL, FULL), 0.25 * COLOUR)
 
 
-def test_an_aslant_surface_follows_the_cosine() -> None:
-    cosine = np.cos(0.6)
-    slope = (float(np.sin(0.6)), 0.0, float(cosine))
-    expected = 0.5 * (0.2 + 0.7 * cosine) + 0.3 * cosine**2
-    np.testing.assert_allclose(lit(slope), expected, rtol=1e-12)
+def test_shadows_take_the_light_of_the_lamp_and_surroundings_the_ambient_one(phong: Phong) -> None:
+    slope = np.array([[0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(phong(COLOUR, slope, ALONG, 0 * FULL, FULL), 0.25 * COLOUR)
+    np.testing.assert_allclose(
+        phong(COLOUR, slope, ALONG, FULL, 0 * FULL), 0.5 * COLOUR + 0.125, rtol=1e-6
+    )
 
 
-def test_light_from_behind_has_no_highlight() -> None:
-    np.testing.assert_allclose(lit((0.0, 0.0, 1.0), np.array([0.0, 0.0, 1.0])), 0.5 * 0.9)
-
-
-def test_shadows_take_the_light_of_the_lamp_and_surroundings_the_ambient_one() -> None:
-    lighting = Lighting(ambient=0.2, diffuse=0.7, specular=0.3, specular_power=2.0, lamp=None)
-    phong = Phong(arrays=NUMPY, lighting=lighting, lamp=None, scale=np.ones(3), floor=1e-9)
-    slope = np.array([[0.0, 0.0, -5.0]])
-    np.testing.assert_allclose(phong(GREY, slope, ALONG, 0 * FULL, FULL), 0.5 * 0.2)
-    np.testing.assert_allclose(phong(GREY, slope, ALONG, FULL, 0 * FULL), 0.5 * 0.7 + 0.3)
-
-
-def test_shares_of_light_are_trilinear_and_clamped() -> None:
-    z, y, x = np.meshgrid(np.arange(2.0), np.arange(3.0), np.arange(4.0), indexing="ij")
-    shares = np.stack([(x + 2 * y + 3 * z) / 20, np.full_like(x, 0.25)], axis=-1)
-    grid = LightGrid(shares=shares.astype(np.float32), first=np.array([1.0, 0.0, 0.0]), cell=2.0)
-    places = np.array([[1.0, 0.0, 0.0], [4.0, 3.0, 1.0], [99.0, 99.0, 99.0], [-9.0, -9.0, -9.0]])
-    lamp, around = LightAt(grid, NUMPY)(places)
-    np.testing.assert_allclose(lamp, [0.0, (1.5 + 3 + 1.5) / 20, 10 / 20, 0.0], atol=1e-7)
-    np.testing.assert_allclose(around, 0.25)
+def test_a_grid_of_light_is_trilinear_and_clamped() -> None:
+    z, y, x = np.meshgrid(*map(np.arange, (3.0, 4.0, 5.0)), indexing="ij")
+    values = np.stack([x / 8 + y / 16, z / 4], axis=-1).astype(np.float32)
+    light = LightAt(LightGrid(shares=values, first=np.array([10.0, 20.0, 30.0]), cell=2.0), NUMPY)
+    places = np.array([[13.0, 21.0, 33.0], [0.0, 0.0, 0.0], [99.0, 99.0, 99.0]])
+    lamp, around = light(places)
+    np.testing.assert_allclose(lamp, [1.5 / 8 + 0.5 / 16, 0.0, 4 / 8 + 3 / 16])
+    np.testing.assert_allclose(around, [1.5 / 4, 0.0, 0.5])

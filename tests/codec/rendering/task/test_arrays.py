@@ -1,25 +1,62 @@
-"""numpy's arrays: repeated rows are added in order, and conversions round towards 0."""
+"""The operations of marching: the same by numpy and by torch."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from fhash_codec.rendering.task.arrays import NUMPY
-
-
-def test_values_of_a_repeated_row_add_up_in_order() -> None:
-    sums = NUMPY.full((2, 1), 0.0)
-    rows = NUMPY.array([0, 1, 0, 0])
-    NUMPY.add_rows(sums, rows, NUMPY.array([[1e16], [5.0], [1.0], [-1e16]]))
-    # In another order the 1 would not be lost.
-    assert sums[:, 0].tolist() == [(1e16 + 1.0) - 1e16, 5.0]
+from fhash_codec.rendering.task.arrays import NUMPY, Arrays
 
 
-def test_integers_are_rounded_towards_zero() -> None:
-    rounded = NUMPY.to_int64(NUMPY.array([-1.9, -0.1, 0.9, 2.0]))
-    assert rounded.tolist() == [-1, 0, 0, 2]
-    assert rounded.dtype == np.int64
+@pytest.fixture(params=["numpy", "torch"])
+def arrays(request: pytest.FixtureRequest) -> Arrays:
+    if request.param == "numpy":
+        return NUMPY
+    import torch
+
+    from fhash_codec.rendering.task.torch_arrays import TorchArrays
+
+    return TorchArrays(torch.device("cpu"))
 
 
-def test_an_array_of_another_type_is_converted() -> None:
-    assert NUMPY.array([1, 2], "float64").dtype == np.float64
+def test_arrays_come_back_as_they_went(arrays: Arrays) -> None:
+    for kind in ("float32", "float64", "int64", "bool"):
+        values = np.arange(6).reshape(2, 3).astype(kind)
+        back = arrays.host(arrays.array(values))
+        np.testing.assert_array_equal(back, values)
+        assert back.dtype == values.dtype
+    assert arrays.host(arrays.array([1, 2], "float32")).dtype == np.float32
+    assert arrays.host(arrays.full(2, 1.5)).tolist() == [1.5, 1.5]
+    assert arrays.host(arrays.full((1, 2), 3, "int64")).tolist() == [[3, 3]]
+    assert arrays.host(arrays.empty((2, 3), "float32")).shape == (2, 3)
+    assert arrays.host(arrays.range(3)).tolist() == [0, 1, 2]
+
+
+def test_numbers_are_converted_towards_zero(arrays: Arrays) -> None:
+    values = arrays.array([-1.7, -0.5, 1.7])
+    assert arrays.host(arrays.to_int64(values)).tolist() == [-1, 0, 1]
+    assert arrays.host(arrays.to_float32(values)).dtype == np.float32
+    assert arrays.host(arrays.to_float64(arrays.range(2))).dtype == np.float64
+
+
+def test_a_copy_has_memory_of_its_own(arrays: Arrays) -> None:
+    first = arrays.array([1.0, 2.0])
+    second = arrays.copy(first)
+    second[0] = 5.0
+    assert arrays.host(first).tolist() == [1.0, 2.0]
+
+
+def test_elements_are_found_and_picked(arrays: Arrays) -> None:
+    array = arrays.array([[0.0, 3.0], [4.0, 0.0]])
+    rows, columns = arrays.nonzero(array)
+    assert arrays.host(rows).tolist() == [0, 1]
+    assert arrays.host(columns).tolist() == [1, 0]
+    picked = arrays.take_along(array, arrays.array([[1], [0]]), 1)
+    assert arrays.host(picked).tolist() == [[3.0], [4.0]]
+
+
+def test_rows_that_are_named_twice_are_added_twice(arrays: Arrays) -> None:
+    total = arrays.full((3, 2), 1.0)
+    values = arrays.array([[1.0, 2.0], [10.0, 20.0], [100.0, 200.0]])
+    arrays.add_rows(total, arrays.array([2, 0, 2]), values)
+    assert arrays.host(total).tolist() == [[11.0, 21.0], [1.0, 1.0], [102.0, 203.0]]

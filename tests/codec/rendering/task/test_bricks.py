@@ -1,4 +1,4 @@
-"""Bricks of a frame: the values that they hold, and which of them matter."""
+"""Value ranges of a frame's bricks, and which of them matter."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def task_of(shape, extinctions, surfaces=()):
 
 
 @pytest.mark.parametrize("shape", [(20, 17, 33), (9, 8, 10), (1, 30, 2), (1, 1, 1), (70, 70, 70)])
-def test_a_brick_has_the_extremes_of_its_vertices(way, shape):
+def test_a_brick_has_the_extremes_of_its_vertices(way, shape) -> None:
     values = np.random.default_rng(3).normal(size=shape).astype(np.float32)
     values[values > 1.5] = np.nan
     bricks = bricks_of(values)
@@ -48,7 +48,7 @@ def test_a_brick_has_the_extremes_of_its_vertices(way, shape):
     )
 
 
-def test_what_is_infinite_has_no_value(way):
+def test_what_is_infinite_has_no_value(way) -> None:
     values = np.zeros((10, 10, 10))
     values[1, 1, 1], values[2, 2, 2] = np.inf, -np.inf
     bricks = bricks_of(values)
@@ -58,7 +58,7 @@ def test_what_is_infinite_has_no_value(way):
     assert bricks_of(np.full((3, 3, 3), np.nan)).value_range == (0.0, 0.0)
 
 
-def test_bricks_matter_where_something_can_be_seen(way):
+def test_bricks_matter_where_something_can_be_seen(way) -> None:
     values = np.zeros((33, 33, 33))
     values[22, 2, 10] = 1.0
     values[2, 26, 26] = 0.4
@@ -71,7 +71,7 @@ def test_bricks_matter_where_something_can_be_seen(way):
     assert bricks.matters(task_of(values.shape, [1.0, 0.0])).all()
 
 
-def test_a_table_of_denormal_width_is_one():
+def test_a_table_of_denormal_width_is_one() -> None:
     values = np.zeros((6, 6, 6), dtype=np.float32)
     values[1, 1, 1] = 1.0
     colours = np.ones((4097, 3), dtype=np.float32)
@@ -81,7 +81,7 @@ def test_a_table_of_denormal_width_is_one():
         assert np.all(bricks_of(values).matters(replace(task, table=table)) == expected)
 
 
-def test_the_distance_is_that_to_the_nearest_brick_that_matters(way):
+def test_the_distance_is_that_to_the_nearest_brick_that_matters(way) -> None:
     values = np.zeros((60, 50, 90))
     for z, y, x in ((4, 4, 4), (50, 20, 60), (33, 44, 85)):
         values[z, y, x] = 1.0

@@ -1,4 +1,4 @@
-"""Frames and extinctions, as a marcher is given them."""
+"""The task of a marcher."""
 
 from __future__ import annotations
 

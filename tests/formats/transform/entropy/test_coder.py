@@ -1,8 +1,7 @@
-"""The adaptive coder: there and back, the same bytes from every engine, and damaged or hostile bytes."""
+"""The adaptive coder: round trips, the same bytes from every engine, damaged and hostile bytes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -15,7 +14,7 @@ from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.basis import fit_basis
 from fhash_formats.transform.axes.spec import WAVELETS, AxisTransform, TransformSpec
-from fhash_formats.transform.entropy import mixing_portable, prior
+from fhash_formats.transform.entropy import mixing_portable
 from fhash_formats.transform.entropy.coder import (
     MAX_INTEGER,
     Encoded,
@@ -24,7 +23,7 @@ from fhash_formats.transform.entropy.coder import (
     encode_block,
     encode_integers,
 )
-from fhash_formats.transform.entropy.prior import blank_state, pack_prior
+from fhash_formats.transform.entropy.prior import blank_state
 from fhash_formats.transform.entropy.table import Table, single_band
 
 Integers = NDArray[np.int32]
@@ -37,7 +36,7 @@ NONE = ("none", "none", "none", "none")
 
 
 def use(engine: str, patch: pytest.MonkeyPatch) -> None:
-    """native, or portable: compiled or plain Python."""
+    """Use an engine: native, compiled (portable, by numba) or plain (portable, in Python)."""
     if engine == "native":
         if native.library() is None:
             pytest.skip("the native library is not built or not wanted")
@@ -207,7 +206,7 @@ def test_compiled_and_native_agree_on_a_larger_tile(monkeypatch: pytest.MonkeyPa
 
 
 def rows_that_are_chosen_away() -> NDArray[np.float32]:
-    """Lone coefficients that are not worth their bits, before many that need more room than there is at first."""
+    """Lone coefficients that are not worth their bits, then many that exceed the first buffer."""
     scaled = np.zeros((1, 1, 600, 16), dtype=np.float32)
     scaled[:, :, :300, 3] = 0.56
     scaled[:, :, 300:] = np.random.default_rng(0).integers(-(2**29), 2**29, (300, 16))
@@ -275,58 +274,20 @@ def test_a_state_is_left_behind_and_helps(engine: str) -> None:
     assert first.data == encode_integers(integers, table, state=blank_state()).data
 
 
-@pytest.mark.usefixtures("fast_engine")
-def test_the_prior_stays_as_it_is() -> None:
-    integers = make("mixed", (2, 2, 8, 20))
-    before = prior.prior_state().copy()
-    first = encode_block(integers)
-    assert encode_block(integers) == first
-    decode_block(first, integers.shape)
-    assert all(
-        (left == right).all()
-        for left, right in zip(
-            vars(before).values(), vars(prior.prior_state()).values(), strict=True
-        )
-    )
-
-
-def test_a_packed_prior_is_a_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-    state = blank_state()
-    encode_integers(
-        make("mixed", (3, 3, 20, 30)), table_of(COUPLED, 2, (3, 3, 20, 30)), state=state
-    )
-    (tmp_path / "prior.bin").write_bytes(pack_prior(state))
-    monkeypatch.setattr(prior, "_FILE", tmp_path / "prior.bin")
-    again = prior.prior_state.__wrapped__()
-    assert (again.weights == state.weights).all()
-    assert (again.simples[:, 0] == state.simples[:, 0]).all()
-    assert again.slots[:, 2].max() == again.simples[:, 1].max() == prior.TRUST
-    seen = state.slots[:, 2] > 0
-    assert (again.slots[~seen, 0] == 32768).all()
-    off = np.abs(logit(again.slots[seen, 0]) - logit(state.slots[seen, 0].clip(2, 65534)))
-    assert off[np.abs(logit(state.slots[seen, 0])) < 10].max() < 1 / 12
-    assert prior.prior_state.__wrapped__().slots.flags.writeable is False
-
-
-def logit(p: NDArray[Any]) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = np.log(p / (65536.0 - p))
-    return values
-
-
 def tries(data: bytes, count: int) -> list[bytes]:
-    """Cuts, flips, and noise."""
+    """Damaged streams: cut, with a flipped bit, and noise."""
     random = np.random.default_rng(len(data))
-    found = [data[:cut] for cut in random.integers(0, len(data), count)]
+    streams = [data[:cut] for cut in random.integers(0, len(data), count)]
     for at in random.integers(0, 8 * len(data), count):
         flipped = bytearray(data)
         flipped[at // 8] ^= 1 << (at % 8)
-        found.append(bytes(flipped))
-    found += [random.bytes(int(size)) for size in random.integers(0, 2 * len(data), count)]
-    return [*found, b"\xff" * len(data), b"\0" * 9, b""]
+        streams.append(bytes(flipped))
+    streams += [random.bytes(int(size)) for size in random.integers(0, 2 * len(data), count)]
+    return [*streams, b"\xff" * len(data), b"\0" * 9, b""]
 
 
 def survives(count: int, shape: Shape, table: Table) -> int:
-    """How many streams are refused; all others give integers."""
+    """Number of streams that are refused; all others give integers."""
     data, refused = encode_integers(make("mixed", shape), table).data, 0
     for damaged in tries(data, count):
         try:
@@ -353,7 +314,8 @@ def test_damage_in_plain_python(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("fast_engine")
 def test_an_endless_magnitude_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    # The largest exponent ends with a 0. A 1 lies below it, so a somewhat smaller number says that the exponent goes on.
+    # The flags of the largest exponent end with a 0. A 1 lies below it in the range, so a somewhat
+    # smaller number says that the exponent goes on.
     table = single_band((1, 1, 1, 1))
     largest = encode_integers(np.full((1, 1, 1, 1), 2**31 - 1, dtype=np.int32), table).data
     endless = []
@@ -424,50 +386,3 @@ def test_threads_do_not_meet() -> None:
         assert (
             list(pool.map(lambda seed: encode_block(make("mixed", shape, seed)), range(8))) == alone
         )
-
-
-def before_rounding() -> dict[str, NDArray[np.float64]]:
-    """Every value that a table rounds down, where rounding can change the table."""
-    p = (np.arange(65536) + 0.5) / 65536
-    stretch = np.log(p / (1 - p)) * 256
-    return {
-        "stretch": stretch[np.abs(stretch) < mixing_portable.STRETCH_MAX + 1] + 0.5,
-        "squash": 65536
-        / (
-            1
-            + np.exp(
-                -np.arange(-mixing_portable.STRETCH_MAX, mixing_portable.STRETCH_MAX + 1) / 256
-            )
-        )
-        + 0.5,
-        "cost": -np.log2(np.arange(1, 65537) / 65536) * 2048 + 0.5,
-        "log": np.log2(np.arange(1, 4096)) * 16 + 0.5,
-        "probabilities": 65536 / (1 + np.exp(-(np.arange(256) - 128) / 12)) + 0.5,
-    }
-
-
-@pytest.mark.parametrize("name", ["stretch", "squash", "cost", "log", "probabilities"])
-def test_no_table_depends_on_the_c_library(name: str) -> None:
-    values = before_rounding()[name]
-    assert np.abs(values - np.rint(values)).min() > 1e-9
-
-
-def test_the_tables_are_those_values_rounded() -> None:
-    rounded: dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]] = {
-        "squash": lambda v: np.clip(np.floor(v), 1, 65535),
-        "cost": np.floor,
-        "log": np.floor,
-    }
-    for name, rule in rounded.items():
-        assert np.array_equal(
-            getattr(mixing_portable.ARRAYS, name)[-len(before_rounding()[name]) :],
-            rule(before_rounding()[name]),
-        )
-    assert np.array_equal(
-        prior._PROBABILITIES, np.clip(np.floor(before_rounding()["probabilities"]), 1, 65535)
-    )
-    assert (
-        mixing_portable.ARRAYS.stretch.min()
-        == -mixing_portable.ARRAYS.stretch.max()
-        == -mixing_portable.STRETCH_MAX
-    )

@@ -1,0 +1,310 @@
+// Contexts of the coder (coder.cpp): the columns of the table of bands, the classes of magnitudes,
+// and the sums over a vertex's neighbours, which are made for a whole row at a time.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <vector>
+
+#include "mixing.hpp"
+
+namespace {
+
+const int CONTEXTS = 6, SIGN_CONTEXTS = 3;  // estimates of a magnitude, and of a sign
+const int LANES = 12, SET = padded(LANES);  // weights of a set: of the caller, and as kept here
+const int DECISIONS = 16;                   // slots of a context
+const int UNARY = 14;                       // magnitudes from this one on have an escape code
+const int KINDS = 64;                       // kinds of bands
+const int LEVELS = 128;                     // quarter octaves of the expected magnitude
+const int SIGN_LIMIT = 255;                 // as SLOW_LIMIT, for signs
+const int MAX_MAGNITUDE = 4095;             // as contexts see it, so that sums stay in 32 bits
+const int PADDING = 2;                      // zeros beside a row of magnitudes
+const int VECTOR = 16;  // sums over a row are made for a multiple of it; those beyond are not used
+
+// Columns of the table of bands (transform/entropy/table.py). LOW, HIGH and SHIFT are the first of
+// four columns, for t, z, y and x. BAND and SHIFT are columns within a reference.
+enum Column { LOW = 0, HIGH = 4, KIND = 8, REFERENCES = 9, BAND = 0, SHIFT = 1 };
+const int REFERENCE_COUNT = 4, REFERENCE_COLUMNS = 5;
+const int COLUMNS = REFERENCES + REFERENCE_COUNT * REFERENCE_COLUMNS;
+
+// Weights of neighbours in the expected magnitude, in 1/1024.
+const int LEFT = 184, LEFT2 = 20;                 // the left neighbour, and the second one
+const int ABOVE = 184, DIAGONAL = 61, ABOVE2 = 41;  // above, each beside that, the second above
+const int BEFORE = 102, AROUND = 20, BEFORE2 = 31;  // before along t or z, around that, the second
+const int REFERENCE = 62;  // the vertex of a reference; the sum around it has weight AROUND
+
+const int SIZES[CONTEXTS] = {LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS};
+const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27};
+
+// Order of the state. Slots: by context, those of the decisions of a context together; then those
+// of the signs. Weights: sets by kind; from SECOND on by level; from SIGNS on those of the signs.
+// Simple estimates: of the escape code; from ROWS on of empty rows; from EMPTIES on of empty bands.
+const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET, SIGNS = SECOND + 64 * DECISIONS * SET;
+const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;
+
+enum Mode { ENCODE, DECODE, CHOOSE };  // CHOOSE encodes magnitudes chosen by rate and distortion
+
+// Class, 0 to 6, of a magnitude or of a sum of some. No table, so that the compiler makes vectors.
+FHASH_INLINE int seven(int v) { return (v > 0) + (v > 1) + (v > 2) + (v > 4) + (v > 6) + (v > 9); }
+
+// The same in classes 0 to 11.
+FHASH_INLINE int twelve(int v) {
+    return seven(v) + (v > 14) + (v > 22) + (v > 36) + (v > 64) + (v > 140);
+}
+
+// `twelve` as a table, for one number at a time.
+struct Classes {
+    uint8_t of[142];
+    Classes() {
+        for (int v = 0; v < 142; v++) of[v] = (uint8_t)twelve(v);
+    }
+};
+const Classes classes;
+FHASH_INLINE int small(int v) { return classes.of[min(v, 141)]; }
+
+// 0 for a negative number, 1 for 0, 2 for a positive number.
+FHASH_INLINE int sign_of(int32_t v) { return v > 0 ? 2 : v < 0 ? 0 : 1; }
+
+using Prediction = Mixed<CONTEXTS>;
+
+// Numbers by vertex of a row, from the neighbours that are known before the row.
+struct Sums {
+    std::vector<int32_t> room;
+    int32_t *expected;                // weighted sum for the expected magnitude
+    int32_t *plane, *before, *below;  // sums over the rows above, the step before, the layer below
+    int32_t *both, *nearest, *sides, *others, *parent;  // shares in the contexts
+    int32_t *share, *level;           // by vertex of a reference: share in `expected`, class
+    explicit Sums(size_t width) : room(11 * width) {
+        int32_t* at = room.data();
+        for (int32_t** array : {&expected, &plane, &before, &below, &both, &nearest, &sides,
+                                &others, &parent, &share, &level}) {
+            *array = at;
+            at += width;
+        }
+    }
+};
+
+struct Reference {
+    int band, shift[4];
+};
+struct Band {
+    int low[4], size[4], kind;
+    Reference references[REFERENCE_COUNT];
+    int64_t stride[3];                 // of magnitudes, along t, z and y
+    std::vector<uint16_t> magnitudes;  // rows with PADDING zeros at both ends
+    std::vector<uint8_t> filled;       // by row: whether it has a magnitude above 0
+    bool any;                          // whether the band has one
+};
+
+// A row of a band.
+struct Row {
+    int t, z, y;                 // indices in the band
+    uint16_t* magnitudes;        // of its vertices
+    const uint8_t* filled;       // its flag; those of other rows lie around
+    const uint16_t* references[REFERENCE_COUNT];  // row of each reference for this row, or null
+    int reference_y[REFERENCE_COUNT];             // index of that row along y
+};
+
+// Read the table of `count` bands. False for a band that does not lie within the shape.
+inline bool read_bands(const int32_t* table, const int64_t* shape, std::vector<Band>& bands) {
+    for (size_t b = 0; b < bands.size(); b++) {
+        const int32_t* const row = table + b * COLUMNS;
+        Band& band = bands[b];
+        for (int a = 0; a < 4; a++) {
+            const int32_t low = row[LOW + a], high = row[HIGH + a];
+            if (low < 0 || low > high || high > shape[a]) return false;
+            band.low[a] = low;
+            band.size[a] = high - low;
+        }
+        band.kind = row[KIND];
+        for (int k = 0; k < REFERENCE_COUNT; k++) {
+            const int32_t* const reference = row + REFERENCES + k * REFERENCE_COLUMNS;
+            band.references[k].band = reference[BAND];
+            for (int a = 0; a < 4; a++) band.references[k].shift[a] = reference[SHIFT + a];
+        }
+        band.any = false;
+    }
+    return true;
+}
+
+// Find the row of each reference that stands for this row. Whether the row of the parent is filled.
+FHASH_INLINE int find_references(const std::vector<Band>& bands, const Band& band, Row& row) {
+    int parent_filled = 0;
+    for (int k = 0; k < REFERENCE_COUNT; k++) {
+        const Reference& to = band.references[k];
+        row.references[k] = nullptr;
+        row.reference_y[k] = 0;
+        if (to.band < 0 || !bands[to.band].any) continue;
+        const Band& other = bands[to.band];
+        const int t = min(row.t >> to.shift[0], other.size[0] - 1);
+        const int z = min(row.z >> to.shift[1], other.size[1] - 1);
+        const int y = min(row.y >> to.shift[2], other.size[2] - 1);
+        row.reference_y[k] = y;
+        row.references[k] = other.magnitudes.data() + t * other.stride[0] + z * other.stride[1] +
+                            y * other.stride[2] + PADDING;
+        if (k == 0)
+            parent_filled = other.filled[((int64_t)t * other.size[1] + z) * other.size[2] + y];
+    }
+    return parent_filled;
+}
+
+// Sum over the neighbours of a row within its band, but those to the left, for `lanes` vertices.
+// Sum of the weights of the neighbours that exist, those to the left included.
+FHASH_INLINE int sum_neighbours(const Band& band, const Row& row, int lanes, Sums& sums) {
+    const int t = row.t, z = row.z, y = row.y, n1 = band.size[1], n2 = band.size[2];
+    const bool has_y = y > 0, has_z = z > 0, has_t = t > 0;
+    // Magnitudes and flags of this row, and the strides of both.
+    const uint16_t* const M = row.magnitudes;
+    const uint8_t* const F = row.filled;
+    const int64_t M0 = band.stride[0], M1 = band.stride[1], M2 = band.stride[2];
+    const int64_t R1 = n2, R0 = (int64_t)n1 * n2;
+    int32_t* FHASH_RESTRICT const expected = sums.expected;
+    int32_t* FHASH_RESTRICT const plane = sums.plane;
+    for (int32_t* array : {sums.expected, sums.plane, sums.before, sums.below})
+        std::memset(array, 0, 4 * (size_t)lanes);
+    int weight = LEFT + LEFT2;
+    if (has_y) {
+        weight += ABOVE + 2 * DIAGONAL;
+        if (F[-1]) {
+            const uint16_t* p = M - M2;
+            FHASH_INDEPENDENT
+            for (int x = 0; x < lanes; x++) {
+                const int sides = p[x - 1] + p[x + 1];
+                expected[x] += ABOVE * p[x] + DIAGONAL * sides;
+                plane[x] += 2 * p[x] + sides;
+            }
+        }
+        if (y > 1) weight += ABOVE2;
+        if (y > 1 && F[-2]) {
+            const uint16_t* p = M - 2 * M2;
+            FHASH_INDEPENDENT
+            for (int x = 0; x < lanes; x++) {
+                expected[x] += ABOVE2 * p[x];
+                plane[x] += p[x];
+            }
+        }
+    }
+    // Add the row p one step or layer before; r is the offset of its flag.
+    auto centre = [&](int32_t* FHASH_RESTRICT sum, int64_t r, const uint16_t* p) FHASH_LAMBDA {
+        if (!F[r]) return;
+        FHASH_INDEPENDENT
+        for (int x = 0; x < lanes; x++) {
+            const int sides = p[x - 1] + p[x + 1];
+            expected[x] += BEFORE * p[x] + AROUND * sides;
+            sum[x] += 2 * p[x] + sides;
+        }
+    };
+    // Add a row beside that one, if it exists.
+    auto neighbour = [&](int32_t* FHASH_RESTRICT sum, bool exists, int64_t r,
+                         const uint16_t* p) FHASH_LAMBDA {
+        if (!exists || !F[r]) return;
+        FHASH_INDEPENDENT
+        for (int x = 0; x < lanes; x++) {
+            expected[x] += AROUND * p[x];
+            sum[x] += p[x];
+        }
+    };
+    // Add the row two steps or layers before.
+    auto second = [&](int64_t r, const uint16_t* p) FHASH_LAMBDA {
+        if (!F[r]) return;
+        FHASH_INDEPENDENT
+        for (int x = 0; x < lanes; x++) expected[x] += BEFORE2 * p[x];
+    };
+    if (has_t) {
+        weight += BEFORE + 4 * AROUND + (t > 1 ? BEFORE2 : 0);
+        centre(sums.before, -R0, M - M0);
+        neighbour(sums.before, has_y, -R0 - 1, M - M0 - M2);
+        neighbour(sums.before, y + 1 < n2, -R0 + 1, M - M0 + M2);
+        neighbour(sums.before, has_z, -R0 - R1, M - M0 - M1);
+        neighbour(sums.before, z + 1 < n1, -R0 + R1, M - M0 + M1);
+        if (t > 1) second(-2 * R0, M - 2 * M0);
+    }
+    if (has_z) {
+        weight += BEFORE + 4 * AROUND + (z > 1 ? BEFORE2 : 0);
+        centre(sums.below, -R1, M - M1);
+        neighbour(sums.below, has_y, -R1 - 1, M - M1 - M2);
+        neighbour(sums.below, y + 1 < n2, -R1 + 1, M - M1 + M2);
+        if (z > 1) second(-2 * R1, M - 2 * M1);
+    }
+    return weight;
+}
+
+// Sum over the references of a row. Sum of the weights of the references that exist.
+FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band, const Row& row,
+                                int lanes, const uint16_t* nothing, Sums& sums) {
+    const int n3 = band.size[3];
+    int32_t* FHASH_RESTRICT const expected = sums.expected;
+    int32_t *FHASH_RESTRICT const others = sums.others, *FHASH_RESTRICT const parent = sums.parent;
+    std::memset(sums.others, 0, 4 * (size_t)lanes);
+    std::memset(sums.parent, 0, 4 * (size_t)lanes);
+    int weight = 0;
+    for (int k = 0; k < REFERENCE_COUNT; k++) {
+        if (band.references[k].band >= 0) weight += REFERENCE + 2 * AROUND;
+        if (!row.references[k]) continue;
+        const Band& other = bands[band.references[k].band];
+        const int shift = band.references[k].shift[3], last = other.size[3] - 1;
+        const int scale = k == 0 ? 343 : k == 1 ? 49 : k == 2 ? 7 : 1;
+        const uint16_t* const p = row.references[k];
+        const uint16_t* const up = row.reference_y[k] > 0 ? p - other.stride[2] : nothing;
+        const bool has_down = row.reference_y[k] + 1 < other.size[2];
+        const uint16_t* const down = has_down ? p + other.stride[2] : nothing;
+        auto around = [&](int i) FHASH_LAMBDA {
+            return 2 * p[i] + p[i - 1] + p[i + 1] + up[i] + down[i];
+        };
+        if (shift == 0 && last >= n3 - 1) {
+            FHASH_INDEPENDENT
+            for (int x = 0; x < lanes; x++) {
+                const int sum = around(x);
+                expected[x] += REFERENCE * p[x] + AROUND * sum;
+                others[x] += seven(sum) * scale;
+            }
+            if (k == 0) {
+                FHASH_INDEPENDENT
+                for (int x = 0; x < lanes; x++) parent[x] = twelve(around(x));
+            }
+            continue;
+        }
+        int32_t *FHASH_RESTRICT const share = sums.share, *FHASH_RESTRICT const level = sums.level;
+        const int needed = min((n3 - 1) >> shift, last) + 1;
+        FHASH_INDEPENDENT
+        for (int i = 0; i < needed; i++) {
+            const int sum = around(i);
+            share[i] = REFERENCE * p[i] + AROUND * sum;
+            level[i] = twelve(sum);
+        }
+        for (int x = 0; x < n3; x++) {
+            const int i = min(x >> shift, last);
+            expected[x] += share[i];
+            others[x] += min(level[i], 6) * scale;
+            if (k == 0) parent[x] = level[i];
+        }
+    }
+    return weight;
+}
+
+// Shares in the contexts of a row that do not depend on the vertices to the left.
+FHASH_INLINE void prepare_contexts(const Band& band, const Row& row, int lanes,
+                                   const uint16_t* nothing, Sums& sums) {
+    const int kind = band.kind;
+    const uint16_t* const above = row.y > 0 ? row.magnitudes - band.stride[2] : nothing;
+    const uint16_t* const below = row.z > 0 ? row.magnitudes - band.stride[1] : nothing;
+    const uint16_t* const before = row.t > 0 ? row.magnitudes - band.stride[0] : nothing;
+    int32_t *FHASH_RESTRICT const both = sums.both, *FHASH_RESTRICT const nearest = sums.nearest;
+    int32_t *FHASH_RESTRICT const sides = sums.sides, *FHASH_RESTRICT const parent = sums.parent;
+    FHASH_INDEPENDENT
+    for (int x = 0; x < lanes; x++) {
+        const int sum_before = sums.before[x], sum_below = sums.below[x];
+        int digits = min<int>(above[x], 2) * 3 + min<int>(above[x - 1], 2);
+        digits = digits * 3 + min<int>(above[x + 1], 2);
+        digits = digits * 3 + min<int>(before[x], 2);
+        nearest[x] = digits * 3 + min<int>(below[x], 2);
+        sides[x] = twelve(sum_before) * 12 + twelve(sum_below);
+        both[x] = sum_before + sum_below;
+        parent[x] = parent[x] * KINDS + kind;
+    }
+}
+
+}  // namespace
