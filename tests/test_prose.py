@@ -15,7 +15,12 @@ SOURCES = sorted(
     for folder in ("fhash_codec", "formats/fhash_formats", "cli/fhash_cli", "tests")
     for path in (ROOT / folder).rglob("*.py")
 )
-NATIVE = sorted(path for suffix in ("cpp", "hpp", "c") for path in ROOT.glob(f"*/**/*.{suffix}"))
+NATIVE = sorted(
+    path
+    for folder in ("fhash_codec", "formats", "tests")
+    for suffix in ("cpp", "hpp", "c")
+    for path in (ROOT / folder).rglob(f"*.{suffix}")
+)
 HEADLESS = re.compile(
     r"\s*(Of|In|By|That|What|As|With|From|Where|When|How|Which|No|More|For|At|On|To|Than)\b"
 )

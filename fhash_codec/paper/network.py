@@ -11,18 +11,14 @@ The promise of repeatable values
 --------------------------------
 A sample gets the same bits whatever other samples are evaluated with it. A matrix product of BLAS
 alone does not promise that: BLAS picks its kernel, and with it the order of the sums, by the shape
-of the matrices. `DenseLayers` therefore never lets the number of samples shape a product. It cuts
-the samples into products of exactly `COLUMNS` columns each and fills the last one up with spare
-columns. Every caller that evaluates the layers must go through `DenseLayers` to keep the promise.
+of the matrices, and some kernels add in another order at another column. Two classes keep the
+promise, both by construction and on every machine:
 
-Two cases of the promise:
-
-* A vertex of a region (`regions.py`) always lies in the same column of the same product, because
-  regions are decoded in whole blocks at fixed places. Its value is equal bit for bit by
-  construction, on every machine.
-* A sample at a free position (`points.py`, rendering) may come in another column. Its value is
-  equal bit for bit where the kernel treats all `COLUMNS` columns alike. `COLUMNS` is a multiple of
-  the vector widths of common kernels for that reason. Elsewhere values differ by rounding only.
+* `DenseLayers`, for the vertices of a region (`regions.py`). Regions are decoded in whole blocks at
+  fixed places, and a block in products of exactly `COLUMNS` columns. So a vertex always lies in the
+  same column of a product of the same shape.
+* `PointwiseLayers` (`pointwise.py`), for samples at free positions (`points.py`, rendering), which
+  may come in any column. It adds without BLAS.
 
 The bits may differ between machines, because their BLAS libraries do.
 """
