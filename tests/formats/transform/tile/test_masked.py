@@ -12,13 +12,8 @@ import pytest
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
-from fhash_formats.transform.tile.encoding import (
-    CodedTile,
-    decode_tile,
-    decode_tile_mask,
-    encode_tile,
-    exact_tile,
-)
+from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
+from fhash_formats.transform.tile.encoding import CodedTile, Coding, encode_tile, exact_tile
 from fhash_formats.transform.tile.settings import TileSettings
 
 SHAPE = (2, 3, 12, 17)
@@ -51,7 +46,7 @@ def tile(dtype: str = "f4") -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
 @pytest.mark.parametrize("own", [False, True])
 def test_a_tile_says_what_is_occupied(dtype: str, options: dict[str, Any], own: bool) -> None:
     values, care = tile(dtype)
-    coded = encode_tile(values, SETTINGS, care=care, own=own, **options)
+    coded = encode_tile(values, SETTINGS, Coding(own_settings=own, **options), in_coreset=care)
     settings = None if own else SETTINGS
     decoded, mask = decode_tile_mask(coded.data, SHAPE, dtype, settings)
     np.testing.assert_array_equal(mask, care)
@@ -68,7 +63,7 @@ def test_a_tile_says_what_is_occupied(dtype: str, options: dict[str, Any], own: 
 
 
 def coded_with(occupied: npt.NDArray[np.bool_] | None) -> CodedTile:
-    return encode_tile(tile()[0], SETTINGS, care=occupied)
+    return encode_tile(tile()[0], SETTINGS, in_coreset=occupied)
 
 
 def test_all_or_nothing_costs_next_to_nothing() -> None:
@@ -93,14 +88,13 @@ def test_without_a_mask_all_is_occupied_and_the_stream_is_what_it_was() -> None:
 def test_what_is_not_finite_is_not_occupied_and_comes_back() -> None:
     values, care = tile()
     values[0, 0, :3], values[1, 2, 5, 6:9] = np.nan, [np.inf, -np.inf, np.nan]
-    for options in ({}, {"error": 0.5}):
-        coded = encode_tile(values, SETTINGS, care=care, **options)
+    for error in (None, 0.5):
+        coded = encode_tile(values, SETTINGS, Coding(error=error), in_coreset=care)
         decoded, mask = decode_tile_mask(coded.data, SHAPE, "f4", SETTINGS)
         np.testing.assert_array_equal(mask, care & np.isfinite(values))
         np.testing.assert_array_equal(decoded[~np.isfinite(values)], values[~np.isfinite(values)])
-    dropped = decode_tile(
-        encode_tile(values, SETTINGS, care=care, keep_missing=False).data, SHAPE, "f4", SETTINGS
-    )
+    coded = encode_tile(values, SETTINGS, Coding(keep_missing=False), in_coreset=care)
+    dropped = decode_tile(coded.data, SHAPE, "f4", SETTINGS)
     np.testing.assert_array_equal(np.isnan(dropped), ~(care & np.isfinite(values)))
 
 
@@ -130,10 +124,11 @@ def test_damage_to_a_tile_with_a_mask_is_found(name: str) -> None:
     small = (1, 2, 6, 9)
     part = tuple(slice(0, n) for n in small)
     values, care = values[part].copy(), care[part]
+    own = Coding(own_settings=True)
     data = {
-        "mask": encode_tile(values, SETTINGS, care=care, own=True).data,
+        "mask": encode_tile(values, SETTINGS, own, in_coreset=care).data,
         "exact": exact_tile(values, occupied=care).data,
-        "empty": encode_tile(values, SETTINGS, care=np.zeros(small, bool), own=True).data,
+        "empty": encode_tile(values, SETTINGS, own, in_coreset=np.zeros(small, bool)).data,
     }[name]
     sound, mask = decode_tile_mask(data, small, "f4")
     damaged = [data[:n] for n in range(len(data))] + [data + b"\0", data + b"\x01a"]
