@@ -114,7 +114,7 @@ def test_less_detail_needs_no_mask() -> None:
 
 
 def test_a_mask_needs_settings_that_know_of_it() -> None:
-    with pytest.raises(DamagedFileError, match="know nothing"):
+    with pytest.raises(DamagedFileError, match="no mask levels"):
         decode_tile(coded_with(tile()[1]).data, SHAPE, "f4", replace(SETTINGS, mask=None))
 
 
