@@ -46,13 +46,7 @@ def bound(run: Run) -> Iterator[Finding]:
         return
     worst = largest_difference(run.values, run.decoded, np.isfinite(run.decoded))
     if error == 0:
-        same = run.values.astype(run.decoded.dtype) == run.decoded
-        yield Finding(
-            name="lossless",
-            worst=_count(~same & np.isfinite(run.decoded)),
-            limit=0.0,
-            unit="values",
-        )
+        yield Finding(name="lossless", worst=_differing(run), limit=0.0, unit="values")
     else:
         yield Finding(
             name="strict bound", worst=float(worst / error), limit=1.0, unit="of the bound"
@@ -95,13 +89,7 @@ def constants(run: Run) -> Iterator[Finding]:
     """A constant series comes back exactly, rounded to the dtype of the volume."""
     finite = run.values[np.isfinite(run.values)]
     if finite.min() == finite.max():
-        same = run.values.astype(run.decoded.dtype) == run.decoded
-        yield Finding(
-            name="exact constant",
-            worst=_count(~same & np.isfinite(run.decoded)),
-            limit=0.0,
-            unit="values",
-        )
+        yield Finding(name="exact constant", worst=_differing(run), limit=0.0, unit="values")
 
 
 def within_range(run: Run) -> Iterator[Finding]:
@@ -222,6 +210,12 @@ def _error_bound(run: Run) -> Fraction | None:
         return Fraction(config.max_error_rel * run.data_range)
     low, high = run.volume.value_range.low, run.volume.value_range.high
     return Fraction(config.max_error_rel) * (Fraction(high) - Fraction(low))
+
+
+def _differing(run: Run) -> float:
+    """The number of coreset values that differ from the original, rounded to the decoded dtype."""
+    same = run.values.astype(run.decoded.dtype) == run.decoded
+    return _count(~same & np.isfinite(run.decoded))
 
 
 def _count(mask: Mask) -> float:

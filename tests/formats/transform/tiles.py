@@ -50,3 +50,13 @@ def streams() -> dict[str, tuple[Values, bytes]]:
         "exact": (holes, exact_tile(holes).data),
         "integers": (integers, encode_tile(integers, replace(SETTINGS, high=99.0), own).data),
     }
+
+
+def damaged_copies(data: bytes) -> list[bytes]:
+    """A stream cut at every length, with bytes after its end, and with each of its bits flipped."""
+    flipped = [
+        data[:n] + bytes([data[n] ^ 1 << bit]) + data[n + 1 :]
+        for n in range(len(data))
+        for bit in range(8)
+    ]
+    return [*(data[:n] for n in range(len(data))), data + b"\0", data + b"\x01a", *flipped]

@@ -21,7 +21,7 @@ from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.entropy.coder import encode_integers
 from fhash_formats.transform.entropy.mask import encode_mask, mask_prior_state
-from fhash_formats.transform.entropy.predict import _blank, encode_predicted
+from fhash_formats.transform.entropy.predict import blank_state, encode_predicted
 from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
 from fhash_formats.transform.entropy.prior import prior_state
 from fhash_formats.transform.entropy.table import single_band
@@ -86,7 +86,7 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             data = np.ascontiguousarray(array).tobytes()
             file.write(struct.pack("<q", len(data)) + data)
 
-        for state in (prior_state(), mask_prior_state(), _blank()):
+        for state in (prior_state(), mask_prior_state(), blank_state()):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
         file.write(struct.pack("<q", len(bands)))

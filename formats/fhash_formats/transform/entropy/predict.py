@@ -49,7 +49,7 @@ Values = npt.NDArray[Any]
 
 
 @cache
-def _blank() -> State:
+def blank_state() -> State:
     """A state that has learned nothing: even odds, and weights that believe the estimates.
 
     The arrays are read-only.
@@ -105,7 +105,7 @@ def encode_predicted(
     if library is None:
         from fhash_formats.transform.entropy import predict_portable
 
-        return predict_portable.encode(integers, counted, predictor, _blank().copy())
+        return predict_portable.encode(integers, counted, predictor, blank_state().copy())
     marks = None if counted is None else np.ascontiguousarray(counted, dtype=np.uint8)
     capacity = max(4096, integers.size)
     while True:
@@ -115,7 +115,7 @@ def encode_predicted(
             result.ctypes.data,
             None if marks is None else marks.ctypes.data,
             *_geometry(integers.shape, predictor),
-            *state_arguments(_blank()),
+            *state_arguments(blank_state()),
             *array_arguments(buffer),
         )
         if checked(size) <= capacity:
@@ -134,13 +134,13 @@ def decode_predicted(
     if library is None:
         from fhash_formats.transform.entropy import predict_portable
 
-        return predict_portable.decode(bytes(data), shape, predictor, _blank().copy())
+        return predict_portable.decode(bytes(data), shape, predictor, blank_state().copy())
     integers = np.zeros(shape, dtype=np.int32)
     source = np.frombuffer(data, dtype=np.uint8)
     code = library.fhash_decode_predicted(
         integers.ctypes.data,
         *_geometry(shape, predictor),
-        *state_arguments(_blank()),
+        *state_arguments(blank_state()),
         *array_arguments(source),
     )
     if checked(code) < 0:

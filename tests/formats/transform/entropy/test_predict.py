@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 import pytest
+from predictors import Four, predictor_of
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError
@@ -21,11 +22,9 @@ from fhash_formats.transform.entropy.predict import (
     integers_of,
     values_of,
 )
-from fhash_formats.transform.entropy.predictor import Predictor, passes_of
 from fhash_formats.transform.entropy.prior import State
 
 Shape = tuple[int, int, int, int]
-Four = tuple[int, int, int, int]
 
 SHAPES: list[Shape] = [
     (1, 1, 1, 1),
@@ -37,26 +36,6 @@ SHAPES: list[Shape] = [
     (2, 13, 1, 17),
 ]
 NATIVE = pytest.mark.skipif(native.library() is None, reason="compares with the native library")
-
-
-def _predictor(
-    levels: Four = (2, 3, 3, 3),
-    order: Four = (0, 1, 2, 3),
-    reach: int = 1,
-    seed: int = 0,
-    step: float = 1.0,
-    origin: float = 0.0,
-) -> Predictor:
-    count = sum(len(a_pass.taps) for a_pass in passes_of(levels, order, reach))
-    weights = np.random.default_rng(seed).integers(-300, 301, count)
-    return Predictor(
-        step=step,
-        origin=origin,
-        levels=levels,
-        order=order,
-        reach=reach,
-        weights=tuple(weights.tolist()),
-    )
 
 
 def _smooth(shape: Shape, scale: float = 40.0, seed: int = 0) -> npt.NDArray[np.int32]:
@@ -72,7 +51,7 @@ def _smooth(shape: Shape, scale: float = 40.0, seed: int = 0) -> npt.NDArray[np.
     [((2, 3, 3, 3), (0, 1, 2, 3), 1), ((0, 1, 2, 0), (3, 2, 1, 0), 2), ((0,) * 4, (0, 3, 2, 1), 0)],
 )
 def test_what_was_coded_comes_back(shape: Shape, levels: Four, order: Four, reach: int) -> None:
-    predictor = _predictor(levels, order, reach)
+    predictor = predictor_of(levels, order, reach)
     integers = _smooth(shape)
     data, coded = encode_predicted(integers, None, predictor)
     np.testing.assert_array_equal(coded, integers)
@@ -84,7 +63,7 @@ def test_from_nothing_to_the_largest(scale: float) -> None:
     integers = np.clip(
         _smooth((3, 5, 6, 21), scale), -MAX_PREDICTED_INTEGER, MAX_PREDICTED_INTEGER
     ).astype(np.int32)
-    predictor = _predictor()
+    predictor = predictor_of()
     np.testing.assert_array_equal(
         decode_predicted(encode_predicted(integers, None, predictor)[0], integers.shape, predictor),
         integers,
@@ -96,8 +75,8 @@ def test_both_ends_of_the_numbers() -> None:
         np.array([-MAX_PREDICTED_INTEGER, 0, MAX_PREDICTED_INTEGER], dtype=np.int32), (3, 5, 6, 7)
     )
     predictor = replace(
-        _predictor(),
-        weights=tuple(32767 if i % 2 else -32767 for i in range(len(_predictor().weights))),
+        predictor_of(),
+        weights=tuple(32767 if i % 2 else -32767 for i in range(len(predictor_of().weights))),
     )
     np.testing.assert_array_equal(
         decode_predicted(encode_predicted(integers, None, predictor)[0], integers.shape, predictor),
@@ -107,7 +86,7 @@ def test_both_ends_of_the_numbers() -> None:
 
 def test_a_constant_costs_next_to_nothing() -> None:
     integers = np.full((8, 16, 32, 32), 7, dtype=np.int32)
-    assert len(encode_predicted(integers, None, _predictor())[0]) < 60
+    assert len(encode_predicted(integers, None, predictor_of())[0]) < 60
 
 
 def test_prediction_pays_on_smooth_values() -> None:
@@ -115,7 +94,7 @@ def test_prediction_pays_on_smooth_values() -> None:
         np.int32
     )
     noise = np.random.default_rng(0).permutation(integers.ravel()).reshape(integers.shape)
-    plain = replace(_predictor(), weights=(0,) * len(_predictor().weights))
+    plain = replace(predictor_of(), weights=(0,) * len(predictor_of().weights))
     assert (
         len(encode_predicted(integers, None, plain)[0])
         < len(encode_predicted(noise, None, plain)[0]) / 2
@@ -126,7 +105,7 @@ def test_what_does_not_count_is_cheap_and_free() -> None:
     integers = _smooth((4, 6, 16, 16))
     counted = np.zeros(integers.shape, bool)
     counted[:, :, :8] = True
-    predictor = _predictor()
+    predictor = predictor_of()
     data, coded = encode_predicted(integers, counted, predictor)
     np.testing.assert_array_equal(coded[counted], integers[counted])
     np.testing.assert_array_equal(decode_predicted(data, integers.shape, predictor), coded)
@@ -144,7 +123,7 @@ def test_without_the_native_library_the_bytes_are_the_same(
 ) -> None:
     integers = _smooth(shape, scale)
     counted = np.random.default_rng(2).random(shape) < 0.8
-    predictor = _predictor((1, 2, 3, 2), order, reach)
+    predictor = predictor_of((1, 2, 3, 2), order, reach)
     native_results = [encode_predicted(integers, mask, predictor) for mask in (None, counted)]
     monkeypatch.setenv("FHASH_NATIVE", "0")
     for (data, coded), mask in zip(native_results, (None, counted), strict=True):
@@ -159,8 +138,8 @@ def test_hostile_bytes_end_the_same_way_everywhere(monkeypatch: pytest.MonkeyPat
     """Any bytes give integers within bounds or an error, the same natively and portably."""
     shape, generator, refused = (2, 3, 4, 9), np.random.default_rng(3), set()
     predictor = replace(
-        _predictor(),
-        weights=tuple(generator.integers(-32767, 32768, len(_predictor().weights)).tolist()),
+        predictor_of(),
+        weights=tuple(generator.integers(-32767, 32768, len(predictor_of().weights)).tolist()),
     )
     for number in range(40):
         data = (
@@ -186,7 +165,7 @@ def test_the_nearest_integers_keep_the_bound(dtype: str) -> None:
     values = (np.random.default_rng(4).random((3, 4, 5, 6)) * 200).astype(dtype)
     error = 3.0
     step = 2 * error * (1 - 1e-6) if values.dtype.kind == "f" else 2 * int(error) + 1.0
-    predictor = _predictor(step=step, origin=100.0)
+    predictor = predictor_of(step=step, origin=100.0)
     integers = integers_of(values, np.ones(values.shape, bool), predictor)
     assert integers is not None
     decoded = values_of(integers, predictor)
@@ -196,7 +175,7 @@ def test_the_nearest_integers_keep_the_bound(dtype: str) -> None:
 
 def test_integers_that_are_too_large_are_refused() -> None:
     values = np.array([0.0, 1e30, np.nan, np.inf]).reshape(1, 1, 1, 4)
-    predictor = _predictor()
+    predictor = predictor_of()
     assert integers_of(values, np.isfinite(values), predictor) is None
     counted = np.array([True, False, False, False]).reshape(1, 1, 1, 4)
     integers = integers_of(values, counted, predictor)
@@ -219,11 +198,11 @@ def test_arguments_hold_the_arrays_that_they_point_to() -> None:
 
 @NATIVE
 def test_threads_that_decode_for_the_first_time_at_once() -> None:
-    predictor, integers = _predictor(), _smooth((3, 7, 2, 11))
+    predictor, integers = predictor_of(), _smooth((3, 7, 2, 11))
     data, coded = encode_predicted(integers, None, predictor)
     with ThreadPoolExecutor(8) as workers:
         for _ in range(20):
-            predict._blank.cache_clear()
+            predict.blank_state.cache_clear()
             for decoded in workers.map(
                 lambda _: decode_predicted(data, coded.shape, predictor), range(16)
             ):

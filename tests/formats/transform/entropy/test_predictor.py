@@ -4,37 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import pytest
+from predictors import Four, predictor_of
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
 
-Four = tuple[int, int, int, int]
-
-
-def _predictor(
-    levels: Four = (2, 3, 3, 3),
-    order: Four = (0, 1, 2, 3),
-    reach: int = 1,
-    seed: int = 0,
-    step: float = 1.0,
-    origin: float = 0.0,
-) -> Predictor:
-    count = sum(len(a_pass.taps) for a_pass in passes_of(levels, order, reach))
-    weights = np.random.default_rng(seed).integers(-300, 301, count)
-    return Predictor(
-        step=step,
-        origin=origin,
-        levels=levels,
-        order=order,
-        reach=reach,
-        weights=tuple(weights.tolist()),
-    )
-
 
 def test_a_predictor_survives_json() -> None:
-    predictor = _predictor((0, 3, 2, 1), (3, 0, 2, 1), 2, step=0.25, origin=-3.5)
+    predictor = predictor_of((0, 3, 2, 1), (3, 0, 2, 1), 2, step=0.25, origin=-3.5)
     assert Predictor.from_dict(predictor.to_dict()) == predictor
 
 
@@ -59,11 +37,11 @@ def test_a_predictor_survives_json() -> None:
 )
 def test_a_bad_predictor_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises((InputError, DamagedFileError)):
-        Predictor.from_dict({**_predictor().to_dict(), **change})
+        Predictor.from_dict({**predictor_of().to_dict(), **change})
 
 
 def test_a_missing_key_is_named() -> None:
-    values = _predictor().to_dict()
+    values = predictor_of().to_dict()
     del values["reach"]
     with pytest.raises(InputError, match="missing key 'reach'"):
         Predictor.from_dict(values)
@@ -84,7 +62,7 @@ def test_taps_are_known_when_they_are_needed() -> None:
 
 
 def test_the_arrays_hold_the_taps_of_each_pass() -> None:
-    predictor = _predictor((1, 2, 0, 2), (3, 1, 2, 0), 1)
+    predictor = predictor_of((1, 2, 0, 2), (3, 1, 2, 0), 1)
     rows, taps, weights = pass_arrays(predictor)
     assert len(taps) == len(weights) == len(predictor.weights)
     for (axis, kind, first, count), a_pass in zip(rows, predictor.passes, strict=True):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from specs import spec_of
-from tiles import SETTINGS, SHAPE, SPEC, same, streams, wave
+from tiles import SETTINGS, SHAPE, SPEC, damaged_copies, same, streams, wave
 
 from fhash_formats.errors import DamagedFileError, FhashError, InputError
 from fhash_formats.transform.axes.bands import band_table
@@ -33,12 +33,7 @@ def test_reduced_resolution_is_the_low_band() -> None:
 def test_damage_is_an_error_or_changes_nothing(name: str) -> None:
     values, data = streams()[name]
     sound = decode_tile(data, values.shape, values.dtype)
-    damaged = [data[:n] for n in range(len(data))] + [data + b"\0", data + b"\x01a"]
-    damaged += [
-        data[:n] + bytes([data[n] ^ 1 << bit]) + data[n + 1 :]
-        for n in range(len(data))
-        for bit in range(8)
-    ]
+    damaged = damaged_copies(data)
     refused = 0
     for other in damaged:
         try:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from tiles import damaged_copies
 
 from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
@@ -131,12 +132,7 @@ def test_damage_to_a_tile_with_a_mask_is_found(name: str) -> None:
         "empty": encode_tile(values, SETTINGS, own, in_coreset=np.zeros(small, bool)).data,
     }[name]
     sound, mask = decode_tile_mask(data, small, "f4")
-    damaged = [data[:n] for n in range(len(data))] + [data + b"\0", data + b"\x01a"]
-    damaged += [
-        data[:n] + bytes([data[n] ^ 1 << bit]) + data[n + 1 :]
-        for n in range(len(data))
-        for bit in range(8)
-    ]
+    damaged = damaged_copies(data)
     refused = 0
     for other in damaged:
         try:
