@@ -4,7 +4,7 @@ BIN := .venv/bin
 # Tests run in a process for each processor; those of a file stay together, since they share what is dear to make.
 SPREAD := -n auto --dist loadfile
 
-.PHONY: demo test hard clean
+.PHONY: demo test hard wheels clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png.
 demo: .venv/.stamp
@@ -24,6 +24,14 @@ hard: .venv/.stamp
 	FHASH_HARD_REPORT=build/hard/figures.jsonl $(BIN)/python tests/hard/fuzz/run.py --march --seconds 600 --crashes build/hard/crashes
 	$(BIN)/fhash selftest --all --report build/hard/stability.md --force
 	$(BIN)/python tests/hard/summary.py build/hard/stability.md build/hard/figures.jsonl docs/stability.md
+
+# A source archive and a stripped wheel for CPython 3.11 and newer (abi3, manylinux) in dist/; needs g++.
+wheels: .venv/.stamp
+	rm -rf dist build/wheels
+	$(BIN)/python -m build --no-isolation --outdir build/wheels
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/auditwheel repair --strip --wheel-dir dist build/wheels/*.whl
+	mv build/wheels/*.tar.gz dist
+	ls -l dist
 
 # torch comes first and alone: where pip has more than one build of the pinned version (a CPU wheel beside the one with CUDA),
 # the choice is made before any other requirement counts.
