@@ -1,0 +1,80 @@
+"""Every command and every piece of Python of the README, word for word, on a fresh install."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from fresh_install import fhash, run
+
+ROOT = Path(__file__).resolve().parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+MAX_LINES = 120
+
+
+@dataclass(frozen=True)
+class Block:
+    """A code block: its language, text, and the line of the README where it begins."""
+
+    language: str
+    text: str
+    line: int
+
+
+def blocks() -> list[Block]:
+    return [
+        Block(match[1], match[2], README[: match.start()].count("\n") + 1)
+        for match in re.finditer(r"```(\w*)\n(.*?)```", README, flags=re.DOTALL)
+    ]
+
+
+def commands(block: Block) -> list[list[str]]:
+    text = block.text.replace("\\\n", " ")
+    lines = [shlex.split(line, comments=True) for line in text.splitlines()]
+    return [line for line in lines if line]
+
+
+def test_the_readme_is_short() -> None:
+    assert README.count("\n") <= MAX_LINES
+
+
+def test_every_block_is_python_or_commands() -> None:
+    assert {block.language for block in blocks()} == {"sh", "python"}
+
+
+def test_installs_name_extras_that_exist() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = set(re.findall(r"fhash\[([a-z,]+)\]", README))
+    assert {name for names in extras for name in names.split(",")} <= set(
+        project["optional-dependencies"]
+    )
+
+
+def test_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text()
+    for target in re.findall(r"`make (\w+)`", README):
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which a reader of the README types everything, in order."""
+    return tmp_path_factory.mktemp("reader")
+
+
+@pytest.mark.parametrize("block", blocks(), ids=lambda block: f"line {block.line}")
+def test_what_the_readme_shows_runs(block: Block, site: Path, folder: Path) -> None:
+    if block.language == "python":
+        result = run(site, folder, "-W", "error", "-c", block.text)
+        assert result.returncode == 0, result.stderr
+        return
+    for words in commands(block):
+        if words[:2] == ["pip", "install"]:  # what the fixture `site` did
+            assert words[2:] == ["."], words
+        else:
+            assert words[0] == "fhash", words
+            fhash(site, folder, *words[1:])

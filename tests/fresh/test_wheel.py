@@ -1,0 +1,89 @@
+"""The wheel on a fresh machine: what a plain install can do, and what it says of the rest."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from fresh_install import fhash, run
+
+LIBRARIES = ("fhash_formats/native/_core.abi3.so", "fhash_codec/native/_codec.abi3.so")
+HEAVY = ("torch", "vtkmodules", "matplotlib", "numba", "hdf5plugin", "skimage", "dask")
+"""Packages of the extras, which a plain install leaves out."""
+
+
+def test_a_plain_install_holds_no_heavy_package(site: Path, tmp_path: Path) -> None:
+    for name in HEAVY:
+        script = f"import importlib.util; print(importlib.util.find_spec({name!r}))"
+        assert run(site, tmp_path, "-c", script).stdout.strip() == "None", name
+
+
+def test_both_libraries_of_the_wheel_are_loaded(site: Path, tmp_path: Path) -> None:
+    script = (
+        "import fhash_formats.native, fhash_codec.native;"
+        "print(fhash_formats.native.library() is not None,"
+        " fhash_codec.native.library() is not None, fhash_codec.__file__)"
+    )
+    result = run(site, tmp_path, "-c", script)
+    assert result.stdout.split() == ["True", "True", str(site / "fhash_codec" / "__init__.py")]
+
+
+def test_the_wheel_holds_the_stripped_abi3_libraries(wheel: Path) -> None:
+    assert "-cp311-abi3-" in wheel.name
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        for name in LIBRARIES:
+            assert name in names
+            assert b".debug_info" not in archive.read(name)
+    assert "fhash_formats/FORMAT.md" in names
+    assert not [name for name in names if name.startswith(("tests/", "build/"))]
+
+
+def test_a_plain_install_encodes_decodes_renders_and_verifies(site: Path, tmp_path: Path) -> None:
+    values = np.linspace(0, 1, 6 * 12 * 14 * 16, dtype=np.float32).reshape(6, 12, 14, 16) ** 2
+    values[:, 4:8, 4:8, 4:8] += 1
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file["density"] = values
+    fhash(site, tmp_path, "encode", "run.h5", "-o", "run.fhz", "--max-error", "0.01")
+    fhash(site, tmp_path, "verify", "run.fhz")
+    fhash(site, tmp_path, "info", "run.fhz")
+    fhash(site, tmp_path, "diff", "run.h5", "run.fhz", "--max-error", "0.01")
+    for suffix in (".npy", ".nc", ".h5", ".zarr", ".vti", ".vtkhdf"):
+        fhash(site, tmp_path, "decode", "run.fhz", "--t", "0", "-o", f"part{suffix}")
+    decoded = np.load(tmp_path / "part.npy")
+    assert np.abs(decoded - values[:1]).max() <= 0.01
+    fhash(site, tmp_path, "encode", "part.nc", "-o", "again.fhz", "--max-error", "0.01")
+    fhash(site, tmp_path, "encode", "part.zarr", "-o", "zarr.fhz", "--max-error", "0.01")
+    fhash(site, tmp_path, "render", "run.fhz", "-o", "picture.png", "--size", "64x64")
+    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_default_encode_needs_no_torch(site: Path, tmp_path: Path) -> None:
+    z, y, x = np.meshgrid(*[np.linspace(-1, 1, n) for n in (20, 24, 28)], indexing="ij")
+    frames = [np.tanh(6 * (x - 0.1 * t) * y + 3 * z) for t in range(6)]
+    np.save(tmp_path / "run.npy", np.array(frames, np.float32))
+    fhash(site, tmp_path, "encode", "run.npy", "-o", "run.fhz")
+    assert '"psnr"' in fhash(site, tmp_path, "info", "run.fhz", "--json")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        (("encode", "run.npy", "-o", "paper.fhz", "--profile", "paper"), "fhash[train]"),
+        (("bench", "rate", "run.npy"), "fhash[bench]"),
+        (("decode", "run.fhz", "--isosurface", "0.5", "-o", "surface.ply"), "fhash[mesh]"),
+    ],
+)
+def test_a_missing_extra_is_one_line_that_names_it(
+    site: Path, tmp_path: Path, arguments: tuple[str, ...], extra: str
+) -> None:
+    np.save(tmp_path / "run.npy", np.random.default_rng(0).random((2, 8, 8, 8)))
+    fhash(site, tmp_path, "encode", "run.npy", "-o", "run.fhz", "--effort", "1", "--psnr", "30")
+    result = run(site, tmp_path, "-m", "fhash_cli.main", *arguments)
+    assert result.returncode == 2
+    assert f"pip install '{extra}'" in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "Traceback" not in result.stderr
