@@ -5,7 +5,9 @@ Each profile adds what it alone knows, such as its model.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
 from math import prod
@@ -18,7 +20,8 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import Container, ContainerWriter, describe_coordinates
-from fhash_formats.series import AXIS_NAMES, Series
+from fhash_formats.series import AXIS_NAMES, Coordinate, Series
+from fhash_formats.support.attributes import json_attributes
 
 MISSING_CHUNK_BYTES = 1 << 20
 """Bytes of one chunk of the missing-value masks. A member for each step would cost 130 bytes."""
@@ -40,10 +43,10 @@ def describe_source(
     return {
         "encoder": {"version": version("fhash"), "seed": config.seed},
         "variable": {
-            "name": series.name,
-            "units": series.units,
+            "name": str(series.name),
+            "units": str(series.units),
             "dtype": series.dtype.name,
-            "attributes": dict(series.attributes),
+            "attributes": json_attributes(series.attributes, without=frozenset()),
         },
         "domain": {"shape": list(series.shape)},
         "value_range": [value_range.low, value_range.high],
@@ -65,10 +68,11 @@ def write_series(
     brief: leave out each array that the header can say in fewer bytes, as the profile compact
     allows. Returns the header entries that then stand for the arrays.
     """
-    described = describe_coordinates(series.coords) if brief else {}
+    coords = {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
+    described = describe_coordinates(coords) if brief else {}
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
-            coordinate = series.coords[axis]
+            coordinate = coords[axis]
             writer.add_whole(
                 f"coords/{stored}",
                 coordinate.values,
@@ -79,6 +83,15 @@ def write_series(
     if scanned.missing:
         _write_missing(writer, series.shape, scanned)
     return {"coordinates": described} if brief else {}
+
+
+def _storable(coordinate: Coordinate) -> Coordinate:
+    """The coordinate with a name and attributes that JSON can hold."""
+    return replace(
+        coordinate,
+        name=str(coordinate.name),
+        attributes=json_attributes(coordinate.attributes, without=frozenset()),
+    )
 
 
 def _write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Scan) -> None:
@@ -139,7 +152,8 @@ def brief_history(
 ) -> list[dict[str, float]]:
     """A training history as a header has it: at most MAX_POINTS points, the last point included.
 
-    Seconds are rounded to milliseconds, PSNR to hundredths of a dB. timings: keep the seconds.
+    Seconds are rounded to milliseconds, PSNR to hundredths of a dB. Figures without a finite value,
+    such as the PSNR of exact values, are left out. timings: keep the seconds.
     """
     count = min(len(history), MAX_POINTS)
     chosen = [history[(number + 1) * len(history) // count - 1] for number in range(count)]
@@ -152,6 +166,17 @@ def brief_history(
         for point in chosen
     ]
     return [{name: value for name, value in point.items() if value is not None} for point in points]
+
+
+def history_columns(points: Sequence[Mapping[str, Any]]) -> Any:
+    """A brief history as lists of numbers by name, which take fewer bytes than a list of points.
+
+    Where a figure of some point is missing, the points themselves are returned.
+    """
+    names = points[0].keys() if points else ()
+    if any(point.keys() != names for point in points):
+        return list(points)
+    return {name: [point[name] for point in points] for name in names}
 
 
 def history_points(
@@ -177,4 +202,4 @@ def _figure(name: str, value: float | None, digits: int) -> float | None:
 
 
 def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits)
+    return None if value is None or not math.isfinite(value) else round(value, digits)

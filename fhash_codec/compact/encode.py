@@ -13,7 +13,7 @@ from fhash_codec.compact.goal import promise
 from fhash_codec.compact.tiles_to_promise import code_series
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import select_features
-from fhash_codec.header import brief_history, describe_source, write_series
+from fhash_codec.header import brief_history, describe_source, history_columns, write_series
 from fhash_codec.progress import Progress
 from fhash_formats import native
 from fhash_formats.container import ContainerWriter
@@ -60,9 +60,7 @@ def encode_compact(
         "model": model_header(table, config),
         "config": _changed_options(config) | promise(config),
         "training": {"seconds": seconds, "epochs": 0, "device": "cpu"},
-        "history": {
-            name: [point.get(name) for point in history] for name in (history[0] if history else ())
-        },
+        "history": history_columns(history),
     }
 
 
