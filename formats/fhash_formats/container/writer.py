@@ -212,7 +212,7 @@ class ContainerWriter:
                 chunk_shape=tuple(int(n) for n in chunk_shape),
                 codecs=tuple(codecs),
                 dimension_names=None if dimension_names is None else tuple(dimension_names),
-                attributes=plain_json(attributes or {}),
+                attributes=dict(attributes or {}),
             )
             # The reader's checks are the writer's, so that a reader accepts what is written.
             document = strict_json.dumps(metadata.to_dict(), f"the metadata of array {name}")
