@@ -27,6 +27,9 @@ from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 OUTSIDE = ("nan", "background")
 """Choices of what `read` gives outside the coreset."""
 
+CLIPPED_SINCE = (1, 2)
+"""Format version since which values between vertices and steps are clipped to the range, too."""
+
 MAX_LOD = 10
 """Coarsest level of detail: every 1024th vertex."""
 
@@ -74,6 +77,7 @@ class Volume:
         self.profile: str = header["model"]["profile"]
         self.value_range = ValueRange(*header["value_range"])
         self.background = float(header["background"])
+        self._clips = tuple(header["format_version"]) >= CLIPPED_SINCE
         self._model = open_model(container)
         self.chunks = self._model.chunks
 
@@ -152,11 +156,10 @@ class Volume:
         if common is not None:
             in_region, in_box = common
             requested = self._occupied(key, in_box)
-            np.copyto(
-                result[in_region.slices()],
-                self._model.read(key, in_box, requested).astype(self.dtype, copy=False),
-                where=requested,
-            )
+            values = self._model.read(key, in_box, requested).astype(self.dtype, copy=False)
+            if not key.is_integer():
+                values = self._in_range(values)
+            np.copyto(result[in_region.slices()], values, where=requested)
         if outside == "background":
             result[np.isnan(result)] = self.background
         missing = self._missing_at(t)
@@ -294,7 +297,7 @@ class Volume:
                 slopes[inside, 0] *= self.key_times.keys_per_step(steps[inside])
             else:
                 values[inside] = self._model.sample(keys[inside], local)
-        values = values.reshape(shape).astype(self.dtype)
+        values = self._in_range(values.reshape(shape).astype(self.dtype))
         return (values, slopes.reshape(*shape, 4).astype(self.dtype)) if gradient else values
 
     def occupancy(self, t: float, region: Spans | None = None) -> npt.NDArray[np.bool_]:
@@ -323,6 +326,13 @@ class Volume:
         return self._checked_times().step_of_time(float(time))
 
     # -- steps, regions and masks --
+
+    def _in_range(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Interpolated values without the rounding that takes some beyond the series' range."""
+        if not self._clips:
+            return values
+        low, high = self.value_range.low, self.value_range.high
+        return np.clip(values, self.dtype.type(low), self.dtype.type(high))
 
     def _checked_times(self) -> KeyTimes:
         if not strictly_monotonic(self.coords["t"].values):
