@@ -11,6 +11,7 @@ from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
 from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,9 @@ MAX_POINTS = 24
 DIGITS = 6
 """Significant digits of a figure over all steps."""
 
+OUTSIDE = "outside"
+"""Value of the header's `missing`: the vertices outside the coreset are those without a value."""
+
 STEP_DIGITS = 5
 """Significant digits of a figure of one step."""
 
@@ -40,14 +44,17 @@ def describe_source(
     series: Series, value_range: ValueRange, config: EncodeConfig
 ) -> dict[str, Any]:
     """Header entries of a series: variable, shape and range, and a quality to be filled in."""
+    variable = {
+        "name": str(series.name),
+        "units": str(series.units),
+        "dtype": (series.source_dtype or series.dtype).name,
+        "attributes": json_attributes(series.attributes, without=frozenset()),
+    }
+    if series.fill is not None and math.isfinite(series.fill):
+        variable["fill"] = series.fill
     return {
         "encoder": {"version": version("fhash"), "seed": config.seed},
-        "variable": {
-            "name": str(series.name),
-            "units": str(series.units),
-            "dtype": series.dtype.name,
-            "attributes": json_attributes(series.attributes, without=frozenset()),
-        },
+        "variable": variable,
         "domain": {"shape": list(series.shape)},
         "value_range": [value_range.low, value_range.high],
         "dilation": config.dilation,
@@ -62,11 +69,13 @@ def write_series(
     key_frames: Sequence[int],
     *,
     brief: bool = False,
+    everything: bool = False,
 ) -> dict[str, Any]:
     """Write coordinates, key frames, and masks of the values that are not finite.
 
     brief: leave out each array that the header can say in fewer bytes, as the profile compact
-    allows. Returns the header entries that then stand for the arrays.
+    allows. everything: all finite values are in the coreset of every step, so that its mask says
+    which are missing. Returns the header entries that then stand for the arrays.
     """
     coords = {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
     described = describe_coordinates(coords) if brief else {}
@@ -80,8 +89,11 @@ def write_series(
             )
     if not brief or len(key_frames) < series.shape[0]:
         writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
-    if scanned.missing:
-        _write_missing(writer, series.shape, scanned)
+    if not scanned.missing:
+        return {"coordinates": described} if brief else {}
+    if brief and everything and len(key_frames) == series.shape[0]:
+        return {"coordinates": described, "missing": OUTSIDE}
+    _write_missing(writer, series.shape, scanned)
     return {"coordinates": described} if brief else {}
 
 
@@ -203,3 +215,27 @@ def _figure(name: str, value: float | None, digits: int) -> float | None:
 
 def _rounded(value: float | None, digits: int) -> float | None:
     return None if value is None or not math.isfinite(value) else round(value, digits)
+
+
+def describe_file(container: Container, path: Path, key_frames: Sequence[int]) -> dict[str, Any]:
+    """The header of a container, and what follows from it; see `Volume.info`."""
+    header = container.header
+    raw = prod(header["domain"]["shape"]) * np.dtype(header["variable"]["dtype"]).itemsize
+    arrays = {
+        name: {
+            "shape": list(array.shape),
+            "dtype": str(array.dtype),
+            "bytes": array.nbytes_stored,
+        }
+        for name, array in container.arrays.items()
+    }
+    return {
+        **header,
+        "path": str(path),
+        "bytes": container.size,
+        "overhead_bytes": container.overhead(),
+        "raw_bytes": raw,
+        "ratio": raw / container.size,
+        "key_frames": list(key_frames),
+        "arrays": arrays,
+    }

@@ -13,7 +13,6 @@ from fhash_cli.output import (
     apart,
     compared,
     describe_error,
-    emit,
     listed,
     number,
     size,

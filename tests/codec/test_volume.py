@@ -10,7 +10,7 @@ import pytest
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, MissingInputError, RegionError
 from fhash_codec.coreset.occupancy import pack
-from fhash_codec.volume import decoded_type
+from fhash_codec.value_type import decoded_type
 from fhash_formats.container import ContainerWriter
 from fhash_formats.series import ArraySeries, Coordinate
 
@@ -360,7 +360,7 @@ def test_what_a_compact_file_leaves_out(tmp_path, stored) -> None:
 
 def wind(dtype: str) -> np.ndarray:
     """Speeds that touch zero along moving fronts."""
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 6, 14, 15)), indexing="ij")
+    t, _, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 6, 14, 15)), indexing="ij")
     noise = np.random.default_rng(0).normal(0, 0.3, t.shape)
     return np.maximum(20 * np.sin(5 * x + 3 * t + y) + noise, 0.1).astype(dtype)
 
