@@ -39,8 +39,15 @@ def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any
     Raises InputError if the series changed since it was opened.
     """
     data_range = volume.value_range.high - volume.value_range.low
+    # Integers of 64 bits are compared as such: as floats, equal ones could differ.
+    exact = volume.dtype.kind in "iu" and not volume.value_type.has_gaps
     quality = measure_quality(
-        series.read, volume.read, series.shape[0], data_range, volume.background, progress
+        series.read,
+        volume.values if exact else volume.read,
+        series.shape[0],
+        data_range,
+        volume.background,
+        progress,
     )
     series.check()
     return quality.to_dict()

@@ -5,10 +5,13 @@ Each profile adds what it alone knows, such as its model.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
 from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +21,8 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import Container, ContainerWriter, describe_coordinates
-from fhash_formats.series import AXIS_NAMES, Series
+from fhash_formats.series import AXIS_NAMES, Coordinate, Series
+from fhash_formats.support.attributes import json_attributes
 
 MISSING_CHUNK_BYTES = 1 << 20
 """Bytes of one chunk of the missing-value masks. A member for each step would cost 130 bytes."""
@@ -29,6 +33,9 @@ MAX_POINTS = 24
 DIGITS = 6
 """Significant digits of a figure over all steps."""
 
+OUTSIDE = "outside"
+"""Value of the header's `missing`: the vertices outside the coreset are those without a value."""
+
 STEP_DIGITS = 5
 """Significant digits of a figure of one step."""
 
@@ -37,14 +44,17 @@ def describe_source(
     series: Series, value_range: ValueRange, config: EncodeConfig
 ) -> dict[str, Any]:
     """Header entries of a series: variable, shape and range, and a quality to be filled in."""
+    variable = {
+        "name": str(series.name),
+        "units": str(series.units),
+        "dtype": (series.source_dtype or series.dtype).name,
+        "attributes": json_attributes(series.attributes, without=frozenset()),
+    }
+    if series.fill is not None and math.isfinite(series.fill):
+        variable["fill"] = series.fill
     return {
         "encoder": {"version": version("fhash"), "seed": config.seed},
-        "variable": {
-            "name": series.name,
-            "units": series.units,
-            "dtype": series.dtype.name,
-            "attributes": dict(series.attributes),
-        },
+        "variable": variable,
         "domain": {"shape": list(series.shape)},
         "value_range": [value_range.low, value_range.high],
         "dilation": config.dilation,
@@ -59,16 +69,19 @@ def write_series(
     key_frames: Sequence[int],
     *,
     brief: bool = False,
+    everything: bool = False,
 ) -> dict[str, Any]:
     """Write coordinates, key frames, and masks of the values that are not finite.
 
     brief: leave out each array that the header can say in fewer bytes, as the profile compact
-    allows. Returns the header entries that then stand for the arrays.
+    allows. everything: all finite values are in the coreset of every step, so that its mask says
+    which are missing. Returns the header entries that then stand for the arrays.
     """
-    described = describe_coordinates(series.coords) if brief else {}
+    coords = {axis: _storable(coordinate) for axis, coordinate in series.coords.items()}
+    described = describe_coordinates(coords) if brief else {}
     for axis, stored in AXIS_NAMES.items():
         if stored not in described:
-            coordinate = series.coords[axis]
+            coordinate = coords[axis]
             writer.add_whole(
                 f"coords/{stored}",
                 coordinate.values,
@@ -76,9 +89,21 @@ def write_series(
             )
     if not brief or len(key_frames) < series.shape[0]:
         writer.add_whole("key_frames", np.array(key_frames, dtype=np.int64))
-    if scanned.missing:
-        _write_missing(writer, series.shape, scanned)
+    if not scanned.missing:
+        return {"coordinates": described} if brief else {}
+    if brief and everything and len(key_frames) == series.shape[0]:
+        return {"coordinates": described, "missing": OUTSIDE}
+    _write_missing(writer, series.shape, scanned)
     return {"coordinates": described} if brief else {}
+
+
+def _storable(coordinate: Coordinate) -> Coordinate:
+    """The coordinate with a name and attributes that JSON can hold."""
+    return replace(
+        coordinate,
+        name=str(coordinate.name),
+        attributes=json_attributes(coordinate.attributes, without=frozenset()),
+    )
 
 
 def _write_missing(writer: ContainerWriter, shape: tuple[int, ...], scanned: Scan) -> None:
@@ -139,7 +164,8 @@ def brief_history(
 ) -> list[dict[str, float]]:
     """A training history as a header has it: at most MAX_POINTS points, the last point included.
 
-    Seconds are rounded to milliseconds, PSNR to hundredths of a dB. timings: keep the seconds.
+    Seconds are rounded to milliseconds, PSNR to hundredths of a dB. Figures without a finite value,
+    such as the PSNR of exact values, are left out. timings: keep the seconds.
     """
     count = min(len(history), MAX_POINTS)
     chosen = [history[(number + 1) * len(history) // count - 1] for number in range(count)]
@@ -152,6 +178,17 @@ def brief_history(
         for point in chosen
     ]
     return [{name: value for name, value in point.items() if value is not None} for point in points]
+
+
+def history_columns(points: Sequence[Mapping[str, Any]]) -> Any:
+    """A brief history as lists of numbers by name, which take fewer bytes than a list of points.
+
+    Where a figure of some point is missing, the points themselves are returned.
+    """
+    names = points[0].keys() if points else ()
+    if any(point.keys() != names for point in points):
+        return list(points)
+    return {name: [point[name] for point in points] for name in names}
 
 
 def history_points(
@@ -177,4 +214,28 @@ def _figure(name: str, value: float | None, digits: int) -> float | None:
 
 
 def _rounded(value: float | None, digits: int) -> float | None:
-    return None if value is None else round(value, digits)
+    return None if value is None or not math.isfinite(value) else round(value, digits)
+
+
+def describe_file(container: Container, path: Path, key_frames: Sequence[int]) -> dict[str, Any]:
+    """The header of a container, and what follows from it; see `Volume.info`."""
+    header = container.header
+    raw = prod(header["domain"]["shape"]) * np.dtype(header["variable"]["dtype"]).itemsize
+    arrays = {
+        name: {
+            "shape": list(array.shape),
+            "dtype": str(array.dtype),
+            "bytes": array.nbytes_stored,
+        }
+        for name, array in container.arrays.items()
+    }
+    return {
+        **header,
+        "path": str(path),
+        "bytes": container.size,
+        "overhead_bytes": container.overhead(),
+        "raw_bytes": raw,
+        "ratio": raw / container.size,
+        "key_frames": list(key_frames),
+        "arrays": arrays,
+    }

@@ -7,8 +7,12 @@ from types import EllipsisType
 
 import numpy as np
 
-from fhash_formats.errors import RegionError
+from fhash_codec.coreset.boxes import Box, Spans
+from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import AXES
+
+MAX_LOD = 10
+"""Coarsest level of detail: every 1024th vertex."""
 
 Index = int | slice | EllipsisType
 """One part of an index."""
@@ -54,3 +58,41 @@ def _positions(part: int | slice, length: int, axis: str) -> range:
     if not -length <= part < length:
         raise RegionError(f"index {part} is outside axis {axis} of {length}")
     return range(part % length, part % length + 1)
+
+
+def checked_region(region: Spans | None, shape: Sequence[int], path: str) -> Box:
+    """The box of a region in vertices (z, y, x) of a domain; the whole domain for None.
+
+    Raises RegionError, naming the path, for a region that is empty or outside the domain.
+    """
+    if region is None:
+        return Box.of_shape(shape)
+    for axis, (low, high), length in zip(AXES[1:], region, shape, strict=True):
+        if not 0 <= low < high <= length:
+            raise RegionError(
+                f"{path}: region {low}:{high} of axis {axis} is empty or outside 0:{length}"
+            )
+    return Box.of(region)
+
+
+def coarse_vertices(box: Box, region: Box, lod: int, path: str) -> tuple[range, range, range]:
+    """Every 2^lod-th vertex (z, y, x) of the feature bounding box that lies in a region.
+
+    Raises InputError for another level of detail than 0 to MAX_LOD, RegionError, naming the path,
+    for a region without such a vertex.
+    """
+    if isinstance(lod, bool) or not isinstance(lod, int | np.integer) or not 0 <= lod <= MAX_LOD:
+        raise InputError(f"lod is {lod}; allowed: 0 to {MAX_LOD}")
+    every = 1 << int(lod)
+    vertices = []
+    for axis, (first, end), (low, high) in zip(AXES[1:], box, region, strict=True):
+        start = first + -(-max(low - first, 0) // every) * every
+        along = range(start, min(high, end), every)
+        if not along:
+            raise RegionError(
+                f"{path}: region {low}:{high} of axis {axis} holds no vertex of level of "
+                f"detail {lod}, every {every}. from {first} to {end - 1}"
+            )
+        vertices.append(along)
+    z, y, x = vertices
+    return z, y, x

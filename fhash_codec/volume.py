@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from math import prod
 from pathlib import Path
 from types import TracebackType
@@ -14,11 +14,13 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box, Spans
 from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
-from fhash_codec.header import read_missing
-from fhash_codec.indexing import Index, expand_index, index_ranges
+from fhash_codec.header import OUTSIDE as OUTSIDE_IS_MISSING
+from fhash_codec.header import describe_file, read_missing
+from fhash_codec.indexing import Index, checked_region, coarse_vertices, expand_index, index_ranges
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.sampling import interpolable
+from fhash_codec.value_type import ValueType
 from fhash_codec.volume_model import open_model
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
@@ -27,29 +29,36 @@ from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 OUTSIDE = ("nan", "background")
 """Choices of what `read` gives outside the coreset."""
 
-MAX_LOD = 10
-"""Coarsest level of detail: every 1024th vertex."""
+CLIPPED_SINCE = (1, 2)
+"""Format version since which values between vertices and steps are clipped to the range, too."""
 
 
-def open(path: str | Path) -> Volume:
+def open(path: str | Path, *, fill: int | float | None = None) -> Volume:
     """Open a `.fhz` file for reading; nothing is decoded yet.
+
+    fill: what `volume[...]` gives at vertices without a value, see `Volume`.
 
     Raises MissingInputError, DamagedFileError or UnsupportedFileError.
     """
-    return Volume(Container.open(path))
+    return Volume(Container.open(path), fill=fill)
 
 
 class Volume:
     """A time-varying volume in a container, read like a numpy array (t, z, y, x).
 
-    Only the tiles that a request needs are decoded. Values are in data units. They are NaN outside
-    the coreset, and where the source had no finite value.
+    Only the tiles that a request needs are decoded. Values are in data units. Vertices outside the
+    coreset, and those where the source had no finite value, have none: they are NaN, or the fill
+    value. Integers stay integers in `volume[...]`, unless they have vertices without a value and no
+    fill value is known; `read` and `sample` always give floats.
 
     Attributes:
         shape: vertices (t, z, y, x).
         dims: names of the axes.
         chunks: vertices (t, z, y, x) that are decoded together.
-        dtype: float64 for sources of float64 or of integers above 16 bits, else float32.
+        dtype: type of `volume[...]`: that of the source for integers, else `float_dtype`.
+        float_dtype: type of `read` and `sample`: float64 for sources of float64 or of integers
+            above 16 bits, else float32.
+        fill: what `volume[...]` has at vertices without a value; None for NaN.
         name, units, attrs: of the variable.
         coords: a Coordinate for each of "t", "z", "y", "x".
         box: the feature bounding box, in vertices of the domain.
@@ -60,13 +69,20 @@ class Volume:
     dims = AXES
     ndim = 4
 
-    def __init__(self, container: Container) -> None:
-        """Read from an open container, which `close` closes; `fhash_codec.open` opens files."""
+    def __init__(self, container: Container, *, fill: int | float | None = None) -> None:
+        """Read from an open container, which `close` closes; `fhash_codec.open` opens files.
+
+        fill: the fill value; None for the source's own, which only integers have, or NaN. Integers
+            become floats for a fill value that their type does not have.
+        """
         header = container.header
         self.container = container
         self.path = Path(container.path)
         self.shape: tuple[int, int, int, int] = tuple(header["domain"]["shape"])
-        self.dtype = decoded_type(np.dtype(header["variable"]["dtype"]))
+        self.value_type = ValueType.of(container)
+        self.float_dtype = self.value_type.floats
+        self._asked_fill = fill
+        self.dtype, self.fill = self.value_type.of_array(fill)
         self.name: str = header["variable"]["name"]
         self.units: str = header["variable"]["units"]
         self.attrs: Mapping[str, Any] = header["variable"]["attributes"]
@@ -74,6 +90,8 @@ class Volume:
         self.profile: str = header["model"]["profile"]
         self.value_range = ValueRange(*header["value_range"])
         self.background = float(header["background"])
+        self._clips = tuple(header["format_version"]) >= CLIPPED_SINCE
+        self._outside_is_missing = header.get("missing") == OUTSIDE_IS_MISSING
         self._model = open_model(container)
         self.chunks = self._model.chunks
 
@@ -104,26 +122,7 @@ class Volume:
 
         Added are the path, bytes, raw bytes, ratio, key frames and arrays.
         """
-        header = self.container.header
-        raw = self.size * np.dtype(header["variable"]["dtype"]).itemsize
-        arrays = {
-            name: {
-                "shape": list(array.shape),
-                "dtype": str(array.dtype),
-                "bytes": array.nbytes_stored,
-            }
-            for name, array in self.container.arrays.items()
-        }
-        return {
-            **header,
-            "path": str(self.path),
-            "bytes": self.container.size,
-            "overhead_bytes": self.container.overhead(),
-            "raw_bytes": raw,
-            "ratio": raw / self.container.size,
-            "key_frames": list(self.key_times.key_frames),
-            "arrays": arrays,
-        }
+        return describe_file(self.container, self.path, self.key_times.key_frames)
 
     def verify(self, progress: Progress = silent) -> int:
         """Read and check every array; return their number. Raises DamagedFileError."""
@@ -134,7 +133,7 @@ class Volume:
     def read(
         self, t: float, region: Spans | None = None, *, outside: str = "nan"
     ) -> npt.NDArray[Any]:
-        """Values (z, y, x) of a region at step `t`, of `self.dtype`.
+        """Values (z, y, x) of a region at step `t`, of `self.float_dtype`.
 
         t: a step; a fraction lies between two steps, and time runs evenly from one to the next.
         region: in vertices of the domain; the whole domain if None.
@@ -147,27 +146,49 @@ class Volume:
             raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
         key = self._key_index(t)
         region = self._checked(region)
-        result = np.full(region.shape, np.nan, dtype=self.dtype)
+        result = np.full(region.shape, np.nan, dtype=self.float_dtype)
         common = self._within_box(region)
         if common is not None:
             in_region, in_box = common
             requested = self._occupied(key, in_box)
-            np.copyto(
-                result[in_region.slices()],
-                self._model.read(key, in_box, requested).astype(self.dtype, copy=False),
-                where=requested,
-            )
-        if outside == "background":
+            values = self._model.read(key, in_box, requested).astype(self.float_dtype, copy=False)
+            if not key.is_integer():
+                values = self._in_range(values)
+            np.copyto(result[in_region.slices()], values, where=requested)
+        if outside == "background" and not self._outside_is_missing:
             result[np.isnan(result)] = self.background
         missing = self._missing_at(t)
         if missing is not None:
             result[missing[region.slices()]] = np.nan
         return result
 
+    def values(
+        self, t: float, region: Spans | None = None, *, outside: str = "nan"
+    ) -> npt.NDArray[Any]:
+        """Values (z, y, x) of a region at step `t` as `volume[...]` has them.
+
+        They are of `self.dtype`, with the fill value where there is no value. Between steps they
+        are interpolated, and so of `self.float_dtype`. Arguments and errors as in `read`; the
+        background is rounded to integers.
+        """
+        if self.dtype.kind == "f" or not float(t).is_integer():
+            return filled(self.read(t, region, outside=outside), self.fill)
+        read = self.read(t, region, outside=outside)
+        gaps, result = np.isnan(read), np.rint(np.nan_to_num(read)).astype(self.dtype)
+        common = self._within_box(self._checked(region))
+        if common is not None and self.dtype.itemsize == 8:
+            # float64 has not every integer of 64 bits.
+            in_region, in_box = common
+            requested = self._occupied(self._key_index(t), in_box)
+            exact = self._model.read(self._key_index(t), in_box, requested)
+            np.copyto(result[in_region.slices()], exact, where=requested)
+        result[gaps] = self.fill
+        return result
+
     def read_lod(self, t: float, lod: int, region: Spans | None = None) -> npt.NDArray[Any]:
         """Low-passed values (z, y, x) at every 2^lod-th vertex of the feature bounding box.
 
-        t: a whole step.
+        They are of `self.float_dtype`. t: a whole step.
         lod: level of detail, 0 to 10; level 0 is the box as `read` gives it.
         region: in vertices of the domain (all if None); see `lod_vertices` for the vertices in it.
 
@@ -183,7 +204,7 @@ class Volume:
             ((along[0] - first) >> lod, ((along[-1] - first) >> lod) + 1)
             for along, first in zip(vertices, self.box.first, strict=True)
         )
-        values = self._model.read_lod(step, int(lod), coarse).astype(self.dtype)
+        values = self._model.read_lod(step, int(lod), coarse).astype(self.float_dtype)
         surrounding = Box.of((along[0], along[-1] + 1) for along in vertices)
         values[~self.occupancy(t, surrounding)[(slice(None, None, 1 << lod),) * 3]] = np.nan
         return values
@@ -195,27 +216,7 @@ class Volume:
         InputError for another lod than 0 to 10, RegionError for a region outside the domain or
         without such a vertex.
         """
-        if (
-            isinstance(lod, bool)
-            or not isinstance(lod, int | np.integer)
-            or not 0 <= lod <= MAX_LOD
-        ):
-            raise InputError(f"lod is {lod}; allowed: 0 to {MAX_LOD}")
-        every = 1 << int(lod)
-        vertices = []
-        for axis, (first, end), (low, high) in zip(
-            AXES[1:], self.box, self._checked(region), strict=True
-        ):
-            start = first + -(-max(low - first, 0) // every) * every
-            along = range(start, min(high, end), every)
-            if not along:
-                raise RegionError(
-                    f"{self.path}: region {low}:{high} of axis {axis} holds no vertex of level of "
-                    f"detail {lod}, every {every}. from {first} to {end - 1}"
-                )
-            vertices.append(along)
-        z, y, x = vertices
-        return z, y, x
+        return coarse_vertices(self.box, self._checked(region), lod, str(self.path))
 
     def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
         """Values by numpy's basic indexing: integers, slices and `...`, negative ones as usual.
@@ -231,7 +232,7 @@ class Volume:
             offsets = zip(space, region.first, strict=True)
             local = np.ix_(*(np.array(positions) - first for positions, first in offsets))
             for number, step in enumerate(steps):
-                result[number] = self.read(step, region)[local]
+                result[number] = self.values(step, region)[local]
         return result[tuple(slice(None) if isinstance(part, slice) else 0 for part in parts)]
 
     def __array__(
@@ -294,8 +295,8 @@ class Volume:
                 slopes[inside, 0] *= self.key_times.keys_per_step(steps[inside])
             else:
                 values[inside] = self._model.sample(keys[inside], local)
-        values = values.reshape(shape).astype(self.dtype)
-        return (values, slopes.reshape(*shape, 4).astype(self.dtype)) if gradient else values
+        values = self._in_range(values.reshape(shape).astype(self.float_dtype))
+        return (values, slopes.reshape(*shape, 4).astype(self.float_dtype)) if gradient else values
 
     def occupancy(self, t: float, region: Spans | None = None) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the vertices of a region that are in the coreset at step `t`.
@@ -324,6 +325,13 @@ class Volume:
 
     # -- steps, regions and masks --
 
+    def _in_range(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Interpolated values without the rounding that takes some beyond the series' range."""
+        if not self._clips:
+            return values
+        low, high = self.value_range.low, self.value_range.high
+        return np.clip(values, self.float_dtype.type(low), self.float_dtype.type(high))
+
     def _checked_times(self) -> KeyTimes:
         if not strictly_monotonic(self.coords["t"].values):
             raise InputError(
@@ -339,15 +347,7 @@ class Volume:
         return self.key_times.key_index(float(t))
 
     def _checked(self, region: Spans | None) -> Box:
-        if region is None:
-            return Box.of_shape(self.shape[1:])
-        for axis, (low, high), length in zip(AXES[1:], region, self.shape[1:], strict=True):
-            if not 0 <= low < high <= length:
-                raise RegionError(
-                    f"{self.path}: region {low}:{high} of axis {axis} is empty "
-                    f"or outside 0:{length}"
-                )
-        return Box.of(region)
+        return checked_region(region, self.shape[1:], str(self.path))
 
     def _within_box(self, region: Box) -> tuple[Box, Box] | None:
         """The vertices that a region shares with the feature bounding box; None if there are none.
@@ -386,14 +386,13 @@ class Volume:
         self.close()
 
     def __reduce__(self) -> tuple[Any, tuple[Path]]:
-        return open, (self.path.absolute(),)
+        return partial(open, fill=self._asked_fill), (self.path.absolute(),)
 
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))
         return f"<fhash Volume '{self.name}' {sizes} {self.dtype} of {self.path}>"
 
 
-def decoded_type(source: np.dtype[Any]) -> np.dtype[Any]:
-    """The type of decoded values: a float wide enough for the source's own precision."""
-    narrow = source.itemsize <= 2 or source == np.float32
-    return np.dtype(np.float32 if narrow else np.float64)
+def filled(values: npt.NDArray[Any], fill: int | float | None) -> npt.NDArray[Any]:
+    """Floats with a fill value in place of NaN; None leaves them as they are."""
+    return values if fill is None else np.where(np.isnan(values), values.dtype.type(fill), values)

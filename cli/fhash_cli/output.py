@@ -13,7 +13,7 @@ from typing import Any, TextIO
 import click
 
 from fhash_formats.errors import FhashError, OutputError
-from fhash_formats.support.attributes import plain_text
+from fhash_formats.support.plain_json import plain_json, plain_text
 
 NO_MEMORY = ("can't allocate memory", "memory allocation failed")
 """Words of the RuntimeErrors by which torch and HDF5 report that memory ran out."""
@@ -41,13 +41,15 @@ def warn(
 def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
     """Print a result on stdout: as one line of JSON, or as text.
 
+    Figures that JSON cannot hold become null.
+
     Raises OutputError where stdout is closed.
     """
     if sys.stdout is None:
         raise OutputError(
             "the result cannot be printed, stdout is closed; files named as outputs are written"
         )
-    click.echo(json.dumps(result, allow_nan=False) if as_json else plain_text(text))
+    click.echo(json.dumps(plain_json(result), allow_nan=False) if as_json else plain_text(text))
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:

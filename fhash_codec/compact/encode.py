@@ -12,8 +12,9 @@ from fhash_codec.compact.coded_table import model_header, required_features, wri
 from fhash_codec.compact.goal import promise
 from fhash_codec.compact.tiles_to_promise import code_series
 from fhash_codec.config import EncodeConfig
+from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.selection import select_features
-from fhash_codec.header import brief_history, describe_source, write_series
+from fhash_codec.header import brief_history, describe_source, history_columns, write_series
 from fhash_codec.progress import Progress
 from fhash_formats import native
 from fhash_formats.container import ContainerWriter
@@ -45,7 +46,14 @@ def encode_compact(
     selection = select_features(series, config, progress, mask)
     extent = selection.extent
     table = code_series(series, selection, config, progress)
-    described = write_series(writer, series, selection.scanned, extent.key_frames, brief=True)
+    described = write_series(
+        writer,
+        series,
+        selection.scanned,
+        extent.key_frames,
+        brief=True,
+        everything=any(isinstance(feature, Everything) for feature in selection.features),
+    )
     write_table(writer, table)
     seconds = round(time.perf_counter() - begun, 3) if config.timings else None
     history = brief_history(table.plan.history, timings=config.timings)
@@ -60,9 +68,7 @@ def encode_compact(
         "model": model_header(table, config),
         "config": _changed_options(config) | promise(config),
         "training": {"seconds": seconds, "epochs": 0, "device": "cpu"},
-        "history": {
-            name: [point.get(name) for point in history] for name in (history[0] if history else ())
-        },
+        "history": history_columns(history),
     }
 
 

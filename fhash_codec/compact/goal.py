@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.config import EncodeConfig
 from fhash_codec.measure.value_range import ValueRange
 
+MAX_INTEGER_ERROR = 2.0**40
+"""Bound on integers from which on a half more makes no difference."""
 DEFAULT_PSNR = 50.0
 """PSNR in dB that is promised where nothing is asked for."""
 
@@ -22,6 +25,8 @@ class Goal:
     """Strict bound of the absolute error, in data units."""
     size: float | None = None
     """Size of the file in bytes."""
+    lossless: bool = False
+    """Whether the bound allows no error at all."""
     data_range: float
     """Range of the values of the series, in data units."""
     overhead: int = 0
@@ -39,17 +44,29 @@ class Goal:
         return coding if self.error is None else replace(coding, error=self.error)
 
 
-def goal_of(config: EncodeConfig, value_range: ValueRange, raw_bytes: int, overhead: int) -> Goal:
+def goal_of(
+    config: EncodeConfig,
+    value_range: ValueRange,
+    raw_bytes: int,
+    overhead: int,
+    *,
+    integers: bool = False,
+) -> Goal:
     """Return the promise of the settings; `EncodeConfig` allows one at most.
 
     raw_bytes: bytes of the series without compression.
     overhead: approximate bytes of the file that are no tiles.
+    integers: whether the values are integers, so that their errors are as well.
     """
     data_range = value_range.high - value_range.low
-    if config.max_error is not None:
-        return Goal(error=config.max_error, data_range=data_range)
+    error = config.max_error
     if config.max_error_rel is not None:
-        return Goal(error=config.max_error_rel * data_range, data_range=data_range)
+        error = config.max_error_rel * data_range
+    if error is not None and integers and error < MAX_INTEGER_ERROR:
+        # Before a decoded value is rounded to an integer, it may be off by half of one more.
+        return Goal(error=math.floor(error) + 0.5, data_range=data_range, lossless=error < 1)
+    if error is not None:
+        return Goal(error=error, data_range=data_range, lossless=error == 0)
     if config.ratio is not None:
         return Goal(size=raw_bytes / config.ratio, data_range=data_range, overhead=overhead)
     return Goal(psnr=DEFAULT_PSNR if config.psnr is None else config.psnr, data_range=data_range)

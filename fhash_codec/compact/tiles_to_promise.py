@@ -54,9 +54,11 @@ def code_series(
 ) -> CodedTable:
     """Plan and code all tiles so that the promise of the settings is kept, if it can be."""
     value_range = selection.scanned.value_range
-    raw_bytes = prod(series.shape) * series.dtype.itemsize
-    goal = goal_of(config, value_range, raw_bytes, OVERHEAD_BYTES)
+    raw_bytes = prod(series.shape) * (series.source_dtype or series.dtype).itemsize
     blocks = Blocks(series, selection.extent, series.shape)
+    goal = goal_of(
+        config, value_range, raw_bytes, OVERHEAD_BYTES, integers=blocks.dtype.kind in "iu"
+    )
     begun = time.perf_counter()
     with thread_pool() as workers:
         coding_plan = plan(

@@ -160,9 +160,11 @@ def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> 
             float(limits.min),
             np.nextafter(float(limits.max), 0.0),
         )
+        if decoded.dtype == original.dtype:
+            nearest = decoded
         # Integer differences wrap at 2^64; differences beyond 2^62 do not need to be exact.
         exact = (original - nearest.astype(original.dtype)).view(np.int64) - (
-            decoded.astype(np.float64) - nearest
+            0.0 if nearest is decoded else decoded.astype(np.float64) - nearest
         )
         difference = np.where(np.abs(difference) < 2.0**62 * scale, exact * scale, difference)
     return difference

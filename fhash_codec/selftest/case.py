@@ -77,14 +77,19 @@ class Run:
 
     @cached_property
     def decoded(self) -> npt.NDArray[Any]:
-        """All decoded values (t, z, y, x), NaN outside the coreset."""
-        return self.volume[...]
+        """All decoded values (t, z, y, x) as floats, NaN outside the coreset."""
+        return as_floats(self.volume)
 
     @property
     def data_range(self) -> float:
         """Range of the finite values in data units, as the codec computes it; infinite if it
         overflows."""
         return self.volume.value_range.high - self.volume.value_range.low
+
+
+def as_floats(volume: Volume) -> npt.NDArray[Any]:
+    """All values (t, z, y, x) of a volume as floats, NaN where there is none."""
+    return np.stack([volume.read(step) for step in range(volume.shape[0])])
 
 
 Check = Callable[[Run], Iterable[Finding]]

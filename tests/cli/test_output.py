@@ -13,7 +13,6 @@ from fhash_cli.output import (
     apart,
     compared,
     describe_error,
-    emit,
     listed,
     number,
     size,
@@ -131,9 +130,9 @@ def test_listed_leaves_out_the_middle() -> None:
     assert listed([str(n) for n in range(20)]) == "0, 1, 2, 3, 4, 5, ..., 19"
 
 
-def test_json_holds_no_nan() -> None:
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        emit({"psnr": float("nan")}, "", True)
+def test_json_holds_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
+    output.emit({"psnr": float("nan"), "range": [float("inf"), 1.5]}, "", as_json=True)
+    assert capsys.readouterr().out == '{"psnr": null, "range": [null, 1.5]}\n'
 
 
 class OutOfMemoryError(RuntimeError):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from fhash_codec.header import brief_history, brief_quality, history_points
+import math
+
+from fhash_codec.header import brief_history, brief_quality, history_columns, history_points
 
 
 def test_figures_in_a_file_are_brief_and_never_better_than_they_are() -> None:
@@ -50,3 +52,13 @@ def test_history_in_a_file_is_brief() -> None:
         == history_points([{"epoch": 1, "psnr": 2.5}, {"epoch": 2, "psnr": 3}])
         == expected
     )
+
+
+def test_exact_values_have_no_psnr_in_the_history() -> None:
+    points = [{"seconds": 0.5, "epoch": n, "psnr": math.inf if n > 1 else 40.0} for n in (1, 2)]
+    brief = brief_history(points, timings=False)
+    assert brief == [{"epoch": 1, "psnr": 40.0}, {"epoch": 2}]
+    assert history_columns(brief) == brief
+    assert history_columns(brief[:1]) == {"epoch": [1], "psnr": [40.0]}
+    assert history_columns([]) == {}
+    assert history_points(brief)[1] == {"seconds": None, "epoch": 2, "psnr": None}

@@ -10,7 +10,7 @@ import pytest
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, MissingInputError, RegionError
 from fhash_codec.coreset.occupancy import pack
-from fhash_codec.volume import decoded_type
+from fhash_codec.value_type import decoded_type
 from fhash_formats.container import ContainerWriter
 from fhash_formats.series import ArraySeries, Coordinate
 
@@ -356,3 +356,25 @@ def test_what_a_compact_file_leaves_out(tmp_path, stored) -> None:
             occupied = np.zeros(shape[1:], dtype=bool)
             occupied[1:3, 0:4, 2:5] = True if stored is None else expected
             np.testing.assert_array_equal(volume.occupancy(t), occupied)
+
+
+def wind(dtype: str) -> np.ndarray:
+    """Speeds that touch zero along moving fronts."""
+    t, _, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 6, 14, 15)), indexing="ij")
+    noise = np.random.default_rng(0).normal(0, 0.3, t.shape)
+    return np.maximum(20 * np.sin(5 * x + 3 * t + y) + noise, 0.1).astype(dtype)
+
+
+@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize("promise", [{"max_error": 0.8}, {"max_error_rel": 0.01}, {"psnr": 30.0}])
+def test_no_value_leaves_the_range_of_the_series(tmp_path, dtype, promise) -> None:
+    values = wind(dtype)
+    fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(effort=1, **promise))
+    points = np.random.default_rng(1).uniform(0, 1, (3, 500)) * [[5], [13], [14]]
+    times = np.random.default_rng(2).uniform(0, 2, 500)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        read = [volume[...], volume.read(0.3), volume.read(1.7), volume.read_lod(1, 1)]
+        read.append(volume.sample(t=times, z=points[0], y=points[1], x=points[2]))
+    for decoded in read:
+        assert values.min() <= decoded.min()
+        assert decoded.max() <= values.max()

@@ -33,7 +33,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.measure.metrics import Errors
 from fhash_codec.progress import Progress
-from fhash_codec.volume import decoded_type
+from fhash_codec.value_type import decoded_type
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
 

@@ -86,7 +86,9 @@ def choose_predictor(
     predictor, predicted_size = best
     # The transform is unused from here on; store the cheapest description of one.
     plain = usual_transform(sample.tiles[0].values.shape)
-    return replace(settings, predictor=predictor, transform=plain, head=None), predicted_size
+    settings = replace(settings, predictor=predictor, transform=plain, head=None)
+    # Predicted values are within the range as they are.
+    return replace(settings, clip=False), predicted_size
 
 
 def best_predictor(

@@ -69,7 +69,10 @@ def with_step(
     if goal.error:
         slack = min(rounding * largest / goal.error, MAX_ROUNDING_SLACK)
         quantum = 2 * goal.error * (1 - SLACK - slack)
-    return replace(settings, step=step, double=double, quantum=quantum)
+    # A residual takes values beyond the range, and so does the rounding of its ends to float32.
+    ends = (settings.low, settings.high)
+    beyond = quantum > 0 or (not double and any(float(np.float32(end)) != end for end in ends))
+    return replace(settings, step=step, double=double, quantum=quantum, clip=beyond)
 
 
 def psnr_search(settings: TileSettings) -> PsnrSearch:

@@ -63,13 +63,14 @@ class Blocks:
         shape: vertices of the box over all steps.
         tile: vertices of a tile; the last tile along an axis may reach beyond the box.
         grid: number of tiles along each axis.
-        dtype: type of the series, in the byte order of this machine.
+        dtype: type of the source, in the byte order of this machine. It is an integer type also
+            where missing values made floats of integers.
         complete: whether all vertices of the box are in the coreset at all steps.
     """
 
     def __init__(self, series: Series, extent: Extent, tile: Shape) -> None:
         self._series, self._extent = series, extent
-        self.dtype: np.dtype[Any] = series.dtype.newbyteorder("=")
+        self.dtype: np.dtype[Any] = (series.source_dtype or series.dtype).newbyteorder("=")
         self.shape: Shape = (series.shape[0], *extent.box.shape)
         self.tile: Shape = tuple(min(n, length) for n, length in zip(tile, self.shape, strict=True))  # type: ignore[assignment]
         self.grid: Index = tuple(
@@ -137,7 +138,12 @@ class Blocks:
         """Read the box at some steps from the series."""
         values = np.empty((len(steps), *self.shape[1:]), dtype=self.dtype)
         for number, step in enumerate(steps):
-            values[number] = self._series.read(step)[self._extent.box.slices()]
+            frame = self._series.read(step)[self._extent.box.slices()]
+            if frame.dtype.kind == "f" and self.dtype.kind != "f":
+                # Missing values are outside the coreset; any integer may stand there.
+                frame = np.where(np.isfinite(frame), frame, np.nanmin(frame, initial=np.inf))
+                frame = np.where(np.isfinite(frame), frame, 0.0)
+            values[number] = frame
         if self.complete:
             return Tile(values, None)
         return Tile(values, np.stack([self._extent.mask(step) for step in steps]))

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
+from fhash_codec.indexing import MAX_LOD
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.camera.view import part_in_view, pixel_vertices
 from fhash_codec.rendering.colour.colours import parse_colour
@@ -28,7 +29,7 @@ from fhash_codec.rendering.scene.scene import (
 )
 from fhash_codec.rendering.task.task import Lighting, Surface, Table, Task
 from fhash_codec.rendering.task.units import Units
-from fhash_codec.volume import MAX_LOD, Volume
+from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
 
 __all__ = ["parse_background", "plan_at", "plan_picture"]

@@ -42,7 +42,7 @@ class Units:
         if low == high:
             low, high = about(low)
         extent = high / 2 - low / 2
-        if volume.dtype == np.float32 and max(abs(low), abs(high)) <= LARGE_OFFSET * extent:
+        if volume.float_dtype == np.float32 and max(abs(low), abs(high)) <= LARGE_OFFSET * extent:
             return cls()
         exponent = math.frexp(extent)[1]
         return cls(

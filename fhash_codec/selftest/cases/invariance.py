@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.encoding import encode
-from fhash_codec.selftest.case import Case, Finding, Run
+from fhash_codec.selftest.case import Case, Finding, Run, as_floats
 from fhash_codec.selftest.cases.fields import Shape, noise, series, waves
 from fhash_codec.selftest.cases.settings import Settings
 from fhash_codec.volume import open as open_volume
@@ -193,7 +193,7 @@ def _encoded(run: Run, values: Values, factor: float, **changes: Any) -> tuple[V
         config = replace(config, max_error=config.max_error * factor)
     encode(series(values), run.folder / "guise.fhz", config, force=True)
     with open_volume(run.folder / "guise.fhz") as volume:
-        return volume[...], sum(array["bytes"] for array in volume.info["arrays"].values())
+        return as_floats(volume), sum(array["bytes"] for array in volume.info["arrays"].values())
 
 
 def _size(run: Run) -> int:

@@ -39,7 +39,10 @@ def regions(run: Run) -> Iterator[Finding]:
     t, z, y, x = (
         slice(*sorted(generator.integers(0, n + 1, 2).tolist())) for n in run.volume.shape
     )
-    wrong += _count_unequal(run.volume[t, z, y, x], run.decoded[t, z, y, x])
+    part, decoded = run.volume[t, z, y, x], run.decoded[t, z, y, x]
+    if part.dtype.kind != "f":
+        decoded = np.where(np.isnan(decoded), run.volume.fill, decoded).astype(part.dtype)
+    wrong += _count_unequal(part, decoded)
     yield Finding(name="region = slice", worst=float(wrong), limit=0.0, unit="values")
 
 

@@ -17,7 +17,7 @@ from fhash_codec.paper.network import ArrayTable, Network
 from fhash_codec.paper.points import sample_points
 from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.storage import NumberType
-from fhash_codec.selftest.case import Finding, Run
+from fhash_codec.selftest.case import Finding, Run, as_floats
 from fhash_codec.selftest.checks.oracle import Oracle
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
@@ -250,5 +250,5 @@ def _apart(run: Run, name: str, config: EncodeConfig, limit: float) -> Finding:
     of the range."""
     encode(run.series, run.folder / "other.fhz", config, force=True)
     with open_volume(run.folder / "other.fhz") as volume:
-        worst = float(np.nanmax(np.abs(volume[...] - run.decoded))) / run.data_range
+        worst = float(np.nanmax(np.abs(as_floats(volume) - run.decoded))) / run.data_range
     return Finding(name=name, worst=worst, limit=limit, unit="of the range")

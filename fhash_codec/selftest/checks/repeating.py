@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fhash_codec.encoding import encode
-from fhash_codec.selftest.case import Finding, Run
+from fhash_codec.selftest.case import Finding, Run, as_floats
 from fhash_codec.selftest.checks.access import rounding
 from fhash_codec.selftest.environment import environment
 from fhash_codec.volume import open as open_volume
@@ -76,7 +76,7 @@ def portable(run: Run) -> Iterator[Finding]:
     if native.library() is None:
         return
     with environment(FHASH_NATIVE="0"), open_volume(run.path) as volume:
-        other = volume[...]
+        other = as_floats(volume)
     if run.volume.profile == "compact":
         kind = f"u{other.dtype.itemsize}"
         wrong = int(np.count_nonzero(other.view(kind) != run.decoded.view(kind)))

@@ -17,10 +17,10 @@ from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 1)
+FORMAT_VERSION = (1, 2)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
-KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, "cross", "mask", "predictor"})
+KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, "clip", "cross", "mask", "predictor"})
 """Names in `required_features` that this version understands."""
 PAPER = "paper"
 COMPACT = "compact"

@@ -26,6 +26,7 @@ from fhash_formats.container.source import FileSource, PreviewSource
 from fhash_formats.container.zip_checked import DOCUMENT, MAX_MEMBER, MAX_NAME, NAME
 from fhash_formats.errors import DamagedFileError, InputError, OutputError
 from fhash_formats.support.atomic import replacing
+from fhash_formats.support.plain_json import plain_json
 from fhash_formats.support.slabs import slab_shape
 
 USUAL_CHUNK_BYTES = 2 << 20
@@ -236,6 +237,7 @@ class ContainerWriter:
         """Write the groups, the root with its header and the directory; give the file its name.
 
         `format`, `format_version` and, unless given, `required_features` are added to the header.
+        Figures that JSON cannot hold become null.
 
         Returns:
             Number of bytes of the file.
@@ -275,7 +277,7 @@ class ContainerWriter:
         }
         complete = {
             "required_features": [],
-            **header,
+            **plain_json(header),
             "format": FORMAT,
             "format_version": list(FORMAT_VERSION),
         }

@@ -300,6 +300,7 @@ def _first_settings(task: _Task, transform: TransformSpec) -> TileSettings | Non
         center=task.center,
         low=float(task.low),
         high=float(task.high),
+        clip=True,
         double=_double(task.tile.dtype, task.largest, 2 * task.half_range, first),
         quantum=0.0 if task.error is None else 2 * task.reach * _QUANTUM_SHARE,
     )

@@ -205,3 +205,15 @@ def test_an_array_of_any_axes_is_a_tile_of_four(
     shape: tuple[int, ...], tile: tuple[int, ...]
 ) -> None:
     assert tile_shape(shape) == tile
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "u1", "i4"])
+@pytest.mark.parametrize("share", [0.02, 0.2])
+def test_no_value_leaves_the_range_of_its_chunk(dtype: str, share: float) -> None:
+    values = field((2, 4, 9, 12), 1 if dtype[0] == "f" else 100, dtype)
+    error = float(values.max() - values.min()) * share
+    decoded = decode_chunk(check(values, error, max_error=error), values.shape, values.dtype)
+    assert values.min() <= decoded.min() <= decoded.max() <= values.max()
+    coarse = encode_chunk(values, step=4 * error)
+    decoded = decode_chunk(coarse, values.shape, values.dtype)
+    assert values.min() <= decoded.min() <= decoded.max() <= values.max()

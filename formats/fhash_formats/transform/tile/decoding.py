@@ -34,7 +34,7 @@ from fhash_formats.transform.tile.sections import (
     zero_levels,
 )
 from fhash_formats.transform.tile.settings import TileSettings
-from fhash_formats.transform.values.elementwise import cast, clip_shifted, corrected
+from fhash_formats.transform.values.elementwise import cast, clip_shifted, clipped, corrected
 from fhash_formats.transform.values.quantise import dequantise
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "linear_values",
     "predicted_values",
     "transform_for",
+    "within_range",
 ]
 
 Values = npt.NDArray[Any]
@@ -182,7 +183,8 @@ def _decode_transformed(
         residual = decode_integers(stream.residual, shape, single_band(shape))
     _check_digest(stream, integers, residual)
     if lod:
-        return cast(linear_values(integers, transform, settings, lod), kind), None
+        values = cast(linear_values(integers, transform, settings, lod), kind)
+        return within_range(values, settings), None
     linear = linear_values(integers, transform, settings)
     mask = None if stream.mask is None else _unpack_mask(stream.mask, linear, settings)
     base = linear if settings.head is None else settings.head.apply(linear)
@@ -190,7 +192,7 @@ def _decode_transformed(
     # Without a residual the values are within the range, and finite.
     if residual is not None and settings.quantum * 2.0**31 > largest / 2 and np.isinf(values).any():
         raise DamagedFileError(f"a residual of a coded tile is beyond {kind}")
-    return values, mask
+    return within_range(values, settings), mask
 
 
 def _check_digest(stream: TileStream, integers: Integers, residual: Integers | None) -> None:
@@ -239,6 +241,14 @@ def predicted_values(
     """Values of a tile that is coded by prediction, clipped to the range."""
     values = values_of(integers, predictor)
     return np.clip(values, settings.low, settings.high, out=values)
+
+
+def within_range(decoded: Values, settings: TileSettings) -> Values:
+    """Decoded values in the type of the array, clipped to the range if the settings ask for it.
+
+    In place. It takes no value farther from one that lies in the range.
+    """
+    return clipped(decoded, settings.low, settings.high) if settings.clip else decoded
 
 
 def blank_unoccupied(decoded: Values, occupied: Mask | None, settings: TileSettings) -> Values:

@@ -22,6 +22,7 @@ from fhash_formats.transform.tile.decoding import (
     linear_values,
     predicted_values,
     transform_for,
+    within_range,
 )
 from fhash_formats.transform.tile.filling import filled
 from fhash_formats.transform.tile.sections import (
@@ -263,6 +264,7 @@ def _transformed_tile(task: _Task) -> CodedTile:
             return task.exact()
         residual = result[0] if result[1] else None
     decoded = corrected(base, residual, settings.quantum, task.values.dtype)
+    decoded = within_range(decoded, settings)
     if error is not None and not within(task.values, decoded, error, task.counted):
         return task.exact()
     stream = build_stream(task.own_settings, task.missing, data, integers, residual, mask)

@@ -25,7 +25,7 @@ __all__ = ["TileSettings"]
 
 _REQUIRED = frozenset({"transform", "step", "center", "range"})
 """Keys of settings that have no default."""
-_KEYS = _REQUIRED | {"offsets", "double", "quantum", "head", "mask", "predictor"}
+_KEYS = _REQUIRED | {"offsets", "double", "quantum", "head", "mask", "predictor", "clip"}
 """All keys of settings."""
 _LISTS = "range is [low, high] and offsets are three whole numbers"
 """Message for a range or offsets that are no lists."""
@@ -39,7 +39,7 @@ class TileSettings:
         transform: kinds, depths and bases along (t, z, y, x).
         step: quantiser step, in units of the values; > 0.
         center: value that is coded as zero, in units of the values.
-        low: lower end of the range to which decoded values are clipped.
+        low: lower end of the range to which values are clipped, before head and residual.
         high: upper end of that range.
         offsets: reconstruction offsets of magnitudes 1, 2 and more, in 1/128 step.
         double: whether the arithmetic is in float64; otherwise it is in float32.
@@ -49,6 +49,9 @@ class TileSettings:
             tiles without masks.
         predictor: predictor of tiles that are coded by prediction instead of the transform; None
             where no tile is.
+        clip: whether decoded values are clipped to the range once more at the end, in the type of
+            the array, so that neither residual nor rounding takes them beyond it. Files up to
+            version 1.1 never are.
     """
 
     transform: TransformSpec
@@ -62,6 +65,7 @@ class TileSettings:
     head: NeighbourHead | None = None
     mask: MaskLevels | None = None
     predictor: Predictor | None = None
+    clip: bool = False
 
     def __post_init__(self) -> None:
         for name in ("step", "center", "low", "high", "quantum"):
@@ -97,6 +101,7 @@ class TileSettings:
             "cross": cross,
             "mask": self.mask is not None,
             "predictor": self.predictor is not None,
+            "clip": self.clip,
         }
         return tuple(name for name, is_used in used.items() if is_used)
 
@@ -120,6 +125,8 @@ class TileSettings:
             result["mask"] = self.mask.to_dict()
         if self.predictor is not None:
             result["predictor"] = self.predictor.to_dict()
+        if self.clip:
+            result["clip"] = True
         return result
 
     @classmethod
@@ -135,9 +142,10 @@ class TileSettings:
         offsets = values.get("offsets", [0, 0, 0])
         if not isinstance(offsets, list | tuple):
             raise InputError(_LISTS)
-        double = values.get("double", False)
-        if not isinstance(double, bool):
-            raise InputError("double is true or false")
+        double, clip = values.get("double", False), values.get("clip", False)
+        for name, switch in (("double", double), ("clip", clip)):
+            if not isinstance(switch, bool):
+                raise InputError(f"{name} is true or false")
         head = _unpack_head(values.get("head"))
         mask, predictor = values.get("mask"), values.get("predictor")
         return cls(
@@ -152,6 +160,7 @@ class TileSettings:
             head=None if head is None else NeighbourHead.from_bytes(head),
             mask=None if mask is None else MaskLevels.from_dict(mask),
             predictor=None if predictor is None else Predictor.from_dict(predictor),
+            clip=clip,
         )
 
 

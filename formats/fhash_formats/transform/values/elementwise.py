@@ -21,6 +21,7 @@ __all__ = [
     "all_finite",
     "cast",
     "clip_shifted",
+    "clipped",
     "corrected",
     "free_values",
     "pieces",
@@ -226,6 +227,20 @@ def clip_shifted(values: Values, center: float, low: float, high: float) -> Valu
     with np.errstate(all="ignore"):
         values += kind(center)
         return np.clip(values, kind(low), kind(high), out=values)
+
+
+def clipped(values: Values, low: float, high: float) -> Values:
+    """Values clipped to [low, high] in their own type, in place; NaN and signs of zeros stay.
+
+    `low` and `high` are first rounded to the type of the values, as by `cast`.
+    """
+    ends = cast(np.array([low, high]), values.dtype)
+    flat = values.reshape(-1) if values.flags.c_contiguous else values
+    for part in (flat[piece] for piece in pieces(flat.shape[0])):
+        # Comparisons say which values change: numpy's clip may change the sign of a zero.
+        np.copyto(part, ends[0], where=part < ends[0])
+        np.copyto(part, ends[1], where=part > ends[1])
+    return values
 
 
 def free_values(

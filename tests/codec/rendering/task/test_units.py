@@ -15,7 +15,7 @@ from fhash_codec.volume import Volume
 
 
 def volume(low: float, high: float, dtype: str) -> Volume:
-    fields = SimpleNamespace(value_range=ValueRange(low, high), dtype=np.dtype(dtype))
+    fields = SimpleNamespace(value_range=ValueRange(low, high), float_dtype=np.dtype(dtype))
     return cast(Volume, fields)
 
 

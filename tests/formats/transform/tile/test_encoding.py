@@ -89,3 +89,40 @@ def test_a_bound_too_fine_for_the_quantum_is_kept_by_an_exact_tile() -> None:
     values = wave(dtype=np.float64)
     coded = encode_tile(values, replace(SETTINGS, quantum=1e-12), Coding(error=1e-17))
     assert same(coded.decoded, values)
+
+
+@pytest.mark.parametrize("dtype", ["f2", "f4", "f8", "i2", "u1"])
+@pytest.mark.parametrize("native", ["0", "1"])
+def test_neither_residual_nor_rounding_leaves_the_range(
+    dtype: str, native: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", native)
+    values = np.maximum(wave(dtype="f8"), 0.1)
+    values = (values * (1 if dtype[0] == "f" else 20)).astype(dtype)
+    low, high = float(values.min()), float(values.max())
+    error = (high - low) * 0.2
+    quantum = 1.99 * (error - (0 if dtype[0] == "f" else 0.5))
+    beyond = replace(SETTINGS, low=low, high=high, step=5 * error, quantum=quantum)
+    settings = replace(beyond, clip=True)
+    coding = Coding(weight=0.09, error=error)
+    free, kept = encode_tile(values, beyond, coding), encode_tile(values, settings, coding)
+    assert free.data == kept.data
+    assert free.decoded.min() < low or free.decoded.max() > high
+    assert low <= kept.decoded.min() <= kept.decoded.max() <= high
+    errors = [np.abs(coded.decoded.astype(float) - values) for coded in (free, kept)]
+    assert (errors[1] <= errors[0]).all()
+    for wanted, coded in ((beyond, free), (settings, kept)):
+        assert same(decode_tile(coded.data, SHAPE, dtype, wanted), coded.decoded)
+    coarse = decode_tile(kept.data, SHAPE, dtype, settings, lod=1)
+    assert low <= coarse.min() <= coarse.max() <= high
+
+
+def test_ends_that_float32_rounds_outwards_are_kept_in_float64() -> None:
+    values = np.where(wave(dtype="f8") > 0.3, 0.7, 0.1)
+    assert float(np.float32(0.7)) < 0.7
+    assert float(np.float32(0.1)) > 0.1
+    values = -values
+    settings = replace(SETTINGS, low=-0.7, high=-0.1, quantum=0.0, clip=True)
+    decoded = encode_tile(values, settings, Coding()).decoded
+    assert decoded.dtype == np.float64
+    assert -0.7 <= decoded.min() <= decoded.max() <= -0.1

@@ -16,7 +16,12 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"double": True, "offsets": (-5, -1, 0)}, {"mask": MaskLevels(), "quantum": 0.0}],
+    [
+        {},
+        {"double": True, "offsets": (-5, -1, 0)},
+        {"mask": MaskLevels(), "quantum": 0.0},
+        {"clip": True},
+    ],
 )
 def test_settings_come_back_from_json(changes: dict[str, Any]) -> None:
     settings = replace(SETTINGS, **changes)
@@ -53,7 +58,8 @@ def test_settings_out_of_range_are_refused(changes: dict[str, Any], message: str
         ({"stepp": 1.0}, "unknown setting 'stepp'"),
         ({"range": [1.0]}, "range is"),
         ({"offsets": 3}, "offsets are three"),
-        ({"double": 1}, "true or false"),
+        ({"double": 1}, "double is true or false"),
+        ({"clip": None}, "clip is true or false"),
         ({"head": "%"}, "not base64"),
     ],
 )

@@ -16,6 +16,7 @@ from fhash_formats.transform.values.elementwise import (
     all_finite,
     cast,
     clip_shifted,
+    clipped,
     corrected,
     free_values,
     residual_of,
@@ -233,3 +234,25 @@ def test_arrays_that_are_not_in_order() -> None:
     result = residual_of(turned, given + np.float32(1), None, 0.5, LARGEST)
     assert result is not None
     assert (result[0] == -2).all()
+
+
+@pytest.mark.parametrize("dtype", TYPES)
+def test_values_are_clipped_in_their_own_type(dtype: str) -> None:
+    original = values(dtype)
+    low, high = (-0.3, 1.1) if original.dtype.kind == "f" else (3.0, 90.0)
+    ends = np.array([low, high]).astype(dtype)
+    result = clipped(original.copy(), low, high)
+    below, above = original < ends[0], original > ends[1]
+    assert np.array_equal(result[below], np.full(below.sum(), ends[0]))
+    assert np.array_equal(result[above], np.full(above.sum(), ends[1]))
+    kept = ~(below | above)
+    assert result[kept].tobytes() == original[kept].tobytes()
+
+
+def test_clipping_keeps_the_signs_of_zeros_and_reaches_every_view() -> None:
+    zeros = clipped(np.array([-0.0, 0.0, np.nan, -1.0], "f4"), 0.0, 1.0)
+    assert np.signbit(zeros).tolist() == [True, False, False, False]
+    assert np.isnan(zeros[2])
+    turned = np.arange(-6.0, 6.0).reshape(3, 4).T
+    assert clipped(turned, -1.0, 2.0) is turned
+    assert (turned.min(), turned.max()) == (-1.0, 2.0)
