@@ -14,6 +14,7 @@ from fhash_codec.compact.tiles_to_promise import code_series
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import select_features
 from fhash_codec.header import brief_history, describe_source, write_series
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
 from fhash_formats import native
 from fhash_formats.container import ContainerWriter
@@ -58,12 +59,20 @@ def encode_compact(
         "features": [str(feature) for feature in selection.features],
         "coreset_fraction": extent.fraction,
         "model": model_header(table, config),
-        "config": _changed_options(config) | promise(config),
+        "config": _changed_options(config)
+        | promise(config, selection.scanned.value_range, table.bulk),
+        # The figures are measured on the written bytes, within this bulk.
+        "quality": {"bulk": _described(table.bulk)},
         "training": {"seconds": seconds, "epochs": 0, "device": "cpu"},
         "history": {
             name: [point.get(name) for point in history] for name in (history[0] if history else ())
         },
     }
+
+
+def _described(bulk: ValueRange | None) -> dict[str, Any] | None:
+    """Return what a header says of a bulk that nothing was measured in yet."""
+    return None if bulk is None else {"range": [bulk.low, bulk.high]}
 
 
 def _changed_options(config: EncodeConfig) -> dict[str, Any]:
