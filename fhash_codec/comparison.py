@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy.typing as npt
+
 from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.measure.bulk import find_bulk
 from fhash_codec.measure.metrics import measure_quality
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
 from fhash_codec.volume import Volume
@@ -36,6 +41,7 @@ def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> di
 def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any]:
     """Measure every decoded step of a volume against its series: `metrics.Quality` as JSON values.
 
+    The bulk is that of the volume's header; it is found in the series if the header knows none.
     Raises InputError if the series changed since it was opened.
     """
     data_range = volume.value_range.high - volume.value_range.low
@@ -48,6 +54,21 @@ def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any
         data_range,
         volume.background,
         progress,
+        bulk=_bulk(series, volume),
     )
     series.check()
     return quality.to_dict()
+
+
+def _bulk(series: Series, volume: Volume) -> ValueRange | None:
+    """The bulk of the values of a series that are in the coreset of a volume."""
+    known = volume.info["quality"]
+    if "bulk" in known:
+        return None if known["bulk"] is None else ValueRange(*map(float, known["bulk"]["range"]))
+
+    def counted_values() -> Iterator[npt.NDArray[Any]]:
+        for step, frame in enumerate(series.frames()):
+            mask = volume.occupancy(step)
+            yield frame if mask.all() else frame[mask]
+
+    return find_bulk(counted_values, volume.value_range, whole=series.dtype.kind in "iu")

@@ -21,8 +21,11 @@ TABLE_TYPES = ("float32", "float16", "uint8", "transform")
 ENGINES = ("slab", "naive")
 """Training engines of the paper profile."""
 
-PROMISES = ("psnr", "max_error", "max_error_rel", "ratio")
-"""Settings that promise a quality or a size; at most one of them is given."""
+PROMISES = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
+"""Settings that promise a quality or a size; at most one of them is given, or PAIR."""
+
+PAIR = ("psnr", "psnr_bulk")
+"""Promises that may be given together."""
 
 
 def option(
@@ -118,6 +121,13 @@ class EncodeConfig:
         None,
         "promise of quality in dB over the coreset of all steps "
         "(compact: 50 if nothing is promised); missing it ends with exit code 3",
+        low=0.0,
+        high=400.0,
+    )
+    psnr_bulk: float | None = option(
+        None,
+        "promise of quality in dB within the bulk, the range of the middle 98 % of the values "
+        "(compact: 40 if nothing is promised); alone or beside psnr",
         low=0.0,
         high=400.0,
     )
@@ -227,14 +237,15 @@ class EncodeConfig:
                 )
 
     def _check_promises(self) -> None:
-        """Raise InputError if more than one promise is given."""
+        """Raise InputError if more than one promise is given, except the two of PAIR."""
         promised = [
-            _option_name(field)
+            field
             for field in dataclasses.fields(self)
             if field.name in PROMISES and getattr(self, field.name) is not None
         ]
-        if len(promised) > 1:
-            raise InputError(f"{' and '.join(promised)} are given; promise one of them")
+        if len(promised) > 1 and not {field.name for field in promised} <= set(PAIR):
+            names = " and ".join(map(_option_name, promised))
+            raise InputError(f"{names} are given; promise one of them")
 
 
 def _option_name(field: dataclasses.Field[Any]) -> str:

@@ -151,6 +151,10 @@ def brief_quality(quality: Mapping[str, Any]) -> dict[str, Any]:
         name: _figure(name, value, DIGITS) if isinstance(value, float) else value
         for name, value in quality.items()
     }
+    bulk = quality.get("bulk")
+    if bulk is not None:
+        # The RMSE follows from the two others.
+        brief["bulk"] = {"psnr": _figure("psnr", bulk["psnr"], DIGITS), "range": bulk["range"]}
     steps = quality["per_step"]
     brief["per_step"] = {
         name: [_figure(name, step[name], STEP_DIGITS) for step in steps]

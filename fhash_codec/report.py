@@ -21,6 +21,9 @@ def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[s
         ratio: raw_bytes / bytes.
         psnr, rmse, max_abs_error, ssim: over the coreset of all steps, those between key frames
             included; in dB and data units. None if the error or the range is 0.
+        psnr_bulk: over the vertices of the coreset whose original value lies in the bulk, the range
+            of the middle 98 % of its values, relative to the width of that range. None without a
+            bulk, or if the error is 0.
         psnr_domain: over every finite vertex, with the background outside the coreset.
         curve: the training history.
         restarts: how often the training diverged and began again at a quarter of the learning rate.
@@ -33,6 +36,7 @@ def report(volume: Volume, quality: dict[str, Any], *, seconds: float) -> dict[s
         "raw_bytes": info["raw_bytes"],
         "ratio": info["ratio"],
         **{name: quality[name] for name in FIGURES},
+        "psnr_bulk": None if quality["bulk"] is None else quality["bulk"]["psnr"],
         "seconds": seconds,
         "epochs": info["training"]["epochs"],
         "curve": history_points(info["history"]),

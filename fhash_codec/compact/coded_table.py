@@ -9,6 +9,7 @@ from fhash_codec.compact.plan import CodingPlan
 from fhash_codec.compact.tiles.coding import Outcome
 from fhash_codec.compact.tiles.tiling import shard_shape
 from fhash_codec.config import EncodeConfig
+from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import ContainerWriter
 
 __all__ = ["CodedTable", "model_header", "required_features", "write_table"]
@@ -24,6 +25,8 @@ class CodedTable:
     """Stream of each tile, in C order."""
     outcome: Outcome
     """Size and error of all tiles."""
+    bulk: ValueRange | None = None
+    """Bulk of the values that count, in data units; None if they have none."""
 
 
 def write_table(writer: ContainerWriter, table: CodedTable) -> None:

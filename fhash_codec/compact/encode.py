@@ -15,6 +15,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.selection import select_features
 from fhash_codec.header import brief_history, describe_source, history_columns, write_series
+from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
 from fhash_formats import native
 from fhash_formats.container import ContainerWriter
@@ -66,10 +67,18 @@ def encode_compact(
         "features": [str(feature) for feature in selection.features],
         "coreset_fraction": extent.fraction,
         "model": model_header(table, config),
-        "config": _changed_options(config) | promise(config),
+        "config": _changed_options(config)
+        | promise(config, selection.scanned.value_range, table.bulk),
+        # The figures are measured on the written bytes, within this bulk.
+        "quality": {"bulk": _described(table.bulk)},
         "training": {"seconds": seconds, "epochs": 0, "device": "cpu"},
         "history": history_columns(history),
     }
+
+
+def _described(bulk: ValueRange | None) -> dict[str, Any] | None:
+    """Return what a header says of a bulk that nothing was measured in yet."""
+    return None if bulk is None else {"range": [bulk.low, bulk.high]}
 
 
 def _changed_options(config: EncodeConfig) -> dict[str, Any]:

@@ -174,15 +174,22 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
     """Return the plan of effort 1: tiles and step from estimates, the usual transform."""
     goal = task.goal
     assert goal.psnr is not None
+    assert goal.even_psnr is not None
     if task.fixed_tile is None:
         size = estimated_size(
-            tiled, settings, psnr=goal.psnr, data_range=goal.data_range, workers=task.workers
+            tiled, settings, psnr=goal.even_psnr, data_range=goal.data_range, workers=task.workers
         )
         tiled = task.blocks.retile(tile_for(task.blocks.shape, size))
     settings = replace(settings, transform=usual_transform(tiled.tile))
-    coding = Coding(filled=True, density=0)
+    coding = Coding(filled=True, density=0, bulk=goal.bulk)
     step = estimated_step(
-        tiled, settings, coding, psnr=goal.psnr, data_range=goal.data_range, workers=task.workers
+        tiled,
+        settings,
+        coding,
+        psnr=goal.psnr,
+        even_psnr=goal.even_psnr,
+        data_range=goal.data_range,
+        workers=task.workers,
     )
     return CodingPlan(
         blocks=tiled, settings=with_step(settings, step, goal), coding=coding, goal=goal

@@ -92,7 +92,7 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
 
 def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attempt:
     """Code a few tiles for a first idea of the size."""
-    coding = Coding(filled=task.blocks.complete, density=0)
+    coding = Coding(filled=task.blocks.complete, density=0, bulk=task.goal.bulk)
     sample = _sample(task, tiled, settings, LOOK_VERTICES)
     settings = _with_mask(task, sample, settings, task.goal.expected_error)
     settings, outcome = find_step(sample, settings, coding, task.goal, tries=2)

@@ -23,6 +23,7 @@ from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile
 from fhash_codec.compact.tiles.coding import Outcome, code, total
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
+from fhash_codec.measure.bulk import find_bulk
 from fhash_codec.progress import Progress
 from fhash_formats.series import Series
 from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
@@ -55,11 +56,11 @@ def code_series(
     """Plan and code all tiles so that the promise of the settings is kept, if it can be."""
     value_range = selection.scanned.value_range
     raw_bytes = prod(series.shape) * (series.source_dtype or series.dtype).itemsize
-    blocks = Blocks(series, selection.extent, series.shape)
-    goal = goal_of(
-        config, value_range, raw_bytes, OVERHEAD_BYTES, integers=blocks.dtype.kind in "iu"
-    )
     begun = time.perf_counter()
+    blocks = Blocks(series, selection.extent, series.shape)
+    integers = blocks.dtype.kind in "iu"
+    bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
+    goal = goal_of(config, value_range, raw_bytes, OVERHEAD_BYTES, bulk, integers=integers)
     with thread_pool() as workers:
         coding_plan = plan(
             blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress, selection.features
@@ -74,7 +75,8 @@ def code_series(
         "bytes": table.outcome.size + OVERHEAD_BYTES,
         "seconds": round(time.perf_counter() - begun, 3),
     }
-    return replace(table, plan=replace(table.plan, gains=[*table.plan.gains, gain]))
+    table = replace(table, plan=replace(table.plan, gains=[*table.plan.gains, gain]))
+    return replace(table, bulk=bulk)
 
 
 @dataclass(frozen=True, kw_only=True)

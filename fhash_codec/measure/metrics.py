@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.measure.ssim import SIGMA, WINDOW, ssim, ssim_steps
-from fhash_codec.measure.sums import Values, squared_errors
-from fhash_codec.measure.value_range import power_of_two
+from fhash_codec.measure.sums import ErrorSums, Values, error_sums
+from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import usable_threads
@@ -31,9 +31,6 @@ FRAMES_HELD = 8
 
 VERTICES_HELD = 1 << 24
 """Vertices of these frames together, at most; a single larger frame is allowed."""
-
-Scaled = tuple[int, float, float]
-"""Number of vertices, sum of squares and largest magnitude of scaled differences."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,11 +47,27 @@ class StepQuality:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BulkQuality:
+    """Figures over the counted vertices whose original value lies in the bulk of the series.
+
+    Attributes:
+        psnr: in dB, relative to the width of the bulk; None if the error is 0.
+        rmse: in data units; None if no such vertex is counted.
+        range: first and last value of the bulk, in data units.
+    """
+
+    psnr: float | None
+    rmse: float | None
+    range: tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Quality:
     """Figures of a series; None if no vertex is counted or a figure has no finite value.
 
     Attributes:
         psnr, rmse, max_abs_error: over the coreset of all steps, in dB and data units.
+        bulk: over the part of it whose values are the bulk; None without a bulk.
         ssim: mean over the coreset of the measured steps.
         ssim_window: sigma and window of the SSIM in vertices, the data range and measured steps.
         psnr_domain, rmse_domain, max_abs_error_domain: over all vertices, with the background as
@@ -65,6 +78,7 @@ class Quality:
     psnr: float | None
     rmse: float | None
     max_abs_error: float | None
+    bulk: BulkQuality | None
     ssim: float | None
     ssim_window: dict[str, Any]
     psnr_domain: float | None
@@ -74,7 +88,10 @@ class Quality:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name."""
-        return {**asdict(self), "per_step": [asdict(step) for step in self.per_step]}
+        values = {**asdict(self), "per_step": [asdict(step) for step in self.per_step]}
+        if self.bulk is not None:
+            values["bulk"]["range"] = list(self.bulk.range)
+        return values
 
 
 class Errors:
@@ -85,20 +102,24 @@ class Errors:
 
     Attributes:
         data_range: of the original series, in data units; inf is allowed and makes PSNR None.
+        bulk: of the original series, in data units; None without one.
         count: vertices compared so far.
         steps: a StepQuality per frame.
     """
 
-    def __init__(self, data_range: float) -> None:
+    def __init__(self, data_range: float, bulk: ValueRange | None = None) -> None:
         """Begin without frames; raises InputError for a range below 0 or NaN."""
         if not data_range >= 0:
             raise InputError(f"data range is {data_range}; 0 or more is needed")
         self.data_range = data_range
+        self.bulk = bulk
         self.count = 0
         self.steps: list[StepQuality] = []
         self._scale = power_of_two(min(data_range, sys.float_info.max))
         self._squares = 0.0
         self._largest = 0.0
+        self._bulk_count = 0
+        self._bulk_squares = 0.0
 
     def add(
         self,
@@ -121,23 +142,26 @@ class Errors:
         original: Values,
         decoded: Values,
         mask: npt.NDArray[np.bool_] | None = None,
-    ) -> Scaled:
+    ) -> ErrorSums:
         """The scaled differences of a frame, for `take`; parameters and errors as in `add`."""
         if original.shape != decoded.shape or (mask is not None and mask.shape != original.shape):
             raise InputError(
                 f"step {step}: the original is {original.shape}, the decoded {decoded.shape}; "
                 "they must be of one shape"
             )
-        errors = squared_errors(original, decoded, mask, self._scale)
-        if errors[0] < 0:
+        bulk = None if self.bulk is None else (self.bulk.low, self.bulk.high)
+        errors = error_sums(original, decoded, mask, self._scale, bulk)
+        if errors.count < 0:
             raise InputError(f"step {step}: decoded values are not finite where they are compared")
         return errors
 
-    def take(self, step: int, errors: Scaled) -> StepQuality:
+    def take(self, step: int, errors: ErrorSums) -> StepQuality:
         """Add the differences of a step, and return its figures."""
-        count, squares, largest = errors
+        count, squares, largest = errors[:3]
         self.count += count
         self._squares += squares
+        self._bulk_count += errors.bulk_count
+        self._bulk_squares += errors.bulk_squares
         self._largest = max(self._largest, largest)
         figures = StepQuality(
             step=step,
@@ -162,6 +186,18 @@ class Errors:
     def max_abs_error(self) -> float | None:
         """The largest difference over all frames, in data units."""
         return self._unscaled(self._largest, self.count)
+
+    def bulk_quality(self) -> BulkQuality | None:
+        """The figures of the bulk over all frames; None without a bulk."""
+        if self.bulk is None:
+            return None
+        squares, count = self._bulk_squares, self._bulk_count
+        width = (self.bulk.high - self.bulk.low) * self._scale
+        return BulkQuality(
+            psnr=psnr(width, math.sqrt(squares / count) if count else None),
+            rmse=self._rmse(squares, count),
+            range=(self.bulk.low, self.bulk.high),
+        )
 
     def _psnr(self, squares: float, count: int) -> float | None:
         # In scaled units: in data units, a mean of denormals would be rounded to a denormal.
@@ -193,8 +229,8 @@ class _Comparison:
     """
 
     step: int
-    coreset: Scaled
-    domain: Scaled
+    coreset: ErrorSums
+    domain: ErrorSums
     similarity: tuple[float, int]
 
 
@@ -204,8 +240,8 @@ class _Comparer:
     The figures are added up in the order of the steps, whatever the number of threads.
     """
 
-    def __init__(self, data_range: float, background: float) -> None:
-        self.coreset, self.domain = Errors(data_range), Errors(data_range)
+    def __init__(self, data_range: float, background: float, bulk: ValueRange | None) -> None:
+        self.coreset, self.domain = Errors(data_range, bulk), Errors(data_range)
         self.similarity, self.similar_vertices = 0.0, 0
         self._background = background
 
@@ -245,6 +281,7 @@ class _Comparer:
             psnr=coreset.psnr,
             rmse=coreset.rmse,
             max_abs_error=coreset.max_abs_error,
+            bulk=coreset.bulk_quality(),
             ssim=self.similarity / self.similar_vertices if self.similar_vertices else None,
             ssim_window={
                 "sigma": SIGMA,
@@ -266,6 +303,8 @@ def measure_quality(
     data_range: float,
     background: float,
     progress: Progress = silent,
+    *,
+    bulk: ValueRange | None = None,
 ) -> Quality:
     """Compare all steps of a decoded series with the original.
 
@@ -273,12 +312,13 @@ def measure_quality(
         vertex is in the coreset if its decoded value is finite.
     data_range: of the original series, in data units.
     background: decoded value outside the coreset for the figures over the domain, in data units.
+    bulk: of the original series, in data units (`find_bulk`); no figures of it if None.
 
     At most FRAMES_HELD frames of each series are in memory. The SSIM is measured over the coreset
     of evenly spaced steps (`ssim_steps`). Raises InputError for frames of different shapes.
     Progress stage: "measuring".
     """
-    comparer = _Comparer(data_range, background)
+    comparer = _Comparer(data_range, background, bulk)
     measured = [-1]
     threads, waiting = usable_threads(), deque[Future[_Comparison]]()
 

@@ -9,7 +9,7 @@ steer the encoder, and its bytes must not depend on the machine.
 from __future__ import annotations
 
 import ctypes
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ import numpy.typing as npt
 from fhash_codec import native
 from fhash_codec.measure.value_range import pieces
 
-__all__ = ["Values", "range_and_sum", "squared_errors"]
+__all__ = ["ErrorSums", "Values", "error_sums", "histogram", "range_and_sum", "squared_errors"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -28,6 +28,21 @@ LANES = 256
 
 PIECE = 1 << 14
 """Values that are summed in lanes before the lanes are added up."""
+
+
+class ErrorSums(NamedTuple):
+    """Sums over the scaled differences of counted vertices, all of them and those of the bulk."""
+
+    count: int
+    """Number of counted vertices."""
+    squares: float
+    """Sum of the squares."""
+    largest: float
+    """Largest magnitude."""
+    bulk_count: int = 0
+    """Number of counted vertices whose original value lies in the bulk."""
+    bulk_squares: float = 0.0
+    """Sum of their squares."""
 
 
 def range_and_sum(values: Values, factor: float = 1.0) -> tuple[int, float, float, float]:
@@ -62,12 +77,27 @@ def squared_errors(
 ) -> tuple[int, float, float]:
     """Number, sum of squares and largest magnitude of (original - decoded) * scale, in float64.
 
+    Parameters and results are those of `error_sums` without a bulk.
+    """
+    return error_sums(original, decoded, mask, scale)[:3]
+
+
+def error_sums(
+    original: Values,
+    decoded: Values,
+    mask: Mask | None,
+    scale: float,
+    bulk: tuple[float, float] | None = None,
+) -> ErrorSums:
+    """Sums over (original - decoded) * scale, in float64.
+
     original, decoded: arrays of one shape and any real type.
     mask: of the same shape; all True if None. A vertex is counted if the mask is True and its
         original value is finite.
     scale: a power of two.
+    bulk: the original values, both ends included, that are summed once more; none if None.
 
-    The number is -1 if a decoded value is not finite at a counted vertex. 64-bit integers are
+    The count is -1 if a decoded value is not finite at a counted vertex. 64-bit integers are
     compared exactly; float64 would round their differences to 0.
     """
     library = native.library()
@@ -76,28 +106,85 @@ def squared_errors(
         and original.dtype == decoded.dtype
         and original.dtype in (np.float32, np.float64)
     ):
-        original, decoded = np.ascontiguousarray(original), np.ascontiguousarray(decoded)
-        mask = None if mask is None else np.ascontiguousarray(mask, dtype=np.bool_)
-        pointers = _pointer(decoded), _pointer(mask)
-        size = ctypes.c_int64(original.size)
-        return _call(library, "errors", original, *pointers, size, scale, results=2)
+        return _native_sums(library, original, decoded, mask, scale, bulk)
     exact = original.dtype.kind in "iu" and original.dtype.itemsize == 8
-    count, squares, largest = 0, 0.0, 0.0
+    total = ErrorSums(0, 0.0, 0.0)
     masks = pieces(np.broadcast_to(np.True_, original.shape) if mask is None else mask)
     for source, result, counted in zip(pieces(original), pieces(decoded), masks, strict=True):
         if library is not None and not exact:
-            errors = squared_errors(
+            sums = error_sums(
                 source.astype(np.float64),
                 result.astype(np.float64),
                 None if mask is None else counted,
                 scale,
+                bulk,
             )
         else:
-            errors = _squared_errors(source, result, counted, np.float64(scale))
-        if errors[0] < 0:
-            return -1, 0.0, 0.0
-        count, squares, largest = count + errors[0], squares + errors[1], max(largest, errors[2])
-    return count, squares, largest
+            sums = _numpy_sums(source, result, counted, np.float64(scale), bulk)
+        if sums.count < 0:
+            return sums
+        total = _joined(total, sums)
+    return total
+
+
+def histogram(
+    values: Values, counts: npt.NDArray[np.int64], *, scale: float, low: float, factor: float
+) -> None:
+    """Add the finite values of an array of any shape and real type to a histogram.
+
+    A value goes to bin (value * scale - low) * factor of `counts`, rounded down, and a value beyond
+    either end to the bin there: so the order of the values stays. Computed in float64.
+    """
+    library = native.library()
+    native_type = values.dtype in (np.float32, np.float64)
+    for piece in pieces(values):
+        wide = piece if native_type else piece.astype(np.float64)
+        if library is not None:
+            wide = np.ascontiguousarray(wide)
+            function = getattr(library, f"fhash_histogram_f{wide.dtype.itemsize * 8}")
+            numbers = (ctypes.c_double(number) for number in (scale, low, factor))
+            size, bins = ctypes.c_int64(wide.size), ctypes.c_int64(counts.size)
+            function(_pointer(wide), size, *numbers, bins, _pointer(counts))
+        else:
+            wide = wide[np.isfinite(wide)].astype(np.float64)
+            with np.errstate(over="ignore"):
+                places = np.clip((wide * scale - low) * factor, 0, counts.size - 1)
+            counts += np.bincount(places.astype(np.int64), minlength=counts.size)
+
+
+def _native_sums(
+    library: ctypes.CDLL,
+    original: Values,
+    decoded: Values,
+    mask: Mask | None,
+    scale: float,
+    bulk: tuple[float, float] | None,
+) -> ErrorSums:
+    """`error_sums` of arrays of one type, float32 or float64."""
+    original, decoded = np.ascontiguousarray(original), np.ascontiguousarray(decoded)
+    mask = None if mask is None else np.ascontiguousarray(mask, dtype=np.bool_)
+    size = ctypes.c_int64(original.size)
+    arguments = (original, _pointer(decoded), _pointer(mask), size, float(scale))
+    if bulk is None:
+        return ErrorSums(*_call(library, "errors", *arguments, results=2))
+    low, high = map(float, bulk)
+    count, squares, largest, bulk_squares, bulk_count = _call(
+        library, "bulk_errors", *arguments, low, high, results=4
+    )
+    if count < 0:
+        return ErrorSums(-1, 0.0, 0.0)
+    return ErrorSums(count, squares, largest, int(bulk_count), bulk_squares)
+
+
+def _joined(first: ErrorSums, second: ErrorSums) -> ErrorSums:
+    """The sums over two arrays."""
+    return ErrorSums(
+        count=first.count + second.count,
+        squares=first.squares + second.squares,
+        largest=max(first.largest, second.largest),
+        bulk_count=first.bulk_count + second.bulk_count,
+        bulk_squares=first.bulk_squares + second.bulk_squares,
+    )
 
 
 def _call(
@@ -105,7 +192,7 @@ def _call(
 ) -> tuple[Any, ...]:
     """The count that a native function returns, and the `results` numbers that it writes.
 
-    name: `scan` or `errors`; the function of the type of the values is called.
+    name: `scan`, `errors` or `bulk_errors`; the function of the type of the values is called.
     """
     function = getattr(library, f"fhash_{name}_f{values.dtype.itemsize * 8}")
     output = (ctypes.c_double * results)()
@@ -130,23 +217,38 @@ def _lane_sum(values: Doubles) -> float:
     return total
 
 
-def _squared_errors(
-    original: Values, decoded: Values, mask: Mask, scale: np.float64
-) -> tuple[int, float, float]:
-    """`squared_errors` of one-dimensional arrays by numpy."""
-    count, squares, largest = 0, 0.0, 0.0
+def _numpy_sums(
+    original: Values,
+    decoded: Values,
+    mask: Mask,
+    scale: np.float64,
+    bulk: tuple[float, float] | None,
+) -> ErrorSums:
+    """`error_sums` of one-dimensional arrays by numpy."""
+    total = ErrorSums(0, 0.0, 0.0)
     for start in range(0, original.size, PIECE):
         piece = slice(start, start + PIECE)
         counted = np.isfinite(original[piece]) & mask[piece]
         errors = _scaled_difference(original[piece], decoded[piece], scale)
         difference = np.where(counted, errors, 0.0)
         if not np.isfinite(difference).all():
-            return -1, 0.0, 0.0
-        count += int(np.count_nonzero(counted))
-        largest = max(largest, float(difference.max()), -float(difference.min()))
+            return ErrorSums(-1, 0.0, 0.0)
         with np.errstate(over="ignore"):
-            squares += _lane_sum(np.square(difference))
-    return count, squares, largest
+            squares = np.square(difference)
+            sums = ErrorSums(
+                count=int(np.count_nonzero(counted)),
+                squares=_lane_sum(squares),
+                largest=max(float(difference.max()), -float(difference.min())),
+            )
+            if bulk is not None:
+                values = original[piece].astype(np.float64)
+                inside = counted & (values >= bulk[0]) & (values <= bulk[1])
+                sums = sums._replace(
+                    bulk_count=int(np.count_nonzero(inside)),
+                    bulk_squares=_lane_sum(np.where(inside, squares, 0.0)),
+                )
+            total = _joined(total, sums)
+    return total
 
 
 def _scaled_difference(original: Values, decoded: Values, scale: np.float64) -> Doubles:

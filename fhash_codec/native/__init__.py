@@ -21,6 +21,8 @@ ABI_VERSION = 1
 _KINDS = ("f32", "f64")
 _SCAN = (ARRAY, INTEGER, REAL, ARRAY)
 _ERRORS = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, ARRAY)
+_BULK_ERRORS = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL, REAL, ARRAY)
+_HISTOGRAM = (ARRAY, INTEGER, REAL, REAL, REAL, INTEGER, ARRAY)
 _SSIM = (ARRAY,) * 7
 
 PROTOTYPES: Prototypes = {
@@ -39,6 +41,8 @@ PROTOTYPES: Prototypes = {
     # quality.cpp
     **{f"fhash_scan_{kind}": _SCAN for kind in _KINDS},
     **{f"fhash_errors_{kind}": _ERRORS for kind in _KINDS},
+    **{f"fhash_bulk_errors_{kind}": _BULK_ERRORS for kind in _KINDS},
+    **{f"fhash_histogram_{kind}": _HISTOGRAM for kind in _KINDS},
     **{f"fhash_ssim_{kind}": _SSIM for kind in _KINDS},
     "fhash_magnitudes": (ARRAY, INTEGER, INTEGER, ARRAY, ARRAY),
 }

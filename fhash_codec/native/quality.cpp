@@ -72,21 +72,22 @@ FHASH_INLINE int64_t scan(const T* values, int64_t n, double factor, double* res
 
 // The number of the values that count: those with a finite original where `mask`, if any, is set;
 // -1 where a difference is not finite. result: the sum of the squares of (original - decoded) *
-// scale, and its largest magnitude.
-template <class T, bool MASKED>
+// scale, and its largest magnitude. With BULK also the sum and the number of those whose original
+// lies from `low` to `high`.
+template <class T, bool MASKED, bool BULK>
 FHASH_INLINE int64_t errors(const T* original, const T* decoded, const uint8_t* mask, int64_t n,
-                            double scale, double* result) {
+                            double scale, double low, double high, double* result) {
     const T limit = sizeof(T) == 4 ? (T)FLT_MAX : (T)DBL_MAX;
-    int64_t count = 0;
-    double total = 0, largest = 0;
+    int64_t count = 0, bulk_count = 0;
+    double total = 0, largest = 0, bulk_total = 0;
     for (int64_t start = 0; start < n; start += PIECE) {
         const int64_t stop = std::min(start + PIECE, n);
-        double sums[LANES] = {0}, most[LANES] = {0}, wrong[LANES] = {0};
+        double sums[LANES] = {0}, most[LANES] = {0}, wrong[LANES] = {0}, bulk_sums[LANES] = {0};
         for (int64_t i = start; i < stop; i += LANES) {
             const int width = (int)std::min<int64_t>(LANES, stop - i);
             const T *const ones = original + i, *const others = decoded + i;
             const uint8_t* const chosen = MASKED ? mask + i : nullptr;
-            int counted_here = 0;
+            int counted_here = 0, bulk_here = 0;
             for (int lane = 0; lane < width; lane++) {
                 const T one = ones[lane];
                 const bool finite = (one < 0 ? -one : one) <= limit;
@@ -94,14 +95,22 @@ FHASH_INLINE int64_t errors(const T* original, const T* decoded, const uint8_t* 
                 const T first = counted ? one : (T)0, second = counted ? others[lane] : (T)0;
                 const double difference = (double)first * scale - (double)second * scale;
                 const double size = std::fabs(difference);
-                sums[lane] += difference * difference;
+                const double square = difference * difference;
+                sums[lane] += square;
                 most[lane] = size > most[lane] ? size : most[lane];
                 wrong[lane] += difference - difference;  // 0, or NaN for good
                 counted_here += counted;
+                if (BULK) {
+                    const bool inside = counted & ((double)one >= low) & ((double)one <= high);
+                    bulk_sums[lane] += inside ? square : 0.0;
+                    bulk_here += inside;
+                }
             }
             count += counted_here;
+            bulk_count += bulk_here;
         }
         total += lane_sum(sums);
+        if (BULK) bulk_total += lane_sum(bulk_sums);
         for (int lane = 0; lane < LANES; lane++) {
             if (wrong[lane] != 0) return -1;
             largest = std::max(largest, most[lane]);
@@ -109,6 +118,28 @@ FHASH_INLINE int64_t errors(const T* original, const T* decoded, const uint8_t* 
     }
     result[0] = total;
     result[1] = largest;
+    if (BULK) {
+        result[2] = bulk_total;
+        result[3] = (double)bulk_count;
+    }
+    return count;
+}
+
+// Add n values to a histogram of equal bins, of which the first begins at `low`, after scaling;
+// factor: bins per unit. Values beyond either end go to the bin there, so that ranks stay right.
+template <class T>
+FHASH_INLINE int64_t histogram(const T* values, int64_t n, double scale, double low, double factor,
+                               int64_t bins, int64_t* counts) {
+    const T largest = sizeof(T) == 4 ? (T)FLT_MAX : (T)DBL_MAX;
+    const double last = (double)(bins - 1);
+    int64_t count = 0;
+    for (int64_t i = 0; i < n; i++) {
+        const T value = values[i];
+        if (!((value < 0 ? -value : value) <= largest)) continue;
+        const double place = ((double)value * scale - low) * factor;
+        counts[(int64_t)(place < 0 ? 0.0 : place > last ? last : place)]++;
+        count++;
+    }
     return count;
 }
 
@@ -314,20 +345,32 @@ FHASH_CLONES int64_t scan_double(const double* values, int64_t n, double factor,
 }
 FHASH_CLONES int64_t errors_float(const float* one, const float* other, int64_t n, double scale,
                                   double* result) {
-    return errors<float, false>(one, other, nullptr, n, scale, result);
+    return errors<float, false, false>(one, other, nullptr, n, scale, 0, 0, result);
 }
 FHASH_CLONES int64_t errors_double(const double* one, const double* other, int64_t n, double scale,
                                    double* result) {
-    return errors<double, false>(one, other, nullptr, n, scale, result);
+    return errors<double, false, false>(one, other, nullptr, n, scale, 0, 0, result);
 }
 FHASH_CLONES int64_t masked_errors_float(const float* one, const float* other, const uint8_t* mask,
                                          int64_t n, double scale, double* result) {
-    return errors<float, true>(one, other, mask, n, scale, result);
+    return errors<float, true, false>(one, other, mask, n, scale, 0, 0, result);
 }
 FHASH_CLONES int64_t masked_errors_double(const double* one, const double* other,
                                           const uint8_t* mask, int64_t n, double scale,
                                           double* result) {
-    return errors<double, true>(one, other, mask, n, scale, result);
+    return errors<double, true, false>(one, other, mask, n, scale, 0, 0, result);
+}
+FHASH_CLONES int64_t bulk_errors_float(const float* one, const float* other, const uint8_t* mask,
+                                       int64_t n, double scale, double low, double high,
+                                       double* result) {
+    return mask ? errors<float, true, true>(one, other, mask, n, scale, low, high, result)
+                : errors<float, false, true>(one, other, mask, n, scale, low, high, result);
+}
+FHASH_CLONES int64_t bulk_errors_double(const double* one, const double* other,
+                                        const uint8_t* mask, int64_t n, double scale, double low,
+                                        double high, double* result) {
+    return mask ? errors<double, true, true>(one, other, mask, n, scale, low, high, result)
+                : errors<double, false, true>(one, other, mask, n, scale, low, high, result);
 }
 FHASH_CLONES int64_t similarity_float(const float* one, const float* other, const Frame& frame,
                                       const int64_t* tile, double* result) {
@@ -366,6 +409,30 @@ FHASH_EXPORT int64_t fhash_errors_f64(const double* original, const double* deco
                                       double* result) {
     return mask ? masked_errors_double(original, decoded, mask, n, scale, result)
                 : errors_double(original, decoded, n, scale, result);
+}
+
+// The same, and in result also the sum of the squares and the number of the values that count whose
+// original lies from low to high.
+FHASH_EXPORT int64_t fhash_bulk_errors_f32(const float* original, const float* decoded,
+                                           const uint8_t* mask, int64_t n, double scale, double low,
+                                           double high, double* result) {
+    return bulk_errors_float(original, decoded, mask, n, scale, low, high, result);
+}
+FHASH_EXPORT int64_t fhash_bulk_errors_f64(const double* original, const double* decoded,
+                                           const uint8_t* mask, int64_t n, double scale, double low,
+                                           double high, double* result) {
+    return bulk_errors_double(original, decoded, mask, n, scale, low, high, result);
+}
+
+// Add the finite ones of n values to `counts`, a histogram of `bins` equal bins: a value goes to
+// bin (value * scale - low) * factor, or to the first or last one. Returns their number.
+FHASH_EXPORT int64_t fhash_histogram_f32(const float* values, int64_t n, double scale, double low,
+                                         double factor, int64_t bins, int64_t* counts) {
+    return histogram(values, n, scale, low, factor, bins, counts);
+}
+FHASH_EXPORT int64_t fhash_histogram_f64(const double* values, int64_t n, double scale, double low,
+                                         double factor, int64_t bins, int64_t* counts) {
+    return histogram(values, n, scale, low, factor, bins, counts);
 }
 
 // The structural similarity over a tile of two frames (fhash_codec/measure/ssim.py). shape: (z, y,

@@ -21,6 +21,7 @@ from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Blocks, Index
 from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Coding, code
 from fhash_codec.compact.tiles.tiling import even_tile
+from fhash_codec.measure.bulk import BULK_SHARE
 from fhash_formats.transform.tile.decoding import transform_for
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -146,17 +147,21 @@ def estimated_step(
     coding: Coding,
     *,
     psnr: float,
+    even_psnr: float,
     data_range: float,
     workers: ThreadPoolExecutor,
 ) -> float:
     """Return the step at which the tiles of a series should reach a PSNR (dB).
+
+    even_psnr: PSNR that keeps the promise if errors are everywhere alike: more than `psnr` where
+        the coding measures a bulk that needs it.
 
     The series must be in memory, all of its vertices in the coreset, and coded in float32.
     """
     min_step = data_range * MIN_STEP_SHARE
     error = _squared_error(blocks, psnr, data_range)
     series = _sum(_tile_magnitudes(blocks, settings, workers))
-    step = series.step(error, min_step)
+    step = series.step(_squared_error(blocks, even_psnr, data_range), min_step)
     if math.prod(blocks.tile) > TRIAL_VERTICES:
         # Large tiles take long to code, and smaller ones tell as much.
         parts = math.prod(blocks.tile) // TRIAL_VERTICES + 1
@@ -166,17 +171,24 @@ def estimated_step(
     indices = list(blocks.indices())
     tiles = _tile_magnitudes(blocks, settings, workers)
 
-    def measured_to_estimated(number: int) -> float:
-        measured = code(blocks.read(indices[number]), settings, coding)[1].squares
+    def measured_to_estimated(number: int) -> tuple[float, float]:
+        outcome = code(blocks.read(indices[number]), settings, coding)[1]
         estimate = tiles[number].error(step)
-        return measured / estimate if estimate > 0 and measured > 0 else 1.0
+        if estimate > 0 and outcome.squares > 0:
+            return outcome.squares / estimate, outcome.bulk_squares / estimate
+        return 1.0, 0.0
 
     # The chance of a tile is its share of the error, so that those of most error stand for all.
     sums = np.cumsum([tile.error(step) for tile in tiles])
     chosen = np.searchsorted(sums, sums[-1] * (np.arange(TRIALS) + 0.5) / TRIALS)
     numbers = np.unique(chosen.clip(0, len(tiles) - 1))
     ratios = list(workers.map(measured_to_estimated, (int(number) for number in numbers)))
-    return series.step(error * len(ratios) / math.fsum(ratios), min_step)
+    whole, bulk = (math.fsum(part) for part in zip(*ratios, strict=True))
+    step = series.step(error * len(ratios) / whole, min_step)
+    if bulk == 0:
+        return step
+    error *= BULK_SHARE
+    return min(step, series.step(error * len(ratios) / bulk, min_step))
 
 
 def _squared_error(blocks: Blocks, psnr: float, data_range: float) -> float:

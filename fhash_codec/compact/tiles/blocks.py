@@ -119,14 +119,32 @@ class Blocks:
             in_coreset = np.ones(values.shape, bool)
         return Tile(np.pad(values, padding, mode="edge"), np.pad(in_coreset, padding))
 
+    def counted_values(self) -> Iterator[Values]:
+        """Yield the values that count of each step, in the type of the source.
+
+        A series that does not stay in memory is read once, step by step.
+        """
+        for step in range(self.shape[0]):
+            if self.in_memory:
+                values, in_coreset = self._whole()
+                frame, mask = values[step], None if in_coreset is None else in_coreset[step]
+            else:
+                values, in_coreset = self._load(range(step, step + 1))
+                frame, mask = values[0], None if in_coreset is None else in_coreset[0]
+            yield frame if mask is None else frame[mask]
+
+    def _whole(self) -> Tile:
+        """Return the box over all steps, which is read at the first call."""
+        with self._box.lock:
+            if self._box.content is None:
+                self._box.content = self._load(range(self.shape[0]))
+            return self._box.content
+
     def _layer(self, t: int) -> Tile:
         """Return one layer of tiles, (up to tile t, z, y, x of the box)."""
         steps = range(t * self.tile[0], min((t + 1) * self.tile[0], self.shape[0]))
         if self.in_memory:
-            with self._box.lock:
-                if self._box.content is None:
-                    self._box.content = self._load(range(self.shape[0]))
-            values, in_coreset = self._box.content
+            values, in_coreset = self._whole()
             span = slice(steps[0], steps[-1] + 1)
             return Tile(values[span], None if in_coreset is None else in_coreset[span])
         if self._last_layer is None or self._last_layer[0] != t:

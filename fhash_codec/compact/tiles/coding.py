@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fhash_codec.compact.tiles.blocks import Tile
-from fhash_codec.measure.sums import squared_errors
+from fhash_codec.measure.sums import error_sums
 from fhash_codec.measure.value_range import power_of_two
 from fhash_formats.transform.tile import encoding
 from fhash_formats.transform.tile.encoding import CodedTile, encode_tile, exact_tile
@@ -26,6 +26,20 @@ MIN_STEP_SHARE = 2.0**-26
 
 
 @dataclass(frozen=True, kw_only=True)
+class BulkPart:
+    """The part of a promise that is about the bulk of the values, as tiles measure it."""
+
+    low: float
+    """Least value of the bulk, in data units."""
+    high: float
+    """Greatest value of the bulk, in data units."""
+    weight: float = 1.0
+    """Mean squared error that is promised of all values, as a multiple of that of the bulk."""
+    alone: bool = False
+    """Whether nothing is promised of the other values; the weight is then 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Coding(encoding.Coding):
     """Options of the encoder for the tiles of a series.
 
@@ -37,6 +51,8 @@ class Coding(encoding.Coding):
     keep_missing: bool = False
     exact: bool = False
     """Whether tiles are stored without loss, by `exact_tile`; the other options are then unused."""
+    bulk: BulkPart | None = None
+    """Part of the promise about the bulk, which changes what is measured and no byte."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +69,23 @@ class Outcome:
     """Largest absolute error, in data units."""
     nonzero: int = 0
     """Number of coefficients that are not 0."""
+    bulk_squares: float = 0.0
+    """Sum of the squared errors in the bulk times its weight; 0 without a promise about it."""
+    bulk_count: int = 0
+    """Number of the values that this sum is over."""
 
     def psnr(self, data_range: float) -> float:
-        """Return the PSNR in dB; infinite without error."""
-        if self.squares == 0 or self.count == 0 or data_range == 0:
+        """Return the PSNR in dB; infinite without error.
+
+        Where a promise about the bulk is harder to keep than that about all values, it is the PSNR
+        over all values that would be as far from its promise.
+        """
+        mean = self.squares / self.count if self.count else 0.0
+        if self.bulk_count:
+            mean = max(mean, self.bulk_squares / self.bulk_count)
+        if mean == 0 or data_range == 0:
             return math.inf
-        return 20 * math.log10(data_range) - 10 * math.log10(self.squares / self.count)
+        return 20 * math.log10(data_range) - 10 * math.log10(mean)
 
 
 def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile, Outcome]:
@@ -74,13 +101,21 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
     coded = encode_tile(values, settings, coding, in_coreset=counted)
     # Scaled, so that neither huge nor tiny ranges over- or underflow.
     scale = power_of_two(settings.high - settings.low)
-    count, squares, max_error = squared_errors(values, coded.decoded, counted, scale)
+    bulk = coding.bulk
+    ends = None if bulk is None else (bulk.low, bulk.high)
+    sums = error_sums(values, coded.decoded, counted, scale, ends)
+    squares, count = sums.squares, sums.count
+    bulk_squares, bulk_count = sums.bulk_squares, sums.bulk_count
+    if bulk is not None and bulk.alone:
+        squares, count, bulk_squares, bulk_count = bulk_squares, bulk_count, 0.0, 0
     outcome = Outcome(
         size=len(coded.data),
         squares=squares / scale**2,
         count=count,
-        max_error=max_error / scale,
+        max_error=sums.largest / scale,
         nonzero=coded.nonzero,
+        bulk_squares=bulk_squares * (1.0 if bulk is None else bulk.weight) / scale**2,
+        bulk_count=bulk_count,
     )
     return coded, outcome
 
@@ -94,4 +129,6 @@ def total(outcomes: Sequence[Outcome], weights: Sequence[int] | None = None) -> 
         count=sum(weight * o.count for weight, o in pairs),
         max_error=max((o.max_error for o in outcomes), default=0.0),
         nonzero=sum(weight * o.nonzero for weight, o in pairs),
+        bulk_squares=math.fsum(weight * o.bulk_squares for weight, o in pairs),
+        bulk_count=sum(weight * o.bulk_count for weight, o in pairs),
     )

@@ -78,7 +78,18 @@ def validate_header(header: Mapping[str, Any]) -> None:
     quality = top.record("quality")
     for key in QUALITY:
         quality.number_or_null(key)
+    _check_bulk(quality)
     _check_history(top, profile)
+
+
+def _check_bulk(quality: Record) -> None:
+    """Check the figures of the bulk, which may be missing or null."""
+    if not quality.has("bulk") or quality.get("bulk") is None:
+        return
+    bulk = quality.record("bulk")
+    bulk.number_or_null("psnr")
+    low, high = bulk.numbers("range", 2)
+    bulk.need(low <= high, "range", "two numbers, the lower first")
 
 
 def _check_format(top: Record) -> None:
