@@ -61,6 +61,10 @@ class Series(ABC):
         attributes: attributes of the variable, JSON values.
         files: files and folders that the series is read from, which no output may replace; empty
             for a series in memory.
+        source_dtype: the integer type of the source where missing values made the frames floats;
+            None where the frames have the type of the source.
+        fill: the number that stood in the source for a missing value; None where there is none.
+        keep_extremes: whether the user said that extreme values which repeat are data.
     """
 
     source: str
@@ -71,6 +75,9 @@ class Series(ABC):
     coords: Mapping[str, Coordinate]
     attributes: Mapping[str, Any]
     files: tuple[Path, ...] = ()
+    source_dtype: np.dtype[Any] | None = None
+    fill: int | float | None = None
+    keep_extremes: bool = False
 
     @abstractmethod
     def read(self, step: int) -> npt.NDArray[Any]:
@@ -131,6 +138,8 @@ class StepsSeries(Series):
         self.steps = tuple(steps)
         self.source, self.name, self.units = series.source, series.name, series.units
         self.dtype, self.attributes, self.files = series.dtype, series.attributes, series.files
+        self.source_dtype, self.fill = series.source_dtype, series.fill
+        self.keep_extremes = series.keep_extremes
         self.shape = (len(self.steps), *series.shape[1:])
         time = series.coords["t"]
         self.coords = {
