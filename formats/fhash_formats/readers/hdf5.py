@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fhash_formats.readers.common import openpmd, step_groups
-from fhash_formats.readers.common.cf_packing import Packing, packing
+from fhash_formats.readers.common.cf_packing import SCALING, Packing, packing
 from fhash_formats.readers.common.failures import Stamp, refusing
 from fhash_formats.readers.common.fields import expand, reading
 from fhash_formats.readers.common.file_series import FileSeries
@@ -33,9 +33,6 @@ from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
 from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
 from fhash_formats.series import Coordinate
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
-
-SCALING = frozenset(("scale_factor", "add_offset"))
-"""Attributes that make stored numbers counts of another unit."""
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 

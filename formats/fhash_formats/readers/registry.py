@@ -45,7 +45,11 @@ class Reader:
 
 RAW = Reader(name="raw", suffixes=(".raw", ".bin", ".dat"), matches=raw.matches, open=raw.open_raw)
 ZARR = Reader(
-    name="Zarr", suffixes=(".zarr", ".zip"), matches=zarr_store.matches, open=zarr_store.open_zarr
+    name="Zarr",
+    suffixes=(".zarr", ".zip"),
+    matches=zarr_store.matches,
+    open=zarr_store.open_zarr,
+    variables=zarr_store.list_zarr,
 )
 REGISTRY = (
     RAW,

@@ -22,6 +22,9 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError
 from fhash_formats.support.attributes import text_of
 
+SCALING = frozenset(("scale_factor", "add_offset"))
+"""Attributes that make stored numbers counts of another unit."""
+
 AS_STORED = "; --raw-values reads the numbers as they are stored"
 """Advice where attributes make no sense."""
 

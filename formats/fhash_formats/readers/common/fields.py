@@ -39,12 +39,17 @@ def leaves(
 
 
 def expand(variables: Sequence[Variable]) -> list[Variable]:
-    """The variables, with one for each field in place of those of a compound or complex type."""
+    """The variables, with one for each field in place of those of a compound type.
+
+    The parts of a complex array are there by name only, beside the array itself.
+    """
     expanded = []
     for variable in variables:
         if variable.dtype.names is None and variable.dtype.kind != "c":
             expanded.append(variable)
             continue
+        if variable.dtype.kind == "c":
+            expanded.append(variable)
         expanded += [
             replace(
                 variable,
@@ -52,6 +57,7 @@ def expand(variables: Sequence[Variable]) -> list[Variable]:
                 shape=(*variable.shape, *shape),
                 dtype=dtype,
                 field=path,
+                auxiliary=variable.auxiliary or variable.dtype.kind == "c",
             )
             for path, dtype, shape in leaves(variable.dtype)
         ]

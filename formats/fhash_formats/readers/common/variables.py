@@ -75,6 +75,11 @@ class Variable:
                 "boolean values; a mask is given with --feature mask:FILE,"
                 " values are integers or floats"
             )
+        if self.dtype.kind == "c":
+            return (
+                f"values of type {kind_of(self.dtype)}; read its parts, with"
+                f" --var {self.name}.real and --var {self.name}.imag"
+            )
         if self.dtype.kind not in "iufb" or self.dtype.itemsize > 8:
             return (
                 f"values of type {kind_of(self.dtype)};"
