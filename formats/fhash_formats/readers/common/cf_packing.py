@@ -174,7 +174,8 @@ def _fill(source: str, value: Any, stored: np.dtype[Any], *, unsigned: bool = Fa
     if not isinstance(value, int | float | np.integer | np.floating):
         raise InputError(f"{source}: the fill value {value!r} is not a number{AS_STORED}")
     if stored.kind == "f":
-        return stored.type(value)
+        with np.errstate(over="ignore"):
+            return stored.type(value)
     if not math.isfinite(value) or value != int(value):
         return None
     integer = int(value)

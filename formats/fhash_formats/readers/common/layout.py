@@ -190,12 +190,14 @@ def arrange(source: str, name: str, dimensions: Sequence[Dimension], request: Re
 
 
 def single(dimensions: Sequence[Dimension], picked: Mapping[int, int]) -> dict[int, int]:
-    """Index 0 along dimensions of length 1 that are no axis, or that are too many."""
+    """Index 0 along named dimensions of length 1 that are no axis, or that are too many."""
     found: dict[int, int] = {}
     for place, dimension in enumerate(dimensions):
         excess = len(dimensions) - len(picked) - len(found) - len(AXES)
         if place in picked or dimension.length != 1 or dimension.role is not None:
             continue
+        if dimension.name is None:
+            continue  # the user says which of several it is
         if dimension.further or excess > 0:
             found[place] = 0
     return found
