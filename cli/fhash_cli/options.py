@@ -109,6 +109,40 @@ class IntervalsType(click.ParamType[tuple[Any, ...]]):
         return intervals
 
 
+class SelectType(click.ParamType[tuple[str, str]]):
+    """One index along a dimension: `member=2`, `dim3=0`, `lev=850.0`, `member=r1i1p1`."""
+
+    name = "NAME=INDEX"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, str]:
+        """Name and index as texts; the file says what they mean."""
+        if isinstance(value, tuple):
+            return value
+        name, equals, index = (word.strip() for word in str(value).rpartition("="))
+        if not (name and equals and index):
+            self.fail(f"'{value}' is not NAME=INDEX, such as member=2 or dim3=0", param, ctx)
+        return name, index
+
+
+class NumberType(click.ParamType[float]):
+    """A number, whole where it is written as one, so that integers of 64 bits stay exact."""
+
+    name = "V"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The number that a text stands for."""
+        for kind in (int, float):
+            try:
+                return kind(value)
+            except ValueError:
+                continue
+        self.fail(f"'{value}' is not a number", param, ctx)
+
+
 def parse_slice(text: str) -> slice:
     """`A:B:S` or one index as a slice; raises ValueError."""
     parts = [int(part) if part.strip() else None for part in text.split(":")]
@@ -130,42 +164,112 @@ class SourceOptions:
     shape: str | None
     dtype: str | None
     endian: str | None
+    select: tuple[tuple[str, str], ...] = ()
+    missing: tuple[float, ...] = ()
+    raw_values: bool = False
+    keep_extremes: bool = False
 
     def open(self, path: str) -> Any:
         """The Series at a path; the caller closes it."""
-        from fhash_formats import RawLayout, open_series, parse_shape
+        from fhash_formats import open_series
 
+        return open_series(path, steps=self.t, keep_extremes=self.keep_extremes, **self._wishes())
+
+    def list(self, path: str) -> Any:
+        """The variables at a path, as `fhash_formats.list_variables` gives them."""
+        from fhash_formats import list_variables
+
+        return list_variables(path, **self._wishes())
+
+    def _wishes(self) -> dict[str, Any]:
+        from fhash_formats import RawLayout, parse_shape
+
+        names = [name for name, _ in self.select]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise InputError(f"--select {twice} is given twice; one index is selected along it")
         raw = RawLayout(
             shape=None if self.shape is None else parse_shape(self.shape),
             dtype=self.dtype,
             endian=self.endian,
         )
-        return open_series(path, var=self.var, axes=self.axes, steps=self.t, raw=raw)
+        return {
+            "var": self.var,
+            "axes": self.axes,
+            "raw": raw,
+            "missing": self.missing,
+            "raw_values": self.raw_values,
+            "select": dict(self.select),
+        }
+
+
+def once(*names: str, why: str = "", **settings: Any) -> Callable[[Command], Command]:
+    """A click option that may be given once; click itself would silently take the last one.
+
+    why: what to do instead of repeating it.
+    """
+
+    def only(context: click.Context, parameter: click.Parameter, values: tuple[Any, ...]) -> Any:
+        if len(values) > 1:
+            raise InputError(
+                f"{names[0]} is given {len(values)} times"
+                + (f"; {why}" if why else "; give it once")
+            )
+        return values[0] if values else None
+
+    decorated: Callable[[Command], Command] = click.option(
+        *names, multiple=True, callback=only, **settings
+    )
+    return decorated
 
 
 def series_options(command: Command) -> Command:
     """Add the options of SourceOptions; the command gets them as `source`."""
 
-    @click.option("--var", metavar="NAME", help="Which variable or dataset of the file.")
+    @once(
+        "--var",
+        metavar="NAME",
+        help="Which variable or dataset of the file; 'state.rho' is a field of a compound type.",
+        why="a file RUN.fhz holds one variable, so encode each with a command of its own",
+    )
     @click.option(
+        "--select",
+        type=SelectType(),
+        multiple=True,
+        help="Index along a dimension that is not t, z, y or x, such as member=2; dim3=0 where it"
+        " has no name. Repeat for several dimensions.",
+    )
+    @click.option(
+        "--missing",
+        type=NumberType(),
+        multiple=True,
+        help="A value that stands for a missing one, such as -9999 or 1e20; repeat for several.",
+    )
+    @click.option(
+        "--raw-values",
+        is_flag=True,
+        help="Read packed numbers as stored: no fill value, scale or offset, and no unit.",
+    )
+    @click.option(
+        "--keep-extremes",
+        is_flag=True,
+        help="An extreme value that repeats, far away from all others, is data.",
+    )
+    @once(
         "--axes",
         metavar="t,z,y,x",
         help="What the file's dimensions are, in its own order; letters left out have length 1.",
     )
-    @click.option(
+    @once(
         "--t", "t", type=SliceType(), help="Only these steps, half-open as in Python: 40:50, ::2."
     )
-    @click.option(
+    @once(
         "--shape",
         metavar="x=64,y=64,z=32,t=10",
         help="Lengths of a raw file, the fastest axis first.",
     )
-    @click.option(
-        "--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8."
-    )
-    @click.option(
-        "--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file."
-    )
+    @once("--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8.")
+    @once("--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file.")
     @functools.wraps(command)
     def collected(**values: Any) -> None:
         names = [field.name for field in dataclasses.fields(SourceOptions)]

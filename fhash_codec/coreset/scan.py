@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.extremes import Extremes
 from fhash_codec.measure.sums import range_and_sum
 from fhash_codec.measure.value_range import Mean, ValueRange, pieces, power_of_two
 from fhash_codec.progress import Progress
@@ -48,10 +49,11 @@ class Scan:
 def scan(series: Series, progress: Progress) -> Scan:
     """Scan every frame once.
 
-    Raises InputError if no value at all is finite, or if the series changed. Progress stage:
-    "scanning".
+    Raises InputError if no value at all is finite, if an extreme value looks like a fill value that
+    nobody declared (extremes.py), or if the series changed. Progress stage: "scanning".
     """
     low, high, mean = np.inf, -np.inf, Mean()
+    extremes = Extremes(series.dtype)
     missing: dict[int, npt.NDArray[np.uint8]] = {}
     last_bits: npt.NDArray[np.uint8] | None = None
     steps = series.shape[0]
@@ -59,6 +61,7 @@ def scan(series: Series, progress: Progress) -> Scan:
         count = 0
         for piece in pieces(frame):
             piece_count, piece_low, piece_high = _scan_piece(piece, mean)
+            extremes.add(piece, piece_count, piece_low, piece_high)
             count, low, high = count + piece_count, min(low, piece_low), max(high, piece_high)
         if count < frame.size:
             bits = np.packbits(~np.isfinite(frame))
@@ -73,6 +76,7 @@ def scan(series: Series, progress: Progress) -> Scan:
             f"{series.source}: '{series.name}' has no finite value in any of its {steps} steps; "
             "there is nothing to encode"
         )
+    extremes.refuse(series)
     value_range = ValueRange(low, high)
     return Scan(
         value_range=value_range,

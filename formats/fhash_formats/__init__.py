@@ -3,12 +3,21 @@
 Importing this package is cheap.
 """
 
-from fhash_formats.readers import RawLayout, open_mask, open_series, parse_shape
+from fhash_formats.readers import (
+    Listed,
+    RawLayout,
+    list_variables,
+    open_mask,
+    open_series,
+    parse_shape,
+)
 from fhash_formats.writers import Region, save_check, save_region
 
 __all__ = [
+    "Listed",
     "RawLayout",
     "Region",
+    "list_variables",
     "open_mask",
     "open_series",
     "parse_shape",

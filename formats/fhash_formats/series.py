@@ -161,6 +161,9 @@ class StepsSeries(Series):
 class ArraySeries(Series):
     """An array in memory, (t, z, y, x) or (z, y, x), as a series; masked floats become NaN.
 
+    missing: numbers that stand for missing values. They become NaN, and integers become floats.
+    keep_extremes: see `Series`.
+
     Raises InputError for an array that cannot be a series, and for coordinates that do not fit.
     """
 
@@ -171,8 +174,15 @@ class ArraySeries(Series):
         name: str = "values",
         units: str = "",
         coords: Mapping[str, Coordinate] | None = None,
+        missing: Sequence[float] = (),
+        keep_extremes: bool = False,
     ) -> None:
         values = _unmasked(array)
+        if missing and values.dtype.kind in "iuf":
+            self.source_dtype = values.dtype if values.dtype.kind in "iu" else None
+            self.fill = missing[0]
+            values = _without(values, missing)
+        self.keep_extremes = keep_extremes
         self.source, self.name, self.units, self.attributes = "array", name, units, {}
         if values.ndim == 3:
             values = values[None]
@@ -247,3 +257,23 @@ def _unmasked(array: npt.ArrayLike) -> npt.NDArray[Any]:
         )
     filled: npt.NDArray[Any] = masked.filled(np.nan)
     return filled
+
+
+def _without(values: npt.NDArray[Any], missing: Sequence[float]) -> npt.NDArray[Any]:
+    """A copy with NaN for some numbers.
+
+    Integers become float32 where it holds all of their type (up to 16 bits), else float64.
+    """
+    dtype = values.dtype
+    if dtype.kind != "f":
+        dtype = np.dtype(np.float32 if dtype.itemsize <= 2 else np.float64)
+    result = values.astype(dtype)
+    for number in missing:
+        # a number of the array's own type is compared exactly; one beyond it is nowhere
+        limits = np.iinfo(values.dtype) if values.dtype.kind in "iu" else None
+        if limits is None:
+            with np.errstate(over="ignore"):
+                result[values == values.dtype.type(number)] = np.nan
+        elif float(number).is_integer() and limits.min <= number <= limits.max:
+            result[values == int(number)] = np.nan
+    return result

@@ -1,12 +1,14 @@
-"""`fhash info`: prints what a container holds and how good it is."""
+"""`fhash info`: prints what a container holds and how good it is, or what a data file holds."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.options import json_option, run_argument
+from fhash_cli.options import SourceOptions, json_option, series_options
 from fhash_cli.output import (
     apart,
     compared,
@@ -25,15 +27,57 @@ if TYPE_CHECKING:
 
 
 @click.command("info")
-@run_argument
+@click.argument("path", metavar="RUN.fhz|DATA", type=click.Path())
+@series_options
 @json_option
-def command(run: str, as_json: bool) -> None:
-    """Say what RUN.fhz holds: variable, domain, features, network and quality."""
+def command(path: str, source: SourceOptions, as_json: bool) -> None:
+    """Say what RUN.fhz or DATA holds.
+
+    Of RUN.fhz: variable, domain, features, network and quality. Of DATA, any source that `fhash
+    encode` reads: the variables with shape, type, units and axes, and the command that encodes
+    each. The options are those of `fhash encode`.
+    """
+    if not _is_run(path):
+        found = source.list(path)
+        variables = [variable.as_dict(path) for variable in found]
+        emit({"path": path, "variables": variables}, _listing(path, variables), as_json)
+        return
     import fhash_codec
 
-    with fhash_codec.open(run) as volume:
+    with fhash_codec.open(path) as volume:
         info = volume.info
         emit(info, table(_rows(volume, info)), as_json)
+
+
+def _is_run(path: str) -> bool:
+    """Whether a path is, or is meant to be, a container."""
+    from fhash_formats.container import is_container
+
+    place = Path(path)
+    return place.suffix.lower() == ".fhz" or (place.is_file() and is_container(place))
+
+
+def _listing(path: str, variables: Sequence[Mapping[str, Any]]) -> str:
+    """The variables of a data file, each with its commands."""
+    count = len(variables)
+    lines = [f"{path} holds {count} variable{'' if count == 1 else 's'}"]
+    for variable in variables:
+        units = f", in {variable['units']}" if variable["units"] not in ("", "1") else ""
+        extents = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
+        shape = extents or "x".join(map(str, variable["shape"])) or "one value"
+        lines.append(f"\n{variable['name']}: {variable['dtype']}, {shape}{units}")
+        if variable["problem"]:
+            lines.append(f"  cannot be encoded: {variable['problem']}")
+        if len(variable["commands"]) > 1:
+            lines.append("  two readings are likely:")
+        lines += [f"  {text}" for text in variable["commands"]]
+    return "\n".join(lines)
+
+
+def _dimension(name: str, length: int, axis: str) -> str:
+    """A dimension and what it is: "lev=17 (z)"."""
+    note = {"?": " (?)", "select": " (select one)", name: ""}.get(axis, f" ({axis})")
+    return f"{name}={length}{note}"
 
 
 def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:

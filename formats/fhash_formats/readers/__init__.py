@@ -5,8 +5,19 @@ files, `masks` opens a mask over a series. `common/` holds what several formats 
 request, the choice of a variable and of its axes, coordinates, packed values, errors.
 """
 
+from fhash_formats.readers.common.listing import Listed
 from fhash_formats.readers.common.request import RawLayout, parse_shape
 from fhash_formats.readers.masks import Mask, open_mask
-from fhash_formats.readers.registry import REGISTRY, Reader, open_series
+from fhash_formats.readers.registry import REGISTRY, Reader, list_variables, open_series
 
-__all__ = ["REGISTRY", "Mask", "RawLayout", "Reader", "open_mask", "open_series", "parse_shape"]
+__all__ = [
+    "REGISTRY",
+    "Listed",
+    "Mask",
+    "RawLayout",
+    "Reader",
+    "list_variables",
+    "open_mask",
+    "open_series",
+    "parse_shape",
+]

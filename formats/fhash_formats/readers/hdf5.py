@@ -5,11 +5,14 @@ NetCDF files are HDF5 too, but have rules of their own (netcdf.py).
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from fhash_formats.readers.common import openpmd, step_groups
+from fhash_formats.readers.common.cf_packing import SCALING, Packing, packing
 from fhash_formats.readers.common.failures import Stamp, refusing
+from fhash_formats.readers.common.fields import expand, reading
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.hdf5_tree import (
     column,
@@ -19,17 +22,17 @@ from fhash_formats.readers.common.hdf5_tree import (
     own_name,
     require_filters,
     require_sources,
+    units_of,
     variables,
 )
-from fhash_formats.readers.common.positions import beside, coordinate, usable
+from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
+from fhash_formats.readers.common.listing import Listed, listing
+from fhash_formats.readers.common.positions import Column, beside
 from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate, role_of_name
-from fhash_formats.readers.common.variables import choose
+from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
 from fhash_formats.series import Coordinate
-from fhash_formats.support.attributes import json_attributes, plain_text, text_of
-
-PACKED = {"scale_factor": 1, "add_offset": 0, "_FillValue": "NaN", "missing_value": "NaN"}
-"""Attributes by which NetCDF files pack values, each with the value that changes nothing."""
+from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -53,8 +56,8 @@ def open_hdf5(path: Path, request: Request) -> FileSeries:
     """Open the series in an HDF5 file: the only suitable dataset, or the one named.
 
     Coordinates are the dimension scales, else 1-D datasets of a conventional name beside the
-    dataset or in the root. Values are as stored: fill values and packing have a meaning in NetCDF
-    files only.
+    dataset or in the root. Packing and fill values of the CF conventions are undone, as in NetCDF.
+    Arrays with one group a step are one variable, and each field of a compound type is one.
     """
     import h5py
 
@@ -69,64 +72,154 @@ def open_hdf5(path: Path, request: Request) -> FileSeries:
         raise
 
 
+class Hdf5File:
+    """The variables of an open HDF5 file, what their dimensions are, and how they are read."""
+
+    def __init__(self, source: str, path: Path, file: Any, request: Request) -> None:
+        self.source, self.path, self.file, self.request = source, path, file, request
+        self.tree = dict(datasets(file))
+        self.variables = step_groups.join(expand(variables(self.tree)), self._attributes)
+
+    def dimensions(self, variable: Variable) -> list[Dimension]:
+        """The dimensions of a variable, with what the file says about each."""
+        if variable.members:
+            steps = Dimension(name="step", length=len(variable.members), role="t")
+            return [steps, *self.dimensions(variable.members[0])]
+        dataset = variable.handle
+        stated = openpmd.axes(self._attributes(parent(variable.name)), dataset.attrs, dataset.shape)
+        return [
+            *(
+                _dimension(dimension, length, column)
+                for dimension, length, column in zip(
+                    dataset.dims, dataset.shape, stated, strict=True
+                )
+            ),
+            *(Dimension(name=None, length=length) for length in variable.shape[dataset.ndim :]),
+        ]
+
+    def check(self, variable: Variable) -> None:
+        """Raise an error that says what is missing, if the values cannot be read here."""
+        for member in variable.members or (variable,):
+            require_filters(self.source, member.name, member.handle)
+            require_sources(self.source, self.path, member.name, member.handle)
+
+    def packing(self, variable: Variable) -> Packing | None:
+        """The packing of the values, None where the user wants them as stored."""
+        if self.request.raw_values or variable.field or variable.dtype.kind not in "iuf":
+            return None
+        return packing(self.source, variable.dtype, variable.handle.attrs)
+
+    def reading(self, variable: Variable) -> Read:
+        """How the values of a variable are read."""
+        if variable.members:
+            return step_groups.reading([self.reading(member) for member in variable.members])
+        dataset, packed = variable.handle, self.packing(variable)
+        if packed is not None:
+            return lambda ranges: packed.unpack(dataset[ranges])
+        return reading(lambda ranges: dataset[ranges], variable, dataset.ndim)
+
+    def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+        """Coordinates of the axes: what the file ties to a dimension, else by name."""
+        group = parent((variable.members or (variable,))[0].name)
+        places = [columns(self.tree, place) for place in dict.fromkeys([group, ""])]
+        said = {
+            axis: dimension
+            for axis, dimension in zip(layout.axes, layout.kept, strict=True)
+            if dimension.column is not None
+        }
+        certain = self.request.axes is not None or all(
+            dimension.role is not None for dimension in layout.kept
+        )
+        coords = beside(
+            self.source, layout.axes, layout.shape, places, certain=certain, tied=[*said]
+        )
+        fitting = {
+            axis: dimension.column
+            for axis, dimension in said.items()
+            if dimension.column is not None
+            and dimension.column.numeric
+            and dimension.column.length == dimension.length
+        }
+        coords |= layout.coordinates(self.source, fitting)
+        if variable.members and "t" in layout.axes and 0 not in layout.picked:
+            coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
+        return coords
+
+    def _attributes(self, path: str) -> Mapping[str, Any]:
+        attributes: Mapping[str, Any] = self.file[path or "/"].attrs
+        return attributes
+
+    def _scalar(self, path: str) -> tuple[float, str] | None:
+        dataset = self.tree.get(path)
+        if dataset is None or dataset.size != 1 or dataset.dtype.kind not in "iuf":
+            return None
+        return float(dataset[()].reshape(-1)[0]), units_of(dataset)
+
+
 def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> FileSeries:
-    tree = dict(datasets(file))
-    var = own_name(file, tree, request.var) if request.var else None
-    variable = choose(source, variables(tree), var, booleans=request.booleans)
-    dataset = variable.handle
-    require_filters(source, variable.name, dataset)
-    require_sources(source, path, variable.name, dataset)
-    _warn_of_packing(variable.name, dataset)
-    scales = [_scale(dimension) for dimension in dataset.dims]
-    names = [
-        dimension.label or (scale[0] if scale else None)
-        for dimension, scale in zip(dataset.dims, scales, strict=True)
-    ]
-    hints = [
-        _hint(dimension.label, scale) for dimension, scale in zip(dataset.dims, scales, strict=True)
-    ]
-    axes = assign_axes(source, dataset.shape, hints, names, request.axes)
-    certain = request.axes is not None or all(hint is not None for hint in hints)
-    group = variable.name.rpartition("/")[0]
-    places = [columns(tree, place) for place in dict.fromkeys([group, ""])]
-    tied = [axis for axis, scale in zip(axes, scales, strict=True) if scale is not None]
-    coords = beside(source, axes, dataset.shape, places, certain=certain, tied=tied)
-    coords |= _scale_coordinates(source, axes, dataset.shape, scales)
+    found = Hdf5File(source, path, file, request)
+    var = own_name(file, found.tree, request.var) if request.var else None
+    variable = choose(
+        source,
+        found.variables,
+        var,
+        booleans=request.booleans,
+        selected=len(request.select),
+    )
+    found.check(variable)
+    layout = arrange(source, variable.name, found.dimensions(variable), request)
+    packed = found.packing(variable)
+    scaled = request.raw_values and SCALING & set(variable.handle.attrs)
+    first = (variable.members or (variable,))[0]
+    chunks = first.handle.chunks
+    trailing = first.shape[first.handle.ndim :]
     return FileSeries(
         source=source,
-        name=variable.name.rpartition("/")[2],
-        shape=dataset.shape,
-        dtype=dataset.dtype,
-        axes=axes,
-        fetch=lambda ranges: dataset[ranges],
+        name=plain_name(variable.name),
+        shape=layout.shape,
+        dtype=variable.dtype if packed is None else packed.dtype,
+        axes=layout.axes,
+        fetch=layout.fetch(found.reading(variable)),
         stamp=stamp,
-        coords=coords,
-        attributes=json_attributes(dataset.attrs),
-        chunks=dataset.chunks,
+        coords=found.coordinates(variable, layout),
+        attributes=json_attributes(
+            variable.handle.attrs,
+            # counts have not the unit of the values
+            without=PLUMBING | PACKING | ({"units"} if scaled else frozenset()),
+        )
+        | layout.attributes(),
+        chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks, *trailing)),
         close=file.close,
-        beside=files_beside(path, dataset),
+        beside=files_beside(path, variable.handle),
+        packing=packed,
     )
 
 
-def _warn_of_packing(name: str, dataset: Any) -> None:
-    """Warn that attributes which change the values of a NetCDF file change none here.
+def list_hdf5(path: Path, request: Request) -> list[Listed]:
+    """The variables of an HDF5 file."""
+    import h5py
 
-    The message names no path, so that it appears once for many files.
-    """
-    attributes = json_attributes(dataset.attrs)
-    packing = [
-        key
-        for key, idle in PACKED.items()
-        if key in attributes and attributes[key] not in (idle, [idle])
-    ]
-    if packing:
-        plural = "s" if len(packing) > 1 else ""
-        text = f"{plain_text(name)} has the attribute{plural} {', '.join(packing)}"
-        warnings.warn(
-            f"{text}; its values are read as they stand in HDF5, a file named .nc is unpacked",
-            UserWarning,
-            stacklevel=2,
-        )
+    source = str(path)
+    with refusing(f"{source} cannot be read as HDF5"), h5py.File(path, "r") as file:
+        found = Hdf5File(source, path, file, request)
+        return listing(source, found.variables, found.dimensions, request)
+
+
+def _dimension(dimension: Any, length: int, stated: Column | None) -> Dimension:
+    scale = _scale(dimension)
+    name = dimension.label or (scale[0] if scale else None)
+    if scale is None:
+        name = name or (stated.name if stated else None)
+        role = role_of_name(name) if name else None
+        return Dimension(name=name, length=length, role=role, column=stated)
+    # a NetCDF dimension without values is a scale too, and says so in its NAME
+    valued = not _valueless(scale[1]) and scale[1].shape == (length,)
+    return Dimension(
+        name=name,
+        length=length,
+        role=_hint(dimension.label, scale),
+        column=column(*scale) if valued and scale[1].dtype.kind in "iufMSOU" else None,
+    )
 
 
 def _scale(dimension: Any) -> tuple[str, Any] | None:
@@ -143,24 +236,6 @@ def _hint(label: str, scale: tuple[str, Any] | None) -> str | None:
         if role is not None:
             return role
     return role_of_name(label) if label else None
-
-
-def _scale_coordinates(
-    source: str, axes: tuple[str, ...], shape: tuple[int, ...], scales: list[tuple[str, Any] | None]
-) -> dict[str, Coordinate]:
-    coords = {}
-    for axis, length, scale in zip(axes, shape, scales, strict=True):
-        # a NetCDF dimension without values is a scale too, and says so in its NAME
-        if (
-            scale is None
-            or scale[1].shape != (length,)
-            or not usable(scale[1].dtype)
-            or _valueless(scale[1])
-        ):
-            continue
-        values = column(*scale)
-        coords[axis] = coordinate(source, values.name, values.read(), values.attributes)
-    return coords
 
 
 def _valueless(scale: Any) -> bool:

@@ -8,25 +8,29 @@ steps apart, calendars of models need no date, and `units` and `calendar` stay b
 
 from __future__ import annotations
 
-import gc
-import importlib
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import numpy.typing as npt
-
-from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.cf_packing import packing
-from fhash_formats.readers.common.failures import Stamp, condense, refusing
+from fhash_formats.readers.common import step_groups
+from fhash_formats.readers.common.failures import Stamp, refusing
 from fhash_formats.readers.common.file_series import FileSeries
-from fhash_formats.readers.common.hdf5_tree import require_filters
+from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
+from fhash_formats.readers.common.listing import Listed, listing
+from fhash_formats.readers.common.netcdf_store import (
+    CLASSIC,
+    CLASSIC_64,
+    check_filters,
+    close_groups,
+    declared,
+    exactly_filled,
+    magic_of,
+    open_groups,
+    quietly,
+)
 from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
 from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate, role_of_name
+from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
 from fhash_formats.readers.common.variables import Variable, choose
 from fhash_formats.readers.hdf5 import is_hdf5
 from fhash_formats.series import AXES, Coordinate
@@ -35,15 +39,9 @@ from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes,
 if TYPE_CHECKING:
     import xarray as xr
 
-Values = npt.NDArray[Any]
-Exact = Callable[[Values, tuple[slice, ...]], Values]
-
 SUFFIXES = (".nc", ".nc4", ".netcdf", ".cdf")
-CLASSIC = (b"CDF\x01", b"CDF\x02")
 MADE_UP = "phony_dim_"
 """Prefix of the names that xarray makes up for dimensions without one."""
-
-CLASSIC_64 = b"CDF\x05"
 
 
 def matches(head: bytes, path: Path) -> bool:
@@ -69,178 +67,204 @@ def _says_netcdf(path: Path) -> bool:
 def open_netcdf(path: Path, request: Request) -> FileSeries:
     """Open the series in a NetCDF file: the only suitable variable of any group, or a named one."""
     source, stamp = str(path), Stamp.of(path)
-    with path.open("rb") as file:
-        head = file.read(4)
-    with _quietly(), refusing(f"{source} cannot be read as NetCDF"):
-        groups = _open_groups(source, path, head)
+    head = magic_of(path)
+    with quietly(), refusing(f"{source} cannot be read as NetCDF"):
+        groups = open_groups(source, path, head)
         try:
             return _series(source, path, stamp, groups, request)
         except BaseException:
-            _close(groups)
+            close_groups(groups)
             raise
 
 
-@contextmanager
-def _quietly() -> Iterator[None]:
-    """Silence xarray's warnings about a file (several fill values, bounds that are missing).
+class NetcdfFile:
+    """The variables of an open NetCDF file, what their dimensions are, and how they are read."""
 
-    None of them changes the values that are read.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+    def __init__(
+        self, source: str, path: Path, groups: Mapping[str, xr.Dataset], request: Request
+    ) -> None:
+        self.source, self.path, self.groups, self.request = source, path, groups, request
+        found = [
+            Variable(
+                name=f"{group}/{name}".lstrip("/"),
+                shape=array.shape,
+                dtype=array.dtype,
+                auxiliary=name in dataset.coords,
+                handle=(group, name),
+                units=str(array.attrs.get("units", "")),
+            )
+            for group, dataset in groups.items()
+            for name, array in ((str(name), array) for name, array in dataset.variables.items())
+        ]
+        self.variables = step_groups.join(found, self._attributes)
 
+    def array(self, variable: Variable) -> xr.Variable:
+        """The stored array of a variable; of the first step where it has one array a step."""
+        group, name = variable.handle
+        return self.groups[group].variables[name]
 
-def _open_groups(source: str, path: Path, head: bytes) -> Mapping[str, xr.Dataset]:
-    """Datasets of all groups by path, "/" first."""
-    if head == CLASSIC_64:
-        raise InputError(
-            f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with:"
-            " nccopy -k nc4 IN OUT"
+    def scope(self, variable: Variable) -> list[xr.Dataset]:
+        """The group of a variable and those around it."""
+        return [
+            self.groups[place] for place in _upwards(variable.handle[0]) if place in self.groups
+        ]
+
+    def dimensions(self, variable: Variable) -> list[Dimension]:
+        """The dimensions of a variable, with what the file says about each."""
+        scope = self.scope(variable)
+        found = []
+        for name, length in zip(*_named_lengths(self.array(variable)), strict=True):
+            column = _labels(name, length, scope)
+            made_up = name.startswith(MADE_UP)
+            found.append(
+                Dimension(
+                    name=None if made_up else name,
+                    length=length,
+                    role=_role(name, scope),
+                    column=column,
+                )
+            )
+        if variable.members:
+            return [Dimension(name="step", length=len(variable.members), role="t"), *found]
+        return found
+
+    def reading(self, variable: Variable) -> Read:
+        """How the values of a variable are read."""
+        if variable.members:
+            return step_groups.reading([self.reading(member) for member in variable.members])
+        check_filters(self.source, self.path, variable.name)
+        array = self.array(variable)
+        exact = None
+        if not self.request.raw_values:
+            exact = exactly_filled(self.source, self.path, variable.name, array.encoding)
+
+        def read(ranges: tuple[slice, ...]) -> Any:
+            with quietly():
+                values = array[ranges].to_numpy()
+                return values if exact is None else exact(values, ranges)
+
+        return read
+
+    def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+        """Coordinates of the axes, of what was selected, and of scalars that lie beside."""
+        group, name = variable.handle
+        names = [str(dimension) for dimension in self.array(variable).dims]
+        if variable.members:
+            names.insert(0, MADE_UP + "step")
+        kept = [name for place, name in enumerate(names) if place not in layout.picked]
+        coords = layout.coordinates(self.source, {}) | _coordinates(
+            self.source,
+            layout.axes,
+            kept,
+            layout.shape,
+            self.scope(variable),
+            self.groups[group][name],
+            self.request.axes is not None,
         )
-    try:
-        import xarray as xr
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{source}: NetCDF needs xarray and h5netcdf; pip install 'fhash[formats]'"
-        ) from error
-    options: dict[str, Any] = {
-        "decode_times": False,
-        "decode_timedelta": False,
-        "decode_coords": "all",
-        "cache": False,
-        "chunks": None,
-    }
-    if head in CLASSIC:
-        try:
-            importlib.import_module("scipy")
-        except ImportError as error:
-            advice = "pip install scipy, or convert it with: nccopy -k nc4 IN OUT"
-            raise InputError(f"{source} is classic NetCDF3, which needs scipy; {advice}") from error
-        return {"/": _open_classic(source, path, options)}
-    try:
-        importlib.import_module("h5netcdf")
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{source}: NetCDF4 needs h5netcdf; pip install 'fhash[formats]'"
-        ) from error
-    # dimensions without a scale get a made-up name, so that HDF5 files named .nc open too
-    return xr.open_groups(path, engine="h5netcdf", phony_dims="access", **options)
+        if variable.members and "t" in layout.axes and 0 not in layout.picked:
+            coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
+        return coords
+
+    def _attributes(self, path: str) -> Mapping[str, Any]:
+        group, _, name = path.rpartition("/")
+        if f"/{path}" in self.groups:
+            return self.groups[f"/{path}"].attrs
+        return self.groups[f"/{group}"].variables[name].attrs
+
+    def _scalar(self, path: str) -> tuple[float, str] | None:
+        group, _, name = path.rpartition("/")
+        dataset = self.groups.get(f"/{group}")
+        array = None if dataset is None else dataset.variables.get(name)
+        if array is None or array.size != 1 or array.dtype.kind not in "iuf":
+            return None
+        return float(array.to_numpy().reshape(-1)[0]), str(array.attrs.get("units", ""))
 
 
-def _open_classic(source: str, path: Path, options: Mapping[str, Any]) -> xr.Dataset:
-    import xarray as xr
-
-    try:
-        return xr.open_dataset(path, engine="scipy", **options)
-    except Exception as error:
-        message = condense(error)
-    # the error is not chained: its traceback holds scipy's half-open file, which warns when it is
-    # dropped, and here nobody hears that
-    gc.collect()
-    raise InputError(
-        f"{source} cannot be read as classic NetCDF3: {message}; nccopy -k nc4 IN OUT may convert"
-        " it"
-    )
+def _named_lengths(array: xr.Variable) -> tuple[list[str], tuple[int, ...]]:
+    return [str(name) for name in array.dims], array.shape
 
 
-def _close(groups: Mapping[str, xr.Dataset]) -> None:
-    with _quietly():
-        for dataset in groups.values():
-            dataset.close()
+def _labels(dimension: str, length: int, scope: Sequence[xr.Dataset]) -> Column | None:
+    """What the file stores along a dimension: its namesake, also of texts, or numbers along it."""
+    if dimension.startswith(MADE_UP):
+        return None
+    for dataset in scope:
+        array = dataset.variables.get(dimension)
+        if array is not None and array.shape == (length,):
+            numeric = array.dtype.kind in "iuf"
+            return Column(
+                name=dimension,
+                length=length,
+                read=array.to_numpy,
+                attributes=array.attrs,
+                numeric=numeric,
+            )
+    for name, array in _along(dimension, scope):
+        return Column(name=name, length=length, read=array.to_numpy, attributes=array.attrs)
+    return None
 
 
 def _series(
     source: str, path: Path, stamp: Stamp, groups: Mapping[str, xr.Dataset], request: Request
 ) -> FileSeries:
-    variables = [
-        Variable(
-            name=f"{group}/{name}".lstrip("/"),
-            shape=array.shape,
-            dtype=array.dtype,
-            auxiliary=name in dataset.coords,
-            handle=(group, name),
-        )
-        for group, dataset in groups.items()
-        for name, array in ((str(name), array) for name, array in dataset.variables.items())
-    ]
-    variable = choose(source, variables, request.var, booleans=request.booleans)
-    group, name = variable.handle
-    array = groups[group].variables[name]
-    _check_filters(source, path, variable.name)
-    scope = [groups[place] for place in _upwards(group) if place in groups]
-    dimensions = [str(dimension) for dimension in array.dims]
-    hints = [_role(dimension, scope) for dimension in dimensions]
-    axes = assign_axes(source, array.shape, hints, dimensions, request.axes)
-
-    exact = _exactly_filled(source, path, variable.name, array.encoding)
-
-    def fetch(ranges: tuple[slice, ...]) -> Any:
-        with _quietly():
-            values = array[ranges].to_numpy()
-            return values if exact is None else exact(values, ranges)
-
-    return FileSeries(
-        source=source,
-        name=name,
-        shape=array.shape,
-        dtype=array.dtype,
-        axes=axes,
-        fetch=fetch,
-        stamp=stamp,
-        coords=_coordinates(
-            source,
-            axes,
-            dimensions,
-            array.shape,
-            scope,
-            groups[group][name],
-            request.axes is not None,
-        ),
-        attributes=json_attributes(array.attrs, without=PLUMBING | PACKING),
-        chunks=array.encoding.get("chunksizes"),
-        close=lambda: _close(groups),
+    found = NetcdfFile(source, path, groups, request)
+    variable = choose(
+        source,
+        found.variables,
+        request.var,
+        booleans=request.booleans,
+        selected=len(request.select),
     )
+    layout = arrange(source, variable.name, found.dimensions(variable), request)
+    array = found.array(variable)
+    packed = declared(source, array)
+    without = PLUMBING | PACKING
+    if request.raw_values:
+        stored = open_groups(source, path, magic_of(path), raw=True)
+        opened = [groups, stored]
+        found = NetcdfFile(source, path, stored, request)
+        array = found.array(variable)
+        # counts have not the unit of the values
+        without |= {"units"} if packed is not None and packed.scaled else frozenset()
+        packed = None
+    else:
+        opened = [groups]
+
+    def close() -> None:
+        for each in opened:
+            close_groups(each)
+
+    try:
+        chunks = array.encoding.get("chunksizes")
+        return FileSeries(
+            source=source,
+            name=variable.handle[1],
+            shape=layout.shape,
+            dtype=array.dtype,
+            axes=layout.axes,
+            fetch=layout.fetch(found.reading(variable)),
+            stamp=stamp,
+            coords=NetcdfFile(source, path, groups, request).coordinates(variable, layout),
+            attributes=json_attributes(array.attrs, without=without) | layout.attributes(),
+            chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks)),
+            close=close,
+            packing=packed,
+        )
+    except BaseException:
+        close()
+        raise
 
 
-def _exactly_filled(
-    source: str, path: Path, name: str, encoding: Mapping[str, Any]
-) -> Exact | None:
-    """A test that tells a fill value from its neighbours; None where float64 suffices.
-
-    xarray compares as float64, in which many 64-bit integers beyond 2^53 are equal.
-    """
-    import h5py
-
-    stored = np.dtype(encoding.get("dtype", np.float32))
-    if stored.kind not in "iu" or stored.itemsize < 8:
-        return None
-    plain = {
-        key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
-        for key, value in encoding.items()
-    }
-    packed = packing(source, stored, plain)
-    if all(abs(int(fill)) < 1 << 53 for fill in packed.fills):
-        return None
-
-    def exact(values: Values, ranges: tuple[slice, ...]) -> Values:
-        if not np.isnan(values).any():
-            return values
-        with h5py.File(path, "r") as file:
-            return packed.unpack(np.asarray(file[name][ranges]))
-
-    return exact
-
-
-def _check_filters(source: str, path: Path, name: str) -> None:
-    import h5py
-
-    if not h5py.is_hdf5(path):
-        return
-    with h5py.File(path, "r") as file:
-        dataset = file.get(name)
-        if isinstance(dataset, h5py.Dataset):
-            require_filters(source, name, dataset)
+def list_netcdf(path: Path, request: Request) -> list[Listed]:
+    """The variables of a NetCDF file."""
+    source = str(path)
+    with quietly(), refusing(f"{source} cannot be read as NetCDF"):
+        groups = open_groups(source, path, magic_of(path))
+        try:
+            found = NetcdfFile(source, path, groups, request)
+            return listing(source, found.variables, found.dimensions, request)
+        finally:
+            close_groups(groups)
 
 
 def _upwards(group: str) -> list[str]:

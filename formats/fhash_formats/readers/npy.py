@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fhash_formats.errors import InputError
 from fhash_formats.readers.common.failures import Stamp, refusing
+from fhash_formats.readers.common.fields import expand, reading
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.flat import FlatArray
+from fhash_formats.readers.common.layout import Dimension, arrange
+from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.roles import assign_axes
 from fhash_formats.readers.common.variables import Variable, choose
 
 MAGIC = b"\x93NUMPY"
@@ -22,48 +25,77 @@ def matches(head: bytes, path: Path) -> bool:
     return head.startswith(MAGIC) or path.suffix.lower() == ".npz"
 
 
+class _Npy:
+    """The header of a .npy file: its variables, one for each field of a structured array."""
+
+    def __init__(self, path: Path, request: Request) -> None:
+        self.source, self.stamp = str(path), Stamp.of(path)
+        if path.suffix.lower() == ".npz":
+            raise InputError(
+                f"{self.source} is a NumPy archive; save its array alone: numpy.save('array.npy',"
+                f" numpy.load('{path.name}')[NAME])"
+            )
+        with refusing(f"{self.source} cannot be read as .npy"):
+            # opened as a map for its header only: type, shape, order and the offset of the values;
+            # Python objects are refused by it
+            header = np.load(path, mmap_mode="r", allow_pickle=False)
+            self.shape, dtype, offset = header.shape, header.dtype, int(header.offset)
+            self.fortran = header.flags.f_contiguous and not header.flags.c_contiguous
+            del header
+        # Fortran's order: the same bytes, read as C order with the dimensions reversed
+        stored = self.shape[::-1] if self.fortran else self.shape
+        self.array = FlatArray(path, stored, dtype, offset=offset)
+        if self.array.end != self.stamp.size:
+            raise InputError(
+                f"{self.source} has {self.stamp.size} bytes, its header promises"
+                f" {self.array.end}; the file is cut or holds more than one array"
+            )
+        whole = Variable(name=path.stem, shape=self.shape, dtype=dtype)
+        self.variables = expand([whole])
+        if self.variables == [whole]:
+            request.refuse_var(self.source)
+
+    def dimensions(self, variable: Variable) -> list[Dimension]:
+        """The dimensions of a variable; none has a name."""
+        return [Dimension(name=None, length=length) for length in variable.shape]
+
+    def read(self, ranges: tuple[slice, ...]) -> Any:
+        """Values of the stored array in ranges of its dimensions."""
+        if self.fortran:
+            return self.array.read(ranges[::-1]).transpose()
+        return self.array.read(ranges)
+
+
 def open_npy(path: Path, request: Request) -> FileSeries:
     """Open the series in a .npy file.
 
     Its dimensions are (t, z, y, x) or (z, y, x) unless the request names the axes.
     """
-    source, stamp = str(path), Stamp.of(path)
-    if path.suffix.lower() == ".npz":
-        raise InputError(
-            f"{source} is a NumPy archive; save its array alone: numpy.save('array.npy',"
-            f" numpy.load('{path.name}')[NAME])"
-        )
-    request.refuse_var(source)
-    with refusing(f"{source} cannot be read as .npy"):
-        # opened as a map for its header only: type, shape, order and the offset of the values;
-        # Python objects are refused by it
-        header = np.load(path, mmap_mode="r", allow_pickle=False)
-        shape, dtype, offset = header.shape, header.dtype, int(header.offset)
-        fortran = header.flags.f_contiguous and not header.flags.c_contiguous
-        del header
-    choose(
-        source,
-        [Variable(name=path.stem, shape=shape, dtype=dtype)],
-        None,
+    found = _Npy(path, request)
+    variable = choose(
+        found.source,
+        found.variables,
+        request.var,
         booleans=request.booleans,
+        selected=len(request.select),
     )
-    axes = assign_axes(source, shape, [None] * len(shape), [None] * len(shape), request.axes)
-    if fortran:
-        # the last dimension is the slowest: the same bytes, read as C order with the dimensions
-        # reversed
-        shape, axes = shape[::-1], axes[::-1]
-    array = FlatArray(path, shape, dtype, offset=offset)
-    if array.end != stamp.size:
-        raise InputError(
-            f"{source} has {stamp.size} bytes, its header promises {array.end}; the file is cut or"
-            " holds more than one array"
-        )
+    layout = arrange(found.source, variable.name, found.dimensions(variable), request)
+    stored = len(found.shape)
     return FileSeries(
-        source=source,
-        name=path.stem,
-        shape=shape,
-        dtype=dtype,
-        axes=axes,
-        fetch=array.read,
-        stamp=stamp,
+        source=found.source,
+        name=variable.name,
+        shape=layout.shape,
+        dtype=variable.dtype,
+        axes=layout.axes,
+        fetch=layout.fetch(reading(found.read, variable, stored)),
+        stamp=found.stamp,
+        attributes=layout.attributes(),
+        # time as the fastest dimension: all steps are read together
+        chunks=layout.chunks(variable.shape) if found.fortran else None,
     )
+
+
+def list_npy(path: Path, request: Request) -> list[Listed]:
+    """The variables of a .npy file."""
+    found = _Npy(path, request)
+    return listing(found.source, found.variables, found.dimensions, request)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,8 @@ from fhash_formats.errors import FhashError, InputError, MissingInputError
 from fhash_formats.readers import hdf5, netcdf, npy, raw, zarr_store
 from fhash_formats.readers.common.failures import condense, refusing
 from fhash_formats.readers.common.file_series import FileSeries
-from fhash_formats.readers.common.request import RawLayout, Request, parse_axes
+from fhash_formats.readers.common.listing import Listed, listed_series
+from fhash_formats.readers.common.request import RawLayout, Request, parse_axes, selection
 from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern
 from fhash_formats.series import Series, StepsSeries
 
@@ -29,12 +30,14 @@ class Reader:
         suffixes: file name suffixes.
         matches: whether a file is of the format, from its first bytes (none for a folder) and path.
         open: opens it.
+        variables: lists what it holds; None for a format of one array, which is opened for it.
     """
 
     name: str
     suffixes: tuple[str, ...]
     matches: Callable[[bytes, Path], bool]
     open: Callable[[Path, Request], FileSeries]
+    variables: Callable[[Path, Request], list[Listed]] | None = None
 
     def __str__(self) -> str:
         return f"{self.name} ({' '.join(self.suffixes)})"
@@ -42,20 +45,35 @@ class Reader:
 
 RAW = Reader(name="raw", suffixes=(".raw", ".bin", ".dat"), matches=raw.matches, open=raw.open_raw)
 ZARR = Reader(
-    name="Zarr", suffixes=(".zarr", ".zip"), matches=zarr_store.matches, open=zarr_store.open_zarr
+    name="Zarr",
+    suffixes=(".zarr", ".zip"),
+    matches=zarr_store.matches,
+    open=zarr_store.open_zarr,
+    variables=zarr_store.list_zarr,
 )
 REGISTRY = (
     RAW,
     Reader(
-        name="NetCDF", suffixes=netcdf.SUFFIXES, matches=netcdf.matches, open=netcdf.open_netcdf
+        name="NetCDF",
+        suffixes=netcdf.SUFFIXES,
+        matches=netcdf.matches,
+        open=netcdf.open_netcdf,
+        variables=netcdf.list_netcdf,
     ),
     Reader(
         name="HDF5",
         suffixes=(".h5", ".hdf5", ".hdf", ".he5"),
         matches=hdf5.matches,
         open=hdf5.open_hdf5,
+        variables=hdf5.list_hdf5,
     ),
-    Reader(name="NumPy", suffixes=(".npy",), matches=npy.matches, open=npy.open_npy),
+    Reader(
+        name="NumPy",
+        suffixes=(".npy",),
+        matches=npy.matches,
+        open=npy.open_npy,
+        variables=npy.list_npy,
+    ),
     ZARR,
 )
 """Formats in the order in which they are tried.
@@ -72,6 +90,10 @@ def open_series(
     axes: str | None = None,
     steps: slice | None = None,
     raw: RawLayout | None = None,
+    missing: Sequence[float] = (),
+    raw_values: bool = False,
+    select: Mapping[str, int | str] | None = None,
+    keep_extremes: bool = False,
 ) -> Series:
     """Open a time-varying volume in any supported format; its frames are read later, one by one.
 
@@ -83,6 +105,12 @@ def open_series(
             1.
         steps: slice of the steps.
         raw: layout of headerless bytes.
+        missing: numbers that stand for missing values, besides those that the file declares.
+        raw_values: whether to read packed numbers as they are stored, without their unit.
+        select: index (or label) along each dimension that is no axis, by its name, or by "dim3" or
+            "3" where it has none: {"member": 2}.
+        keep_extremes: whether extreme values that repeat far away from all others are data;
+            encoding refuses them otherwise.
 
     Raises MissingInputError, InputError for an unsuitable input, and MissingDependencyError that
     names what to install.
@@ -91,6 +119,10 @@ def open_series(
         var=var,
         axes=None if axes is None else parse_axes(axes),
         raw=None if raw == RawLayout() else raw,
+        missing=tuple(missing),
+        raw_values=raw_values,
+        select=selection(select),
+        keep_extremes=keep_extremes,
     )
     series = open_whole(path, request)
     if steps is None:
@@ -107,6 +139,39 @@ def open_series(
         raise
 
 
+def list_variables(
+    path: str | Path,
+    *,
+    var: str | None = None,
+    axes: str | None = None,
+    raw: RawLayout | None = None,
+    missing: Sequence[float] = (),
+    raw_values: bool = False,
+    select: Mapping[str, int | str] | None = None,
+) -> list[Listed]:
+    """The variables of anything that `open_series` reads, whether or not they can be encoded.
+
+    The other arguments are those of `open_series`; they are wishes, and the listing says what they
+    leave open. The files of a pattern are alike: the first one is listed. Raises as `open_series`
+    does for a source that cannot be read at all.
+    """
+    text = str(path)
+    request = Request(
+        var=var,
+        axes=None if axes is None else parse_axes(axes),
+        raw=None if raw == RawLayout() else raw,
+        missing=tuple(missing),
+        raw_values=raw_values,
+        select=selection(select),
+    )
+    place = files_of(text)[0] if is_pattern(text) else Path(path)
+    found = find_reader(place, request)
+    if found.variables is not None:
+        return found.variables(place, request)
+    with open_whole(place, request) as series:
+        return [listed_series(series, request)]
+
+
 def open_whole(path: str | Path, request: Request) -> Series:
     """Open all steps of the series in a file, folder or pattern of files."""
     text = str(path)
@@ -117,7 +182,10 @@ def open_whole(path: str | Path, request: Request) -> Series:
 
 def _open_one(path: Path, request: Request) -> FileSeries:
     try:
-        return find_reader(path, request).open(path, request)
+        series = find_reader(path, request).open(path, request)
+        series.hide(request.missing)
+        series.keep_extremes = request.keep_extremes
+        return series
     except OSError as error:  # a folder that may not be entered, wherever somebody looks into it
         if isinstance(error, FhashError):
             raise

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,14 +12,25 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.readers.common.cf_packing import packing
-from fhash_formats.readers.common.failures import FolderStamp, Stamp, condense, refusing
+from fhash_formats.readers.common import step_groups
+from fhash_formats.readers.common.cf_packing import SCALING, packing
+from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
+from fhash_formats.readers.common.fields import expand, reading
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.hdf5_tree import sibling
-from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
+from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
+from fhash_formats.readers.common.listing import Listed, listing
+from fhash_formats.readers.common.positions import Column, beside, usable
 from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate, role_of_name
-from fhash_formats.readers.common.variables import Variable, choose
+from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
+from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
+from fhash_formats.readers.common.zarr_nodes import (
+    METADATA,
+    metadata_of,
+    nodes_in_folder,
+    nodes_in_zip,
+    open_arrays,
+)
 from fhash_formats.series import Coordinate
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes
 
@@ -28,16 +38,11 @@ if TYPE_CHECKING:
     import zarr
 
 ZIP = b"PK\x03\x04"
-METADATA = ("zarr.json", ".zarray", ".zgroup")
 
 
 def matches(head: bytes, path: Path) -> bool:
     """Whether this is a folder with zarr metadata, or a ZIP."""
-    return _metadata(path) is not None if path.is_dir() else head.startswith(ZIP)
-
-
-def _metadata(path: Path) -> Path | None:
-    return next((path / name for name in METADATA if (path / name).is_file()), None)
+    return metadata_of(path) is not None if path.is_dir() else head.startswith(ZIP)
 
 
 def open_zarr(path: Path, request: Request) -> FileSeries:
@@ -47,125 +52,199 @@ def open_zarr(path: Path, request: Request) -> FileSeries:
     is undone (cf_packing.py). Consolidated metadata is ignored: an outdated copy would hide
     appended steps.
     """
-    from zarr.storage import LocalStore, ZipStore
-
-    source = str(path)
-    if path.is_dir():
-        if _metadata(path) is None:
-            raise InputError(f"{source} holds no zarr metadata ({', '.join(METADATA)})")
-        inside, nodes = "", ["", *_nodes_in_folder(path)]
-        store: LocalStore | ZipStore = LocalStore(path, read_only=True)
-    else:
-        inside, nodes = _nodes_in_zip(source, path)
-        store = ZipStore(path, mode="r")
+    store, found = _open_tree(path, request)
     try:
-        with warnings.catch_warnings(), refusing(f"{source} cannot be read as zarr"):
-            warnings.simplefilter(
-                "ignore"
-            )  # zarr warns of codecs and types that are not in the specification
-            arrays, failed = _open_arrays(store, inside, nodes)
-            if "" in failed:
-                raise InputError(f"{source} cannot be read as zarr: {failed['']}")
-            place = (
-                path if path.name.strip(".") else path.resolve()
-            )  # "." and ".." have a name and a folder around them too
-            if (
-                "" in arrays
-                and path.is_dir()
-                and request.var is None
-                and _metadata(place.parent) is not None
-            ):
-                # an array of a group, named by its folder: its coordinates are beside it
-                store.close()
-                return open_zarr(place.parent, replace(request, var=place.name))
-            return _series(path, store, arrays, failed, request)
+        with refusing(f"{path} cannot be read as zarr"):
+            return _series(found.root, store, found)
     except BaseException:
         store.close()
         raise
 
 
-def _nodes_in_folder(folder: Path, place: str = "") -> Iterator[str]:
-    """Paths of all groups and arrays below a group.
-
-    Folders of chunks have no metadata and are not entered.
-    """
-    for child in sorted(folder.iterdir()):
-        if child.is_dir() and _metadata(child) is not None:
-            yield f"{place}{child.name}"
-            if not (child / ".zarray").is_file():
-                yield from _nodes_in_folder(child, f"{place}{child.name}/")
+def list_zarr(path: Path, request: Request) -> list[Listed]:
+    """The variables of a zarr hierarchy."""
+    store, found = _open_tree(path, request)
+    try:
+        with refusing(f"{path} cannot be read as zarr"):
+            return listing(found.source, found.variables, found.dimensions, found.request)
+    finally:
+        store.close()
 
 
-def _nodes_in_zip(source: str, path: Path) -> tuple[str, list[str]]:
-    """Place of the hierarchy in a ZIP, and its groups and arrays from there.
+def _open_tree(path: Path, request: Request) -> tuple[Any, ZarrTree]:
+    """The store at a path, open, and what is in it."""
+    from zarr.storage import LocalStore, ZipStore
 
-    The place is the top, or the one folder that was zipped.
-    """
-    with refusing(f"{source} cannot be read as a ZIP"), zipfile.ZipFile(path) as file:
-        names = file.namelist()
-    nodes = sorted(
-        {name.rpartition("/")[0] for name in names if name.rpartition("/")[2] in METADATA}
-    )
-    tops = {name.split("/", 1)[0] for name in names}
-    inside = "" if "" in nodes else next(iter(tops)) if len(tops) == 1 else None
-    if inside is None or inside not in nodes:
-        raise InputError(
-            f"{source} is a ZIP that holds no zarr hierarchy ({', '.join(METADATA)} at its top)"
+    source = str(path)
+    if path.is_dir():
+        if metadata_of(path) is None:
+            raise InputError(f"{source} holds no zarr metadata ({', '.join(METADATA)})")
+        inside, nodes = "", ["", *nodes_in_folder(path)]
+        store: LocalStore | ZipStore = LocalStore(path, read_only=True)
+    else:
+        inside, nodes = nodes_in_zip(source, path)
+        store = ZipStore(path, mode="r")
+    try:
+        with warnings.catch_warnings(), refusing(f"{source} cannot be read as zarr"):
+            # zarr warns of codecs and types that are not in the specification
+            warnings.simplefilter("ignore")
+            arrays, groups, failed = open_arrays(store, inside, nodes)
+            if "" in failed:
+                raise InputError(f"{source} cannot be read as zarr: {failed['']}")
+            # "." and ".." have a name and a folder around them too
+            place = path if path.name.strip(".") else path.resolve()
+            alone = "" in arrays and path.is_dir() and request.var is None
+            if alone and metadata_of(place.parent) is not None:
+                # an array of a group, named by its folder: its coordinates are beside it
+                store.close()
+                return _open_tree(place.parent, replace(request, var=place.name))
+            return store, ZarrTree(path, arrays, groups, failed, request)
+    except BaseException:
+        store.close()
+        raise
+
+
+class ZarrTree:
+    """The variables of an open hierarchy, what their dimensions are, and how they are read."""
+
+    def __init__(
+        self,
+        root: Path,
+        arrays: Mapping[str, zarr.Array[Any]],
+        groups: Mapping[str, Mapping[str, Any]],
+        failed: Mapping[str, str],
+        request: Request,
+    ) -> None:
+        self.source, self.root, self.request = str(root), root, request
+        self.arrays, self.groups = arrays, groups
+        self.variables = step_groups.join(
+            expand(_variables(root, arrays, failed)), self._attributes
         )
-    return inside, [node.removeprefix(inside).lstrip("/") for node in nodes]
+
+    def dimensions(self, variable: Variable) -> list[Dimension]:
+        """The dimensions of a variable, with what the store says about each."""
+        if variable.members:
+            steps = Dimension(name="step", length=len(variable.members), role="t")
+            return [steps, *self.dimensions(variable.members[0])]
+        path, array = variable.handle
+        columns = self._places(path)
+        stored = zip(dimension_names(array), array.shape, strict=True)
+        return [
+            *(_dimension(columns, name, length) for name, length in stored),
+            *(Dimension(name=None, length=length) for length in variable.shape[array.ndim :]),
+        ]
+
+    def values(self, variable: Variable) -> _Values:
+        """How the array of a variable is unpacked; of the first step where it has several."""
+        return _Values(self.source, variable.handle[1], raw=self.request.raw_values)
+
+    def reading(self, variable: Variable) -> Read:
+        """How the values of a variable are read."""
+        if variable.members:
+            return step_groups.reading([self.reading(member) for member in variable.members])
+        values = self.values(variable)
+        return reading(values.read, variable, values.array.ndim)
+
+    def coordinates(self, variable: Variable, layout: Layout) -> dict[str, Coordinate]:
+        """Coordinates of the axes: those along a dimension by its name, else by their own name."""
+        columns = self._places(variable.handle[0])
+        lower = [{name.lower(): column for name, column in place.items()} for place in columns]
+        certain = self.request.axes is not None or all(
+            dimension.role is not None for dimension in layout.kept
+        )
+        named = [
+            (axis, dimension)
+            for axis, dimension in zip(layout.axes, layout.kept, strict=True)
+            if dimension.name is not None
+        ]
+        coords = beside(
+            self.source,
+            layout.axes,
+            layout.shape,
+            lower,
+            certain=certain,
+            tied=[axis for axis, _ in named],
+        )
+        found = {
+            axis: _namesake(columns, dimension.name) or _along(columns, axis, dimension.name)
+            for axis, dimension in named
+        }
+        coords |= layout.coordinates(
+            self.source,
+            {
+                axis: column
+                for (axis, dimension), column in zip(named, found.values(), strict=True)
+                if column is not None and column.numeric and column.length == dimension.length
+            },
+        )
+        if variable.members and "t" in layout.axes and 0 not in layout.picked:
+            coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
+        return coords
+
+    def _places(self, path: str) -> list[dict[str, Column]]:
+        """Columns in the group of an array, then in the root."""
+        group = parent(path)
+        return [_columns(self.source, self.arrays, place) for place in dict.fromkeys([group, ""])]
+
+    def _attributes(self, path: str) -> Mapping[str, Any]:
+        return dict(self.arrays[path].attrs) if path in self.arrays else self.groups.get(path, {})
+
+    def _scalar(self, path: str) -> tuple[float, str] | None:
+        array = self.arrays.get(path)
+        if array is None or array.size != 1 or array.dtype.kind not in "iuf":
+            return None
+        value = float(np.asarray(array[...]).reshape(-1)[0])
+        return value, str(array.attrs.get("units", ""))
 
 
-def _open_arrays(
-    store: Any, inside: str, nodes: Iterable[str]
-) -> tuple[dict[str, zarr.Array[Any]], dict[str, str]]:
-    """Arrays by path, and the errors of those that cannot be opened.
-
-    An array with an unknown codec does not bar the others.
-    """
-    import zarr
-
-    arrays: dict[str, zarr.Array[Any]] = {}
-    failed: dict[str, str] = {}
-    for node in nodes:
-        try:
-            opened = zarr.open(store=store, path=f"{inside}/{node}".strip("/"), mode="r")
-        except Exception as error:  # codecs, types and JSON raise all kinds
-            failed[node] = condense(error)
-            continue
-        if isinstance(opened, zarr.Array):
-            arrays[node] = opened
-    return arrays, failed
+def _dimension(columns: Sequence[Mapping[str, Column]], name: str | None, length: int) -> Dimension:
+    column = _namesake(columns, name)
+    role = _hint(name, column)
+    if column is None and name:
+        along = [one for place in columns for one in place.values() if one.along == name]
+        column = along[0] if along else None
+    fitting = column if column is not None and column.length == length else None
+    return Dimension(name=name, length=length, role=role, column=fitting)
 
 
-def _series(
-    root: Path,
-    store: Any,
-    arrays: Mapping[str, zarr.Array[Any]],
-    failed: Mapping[str, str],
-    request: Request,
-) -> FileSeries:
-    source = str(root)
+def _series(root: Path, store: Any, found: ZarrTree) -> FileSeries:
+    request = found.request
     variable = choose(
-        source, _variables(root, arrays, failed), request.var, booleans=request.booleans
+        found.source,
+        found.variables,
+        request.var,
+        booleans=request.booleans,
+        selected=len(request.select),
     )
+    layout = arrange(found.source, variable.name, found.dimensions(variable), request)
     path, array = variable.handle
-    axes, coords = _axes_and_coordinates(source, arrays, path, request)
-    values = _Values(source, array)
+    packed = None if variable.field else found.values(variable).packing
+    scaled = request.raw_values and SCALING & set(array.attrs)
+    # the whole hierarchy where the steps are spread over it
+    folder = root if variable.members else root / path
+    chunks = (*((1,) if variable.members else ()), *array.chunks)
+    trailing = variable.shape[len(chunks) :]
     return FileSeries(
-        source=source,
-        name=variable.name.rpartition("/")[2],
-        shape=array.shape,
-        dtype=values.dtype,
-        axes=axes,
-        fetch=values.read,
+        source=found.source,
+        name=plain_name(variable.name),
+        shape=layout.shape,
+        dtype=variable.dtype if packed is None else packed.dtype,
+        axes=layout.axes,
+        fetch=layout.fetch(found.reading(variable)),
         # In a folder the array's metadata shows a change of shape at once; a changed chunk shows
         # when all files are checked at the end.
-        stamp=Stamp.of((_metadata(root / path) or root) if root.is_dir() else root),
-        folder=FolderStamp.of(root / path) if root.is_dir() else None,
-        coords=coords,
-        attributes=json_attributes(dict(array.attrs), without=PLUMBING | PACKING),
-        chunks=array.chunks,
+        stamp=Stamp.of((metadata_of(root / path) or root) if root.is_dir() else root),
+        folder=FolderStamp.of(folder) if root.is_dir() else None,
+        coords=found.coordinates(variable, layout),
+        attributes=json_attributes(
+            dict(array.attrs),
+            # counts have not the unit of the values
+            without=PLUMBING | PACKING | ({"units"} if scaled else frozenset()),
+        )
+        | layout.attributes(),
+        chunks=layout.chunks((*chunks, *trailing)),
         close=store.close,
+        packing=packed,
     )
 
 
@@ -185,6 +264,7 @@ def _variables(
             dtype=array.dtype,
             auxiliary=name in bounds,
             handle=(name, array),
+            units=str(array.attrs.get("units", "")),
         )
         for name, array in arrays.items()
     ]
@@ -192,30 +272,6 @@ def _variables(
         Variable(name=name or root.stem, shape=(), dtype=np.dtype(object), error=error)
         for name, error in failed.items()
     ]
-
-
-def _axes_and_coordinates(
-    source: str, arrays: Mapping[str, zarr.Array[Any]], path: str, request: Request
-) -> tuple[tuple[str, ...], dict[str, Coordinate]]:
-    """The axis of each dimension of the array at `path`, and its coordinates by axis."""
-    array = arrays[path]
-    names = dimension_names(array)
-    group = path.rpartition("/")[0]
-    columns = [_columns(source, arrays, place) for place in dict.fromkeys([group, ""])]
-    namesakes = [_namesake(columns, name) for name in names]
-    hints = [_hint(name, column) for name, column in zip(names, namesakes, strict=True)]
-    axes = assign_axes(source, array.shape, hints, names, request.axes)
-    lower = [{name.lower(): column for name, column in place.items()} for place in columns]
-    certain = request.axes is not None or all(hint is not None for hint in hints)
-    tied = [axis for axis, name in zip(axes, names, strict=True) if name is not None]
-    coords: dict[str, Coordinate] = beside(
-        source, axes, array.shape, lower, certain=certain, tied=tied
-    )
-    for axis, length, name, namesake in zip(axes, array.shape, names, namesakes, strict=True):
-        column = namesake or _along(columns, axis, name)
-        if column is not None and column.length == length:
-            coords[axis] = coordinate(source, column.name, column.read(), column.attributes)
-    return axes, coords
 
 
 def _namesake(columns: Sequence[Mapping[str, Column]], name: str | None) -> Column | None:
@@ -273,7 +329,8 @@ def _columns(source: str, arrays: Mapping[str, zarr.Array[Any]], group: str) -> 
     columns = {}
     for path, array in arrays.items():
         place, _, name = path.rpartition("/")
-        if path and place == group and array.ndim < 2 and usable(array.dtype):
+        numeric = usable(array.dtype)
+        if path and place == group and array.ndim < 2 and (numeric or array.dtype.kind in "SUTO"):
             along = dimension_names(array)[0] if array.ndim else None
             attributes = json_attributes(dict(array.attrs), without=PLUMBING | PACKING)
             columns[name] = Column(
@@ -282,14 +339,15 @@ def _columns(source: str, arrays: Mapping[str, zarr.Array[Any]], group: str) -> 
                 along=along,
                 read=_Values(source, array).whole,
                 attributes=attributes,
+                numeric=numeric,
             )
     return columns
 
 
 class _Values:
-    """Physical values of a zarr array, and their type."""
+    """Physical values of a zarr array, and their type; the stored ones if they are `raw`."""
 
-    def __init__(self, source: str, array: zarr.Array[Any]) -> None:
+    def __init__(self, source: str, array: zarr.Array[Any], *, raw: bool = False) -> None:
         self.array = array
         # xarray keeps `_FillValue` as the fill value of zarr's own in format 2, where other writers
         # use that for chunks never written
@@ -300,7 +358,7 @@ class _Values:
         )
         self.packing = (
             packing(source, array.dtype, dict(array.attrs), cf_fill)
-            if array.dtype.kind in "iuf"
+            if array.dtype.kind in "iuf" and not raw
             else None
         )
         self.dtype = self.packing.dtype if self.packing else array.dtype

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 from click.testing import Result
 
@@ -79,9 +82,48 @@ def test_a_cut_file_is_found(
     refused(4, command, tmp_path / "cut.fhz")
 
 
-@pytest.mark.parametrize("command", ["info", "verify", "decode"])
+@pytest.mark.parametrize("command", ["verify", "decode"])
 def test_what_is_no_container_is_refused(
     refused: Callable[..., str], data: Path, tmp_path: Path, command: str
 ) -> None:
     refused(4, command, data)
     refused(2, command, tmp_path / "missing.fhz")
+
+
+def test_info_of_data_lists_variables_and_their_commands(
+    fhash: Fhash, data: Path, tmp_path: Path
+) -> None:
+    result = fhash("info", data)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert "density: float32, time=3 (t), z=6, y=7, x=8, in kg m-3" in result.stdout
+    with h5py.File(tmp_path / "flow data.h5", "w") as file:
+        file["flow"] = np.ones((16, 12, 12, 3), "f4")
+        file["ensemble"] = np.ones((2, 3, 4, 5, 6), "f4")
+    listed = json.loads(fhash("info", tmp_path / "flow data.h5", "--json").stdout)
+    ensemble, flow = listed["variables"]
+    assert ensemble["dimensions"][0] == {"name": "dim0", "length": 2, "axis": "select"}
+    assert [variable["problem"] for variable in (ensemble, flow)] == ["", ""]
+    commands = ensemble["commands"] + flow["commands"]
+    assert len(commands) == 3
+    shapes = []
+    for number, command in enumerate(commands):
+        words = shlex.split(command)[1:]
+        words[words.index("-o") + 1] = str(tmp_path / f"{number}.fhz")
+        result = fhash(*words, "--effort", "1", "--quiet", "--json")
+        assert result.exit_code == 0, result.stderr
+        shapes.append(json.loads(result.stdout)["shape"])
+    assert shapes == [[3, 4, 5, 6], [16, 12, 12, 3], [1, 16, 12, 12]]
+
+
+def test_info_of_data_repeats_what_the_user_said(fhash: Fhash, tmp_path: Path) -> None:
+    (tmp_path / "a.bin").write_bytes(bytes(4 * 5 * 6 * 2))
+    said = ["--shape", "x=4,y=5,z=6", "--dtype", "u2", "--missing", "-9", "--missing", "1e20"]
+    listed = json.loads(fhash("info", tmp_path / "a.bin", *said, "--json").stdout)
+    words = shlex.split(listed["variables"][0]["commands"][0])
+    assert words[-8:] == [*said[:-1], "1e+20"]
+
+
+def test_info_of_no_data_is_refused(refused: Callable[..., str], tmp_path: Path) -> None:
+    assert "does not exist" in refused(2, "info", tmp_path / "missing.h5")
+    (tmp_path / "a.txt").write_text("words")
+    assert "no format that can be read" in refused(2, "info", tmp_path / "a.txt")

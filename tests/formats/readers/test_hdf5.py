@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import itertools
 import os
+import shutil
+import warnings
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+import xarray as xr
 from stored_series import (
     VALUES,
     assert_frames,
     write_hdf5,
 )
 
-from fhash_formats import open_series
+from fhash_formats import list_variables, open_series
 from fhash_formats.errors import InputError
 
 
@@ -109,16 +113,70 @@ def test_coordinates_from_dimension_scales(tmp_path: Path) -> None:
         np.testing.assert_array_equal(series.read(2), VALUES[2])
 
 
-def test_fill_values_and_packing_mean_nothing_in_plain_hdf5(tmp_path: Path) -> None:
+PACKED = [
+    ("f4", {"_FillValue": np.float32(1e20)}),
+    ("f8", {"missing_value": 1e20}),
+    ("i2", {"_FillValue": np.int16(-32768)}),
+    ("i4", {"_FillValue": np.array([-9999], "i4"), "missing_value": np.int32(7)}),
+    ("i2", {"_FillValue": np.int16(-99), "scale_factor": 0.01, "add_offset": 273.15}),
+    ("i2", {"scale_factor": np.float32(0.01), "add_offset": np.float32(2)}),
+    ("i2", {"scale_factor": np.array([0.5], "f4")}),
+    ("i4", {"scale_factor": np.float32(0.01), "add_offset": np.float32(2)}),
+    ("u1", {"add_offset": np.float32(-3)}),
+    ("i1", {"_Unsigned": "true", "_FillValue": np.int8(-1)}),
+    ("u1", {"_Unsigned": "false", "_FillValue": np.uint8(255)}),
+]
+
+
+@pytest.mark.parametrize(("stored", "attributes"), PACKED)
+def test_packing_and_fill_values_are_those_of_the_same_bytes_in_netcdf(
+    tmp_path: Path, stored: str, attributes: dict[str, Any]
+) -> None:
+    values = (np.arange(60) % 50).astype(stored).reshape(3, 4, 5)
+    fill = attributes.get("_FillValue", attributes.get("missing_value"))
+    if fill is not None:
+        values[1, 2] = fill
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["v"] = VALUES
-        file["v"].attrs["_FillValue"] = VALUES[0, 0, 0, 0]
-        file["v"].attrs["scale_factor"] = 2.0
-    with pytest.warns(
-        UserWarning,
-        match="v has the attributes scale_factor, _FillValue; its values are read as they stand",
-    ):
-        assert_frames(tmp_path / "a.h5", VALUES)
+        file["v"] = values
+        file["v"].attrs.update({**attributes, "units": "K"})
+    shutil.copy(tmp_path / "a.h5", tmp_path / "a.nc")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of several fill values
+        dataset = xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf", phony_dims="sort")
+    with dataset:
+        expected = dataset["v"].to_numpy()
+    assert fill is None or np.isnan(expected[1, 2]).all()
+    for name in ("a.h5", "a.nc"):
+        assert_frames(tmp_path / name, expected[None])
+        with open_series(tmp_path / name) as series:
+            assert series.attributes == {"units": "K"}
+        assert_frames(tmp_path / name, values[None], raw_values=True)
+
+
+@pytest.mark.parametrize("name", ["a.h5", "a.nc"])
+def test_units_never_stand_beside_packed_counts(tmp_path: Path, name: str) -> None:
+    with h5py.File(tmp_path / name, "w") as file:
+        file["v"] = np.ones((3, 4, 5), "i2")
+        file["v"].attrs.update({"scale_factor": 0.5, "units": "K", "long_name": "warmth"})
+        file["w"] = np.ones((3, 4, 5), "i2")
+        file["w"].attrs.update({"_FillValue": np.int16(-9), "units": "K"})
+    with open_series(tmp_path / name, var="v") as series:
+        assert (series.units, series.dtype) == ("K", np.float64)
+    with open_series(tmp_path / name, var="v", raw_values=True) as series:
+        assert (series.units, series.attributes) == ("", {"long_name": "warmth"})
+        assert series.dtype == np.int16
+    with open_series(tmp_path / name, var="w", raw_values=True) as series:
+        assert series.units == "K"
+
+
+def test_integers_with_a_fill_value_say_what_the_file_has(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["v"] = np.ones((3, 4, 5), "i1")
+        file["v"].attrs["_FillValue"] = np.int8(-100)
+    with open_series(tmp_path / "a.h5") as series:
+        assert (series.dtype, series.source_dtype, series.fill) == (np.float32, np.int8, -100)
+    with open_series(tmp_path / "a.h5", raw_values=True) as series:
+        assert (series.dtype, series.source_dtype, series.fill) == (np.int8, None, None)
 
 
 def test_a_user_block_before_the_signature(tmp_path: Path) -> None:
@@ -171,20 +229,139 @@ def test_a_closed_series_is_refused(tmp_path: Path) -> None:
         series.read(0)
 
 
-def test_packing_in_plain_hdf5_is_warned_of(tmp_path: Path) -> None:
+FIELDS = np.dtype([("rho", ">f4"), ("v", [("x", "f8"), ("y", "f8")]), ("E", "f4", (3,))])
+
+
+def test_fields_of_compound_types_are_variables(tmp_path: Path) -> None:
+    state = np.zeros((4, 12, 13, 14), FIELDS)
+    state["rho"], state["v"]["y"] = np.arange(4)[:, None, None, None], 7
+    state["E"] = np.arange(3)
+    path = write_hdf5(tmp_path / "a.h5", out__state=state)
+    for var in ("out/state.rho", "state.rho", "rho"):
+        assert_frames(path, state["rho"], var=var)
+    assert_frames(path, state["v"]["y"], var="state.v.y")
+    assert_frames(path, state["E"][..., 2], var="E", select={"dim4": 2})
+    with pytest.raises(InputError, match=r"state\.E has 5 dimensions .*--select dim4=0"):
+        open_series(path, var="E")
+    with pytest.raises(InputError, match=r"holds 3 variables: out/state\.rho .*state\.v\.x"):
+        open_series(path)
+
+
+def test_parts_of_complex_numbers_are_variables(tmp_path: Path) -> None:
+    wave = VALUES + 1j * VALUES[::-1]
+    path = write_hdf5(tmp_path / "a.h5", psi=wave)
+    assert_frames(path, wave.real, var="psi.real")
+    assert_frames(path, wave.imag, var="imag")
+
+
+def write_steps(path: Path, form: str, attributes: list[dict[str, Any]]) -> Path:
+    """One group a step, in an order of names that is not that of the numbers."""
+    with h5py.File(path, "w") as file:
+        for step, given in enumerate(attributes):
+            place = form.format(8 + step)
+            file[place] = VALUES[step]
+            file[place.split("/fields")[0].rpartition("/density")[0] or place].attrs.update(given)
+    return path
+
+
+@pytest.mark.parametrize("form", ["Step#{}/density", "timestep_{:04}/density", "plt{}/density"])
+def test_one_group_a_step_is_a_series(tmp_path: Path, form: str) -> None:
+    path = write_steps(tmp_path / "a.h5", form, [{"Time": 0.5 * step} for step in range(4)])
+    assert_frames(path, VALUES)
+    with open_series(path) as series:
+        assert series.name == "density"
+        np.testing.assert_array_equal(series.coords["t"].values, [0, 0.5, 1, 1.5])
+    with open_series(path, var=form.format(9)) as series:
+        np.testing.assert_array_equal(series.read(0), VALUES[1])
+        assert series.shape[0] == 1
+
+
+def test_numbers_of_steps_stand_for_times_that_are_missing(tmp_path: Path) -> None:
+    path = write_steps(tmp_path / "a.h5", "Step#{}/density", [{"Time": 1.0}, {}, {}])
+    with open_series(path) as series:
+        assert (series.coords["t"].name, series.coords["t"].values.tolist()) == ("step", [8, 9, 10])
+
+
+def test_openpmd_axes_positions_and_times(tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for step in range(4):
+            group = file.create_group(f"data/{100 * step}")
+            group.attrs.update({"time": 2.0 * step, "timeUnitSI": 1e-15, "dt": 1.0})
+            for name in ("x", "y"):
+                group[f"fields/E/{name}"] = VALUES[step].T * (1 if name == "x" else 2)
+                group[f"fields/E/{name}"].attrs["position"] = [0.5, 0.0, 0.0]
+            group["fields/E"].attrs.update(
+                axisLabels=[b"x", b"y", b"z"],
+                gridSpacing=[0.1, 0.2, 0.3],
+                gridGlobalOffset=[1.0, 0.0, 0.0],
+                gridUnitSI=1e-6,
+                dataOrder="C",
+            )
+    assert_frames(path, VALUES * 2, var="E/y")
+    with open_series(path, var="fields/E/x") as series:
+        np.testing.assert_allclose(series.coords["t"].values, [0, 2e-15, 4e-15, 6e-15])
+        assert series.coords["t"].attributes == {"units": "s"}
+        np.testing.assert_allclose(
+            series.coords["x"].values, (1 + 0.1 * (np.arange(6) + 0.5)) * 1e-6
+        )
+        np.testing.assert_allclose(series.coords["z"].values, 0.3e-6 * np.arange(3))
+        assert series.coords["x"].attributes == {"units": "m"}
+
+
+def test_levels_and_members_are_no_steps(tmp_path: Path) -> None:
+    path = write_hdf5(tmp_path / "a.h5", level_0__rho=VALUES[0], level_1__rho=VALUES[1])
+    with pytest.raises(InputError, match=r"holds 2 variables: level_0/rho .*, level_1/rho"):
+        open_series(path)
+    assert_frames(path, VALUES[1:2], var="level_1/rho")
+
+
+def test_labels_and_positions_select(tmp_path: Path) -> None:
+    members = np.stack([VALUES, VALUES * 2])
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["v"] = np.arange(24, dtype="i2").reshape(2, 3, 4)
-        file["v"].attrs.update(
-            {"scale_factor": 0.5, "missing_value": np.int16(3), "add_offset": 0.0}
-        )
-    with pytest.warns(
-        UserWarning,
-        match=r"^v has the attributes scale_factor, missing_value; .*"
-        r" a file named \.nc is unpacked$",
-    ):
-        open_series(tmp_path / "a.h5").close()
-    with h5py.File(tmp_path / "a.h5", "a") as file:
-        file["v"].attrs.update(
-            {"scale_factor": 1, "missing_value": np.nan, "_FillValue": np.array([np.nan])}
-        )
-    open_series(tmp_path / "a.h5").close()
+        dataset = file.create_dataset("v", data=members)
+        scales = {
+            "member": np.array([b"r1", b"r2"]),
+            "time": np.arange(4.0),
+            "lev": np.array([1000.0, 850.0, 500.0]),
+            "lat": np.arange(5.0),
+            "lon": np.arange(6.0),
+        }
+        for place, (name, values) in enumerate(scales.items()):
+            file[name] = values
+            file[name].make_scale(name)
+            dataset.dims[place].attach_scale(file[name])
+    path = tmp_path / "a.h5"
+    assert_frames(path, VALUES * 2, select={"member": "r2"}, var="v")
+    assert_frames(path, VALUES * 2, select={"member": -1})
+    with pytest.raises(InputError, match=r"--select member=r9 is no index 0\.\.1, or .* r1, r2"):
+        open_series(path, select={"member": "r9"})
+    with open_series(path, select={"member": 0, "lev": "850.0"}) as series:
+        assert series.shape == (4, 1, 5, 6)
+        np.testing.assert_array_equal(series.read(3)[0], VALUES[3, 1])
+        assert series.coords["z"].values.tolist() == [850.0]
+        assert series.attributes["selection"] == "member=0, lev=1"
+
+
+def test_the_listing_of_a_file(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["flow"] = np.zeros((16, 24, 24, 3), "f4")
+        file["flow"].attrs["units"] = "m/s"
+        file["run/T"] = np.zeros((2, 5, 6, 7, 8))
+        file["note"] = "text"
+    flow, note, warmth = list_variables(tmp_path / "a.h5")
+    assert (flow.name, flow.shape, flow.dtype, flow.units) == (
+        "flow",
+        (16, 24, 24, 3),
+        "float32",
+        "m/s",
+    )
+    assert flow.options == (
+        ("--var", "flow", "--axes", "t,z,y,x"),
+        ("--var", "flow", "--select", "dim3=0"),
+    )
+    assert (note.options, note.problem) == ((), "0 dimensions (); 3 or 4 can be read") or (
+        note.problem.startswith("values of type")
+    )
+    assert warmth.options == (("--var", "run/T", "--select", "dim0=0"),)
+    assert [axis for _, axis in warmth.dimensions] == ["select", "t", "z", "y", "x"]

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.readers.common.cf_packing import Packing, missing_values
 from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
 from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
 from fhash_formats.support.attributes import plain_text
@@ -45,6 +46,7 @@ class FileSeries(Series):
         stamp: checked before and after every fetch.
         beside: further files that hold values, checked likewise.
         folder: stamp of all files, which `check` alone looks at.
+        packing: the packing that `fetch` undoes, if any; it says what stood for missing values.
 
     Raises InputError for a shape or type that cannot be a series.
 
@@ -69,6 +71,7 @@ class FileSeries(Series):
         close: Callable[[], None] = lambda: None,
         beside: Sequence[Path] = (),
         folder: FolderStamp | None = None,
+        packing: Packing | None = None,
     ) -> None:
         lengths = dict(zip(axes, shape, strict=True))
         self.source, self.name, self.dtype = source, plain_text(name), native(dtype)
@@ -91,6 +94,25 @@ class FileSeries(Series):
             1, min(_steps_of_a_chunk(self._axes, shape, chunks), SLAB_BYTES // frame_bytes)
         )
         self._slab: tuple[int, npt.NDArray[Any]] | None = None
+        self._missing: Packing | None = None
+        if packing is not None:
+            self._note_fills(packing)
+
+    def hide(self, missing: Sequence[float]) -> None:
+        """Make some values missing: they become NaN, and integers become floats.
+
+        missing: as they are read, after unpacking.
+        """
+        if missing:
+            self._missing = missing_values(self.source, self.dtype, missing)
+            self._note_fills(self._missing)
+            self.dtype = self._missing.dtype
+
+    def _note_fills(self, packing: Packing) -> None:
+        if packing.fills and not packing.scaled and self.fill is None:
+            self.fill = packing.fills[0].item()
+        if packing.integers:
+            self.source_dtype = packing.stored
 
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)
@@ -136,6 +158,8 @@ class FileSeries(Series):
                 f"{self.source}: {steps} of {self.name} came as {values.shape}; the file changed"
                 " while it was being read"
             )
+        if self._missing is not None:
+            values = self._missing.unpack(values.astype(self._missing.stored, copy=False))
         present = [axis for axis in AXES if axis in self._axes]
         ordered = values.transpose([self._axes.index(axis) for axis in present])
         return np.expand_dims(

@@ -36,7 +36,7 @@ class FlatArray:
         return self.offset + prod(self.shape) * self.dtype.itemsize
 
     def read(self, ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
-        """Values in ranges, of which at most one is not the whole dimension.
+        """Values in ranges of the dimensions, one for each.
 
         Raises InputError where the file ends too early.
         """
@@ -45,6 +45,8 @@ class FlatArray:
             for place, (part, length) in enumerate(zip(ranges, self.shape, strict=True))
             if part != slice(0, length)
         ]
+        if len(parts) > 1:
+            return self._read_parts(ranges, parts[0])
         place = parts[0] if parts else 0
         part = ranges[place]
         rows, inner = prod(self.shape[:place]), prod(self.shape[place + 1 :])
@@ -52,6 +54,26 @@ class FlatArray:
         with self.path.open("rb") as file:
             self._fill(file, result, self.shape[place] * inner, part.start * inner)
         return result.reshape(*self.shape[:place], part.stop - part.start, *self.shape[place + 1 :])
+
+    def _read_parts(self, ranges: tuple[slice, ...], place: int) -> npt.NDArray[Any]:
+        """Values in ranges of which several are parts; `place` is the slowest of these.
+
+        Whatever lies behind an index along it is an array of its own.
+        """
+        inner = self.shape[place + 1 :]
+        bytes_inside = prod(inner) * self.dtype.itemsize
+        slow = [range(part.start, part.stop) for part in ranges[: place + 1]]
+        result = np.empty([len(part) for part in slow] + _lengths(ranges[place + 1 :]), self.dtype)
+        strides = [prod(self.shape[deeper + 1 : place + 1]) for deeper in range(place + 1)]
+        for where in np.ndindex(*(len(part) for part in slow)):
+            number = sum(
+                part[index] * stride
+                for part, index, stride in zip(slow, where, strides, strict=True)
+            )
+            offset = self.offset + number * bytes_inside
+            array = FlatArray(self.path, inner, self.dtype, offset=offset)
+            result[where] = array.read(ranges[place + 1 :])
+        return result
 
     def _fill(self, file: BinaryIO, result: npt.NDArray[Any], stride: int, first: int) -> None:
         """Fill each row of the result from `first` on in each `stride` values of the file."""
@@ -79,3 +101,7 @@ class FlatArray:
                     f"{self.path} ends after {file.tell()} bytes, {self.end} are needed"
                 )
             done += count
+
+
+def _lengths(ranges: tuple[slice, ...]) -> list[int]:
+    return [part.stop - part.start for part in ranges]

@@ -7,10 +7,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.readers.common.cf_packing import packing
 from fhash_formats.readers.common.positions import Column, usable
 from fhash_formats.readers.common.variables import Variable
-from fhash_formats.support.attributes import text_of
+from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
 
 FILTER_NAMES = {
     305: "LZO",
@@ -97,6 +100,7 @@ def variables(tree: Mapping[str, Any]) -> list[Variable]:
             dtype=dataset.dtype,
             auxiliary=dataset.is_scale or name in bounds,
             handle=dataset,
+            units=units_of(dataset),
         )
         for name, dataset in tree.items()
         if dataset.shape is not None
@@ -123,9 +127,26 @@ def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
 
 def column(path: str, dataset: Any) -> Column:
     """A dataset of at most one dimension as a Column."""
+    numeric = usable(dataset.dtype)
+    packed = packing(path, dataset.dtype, dataset.attrs) if dataset.dtype.kind in "iuf" else None
+
+    def read() -> Any:
+        stored = dataset[()]
+        return stored if packed is None else packed.unpack(np.array(stored))
+
     return Column(
-        name=path, length=dataset.size, read=lambda: dataset[()], attributes=dataset.attrs
+        name=path,
+        length=dataset.size,
+        read=read,
+        attributes=json_attributes(dataset.attrs, without=PLUMBING | PACKING),
+        numeric=numeric,
     )
+
+
+def units_of(dataset: Any) -> str:
+    """The attribute `units` of a dataset as text, "" without one."""
+    units = dataset.attrs.get("units", "") if "units" in dataset.attrs else ""
+    return text_of(units) if isinstance(units, str | bytes) else ""
 
 
 def sibling(path: str, name: str) -> str:

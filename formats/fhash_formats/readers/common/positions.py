@@ -29,7 +29,8 @@ TIME_UNITS = {
 class Column:
     """A stored 1-D array (or scalar, length 1) that may be a coordinate.
 
-    `read` gives its values, `along` is the name of its dimension.
+    `read` gives its values, `along` is the name of its dimension. A column that is not `numeric`
+    holds labels, such as the names of members.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Column:
     along: str | None = None
     read: Callable[[], npt.NDArray[Any]]
     attributes: Mapping[str, Any]
+    numeric: bool = True
 
 
 def coordinate(

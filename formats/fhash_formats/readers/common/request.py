@@ -73,6 +73,11 @@ def parse_axes(text: str) -> tuple[str, ...]:
     return letters
 
 
+def selection(select: Mapping[str, int | str] | None) -> tuple[tuple[str, str], ...]:
+    """Pairs of names and indices, as `Request` holds them."""
+    return tuple((str(name), str(index)) for name, index in (select or {}).items())
+
+
 @dataclass(frozen=True)
 class RawLayout:
     """Layout of a headerless file; the file's name replaces what is None.
@@ -110,14 +115,25 @@ class RawLayout:
 class Request:
     """A request to a reader: name of the variable, axes of its dimensions, layout of raw bytes.
 
-    None stands for what was not said. `booleans` lets boolean arrays through (for masks), as the
-    numbers 0 and 1.
+    None stands for what was not said.
+
+    Attributes:
+        booleans: lets boolean arrays through (for masks), as the numbers 0 and 1.
+        missing: numbers that stand for missing values, besides those that the file declares. They
+            are compared with the values after unpacking; `open_series` sees to it for all formats.
+        raw_values: the numbers are read as stored; fill values, scale and offset are not applied.
+        select: for dimensions that are no axis, (name, index) as texts; see layout.py.
+        keep_extremes: extreme values that repeat are data, see `Series`.
     """
 
     var: str | None = None
     axes: tuple[str, ...] | None = None
     raw: RawLayout | None = None
     booleans: bool = False
+    missing: tuple[float, ...] = ()
+    raw_values: bool = False
+    select: tuple[tuple[str, str], ...] = ()
+    keep_extremes: bool = False
 
     def refuse_var(self, source: str) -> None:
         """Raise InputError if a variable was named for a format that has none."""

@@ -25,6 +25,10 @@ KINDS = {
 }
 
 
+MIN_DIMENSIONS = 3
+"""Dimensions of an array that may be a series; those beyond 4 are selected (layout.py)."""
+
+
 def kind_of(dtype: np.dtype[Any]) -> str:
     """A type in words: "float32", "boolean", "text", "compound" and so on."""
     if dtype.kind == "V":
@@ -43,6 +47,10 @@ class Variable:
         auxiliary: it only describes others (coordinates, bounds).
         error: why a library cannot open it, "" if it can.
         handle: whatever the reader needs to find it again.
+        units: of the values, "" where unknown.
+        field: path of names in a compound type, () where the array is no such (fields.py).
+        members: arrays of the same kind, one a step; () for an array that the file holds as one
+            (step_groups.py).
     """
 
     name: str
@@ -51,6 +59,9 @@ class Variable:
     auxiliary: bool = False
     error: str = ""
     handle: Any = None
+    units: str = ""
+    field: tuple[str, ...] = ()
+    members: tuple[Variable, ...] = ()
 
     def __str__(self) -> str:
         return f"{self.name} {self.shape}"
@@ -64,12 +75,17 @@ class Variable:
                 "boolean values; a mask is given with --feature mask:FILE,"
                 " values are integers or floats"
             )
+        if self.dtype.kind == "c":
+            return (
+                f"values of type {kind_of(self.dtype)}; read its parts, with"
+                f" --var {self.name}.real and --var {self.name}.imag"
+            )
         if self.dtype.kind not in "iufb" or self.dtype.itemsize > 8:
             return (
                 f"values of type {kind_of(self.dtype)};"
                 " integers and floats up to 64 bits can be read"
             )
-        if len(self.shape) not in (3, 4):
+        if len(self.shape) < MIN_DIMENSIONS:
             return f"{len(self.shape)} dimensions {self.shape}; 3 or 4 can be read"
         if 0 in self.shape:
             return f"an axis of length 0, shape {self.shape}; there is nothing to read"
@@ -77,15 +93,25 @@ class Variable:
 
 
 def choose(
-    source: str, variables: Sequence[Variable], var: str | None, *, booleans: bool = False
+    source: str,
+    variables: Sequence[Variable],
+    var: str | None,
+    *,
+    booleans: bool = False,
+    selected: int = 0,
 ) -> Variable:
     """The variable named `var`, or the only suitable one.
 
-    `var` is a full name, or its last part where only one variable has it. Raises InputError for no
-    such name, an unsuitable one, several to choose from, or none.
+    `var` is a full name, or its last parts where only one variable has them: "E/x", "state.rho",
+    "rho". `selected` is the number of dimensions that the user selects along: arrays that then have
+    3 or 4 left come before others. Raises InputError for no such name, an unsuitable one, several
+    to choose from, or none.
     """
     suitable = [variable for variable in variables if not variable.problem(booleans)]
     candidates = [variable for variable in suitable if not variable.auxiliary]
+    fitting = [variable for variable in candidates if len(variable.shape) - selected in (3, 4)]
+    if var is None:
+        candidates = fitting or candidates
     if var is not None:
         return _named(source, variables, candidates or suitable, var, booleans)
     if len(candidates) == 1:
@@ -108,6 +134,16 @@ def choose(
     )
 
 
+def parent(name: str) -> str:
+    """The group of a variable, "" at the top."""
+    return name.rpartition("/")[0]
+
+
+def plain_name(name: str) -> str:
+    """The name of a variable without the groups around it."""
+    return name.rpartition("/")[2]
+
+
 def _named(
     source: str,
     variables: Sequence[Variable],
@@ -118,8 +154,11 @@ def _named(
     name = var.strip("/")
     named = [variable for variable in variables if variable.name == name]
     named = named or [
-        variable for variable in variables if variable.name.rsplit("/", 1)[-1] == name
+        variable for variable in variables if variable.name.endswith((f"/{name}", f".{name}"))
     ]
+    if len(named) > 1:
+        # a series of steps comes before each of its steps
+        named = [variable for variable in named if not variable.auxiliary] or named
     if len(named) > 1:
         raise InputError(
             f"{source}: --var {var} means {len(named)} variables: {_listed(named)}; give the whole"

@@ -46,7 +46,7 @@ def test_scales_and_bounds_are_no_candidates_but_can_be_named(tmp_path: Path) ->
         file["scale"].make_scale("scale")
     with open_series(tmp_path / "a.h5") as series:
         assert series.name == "v"
-    with open_series(tmp_path / "a.h5", var="corners") as series:
+    with open_series(tmp_path / "a.h5", var="corners", axes="z,y,x") as series:
         assert series.shape == (1, 5, 6, 4)
 
 

@@ -100,7 +100,7 @@ def test_axes_by_cf_attributes(
         (("lev", "lat", "lon"), (1, 4, 3, 5)),
         (("lon", "lat", "time_0"), (5, 1, 3, 4)),
         (("time", "z", "x"), (4, 3, 1, 5)),
-        (("member", "south_north", "west_east"), (1, 4, 3, 5)),
+        (("sheet", "south_north", "west_east"), (1, 4, 3, 5)),
     ],
 )
 def test_three_dimensions_by_name(

@@ -1,0 +1,192 @@
+"""Fill values that nobody declared: one extreme value, repeated, far away from all others.
+
+A quality is promised relative to the range of a series. Where 1e20 stands for "no value", the range
+is 1e20, and every good value may be wrong by 1e17. Such a series is refused, and the user says what
+the value means. Real data have extremes that repeat too: zeros, saturated counts, plateaus, labels.
+What tells them apart is the gap: the range with the value is many times that of all other values.
+How many times depends on the value (`least_ratio`).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.series import Series
+
+MOST = 2.0
+"""Ratio of the ranges with and without a value that is hardly ever data: -9999, -32768."""
+
+SEVERAL = 10.0
+"""Ratio for a value that may be data too: 9999, or 65535 where a detector is saturated."""
+
+HUGE = 1e3
+"""Ratio for a large power of ten and the like: 1e20 is a density of electrons as well."""
+
+ABSURD = 1e6
+"""Ratio for any other value: without it, less than a millionth of the range is left.
+
+A plateau of 1000 in a background of 1.2 +- 0.1, as water in air, has a ratio of 5000.
+"""
+
+NINES = re.compile(r"-99+(\.9+)?|999+(\.9+)?")
+HUGE_VALUES = (1e15, 1e20, 1e30, 1e33, 1e34, 1e35, 1e36, 1e37, 1e38, 9.969209968386869e36)
+"""Magnitudes that are in use for missing values; the last is NetCDF's default."""
+
+LARGEST_FLOATS = (float(np.finfo(np.float32).max), float(np.finfo(np.float64).max))
+
+
+def least_ratio(value: float) -> float:
+    """The ratio of the ranges with and without a value, from which on it is taken for a fill value.
+
+    The value is finite.
+    """
+    if value in _type_ends(low=True):
+        return MOST
+    if value in _type_ends(low=False):
+        return SEVERAL
+    if NINES.fullmatch(f"{value:.9g}"):
+        return MOST if value < 0 else SEVERAL
+    return HUGE if _is_huge(value) else ABSURD
+
+
+def _type_ends(*, low: bool) -> set[int]:
+    """Ends of the integer types of 16 to 64 bits; at the lower end also NetCDF's default, one
+    above."""
+    if low:
+        return {-(2**bits) + more for bits in (15, 31, 63) for more in (0, 1, 2)}
+    return {2**bits - more for bits in (15, 16, 31, 32, 63, 64) for more in (1, 2)}
+
+
+def _is_huge(value: float) -> bool:
+    # a float32 of 1e20 is 1.00000002e20 as a float64
+    return abs(value) in LARGEST_FLOATS or any(
+        math.isclose(abs(value), huge, rel_tol=1e-6) for huge in HUGE_VALUES
+    )
+
+
+@dataclass
+class _End:
+    """One end of the range of the values so far: the value, how often it occurs, the next one."""
+
+    low: bool
+    value: float | None = None
+    count: int = 0
+    next: float | None = None
+
+    def add(self, piece: npt.NDArray[Any], extreme: float) -> None:
+        """Add a piece whose finite values have this extreme."""
+        if self.value is None or self._beyond(extreme, self.value):
+            self._candidate(self.value)
+            self.value, self.count = extreme, 0
+        if extreme == self.value:
+            self.count += int(np.count_nonzero(piece == extreme))
+            self._candidate(_inner(piece, extreme, self.low))
+        else:
+            self._candidate(extreme)
+
+    def _beyond(self, one: float, other: float) -> bool:
+        return one < other if self.low else one > other
+
+    def _candidate(self, value: float | None) -> None:
+        if value is not None and (self.next is None or self._beyond(value, self.next)):
+            self.next = value
+
+
+def _inner(piece: npt.NDArray[Any], extreme: float, low: bool) -> float | None:
+    """The finite value of a piece nearest to its extreme; None if there is no other."""
+    inside = piece > extreme if low else piece < extreme
+    if piece.dtype.kind == "f":
+        start: Any = np.inf if low else -np.inf
+    else:
+        limits = np.iinfo(piece.dtype)
+        start = limits.max if low else limits.min
+    found = (np.min if low else np.max)(piece, initial=start, where=inside)
+    if found == start and not (np.isfinite(start) and inside.any()):
+        return None
+    number: float = found.item()
+    return number
+
+
+class Extremes:
+    """The two ends of the range of a series, gathered piece by piece, and the values next to them.
+
+    Integers of 8 bits are passed over: their range is 255 at most, and label 127 is a label.
+    """
+
+    def __init__(self, dtype: np.dtype[Any]) -> None:
+        self._relevant = dtype.kind == "f" or dtype.itemsize > 1
+        self._low, self._high = _End(low=True), _End(low=False)
+        self._count = 0
+
+    def add(self, piece: npt.NDArray[Any], count: int, low: float, high: float) -> None:
+        """Add a piece with `count` finite values from `low` to `high`; the others are no matter."""
+        if self._relevant and count:
+            self._count += count
+            self._low.add(piece, low)
+            self._high.add(piece, high)
+
+    def suspects(self) -> list[float]:
+        """The ends that look like fill values; none, one or both."""
+        low, high = self._low, self._high
+        for ends in ([low], [high], [low, high]):
+            if all(end.count > 1 for end in ends) and self._apart(ends):
+                return [end.value for end in ends if end.value is not None]
+        return []
+
+    def _apart(self, ends: list[_End]) -> bool:
+        """Whether the range without some ends is so small that they must be fill values."""
+        rest = self._rest(ends)
+        if rest is None or self._low.value is None or self._high.value is None:
+            return False
+        # halved, so that no difference of finite numbers overflows
+        full, left = self._high.value / 2 - self._low.value / 2, rest[1] / 2 - rest[0] / 2
+        values = [end.value for end in ends if end.value is not None]
+        if left == 0:
+            # all others are equal, as in a mask; only a value that is hardly ever data counts
+            return all(least_ratio(value) in (MOST, HUGE) for value in values)
+        return all(full >= least_ratio(value) * left for value in values)
+
+    def _rest(self, ends: list[_End]) -> tuple[float, float] | None:
+        """The range of the values without some ends; None if none is left."""
+        low = self._low.next if self._low in ends else self._low.value
+        high = self._high.next if self._high in ends else self._high.value
+        return None if low is None or high is None or low > high else (low, high)
+
+    def refuse(self, series: Series) -> None:
+        """Raise InputError if an end looks like a fill value, unless the user said it is data."""
+        suspects = [] if series.keep_extremes else self.suspects()
+        if not suspects:
+            return
+        counts = {self._low.value: self._low.count, self._high.value: self._high.count}
+        stands = " and ".join(
+            f"{_shown(value, series.dtype)} at {_percent(counts[value] / self._count)}"
+            for value in suspects
+        )
+        rest = self._rest([end for end in (self._low, self._high) if end.value in suspects])
+        assert rest is not None
+        others = " to ".join(_shown(value, series.dtype) for value in dict.fromkeys(rest))
+        options = " ".join(f"--missing {_shown(value, series.dtype)}" for value in suspects)
+        raise InputError(
+            f"{series.source}: '{series.name}' has {stands} of its vertices, and only {others}"
+            f" elsewhere; give {options} if that marks missing values,"
+            " or --keep-extremes if it is data"
+        )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"
+
+
+def _shown(value: float, dtype: np.dtype[Any]) -> str:
+    """The shortest text that stands for a value of a type."""
+    if dtype.kind != "f":
+        return str(int(value))
+    text = str(dtype.type(value))
+    return text.removesuffix(".0")

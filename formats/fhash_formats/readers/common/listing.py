@@ -1,0 +1,184 @@
+"""What a source holds, for users who see it for the first time: variables, axes, options."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from fhash_formats.errors import InputError
+from fhash_formats.readers.common.layout import (
+    Dimension,
+    arrange,
+    is_asked,
+    label,
+    must_select,
+    picks,
+    readings,
+    single,
+)
+from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.variables import Variable, kind_of, plain_name
+from fhash_formats.series import AXES, Series
+from fhash_formats.support.attributes import plain_text
+
+
+@dataclass(frozen=True, kw_only=True)
+class Listed:
+    """One variable of a source.
+
+    Attributes:
+        name: full name, as `--var` takes it.
+        shape: lengths in the file's order.
+        dtype: type of the stored numbers, in words.
+        units: of the values, "" where unknown.
+        dimensions: name and axis of each dimension; the axis is "t", "z", "y" or "x", "select"
+            where an index must be selected, and "?" where two readings are likely.
+        options: for each likely reading, the options of `fhash encode` that it needs; none if the
+            variable cannot be encoded.
+        problem: why it cannot be encoded, "" if it can.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+    units: str = ""
+    dimensions: tuple[tuple[str, str], ...] = ()
+    options: tuple[tuple[str, ...], ...] = ()
+    problem: str = ""
+
+    def commands(self, path: str) -> list[str]:
+        """The command for each likely reading, for a shell."""
+        output = plain_name(self.name).replace("*", "").strip(".") or "run"
+        return [
+            shlex.join(["fhash", "encode", path, "-o", f"{output}.fhz", *options])
+            for options in self.options
+        ]
+
+    def as_dict(self, path: str) -> dict[str, Any]:
+        """JSON values: all attributes, and the commands."""
+        return {
+            "name": self.name,
+            "shape": list(self.shape),
+            "dtype": self.dtype,
+            "units": self.units,
+            "dimensions": [
+                {"name": name, "length": length, "axis": axis}
+                for (name, axis), length in zip(self.dimensions, self.shape, strict=False)
+            ],
+            "commands": self.commands(path),
+            "problem": self.problem,
+        }
+
+
+def listing(
+    source: str,
+    variables: Sequence[Variable],
+    dimensions: Callable[[Variable], list[Dimension]],
+    request: Request,
+) -> list[Listed]:
+    """The variables of a file; coordinates and the members of joined ones are left out.
+
+    dimensions: of a variable that can be read.
+    """
+    shown = [variable for variable in variables if not variable.auxiliary]
+    several = sum(not variable.problem(request.booleans) for variable in shown) > 1
+    found = []
+    for variable in shown:
+        name, problem = plain_text(variable.name), variable.problem(request.booleans)
+        entry = Listed(
+            name=name,
+            shape=variable.shape,
+            dtype=kind_of(variable.dtype),
+            units=plain_text(variable.units),
+            problem=problem,
+        )
+        if not problem:
+            named = ("--var", name) if several or request.var else ()
+            entry = _read(source, entry, dimensions(variable), request, named)
+        found.append(entry)
+    return found
+
+
+def _read(
+    source: str,
+    entry: Listed,
+    dimensions: Sequence[Dimension],
+    request: Request,
+    named: tuple[str, ...],
+) -> Listed:
+    """An entry with its dimensions and the options of its readings."""
+    names = [label(place, dimension) for place, dimension in enumerate(dimensions)]
+    said = (*named, *_given(request))
+    axes = ["?"] * len(dimensions)
+    try:
+        picked = picks(source, entry.name, dimensions, request.select)
+        extra: list[int] = []
+        if request.axes is None:
+            picked |= single(dimensions, picked)
+            extra = must_select(dimensions, picked)
+        for place in {**picked, **dict.fromkeys(extra, 0)}:
+            axes[place] = "select"
+        chosen = {**picked, **dict.fromkeys(extra, 0)}
+        select = tuple(("--select", f"{names[place]}=0") for place in extra)
+        options = (*said, *(word for pair in select for word in pair))
+        kept = [place for place in range(len(dimensions)) if place not in chosen]
+        if request.axes is None and is_asked(
+            dimensions, chosen, selected=bool(request.select or extra)
+        ):
+            both = readings(dimensions, [dimensions[place] for place in kept])
+            for place in kept[:-1]:
+                axes[place] = dimensions[place].role or "?"
+            return replace(
+                entry,
+                dimensions=tuple(zip(names, axes, strict=True)),
+                options=tuple((*options, *text.split()) for text in both),
+            )
+        wishes = tuple((names[place], "0") for place in extra)
+        layout = arrange(
+            source, entry.name, dimensions, replace(request, select=(*request.select, *wishes))
+        )
+    except InputError as error:
+        return replace(
+            entry,
+            dimensions=tuple(zip(names, axes, strict=True)),
+            problem=str(error).removeprefix(f"{source}: "),
+        )
+    for place, axis in zip(kept, layout.axes, strict=True):
+        axes[place] = axis
+    return replace(entry, dimensions=tuple(zip(names, axes, strict=True)), options=(options,))
+
+
+def _given(request: Request) -> tuple[str, ...]:
+    """The options that the user gave already, which the commands repeat."""
+    words: list[str] = []
+    if request.axes is not None:
+        words += ["--axes", ",".join(request.axes)]
+    for name, index in request.select:
+        words += ["--select", f"{name}={index}"]
+    if request.raw is not None:
+        raw = request.raw
+        if raw.shape is not None:
+            words += ["--shape", ",".join(f"{axis}={n}" for axis, n in raw.shape.items())]
+        if raw.dtype is not None:
+            words += ["--dtype", raw.dtype]
+        if raw.endian is not None:
+            words += ["--endian", raw.endian]
+    if request.raw_values:
+        words.append("--raw-values")
+    for value in request.missing:
+        words += ["--missing", f"{value:.17g}" if isinstance(value, float) else str(value)]
+    return tuple(words)
+
+
+def listed_series(series: Series, request: Request) -> Listed:
+    """The only variable of a source that is one series already."""
+    return Listed(
+        name=series.name,
+        shape=series.shape,
+        dtype=kind_of(series.dtype),
+        units=series.units,
+        dimensions=tuple((series.coords[axis].name, axis) for axis in AXES),
+        options=(("--var", request.var, *_given(request)) if request.var else _given(request),),
+    )

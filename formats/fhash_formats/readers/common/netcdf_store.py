@@ -1,0 +1,156 @@
+"""Opening NetCDF files with xarray: NetCDF4 through h5netcdf, classic NetCDF3 through scipy.
+
+Times are not decoded, and nothing is read before it is asked for.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.readers.common.cf_packing import Packing, packing
+from fhash_formats.readers.common.failures import condense
+from fhash_formats.readers.common.hdf5_tree import require_filters
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Values = npt.NDArray[Any]
+Exact = Callable[[Values, tuple[slice, ...]], Values]
+
+CLASSIC = (b"CDF\x01", b"CDF\x02")
+CLASSIC_64 = b"CDF\x05"
+
+
+def magic_of(path: Path) -> bytes:
+    """The first four bytes of a file."""
+    with path.open("rb") as file:
+        return file.read(4)
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Silence xarray's warnings about a file (several fill values, bounds that are missing).
+
+    None of them changes the values that are read.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def open_groups(
+    source: str, path: Path, head: bytes, *, raw: bool = False
+) -> Mapping[str, xr.Dataset]:
+    """Datasets of all groups by path, "/" first; `raw` leaves values packed."""
+    if head == CLASSIC_64:
+        raise InputError(
+            f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with:"
+            " nccopy -k nc4 IN OUT"
+        )
+    try:
+        import xarray as xr
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"{source}: NetCDF needs xarray and h5netcdf; pip install 'fhash[formats]'"
+        ) from error
+    options: dict[str, Any] = {
+        "decode_times": False,
+        "decode_timedelta": False,
+        "decode_coords": "all",
+        "cache": False,
+        "chunks": None,
+        "mask_and_scale": not raw,
+    }
+    if head in CLASSIC:
+        try:
+            importlib.import_module("scipy")
+        except ImportError as error:
+            advice = "pip install scipy, or convert it with: nccopy -k nc4 IN OUT"
+            raise InputError(f"{source} is classic NetCDF3, which needs scipy; {advice}") from error
+        return {"/": _open_classic(source, path, options)}
+    try:
+        importlib.import_module("h5netcdf")
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"{source}: NetCDF4 needs h5netcdf; pip install 'fhash[formats]'"
+        ) from error
+    # dimensions without a scale get a made-up name, so that HDF5 files named .nc open too
+    return xr.open_groups(path, engine="h5netcdf", phony_dims="access", **options)
+
+
+def _open_classic(source: str, path: Path, options: Mapping[str, Any]) -> xr.Dataset:
+    import xarray as xr
+
+    try:
+        return xr.open_dataset(path, engine="scipy", **options)
+    except Exception as error:
+        message = condense(error)
+    # the error is not chained: its traceback holds scipy's half-open file, which warns when it is
+    # dropped, and here nobody hears that
+    gc.collect()
+    raise InputError(
+        f"{source} cannot be read as classic NetCDF3: {message}; nccopy -k nc4 IN OUT may convert"
+        " it"
+    )
+
+
+def close_groups(groups: Mapping[str, xr.Dataset]) -> None:
+    """Close the datasets of all groups."""
+    with quietly():
+        for dataset in groups.values():
+            dataset.close()
+
+
+def declared(source: str, array: xr.Variable) -> Packing | None:
+    """The packing of a variable that xarray unpacks; None for types that cannot be packed."""
+    stored = np.dtype(array.encoding.get("dtype", array.dtype))
+    return packing(source, stored, array.encoding) if stored.kind in "iuf" else None
+
+
+def exactly_filled(source: str, path: Path, name: str, encoding: Mapping[str, Any]) -> Exact | None:
+    """A test that tells a fill value from its neighbours; None where float64 suffices.
+
+    xarray compares as float64, in which many 64-bit integers beyond 2^53 are equal.
+    """
+    import h5py
+
+    stored = np.dtype(encoding.get("dtype", np.float32))
+    if stored.kind not in "iu" or stored.itemsize < 8:
+        return None
+    plain = {
+        key: value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+        for key, value in encoding.items()
+    }
+    packed = packing(source, stored, plain)
+    if all(abs(int(fill)) < 1 << 53 for fill in packed.fills):
+        return None
+
+    def exact(values: Values, ranges: tuple[slice, ...]) -> Values:
+        if not np.isnan(values).any():
+            return values
+        with h5py.File(path, "r") as file:
+            return packed.unpack(np.asarray(file[name][ranges]))
+
+    return exact
+
+
+def check_filters(source: str, path: Path, name: str) -> None:
+    """Raise an error that says what is missing, if a variable cannot be decompressed here."""
+    import h5py
+
+    if not h5py.is_hdf5(path):
+        return
+    with h5py.File(path, "r") as file:
+        dataset = file.get(name)
+        if isinstance(dataset, h5py.Dataset):
+            require_filters(source, name, dataset)

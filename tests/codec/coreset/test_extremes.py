@@ -1,0 +1,191 @@
+"""Fill values that nobody declared: which series are refused, and which real data are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from fhash_codec.coreset.extremes import (
+    ABSURD,
+    HUGE,
+    LARGEST_FLOATS,
+    MOST,
+    SEVERAL,
+    Extremes,
+    least_ratio,
+)
+from fhash_codec.coreset.scan import scan
+from fhash_codec.measure.value_range import pieces
+from fhash_codec.progress import silent
+from fhash_formats.errors import InputError
+from fhash_formats.series import ArraySeries, StepsSeries
+
+Values = npt.NDArray[np.generic]
+GRID = np.linspace(0, 1, 8 * 9 * 10).reshape(1, 8, 9, 10)
+"""A smooth field (t, z, y, x) from 0 to 1."""
+
+MASK = GRID < 0.3
+"""Vertices without a value, as over land."""
+
+
+def suspects(values: Values, step: int = 10**6) -> list[float]:
+    """Suspects among the values, given in pieces of `step`."""
+    found = Extremes(values.dtype)
+    flat = values.reshape(-1)
+    for start in range(0, flat.size, step):
+        for piece in pieces(flat[start : start + step]):
+            finite = piece[np.isfinite(piece)]
+            if finite.size:
+                found.add(piece, finite.size, float(finite.min()), float(finite.max()))
+            else:
+                found.add(piece, 0, np.inf, -np.inf)
+    return found.suspects()
+
+
+def masked(values: Values, fill: float, dtype: str = "f4") -> Values:
+    return np.where(MASK, fill, values).astype(dtype)
+
+
+@pytest.mark.parametrize("step", [7, 100, 10**6])
+@pytest.mark.parametrize(
+    ("fill", "low", "high", "dtype"),
+    [
+        (1e20, 250, 310, "f4"),
+        (1e20, 0, 1e-6, "f8"),
+        (9.969209968386869e36, -5, 40, "f4"),
+        (-9999, 0, 5000, "f4"),
+        (-9999.9, 0, 5000, "f8"),
+        (-999, 0, 200, "i2"),
+        (-99, 0, 30, "f4"),
+        (-32768, 0, 30000, "i2"),
+        (-32767, 0, 30000, "f4"),
+        (-(2**31), -(10**6), 10**6, "i4"),
+        (-(2**63), 0, 10**9, "i8"),
+        (65535, 0, 4095, "u2"),
+        (9999, 0, 100, "f4"),
+        (3.4028234663852886e38, 0, 1, "f4"),
+        (-1e34, 0, 1, "f4"),
+        (1.2345e10, 0, 100, "f8"),
+    ],
+)
+def test_a_fill_value_is_found(fill: float, low: float, high: float, dtype: str, step: int) -> None:
+    values = masked(low + (high - low) * GRID, fill, dtype)
+    assert suspects(values, step) == [float(np.array(fill, dtype))]
+
+
+def test_fill_values_at_both_ends_are_found() -> None:
+    values = masked(GRID, -1e30)
+    values[:, -1] = 1e30
+    assert suspects(values) == [float(np.float32(-1e30)), float(np.float32(1e30))]
+
+
+RANDOM = np.random.default_rng(0).normal(size=GRID.shape)
+PEAK = np.exp(-((GRID - 0.5) ** 2) / 1e-5)
+
+
+def two_phase() -> Values:
+    """Water of 1000 in air of 1.2, which alone has noise, without a vertex between."""
+    return np.where(MASK, 1000, 1.2 + 0.02 * RANDOM)
+
+
+def hot_pixels() -> Values:
+    values = 12000 + 3000 * RANDOM
+    values.flat[::100] = 65535
+    return values.clip(0, 65535).astype("u2")
+
+
+REAL = {
+    "a thin peak in zeros": np.where(PEAK > 1e-3, PEAK, 0).astype("f4"),
+    "one spike": np.where(np.arange(GRID.size).reshape(GRID.shape) == 5, 1e20, GRID),
+    "one -9999": np.where(np.arange(GRID.size).reshape(GRID.shape) == 5, -9999, GRID),
+    "a plateau without a shell": np.where(MASK, 100, 0).astype("f4"),
+    "a plateau with a shell": np.where(MASK, 1e6, np.where(GRID < 0.31, 5e5, 0.001 * RANDOM)),
+    "a plateau above noise": np.where(MASK, 100, 1e-3 * RANDOM).astype("f4"),
+    "two phases": two_phase(),
+    "mostly zero": np.where(MASK, GRID, 0),
+    "values from 250 K and zeros": np.where(MASK, 0, 250 + 60 * GRID).astype("f4"),
+    "saturated 8 bits": (300 * GRID).clip(0, 255).astype("u1"),
+    "isolated 255": np.where(MASK, 255, 20 * GRID).astype("u1"),
+    "labels with 127": np.where(MASK, 127, np.rint(5 * GRID)).astype("i1"),
+    "labels with -100": np.where(MASK, -100, np.rint(58 * GRID)).astype("i1"),
+    "saturated 16 bits": (90000 * GRID).clip(0, 65535).astype("u2"),
+    "hot pixels": hot_pixels(),
+    "a 0/1 mask": MASK.astype("i4"),
+    "a mask of 0 and 65535": np.where(MASK, 65535, 0).astype("u2"),
+    "a sign": np.where(MASK, -1.0, 1.0),
+    "labels of 16 bits": np.where(MASK, 2035, np.rint(77 * GRID)).astype("i2"),
+    "clipped below": (-20000 + 30000 * GRID - 30000 * (GRID < 0.1)).clip(-32768).astype("i2"),
+    "constant": np.full(GRID.shape, 1e20),
+    "all of a range": np.array([-1.7e308, 1.7e308, -1.7e308, 1.7e308]).reshape(1, 1, 2, 2),
+    "no finite value": np.full(GRID.shape, np.nan),
+}
+
+
+@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("step", [7, 10**6])
+def test_real_data_are_not_suspected(name: str, step: int) -> None:
+    assert suspects(REAL[name], step) == []
+
+
+@pytest.mark.parametrize(
+    ("value", "ratio"),
+    [
+        (-9999, MOST),
+        (-999.99, MOST),
+        (-99, MOST),
+        (-9, ABSURD),
+        (-98, ABSURD),
+        (99, ABSURD),
+        (999, SEVERAL),
+        (9999, SEVERAL),
+        (-32768, MOST),
+        (-32767, MOST),
+        (-32765, ABSURD),
+        (32767, SEVERAL),
+        (65534, SEVERAL),
+        (65533, ABSURD),
+        (1e20, HUGE),
+        (float(np.float32(1e20)), HUGE),
+        (1.00001e20, ABSURD),
+        (1e19, ABSURD),
+        (-LARGEST_FLOATS[1], HUGE),
+        (0, ABSURD),
+    ],
+)
+def test_how_far_away_a_value_must_be(value: float, ratio: float) -> None:
+    assert least_ratio(value) == ratio
+
+
+@pytest.mark.parametrize(
+    ("value", "ratio"), [(-9999, MOST), (9999, SEVERAL), (1e20, HUGE), (12345.0, ABSURD)]
+)
+def test_each_ratio_on_both_sides(value: float, ratio: float) -> None:
+    full = abs(value) / 2
+    far = value + (full if value < 0 else -full)
+    for shift, found in ((0.999, [value]), (1.001, [])):
+        others = far + np.linspace(0, 1, 50) * (value - far) / ratio * shift
+        values = np.concatenate([np.full(5, float(value)), others]).reshape(1, 1, 5, 11)
+        assert suspects(values) == found
+
+
+def test_the_scan_stops_with_the_value_its_share_and_the_options() -> None:
+    values = masked(250 + 60 * GRID, 1e20)
+    share = 100 * MASK.mean()
+    with pytest.raises(
+        InputError,
+        match=rf"array: 'T' has 1e\+20 at {share:.3g} % of its vertices, and only 268\S* to 310"
+        r" elsewhere; give --missing 1e\+20 if .*, or --keep-extremes if it is data",
+    ):
+        scan(ArraySeries(values, name="T"), silent)
+    scan(ArraySeries(values, keep_extremes=True), silent)
+    scan(StepsSeries(ArraySeries(values, keep_extremes=True), [0]), silent)
+    seen = scan(ArraySeries(values, missing=[1e20]), silent)
+    assert seen.value_range.high == 310
+    assert seen.finite_count == (~MASK).sum()
+
+
+def test_integers_of_an_array_with_missing_values() -> None:
+    series = ArraySeries(masked(1000 * GRID, -32768, "i2"), missing=[-32768])
+    assert (series.dtype, series.source_dtype, series.fill) == (np.float32, np.int16, -32768)
+    assert np.isnan(series.read(0)[MASK[0]]).all()
