@@ -67,10 +67,17 @@ class JoinedSeries(Series):
     All files have the same variable, frame shape, type and spatial coordinates. Times are those of
     the files if they give them, and must then increase from file to file; otherwise they are 0, 1,
     2, ... Raises InputError that names the file which differs.
+
+    times: of all steps, in place of those of the files.
     """
 
     def __init__(
-        self, pattern: str, paths: Sequence[Path], open_part: Callable[[Path], FileSeries]
+        self,
+        pattern: str,
+        paths: Sequence[Path],
+        open_part: Callable[[Path], FileSeries],
+        *,
+        times: Coordinate | None = None,
     ) -> None:
         self.source = pattern
         self._open_part = open_part
@@ -94,7 +101,7 @@ class JoinedSeries(Series):
         self.units, self.dtype, self.attributes = first.units, first.dtype, first.attributes
         self._ends = list(accumulate(part.steps for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
-        self.coords = {**first.coords, "t": self._times()}
+        self.coords = {**first.coords, "t": times or self._times()}
 
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)
