@@ -42,7 +42,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("compact",),
         ("paper",),
         ("volume_model",),
-        ("indexing", "sampling"),
+        ("indexing", "sampling", "times"),
         ("volume",),
         ("rendering", "report"),
         ("comparison", "demo", "isosurface"),

@@ -29,12 +29,16 @@ def region(axes: dict[str, list[float]], dtype: str) -> Region:
         for axis, values in axes.items()
     }
     t, z, y, x = (len(axes[axis]) for axis in "tzyx")
-    return Region(name="wind", units="m/s", dtype=np.dtype(dtype), shape=(t, z, y, x), coords=coords)
+    return Region(
+        name="wind", units="m/s", dtype=np.dtype(dtype), shape=(t, z, y, x), coords=coords
+    )
 
 
 @pytest.mark.parametrize("steps", [1, 3])
 @pytest.mark.parametrize("dtype", ["f4", "f8", "i2"])
-@pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr", ".raw", ".vti", ".vtr", ".pvd", ".vtkhdf"])
+@pytest.mark.parametrize(
+    "suffix", [".h5", ".nc", ".zarr", ".raw", ".vti", ".vtr", ".pvd", ".vtkhdf"]
+)
 def test_an_export_comes_back(tmp_path: Path, suffix: str, dtype: str, steps: int) -> None:
     axes = {**(UNEVEN if suffix == ".vtr" else EVEN), "t": EVEN["t"][:steps]}
     described = region(axes, dtype)

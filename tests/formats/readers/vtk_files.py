@@ -68,7 +68,11 @@ def write(path: Path, grid: Any, **options: Any) -> Path:
     else:
         getattr(writer, f"SetCompressorTypeTo{compressor}")()
     writer.SetBlockSize(options.get("block", 512))
-    (writer.SetHeaderTypeToUInt32 if options.get("header") == 32 else writer.SetHeaderTypeToUInt64)()
+    (
+        writer.SetHeaderTypeToUInt32
+        if options.get("header") == 32
+        else writer.SetHeaderTypeToUInt64
+    )()
     (writer.SetByteOrderToBigEndian if options.get("big") else writer.SetByteOrderToLittleEndian)()
     assert writer.Write() == 1
     return path
