@@ -22,6 +22,7 @@ from fhash_formats.readers.common.hdf5_tree import (
     variables,
 )
 from fhash_formats.readers.common.positions import beside, coordinate, usable
+from fhash_formats.readers.common.real_time import counts_steps
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate, role_of_name
 from fhash_formats.readers.common.variables import choose
@@ -89,9 +90,12 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
     certain = request.axes is not None or all(hint is not None for hint in hints)
     group = variable.name.rpartition("/")[0]
     places = [columns(tree, place) for place in dict.fromkeys([group, ""])]
+    scaled = _scale_coordinates(source, axes, dataset.shape, scales)
     tied = [axis for axis, scale in zip(axes, scales, strict=True) if scale is not None]
+    if "t" in scaled and counts_steps(scaled["t"].values) and "units" not in scaled["t"].attributes:
+        tied.remove("t")  # numbers of steps: a time beside them comes first
     coords = beside(source, axes, dataset.shape, places, certain=certain, tied=tied)
-    coords |= _scale_coordinates(source, axes, dataset.shape, scales)
+    coords = {**scaled, **coords}
     return FileSeries(
         source=source,
         name=variable.name.rpartition("/")[2],

@@ -27,6 +27,19 @@ from fhash_formats.readers.common.grid import (
     component_variables,
     lattice,
 )
+from fhash_formats.readers.common.nrrd_header import (
+    MAGIC,
+    MAX_HEADER,
+    Fields,
+    directions_of,
+    dtype_of,
+    number_of,
+    read_header,
+    sizes_of,
+    vectors,
+    whole,
+    words_of,
+)
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_name
 from fhash_formats.readers.common.stored_bytes import (
@@ -41,32 +54,12 @@ from fhash_formats.readers.common.variables import choose
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 
 SUFFIXES = (".nrrd", ".nhdr")
-MAGIC = b"NRRD000"
 
-TYPE_NAMES = {
-    "i1": "signed char|int8|int8_t",
-    "u1": "uchar|unsigned char|uint8|uint8_t",
-    "i2": "short|short int|signed short|signed short int|int16|int16_t",
-    "u2": "ushort|unsigned short|unsigned short int|uint16|uint16_t",
-    "i4": "int|signed int|int32|int32_t",
-    "u4": "uint|unsigned int|uint32|uint32_t",
-    "i8": "longlong|long long|long long int|signed long long|signed long long int|int64|int64_t",
-    "u8": "ulonglong|unsigned long long|unsigned long long int|uint64|uint64_t",
-    "f4": "float",
-    "f8": "double",
-}
-TYPES = {name: short for short, names in TYPE_NAMES.items() for name in names.split("|")}
-"""Number types by their names in the header."""
-
-MAX_HEADER = 64 * 2**20
-"""Bytes of the longest header; own ones list every coordinate."""
 
 SPATIAL = ("domain", "space", "none", "???")
 """Kinds of axes that are positions, or say nothing."""
 
 COLOURS = ("RGB-color", "RGBA-color", "HSV-color", "XYZ-color")
-
-Fields = Mapping[str, str]
 
 
 def matches(head: bytes, path: Path) -> bool:
@@ -82,11 +75,11 @@ def open_nrrd(path: Path, request: Request) -> FileSeries:
     """
     source, stamp = str(path), Stamp.of(path)
     with naming(source):
-        fields, pairs, end = _header(path)
-        sizes = _sizes(fields)
-        kinds = _words(fields, "kinds", len(sizes), "domain")
+        fields, pairs, end = read_header(path)
+        sizes = sizes_of(fields)
+        kinds = words_of(fields, "kinds", len(sizes), "domain")
         axes, vector = _axes(fields, pairs, sizes, kinds)
-        dtype = _dtype(fields)
+        dtype = dtype_of(fields)
         name = _content(fields, path)
         values = component_variables(
             name,
@@ -134,72 +127,6 @@ def open_nrrd(path: Path, request: Request) -> FileSeries:
     )
 
 
-def _header(path: Path) -> tuple[dict[str, str], dict[str, str], int]:
-    """Fields, key/value pairs, and the first byte behind the header."""
-    fields: dict[str, str] = {}
-    pairs: dict[str, str] = {}
-    with path.open("rb") as file:
-        lines = [file.readline(MAX_HEADER)]
-        if not re.fullmatch(rb"NRRD000[1-5]\r?\n", lines[0]):
-            raise InputError(f"it begins with {lines[0][:20]!r}; NRRD0001 to NRRD0005 can be read")
-        while line := file.readline(MAX_HEADER):
-            text = line.decode("utf-8", errors="replace").rstrip("\r\n")
-            if file.tell() > MAX_HEADER:
-                raise InputError(f"its header is longer than {MAX_HEADER} bytes")
-            if not text:
-                break
-            if text.startswith("#"):
-                continue
-            key, separator, value = text.partition(":=")
-            if separator and ": " not in key:
-                pairs[key] = value
-                continue
-            key, separator, value = text.partition(":")
-            if not separator:
-                raise InputError(f"its header has the line {text[:60]!r}")
-            key = re.sub(r"[ _-]", "", key.strip().lower())
-            key = ALIASES.get(key, key)
-            fields[key] = value.strip()
-            if key == "data file" and value.split()[:1] == ["LIST"]:
-                rest = file.read(MAX_HEADER).decode("utf-8", errors="replace")
-                fields["list"] = rest
-                break
-        return fields, pairs, file.tell()
-
-
-ALIASES = {
-    "datafile": "data file",
-    "sampleunits": "sample units",
-    "axismins": "axis mins",
-    "spacedirections": "space directions",
-    "spaceorigin": "space origin",
-    "spacedimension": "space dimension",
-    "lineskip": "line skip",
-    "byteskip": "byte skip",
-    "centers": "centerings",
-}
-"""Names of fields without blanks, and the usual names."""
-
-
-def _sizes(fields: Fields) -> tuple[int, ...]:
-    words = fields.get("sizes", "").split()
-    dimension = fields.get("dimension", "")
-    if not words or not all(word.isascii() and word.isdigit() and int(word) > 0 for word in words):
-        raise InputError(
-            f"its sizes are {fields.get('sizes', '')!r}; whole numbers above 0 are needed"
-        )
-    if dimension != str(len(words)):
-        raise InputError(f"it has {len(words)} sizes and the dimension {dimension!r}")
-    return tuple(map(int, words))
-
-
-def _words(fields: Fields, name: str, count: int, default: str) -> list[str]:
-    words = fields[name].split() if name in fields else [default] * count
-    if len(words) != count:
-        raise InputError(f"its {name} are {len(words)}, its dimensions {count}")
-    return words
-
-
 def _axes(
     fields: Fields, pairs: Mapping[str, str], sizes: Sequence[int], kinds: Sequence[str]
 ) -> tuple[list[str], int | None]:
@@ -208,7 +135,7 @@ def _axes(
     The file's kinds, labels and space directions say which dimension is time or components; the
     others are x, y and z in their order.
     """
-    directions = _directions(fields, len(sizes))
+    directions = directions_of(fields, len(sizes))
     axes = [""] * len(sizes)
     vector = None
     labels = re.findall(r'"((?:[^"\\]|\\.)*)"', fields.get("labels", ""))
@@ -238,39 +165,6 @@ def _axes(
     for place, axis in zip(free, letters, strict=False):
         axes[place] = axis
     return axes, vector
-
-
-def _directions(fields: Fields, count: int) -> list[tuple[float, ...] | None] | None:
-    """The vector of each dimension in space, None for one that has none; None without the field."""
-    if "space directions" not in fields:
-        return None
-    vectors = _vectors(fields["space directions"])
-    if len(vectors) != count:
-        raise InputError(f"its space directions are {len(vectors)}, its dimensions {count}")
-    return vectors
-
-
-def _vectors(text: str) -> list[tuple[float, ...] | None]:
-    found: list[tuple[float, ...] | None] = []
-    for word in re.findall(r"\([^)]*\)|\S+", text):
-        if word == "none":
-            found.append(None)
-            continue
-        try:
-            found.append(tuple(float(part) for part in word.strip("()").split(",")))
-        except ValueError as error:
-            raise InputError(f"{word!r} is no vector") from error
-    return [None if each is not None and np.isnan(each).all() else each for each in found]
-
-
-def _dtype(fields: Fields) -> np.dtype[Any]:
-    kind = TYPES.get(" ".join(fields.get("type", "").lower().split()))
-    if kind is None:
-        raise InputError(f"its values are of the type {fields.get('type')!r}, which has no numbers")
-    order = fields.get("endian", "little").lower()
-    if order not in ("little", "big"):
-        raise InputError(f"its byte order is {order!r}")
-    return np.dtype(("<" if order == "little" else ">") + kind)
 
 
 def _content(fields: Fields, path: Path) -> str:
@@ -319,8 +213,8 @@ def _one_file(
 ) -> StoredBytes:
     """The bytes of one file, from `start` or what the header skips."""
     encoding = fields.get("encoding", "").lower()
-    skip = _whole(fields, "byte skip")
-    start = _after_lines(path, start, _whole(fields, "line skip"))
+    skip = whole(fields, "byte skip")
+    start = _after_lines(path, start, whole(fields, "line skip"))
     if encoding == "raw":
         place = path.stat().st_size - size if skip == -1 else start + skip
         return PlainFile(path, start=place, size=size)
@@ -334,17 +228,6 @@ def _one_file(
     if skip:
         raise InputError("it skips decompressed bytes, which is not supported")
     return CompressedFile(path, kind, start=start, size=size)
-
-
-def _whole(fields: Fields, name: str) -> int:
-    text = fields.get(name, "0")
-    try:
-        number = int(text)
-    except ValueError as error:
-        raise InputError(f"its {name} is {text!r}") from error
-    if number < -1:
-        raise InputError(f"its {name} is {number}")
-    return number
 
 
 def _after_lines(path: Path, start: int, lines: int) -> int:
@@ -399,11 +282,11 @@ def _exact(pairs: Mapping[str, str], axis: str, length: int) -> Coordinate:
 def _even(fields: Fields, sizes: Sequence[int], axes: Sequence[str]) -> dict[str, Coordinate]:
     """Coordinates from directions and origin, else from spacings and minima."""
     coords: dict[str, Coordinate] = {}
-    directions = _directions(fields, len(sizes))
+    directions = directions_of(fields, len(sizes))
     count = len(sizes)
-    spacings = [_float(word) for word in _words(fields, "spacings", count, "nan")]
-    minima = [_float(word) for word in _words(fields, "axis mins", count, "nan")]
-    centred = [word == "cell" for word in _words(fields, "centerings", count, "???")]
+    spacings = [number_of(word) for word in words_of(fields, "spacings", count, "nan")]
+    minima = [number_of(word) for word in words_of(fields, "axis mins", count, "nan")]
+    centred = [word == "cell" for word in words_of(fields, "centerings", count, "???")]
     for place, axis in enumerate(axes):
         if axis and (np.isfinite(spacings[place]) or np.isfinite(minima[place])):
             step = spacings[place] if np.isfinite(spacings[place]) else 1.0
@@ -418,17 +301,10 @@ def _even(fields: Fields, sizes: Sequence[int], axes: Sequence[str]) -> dict[str
         raise InputError(f"its space directions {fields['space directions']!r} fit no grid")
     order = sorted(range(len(placed)), key=lambda number: "xyzt".find(placed[number][0]))
     steps = axis_steps(matrix[order])
-    origins = (_vectors(fields.get("space origin", "")) or [None])[0] or (0.0,) * len(placed)
+    origins = (vectors(fields.get("space origin", "")) or [None])[0] or (0.0,) * len(placed)
     if len(origins) != len(placed):
         raise InputError(f"its space origin {fields['space origin']!r} fits no grid")
     for number, step, origin in zip(order, steps, origins, strict=True):
         axis = placed[number][0]
         coords[axis] = lattice(axis, float(origin), float(step), sizes[axes.index(axis)])
     return coords
-
-
-def _float(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError as error:
-        raise InputError(f"{text!r} stands where a number is needed") from error

@@ -18,6 +18,7 @@ from fhash_formats.readers.common.failures import FolderStamp, Stamp, condense, 
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.hdf5_tree import sibling
 from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
+from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate, role_of_name
 from fhash_formats.readers.common.variables import Variable, choose
@@ -213,6 +214,9 @@ def _axes_and_coordinates(
     )
     for axis, length, name, namesake in zip(axes, array.shape, names, namesakes, strict=True):
         column = namesake or _along(columns, axis, name)
+        if axis == "t" and name is not None:
+            along = [each for place in columns for each in place.values() if each.along == name]
+            column = real_time(namesake, [each for each in along if each is not namesake]) or column
         if column is not None and column.length == length:
             coords[axis] = coordinate(source, column.name, column.read(), column.attributes)
     return axes, coords
