@@ -42,7 +42,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("compact",),
         ("paper",),
         ("volume_model",),
-        ("indexing", "sampling", "value_type"),
+        ("indexing", "sampling", "times", "value_type"),
         ("volume",),
         ("rendering", "report"),
         ("comparison", "demo", "isosurface"),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.options import Command
+from fhash_cli.selection import time_of
 from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
@@ -143,6 +144,8 @@ class SceneOptions:
             _put(values, place, value)
         if values.get("step") is not None and float(values["step"]) < 0:
             values["step"] += volume.shape[0]
+        if isinstance(values.get("time"), str):
+            values["time"] = time_of(volume, values["time"])
         for name in self.effects:
             _put(values, f"effects.{_effect(name)}", True)
         if self.isosurfaces:
@@ -171,7 +174,11 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         metavar="N",
         help="Step, between two of them too; -1 is the last. Default: the first.",
     ),
-    click.option("--time", type=float, metavar="T", help="A physical time instead of a step."),
+    click.option(
+        "--time",
+        metavar="T",
+        help="A time instead of a step: a number, or a date such as 2001-02-10T06:00.",
+    ),
     click.option("--size", type=SizeType(), help="Pixels across and down.  [default: 512x512]"),
     click.option(
         "--view", metavar="NAME", help="Direction to look from: iso, xy, xz, yz, yx, zx or zy."

@@ -27,6 +27,21 @@ def steps_of(volume: Volume, chosen: slice | None, option: str = "--t") -> list[
     return [float(step) for step in range(low, high, chosen.step or 1)]
 
 
+def time_of(volume: Volume, text: str | float) -> float:
+    """The time of `--time`, a number or a date, in the units of the series.
+
+    Raises InputError for text that is neither, and RegionError for a time outside the series.
+    """
+    from fhash_codec import times
+
+    return times.time_of(volume.coords["t"], text, str(volume.path))
+
+
+def steps_at(volume: Volume, times: Sequence[str]) -> list[float]:
+    """Indices of the steps at times as `time_of` takes them, fractional between two steps."""
+    return [volume.step_of_time(time_of(volume, time)) for time in times]
+
+
 def region_of(
     volume: Volume, roi: Sequence[Sequence[int | None]] | None
 ) -> tuple[Span, Span, Span]:

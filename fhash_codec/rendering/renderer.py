@@ -177,7 +177,7 @@ class Renderer:
             digest=volume.container.digest,
         )
         units = "" if volume.units in ("", "1") else f" [{volume.units}]"
-        label = time_text(plan.step, plan.time, str(volume.coords["t"].attributes.get("units", "")))
+        label = time_text(plan.step, plan.time, volume.coords["t"])
         drawn = overlay(
             image,
             plan.scene.effects,

@@ -18,7 +18,7 @@ from fhash_cli.options import (
     run_argument,
 )
 from fhash_cli.output import Progress, apart, emit, extent, listed, number, spans, table
-from fhash_cli.selection import Span, coordinates, region_of, region_of_box, steps_of
+from fhash_cli.selection import Span, coordinates, region_of, region_of_box, steps_at, steps_of
 from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
@@ -55,9 +55,8 @@ TYPES = (
     "--time",
     "times",
     metavar="T",
-    type=float,
     multiple=True,
-    help="A physical time, between steps too; may be repeated.",
+    help="A number or a date such as 2001-02-10T06:00, between steps too; may be repeated.",
 )
 @click.option(
     "--roi",
@@ -108,7 +107,7 @@ TYPES = (
 def command(
     run: str,
     steps: slice | None,
-    times: tuple[float, ...],
+    times: tuple[str, ...],
     roi: Sequence[Sequence[int | None]] | None,
     box: Sequence[Sequence[float | None]] | None,
     lod: int | None,
@@ -196,7 +195,7 @@ class Selection:
         cls,
         volume: Volume,
         steps: slice | None,
-        times: tuple[float, ...],
+        times: tuple[str, ...],
         roi: Sequence[Sequence[int | None]] | None,
         box: Sequence[Sequence[float | None]] | None,
         lod: int | None,
@@ -206,7 +205,7 @@ class Selection:
         """Resolve the options; raises RegionError where they leave the series or its domain."""
         import numpy as np
 
-        chosen = [volume.step_of_time(time) for time in times] if times else steps_of(volume, steps)
+        chosen = steps_at(volume, times) if times else steps_of(volume, steps)
         region = region_of_box(volume, box) if box is not None else region_of(volume, roi)
         # A level of detail has its own vertices: those of the feature bounding box in the region.
         z, y, x = (

@@ -152,8 +152,16 @@ def _compact(volume: Volume, seconds: str) -> list[tuple[str, str]]:
 
 
 def _positions(volume: Volume, axis: str) -> str:
-    """Name, first and last position, and units of an axis."""
+    """Name, first and last position, and units of an axis; times as dates where they are."""
+    from fhash_codec.times import is_dated, number_text, time_text
+
     coordinate = volume.coords[axis]
     units = coordinate.attributes.get("units", "")
-    ends = " to ".join(apart(coordinate.values[0], coordinate.values[-1]))
-    return f"{coordinate.name} {ends} {units}".rstrip()
+    ends = [float(coordinate.values[0]), float(coordinate.values[-1])]
+    if axis != "t":
+        return f"{coordinate.name} {' to '.join(apart(*ends))} {units}".rstrip()
+    numbers = " to ".join(number_text(coordinate, time) for time in ends)
+    if not is_dated(coordinate):
+        return f"{coordinate.name} {numbers} {units}".rstrip()
+    dates = " to ".join(time_text(coordinate, time) for time in ends)
+    return f"{coordinate.name} {dates} ({numbers} {units})"

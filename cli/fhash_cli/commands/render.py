@@ -64,6 +64,7 @@ def command(
     """
     import fhash_codec
     from fhash_codec.rendering.renderer import Renderer
+    from fhash_codec.times import time_text
 
     path = Path(output) if output is not None else Path(Path(run).stem + ".png")
     with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
@@ -84,6 +85,7 @@ def command(
         renderer = Renderer(volume)
         plan = renderer.plan(scene)
         image = renderer.render(plan=plan, progress=progress)
+        time = time_text(volume.coords["t"], plan.time)
     paths = [str(written) for written in _save(image, path, save_scene, force)]
     result = {
         "paths": paths,
@@ -97,7 +99,7 @@ def command(
     }
     if explain:
         result["plan"] = plan.to_dict()
-    emit(result, _text(plan, image, paths, explain), as_json)
+    emit(result, _text(plan, image, time, paths, explain), as_json)
 
 
 def _check_outputs(path: Path, save_scene: str | None, scene: Scene, force: bool, run: str) -> None:
@@ -125,7 +127,7 @@ def _save(image: Image, path: Path, save_scene: str | None, force: bool) -> list
     return [Path(save_scene), *paths]
 
 
-def _text(plan: Plan, image: Image, paths: list[str], explain: bool) -> str:
+def _text(plan: Plan, image: Image, time: str, paths: list[str], explain: bool) -> str:
     from fhash_codec.rendering.task.counters import rows
 
     lines = [("written", path) for path in paths]
@@ -133,7 +135,7 @@ def _text(plan: Plan, image: Image, paths: list[str], explain: bool) -> str:
         height, width = image.rgba.shape[:2]
         lines += [
             ("size", extent((width, height))),
-            ("step", f"{plan.step:g}, t = {plan.time:.6g}"),
+            ("step", f"{plan.step:g}, t = {time}"),
         ]
     lines.append(("seconds", number(image.seconds, digits=3)))
     if not explain:

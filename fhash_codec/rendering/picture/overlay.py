@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import times
 from fhash_codec.rendering.camera.box import edges, outer_edges
 from fhash_codec.rendering.camera.camera import Rays
 from fhash_codec.rendering.colour.colours import ColourMap
@@ -71,9 +72,12 @@ def overlay(
     return dataclasses.replace(image, rgba=picture)
 
 
-def time_text(step: float, time: float, units: str) -> str:
-    """The time label: step and physical time."""
-    return f"step {step:g}   t = {time:.6g}{f' {units}' if units else ''}"
+def time_text(step: float, time: float, coordinate: Coordinate) -> str:
+    """The time label: step and physical time, which is a date where the series has dates."""
+    text = times.time_text(coordinate, time)
+    if times.is_dated(coordinate):
+        return f"step {step:g}   {text.replace('T', ' ')}"
+    return f"step {step:g}   t = {text}"
 
 
 def _paint_before(picture: Single, colour: Floats, opacity: Single) -> None:

@@ -28,6 +28,7 @@ from fhash_formats.readers.common.hdf5_tree import (
 from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside
+from fhash_formats.readers.common.real_time import counts_steps
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
 from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
@@ -130,9 +131,6 @@ class Hdf5File:
         certain = self.request.axes is not None or all(
             dimension.role is not None for dimension in layout.kept
         )
-        coords = beside(
-            self.source, layout.axes, layout.shape, places, certain=certain, tied=[*said]
-        )
         fitting = {
             axis: dimension.column
             for axis, dimension in said.items()
@@ -140,7 +138,11 @@ class Hdf5File:
             and dimension.column.numeric
             and dimension.column.length == dimension.length
         }
-        coords |= layout.coordinates(self.source, fitting)
+        tied = [*said]
+        if "t" in fitting and _counts_steps(fitting["t"]):
+            tied.remove("t")  # a time beside the numbers of steps comes first
+        named = beside(self.source, layout.axes, layout.shape, places, certain=certain, tied=tied)
+        coords = layout.coordinates(self.source, fitting) | named
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
             coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
         return coords
@@ -154,6 +156,11 @@ class Hdf5File:
         if dataset is None or dataset.size != 1 or dataset.dtype.kind not in "iuf":
             return None
         return float(dataset[()].reshape(-1)[0]), units_of(dataset)
+
+
+def _counts_steps(column: Column) -> bool:
+    """Whether a coordinate has no unit and only counts steps."""
+    return "units" not in column.attributes and counts_steps(column.read())
 
 
 def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> FileSeries:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.common.failures import FolderStamp, Stamp
 from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.times import join_times
 from fhash_formats.series import Coordinate, Series, index_coordinate
 
 
@@ -65,12 +66,19 @@ class JoinedSeries(Series):
     """The steps of several files one after the other; only the file read last is open.
 
     All files have the same variable, frame shape, type and spatial coordinates. Times are those of
-    the files if they give them, and must then increase from file to file; otherwise they are 0, 1,
-    2, ... Raises InputError that names the file which differs.
+    the files if they give them, counted as in the first one, and must then increase from file to
+    file; otherwise they are 0, 1, 2, ... Raises InputError that names the file which differs.
+
+    times: of all steps, in place of those of the files.
     """
 
     def __init__(
-        self, pattern: str, paths: Sequence[Path], open_part: Callable[[Path], FileSeries]
+        self,
+        pattern: str,
+        paths: Sequence[Path],
+        open_part: Callable[[Path], FileSeries],
+        *,
+        times: Coordinate | None = None,
     ) -> None:
         self.source = pattern
         self._open_part = open_part
@@ -96,7 +104,7 @@ class JoinedSeries(Series):
         self.keep_extremes = first.keep_extremes
         self._ends = list(accumulate(part.steps for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
-        self.coords = {**first.coords, "t": self._times()}
+        self.coords = {**first.coords, "t": times or self._times()}
 
     def read(self, step: int) -> npt.NDArray[Any]:
         self.require_step(step)
@@ -129,34 +137,15 @@ class JoinedSeries(Series):
         return series
 
     def _times(self) -> Coordinate:
-        times = [part.time for part in self._parts if part.time is not None]
+        times = [(part.path, part.time) for part in self._parts if part.time is not None]
         if not times:
             return index_coordinate("t", self.shape[0])
         for part in self._parts:
-            if part.time is None or dict(part.time.attributes) != dict(times[0].attributes):
+            if part.time is None:
                 raise InputError(
-                    f"{self.source}: the time in {part.path} has not the units of the time in"
-                    f" {self._parts[0].path}"
+                    f"{self.source}: {part.path} has no time, and {times[0][0]} has one"
                 )
-        for before, after in zip(self._parts[:-1], self._parts[1:], strict=True):
-            last, following = before.time, after.time
-            if (
-                last is not None
-                and following is not None
-                and not last.values[-1] < following.values[0]
-            ):
-                passed = (
-                    f"{following.values[0]:g} in {after.path}"
-                    f" after {last.values[-1]:g} in {before.path}"
-                )
-                raise InputError(
-                    f"{self.source}: times do not increase in the order of the file names: {passed}"
-                )
-        return Coordinate(
-            name=times[0].name,
-            values=np.concatenate([time.values for time in times]),
-            attributes=times[0].attributes,
-        )
+        return join_times(self.source, times)
 
 
 def _common_name(names: Sequence[str]) -> str:

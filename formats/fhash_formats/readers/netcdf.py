@@ -29,6 +29,7 @@ from fhash_formats.readers.common.netcdf_store import (
     quietly,
 )
 from fhash_formats.readers.common.positions import Column, beside, coordinate, usable
+from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
 from fhash_formats.readers.common.variables import Variable, choose
@@ -340,12 +341,18 @@ def _coordinates(
         )
     coords = {}
     for axis, dimension, length in zip(axes, dimensions, shape, strict=True):
-        for name, array in _along(dimension, scope):
-            if array.shape == (length,) and (
-                name == dimension or role_of_coordinate(name, array.attrs) == axis
-            ):
-                coords[axis] = coordinate(source, name, array.to_numpy(), array.attrs)
-                break
+        along = [
+            Column(name=name, length=length, read=array.to_numpy, attributes=array.attrs)
+            for name, array in _along(dimension, scope)
+            if array.shape == (length,)
+        ]
+        named = next((column for column in along if column.name == dimension), None)
+        others = [column for column in along if column is not named]
+        roles = (each for each in others if role_of_coordinate(each.name, each.attributes) == axis)
+        found = real_time(named, others) if axis == "t" else named
+        found = found or next(roles, None)
+        if found is not None:
+            coords[axis] = coordinate(source, found.name, found.read(), found.attributes)
     for key, scalar in values.coords.items():
         role = role_of_coordinate(str(key), scalar.attrs)
         if (

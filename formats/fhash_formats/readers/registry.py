@@ -7,7 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fhash_formats.errors import FhashError, InputError, MissingInputError
-from fhash_formats.readers import hdf5, netcdf, npy, raw, zarr_store
+from fhash_formats.readers import (
+    hdf5,
+    metaimage,
+    netcdf,
+    npy,
+    nrrd,
+    pvd,
+    raw,
+    tiff,
+    vtk_xml,
+    vtkhdf,
+    zarr_store,
+)
 from fhash_formats.readers.common.failures import condense, refusing
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.listing import Listed, listed_series
@@ -36,7 +48,7 @@ class Reader:
     name: str
     suffixes: tuple[str, ...]
     matches: Callable[[bytes, Path], bool]
-    open: Callable[[Path, Request], FileSeries]
+    open: Callable[[Path, Request], FileSeries | JoinedSeries]
     variables: Callable[[Path, Request], list[Listed]] | None = None
 
     def __str__(self) -> str:
@@ -53,6 +65,9 @@ ZARR = Reader(
 )
 REGISTRY = (
     RAW,
+    Reader(
+        name="VTKHDF", suffixes=vtkhdf.SUFFIXES, matches=vtkhdf.matches, open=vtkhdf.open_vtkhdf
+    ),
     Reader(
         name="NetCDF",
         suffixes=netcdf.SUFFIXES,
@@ -75,11 +90,21 @@ REGISTRY = (
         variables=npy.list_npy,
     ),
     ZARR,
+    Reader(name="VTK", suffixes=vtk_xml.SUFFIXES, matches=vtk_xml.matches, open=vtk_xml.open_vtk),
+    Reader(name="collection", suffixes=pvd.SUFFIXES, matches=pvd.matches, open=pvd.open_pvd),
+    Reader(name="NRRD", suffixes=nrrd.SUFFIXES, matches=nrrd.matches, open=nrrd.open_nrrd),
+    Reader(
+        name="MetaImage",
+        suffixes=metaimage.SUFFIXES,
+        matches=metaimage.matches,
+        open=metaimage.open_metaimage,
+    ),
+    Reader(name="TIFF", suffixes=tiff.SUFFIXES, matches=tiff.matches, open=tiff.open_tiff),
 )
 """Formats in the order in which they are tried.
 
-Raw comes first: its suffix says more than bytes that are values. NetCDF comes before HDF5, since
-its files are HDF5 too.
+Raw comes first: its suffix says more than bytes that are values. VTKHDF and NetCDF come before
+HDF5, since their files are HDF5 too.
 """
 
 
@@ -175,17 +200,29 @@ def list_variables(
 def open_whole(path: str | Path, request: Request) -> Series:
     """Open all steps of the series in a file, folder or pattern of files."""
     text = str(path)
-    if is_pattern(text):
-        return JoinedSeries(text, files_of(text), lambda file: _open_one(file, request))
-    return _open_one(Path(path), request)
+    if not is_pattern(text):
+        return _open_one(Path(path), request)
+    files = files_of(text)
+    if all(tiff.matches(b"", file) for file in files):
+        pages = tiff.open_pages(text, files, request)
+        if pages is not None:
+            return pages.as_asked(request)
+    return JoinedSeries(text, files, lambda file: _open_part(file, request))
 
 
-def _open_one(path: Path, request: Request) -> FileSeries:
+def _open_part(path: Path, request: Request) -> FileSeries:
+    """Open one file of a pattern."""
+    part = _open_one(path, request)
+    if isinstance(part, FileSeries):
+        return part
+    part.close()
+    raise InputError(f"{path} lists many files, and cannot be one of a pattern; give it alone")
+
+
+def _open_one(path: Path, request: Request) -> FileSeries | JoinedSeries:
     try:
         series = find_reader(path, request).open(path, request)
-        series.hide(request.missing)
-        series.keep_extremes = request.keep_extremes
-        return series
+        return series.as_asked(request) if isinstance(series, FileSeries) else series
     except OSError as error:  # a folder that may not be entered, wherever somebody looks into it
         if isinstance(error, FhashError):
             raise

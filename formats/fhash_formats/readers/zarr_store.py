@@ -21,6 +21,7 @@ from fhash_formats.readers.common.hdf5_tree import sibling
 from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.positions import Column, beside, usable
+from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import role_of_coordinate, role_of_name
 from fhash_formats.readers.common.variables import Variable, choose, parent, plain_name
@@ -165,10 +166,7 @@ class ZarrTree:
             certain=certain,
             tied=[axis for axis, _ in named],
         )
-        found = {
-            axis: _namesake(columns, dimension.name) or _along(columns, axis, dimension.name)
-            for axis, dimension in named
-        }
+        found = {axis: _column_of(columns, axis, dimension.name) for axis, dimension in named}
         coords |= layout.coordinates(
             self.source,
             {
@@ -299,6 +297,19 @@ def dimension_names(array: zarr.Array[Any]) -> list[str | None]:
     if not isinstance(names, list | tuple) or len(names) != array.ndim:
         return [None] * array.ndim
     return [str(name) if name is not None else None for name in names]
+
+
+def _column_of(
+    columns: Sequence[Mapping[str, Column]], axis: str, dimension: str | None
+) -> Column | None:
+    """The column of positions along a dimension; of time, one that does not only count steps."""
+    namesake = _namesake(columns, dimension)
+    if axis == "t" and dimension is not None:
+        along = [each for place in columns for each in place.values() if each.along == dimension]
+        time = real_time(namesake, [each for each in along if each is not namesake])
+        if time is not None:
+            return time
+    return namesake or _along(columns, axis, dimension)
 
 
 def _along(

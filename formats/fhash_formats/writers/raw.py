@@ -94,8 +94,10 @@ def _header(region: Region, dtype: np.dtype[Any], data_file: str) -> str:
     for axis in AXES:
         coordinate = region.coords[axis]
         lines.append(f"name_{axis}:={printable(coordinate.name, ' ')}")
-        if "units" in coordinate.attributes:
-            lines.append(f"units_{axis}:={printable(str(coordinate.attributes['units']), ' ')}")
+        for key in ("units", "calendar"):
+            if key in coordinate.attributes:
+                text = printable(str(coordinate.attributes[key]), " ")
+                lines.append(f"{key}_{axis}:={text}")
         lines.append(f"coordinates_{axis}:={' '.join(map(repr, coordinate.values.tolist()))}")
     return "\n".join(lines) + "\n\n"
 

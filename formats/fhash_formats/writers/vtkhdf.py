@@ -1,8 +1,10 @@
 """Writer of VTK's HDF5 format (.vtkhdf): all steps of an evenly spaced grid in one file.
 
-ParaView 5.12 and newer read it. VTKHDF 2.0, type ImageData: point data (t, z, y, x) and a group
-Steps with the physical times, docs.vtk.org ("VTKHDF file format"). As in .vti, a descending axis is
-reversed, values and coordinates, and float16 is stored as float32, exactly.
+A single step is VTKHDF 1.0, which ParaView 5.11 reads: point data (z, y, x), and its time as the
+field array TimeValue. Several steps are VTKHDF 2.0, which ParaView 5.12 and newer read: point data
+(t, z, y, x) and a group Steps with the physical times. The type is ImageData, docs.vtk.org
+("VTKHDF file format"). As in .vti, a descending axis is reversed, values and coordinates, and
+float16 is stored as float32, exactly.
 """
 
 from __future__ import annotations
@@ -23,7 +25,14 @@ from fhash_formats.writers.common.writer import Frame, Put, Writer, chunk_shape,
 from fhash_formats.writers.hdf5 import COMPRESSION
 from fhash_formats.writers.vti import SPACE, direction
 
-VERSION = (2, 0)
+SINGLE_VERSION = (1, 0)
+"""Version of a file of one step."""
+
+SERIES_VERSION = (2, 0)
+"""Version of a file of several steps; it is the first with a group Steps."""
+
+SERIES_NEEDS = "ParaView 5.12 or newer, as every .vtkhdf of several steps"
+"""Programs that read a file of several steps, for messages."""
 
 
 def _outputs(path: Path, region: Region) -> list[Path]:
@@ -44,6 +53,7 @@ def _outputs(path: Path, region: Region) -> list[Path]:
 def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
     import h5py
 
+    steps = region.shape[0]
     turn = tuple(slice(None, None, direction(region.coords[axis].values)) for axis in SPACE)
     # Links in the order of their creation, as the reader of VTK demands for composite files and
     # takes for all.
@@ -56,7 +66,7 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
 
         def put(step: int, frame: Frame) -> None:
             with file.calling():
-                values[step] = frame[turn]
+                values[step if steps > 1 else ...] = frame[turn]
 
         yield put
 
@@ -70,7 +80,7 @@ def _create(root: Any, region: Region) -> Any:
     }
     steps, *size = region.shape
     group = root.create_group("VTKHDF", track_order=True)
-    group.attrs["Version"] = np.array(VERSION, dtype="<i8")
+    group.attrs["Version"] = np.array(SERIES_VERSION if steps > 1 else SINGLE_VERSION, dtype="<i8")
     group.attrs["Type"] = np.bytes_("ImageData")
     group.attrs["WholeExtent"] = np.array(
         [bound for length in reversed(size) for bound in (0, length - 1)], dtype="<i8"
@@ -85,17 +95,21 @@ def _create(root: Any, region: Region) -> Any:
     points.attrs["Scalars"] = np.bytes_(name.encode())
     values = points.create_dataset(
         name,
-        shape=region.shape,
+        shape=region.shape if steps > 1 else region.shape[1:],
         dtype=little_endian(region.dtype),
-        chunks=chunk_shape(region),
+        chunks=chunk_shape(region) if steps > 1 else chunk_shape(region)[1:],
         **COMPRESSION,
     )
     if region.units:
         values.attrs["units"] = region.units.replace("\0", "")
-    times = group.create_group("Steps", track_order=True)
-    times.attrs["NSteps"] = np.int64(steps)
-    times.create_dataset("Values", data=region.coords["t"].values.astype("<f8"))
-    offsets = times.create_group("PointDataOffsets", track_order=True)
+    times = region.coords["t"].values.astype("<f8")
+    if steps == 1:
+        group.create_group("FieldData", track_order=True).create_dataset("TimeValue", data=times)
+        return values
+    series = group.create_group("Steps", track_order=True)
+    series.attrs["NSteps"] = np.int64(steps)
+    series.create_dataset("Values", data=times)
+    offsets = series.create_group("PointDataOffsets", track_order=True)
     offsets.create_dataset(name, data=np.arange(steps, dtype="<i8"))
     return values
 

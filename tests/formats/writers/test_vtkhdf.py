@@ -112,4 +112,26 @@ def test_one_step_of_one_vertex(tmp_path: Path) -> None:
     )
     with h5py.File(tmp_path / "out.vtkhdf") as file:
         assert file["VTKHDF"].attrs["Spacing"].tolist() == [1, 1, 1]
-        assert file["VTKHDF/PointData/wind"].shape == (1, 1, 1, 1)
+        assert file["VTKHDF/PointData/wind"].shape == (1, 1, 1)
+
+
+@pytest.mark.parametrize("dtype", ["f4", "u1", "i8"])
+def test_one_step_is_of_the_first_version(tmp_path: Path, dtype: str) -> None:
+    data = DATA[1:2].astype(dtype)
+    save_region(tmp_path / "out.vtkhdf", region(dtype, t=[4.0]), data)
+    with h5py.File(tmp_path / "out.vtkhdf") as file:
+        group = file["VTKHDF"]
+        assert group.attrs["Version"].tolist() == [1, 0]
+        assert sorted(group) == ["FieldData", "PointData"]
+        assert group["FieldData/TimeValue"][:].tolist() == [4.0]
+    io = pytest.importorskip("vtkmodules.vtkIOHDF")
+    arrays = pytest.importorskip("vtkmodules.util.numpy_support")
+    reader = io.vtkHDFReader()
+    reader.SetFileName(str(tmp_path / "out.vtkhdf"))
+    reader.Update()
+    image = reader.GetOutputDataObject(0)
+    assert image.GetDimensions() == (3, 4, 2)
+    assert image.GetOrigin() == (10.0, -1.0, 2.0)
+    found = arrays.vtk_to_numpy(image.GetPointData().GetArray("wind"))
+    np.testing.assert_array_equal(found, data.ravel())
+    assert image.GetFieldData().GetArray("TimeValue").GetTuple1(0) == 4.0

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from fhash_formats.errors import FhashError, InputError
+from fhash_formats.errors import FhashError, InputError, MissingDependencyError
 
 LONGEST_MESSAGE = 240
 """Characters kept of a library's message; HDF5 and zarr write paragraphs."""
@@ -37,6 +37,21 @@ def refusing(what: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise InputError(f"{what}: {condense(error)}") from error
+
+
+@contextmanager
+def naming(source: str) -> Iterator[None]:
+    """Put the name of a file before each message of this project that is raised inside.
+
+    Errors of libraries become InputError, as in `refusing`.
+    """
+    try:
+        with refusing(f"{source} cannot be read"):
+            yield
+    except (InputError, MissingDependencyError) as error:
+        if source in str(error):
+            raise
+        raise type(error)(f"{source}: {error}") from error
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,7 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf_packing import Packing, missing_values
 from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
+from fhash_formats.readers.common.request import Request
 from fhash_formats.series import AXES, Coordinate, Series, check_values, index_coordinate
 from fhash_formats.support.attributes import plain_text
 
@@ -107,6 +108,12 @@ class FileSeries(Series):
             self._missing = missing_values(self.source, self.dtype, missing)
             self._note_fills(self._missing)
             self.dtype = self._missing.dtype
+
+    def as_asked(self, request: Request) -> Self:
+        """Return this series with the values missing, or kept, that the user named."""
+        self.hide(request.missing)
+        self.keep_extremes = request.keep_extremes
+        return self
 
     def _note_fills(self, packing: Packing) -> None:
         if packing.fills and not packing.scaled and self.fill is None:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.readers.common.real_time import real_time
 from fhash_formats.readers.common.roles import NAMES
 from fhash_formats.series import AXES, Coordinate
 from fhash_formats.support.attributes import json_attributes
@@ -108,9 +109,9 @@ def beside(
         columns = [place[name] for place in places for name in NAMES[axis].split() if name in place]
         fitting = [column for column in columns if column.length == lengths.get(axis, 1)]
         if fitting:
-            coords[axis] = coordinate(
-                source, fitting[0].name, fitting[0].read(), fitting[0].attributes
-            )
+            column = real_time(fitting[0], fitting[1:]) if axis == "t" else fitting[0]
+            assert column is not None
+            coords[axis] = coordinate(source, column.name, column.read(), column.attributes)
         elif columns and not certain and columns[0].length in shape and columns[0].length > 1:
             column = columns[0]
             assumed = (

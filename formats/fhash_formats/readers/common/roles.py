@@ -10,14 +10,14 @@ from fhash_formats.errors import InputError
 from fhash_formats.series import AXES
 
 NAMES = {
-    "t": "time t times timestep timesteps time_step step steps date time_counter valid_time"
-    " frame frames",
+    "t": "time t times time_counter valid_time leadtime lead_time forecast_period forecast_time"
+    " date timestep timesteps time_step step steps record records frame frames",
     "z": "z lev level levels height depth altitude alt plev pressure pressure_level isobaric"
     " model_level_number bottom_top zc x3v x3 k",
     "y": "y lat latitude rlat grid_latitude projection_y_coordinate south_north nlat yc x2v x2 j",
     "x": "x lon longitude rlon grid_longitude projection_x_coordinate west_east nlon xc x1v x1 i",
 }
-"""Conventional names of coordinates, the most usual first.
+"""Conventional names of coordinates, the most usual first; those of times before those of steps.
 
 x1v, x2v, x3v are Athena++'s, bottom_top and the like WRF's.
 """
@@ -25,7 +25,7 @@ x1v, x2v, x3v are Athena++'s, bottom_top and the like WRF's.
 ROLE_OF_NAME = {name: axis for axis, names in NAMES.items() for name in names.split()}
 
 STANDARD_NAMES = (
-    ("t", re.compile(r"time|forecast_reference_time")),
+    ("t", re.compile(r"time|forecast_reference_time|forecast_period")),
     (
         "z",
         re.compile(

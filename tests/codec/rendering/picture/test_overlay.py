@@ -126,5 +126,13 @@ def test_the_colour_bar_shows_the_colours_from_bottom_to_top() -> None:
 
 
 def test_the_text_of_a_time() -> None:
-    assert time_text(3, 0.25, "s") == "step 3   t = 0.25 s"
-    assert time_text(3.5, 1e-9, "") == "step 3.5   t = 1e-09"
+    def times(values: list[float], units: str) -> Coordinate:
+        return Coordinate(name="time", values=np.array(values), attributes={"units": units})
+
+    assert time_text(3, 0.25, times([0, 0.25], "s")) == "step 3   t = 0.25 s"
+    assert time_text(3.5, 1e-9, times([0, 2e-9], "")) == "step 3.5   t = 1e-09"
+    late = times([347921.001, 347921.002], "s")
+    assert time_text(0, 347921.001, late) == "step 0   t = 347921.001 s"
+    dated = times([40.0, 40.25], "days since 2001-01-01")
+    assert time_text(1, 40.25, dated) == "step 1   2001-02-10 06:00"
+    assert time_text(0, 40.0, dated) == "step 0   2001-02-10"

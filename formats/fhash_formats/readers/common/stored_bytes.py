@@ -1,0 +1,256 @@
+"""The bytes of an array in files that are plain, compressed, text, or many that follow each other.
+
+A compressed file is decompressed forward as it is read, and from its start again for earlier bytes.
+One object serves many reads, so that the frames of a series in order decompress the file once.
+"""
+
+from __future__ import annotations
+
+import bz2
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError
+from fhash_formats.readers.common.flat import FlatArray
+
+BLOCK_BYTES = 2**20
+"""Bytes that are decompressed at once where they are only skipped."""
+
+STORED_BYTES = 2**18
+"""Stored bytes that are read at once."""
+
+DEFLATE_RATIO = 1032
+"""Largest factor by which zlib and gzip can shrink data."""
+
+LONGEST_NUMBER = 64
+"""Characters of the longest number in text."""
+
+
+class StoredBytes(Protocol):
+    """The bytes of an array, wherever they are."""
+
+    size: int
+
+    def readinto(self, place: int, view: memoryview) -> None:
+        """Fill a view with the bytes from `place` on; raises InputError where they end."""
+
+    def close(self) -> None:
+        """Close the files; a further read opens them again."""
+
+
+class PlainFile:
+    """`size` bytes of a file from byte `start` on; raises InputError where the file is shorter."""
+
+    def __init__(self, path: Path, *, start: int, size: int) -> None:
+        self.path, self.start, self.size = path, start, size
+        stored = path.stat().st_size
+        if start < 0 or stored < start + size:
+            raise InputError(
+                f"{path} has {stored} bytes, its header promises {start + size}; it is cut or its"
+                " header is wrong"
+            )
+
+    def readinto(self, place: int, view: memoryview) -> None:
+        """Fill a view with the bytes from `place` on."""
+        with self.path.open("rb") as file:
+            file.seek(self.start + place)
+            done = 0
+            while done < len(view):
+                count = file.readinto(view[done:])  # type: ignore[attr-defined]
+                if not count:
+                    raise InputError(f"{self.path} ends after {file.tell()} bytes; it is cut")
+                done += count
+
+    def close(self) -> None:
+        """Close nothing: each read opens the file for itself."""
+
+
+class NumbersInText:
+    """Values of a type that a file holds as text, from byte `start` on."""
+
+    def __init__(self, path: Path, dtype: np.dtype[Any], *, start: int, size: int) -> None:
+        self.path, self.dtype, self.start, self.size = path, dtype, start, size
+        count = size // dtype.itemsize
+        if path.stat().st_size - start < 2 * count - 1:
+            raise InputError(f"{path} is too short for {count} numbers; it is cut")
+        self._values: npt.NDArray[np.uint8] | None = None
+
+    def readinto(self, place: int, view: memoryview) -> None:
+        """Fill a view with the bytes from `place` on."""
+        if self._values is None:
+            self._values = self._parsed()
+        view[:] = self._values[place : place + len(view)].data
+
+    def close(self) -> None:
+        """Forget the values."""
+        self._values = None
+
+    def _parsed(self) -> npt.NDArray[np.uint8]:
+        with self.path.open("rb") as file:
+            file.seek(self.start)
+            words = file.read().replace(b",", b" ").split()
+        count = self.size // self.dtype.itemsize
+        if len(words) != count:
+            raise InputError(f"{self.path} holds {len(words)} numbers, {count} are needed")
+        try:
+            values = numbers_of_words(words, self.dtype)
+        except ValueError as error:
+            raise InputError(f"{self.path}: {error}") from error
+        return values.view(np.uint8)
+
+
+class ManyFiles:
+    """Bytes of files that follow each other, each with the same number of them."""
+
+    def __init__(self, parts: Sequence[StoredBytes]) -> None:
+        self.parts, self.each = parts, parts[0].size
+        self.size = self.each * len(parts)
+        self._open = 0
+
+    def readinto(self, place: int, view: memoryview) -> None:
+        """Fill a view with the bytes from `place` on."""
+        done = 0
+        while done < len(view):
+            number, inside = divmod(place + done, self.each)
+            if number != self._open:
+                self.parts[self._open].close()
+                self._open = number
+            count = min(len(view) - done, self.each - inside)
+            self.parts[number].readinto(inside, view[done : done + count])
+            done += count
+
+    def close(self) -> None:
+        """Close the file that is open."""
+        self.parts[self._open].close()
+
+
+class StoredArray(FlatArray):
+    """An array of `shape` (slowest dimension first) and `dtype` in stored bytes."""
+
+    def __init__(
+        self, path: Path, shape: tuple[int, ...], dtype: np.dtype[Any], stored: StoredBytes
+    ) -> None:
+        super().__init__(path, shape, dtype)
+        self.stored = stored
+
+    def _read(self, file: BinaryIO, into: npt.NDArray[Any], start: int) -> None:
+        self.stored.readinto(start * self.dtype.itemsize, into.view(np.uint8).data)
+
+
+def numbers_of_words(words: Sequence[bytes], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Numbers of a type from their texts; raises ValueError for other text and for larger ones."""
+    if max(map(len, words), default=0) > LONGEST_NUMBER:
+        raise ValueError("text stands where numbers are needed")
+    if dtype.kind == "f":
+        return np.array(words, dtype=f"S{LONGEST_NUMBER}").astype(dtype)
+    limits, numbers = np.iinfo(dtype), [int(word) for word in words]
+    if numbers and not limits.min <= min(numbers) <= max(numbers) <= limits.max:
+        raise ValueError(f"a number is beyond the type {dtype.name}")
+    return np.array(numbers, dtype)
+
+
+class _Inflate:
+    """Decompression of zlib or gzip, whichever the data begin with.
+
+    The members of one gzip file follow each other.
+    """
+
+    def __init__(self) -> None:
+        self.inner = zlib.decompressobj(wbits=47)
+
+    def __call__(self, stored: bytes, limit: int) -> tuple[bytes, bytes, bool]:
+        data = self.inner.decompress(stored, limit)
+        if not self.inner.eof:
+            return data, self.inner.unconsumed_tail, False
+        rest = self.inner.unused_data
+        if rest[:2] != b"\x1f\x8b":
+            return data, b"", True
+        self.inner = zlib.decompressobj(wbits=47)
+        return data, rest, False
+
+
+class _Bunzip:
+    """Decompression of bzip2."""
+
+    def __init__(self) -> None:
+        self.inner = bz2.BZ2Decompressor()
+
+    def __call__(self, stored: bytes, limit: int) -> tuple[bytes, bytes, bool]:
+        data = self.inner.decompress(stored, limit)
+        return data, b"", self.inner.eof
+
+
+KINDS: dict[str, Callable[[], Any]] = {"deflate": _Inflate, "bzip2": _Bunzip}
+"""Decompressors: (stored bytes, limit) -> (true bytes, stored bytes left, whether it ended)."""
+
+
+class CompressedFile:
+    """The true bytes of a file that is compressed from byte `start` on.
+
+    Args:
+        path: of the file.
+        kind: a key of KINDS.
+        start: first compressed byte.
+        size: true bytes that are needed; raises InputError where so few stored bytes cannot hold
+            them.
+    """
+
+    def __init__(self, path: Path, kind: str, *, start: int, size: int) -> None:
+        self.path, self.kind, self.start, self.size = path, kind, start, size
+        stored = path.stat().st_size - start
+        if kind == "deflate" and size > DEFLATE_RATIO * stored:
+            raise InputError(
+                f"{path} promises {size} bytes, which its {stored} compressed ones cannot hold; it"
+                " is cut or damaged"
+            )
+        self._file: BinaryIO | None = None
+        self._begin()
+
+    def readinto(self, place: int, view: memoryview) -> None:
+        """Fill a view with the true bytes from `place` on; raises InputError where they end."""
+        if place < self._place or self._file is None:
+            self._begin()
+        while self._place < place:
+            self._need(min(BLOCK_BYTES, place - self._place))
+        done = 0
+        while done < len(view):
+            data = self._need(min(BLOCK_BYTES, len(view) - done))
+            view[done : done + len(data)] = data
+            done += len(data)
+
+    def close(self) -> None:
+        """Close the file; a further read opens it again."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _begin(self) -> None:
+        self.close()
+        self._next = KINDS[self.kind]()
+        self._place, self._stored, self._ended = 0, b"", False
+
+    def _need(self, limit: int) -> bytes:
+        """At least one and at most `limit` true bytes."""
+        if self._file is None:
+            self._file = self.path.open("rb")
+            self._file.seek(self.start)
+        while not self._ended:
+            hungry = getattr(self._next.inner, "needs_input", True)
+            stored = self._stored or (self._file.read(STORED_BYTES) if hungry else b"")
+            try:
+                data, self._stored, self._ended = self._next(stored, limit)
+            except (zlib.error, OSError, EOFError) as error:
+                raise InputError(f"{self.path} cannot be decompressed: {error}") from error
+            if data:
+                self._place += len(data)
+                return bytes(data)
+            if hungry and not stored:
+                break
+        raise InputError(
+            f"{self.path} ends after {self._place} decompressed bytes, {self.size} are needed"
+        )

@@ -1,0 +1,314 @@
+"""TIFF stacks (.tif, .tiff), read with tifffile: pages along z, ImageJ and OME hyperstacks by axes.
+
+Time, z and channels come from the series' own axes; a channel is a variable, such as `cells.0`.
+Pages without axes lie along z. Several files of one page each may be slices or steps, and nothing
+in them says which: `--axes z,y,x` or `--axes t,y,x` does.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping, Sequence
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.readers.common.failures import Stamp, naming
+from fhash_formats.readers.common.file_series import FileSeries
+from fhash_formats.readers.common.grid import component_by_number, component_variables, lattice
+from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.variables import choose
+from fhash_formats.series import Coordinate
+
+SUFFIXES = (".tif", ".tiff")
+MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+PAGES = "QIZ"
+"""Letters of tifffile for pages, images and z: all are slices along z."""
+
+CENTIMETRE = {2: "inch", 3: "cm"}
+"""Units of a page's resolution by its code."""
+
+
+def matches(head: bytes, path: Path) -> bool:
+    """Whether this is TIFF, by its first bytes or its suffix."""
+    return head[:4] in MAGIC or path.suffix.lower() in SUFFIXES
+
+
+def _tifffile(source: str) -> Any:
+    try:
+        return importlib.import_module("tifffile")
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"{source}: TIFF needs tifffile; pip install tifffile"
+        ) from error
+
+
+def open_tiff(path: Path, request: Request) -> FileSeries:
+    """Open the stack in a TIFF file.
+
+    Raises InputError for colours and for axes beyond time, z, channel, y and x.
+    """
+    source, stamp = str(path), Stamp.of(path)
+    tifffile = _tifffile(source)
+    with naming(source):
+        file = tifffile.TiffFile(path)
+    try:
+        with naming(source):
+            return _series(source, path, stamp, file, request)
+    except BaseException:
+        file.close()
+        raise
+
+
+def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) -> FileSeries:
+    if not file.series:
+        raise InputError("it holds no picture")
+    if len(file.series) > 1:
+        shapes = ", ".join(str(each.shape) for each in file.series[:4])
+        raise InputError(f"it holds {len(file.series)} series of pages ({shapes}); keep one")
+    series = file.series[0]
+    letters, shape = str(series.axes), tuple(int(length) for length in series.shape)
+    axes = _roles(letters, shape, request)
+    channel = letters.find("C")
+    outer = [length for place, length in enumerate(shape) if place != channel]
+    roles = [axis for place, axis in enumerate(axes) if place != channel]
+    kept = [axis for axis in roles if axis]
+    lengths = tuple(length for length, axis in zip(outer, roles, strict=True) if axis)
+    if len(lengths) == 2:  # a plane
+        kept, lengths = ["z", *kept], (1, *lengths)
+    variables = component_variables(
+        path.stem, 1 if channel < 0 else shape[channel], lengths, np.dtype(series.dtype), 0
+    )
+    var = component_by_number(request.var, variables)
+    variable = choose(source, variables, var, booleans=request.booleans)
+    _check_size(path, series)
+
+    def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
+        steps = ranges[kept.index("t")] if "t" in kept else slice(None)
+        values = _pages(series, axes, channel, variable.handle[1], steps)
+        read = [_length(each, full) for each, full in zip(ranges, lengths, strict=True)]
+        return values.reshape(read)
+
+    return FileSeries(
+        source=source,
+        name=variable.name,
+        shape=lengths,
+        dtype=np.dtype(series.dtype),
+        axes=kept,
+        fetch=fetch,
+        stamp=stamp,
+        coords=_coordinates(file, dict(zip(kept, lengths, strict=True))),
+        close=file.close,
+    )
+
+
+def _length(part: slice, full: int) -> int:
+    return len(range(*part.indices(full)))
+
+
+def _roles(letters: str, shape: Sequence[int], request: Request) -> list[str]:
+    """The axis of each dimension of the series; "" for those of one picture, and for channels."""
+    axes = []
+    for letter, length in zip(letters, shape, strict=True):
+        if letter == "S" and length > 1:
+            raise InputError(f"its pages are colour pictures of {length} samples; one can be read")
+        role = "z" if letter in PAGES else {"T": "t", "Y": "y", "X": "x"}.get(letter, "")
+        if (length == 1 and letter not in "YX") or letter in "CS":
+            role = ""
+        elif not role or role in axes:
+            raise InputError(
+                f"its axes are {letters} {tuple(shape)}; time, z, channels, y and x can be read"
+            )
+        axes.append(role)
+    if not letters.endswith("YX") and not letters.endswith("YXS"):
+        raise InputError(f"its axes are {letters}; the last two must be y and x")
+    if request.axes is not None:
+        pages = [axis for axis in axes if axis]
+        wanted = list(request.axes)
+        if len(wanted) != len(pages) or wanted[-2:] != ["y", "x"]:
+            raise InputError(
+                f"--axes {','.join(wanted)} does not fit its dimensions"
+                f" ({','.join(pages)}); the last two are y and x"
+            )
+        new = iter(wanted)
+        axes = [next(new) if axis else "" for axis in axes]
+    return axes
+
+
+def _check_size(path: Path, series: Any) -> None:
+    """Raise InputError where pages lie beyond the end of the file, or promise too much."""
+    size = path.stat().st_size
+    stored = 0
+    for page in series.pages:
+        if page is None:
+            continue
+        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=False):
+            if offset + count > size:
+                raise InputError(f"a page lies beyond its end at byte {size}; it is cut")
+            stored += count
+        if page.compression == 1 and series.dataoffset is not None:
+            break
+    needed = prod(series.shape) * np.dtype(series.dtype).itemsize
+    if series.dataoffset is not None and series.dataoffset + needed > size:
+        raise InputError(f"it needs {series.dataoffset + needed} bytes and has {size}; it is cut")
+
+
+def _pages(
+    series: Any, axes: Sequence[str], channel: int, number: int, steps: slice
+) -> npt.NDArray[Any]:
+    """The pages of some steps and one channel, in the order of the file's dimensions."""
+    index: list[slice | int] = [slice(None)] * len(axes)
+    if channel >= 0:
+        index[channel] = number
+    if "t" in axes:
+        index[axes.index("t")] = steps
+    per_page = prod(series.keyframe.shape)
+    outer = 0
+    while prod(series.shape[outer:]) > per_page:
+        outer += 1
+    if series.dataoffset is not None:
+        # ImageJ's large files have one page that stands for all values in a row
+        mapped = np.memmap(
+            series.parent.filehandle.path,
+            np.dtype(series.dtype).newbyteorder(series.parent.byteorder),
+            "r",
+            series.dataoffset,
+            tuple(series.shape),
+        )
+        return np.array(mapped[tuple(index)])
+    numbers = np.arange(prod(series.shape[:outer])).reshape(series.shape[:outer])
+    chosen = numbers[tuple(index[:outer])]
+    pages = [_page(series, int(page)) for page in chosen.ravel()]
+    stack = np.stack(pages).reshape(*chosen.shape, *series.shape[outer:])
+    rest = tuple(index[outer:])
+    return stack[(..., *rest)] if rest else stack
+
+
+def _page(series: Any, number: int) -> npt.NDArray[Any]:
+    page = series.pages[number]
+    if page is None:
+        raise InputError(f"page {number} is missing")
+    return np.asarray(page.asarray())
+
+
+def _coordinates(file: Any, lengths: Mapping[str, int]) -> dict[str, Coordinate]:
+    """Positions from ImageJ's metadata, OME's, or the resolution of the first page."""
+    steps: dict[str, tuple[float, str]] = {}
+    resolution = _resolution(file.series[0].keyframe)
+    if file.is_imagej:
+        found: Mapping[str, Any] = file.imagej_metadata or {}
+        unit = str(found.get("unit", "") or "").replace("\\u00B5", "µ")
+        for axis in "xy":
+            if axis in resolution and unit and unit != "pixel":
+                steps[axis] = (1 / resolution[axis][0], unit)
+        steps["z"] = (_number(found.get("spacing")), unit)
+        steps["t"] = (_number(found.get("finterval")), "s")
+    elif file.is_ome:
+        steps = _ome_steps(file)
+    else:
+        steps = {
+            axis: (1 / per_unit, unit) for axis, (per_unit, unit) in resolution.items() if unit
+        }
+    coords = {}
+    for axis, (step, unit) in steps.items():
+        if axis in lengths and np.isfinite(step) and step > 0:
+            place = lattice(axis, 0.0, step, lengths[axis])
+            extra = {"units": unit} if unit else {}
+            coords[axis] = Coordinate(name=place.name, values=place.values, attributes=extra)
+    return coords
+
+
+def _ome_steps(file: Any) -> dict[str, tuple[float, str]]:
+    pixels = importlib.import_module("tifffile").xml2dict(file.ome_metadata)
+    for key in ("OME", "Image", "Pixels"):
+        pixels = pixels.get(key, {}) if isinstance(pixels, dict) else {}
+        pixels = pixels[0] if isinstance(pixels, list) and pixels else pixels
+    if not isinstance(pixels, dict):
+        return {}
+    names = {axis: f"PhysicalSize{axis.upper()}" for axis in "xyz"} | {"t": "TimeIncrement"}
+    return {
+        axis: (
+            _number(pixels.get(name)),
+            str(pixels.get(f"{name}Unit", "s" if axis == "t" else "µm")),
+        )
+        for axis, name in names.items()
+    }
+
+
+def _resolution(page: Any) -> dict[str, tuple[float, str]]:
+    """Pixels per unit along x and y, and the unit, "" for none."""
+    found = {}
+    code = page.tags.get("ResolutionUnit")
+    unit = CENTIMETRE.get(int(code.value) if code is not None else 2, "")
+    for axis, name in (("x", "XResolution"), ("y", "YResolution")):
+        tag = page.tags.get(name)
+        if tag is not None and len(tag.value) == 2 and tag.value[0] > 0 and tag.value[1] > 0:
+            found[axis] = (tag.value[0] / tag.value[1], unit)
+    return found
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return float("nan")
+
+
+def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> FileSeries | None:
+    """Open files of one page each as one series: `--axes` says what they are.
+
+    None where the first file holds more than a page, or where there is one file: each file is then
+    a step, as in any pattern. Raises InputError where the axes are not given, and for files that
+    differ from the first.
+    """
+    tifffile = _tifffile(pattern)
+    with naming(str(paths[0])), tifffile.TiffFile(paths[0]) as file:
+        if len(file.series) != 1 or len(paths) == 1:
+            return None
+        letters, shape = str(file.series[0].axes), tuple(file.series[0].shape)
+        dtype = np.dtype(file.series[0].dtype).newbyteorder("=")
+    if letters == "YXS":
+        raise InputError(f"{paths[0]} is a colour picture; one number a pixel can be read")
+    if letters != "YX":
+        return None
+    if request.axes not in (("z", "y", "x"), ("t", "y", "x")):
+        raise InputError(
+            f"{pattern}: {len(paths)} files of one page each; say whether they are slices, with"
+            " --axes z,y,x, or steps, with --axes t,y,x"
+        )
+    request.refuse_var(pattern)
+    stamps = [Stamp.of(path) for path in paths]
+
+    def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
+        return np.stack([_plane(tifffile, path, shape, dtype) for path in paths[ranges[0]]])
+
+    common = tifffile  # opened once more for its positions
+    with naming(str(paths[0])), common.TiffFile(paths[0]) as file:
+        coords = _coordinates(file, {"y": shape[0], "x": shape[1]})
+    return FileSeries(
+        source=pattern,
+        name=paths[0].stem.rstrip("0123456789_-. ") or paths[0].stem,
+        shape=(len(paths), *shape),
+        dtype=dtype,
+        axes=request.axes,
+        fetch=fetch,
+        stamp=stamps[0],
+        coords=coords,
+        beside=paths,
+    )
+
+
+def _plane(
+    tifffile: Any, path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]
+) -> npt.NDArray[Any]:
+    with naming(str(path)), tifffile.TiffFile(path) as file:
+        found = file.series[0] if file.series else None
+        if found is None or tuple(found.shape) != shape or np.dtype(found.dtype) != dtype:
+            raise InputError(f"its page is not {dtype} {shape}, as that of the first file")
+        _check_size(path, found)
+        return np.asarray(file.series[0].asarray())
