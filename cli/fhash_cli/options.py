@@ -131,10 +131,19 @@ class SourceOptions:
     dtype: str | None
     endian: str | None
 
-    def open(self, path: str) -> Any:
-        """The Series at a path; the caller closes it."""
+    @property
+    def part(self) -> bool:
+        """Whether the options choose a part of what the source holds."""
+        return self.var is not None or self.t is not None
+
+    def open(self, path: str, progress: Callable[[str, int, int, str], None]) -> Any:
+        """The Series at a path; the caller closes it.
+
+        progress: is told that the source is being opened: many files take their time.
+        """
         from fhash_formats import RawLayout, open_series, parse_shape
 
+        progress("opening", 0, 1, path)
         raw = RawLayout(
             shape=None if self.shape is None else parse_shape(self.shape),
             dtype=self.dtype,

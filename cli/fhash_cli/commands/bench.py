@@ -123,7 +123,7 @@ def train(
     """
     from fhash_codec.config import ENGINES
 
-    with source.open(data) as series, Progress(quiet=quiet) as progress:
+    with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         from fhash_codec.bench.train import bench_train
 
         result = bench_train(
@@ -231,7 +231,7 @@ def rate(
     """
     if plot is not None:
         check_writable(plot, force, sources=[data])
-    with source.open(data) as series, Progress(quiet=quiet) as progress:
+    with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         from fhash_codec.bench.rate.own import PROFILES
         from fhash_codec.bench.rate.plot import plot as draw
         from fhash_codec.bench.rate.plot import require_matplotlib

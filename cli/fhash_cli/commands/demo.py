@@ -12,6 +12,7 @@ from fhash_cli.options import check_writable, force_option, json_option, quiet_o
 from fhash_cli.output import (
     Progress,
     compared,
+    duration,
     emit,
     extent,
     number,
@@ -148,6 +149,6 @@ def _rows(result: dict[str, Any], series: Series) -> list[tuple[str, str]]:
         ("size", compared(result)),
         ("coreset", f"{result['coreset_fraction']:.3%} of the domain"),
         *quality_rows(result),
-        ("encoding", f"{number(result['seconds'], 's', digits=3)} on {result['device']}"),
-        ("comparing", number(result["diff_seconds"], "s", digits=3)),
+        ("encoding", f"{duration(result['seconds'])} on {result['device']}"),
+        ("comparing", duration(result["diff_seconds"])),
     ]

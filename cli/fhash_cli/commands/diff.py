@@ -46,10 +46,10 @@ def command(
     import fhash_codec
     from fhash_formats.errors import QualityError
 
-    with source.open(data) as series, Progress(quiet=quiet) as progress:
+    with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         report = fhash_codec.diff(series, run, progress=progress)
     rows = [
-        ("size", compared(report)),
+        ("size", compared(report, part=source.part)),
         ("steps, z, y, x", extent(report["shape"])),
         *quality_rows(report, series.units),
     ]
