@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from fhash_codec.header import history_points
 from fhash_codec.volume import Volume
 
 FIGURES = ("psnr", "rmse", "max_abs_error", "ssim", "psnr_domain")
@@ -46,7 +45,7 @@ def report(
         **{name: quality[name] for name in FIGURES},
         "seconds": seconds,
         "epochs": info["training"]["epochs"],
-        "curve": history_points(info["history"]),
+        "curve": info["history"],
         "shape": info["domain"]["shape"],
         "key_frames": info["key_frames"],
         "feature_bounding_box": info["feature_bounding_box"],

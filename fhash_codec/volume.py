@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box, Spans
 from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
-from fhash_codec.header import read_missing
+from fhash_codec.header import full_header, read_missing
 from fhash_codec.indexing import Index, expand_index, index_ranges
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
@@ -115,7 +115,7 @@ class Volume:
             for name, array in self.container.arrays.items()
         }
         return {
-            **header,
+            **full_header(header),
             "path": str(self.path),
             "bytes": self.container.size,
             "overhead_bytes": self.container.overhead(),

@@ -61,7 +61,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "fhash_cli": (
         ("progress_bar",),
-        ("options", "output", "selection"),
+        ("base_command", "options", "output", "selection"),
         ("animation_options", "scene_options"),
         ("commands",),
         ("main",),

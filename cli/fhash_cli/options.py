@@ -43,6 +43,12 @@ def check_writable(
 class RealRange(click.FloatRange):
     """A number within limits, and no NaN, which click's own range lets through."""
 
+    def _describe_range(self) -> str:
+        """The limits in the help, in few digits and without those that nobody meets."""
+        low = "" if self.min is None else f"{self.min:g}<="
+        high = "" if self.max is None or self.max > 1e12 else f"<={self.max:g}"
+        return f"{low}x{high}"
+
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:

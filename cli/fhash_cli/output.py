@@ -6,19 +6,49 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
+from contextvars import ContextVar
 from typing import Any, TextIO
 
 import click
 
 from fhash_cli.progress_bar import Progress, say
-from fhash_formats.errors import FhashError, OutputError
+from fhash_formats.errors import (
+    DamagedFileError,
+    FhashError,
+    InputError,
+    InterruptedEncodingError,
+    MissingDependencyError,
+    MissingInputError,
+    OutputError,
+    OutputExistsError,
+    QualityError,
+    RegionError,
+    UnsupportedFileError,
+)
 from fhash_formats.support.attributes import plain_text
 
 __all__ = [
-    "Progress", "apart", "compared", "describe_error", "duration", "emit", "extent", "factor",
-    "listed", "loss_rows", "number", "quality_rows", "say", "size", "spans", "table", "warn",
+    "Progress", "apart", "compared", "describe_error", "duration", "emit", "error_object",
+    "extent", "factor", "listed", "loss_rows", "number", "print_json", "printed", "quality_rows",
+    "say", "size", "spans", "table", "warn",
 ]  # fmt: skip
 
+KINDS: dict[str, tuple[type[Exception], ...]] = {
+    "usage": (click.ClickException,),
+    "missing-input": (MissingInputError,),
+    "missing-dependency": (MissingDependencyError,),
+    "output-exists": (OutputExistsError,),
+    "region": (RegionError,),
+    "quality": (QualityError,),
+    "unsupported": (UnsupportedFileError,),
+    "damaged": (DamagedFileError,),
+    "interrupted": (InterruptedEncodingError,),
+    "input": (InputError,),
+    "output": (OutputError,),
+}
+"""Errors by kind, the first that fits; others are `memory` or `failure`."""
+printed: ContextVar[bool] = ContextVar("printed", default=False)
+"""Whether the JSON object of the present command line was printed."""
 NO_MEMORY = ("can't allocate memory", "memory allocation failed")
 """Words of the RuntimeErrors by which torch and HDF5 report that memory ran out."""
 
@@ -35,8 +65,13 @@ def warn(
     say(f"warning: {' '.join(str(message).split())}")
 
 
-def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
-    """Print a result on stdout: as one line of JSON, or as text.
+def emit(
+    result: Mapping[str, Any], text: str, as_json: bool, missed: FhashError | None = None
+) -> None:
+    """Print a result on stdout, as one line of JSON or as text, and raise what was missed.
+
+    missed: a gate or promise that the result misses; JSON holds it beside the result, see
+        `error_object`.
 
     Raises OutputError where stdout is closed.
     """
@@ -44,7 +79,34 @@ def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
         raise OutputError(
             "the result cannot be printed, stdout is closed; files named as outputs are written"
         )
-    click.echo(json.dumps(result, allow_nan=False) if as_json else plain_text(text))
+    if as_json:
+        print_json({**result, **({} if missed is None else error_object(missed))})
+    else:
+        click.echo(plain_text(text))
+    if missed is not None:
+        raise missed
+
+
+def print_json(values: Mapping[str, Any]) -> None:
+    """Print the one JSON object of a command on stdout."""
+    click.echo(json.dumps(values, allow_nan=False))
+    printed.set(True)
+
+
+def error_object(error: Exception) -> dict[str, Any]:
+    """An error as JSON: what went wrong in one line, its kind and the exit code."""
+    line, code = describe_error(error)
+    return {"error": line, "kind": _kind(error, code), "exit_code": code}
+
+
+def _kind(error: Exception, code: int) -> str:
+    """A word for an error that scripts can rely on, see docs/json.md."""
+    for kind, errors in KINDS.items():
+        if isinstance(error, errors):
+            return kind
+    if _is_no_memory(error):
+        return "memory"
+    return "input" if code == 2 else "failure"
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.base_command import BaseGroup
 from fhash_cli.commands.bench_render import render
 from fhash_cli.options import (
     RealRange,
@@ -72,7 +73,7 @@ class NamesType(click.ParamType[str]):
         return str(value)
 
 
-@click.group("bench", short_help="measure speed and size on this machine")
+@click.group("bench", cls=BaseGroup, short_help="measure speed and size on this machine")
 def command() -> None:
     """Measure speed and size on this machine."""
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import check_writable, force_option, json_option, quiet_option
 from fhash_cli.output import (
     Progress,
@@ -34,7 +35,7 @@ COLUMNS = 4
 """Steps that the picture shows side by side."""
 
 
-@click.command("demo")
+@click.command("demo", cls=BaseCommand)
 @click.option(
     "--scene",
     type=click.Choice(tuple(SCENES)),

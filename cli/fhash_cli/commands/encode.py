@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
     SourceOptions,
     check_writable,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
 
 
-@click.command("encode")
+@click.command("encode", cls=BaseCommand)
 @click.argument("data", type=click.Path())
 @click.option(
     "-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write."
@@ -74,9 +75,7 @@ def command(
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
-    emit(report, table(rows), as_json)
-    if missed is not None:
-        raise missed
+    emit(report, table(rows), as_json, missed)
 
 
 def report_rows(

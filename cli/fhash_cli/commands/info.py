@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import json_option, run_argument
 from fhash_cli.output import (
     apart,
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from fhash_codec import Volume
 
 
-@click.command("info")
+@click.command("info", cls=BaseCommand)
 @run_argument
 @json_option
 def command(run: str, as_json: bool) -> None:

@@ -179,8 +179,8 @@ def _optimise(
         if share >= min(1.0, (len(history) + 1) / MEASUREMENTS):
             gain = float(_gains(network.parameters, held_out, rounded=True).max())
             history.append((perf_counter() - began, update, gain))
-        if progress is not None:
-            progress(share)
+            if progress is not None:
+                progress(share)
     return history
 
 
