@@ -35,7 +35,8 @@ def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> di
                 "in (t, z, y, x); give the same --var, --axes, --t"
             )
         quality = measure(series, volume, progress)
-        return report(volume, quality, seconds=time.perf_counter() - begun)
+        seconds = time.perf_counter() - begun
+        return report(volume, quality, seconds=seconds, files=series.files)
 
 
 def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any]:

@@ -70,11 +70,14 @@ def encode(
             with Volume(writer.preview(header)) as volume:
                 quality = measure(series, volume, progress)
             header["quality"] = brief_quality(quality)
+            progress("writing", 0, 1, "")
             writer.commit(header)
+            progress("writing", 1, 1, "")
         if checkpoint is not None:
             checkpoint.unlink(missing_ok=True)
     with open_volume(path) as volume:
-        figures = report(volume, quality, seconds=time.perf_counter() - begun)
+        seconds = time.perf_counter() - begun
+        figures = report(volume, quality, seconds=seconds, files=series.files)
     _check_promise(path, config, figures)
     return figures
 

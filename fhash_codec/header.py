@@ -209,6 +209,36 @@ def history_points(
     return [{"seconds": None, "psnr": None, **point} for point in history]
 
 
+def full_header(header: Mapping[str, Any]) -> dict[str, Any]:
+    """A header with the figures of steps and of the training in one shape, whatever the file has.
+
+    `quality.per_step` is a list with step, psnr, rmse and max_abs_error of each step, and `history`
+    a list of points, both as a report has them.
+    """
+    full = {**header, "history": history_points(header.get("history", ()))}
+    quality = header.get("quality", {})
+    if "per_step" in quality:
+        full["quality"] = {**quality, "per_step": _steps(quality["per_step"])}
+    return full
+
+
+def _steps(per_step: Any) -> list[dict[str, Any]]:
+    """The figures of each step, from lists by name; what another writer misshaped is left out."""
+    if not isinstance(per_step, Mapping):
+        return [dict(step) for step in per_step if isinstance(step, Mapping)]
+    lists = {
+        name: per_step.get(name) for name in ("psnr", "rmse", "max_abs_error") if name in per_step
+    }
+    if not all(isinstance(values, list) for values in lists.values()):
+        return []
+    count = max((len(values) for values in lists.values()), default=0)
+    return [
+        {"step": step}
+        | {name: values[step] if step < len(values) else None for name, values in lists.items()}
+        for step in range(count)
+    ]
+
+
 def _figure(name: str, value: float | None, digits: int) -> float | None:
     """A figure rounded to significant digits, never to a better value."""
     if value is None:
@@ -234,7 +264,7 @@ def describe_file(container: Container, path: Path, key_frames: Sequence[int]) -
         for name, array in container.arrays.items()
     }
     return {
-        **header,
+        **full_header(header),
         "path": str(path),
         "bytes": container.size,
         "overhead_bytes": container.overhead(),

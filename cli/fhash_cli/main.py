@@ -12,12 +12,14 @@ import signal
 import sys
 import traceback
 import warnings
+from collections.abc import Sequence
+from contextlib import suppress
 from types import FrameType
 from typing import Any, cast
 
 import click
 
-from fhash_cli.output import describe_error, say, warn
+from fhash_cli.output import describe_error, error_object, print_json, printed, say, warn
 from fhash_formats.errors import InterruptedEncodingError
 
 COMMANDS = {
@@ -30,6 +32,7 @@ COMMANDS = {
     "demo": "simulate, encode, decode, compare, draw",
     "bench": "measure speed on this machine",
     "selftest": "check hard cases on this machine",
+    "completion": "print the shell code that completes fhash's words on Tab",
 }
 """Help line of each command; its module `fhash_cli.commands.NAME` is imported only on use."""
 
@@ -68,7 +71,12 @@ class Program(click.Group):
                 raise InterruptedEncodingError("interrupted") from None
 
     def main(self, *args: Any, **extra: Any) -> Any:
-        """Run the command line and raise SystemExit."""
+        """Run the command line and raise SystemExit.
+
+        With --json an error is an object on stdout too, unless the result stands there already.
+        """
+        printed.set(False)
+        words = list(args[0] if args and args[0] is not None else extra.get("args") or sys.argv[1:])
         try:
             result = super().main(*args, **{**extra, "standalone_mode": False})
         except Exception as error:
@@ -77,10 +85,18 @@ class Program(click.Group):
             if os.environ.get("FHASH_DEBUG"):
                 traceback.print_exc(file=sys.stderr)
             line, code = describe_error(error)
+            if _asks_for_json(words) and not printed.get() and sys.stdout is not None:
+                with suppress(OSError):
+                    print_json(error_object(error))
             say(f"error: {line}")
             sys.exit(code)
         # click returns the exit code of commands that end early (--help, --version), else None.
         sys.exit(result if isinstance(result, int) else 0)
+
+
+def _asks_for_json(words: Sequence[str]) -> bool:
+    """Whether a command line has the option --json, also one that cannot be parsed."""
+    return "--json" in words[: words.index("--") if "--" in words else None]
 
 
 @click.group(
@@ -93,9 +109,23 @@ class Program(click.Group):
 def program(context: click.Context) -> None:
     """A codec for time-varying volumes: keeps the features you name, reads any region at any time.
 
-    Results go to stdout (one JSON object with --json), log and progress to stderr.
-    Exit codes: 0 success, 1 failure, 2 usage or unsuitable input, 3 quality gate missed,
-    4 damaged or unsupported file, 130 interrupted.
+    Results go to stdout, messages and progress to stderr. With --json the result, or the error, is
+    one JSON object; docs/json.md describes it.
+
+    \b
+    Exit codes:
+      0    success
+      1    failure: a full disk, no memory, a check of selftest that does not hold
+      2    usage, or an unsuitable input
+      3    a promise of quality or a gate missed; the file is written
+      4    a damaged or unsupported file
+      130  interrupted by Ctrl-C
+
+    \b
+    Completion by the Tab key, in the start-up file of the shell:
+      bash   eval "$(fhash completion bash)"       in ~/.bashrc
+      zsh    eval "$(fhash completion zsh)"        in ~/.zshrc
+      fish   fhash completion fish | source        in ~/.config/fish/config.fish
     """
     if context.invoked_subcommand is None:
         click.echo(context.get_help(), err=True)

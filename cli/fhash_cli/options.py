@@ -43,6 +43,12 @@ def check_writable(
 class RealRange(click.FloatRange):
     """A number within limits, and no NaN, which click's own range lets through."""
 
+    def _describe_range(self) -> str:
+        """The limits in the help, in few digits and without those that nobody meets."""
+        low = "" if self.min is None else f"{self.min:g}<="
+        high = "" if self.max is None or self.max > 1e12 else f"<={self.max:g}"
+        return f"{low}x{high}"
+
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
@@ -169,10 +175,19 @@ class SourceOptions:
     raw_values: bool = False
     keep_extremes: bool = False
 
-    def open(self, path: str) -> Any:
-        """The Series at a path; the caller closes it."""
+    @property
+    def part(self) -> bool:
+        """Whether the options choose a part of what the source holds."""
+        return self.var is not None or self.t is not None or bool(self.select)
+
+    def open(self, path: str, progress: Callable[[str, int, int, str], None]) -> Any:
+        """The Series at a path; the caller closes it.
+
+        progress: is told that the source is being opened: many files take their time.
+        """
         from fhash_formats import open_series
 
+        progress("opening", 0, 1, path)
         return open_series(path, steps=self.t, keep_extremes=self.keep_extremes, **self._wishes())
 
     def list(self, path: str) -> Any:

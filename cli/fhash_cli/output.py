@@ -5,25 +5,52 @@ from __future__ import annotations
 import json
 import math
 import sys
-import time
 from collections.abc import Mapping, Sequence
-from types import TracebackType
+from contextvars import ContextVar
 from typing import Any, TextIO
 
 import click
 
-from fhash_formats.errors import FhashError, OutputError
+from fhash_cli.progress_bar import Progress, say
+from fhash_formats.errors import (
+    DamagedFileError,
+    FhashError,
+    InputError,
+    InterruptedEncodingError,
+    MissingDependencyError,
+    MissingInputError,
+    OutputError,
+    OutputExistsError,
+    QualityError,
+    RegionError,
+    UnsupportedFileError,
+)
 from fhash_formats.support.plain_json import plain_json, plain_text
 
+__all__ = [
+    "Progress", "apart", "compared", "describe_error", "duration", "emit", "error_object",
+    "extent", "factor", "listed", "loss_rows", "number", "print_json", "printed", "quality_rows",
+    "say", "size", "spans", "table", "warn",
+]  # fmt: skip
+
+KINDS: dict[str, tuple[type[Exception], ...]] = {
+    "usage": (click.ClickException,),
+    "missing-input": (MissingInputError,),
+    "missing-dependency": (MissingDependencyError,),
+    "output-exists": (OutputExistsError,),
+    "region": (RegionError,),
+    "quality": (QualityError,),
+    "unsupported": (UnsupportedFileError,),
+    "damaged": (DamagedFileError,),
+    "interrupted": (InterruptedEncodingError,),
+    "input": (InputError,),
+    "output": (OutputError,),
+}
+"""Errors by kind, the first that fits; others are `memory` or `failure`."""
+printed: ContextVar[bool] = ContextVar("printed", default=False)
+"""Whether the JSON object of the present command line was printed."""
 NO_MEMORY = ("can't allocate memory", "memory allocation failed")
 """Words of the RuntimeErrors by which torch and HDF5 report that memory ran out."""
-QUIET_SECONDS = 2.0
-"""Stages shorter than this show no progress."""
-
-
-def say(message: str) -> None:
-    """One line on stderr."""
-    click.echo(f"fhash: {message}", err=True)
 
 
 def warn(
@@ -38,8 +65,13 @@ def warn(
     say(f"warning: {' '.join(str(message).split())}")
 
 
-def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
-    """Print a result on stdout: as one line of JSON, or as text.
+def emit(
+    result: Mapping[str, Any], text: str, as_json: bool, missed: FhashError | None = None
+) -> None:
+    """Print a result on stdout, as one line of JSON or as text, and raise what was missed.
+
+    missed: a gate or promise that the result misses; JSON holds it beside the result, see
+        `error_object`.
 
     Figures that JSON cannot hold become null.
 
@@ -49,7 +81,34 @@ def emit(result: Mapping[str, Any], text: str, as_json: bool) -> None:
         raise OutputError(
             "the result cannot be printed, stdout is closed; files named as outputs are written"
         )
-    click.echo(json.dumps(plain_json(result), allow_nan=False) if as_json else plain_text(text))
+    if as_json:
+        print_json({**result, **({} if missed is None else error_object(missed))})
+    else:
+        click.echo(plain_text(text))
+    if missed is not None:
+        raise missed
+
+
+def print_json(values: Mapping[str, Any]) -> None:
+    """Print the one JSON object of a command on stdout."""
+    click.echo(json.dumps(plain_json(values), allow_nan=False))
+    printed.set(True)
+
+
+def error_object(error: Exception) -> dict[str, Any]:
+    """An error as JSON: what went wrong in one line, its kind and the exit code."""
+    line, code = describe_error(error)
+    return {"error": line, "kind": _kind(error, code), "exit_code": code}
+
+
+def _kind(error: Exception, code: int) -> str:
+    """A word for an error that scripts can rely on, see docs/json.md."""
+    for kind, errors in KINDS.items():
+        if isinstance(error, errors):
+            return kind
+    if _is_no_memory(error):
+        return "memory"
+    return "input" if code == 2 else "failure"
 
 
 def table(rows: Sequence[Sequence[str]]) -> str:
@@ -75,20 +134,53 @@ def size(count: float) -> str:
     """Bytes for people, in decimal units."""
     for unit in ("B", "kB", "MB", "GB"):
         if count < 999.5:
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.3g} {unit}"
+            return f"{count:.0f} B" if unit == "B" else f"{_three_digits(count)} {unit}"
         count /= 1000
-    return f"{count:.3g} TB"
+    return f"{_three_digits(count)} TB"
 
 
-def compared(report: Mapping[str, Any]) -> str:
-    """The size of a container beside that of the data."""
-    ratio = report["ratio"]
-    word = (
-        f"{number(ratio, digits=3)}x smaller"
-        if ratio >= 1
-        else f"{number(1 / ratio, digits=3)}x larger"
-    )
-    return f"{size(report['bytes'])} of {size(report['raw_bytes'])}, {word}"
+def factor(ratio: float) -> str:
+    """A ratio of sizes with three digits, such as 1.97x, 197x or 52,700x."""
+    return f"{_three_digits(ratio)}x"
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people, such as 0.43 s, 54 s, 2 min 20 s or 3 h 5 min."""
+    if seconds < 9.95:
+        return f"{seconds:.2g} s"
+    if seconds < 119.5:
+        return f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def _three_digits(value: float) -> str:
+    """A positive number with three significant digits and no exponent, such as 14.0 or 52,700."""
+    decimals = 2 - math.floor(math.log10(value)) if value > 0 else 0
+    rounded = round(value, decimals)
+    # 9.999 has two decimals, but 10.0, to which it is rounded, has one.
+    decimals = 2 - math.floor(math.log10(rounded)) if rounded > 0 else 0
+    return f"{rounded:,.{max(decimals, 0)}f}"
+
+
+def compared(report: Mapping[str, Any], *, part: bool = False) -> str:
+    """The size of a container beside the array, and beside the files that it was read from.
+
+    part: whether options chose a part of what the files hold.
+    """
+    array = f"{_smaller(report['ratio'])} than the array ({size(report['raw_bytes'])})"
+    text = f"{size(report['bytes'])}: {array}"
+    if not report.get("source_bytes"):
+        return text
+    source = "the whole source" if part else "the source"
+    ratio = _smaller(report["source_ratio"])
+    return f"{text}, {ratio} than {source} on disk ({size(report['source_bytes'])})"
+
+
+def _smaller(ratio: float) -> str:
+    return f"{factor(ratio)} smaller" if ratio >= 1 else f"{factor(1 / ratio)} larger"
 
 
 def number(value: float | None, unit: str = "", *, digits: int = 4) -> str:
@@ -180,76 +272,3 @@ def _is_no_memory(error: Exception) -> bool:
             words in str(error) for words in NO_MEMORY
         )
     return isinstance(error, MemoryError)
-
-
-class Progress:
-    """The codec's progress callback (stage, done, total, note), as a context manager.
-
-    It draws a bar on a terminal, and prints a line every 10 % elsewhere. The first QUIET_SECONDS of
-    a stage show nothing; `quiet` shows nothing at all. Leaving the context removes the bar.
-    """
-
-    def __init__(self, *, quiet: bool) -> None:
-        self.quiet = quiet
-        self.terminal = sys.stderr is not None and sys.stderr.isatty()
-        self.stage = ""
-        self.start = self.last = time.monotonic()
-        self.shown = 0.0
-        self.tenth = 0
-        self.drawn = False
-
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._erase()
-
-    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Report that `done` of `total` parts of a stage are done.
-
-        note: a remark such as "41.2 dB".
-        """
-        if self.quiet:
-            return
-        now = time.monotonic()
-        if stage != self.stage:
-            # The first report follows the first part: the stage began at the end of the last.
-            self._erase()
-            self.stage, self.start, self.tenth = stage, self.last, 0
-        self.last = now
-        share = done / total if total else 1.0
-        passed = now - self.start
-        if passed < QUIET_SECONDS:
-            self.tenth = math.floor(10 * share)
-            return
-        left = f", {_clock(passed / share - passed)} left" if 0 < share < 1 else ""
-        remark = f", {note}" if note else ""
-        if self.terminal and (now - self.shown > 0.1 or share == 1):
-            filled = round(24 * share)
-            click.echo(
-                f"\r{stage:10} {'#' * filled}{'-' * (24 - filled)} {share:4.0%}"
-                f"{remark}{left}\x1b[K",
-                err=True,
-                nl=False,
-            )
-            self.drawn, self.shown = True, now
-        elif not self.terminal and math.floor(10 * share) > self.tenth:
-            self.tenth = math.floor(10 * share)
-            say(f"{stage} {share:.0%}{remark}{left}")
-
-    def _erase(self) -> None:
-        if self.drawn:
-            click.echo("\r\x1b[K", err=True, nl=False)
-            self.drawn = False
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return (
-        f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"
-    )

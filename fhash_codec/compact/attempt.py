@@ -16,6 +16,7 @@ from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Feature
 from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.progress import Parts
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -57,6 +58,8 @@ class PlanTask:
     """Tile that the settings name; None if it is to be chosen."""
     workers: ThreadPoolExecutor
     gains: GainLog
+    parts: Parts = field(default_factory=Parts)
+    """Progress of the planning."""
 
     @property
     def density(self) -> int:

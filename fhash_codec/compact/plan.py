@@ -29,7 +29,7 @@ from fhash_codec.compact.tiles.tiling import first_tile, parse_tile, tile_for
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Feature
 from fhash_codec.measure.value_range import ValueRange
-from fhash_codec.progress import Progress
+from fhash_codec.progress import Parts, Progress
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
@@ -40,8 +40,8 @@ MAX_VALUE = 1e145
 """Largest magnitude of a value whose squared errors fit float64."""
 MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
-STAGES = 4
-"""Number of stages that the progress counts."""
+STAGES = 6
+"""Number of parts of the planning that its progress counts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,23 +96,28 @@ def plan(
         fixed_tile=fixed_tile,
         workers=workers,
         gains=gains,
+        parts=Parts("planning", STAGES, progress),
     )
-    progress("planning", 0, STAGES, "")
+    parts = task.parts
+    parts.begin("first guess")
     tiled = blocks.retile(tile)
     settings = first_settings(task, tiled)
     if _can_estimate(task, tiled, settings):
         estimated_plan = _estimated_plan(task, tiled, settings)
-        progress("planning", STAGES, STAGES, "")
+        parts.end()
         return estimated_plan
     attempt = first_guess(task, tiled, settings)
-    progress("planning", 1, STAGES, "")
+    parts.begin("tiles and transform")
     attempt = choose_tiles(task, attempt)
-    progress("planning", 2, STAGES, "")
+    parts.begin("fill values")
     attempt = fill_tiles(task, attempt)
+    parts.begin("quantiser step")
     attempt = choose_step(task, attempt)
+    parts.begin("head")
     attempt = try_head(task, attempt)
+    parts.begin("prediction")
     attempt = try_predictor(task, attempt)
-    progress("planning", STAGES, STAGES, "")
+    parts.end()
     return CodingPlan(
         blocks=attempt.sample.blocks,
         sample=attempt.sample,

@@ -62,7 +62,7 @@ SAME_STEP = 0.1
 
 def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
     """Return settings to begin with: the usual transform, the mean as centre, a guessed step."""
-    sample = Sample(tiled, LOOK_VERTICES, task.workers)
+    sample = Sample(tiled, LOOK_VERTICES, task.workers, tick=task.parts.tick)
     goal, value_range = task.goal, task.value_range
     if goal.psnr is not None:
         step = 4 * goal.expected_error
@@ -186,6 +186,7 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
         effort=config.effort,
         seed=config.seed,
         device=config.device,
+        parts=task.parts,
     )
     task.gains.note("head" if settings.head is not None else "head (left out)", outcome)
     return replace(attempt, settings=settings, outcome=outcome, history=history)
@@ -212,7 +213,7 @@ def _sample(task: PlanTask, tiled: Blocks, settings: TileSettings, max_vertices:
     """
     usual = replace(settings, transform=usual_transform(tiled.tile))
     costs = tile_costs(tiled, usual, task.workers)
-    return Sample(tiled, max_vertices, task.workers, costs).filled(usual, 1)
+    return Sample(tiled, max_vertices, task.workers, costs, task.parts.tick).filled(usual, 1)
 
 
 def _with_mask(

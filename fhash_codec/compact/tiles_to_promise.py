@@ -150,7 +150,8 @@ def _search_psnr(
     """Code all tiles with step after step; the best table of these and of the one given."""
     search = psnr_search(coding_plan.settings)
     for attempt in range(PASSES):
-        table = _code_all(coding_plan, workers, progress)
+        note = f"pass {attempt + 1}" if attempt else ""
+        table = _code_all(coding_plan, workers, progress, note)
         psnr = aim.psnr_of(table.outcome)
         if best is None or aim.prefers(table.outcome, best.outcome):
             best = table
@@ -182,9 +183,12 @@ def _simpler_plans(coding_plan: CodingPlan) -> Iterator[CodingPlan]:
 
 
 def _code_all(
-    coding_plan: CodingPlan, workers: ThreadPoolExecutor, progress: Progress
+    coding_plan: CodingPlan, workers: ThreadPoolExecutor, progress: Progress, note: str = ""
 ) -> CodedTable:
-    """Code every tile; few tiles are worked on at a time, so that memory stays bounded."""
+    """Code every tile; few tiles are worked on at a time, so that memory stays bounded.
+
+    note: for the progress.
+    """
     blocks = coding_plan.blocks
     filled_tiles: dict[Index, Tile] = {}
     if coding_plan.sample is not None and coding_plan.coding.filled:
@@ -209,5 +213,5 @@ def _code_all(
     for data, outcome in map_ahead(workers, work, sources, 2 * usable_threads()):
         streams.append(data)
         outcomes.append(outcome)
-        progress("coding", len(streams), prod(blocks.grid), "")
+        progress("coding", len(streams), prod(blocks.grid), note)
     return CodedTable(plan=coding_plan, streams=streams, outcome=total(outcomes))

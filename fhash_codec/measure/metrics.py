@@ -325,7 +325,9 @@ def measure_quality(
     def collect() -> None:
         """Wait for the first step under way, and add it."""
         figures = comparer.add(waiting.popleft().result())
-        note = "" if figures.psnr is None else f"{figures.psnr:.1f} dB"
+        # The figure of all steps so far: those of single steps would go up and down.
+        psnr = comparer.coreset.psnr
+        note = "" if psnr is None else f"{psnr:.1f} dB so far"
         progress("measuring", figures.step + 1, steps, note)
 
     with ThreadPoolExecutor(threads, thread_name_prefix="fhash-measure") as workers:

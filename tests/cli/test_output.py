@@ -1,4 +1,4 @@
-"""Tables, numbers for people, and progress, which is quiet when there is nothing to say."""
+"""Tables, numbers for people, and errors."""
 
 from __future__ import annotations
 
@@ -7,82 +7,18 @@ import errno
 import click
 import pytest
 
-from fhash_cli import output
 from fhash_cli.output import (
-    Progress,
     apart,
     compared,
     describe_error,
+    duration,
+    factor,
     listed,
     number,
     size,
     table,
 )
 from fhash_formats.errors import DamagedFileError, InputError, QualityError
-
-
-class Terminal:
-    """A stderr that is a terminal or is not."""
-
-    def __init__(self, terminal: bool) -> None:
-        self.terminal = terminal
-        self.text = ""
-
-    def isatty(self) -> bool:
-        return self.terminal
-
-    def write(self, text: str) -> int:
-        self.text += text
-        return len(text)
-
-    def flush(self) -> None:
-        pass
-
-
-def reports(
-    monkeypatch: pytest.MonkeyPatch, *, seconds: float, terminal: bool = False, quiet: bool = False
-) -> str:
-    """The text printed for a stage of 40 parts of `seconds` each, after one that took no time."""
-    screen, now = Terminal(terminal), [0.0]
-    monkeypatch.setattr("sys.stderr", screen)
-    monkeypatch.setattr(output.time, "monotonic", lambda: now[0])
-    with Progress(quiet=quiet) as progress:
-        progress("reading", 1, 1, "")
-        for part in range(1, 41):
-            now[0] += seconds
-            progress("training", part, 40, f"{part} dB")
-    return screen.text
-
-
-def test_short_stages_are_silent(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert reports(monkeypatch, seconds=0.04) == ""
-    assert reports(monkeypatch, seconds=0.04, terminal=True) == ""
-
-
-@pytest.mark.parametrize("terminal", [False, True])
-def test_quiet_is_silent(monkeypatch: pytest.MonkeyPatch, terminal: bool) -> None:
-    assert reports(monkeypatch, seconds=9.0, terminal=terminal, quiet=True) == ""
-
-
-def test_without_a_terminal_there_is_a_line_every_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = reports(monkeypatch, seconds=1.0).splitlines()
-    assert len(lines) == 10
-    assert lines[0] == "fhash: training 10%, 4 dB, 0:36 left"
-    assert lines[-1] == "fhash: training 100%, 40 dB"
-
-
-def test_what_passed_before_the_first_report_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert (
-        reports(monkeypatch, seconds=120.0).splitlines()[0]
-        == "fhash: training 10%, 4 dB, 1:12:00 left"
-    )
-
-
-def test_on_a_terminal_a_bar_is_drawn_in_place_and_removed(monkeypatch: pytest.MonkeyPatch) -> None:
-    text = reports(monkeypatch, seconds=1.0, terminal=True)
-    assert "\n" not in text
-    assert "training   ############------------  50%, 20 dB, 0:20 left" in text
-    assert text.endswith("\r\x1b[K")
 
 
 def test_table_aligns_its_columns() -> None:
@@ -95,10 +31,17 @@ def test_table_aligns_its_columns() -> None:
     [
         (0, "0 B"),
         (999, "999 B"),
-        (1000, "1 kB"),
+        (999.4, "999 B"),
+        (999.5, "1.00 kB"),
+        (1000, "1.00 kB"),
+        (9_994, "9.99 kB"),
+        (9_996, "10.0 kB"),
         (98_600, "98.6 kB"),
-        (4.7e9, "4.7 GB"),
-        (2e15, "2e+03 TB"),
+        (13_965_614, "14.0 MB"),
+        (999_499, "999 kB"),
+        (999_501, "1.00 MB"),
+        (4.7e9, "4.70 GB"),
+        (2e15, "2,000 TB"),
     ],
 )
 def test_size(count: float, text: str) -> None:
@@ -114,15 +57,59 @@ def test_number_has_its_unit_or_is_a_dash() -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("ratio", "text"),
+    [
+        (0.5, "0.500x"),
+        (1.0, "1.00x"),
+        (9.996, "10.0x"),
+        (47.25, "47.2x"),
+        (999.6, "1,000x"),
+        (52_683.0, "52,700x"),
+    ],
+)
+def test_factor_has_three_digits_and_no_exponent(ratio: float, text: str) -> None:
+    assert factor(ratio) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0 s"),
+        (0.434, "0.43 s"),
+        (9.94, "9.9 s"),
+        (9.96, "10 s"),
+        (119.4, "119 s"),
+        (119.6, "2 min 0 s"),
+        (140.2, "2 min 20 s"),
+        (3599.4, "59 min 59 s"),
+        (3599.6, "1 h 0 min"),
+        (11_130, "3 h 5 min"),
+    ],
+)
+def test_duration_is_in_units_that_people_read(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+FIGURES = {"bytes": 100_000, "raw_bytes": 4_720_000, "ratio": 47.2}
+
+
 def test_compared_says_larger_where_it_is() -> None:
-    assert (
-        compared({"bytes": 100_000, "raw_bytes": 4_720_000, "ratio": 47.2})
-        == "100 kB of 4.72 MB, 47.2x smaller"
-    )
+    assert compared(FIGURES) == "100 kB: 47.2x smaller than the array (4.72 MB)"
     assert (
         compared({"bytes": 11_800, "raw_bytes": 480, "ratio": 480 / 11_800})
-        == "11.8 kB of 480 B, 24.6x larger"
+        == "11.8 kB: 24.6x larger than the array (480 B)"
     )
+
+
+def test_compared_has_the_source_as_it_lies_on_disk_too() -> None:
+    on_disk = {**FIGURES, "source_bytes": 2_000_000, "source_ratio": 20.0}
+    array = "100 kB: 47.2x smaller than the array (4.72 MB)"
+    assert compared(on_disk) == f"{array}, 20.0x smaller than the source on disk (2.00 MB)"
+    assert compared(on_disk, part=True) == (
+        f"{array}, 20.0x smaller than the whole source on disk (2.00 MB)"
+    )
+    assert compared({**FIGURES, "source_bytes": None, "source_ratio": None}) == array
 
 
 def test_listed_leaves_out_the_middle() -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.report import bytes_on_disk
 
 
 def test_the_figures_are_those_of_the_file(field, tmp_path) -> None:
@@ -52,3 +54,20 @@ def test_figures_count_the_steps_between_key_frames(field, tmp_path) -> None:
     assert sorted(steps) == [0, 1, 2, 3, 4]
     assert figures["key_frames"] == [0, 2, 4]
     assert min(steps[0], steps[2], steps[4]) > max(steps[1], steps[3])
+
+
+def test_the_source_is_counted_as_it_lies_on_disk(tmp_path: Path) -> None:
+    folder = tmp_path / "a.zarr" / "c"
+    folder.mkdir(parents=True)
+    (folder / "0").write_bytes(b"12345")
+    (folder.parent / "zarr.json").write_bytes(b"{}")
+    (tmp_path / "b.raw").write_bytes(b"123")
+    assert bytes_on_disk([folder.parent]) == 7
+    assert bytes_on_disk([folder.parent, tmp_path / "b.raw"]) == 10
+    assert bytes_on_disk([]) is None
+    assert bytes_on_disk([tmp_path / "gone"]) is None
+
+
+def test_an_array_has_no_source_on_disk(field, tmp_path) -> None:
+    figures = fhash_codec.encode(field((2, 4, 5, 6)), tmp_path / "a.fhz", EncodeConfig(effort=1))
+    assert (figures["source_bytes"], figures["source_ratio"]) == (None, None)

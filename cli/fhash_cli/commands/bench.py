@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.base_command import BaseGroup
 from fhash_cli.commands.bench_render import render
 from fhash_cli.options import (
     RealRange,
@@ -72,7 +73,7 @@ class NamesType(click.ParamType[str]):
         return str(value)
 
 
-@click.group("bench", short_help="measure speed and size on this machine")
+@click.group("bench", cls=BaseGroup, short_help="measure speed and size on this machine")
 def command() -> None:
     """Measure speed and size on this machine."""
 
@@ -123,7 +124,7 @@ def train(
     """
     from fhash_codec.config import ENGINES
 
-    with source.open(data) as series, Progress(quiet=quiet) as progress:
+    with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         from fhash_codec.bench.train import bench_train
 
         result = bench_train(
@@ -231,7 +232,7 @@ def rate(
     """
     if plot is not None:
         check_writable(plot, force, sources=[data])
-    with source.open(data) as series, Progress(quiet=quiet) as progress:
+    with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         from fhash_codec.bench.rate.own import PROFILES
         from fhash_codec.bench.rate.plot import plot as draw
         from fhash_codec.bench.rate.plot import require_matplotlib

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import check_writable, force_option, json_option, quiet_option, run_argument
 from fhash_cli.output import Progress, emit, extent, number, table
 
@@ -29,7 +30,7 @@ class PartType(click.ParamType[str]):
         return str(value)
 
 
-@click.command("render", short_help="time and quality of pictures, beside VTK")
+@click.command("render", cls=BaseCommand, short_help="time and quality of pictures, beside VTK")
 @run_argument
 @click.option(
     "--scene",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
     IntervalsType,
     SliceType,
@@ -43,7 +44,7 @@ TYPES = (
 )
 
 
-@click.command("decode")
+@click.command("decode", cls=BaseCommand)
 @run_argument
 @click.option(
     "--t",

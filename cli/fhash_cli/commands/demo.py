@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import check_writable, force_option, json_option, quiet_option
 from fhash_cli.output import (
     Progress,
     compared,
+    duration,
     emit,
     extent,
     number,
@@ -33,7 +35,7 @@ COLUMNS = 4
 """Steps that the picture shows side by side."""
 
 
-@click.command("demo")
+@click.command("demo", cls=BaseCommand)
 @click.option(
     "--scene",
     type=click.Choice(tuple(SCENES)),
@@ -148,6 +150,6 @@ def _rows(result: dict[str, Any], series: Series) -> list[tuple[str, str]]:
         ("size", compared(result)),
         ("coreset", f"{result['coreset_fraction']:.3%} of the domain"),
         *quality_rows(result),
-        ("encoding", f"{number(result['seconds'], 's', digits=3)} on {result['device']}"),
-        ("comparing", number(result["diff_seconds"], "s", digits=3)),
+        ("encoding", f"{duration(result['seconds'])} on {result['device']}"),
+        ("comparing", duration(result["diff_seconds"])),
     ]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
     RealRange,
     SourceOptions,
@@ -13,9 +16,10 @@ from fhash_cli.options import (
     series_options,
 )
 from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, table
+from fhash_formats.errors import QualityError
 
 
-@click.command("diff")
+@click.command("diff", cls=BaseCommand)
 @click.argument("data", type=click.Path())
 @run_argument
 @series_options
@@ -44,18 +48,25 @@ def command(
 ) -> None:
     """Compare RUN.fhz with the DATA it was made from, over all steps."""
     import fhash_codec
-    from fhash_formats.errors import QualityError
 
-    with source.open(data) as series, Progress(quiet=quiet) as progress:
+    with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         report = fhash_codec.diff(series, run, progress=progress)
     rows = [
-        ("size", compared(report)),
+        ("size", compared(report, part=source.part)),
         ("steps, z, y, x", extent(report["shape"])),
         *quality_rows(report, series.units),
     ]
-    emit(report, table(rows), as_json)
-    # Where nothing differs no PSNR is defined, and any gate is met. Where the data are constant, or
-    # nothing can be compared, none is defined either, and no gate is met.
+    emit(report, table(rows), as_json, _missed_gate(run, report, min_psnr, max_error))
+
+
+def _missed_gate(
+    run: str, report: dict[str, Any], min_psnr: float | None, max_error: float | None
+) -> QualityError | None:
+    """The error of the first gate that the figures miss; None if they miss none.
+
+    Where nothing differs no PSNR is defined, and any gate is met. Where the data are constant, or
+    nothing can be compared, none is defined either, and no gate is met.
+    """
     if (
         min_psnr is not None
         and report["rmse"] != 0
@@ -66,10 +77,11 @@ def command(
             if report["psnr"] is None
             else f"PSNR {number(report['psnr'], 'dB')}"
         )
-        raise QualityError(
+        return QualityError(
             f"{run}: {reached} in the coreset; at least {min_psnr:g} dB was asked for"
         )
     worst = report["max_abs_error"]
     if max_error is not None and not (worst is not None and worst <= max_error):
         largest = "no value can be compared" if worst is None else f"largest error {worst:.6g}"
-        raise QualityError(f"{run}: {largest} in the coreset; at most {max_error:g} was asked for")
+        return QualityError(f"{run}: {largest} in the coreset; at most {max_error:g} was asked for")
+    return None

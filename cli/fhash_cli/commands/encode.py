@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
     SourceOptions,
     check_writable,
@@ -20,10 +21,10 @@ from fhash_cli.options import (
 from fhash_cli.output import (
     Progress,
     compared,
+    duration,
     emit,
     extent,
     loss_rows,
-    number,
     quality_rows,
     size,
     spans,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
 
 
-@click.command("encode")
+@click.command("encode", cls=BaseCommand)
 @click.argument("data", type=click.Path())
 @click.option(
     "-o", "output", metavar="RUN.fhz", required=True, type=click.Path(), help="Where to write."
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
 @force_option
 @json_option
 @quiet_option
+@click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
 def command(
     data: str,
     output: str,
@@ -53,6 +55,7 @@ def command(
     force: bool,
     as_json: bool,
     quiet: bool,
+    verbose: bool,
 ) -> None:
     """Find the features of DATA, encode them and write them as RUN.fhz.
 
@@ -64,20 +67,25 @@ def command(
 
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
-    with source.open(data) as series, Progress(quiet=quiet) as progress:
+    with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         missed = None
         try:
             report = fhash_codec.encode(series, output, config, force=force, progress=progress)
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
-    emit(report, table(report_rows(report, series.units)), as_json)
-    if missed is not None:
-        raise missed
+    rows = report_rows(report, series.units, part=source.part, verbose=verbose)
+    emit(report, table(rows), as_json, missed)
 
 
-def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
-    """An encoding's report as a table."""
+def report_rows(
+    report: dict[str, Any], units: str, *, part: bool, verbose: bool
+) -> list[tuple[str, str]]:
+    """An encoding's report as a table.
+
+    part: whether options chose a part of the source.
+    verbose: whether the table has the size after each stage of the search.
+    """
     paper = report["profile"] == "paper"
     model = (
         f"{report['parameters']:,} parameters, {report['epochs']} epochs"
@@ -86,8 +94,8 @@ def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
     )
     return [
         ("written", str(report["path"])),
-        ("size", compared(report)),
-        *gain_rows(report),
+        ("size", compared(report, part=part)),
+        *(gain_rows(report) if verbose else ()),
         ("steps, z, y, x", extent(report["shape"])),
         *([("key frames", str(len(report["key_frames"])))] if paper else []),
         (
@@ -98,7 +106,7 @@ def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
         *quality_rows(report, units),
         ("model", f"{model}, {report['profile']}"),
         *loss_rows(report),
-        ("time", f"{number(report['seconds'], 's', digits=3)} on {report['device']}"),
+        ("time", f"{duration(report['seconds'])} on {report['device']}"),
     ]
 
 
@@ -118,4 +126,4 @@ def gain_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _after(gain: Mapping[str, Any]) -> str:
-    return f" after {number(gain['seconds'], 's', digits=2)}" if "seconds" in gain else ""
+    return f" after {duration(gain['seconds'])}" if "seconds" in gain else ""

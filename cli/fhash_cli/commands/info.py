@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import SourceOptions, json_option, series_options
 from fhash_cli.output import (
     apart,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from fhash_codec import Volume
 
 
-@click.command("info")
+@click.command("info", cls=BaseCommand)
 @click.argument("path", metavar="RUN.fhz|DATA", type=click.Path())
 @series_options
 @json_option

@@ -14,6 +14,7 @@ from fhash_cli.animation_options import (
     run_animation,
     tracking,
 )
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import check_writable, force_option, json_option, quiet_option, run_argument
 from fhash_cli.output import Progress, emit, extent, number, table
 from fhash_cli.scene_options import SceneOptions, scene_options
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.scene.scene import Scene
 
 
-@click.command("render")
+@click.command("render", cls=BaseCommand)
 @run_argument
 @click.option(
     "-o",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import check_writable, force_option, json_option, quiet_option
 from fhash_cli.output import Progress, emit, table
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from fhash_codec.selftest.results import Summary
 
 
-@click.command("selftest")
+@click.command("selftest", cls=BaseCommand)
 @click.option(
     "--all",
     "everything",

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import click
 
+from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import json_option, quiet_option, run_argument
 from fhash_cli.output import Progress, emit
 
 
-@click.command("verify")
+@click.command("verify", cls=BaseCommand)
 @run_argument
 @json_option
 @quiet_option

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from threading import Event
 from typing import TYPE_CHECKING, NamedTuple
 
 from fhash_codec.compact.choices.head_samples import Pair
 from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
+from fhash_codec.progress import Parts
 from fhash_formats.errors import InputError
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
@@ -119,6 +122,7 @@ def choose_head(
     effort: int,
     seed: int,
     device: str,
+    parts: Parts | None = None,
 ) -> tuple[TileSettings, Outcome, HeadHistory]:
     """Return settings with a head and a larger step if they make the sample smaller.
 
@@ -132,13 +136,16 @@ def choose_head(
     strict: whether the promise is a bound, which all outcomes keep; else sizes are compared at
         the same PSNR.
     data_range: range of the values, in data units.
+    parts: progress of the planning, which is told about the training.
     """
     if outcome.size < MIN_BYTES:
         return settings, outcome, []
     wider = sample.wider(TRAINING_VERTICES)
     training = _Training(seed=seed, device=device)
     pairs = _training_pairs(wider, settings, coding)
-    trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET)
+    parts = parts or Parts()
+    tell = partial(parts.report, "training")
+    trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET, tell)
     if trial is None or trial.gain_db < MIN_GAIN:
         return settings, outcome, []
     gain = GAIN_FACTOR * trial.gain_db + GAIN_BESIDES
@@ -148,9 +155,10 @@ def choose_head(
     pairs = _training_pairs(wider, coarser, coding)
     budget = EFFORTS[effort].budget
 
-    def train(shape: Shape) -> _Candidate | None:
+    def train(shape: Shape, tell: Callable[[float], None]) -> _Candidate | None:
         factor = 1 if shape.cross else PERCEPTRON_LONGER
-        trained = training.run(pairs, coarser, shape, budget.times(factor))
+        trained = training.run(pairs, coarser, shape, budget.times(factor), tell)
+        tell(1.0)
         if trained is None:
             return None
         tried_with_head: list[Outcome] = []
@@ -159,11 +167,38 @@ def choose_head(
         return _Candidate(trained, settings_with_head, outcome_with_head, tried_with_head)
 
     shapes = [Shape(widths, cross=True), PERCEPTRON] if widths else [PERCEPTRON]
-    # Side by side: a training takes one processor, and so does coding a single tile.
-    with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
-        trained_heads = list(workers.map(train, shapes))
+    trained_heads = _side_by_side(shapes, train, parts)
     candidates = [candidate for candidate in trained_heads if candidate is not None]
     return _cheapest(settings, outcome, candidates, strict=strict, data_range=data_range)
+
+
+def _side_by_side(
+    shapes: Sequence[Shape],
+    train: Callable[[Shape, Callable[[float], None]], _Candidate | None],
+    parts: Parts,
+) -> list[_Candidate | None]:
+    """Train heads in threads: a training takes one processor, and so does coding a single tile.
+
+    train: trains a head and tells the share that is done to its second argument.
+    parts: progress of the planning.
+    """
+    shares, stopped = dict.fromkeys(shapes, 0.0), Event()
+
+    def run(shape: Shape) -> _Candidate | None:
+        def tell(share: float) -> None:
+            if stopped.is_set():
+                raise CancelledError  # ends this thread where the other or the user stopped it
+            shares[shape] = share
+
+        return train(shape, tell)
+
+    with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
+        works = [workers.submit(run, shape) for shape in shapes]
+        try:
+            parts.wait(works, "training", lambda: sum(shares.values()) / len(shares))
+            return [work.result() for work in works]
+        finally:
+            stopped.set()
 
 
 def _cheapest(
@@ -246,9 +281,17 @@ class _Training:
     device: str
 
     def run(
-        self, pairs: Sequence[Pair], settings: TileSettings, shape: Shape, budget: Budget
+        self,
+        pairs: Sequence[Pair],
+        settings: TileSettings,
+        shape: Shape,
+        budget: Budget,
+        progress: Callable[[float], None],
     ) -> TrainedHead | None:
-        """Train a head; None where the decoded values are exact, so that there is no error."""
+        """Train a head; None where the decoded values are exact, so that there is no error.
+
+        progress: called with the share of the training that is done.
+        """
         # torch takes seconds to import, and an effort without training does not need it.
         from fhash_codec.compact.choices.head_training import train_head
 
@@ -263,6 +306,7 @@ class _Training:
                 samples=budget.samples,
                 seed=self.seed,
                 device=self.device,
+                progress=progress,
             )
         except InputError:
             return None

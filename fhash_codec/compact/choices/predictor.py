@@ -125,11 +125,14 @@ def best_predictor(
         return None
     for order in ORDERS[1:] if effort > 2 else ():
         best = min(best, trials.run(DEPTHS[0], order, 1), key=lambda pair: pair[0])
+        sample.tick()
     for levels in DEPTHS[1:] if effort > 2 else ():
         best = min(best, trials.run(levels, best[1].order, 1), key=lambda pair: pair[0])
+        sample.tick()
     for reach in (0, 2) if effort > 3 else ():
         trial = trials.run(best[1].levels, best[1].order, reach)
         best = min(best, trial, key=lambda pair: pair[0])
+        sample.tick()
     chosen = best[1]
     predictor = _predictor(step, origin, chosen.levels, chosen.order, chosen.reach, training)
     sizes = _coded_sizes(codable, predictor)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from math import prod
@@ -75,11 +75,13 @@ class Sample:
         max_vertices: int,
         pool: ThreadPoolExecutor,
         costs: Sequence[float] | None = None,
+        tick: Callable[[], None] = lambda: None,
     ) -> None:
         """Read tiles of at most `max_vertices` vertices together, at least one tile.
 
         costs: approximate cost of each tile, in C order. Tiles are then chosen by `strata`, else
         spread evenly.
+        tick: called after each tile that is worked on, in the thread that asked for the work.
         """
         indices = list(blocks.indices())
         count = min(len(indices), max(1, max_vertices // prod(blocks.tile)))
@@ -97,6 +99,7 @@ class Sample:
         self.blocks = blocks
         self._pool, self._costs, self._source = pool, costs, self.tiles
         self._filling: tuple[TileSettings, int] | None = None
+        self.tick = tick
 
     def wider(self, max_vertices: int) -> Sample:
         """Return a sample of more tiles, up to `max_vertices` together, filled in the same way.
@@ -105,7 +108,7 @@ class Sample:
         """
         if self.complete:
             return self
-        other = Sample(self.blocks, max_vertices, self._pool, self._costs)
+        other = Sample(self.blocks, max_vertices, self._pool, self._costs, self.tick)
         return other if self._filling is None else other.filled(*self._filling)
 
     def filled(self, settings: TileSettings, density: int) -> Sample:
@@ -114,21 +117,23 @@ class Sample:
             return self
         other = copy(self)
         other._filling = settings, density
-        other.tiles = list(self._pool.map(lambda tile: fill(tile, settings, density), self._source))
+        filled = self._pool.map(lambda tile: fill(tile, settings, density), self._source)
+        other.tiles = list(self._ticking(filled))
         return other
 
     def map(self, work: Callable[[Tile], Result]) -> list[Result]:
         """Return the results of `work` for the tiles of the sample, in order, by all threads."""
-        return list(self._pool.map(work, self.tiles))
+        return list(self._ticking(self._pool.map(work, self.tiles)))
 
     def map_all(self, work: Callable[[Tile], Result]) -> Iterator[Result]:
         """Yield the results of `work` for all tiles of the series, in C order."""
         indices = list(self.blocks.indices())
         if self.blocks.in_memory:
-            yield from self._pool.map(lambda index: work(self.blocks.read(index)), indices)
+            results = self._pool.map(lambda index: work(self.blocks.read(index)), indices)
+            yield from self._ticking(results)
         else:
             tiles = (self.blocks.read(index) for index in indices)
-            yield from map_ahead(self._pool, work, tiles, MAX_TILES_AHEAD)
+            yield from self._ticking(map_ahead(self._pool, work, tiles, MAX_TILES_AHEAD))
 
     def run(self, settings: TileSettings, coding: Coding) -> Outcome:
         """Code the tiles; the outcome that the series would have, by their weights."""
@@ -140,7 +145,7 @@ class Sample:
         All trials run at once, so that a few large tiles keep all processors busy, too.
         """
         jobs = [(tile, settings, coding) for settings, coding in trials for tile in self.tiles]
-        outcomes = list(self._pool.map(lambda job: code(*job)[1], jobs))
+        outcomes = list(self._ticking(self._pool.map(lambda job: code(*job)[1], jobs)))
         number = len(self.tiles)
         return [
             total(outcomes[start : start + number], self.weights)
@@ -150,6 +155,12 @@ class Sample:
     def decoded(self, settings: TileSettings, coding: Coding) -> list[npt.NDArray[np.float32]]:
         """Code and decode the tiles; the decoded values, float32."""
         return self.map(lambda tile: code(tile, settings, coding)[0].decoded.astype(np.float32))
+
+    def _ticking(self, results: Iterable[Result]) -> Iterator[Result]:
+        """Yield results, and call `tick` after each has come."""
+        for result in results:
+            self.tick()
+            yield result
 
 
 def _choose_tiles(tiles: int, count: int, costs: Sequence[float] | None) -> list[tuple[int, int]]:

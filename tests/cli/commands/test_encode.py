@@ -37,6 +37,8 @@ def test_json_is_one_object_with_the_figures_of_the_file(
     assert set(report) >= KEYS
     assert report["bytes"] == (tmp_path / "run.fhz").stat().st_size
     assert report["raw_bytes"] == 3 * 6 * 7 * 8 * 4
+    assert report["source_bytes"] == data.stat().st_size
+    assert report["source_ratio"] == report["source_bytes"] / report["bytes"]
     assert report["shape"] == [3, 6, 7, 8]
     assert report["epochs"] == 2
     assert [set(point) for point in report["curve"]] == [{"seconds", "epoch", "psnr"}] * 2
@@ -47,6 +49,7 @@ def test_table_says_what_was_written(fhash: Fhash, data: Path, tmp_path: Path) -
     assert (result.exit_code, result.stderr) == (0, "")
     assert str(tmp_path / "run.fhz") in result.stdout
     assert "3 x 6 x 7 x 8" in result.stdout
+    assert "than the source on disk" in result.stdout
     assert "100.000% of the domain, in z 0:6, y 0:7, x 0:8" in result.stdout
 
 
@@ -89,7 +92,9 @@ def test_series_options_reach_the_reader(fhash: Fhash, tmp_path: Path) -> None:
         "1:4:2",
         *SMALL,
     ]
-    assert fhash(*words).exit_code == 0
+    result = fhash(*words)
+    assert result.exit_code == 0
+    assert "than the whole source on disk" in result.stdout
     with fhash_codec.open(tmp_path / "run.fhz") as volume:
         assert volume.shape == (2, 5, 6, 7)
         assert (volume.value_range.low, volume.value_range.high) == (
@@ -117,13 +122,15 @@ def test_what_each_stage_bought_is_in_the_table_and_in_json(
     assert [set(gain) for gain in report["gains"]] == [{"what", "bytes", "seconds"}] * len(
         report["gains"]
     )
-    lines = fhash(*words).stdout.splitlines()
+    lines = fhash(*words, "-v").stdout.splitlines()
+    brief = fhash(*words).stdout.splitlines()
     for gain in report["gains"]:
         assert sum(line.startswith(f"  {gain['what']}  ") for line in lines) == 1
+        assert not any(line.startswith(f"  {gain['what']}  ") for line in brief)
     assert not any("key frames" in line or "epochs" in line for line in lines)
     bare = json.loads(fhash(*words, "--no-timings", "--json").stdout)
     assert [set(gain) for gain in bare["gains"]] == [{"what", "bytes"}] * len(report["gains"])
-    assert fhash(*words, "--no-timings").exit_code == 0
+    assert fhash(*words, "--no-timings", "-v").exit_code == 0
 
 
 @pytest.mark.parametrize(

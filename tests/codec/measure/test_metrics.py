@@ -174,8 +174,9 @@ def test_quality_measures_the_coreset_and_the_domain() -> None:
     assert [step["step"] for step in figures["per_step"]] == [0, 1, 2, 3]
     assert figures["per_step"][2] == {"step": 2, "psnr": None, "rmse": None, "max_abs_error": None}
     assert [call[:3] for call in calls] == [("measuring", step, 4) for step in (1, 2, 3, 4)]
-    assert calls[2][3] == ""
-    assert calls[3][3].endswith(" dB")
+    # The note is of all steps so far, not of the last one, which has no PSNR here.
+    assert [calls[step][3] for step in (1, 2)] == [calls[1][3]] * 2
+    assert calls[3][3] == f"{figures['psnr']:.1f} dB so far"
 
 
 @pytest.mark.parametrize(("data_range", "value"), [(0.0, 3.0), (math.inf, 1e308)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -41,15 +42,33 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
     budget = Budget(updates=200, samples=40_000)
     monkeypatch.setattr("fhash_codec.compact.choices.head.TRIAL_BUDGET", budget)
     monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget))
-    source, sizes = fronts(), {}
+    source, sizes, calls = fronts(), {}, []
+
+    def progress(stage: str, done: int, total: int, note: str) -> None:
+        assert threading.current_thread() is threading.main_thread()
+        assert 0 <= done <= total >= 1
+        calls.append((stage, note.partition(",")[0]))
+
     for effort in (4, 5):
         config = EncodeConfig(effort=effort, max_error=0.01)
-        figures = fhash_codec.encode(source, tmp_path / "a.fhz", config, force=True)
+        calls.clear()
+        figures = fhash_codec.encode(
+            source, tmp_path / "a.fhz", config, force=True, progress=progress
+        )
         with fhash_codec.open(tmp_path / "a.fhz") as volume:
             assert np.abs(volume[...].astype(np.float64) - source).max() <= 0.01
             assert (volume.info["model"]["head"] is not None) == (effort == 5)
         sizes[effort] = figures["bytes"]
     assert sizes[5] < 0.97 * sizes[4]
+    # Every stage of the last encoding reported, the trials and the training too.
+    for part in ("first guess", "tiles and transform", "fill values", "quantiser step", "head"):
+        assert ("planning", part) in calls
+    assert calls.count(("planning", "tiles and transform")) > 10
+    assert calls.count(("training", "")) > 10
+    stages = [stage for stage, _ in dict.fromkeys(calls)]
+    assert list(dict.fromkeys(stages)) == [
+        "scanning", "selecting", "planning", "training", "coding", "measuring", "writing",
+    ]  # fmt: skip
 
 
 def test_a_small_file_gets_no_head_and_a_large_one_a_large_head() -> None:
@@ -65,3 +84,28 @@ def test_a_small_file_gets_no_head_and_a_large_one_a_large_head() -> None:
     assert widths(1e9, gain=3.0) == (14, 24)
     assert widths(1e9, gain=3.0, effort=5) == (12, 12)
     assert widths(1e6, gain=0.01) is None
+
+
+def test_an_interruption_ends_the_trainings_of_other_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    budget = Budget(updates=100, samples=40_000)
+    monkeypatch.setattr("fhash_codec.compact.choices.head.TRIAL_BUDGET", budget)
+    endless = Budget(updates=10**9, samples=40_000)
+    monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=endless))
+    whole = []
+
+    def interrupt(stage: str, done: int, total: int, note: str) -> None:
+        if stage == "training":
+            whole.append(done)
+            # The trial has gone to its end, and a full training has begun.
+            if done == 0 and max(whole) == 100:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fhash_codec.encode(fronts(), tmp_path / "a.fhz", EncodeConfig(effort=5), progress=interrupt)
+    assert not any(
+        thread.name.startswith("fhash-head") and thread.is_alive()
+        for thread in threading.enumerate()
+    )
+    assert list(tmp_path.iterdir()) == []

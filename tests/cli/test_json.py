@@ -1,0 +1,262 @@
+"""Every command's JSON is what docs/json.md says, key by key and in both directions."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from click.testing import Result
+
+import fhash_codec
+from fhash_cli.commands import demo
+from fhash_cli.main import COMMANDS
+from fhash_codec.bench import train
+from fhash_codec.bench.pictures.results import RenderBench
+from fhash_codec.bench.rate.results import Access, Point, RateBench, Speed
+from fhash_codec.selftest.case import Finding
+from fhash_codec.selftest.results import CaseResult, Summary
+
+Fhash = Callable[..., Result]
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "json.md"
+TYPES = {"text": str, "number": (int, float), "integer": int, "boolean": bool, "object": dict}
+WITHOUT_JSON = {"completion"}
+"""Commands whose output is no result."""
+
+
+def documented() -> dict[str, dict[str, str]]:
+    """Types by key of each command, as the document has them."""
+    commands: dict[str, dict[str, str]] = {}
+    for section in DOCUMENT.read_text().split("\n## ")[1:]:
+        title = section.partition("\n")[0].replace("`", "").removeprefix("fhash ")
+        inherited = re.search(r"All keys of `fhash (\w+)`", section)
+        rows = re.findall(r"^\| `([^`]+)` \| ([a-z ]+) \|", section, re.MULTILINE)
+        commands[title] = {**(commands[inherited[1]] if inherited else {}), **dict(rows)}
+    return commands
+
+
+KEYS = documented()
+
+
+def fits(value: Any, kind: str) -> bool:
+    """Whether a value is of a documented type, such as `list of numbers or null`."""
+    if " or " in kind:
+        return any(fits(value, part) for part in kind.split(" or "))
+    if kind.startswith(("list of ", "lists of ")):
+        inner = kind.partition(" of ")[2]
+        return isinstance(value, list) and all(fits(entry, inner) for entry in value)
+    if kind == "null":
+        return value is None
+    name = kind.removeprefix("free ")
+    allowed = TYPES[name if name in TYPES else name.removesuffix("s")]
+    return isinstance(value, allowed) and (allowed is bool or not isinstance(value, bool))
+
+
+def entries(values: Any, kinds: dict[str, str], place: str = "") -> Iterator[tuple[str, Any]]:
+    """Every key of an object with its value, as the document writes keys; free objects closed."""
+    for name, value in values.items():
+        key = place + name
+        if key not in kinds and any(kind.startswith(f"{place}*") for kind in kinds):
+            key = f"{place}*"
+        if key in kinds or not key.endswith("*"):
+            yield key, value
+        free = "free object" in kinds.get(key, "")
+        if isinstance(value, dict) and not free:
+            yield from entries(value, kinds, f"{key}.")
+        elif isinstance(value, list) and not free:
+            for entry in value:
+                if isinstance(entry, dict):
+                    yield from entries(entry, kinds, f"{key}[].")
+
+
+def check(command: str, *results: Any) -> None:
+    """Compare the objects that a command printed with its section of the document."""
+    kinds, seen = KEYS[command], set()
+    for result in results:
+        for key, value in entries(result, kinds):
+            assert key in kinds, f"docs/json.md lacks the key `{key}` of fhash {command}"
+            assert fits(value, kinds[key]), f"{command}: {key} is {value!r}, not {kinds[key]}"
+            seen.add(key)
+    unseen = {key for key in kinds.keys() - seen if not key.endswith("*")}
+    assert not unseen, f"docs/json.md has keys that fhash {command} did not print: {unseen}"
+
+
+def parsed(result: Result, code: int = 0) -> Any:
+    assert result.exit_code == code, result.output
+    (line,) = result.stdout.splitlines()
+    return json.loads(line, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+
+
+def test_the_document_names_every_command() -> None:
+    commands = {title.split()[0] for title in KEYS} - {"Errors"}
+    assert commands == set(COMMANDS) - WITHOUT_JSON
+    assert {"bench train", "bench rate", "bench render"} <= KEYS.keys()
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "fit"),
+    [
+        (1, "number", True),
+        (1.5, "integer", False),
+        (True, "integer", False),
+        (True, "boolean", True),
+        (None, "number or null", True),
+        ([[1, 2]], "list of lists of integers", True),
+        ([[1, 2.5]], "list of lists of integers", False),
+        ([{}], "list of free objects", True),
+        (["a", 1], "list of text", False),
+    ],
+)
+def test_types_are_told_apart(value: Any, kind: str, fit: bool) -> None:
+    assert fits(value, kind) is fit
+
+
+def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.fhz"
+    outputs: dict[str, list[Any]] = {"encode": [], "diff": [], "info": []}
+    for settings in (
+        ["--effort", "2"],
+        ["--effort", "2", "--no-timings"],
+        ["--profile", "paper", "--epochs", "1", "--width", "4"],
+    ):
+        words = ["encode", data, "-o", path, "--force", *settings]
+        outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
+        outputs["diff"].append(parsed(fhash("diff", data, path, "--json", "-q")))
+        outputs["info"].append(parsed(fhash("info", path, "--json")))
+    for command, results in outputs.items():
+        check(command, *results)
+
+
+def test_demo(fhash: Fhash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulate, encode = demo.simulate, fhash_codec.encode
+
+    def encode_fast(*words: Any, **options: Any) -> dict[str, Any]:
+        *files, config = words
+        return encode(*files, replace(config, effort=2), **options)
+
+    monkeypatch.setattr(demo, "simulate", lambda name: simulate(name, (5, 8, 10, 12)))
+    monkeypatch.setattr(fhash_codec, "encode", encode_fast)
+    for name in ("curve[].epoch", "curve[].seconds", "curve[].psnr"):  # nothing is trained here
+        monkeypatch.delitem(KEYS["demo"], name)
+    check("demo", parsed(fhash("demo", "-o", tmp_path, "--json", "-q")))
+
+
+def test_verify_and_decode(fhash: Fhash, run: Path) -> None:
+    check("verify", parsed(fhash("verify", run, "--json", "-q")))
+    check("decode", parsed(fhash("decode", run, "--json", "-q")))
+
+
+def test_render(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    words = ["render", run, "--size", "16x16", "--json", "-q", "-o", tmp_path / "a.png"]
+    check(
+        "render",
+        parsed(fhash(*words, "--explain")),
+        parsed(fhash(*words, "--animate", "steps")),
+        parsed(fhash(*words, "--force", "--evolution", "0:2", "--track", "own")),
+    )
+
+
+def test_selftest(fhash: Fhash, monkeypatch: pytest.MonkeyPatch) -> None:
+    findings = tuple(
+        Finding(name="a", worst=worst, limit=1.0, unit="dB", under="psnr")
+        for worst in (0.5, float("nan"))
+    )
+    result = CaseResult(name="a", group="b", about="c", under=("psnr",), findings=findings)
+    monkeypatch.setattr(
+        "fhash_codec.selftest.workers.run_cases", lambda *_, **__: Summary(results=[result])
+    )
+    check("selftest", parsed(fhash("selftest", "--json", "-q"), code=1))
+
+
+def test_bench_train(fhash: Fhash, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ticks = count()
+    monkeypatch.setattr(train, "time", SimpleNamespace(perf_counter=lambda: next(ticks) / 100))
+    monkeypatch.setattr(train, "INFER_SECONDS", 0.01)
+    words = ["bench", "train", data, "--seconds", "0.1", "--width", "4", "--engines", "slab"]
+    check("bench train", parsed(fhash(*words, "--json", "-q")))
+
+
+def test_bench_rate() -> None:
+    point = Point(
+        codec="SZ3", goal="psnr", asked=40.0, reached=True, bytes=9, psnr=None, max_error=0.0,
+        setting="", as_asked=None,
+    )  # fmt: skip
+    speed = Speed(
+        codec="SZ3", setting="", psnr=40.0, encode_mb_s=1.0, decode_mb_s=2.0, encode_runs=3
+    )
+    access = Access(
+        codec="SZ3", setting="", region=(1, 2, 3), bytes=9, psnr=None, milliseconds=0.5,
+        bytes_read=9,
+    )  # fmt: skip
+    result = RateBench(
+        series="a", shape=(1, 2, 3, 4), dtype="float32", raw_bytes=96, value_range=(0.0, 1.0),
+        missing=0, points=(point, replace(point, codec="fhash compact")), speeds=(speed,),
+        access=(access,), refused={"ZFP": "no"}, machine={}, notes=("a",),
+    )  # fmt: skip
+    check("bench rate", json.loads(json.dumps(result.to_dict())))
+
+
+def test_bench_render() -> None:
+    result = RenderBench(
+        series="a", shape=(1, 2, 3, 4), step=0.0, size=16, turns=1, effects=(), accelerations=(),
+        streams=(), against=(), exactness=(), playback=(), curves=(), refused={"vtk": "no"},
+        machine={}, notes=(),
+    )  # fmt: skip
+    check("bench render", json.loads(json.dumps(result.to_dict())))
+
+
+ERRORS = (
+    ("usage", 2, ["info", "--json"]),
+    ("usage", 2, ["info", "x", "--jsno", "--json"]),
+    ("usage", 2, ["nonsense", "--json"]),
+    ("missing-input", 2, ["info", "gone.fhz", "--json"]),
+    ("missing-input", 2, ["encode", "gone.h5", "-o", "a.fhz", "--json"]),
+    ("missing-input", 2, ["diff", "gone.h5", "RUN", "--json"]),
+    ("missing-input", 2, ["bench", "rate", "gone.h5", "--json"]),
+    ("region", 2, ["decode", "RUN", "--t", "99", "--json"]),
+    ("input", 2, ["render", "RUN", "--t", "99", "-o", "a.png", "--json"]),
+    ("output-exists", 2, ["decode", "RUN", "-o", "there.npy", "--json"]),
+    ("input", 2, ["decode", "RUN", "-o", "a.docx", "--json"]),
+    ("input", 2, ["selftest", "--case", "gone", "--json"]),
+    ("damaged", 4, ["verify", "there.npy", "--json"]),
+)
+
+
+@pytest.mark.parametrize(("kind", "code", "words"), ERRORS, ids=str)
+def test_an_error_is_an_object_too(
+    fhash: Fhash,
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    kind: str,
+    code: int,
+    words: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there.npy").write_bytes(b"there")
+    result = fhash(*(run if word == "RUN" else word for word in words))
+    error = parsed(result, code)
+    check("Errors", error)
+    assert (error["kind"], error["exit_code"]) == (kind, code)
+    assert result.stderr == f"fhash: error: {error['error']}\n"
+    assert f"| `{kind}` | {code} |" in DOCUMENT.read_text()
+
+
+def test_a_missed_gate_is_beside_the_figures(fhash: Fhash, data: Path, run: Path) -> None:
+    words = ["diff", data, run, "--max-error", "0", "-q"]
+    report = parsed(fhash(*words, "--json"), code=3)
+    assert (report["kind"], report["exit_code"]) == ("quality", 3)
+    assert report["max_abs_error"] > 0
+    assert KEYS["Errors"].keys() < report.keys()
+    assert fhash(*words).exit_code == 3
+
+
+def test_without_json_stdout_stays_empty(fhash: Fhash) -> None:
+    assert fhash("info", "gone.fhz").stdout == ""
+    assert fhash("info", "--", "--json").stdout == ""
