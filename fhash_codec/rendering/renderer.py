@@ -22,12 +22,14 @@ from fhash_codec.rendering.picture.planning import plan_at, plan_picture
 from fhash_codec.rendering.scene.scene import Scene
 from fhash_codec.rendering.stream.fields import Field, FrameField, NetworkField
 from fhash_codec.rendering.stream.stream import stream
+from fhash_codec.rendering.stream.warped_field import WarpedField
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.counters import complete
 from fhash_codec.rendering.task.devices import arrays_on
 from fhash_codec.rendering.task.light import light_grid
 from fhash_codec.rendering.task.task import Frame, Marched, Task
 from fhash_codec.rendering.task.units import Units
+from fhash_codec.rendering.task.warping import warped
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashError
 
@@ -156,6 +158,8 @@ class Renderer:
             field = FrameField(decoded.frame, task.rays.grid, decoded.bricks, arrays)
         else:
             field = NetworkField(self.volume, plan.step, plan.units, arrays)
+            if task.rays.grid.warp is not None:
+                field = WarpedField(field, task.rays.grid.warp)
         return stream(
             field,
             task,
@@ -292,7 +296,10 @@ def _histogram_of(volume: Volume) -> Histogram:
 
 
 def _decode(volume: Volume, plan: Plan) -> _DecodedFrame:
-    frame = decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units)
+    frame = warped(
+        decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units),
+        plan.task.rays.grid.warp,
+    )
     return _DecodedFrame(frame=frame, region=plan.region, bricks=Bricks.of(frame))
 
 

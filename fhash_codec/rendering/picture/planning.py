@@ -157,7 +157,7 @@ def _function(
         return TransferFunction.of(
             spec,
             value_range=value_range,
-            spacing=grid.vertex_spacing,
+            spacing=grid.series_spacing,
             features=features,
             histogram=counted,
         )

@@ -34,8 +34,9 @@ Point = tuple[float, float]
 
 MAX_SIDE = 16384
 """Most pixels along a side of an image."""
-VIEWS = ("iso", "xy", "xz", "yz", "yx", "zx", "zy")
-"""Names of the directions to look from, as in PyVista: `xy` has x to the right and y upwards."""
+VIEWS = ("auto", "iso", "xy", "xz", "yz", "yx", "zx", "zy")
+"""Names of the directions to look from, as in PyVista: `xy` has x to the right and y upwards.
+`auto` is `iso`, but from above for a volume with an axis of one vertex."""
 MARCHES = ("auto", "cache", "arm", "stream")
 """Names of the ways to march: through a decoded frame, or straight through the model."""
 DEVICES = ("auto", "cpu", "cuda")
@@ -54,7 +55,7 @@ class Camera(Record):
     `azimuth` and `elevation` turn the camera from there.
     """
 
-    view: str = limits("iso", "direction to look from", choices=VIEWS)
+    view: str = limits("auto", "direction to look from", choices=VIEWS)
     azimuth: float = limits(
         0.0, "degrees to turn about the upward direction", low=-36000, high=36000
     )
