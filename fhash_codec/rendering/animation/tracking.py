@@ -21,8 +21,9 @@ from fhash_codec.coreset.features import (
 )
 from fhash_codec.coreset.features import Isosurface as SurfaceFeature
 from fhash_codec.progress import Progress, silent
+from fhash_codec.rendering.camera.grid import Grid
 from fhash_codec.rendering.colour.colours import colour_code, parse_colour
-from fhash_codec.rendering.colour.opacity import opacity_preset
+from fhash_codec.rendering.colour.opacity import opacity_preset, raised
 from fhash_codec.rendering.scene.scene import Isosurface, Scene, TransferFunctionSpec
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
@@ -128,7 +129,7 @@ def tracking_scene(scene: Scene, tracked: Sequence[Tracked], volume: Volume) -> 
         scene.effects, isosurfaces=(*scene.effects.isosurfaces, *surfaces)
     )
     function = (
-        _transfer_function(scene.transfer_function, filled, volume)
+        _transfer_function(scene, filled, volume)
         if filled
         else dataclasses.replace(scene.transfer_function, nothing=True)
     )
@@ -136,9 +137,10 @@ def tracking_scene(scene: Scene, tracked: Sequence[Tracked], volume: Volume) -> 
 
 
 def _transfer_function(
-    given: TransferFunctionSpec, filled: Sequence[Tracked], volume: Volume
+    scene: Scene, filled: Sequence[Tracked], volume: Volume
 ) -> TransferFunctionSpec:
     """The transfer function of intervals and segmentations, with the density that is given."""
+    given = scene.transfer_function
     low, high = volume.value_range.low, volume.value_range.high
     points = opacity_preset(
         "feature",
@@ -147,6 +149,8 @@ def _transfer_function(
         features=[str(item.feature) for item in filled],
         histogram=None,
     )
+    if given.unit_distance is None:
+        points = raised(points, Grid.of(volume.coords, scene.scale).thinnest)
     return TransferFunctionSpec(
         colours=_colours(filled, low, high),
         opacity=tuple((float(value), float(opacity)) for value, opacity in points),

@@ -121,6 +121,14 @@ class Grid:
         return 1 in self.counts
 
     @property
+    def thinnest(self) -> tuple[int, float]:
+        """Vertices of the axis with the fewest, and its length in mean vertex spacings."""
+        count = min(self.series_counts)
+        lengths = np.abs(self.spacing) * np.diff(self.bounds, axis=1)[:, 0] / self.series_spacing
+        axes = [axis for axis in range(3) if self.series_counts[axis] == count]
+        return count, float(min(lengths[axes]))
+
+    @property
     def series_counts(self) -> tuple[int, int, int]:
         """Vertices of the series along x, y, z."""
         return self.counts if self.warp is None else self.warp.counts

@@ -63,7 +63,7 @@ def plan_picture(
     rays = Rays.of(scene.camera, grid, scene.size)
     function = _function(volume, scene, grid, histogram)
     lod, why_lod = _level(volume, scene, rays)
-    shadows, occlusion = _secondary_light(scene)
+    shadows, occlusion = _secondary_light(scene, grid)
     lamp = _lamp(rays, scene.effects.shading, shadows)
     units = Units.of(volume)
     task = _task(scene, rays, function, units, lamp, lod)
@@ -160,6 +160,7 @@ def _function(
             spacing=grid.series_spacing,
             features=features,
             histogram=counted,
+            thinnest=grid.thinnest,
         )
 
     without = function_of(None)
@@ -202,11 +203,12 @@ def _level(volume: Volume, scene: Scene, rays: Rays) -> tuple[int, str]:
     )
 
 
-def _secondary_light(scene: Scene) -> tuple[Shadows | None, AmbientOcclusion | None]:
+def _secondary_light(scene: Scene, grid: Grid) -> tuple[Shadows | None, AmbientOcclusion | None]:
     """The shadows and the ambient occlusion of a scene, None where they would change nothing."""
     effects = scene.effects
-    if effects.maximum_intensity or scene.transfer_function.nothing:
-        # Only the volume takes light away, and only from what is drawn of it or in it.
+    if effects.maximum_intensity or scene.transfer_function.nothing or grid.flat:
+        # Only the volume takes light away, and only from what is drawn of it or in it. A plane is
+        # drawn in its colours.
         return None, None
     shadows, occlusion = effects.shadows, effects.ambient_occlusion
     return (
@@ -268,7 +270,11 @@ def _task(
         threshold=march.threshold,
         table=table,
         lighting=None if shading is None else _lighting(shading, lamp),
-        shaded=effects.shading is not None and table is not None and not effects.maximum_intensity,
+        # The gradients of a plane lie in it: no light that falls on it would be scattered back.
+        shaded=effects.shading is not None
+        and table is not None
+        and not effects.maximum_intensity
+        and not rays.grid.flat,
         surfaces=_surfaces(effects, function, units),
         maximum=effects.maximum_intensity,
         depth="depth" in effects.buffers,
