@@ -16,7 +16,8 @@ from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.picture.evolution import evolution
 from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.picture.overlay import overlay, time_text
+from fhash_codec.rendering.picture.layout import Layout, quantity_of
+from fhash_codec.rendering.picture.overlay import overlay, surrounded, time_text
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.picture.planning import plan_at, plan_picture
 from fhash_codec.rendering.scene.scene import Scene
@@ -122,7 +123,14 @@ class Renderer:
         the series.
         """
         if plan is None and scene is not None and scene.evolution is not None:
-            return evolution(self.volume, scene, progress=progress, draw=self.render)
+            panels = evolution(self.volume, scene, progress=progress, draw=self.render)
+            first = replace(scene, evolution=None, step=scene.evolution.steps[0])
+            return surrounded(
+                panels,
+                scene.effects,
+                colours=self.plan(first).function.colours,
+                quantity=quantity_of(self.volume.name, self.volume.units),
+            )
         begin = time.perf_counter()
         if plan is None:
             plan = self.plan(Scene() if scene is None else scene)
@@ -171,24 +179,23 @@ class Renderer:
     def _finish(self, plan: Plan, marched: Marched, secondary_rays: int, begin: float) -> Image:
         """Make a picture of what was marched, with its overlay; `begin` is when rendering began."""
         volume = self.volume
+        layout = plan.layout
         image = Image(
-            rgba=marched.rgba,
-            depth=marched.depth,
-            normal=marched.normal,
+            rgba=_placed(marched.rgba, layout, 0.0),
+            depth=None if marched.depth is None else _placed(marched.depth, layout, np.inf),
+            normal=None if marched.normal is None else _placed(marched.normal, layout, 0.0),
             counters=complete(marched.counters, {"secondary_rays": secondary_rays}),
             scene=plan.scene.to_dict(),
             source=volume.path.name,
             digest=volume.container.digest,
         )
-        units = "" if volume.units in ("", "1") else f" [{volume.units}]"
         label = time_text(plan.step, plan.time, str(volume.coords["t"].attributes.get("units", "")))
         drawn = overlay(
             image,
             plan.scene.effects,
             plan.task.rays,
+            layout,
             colours=plan.function.colours,
-            quantity=f"{volume.name}{units}",
-            coords=volume.coords,
             label=label,
         )
         return replace(drawn, seconds=time.perf_counter() - begin)
@@ -253,6 +260,18 @@ class Renderer:
             return future.result()
         future.exception()  # wait; the error of a prefetched frame that nobody needs is dropped
         return None
+
+
+def _placed(
+    pixels: npt.NDArray[np.float32], layout: Layout, empty: float
+) -> npt.NDArray[np.float32]:
+    """A picture (H, W) or (H, W, n) with the pixels of its view, and one number around them."""
+    left, top, width, height = layout.view
+    if (width, height) == layout.size:
+        return pixels
+    whole = np.full((*layout.size[::-1], *pixels.shape[2:]), empty, dtype=np.float32)
+    whole[top : top + height, left : left + width] = pixels
+    return whole
 
 
 def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple[Task, int]:

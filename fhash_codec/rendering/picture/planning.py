@@ -17,6 +17,7 @@ from fhash_codec.rendering.colour.colours import parse_colour
 from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.colour.transfer_function import TransferFunction
 from fhash_codec.rendering.picture.explain import reasons
+from fhash_codec.rendering.picture.layout import lay_out, quantity_of
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.scene.scene import (
     AmbientOcclusion,
@@ -60,8 +61,10 @@ def plan_picture(
     _check(scene)
     step = _step_of(volume, scene)
     grid = Grid.of(volume.coords, scene.scale)
-    rays = Rays.of(scene.camera, grid, scene.size)
     function = _function(volume, scene, grid, histogram)
+    layout, rays = lay_out(
+        scene, grid, volume.coords, function.colours, quantity_of(volume.name, volume.units)
+    )
     lod, why_lod = _level(volume, scene, rays)
     shadows, occlusion = _secondary_light(scene, grid)
     lamp = _lamp(rays, scene.effects.shading, shadows)
@@ -74,6 +77,7 @@ def plan_picture(
     lit = shadows is not None or occlusion is not None
     plan = Plan(
         scene=scene,
+        layout=layout,
         task=task,
         step=step,
         time=_time_of(volume, step),

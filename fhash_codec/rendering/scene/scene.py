@@ -21,6 +21,7 @@ __all__ = [
     "Effects",
     "Evolution",
     "Isosurface",
+    "LegendEntry",
     "Marching",
     "Scene",
     "Shading",
@@ -156,6 +157,14 @@ class Isosurface(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LegendEntry(Record):
+    """A colour and its meaning."""
+
+    text: str = limits(dataclasses.MISSING, "meaning of the colour")
+    colour: str = limits(dataclasses.MISSING, "'#rrggbb' or a name")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Effects(Record):
     """Effects of a picture: each is off unless it is named; `true` stands for its defaults."""
 
@@ -175,6 +184,7 @@ class Effects(Record):
     axes: bool = limits(False, "names and ends of the axes")
     colour_bar: bool = limits(False, "the colours and their values")
     time_label: bool = limits(False, "step and time")
+    legend: tuple[LegendEntry, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
