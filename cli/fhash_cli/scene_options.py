@@ -174,7 +174,9 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
     click.option("--time", type=float, metavar="T", help="A physical time instead of a step."),
     click.option("--size", type=SizeType(), help="Pixels across and down.  [default: 512x512]"),
     click.option(
-        "--view", metavar="NAME", help="Direction to look from: auto, iso, xy, xz, yz, yx, zx or zy."
+        "--view",
+        metavar="NAME",
+        help="Direction to look from: auto, iso, xy, xz, yz, yx, zx or zy.",
     ),
     click.option(
         "--azimuth",

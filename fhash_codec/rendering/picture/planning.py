@@ -69,7 +69,8 @@ def plan_picture(
     shadows, occlusion = _secondary_light(scene, grid)
     lamp = _lamp(rays, scene.effects.shading, shadows)
     units = Units.of(volume)
-    task = _task(scene, rays, function, units, lamp, lod)
+    noise = coding_noise(volume) * units.factor * grid.vertex_spacing / grid.series_spacing
+    task = _task(scene, rays, function, units, lamp, lod, noise)
     _check_ray_length(task)
     mode = _mode(scene.march)
     # Light comes from all of the volume, whether it is in view or not.
@@ -263,6 +264,7 @@ def _task(
     units: Units,
     lamp: Floats | None,
     lod: int,
+    noise: float,
 ) -> Task:
     """The task of a marcher, without the light that is computed from a frame."""
     effects, march = scene.effects, scene.march
@@ -286,7 +288,21 @@ def _task(
         antialiasing=effects.antialiasing,
         jitter=effects.jitter,
         skipping=march.skipping,
+        noise=noise,
     )
+
+
+def coding_noise(volume: Volume) -> float:
+    """The difference of two neighbouring vertices that the errors of a bounded file can make.
+
+    Both vertices may be wrong by the largest error, in opposite directions. The noise is 0 for a
+    file without a bound: its errors are small where the values are smooth.
+    """
+    config = volume.container.header.get("config", {})
+    if config.get("max_error") is None and config.get("max_error_rel") is None:
+        return 0.0
+    largest = volume.container.header["quality"].get("max_abs_error")
+    return 0.0 if largest is None else 2 * float(largest)
 
 
 def _shading(effects: Effects) -> Shading | None:
