@@ -61,7 +61,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "fhash_cli": (
         ("options", "output", "selection"),
-        ("animation_options", "scene_options"),
+        ("animation_options", "gallery", "scene_options"),
         ("commands",),
         ("main",),
     ),

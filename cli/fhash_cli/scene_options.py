@@ -176,7 +176,7 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
     click.option(
         "--view",
         metavar="NAME",
-        help="Direction to look from: auto, iso, xy, xz, yz, yx, zx or zy.",
+        help="Direction to look from: auto, iso, xy, xz, yz, yx, zx, zy.",
     ),
     click.option(
         "--azimuth",

@@ -175,8 +175,8 @@ def _thickness(spacing: Floats, axes: Sequence[Axis]) -> float:
         return 1.0
     thickness = float(np.mean(spacing[extended]))
     if np.count_nonzero(extended) == 1:
-        (axis,) = np.flatnonzero(extended)
-        thickness = max(thickness, LINE * float(spacing[axis]) * (len(axes[axis].values) - 1))
+        longest = max(len(axis.values) for axis in axes)
+        thickness = max(thickness, LINE * thickness * (longest - 1))
     return thickness
 
 

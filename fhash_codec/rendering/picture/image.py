@@ -27,7 +27,7 @@ __all__ = ["PICTURES", "Draw", "Image", "check_picture_name"]
 PICTURES = (".png", ".jpg", ".jpeg")
 """Suffixes of pictures, in lower case."""
 JPEG_QUALITY = 92
-"""Quality of a JPEG, 1..95: letters and edges stay clean at about a fifth of a PNG's bytes."""
+"""Quality of a JPEG, 1..95, at which letters and edges stay clean."""
 
 Single = npt.NDArray[np.float32]
 

@@ -9,7 +9,7 @@ import numpy as np
 from fhash_codec.rendering.camera.axes import Warp
 from fhash_codec.rendering.stream.fields import Field
 from fhash_codec.rendering.task.arrays import Array
-from fhash_codec.rendering.task.bricks import SIDE
+from fhash_codec.rendering.task.bricks import SIDE, Bricks
 from fhash_codec.rendering.task.palette import Palette
 
 __all__ = ["WarpedField"]
@@ -52,7 +52,7 @@ class WarpedField:
             )
         return np.array(drawn)
 
-    def _drawn_bricks(self) -> object:
+    def _drawn_bricks(self) -> Bricks:
         """Bricks of drawn cells with the extreme values of all bricks that they touch."""
         bricks = self._field.bricks
         first = self.arrays.host(self._field.first)

@@ -61,7 +61,7 @@ def _resampled(values: Single, at: npt.NDArray[np.float64], axis: int) -> Single
     shape[axis] = len(at)
     share = (at - before).astype(np.float32).reshape(shape)
     low = np.take(values, before, axis=axis)
-    mixed = np.take(values, after, axis=axis)
+    mixed: Single = np.take(values, after, axis=axis)
     # A missing vertex of no weight does not matter.
     with np.errstate(invalid="ignore", over="ignore"):
         mixed -= low
