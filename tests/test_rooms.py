@@ -62,7 +62,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fhash_cli": (
         ("progress_bar",),
         ("base_command", "options", "output", "selection"),
-        ("animation_options", "scene_options"),
+        ("animation_options", "gallery", "scene_options"),
         ("commands",),
         ("main",),
     ),

@@ -230,13 +230,11 @@ def _draw_evolution(
 
     from fhash_codec.rendering import render
     from fhash_codec.rendering.animation.tracking import follow, tracking_scene
+    from fhash_codec.rendering.picture.image import check_picture_name
 
     tracked = options.tracked(volume, progress)
     shown = tracking_scene(scene, tracked, volume) if tracked else scene
-    if Path(output).suffix.lower() != ".png":
-        raise InputError(
-            f"{output}: an evolution is one picture and is written as .png; use such a name"
-        )
+    check_picture_name(Path(output), shown.background)
     check_writable(output, force, sources=[volume.path])
     assert shown.evolution is not None
     steps = list(shown.evolution.steps)

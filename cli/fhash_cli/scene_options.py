@@ -181,7 +181,9 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
     ),
     click.option("--size", type=SizeType(), help="Pixels across and down.  [default: 512x512]"),
     click.option(
-        "--view", metavar="NAME", help="Direction to look from: iso, xy, xz, yz, yx, zx or zy."
+        "--view",
+        metavar="NAME",
+        help="Direction to look from: auto, iso, xy, xz, yz, yx, zx, zy.",
     ),
     click.option(
         "--azimuth",
@@ -316,7 +318,7 @@ def _effect(name: str) -> str:
     names = [
         field.name
         for field in dataclasses.fields(Effects)
-        if field.name not in ("isosurfaces", "buffers", "antialiasing")
+        if field.name not in ("isosurfaces", "buffers", "antialiasing", "legend")
     ]
     plain = name.replace("-", "_").replace("color", "colour")
     if plain not in names:

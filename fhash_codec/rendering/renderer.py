@@ -16,18 +16,21 @@ from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.picture.evolution import evolution
 from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.picture.overlay import overlay, time_text
+from fhash_codec.rendering.picture.layout import Layout, quantity_of
+from fhash_codec.rendering.picture.overlay import overlay, surrounded, time_text
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.picture.planning import plan_at, plan_picture
 from fhash_codec.rendering.scene.scene import Scene
 from fhash_codec.rendering.stream.fields import Field, FrameField, NetworkField
 from fhash_codec.rendering.stream.stream import stream
+from fhash_codec.rendering.stream.warped_field import WarpedField
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.counters import complete
 from fhash_codec.rendering.task.devices import arrays_on
 from fhash_codec.rendering.task.light import light_grid
 from fhash_codec.rendering.task.task import Frame, Marched, Task
 from fhash_codec.rendering.task.units import Units
+from fhash_codec.rendering.task.warping import warped
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashError
 
@@ -120,7 +123,14 @@ class Renderer:
         the series.
         """
         if plan is None and scene is not None and scene.evolution is not None:
-            return evolution(self.volume, scene, progress=progress, draw=self.render)
+            panels = evolution(self.volume, scene, progress=progress, draw=self.render)
+            first = replace(scene, evolution=None, step=scene.evolution.steps[0])
+            return surrounded(
+                panels,
+                scene.effects,
+                colours=self.plan(first).function.colours,
+                quantity=quantity_of(self.volume.name, self.volume.units),
+            )
         begin = time.perf_counter()
         if plan is None:
             plan = self.plan(Scene() if scene is None else scene)
@@ -156,6 +166,8 @@ class Renderer:
             field = FrameField(decoded.frame, task.rays.grid, decoded.bricks, arrays)
         else:
             field = NetworkField(self.volume, plan.step, plan.units, arrays)
+            if task.rays.grid.warp is not None:
+                field = WarpedField(field, task.rays.grid.warp)
         return stream(
             field,
             task,
@@ -167,24 +179,23 @@ class Renderer:
     def _finish(self, plan: Plan, marched: Marched, secondary_rays: int, begin: float) -> Image:
         """Make a picture of what was marched, with its overlay; `begin` is when rendering began."""
         volume = self.volume
+        layout = plan.layout
         image = Image(
-            rgba=marched.rgba,
-            depth=marched.depth,
-            normal=marched.normal,
+            rgba=_placed(marched.rgba, layout, 0.0),
+            depth=None if marched.depth is None else _placed(marched.depth, layout, np.inf),
+            normal=None if marched.normal is None else _placed(marched.normal, layout, 0.0),
             counters=complete(marched.counters, {"secondary_rays": secondary_rays}),
             scene=plan.scene.to_dict(),
             source=volume.path.name,
             digest=volume.container.digest,
         )
-        units = "" if volume.units in ("", "1") else f" [{volume.units}]"
         label = time_text(plan.step, plan.time, volume.coords["t"])
         drawn = overlay(
             image,
             plan.scene.effects,
             plan.task.rays,
+            layout,
             colours=plan.function.colours,
-            quantity=f"{volume.name}{units}",
-            coords=volume.coords,
             label=label,
         )
         return replace(drawn, seconds=time.perf_counter() - begin)
@@ -251,6 +262,18 @@ class Renderer:
         return None
 
 
+def _placed(
+    pixels: npt.NDArray[np.float32], layout: Layout, empty: float
+) -> npt.NDArray[np.float32]:
+    """A picture (H, W) or (H, W, n) with the pixels of its view, and one number around them."""
+    left, top, width, height = layout.view
+    if (width, height) == layout.size:
+        return pixels
+    whole = np.full((*layout.size[::-1], *pixels.shape[2:]), empty, dtype=np.float32)
+    whole[top : top + height, left : left + width] = pixels
+    return whole
+
+
 def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple[Task, int]:
     """The task of a plan with its light, and the number of secondary rays that the light took."""
     if not plan.lights:
@@ -292,7 +315,10 @@ def _histogram_of(volume: Volume) -> Histogram:
 
 
 def _decode(volume: Volume, plan: Plan) -> _DecodedFrame:
-    frame = decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units)
+    frame = warped(
+        decoded_frame(volume, plan.step, plan.lod, plan.region, plan.units),
+        plan.task.rays.grid.warp,
+    )
     return _DecodedFrame(frame=frame, region=plan.region, bricks=Bricks.of(frame))
 
 

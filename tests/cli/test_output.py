@@ -12,6 +12,7 @@ from fhash_cli.output import (
     compared,
     describe_error,
     duration,
+    emit,
     factor,
     listed,
     number,
@@ -118,7 +119,7 @@ def test_listed_leaves_out_the_middle() -> None:
 
 
 def test_json_holds_no_nan(capsys: pytest.CaptureFixture[str]) -> None:
-    output.emit({"psnr": float("nan"), "range": [float("inf"), 1.5]}, "", as_json=True)
+    emit({"psnr": float("nan"), "range": [float("inf"), 1.5]}, "", as_json=True)
     assert capsys.readouterr().out == '{"psnr": null, "range": [null, 1.5]}\n'
 
 

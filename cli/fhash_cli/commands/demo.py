@@ -52,11 +52,33 @@ COLUMNS = 4
     show_default=True,
     help="Folder for the three files.",
 )
+@click.option(
+    "--gallery",
+    metavar="DIR",
+    type=click.Path(),
+    help="Make the gallery instead: pictures in DIR, and the page DIR.md with their commands.",
+)
 @force_option
 @json_option
 @quiet_option
-def command(scene: str, folder: str, force: bool, as_json: bool, quiet: bool) -> None:
+def command(
+    scene: str, folder: str, gallery: str | None, force: bool, as_json: bool, quiet: bool
+) -> None:
     """Simulate a small series, encode, decode, compare and draw it: DIR/SCENE.h5, .fhz and .png."""
+    if gallery is not None:
+        from fhash_cli.commands import encode, render
+        from fhash_cli.gallery import make_gallery
+
+        made = make_gallery(
+            Path(gallery),
+            {"encode": encode.command, "render": render.command},
+            force=force,
+            quiet=quiet,
+        )
+        emit(
+            made, table([("page", made["page"]), ("pictures", str(len(made["pictures"])))]), as_json
+        )
+        return
     from fhash_codec.config import EncodeConfig
     from fhash_formats import Region, open_series, save_region
     from fhash_formats.support.atomic import replacing

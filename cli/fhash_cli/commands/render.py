@@ -1,4 +1,4 @@
-"""`fhash render`: a picture of a container, as a PNG that holds its scene."""
+"""`fhash render`: a picture of a container, as a PNG that holds its scene, or as a JPEG."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     "output",
     metavar="VIEW.png",
     type=click.Path(),
-    help="The picture to write.  [default: RUN.png in this folder]",
+    help="The picture to write, .png or .jpg; only a .png holds its scene."
+    "  [default: RUN.png in this folder]",
 )
 @scene_options
 @add_animation_options
@@ -60,6 +61,7 @@ def command(
 ) -> None:
     """Draw RUN.fhz at one time; unless options say more, the file's features decide what is shown.
 
+    A volume with an axis of one vertex is drawn as an opaque plane, seen from above.
     With --animate the output is NAME.png for numbered pictures, of which only missing ones are
     drawn, or a film NAME.mp4 or NAME.gif.
     """
@@ -105,8 +107,9 @@ def command(
 
 def _check_outputs(path: Path, save_scene: str | None, scene: Scene, force: bool, run: str) -> None:
     """Refuse outputs before any work."""
-    if path.suffix.lower() != ".png":
-        raise InputError(f"{path}: pictures are written as .png; use such a name")
+    from fhash_codec.rendering.picture.image import check_picture_name
+
+    check_picture_name(path, scene.background)
     outputs = [path, *(path.with_name(f"{path.stem}.{name}.npy") for name in scene.effects.buffers)]
     if save_scene is not None:
         if Path(save_scene).suffix.lower() != ".json":
@@ -138,6 +141,8 @@ def _text(plan: Plan, image: Image, time: str, paths: list[str], explain: bool) 
             ("size", extent((width, height))),
             ("step", f"{plan.step:g}, t = {time}"),
         ]
+    if Path(paths[-1]).suffix.lower() != ".png" and len(paths) == 1:
+        lines.append(("scene", "not in a JPEG; --save-scene FILE.json keeps it"))
     lines.append(("seconds", number(image.seconds, digits=3)))
     if not explain:
         return table(lines)

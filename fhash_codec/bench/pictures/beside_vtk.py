@@ -21,6 +21,7 @@ from fhash_codec.bench.pictures.reference import vtk_picture
 from fhash_codec.bench.pictures.results import Against, Exactness, Playback
 from fhash_codec.bench.pictures.vtk_peer import VtkPeer, require_vtk
 from fhash_codec.progress import Progress
+from fhash_codec.rendering.camera.grid import Grid
 from fhash_codec.rendering.march import march
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.renderer import Renderer
@@ -28,6 +29,7 @@ from fhash_codec.rendering.scene.scene import GRADIENTS, Scene, Shading, Transfe
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.task import Frame
 from fhash_codec.rendering.task.units import Units
+from fhash_codec.rendering.task.warping import warped
 from fhash_codec.volume import Volume
 from fhash_formats.support.threads import usable_threads
 
@@ -258,11 +260,15 @@ def turned(scene: Scene, turn: int, turns: int) -> Scene:
 def whole_frame(volume: Volume, step: float, units: Units) -> Single:
     """Values (z, y, x) of the whole domain in marched units.
 
-    The background stands for missing values, which VTK does not know.
+    The background stands for missing values, which VTK does not know. Uneven axes are resampled as
+    they are drawn.
     """
     values = volume.read(step, outside="background")
     values[~np.isfinite(values)] = volume.background
-    return np.ascontiguousarray(values if units == Units() else units.to(values), dtype=np.float32)
+    marched = np.ascontiguousarray(
+        values if units == Units() else units.to(values), dtype=np.float32
+    )
+    return warped(Frame(values=marched, first=(0, 0, 0)), Grid.of(volume.coords).warp).values
 
 
 def transfer_functions(values: Single, units: Units) -> dict[str, TransferFunctionSpec]:

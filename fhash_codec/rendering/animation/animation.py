@@ -203,6 +203,9 @@ class Animation(Record):
             raise InputError(
                 f"animation: nothing changes; give {FORMS}, or a file with two keys or more"
             )
+        if self.orbit and scene.camera.view == "auto":
+            # A plane seen from above would be seen from its edge in the middle of its orbit.
+            scene = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, view="iso"))
         key_scenes = [key.over(scene) for key in self.keys] or [scene]
         given = [float(key.at) for key in self.keys if key.at is not None]
         at = given or np.linspace(0, 1, len(key_scenes)).tolist()

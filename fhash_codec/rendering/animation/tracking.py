@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -21,9 +22,15 @@ from fhash_codec.coreset.features import (
 )
 from fhash_codec.coreset.features import Isosurface as SurfaceFeature
 from fhash_codec.progress import Progress, silent
+from fhash_codec.rendering.camera.grid import Grid
 from fhash_codec.rendering.colour.colours import colour_code, parse_colour
-from fhash_codec.rendering.colour.opacity import opacity_preset
-from fhash_codec.rendering.scene.scene import Isosurface, Scene, TransferFunctionSpec
+from fhash_codec.rendering.colour.opacity import opacity_preset, raised
+from fhash_codec.rendering.scene.scene import (
+    Isosurface,
+    LegendEntry,
+    Scene,
+    TransferFunctionSpec,
+)
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
@@ -112,9 +119,9 @@ def _check_trackable(name: str) -> None:
 def tracking_scene(scene: Scene, tracked: Sequence[Tracked], volume: Volume) -> Scene:
     """Show several features in a scene, each in its colour.
 
-    Intervals and segmentations are shown by the transfer function, isosurfaces as surfaces. A value
-    of several features has the largest of their opacities and the mean of their colours. Raises
-    InputError without a feature.
+    Intervals and segmentations are shown by the transfer function, isosurfaces as surfaces, within
+    the box of the volume and with a legend. A value of several features has the largest of their
+    opacities and the mean of their colours. Raises InputError without a feature.
     """
     if not tracked:
         raise InputError("no feature to track; give at least one")
@@ -125,20 +132,48 @@ def tracking_scene(scene: Scene, tracked: Sequence[Tracked], volume: Volume) -> 
     )
     filled = [item for item in tracked if not isinstance(item.feature, SurfaceFeature)]
     effects = dataclasses.replace(
-        scene.effects, isosurfaces=(*scene.effects.isosurfaces, *surfaces)
+        scene.effects,
+        isosurfaces=(*scene.effects.isosurfaces, *surfaces),
+        box=True,
+        legend=(*scene.effects.legend, *_legend(tracked, volume)),
     )
     function = (
-        _transfer_function(scene.transfer_function, filled, volume)
+        _transfer_function(scene, filled, volume)
         if filled
         else dataclasses.replace(scene.transfer_function, nothing=True)
     )
     return dataclasses.replace(scene, transfer_function=function, effects=effects)
 
 
+def _legend(tracked: Sequence[Tracked], volume: Volume) -> list[LegendEntry]:
+    """The entries of tracked features, with units of their values."""
+    units = "" if volume.units in ("", "1") else f" {volume.units}"
+    return [
+        LegendEntry(text=f"{_in_words(item.feature, volume.name)}{units}", colour=item.colour)
+        for item in tracked
+    ]
+
+
+def _in_words(feature: Feature, name: str) -> str:
+    """The values of a feature, as people write them."""
+    if isinstance(feature, SurfaceFeature):
+        return f"{name} = {feature.value:.6g}"
+    assert isinstance(feature, Interval | Segmentation)
+    low, high = (
+        (feature.low, feature.high)
+        if isinstance(feature, Interval)
+        else (feature.threshold if feature.threshold is not None else -math.inf, math.inf)
+    )
+    if math.isinf(high):
+        return f"{name} ≥ {low:.6g}" if math.isfinite(low) else name
+    return f"{name} ≤ {high:.6g}" if math.isinf(low) else f"{name}: {low:.6g} to {high:.6g}"
+
+
 def _transfer_function(
-    given: TransferFunctionSpec, filled: Sequence[Tracked], volume: Volume
+    scene: Scene, filled: Sequence[Tracked], volume: Volume
 ) -> TransferFunctionSpec:
     """The transfer function of intervals and segmentations, with the density that is given."""
+    given = scene.transfer_function
     low, high = volume.value_range.low, volume.value_range.high
     points = opacity_preset(
         "feature",
@@ -147,6 +182,8 @@ def _transfer_function(
         features=[str(item.feature) for item in filled],
         histogram=None,
     )
+    if given.unit_distance is None:
+        points = raised(points, Grid.of(volume.coords, scene.scale).thinnest)
     return TransferFunctionSpec(
         colours=_colours(filled, low, high),
         opacity=tuple((float(value), float(opacity)) for value, opacity in points),

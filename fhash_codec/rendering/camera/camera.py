@@ -8,24 +8,21 @@ with uneven voxels and descending axes too.
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.rendering.camera.grid import Grid
 from fhash_codec.rendering.scene.scene import Camera
-from fhash_formats.errors import FhashWarning, InputError
-from fhash_formats.series import Coordinate
+from fhash_formats.errors import InputError
 
-__all__ = ["Grid", "Rays"]
+__all__ = ["Grid", "Rays", "view_of"]
 
 Floats = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
 
-TOLERANCE = 1e-3
-"""Largest distance of coordinates from even ones without a warning, as a share of the extent."""
 VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "iso": ((1, 1, 1), (0, 0, 1)),
     "xy": ((0, 0, 1), (0, 1, 0)),
@@ -36,102 +33,12 @@ VIEWS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]
     "zy": ((-1, 0, 0), (0, 1, 0)),
 }
 """Views by name, as in PyVista: direction from the volume to the camera, and upward direction."""
-MAX_POSITION = 1e100
-"""Largest position that is drawn where it is; its reciprocal is the extent of the shortest axis."""
-MAX_AXES_RATIO = 1e14
-"""Largest ratio of the longest axis to the shortest vertex spacing.
-
-The eye is a few times as far away as the axis is long, and there float64 tells apart 0.1 spacings.
-"""
+AUTO = "auto"
+"""Name of the view that depends on the volume, see `view_of`."""
+FILLED = 0.98
+"""Share of the picture, across or down, that a plane seen from above fills."""
 PARALLEL = 1e-6
 """Sine of the angle between view and upward direction below which the picture has no upright."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Grid:
-    """The even grid of vertices that is drawn.
-
-    An axis of one vertex has the mean spacing of the others and reaches half of it to both sides.
-
-    Attributes:
-        counts: vertices along x, y, z.
-        origin: physical position (x, y, z) of the first vertex, stretched by `scale`.
-        spacing: between two vertices (x, y, z), stretched; negative where coordinates descend.
-        scale: factors by which the axes (x, y, z) are stretched.
-    """
-
-    counts: tuple[int, int, int]
-    origin: Floats
-    spacing: Floats
-    scale: Vector = (1.0, 1.0, 1.0)
-
-    @classmethod
-    def of(cls, coords: Mapping[str, Coordinate], scale: Vector | None = None) -> Grid:
-        """Make the grid of a volume's coordinates.
-
-        Coordinates that are not even are spread evenly, with an FhashWarning.
-
-        Args:
-            coords: by axis.
-            scale: factors by which the axes are stretched. If None, axes have the lengths of their
-                coordinates, except an axis in other units than most have: its length cannot be
-                compared, so its vertices are drawn as far apart as those of the others.
-
-        Raises InputError where axes have lengths too different to place rays.
-        """
-        axes = [np.asarray(coords[axis].values, dtype=np.float64) for axis in "xyz"]
-        spacing = np.full(3, np.nan)
-        origin = np.array([values[0] if abs(values[0]) <= MAX_POSITION else 0.0 for values in axes])
-        for number, values in enumerate(axes):
-            if len(values) == 1:
-                continue
-            between, problem = _even_spacing(values)
-            if between is None:
-                spacing[number], origin[number] = 1.0, 0.0
-            else:
-                spacing[number] = between
-            if problem:
-                warnings.warn(
-                    f"the coordinates {coords['xyz'[number]].name!r} of {'xyz'[number]} {problem}",
-                    FhashWarning,
-                    stacklevel=2,
-                )
-        single = np.isnan(spacing)
-        factors = (
-            _proportions([coords[axis] for axis in "xyz"], np.abs(spacing))
-            if scale is None
-            else np.array(scale, dtype=np.float64)
-        )
-        spacing[single] = (
-            np.mean(np.abs(spacing * factors)[~single]) / factors[single]
-            if not single.all()
-            else 1.0
-        )
-        spacing *= factors
-        _check_lengths(spacing, [len(values) for values in axes])
-        return cls(
-            counts=(len(axes[0]), len(axes[1]), len(axes[2])),
-            origin=origin * factors,
-            spacing=spacing,
-            scale=(float(factors[0]), float(factors[1]), float(factors[2])),
-        )
-
-    @property
-    def vertex_spacing(self) -> float:
-        """The distance between vertices as one length: the geometric mean over the axes."""
-        return float(np.exp(np.mean(np.log(np.abs(self.spacing)))))
-
-    @property
-    def bounds(self) -> Floats:
-        """The box that is drawn in index space: float64 (3, 2), x, y, z."""
-        return np.array(
-            [[-0.5, 0.5] if count == 1 else [0.0, count - 1.0] for count in self.counts]
-        )
-
-    @property
-    def corners(self) -> Floats:
-        """The drawn box in physical coordinates (3, 2); descending on descending axes."""
-        return self.origin[:, None] + self.bounds * self.spacing[:, None]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -169,6 +76,7 @@ class Rays:
         """Place the rays of a camera; raises InputError without a direction or an upright."""
         low, high = grid.corners[:, 0], grid.corners[:, 1]
         middle = low / 2 + high / 2
+        view = view_of(camera.view, grid)
         radius = float(np.linalg.norm((grid.bounds[:, 1] - grid.bounds[:, 0]) * grid.spacing / 2))
         focal = middle if camera.focal_point is None else np.array(camera.focal_point)
         aspect = size[0] / size[1]
@@ -176,8 +84,13 @@ class Rays:
         # which is the same for small ones.
         half = float(np.tan(np.radians(camera.view_angle) / 2))
         narrow = float(np.sin(np.arctan(half * min(aspect, 1.0))))
-        away, distance = _towards_camera(camera, focal, radius, radius / narrow)
-        upward = np.array(VIEWS[camera.view][1], dtype=np.float64)
+        distance, parallel_half = radius / narrow, radius / min(aspect, 1.0)
+        if camera.view == AUTO and grid.flat:
+            parallel_half = _half_height(grid, view, aspect)
+            thickness = float(np.abs(np.diff(grid.corners, axis=1)[:, 0] @ VIEWS[view][0]))
+            distance = parallel_half / half + thickness / 2
+        away, distance = _towards_camera(camera, view, focal, radius, distance)
+        upward = np.array(VIEWS[view][1], dtype=np.float64)
         if camera.view_up is not None:
             upward = np.array(camera.view_up)
         turn, right = _upright(away, upward)
@@ -187,11 +100,7 @@ class Rays:
         away = _turned(away, -right, camera.elevation)
         up = np.cross(away, right)
         if camera.projection == "parallel":
-            half = (
-                camera.parallel_scale
-                if camera.parallel_scale is not None
-                else radius / min(aspect, 1.0)
-            )
+            half = camera.parallel_scale if camera.parallel_scale is not None else parallel_half
         half /= camera.zoom
         spacing = grid.spacing
         # Measured from the first vertex: where coordinates are large beside the volume, a sum with
@@ -255,70 +164,41 @@ class Rays:
         return np.stack([(u + 1) / 2 * width, (1 - w) / 2 * height], axis=-1), depth
 
 
-def _even_spacing(values: Floats) -> tuple[float | None, str]:
-    """The spacing of two coordinates or more, None if there is none, and a problem, '' if none."""
-    # Products of a few lengths, and squares of distances, stay far from the ends of float64. NaN
-    # is not ordinary, either.
-    ordinary = bool(np.all(np.abs(values) <= MAX_POSITION))
-    extent = float(values[-1] - values[0]) if ordinary else 0.0
-    if abs(extent) < 1 / MAX_POSITION:
-        return None, "are no positions along a line; vertices are drawn one unit apart"
-    spacing = extent / (len(values) - 1)
-    even = np.linspace(values[0], values[-1], len(values))
-    if np.max(np.abs(values - even)) <= TOLERANCE * abs(extent):
-        return spacing, ""
-    return spacing, "are not evenly spaced; they are drawn as if they were"
+def view_of(name: str, grid: Grid) -> str:
+    """The key of VIEWS that the name of a view stands for.
 
-
-def _check_lengths(spacing: Floats, counts: Sequence[int]) -> None:
-    """Raise InputError where one axis is too long for the vertex spacing of another."""
-    longest = float(np.max(np.abs(spacing) * counts))
-    shortest = float(np.min(np.abs(spacing)))
-    if longest > MAX_AXES_RATIO * shortest:
-        raise InputError(
-            f"the longest axis of the volume is {longest:.3g}, and vertices of the shortest are "
-            f"{shortest:.3g} apart: no ray can be placed that finely, at most "
-            f"{MAX_AXES_RATIO:.0e} times; stretch the axes with 'scale'"
-        )
-
-
-def _proportions(coords: Sequence[Coordinate], spacing: Floats) -> Floats:
-    """Factors (3,) that draw vertices of axes in uncommon units as far apart as the others.
-
-    Axes in the commonest units keep their lengths. Where an axis has no units, all do.
-
-    Args:
-        coords: of x, y, z.
-        spacing: between vertices, at least 0; NaN for an axis of one vertex, which does not count.
+    'auto' is 'iso', but the view along an axis of one vertex: the plane is seen from above.
     """
-    units = [str(coordinate.attributes.get("units", "")).strip() for coordinate in coords]
-    extended = np.isfinite(spacing)
-    extended_units = [unit for unit, counts in zip(units, extended, strict=True) if counts]
-    factors = np.ones(3)
-    if len(set(extended_units)) < 2 or "" in extended_units:
-        return factors
-    usual = max(extended_units, key=extended_units.count)
-    is_usual = np.array([unit == usual for unit in units])
-    across = float(np.mean(spacing[extended & is_usual]))
-    other = extended & ~is_usual
-    factors[other] = across / spacing[other]
-    return factors
+    if name != AUTO:
+        return name
+    for axis, view in ((2, "xy"), (1, "xz"), (0, "yz")):
+        if grid.counts[axis] == 1:
+            return view
+    return "iso"
+
+
+def _half_height(grid: Grid, view: str, aspect: float) -> float:
+    """Half the height of a picture that a plane or line fills when it is seen from above."""
+    away, up = (np.abs(np.array(axis, dtype=np.float64)) for axis in VIEWS[view])
+    extent = np.abs(np.diff(grid.corners, axis=1)[:, 0]) / 2
+    return float(max(extent @ up, extent @ (1 - up - away) / aspect)) / FILLED
 
 
 def _towards_camera(
-    camera: Camera, focal: Floats, radius: float, distance: float
+    camera: Camera, view: str, focal: Floats, radius: float, distance: float
 ) -> tuple[Floats, float]:
     """The unit vector from the focal point towards the camera, before it turns, and its distance.
 
     Args:
         camera: of the scene.
+        view: key of VIEWS.
         focal: the focal point.
         radius: of the volume.
         distance: of a camera without a position.
 
     Raises InputError for a camera that stands at its focal point.
     """
-    away = np.array(VIEWS[camera.view][0], dtype=np.float64)
+    away = np.array(VIEWS[view][0], dtype=np.float64)
     if camera.position is not None:
         away = np.array(camera.position) - focal
         distance = float(np.linalg.norm(away))

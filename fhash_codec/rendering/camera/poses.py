@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.rendering.camera.camera import VIEWS, Grid, Rays
+from fhash_codec.rendering.camera.camera import VIEWS, Grid, Rays, view_of
 from fhash_codec.rendering.camera.curves import pchip
 from fhash_codec.rendering.camera.quaternions import from_matrix, spline, to_matrix
 from fhash_codec.rendering.scene.scene import Camera
@@ -101,7 +101,11 @@ class CameraPath:
         None unless all poses have the same upward direction and none looks along it.
         """
         ups = np.array(
-            [camera.view_up or VIEWS[camera.view][1] for camera in self.cameras], dtype=np.float64
+            [
+                camera.view_up or VIEWS[view_of(camera.view, self.grid)][1]
+                for camera in self.cameras
+            ],
+            dtype=np.float64,
         )
         ups /= np.linalg.norm(ups, axis=1, keepdims=True)
         away = np.array([to_matrix(rotation)[:, 2] for rotation in rotations])

@@ -20,14 +20,14 @@ MAX_PART = 0.5
 
 
 def pixel_vertices(rays: Rays) -> float:
-    """Measure a pixel in vertices, where the volume is nearest to the camera; 0 inside the volume.
+    """Measure a pixel in vertices of the series, where the volume is nearest; 0 inside the volume.
 
-    Both the side of the pixel and the axis of the volume are those that give the smallest number.
+    Side of the pixel, axis of the volume and place along it are those of the smallest number.
     """
     bounds = rays.grid.bounds
     across = np.abs(rays.right) * 2 / rays.size[0], np.abs(rays.up) * 2 / rays.size[1]
     lengths = [float(np.linalg.norm(side * rays.grid.spacing)) for side in across]
-    width = min(lengths) / float(np.max(np.abs(rays.grid.spacing)))
+    width = min(lengths) / float(np.max(np.abs(rays.grid.spacing) * rays.grid.coarseness))
     if rays.parallel:
         return width
     nearest = np.clip(rays.eye, bounds[:, 0], bounds[:, 1])
@@ -51,6 +51,9 @@ def part_in_view(rays: Rays, volume: Volume) -> Box:
         seen = _seen(rays)
     if seen is None:
         return Box.of_shape((1, 1, 1))
+    warp = rays.grid.warp
+    if warp is not None:
+        seen = np.stack([warp.to_series(axis, ends) for axis, ends in enumerate(seen)])
     region = []
     for low, high, length, chunk, (first, _) in zip(
         *seen[::-1].T, volume.shape[1:], volume.chunks[1:], volume.box, strict=True

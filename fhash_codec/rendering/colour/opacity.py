@@ -16,12 +16,14 @@ from fhash_codec.coreset.features import Interval, Isosurface, Segmentation, par
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
 
-__all__ = ["PRESETS", "Histogram", "about", "opacity_preset", "shown_range"]
+__all__ = ["PRESETS", "Histogram", "Thinnest", "about", "opacity_preset", "raised", "shown_range"]
 
 Floats = npt.NDArray[np.float64]
 Range = tuple[float, float]
 Histogram = tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]
 """Bin edges (n + 1,), ascending, and counts (n,) of values."""
+Thinnest = tuple[int, float]
+"""Vertices of the axis with the fewest, and its length in unit distances of the opacity."""
 
 PRESETS = (
     "auto",
@@ -43,6 +45,9 @@ SURFACE = 0.6
 """Largest opacity per vertex spacing at the value of an isosurface."""
 BACKGROUND = 0.25
 """Largest opacity per vertex spacing of values far from the background."""
+THIN = 8
+"""Vertices along the thinnest axis up to which a volume is thin: nothing hides behind its values.
+All of them are shown, and as opaque together as so many vertex spacings would be."""
 EDGE = 0.1
 """Share of an interval's width over which its opacity rises, and falls again."""
 TENT = 0.02
@@ -60,6 +65,7 @@ def opacity_preset(
     value_range: Range,
     features: Sequence[str],
     histogram: Histogram | None,
+    thinnest: Thinnest | None = None,
 ) -> Floats:
     """Find a preset by name: points (value, opacity), float64 (n, 2), values strictly ascending.
 
@@ -69,6 +75,8 @@ def opacity_preset(
         value_range: lowest and highest value of the series.
         features: of the file, as texts.
         histogram: of the values of the series, for `auto` without a suitable feature.
+        thinnest: axis of the volume, by which `auto` makes planes opaque and thin volumes more so;
+            None for a volume that is not thin.
 
     Raises InputError for an unknown name, with the nearest one, and for `feature` if the file has
     no feature that tells values apart.
@@ -81,6 +89,8 @@ def opacity_preset(
         )
     if name not in ("auto", "feature"):
         return _pyvista(name, shown)
+    if name == "auto" and thinnest is not None and thinnest[0] <= THIN:
+        return _of_thin(thinnest, features, value_range)
     points = _of_features(features, value_range)
     if points is not None:
         return points
@@ -92,6 +102,28 @@ def opacity_preset(
     if histogram is not None:
         return _away_from_background(histogram, value_range)
     return _over(value_range, np.array([0.0, 1.0]), np.array([0.0, BACKGROUND]))
+
+
+def raised(points: Floats, thinnest: Thinnest) -> Floats:
+    """Raise opacities (n, 2) of a thin volume, so that its thickness is as opaque as THIN spacings.
+
+    The points of other volumes stay as they are.
+    """
+    vertices, length = thinnest
+    if vertices > THIN or not length < THIN:
+        return points
+    with np.errstate(divide="ignore"):
+        depth = np.log1p(-points[:, 1]) * (THIN / max(length, 1e-30))
+    return np.stack([points[:, 0], -np.expm1(depth)], axis=-1)
+
+
+def _of_thin(thinnest: Thinnest, features: Sequence[str], value_range: Range) -> Floats:
+    """The points of a thin volume: a plane is opaque, of a thicker one every value is seen."""
+    everything = _over(value_range, np.array([0.0, 1.0]), np.array([BACKGROUND, BACKGROUND]))
+    if thinnest[0] == 1:
+        return np.array([[everything[0, 0], 1.0]])
+    points = _of_features(features, value_range)
+    return raised(everything if points is None else points, thinnest)
 
 
 def _pyvista(name: str, shown: Range) -> Floats:

@@ -19,7 +19,13 @@ import numpy.typing as npt
 
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.rendering.colour.colours import ColourMap, is_map, named_map, parse_colour
-from fhash_codec.rendering.colour.opacity import Histogram, about, opacity_preset, shown_range
+from fhash_codec.rendering.colour.opacity import (
+    Histogram,
+    Thinnest,
+    about,
+    opacity_preset,
+    shown_range,
+)
 from fhash_codec.rendering.colour.paraview import Preset, read_preset
 from fhash_codec.rendering.scene.scene import TransferFunctionSpec
 from fhash_formats.errors import FhashWarning, InputError
@@ -83,6 +89,7 @@ class TransferFunction:
         spacing: float,
         features: Sequence[str] = (),
         histogram: Histogram | None = None,
+        thinnest: Thinnest | None = None,
     ) -> TransferFunction:
         """Make the transfer function that a scene asks for.
 
@@ -92,6 +99,8 @@ class TransferFunction:
             spacing: between vertices in units of the coordinates; the unit distance by default.
             features: of the file, as texts.
             histogram: bin edges (n + 1,) and counts (n,) of values, for the opacity `auto`.
+            thinnest: axis of the volume, by which `auto` makes thin volumes opaque, unless the
+                scene has a unit distance of its own.
 
         Raises InputError for an unknown name, for points that do not ascend, and where nothing
         would be visible, unless `spec.nothing`.
@@ -117,6 +126,7 @@ class TransferFunction:
                 value_range=value_range,
                 features=features,
                 histogram=histogram,
+                thinnest=thinnest if spec.unit_distance is None else None,
             )
         function = cls(
             colours=colours,

@@ -66,7 +66,7 @@ class MarchInput:
         low, high = (task.table.low, task.table.high) if task.table is not None else (least, most)
         scaling = _Scaling.of(low, high, max(abs(least), abs(most)))
         low, high, least, most = map(scaling.number, (low, high, least, most))
-        span, floor = flatness(low, high, least, most)
+        span, floor = flatness(low, high, least, most, scaling.width(task.noise))
         light = task.light
         return cls(
             values=scaling.array(bricks.values),
@@ -105,6 +105,10 @@ class _Scaling:
     def number(self, value: float) -> float:
         """Scale a value."""
         return value / self.unit - self.middle / self.unit
+
+    def width(self, difference: float) -> float:
+        """Scale a difference of two values."""
+        return difference / self.unit
 
     def array(self, values: Single) -> Single:
         """Scale values, clipped to MAX_MAGNITUDE; without scaling the result is the same array."""

@@ -26,7 +26,8 @@ WIDE = 1.6
 def evolution(volume: Volume, scene: Scene, *, draw: Draw, progress: Progress = silent) -> Image:
     """Draw the steps of `scene.evolution` row by row in one picture.
 
-    Each panel has a time label. Only the last panel has the colour bar, if the scene asks for one.
+    Each panel has a time label. Colour bar and legend of the scene are of the whole picture and are
+    not drawn here.
 
     Args:
         volume: names the source of the picture.
@@ -119,12 +120,10 @@ def _layout(scene: Scene) -> _Layout:
 def _panels(scene: Scene) -> list[Scene]:
     """The scene of each panel."""
     assert scene.evolution is not None
-    plain = dataclasses.replace(scene.effects, time_label=True, colour_bar=False, buffers=())
-    last = dataclasses.replace(plain, colour_bar=scene.effects.colour_bar)
-    steps = scene.evolution.steps
+    plain = dataclasses.replace(
+        scene.effects, time_label=True, colour_bar=False, legend=(), buffers=()
+    )
     return [
-        dataclasses.replace(
-            scene, evolution=None, step=step, effects=plain if number < len(steps) - 1 else last
-        )
-        for number, step in enumerate(steps)
+        dataclasses.replace(scene, evolution=None, step=step, effects=plain)
+        for step in scene.evolution.steps
     ]

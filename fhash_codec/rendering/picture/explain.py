@@ -42,13 +42,18 @@ def _extras(plan: Plan) -> list[tuple[str, str]]:
     task, effects = plan.task, plan.scene.effects
     buffers = [name for name, on in (("depth", task.depth), ("normal", task.normal)) if on]
     around = [
-        name for name in ("box", "axes", "colour_bar", "time_label") if getattr(effects, name)
+        name
+        for name in ("box", "axes", "colour_bar", "time_label", "legend")
+        if getattr(effects, name)
     ]
     lines = []
     if buffers:
         lines.append(("buffers", ", ".join(buffers)))
     if around:
-        lines.append(("around", ", ".join(around) + ": drawn afterwards"))
+        wide, tall = plan.layout.view[2:]
+        lines.append(
+            ("around", ", ".join(around) + f": drawn afterwards; the volume has {wide} x {tall}")
+        )
     return lines
 
 

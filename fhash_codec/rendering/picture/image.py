@@ -1,7 +1,7 @@
 """A finished picture: pixels, buffers, what they cost, and the scene that they show.
 
 A PNG holds the scene as JSON in an iTXt chunk `fhash.scene`, the name of the volume's file in
-`fhash.source` and its digest in `fhash.digest`.
+`fhash.source` and its digest in `fhash.digest`. A JPEG holds the pixels alone.
 """
 
 from __future__ import annotations
@@ -22,7 +22,12 @@ from fhash_codec.rendering.scene.scene import Scene
 from fhash_formats.errors import InputError
 from fhash_formats.support.atomic import check_output, replacing_all
 
-__all__ = ["Draw", "Image"]
+__all__ = ["PICTURES", "Draw", "Image", "check_picture_name"]
+
+PICTURES = (".png", ".jpg", ".jpeg")
+"""Suffixes of pictures, in lower case."""
+JPEG_QUALITY = 92
+"""Quality of a JPEG, 1..95, at which letters and edges stay clean."""
 
 Single = npt.NDArray[np.float32]
 
@@ -32,6 +37,20 @@ class Draw(Protocol):
 
     def __call__(self, scene: Scene, /, *, upcoming: Scene | None = None) -> Image:
         """Render `scene`; `upcoming` is the scene of the next picture."""
+
+
+def check_picture_name(path: Path, background: str) -> None:
+    """Raise InputError for a name that no picture with this background can have."""
+    suffix = path.suffix.lower()
+    if suffix not in PICTURES:
+        raise InputError(
+            f"{path}: pictures are written as {', '.join(PICTURES[:-1])} or {PICTURES[-1]}; "
+            "use such a name"
+        )
+    if suffix != ".png" and background == "transparent":
+        raise InputError(
+            f"{path}: a JPEG cannot be transparent; choose a background, or a name in .png"
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,8 +104,9 @@ class Image:
     def save(self, path: str | Path, *, force: bool = False) -> list[Path]:
         """Write NAME.png, and the buffers as NAME.depth.npy and NAME.normal.npy; return the paths.
 
-        All files are written completely, or none is. Raises InputError for a name that does not end
-        in .png, OutputExistsError unless `force`, OutputError for what cannot be written.
+        A name in .jpg or .jpeg gives a JPEG, which holds no scene. All files are written
+        completely, or none is. Raises InputError for another suffix and for a transparent picture
+        as JPEG, OutputExistsError unless `force`, OutputError for what cannot be written.
         """
         path = Path(path)
         outputs = self.outputs(path)
@@ -98,13 +118,12 @@ class Image:
                 with temporary.open("xb") as file:
                     np.save(file, np.ascontiguousarray(buffer, dtype="<f4"))
             with temporaries[-1].open("xb") as file:
-                self._write_png(file)
+                self._write(file, "PNG" if path.suffix.lower() == ".png" else "JPEG")
         return outputs
 
     def outputs(self, path: Path) -> list[Path]:
-        """List every path that `save` writes, the PNG last."""
-        if path.suffix.lower() != ".png":
-            raise InputError(f"{path}: pictures are written as .png; use such a name")
+        """List every path that `save` writes, the picture last."""
+        check_picture_name(path, self.background)
         named = (("depth", self.depth), ("normal", self.normal))
         return [
             *(
@@ -115,10 +134,16 @@ class Image:
             path,
         ]
 
-    def _write_png(self, file: BinaryIO | io.BytesIO) -> None:
+    def _write(self, file: BinaryIO | io.BytesIO, form: str) -> None:
         from PIL import Image as Pictures
         from PIL.PngImagePlugin import PngInfo
 
+        if form == "JPEG":
+            # Colours at full resolution: thin lines would get coloured fringes.
+            Pictures.fromarray(self.to_uint8()).save(
+                file, format=form, quality=JPEG_QUALITY, subsampling=0
+            )
+            return
         info = PngInfo()
         info.add_itxt(SCENE_KEY, json.dumps(dict(self.scene)))
         if self.source:
@@ -130,7 +155,7 @@ class Image:
     def _repr_png_(self) -> bytes:
         """PNG bytes, for notebooks."""
         file = io.BytesIO()
-        self._write_png(file)
+        self._write(file, "PNG")
         return file.getvalue()
 
     def __repr__(self) -> str:

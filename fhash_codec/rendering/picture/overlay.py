@@ -1,9 +1,8 @@
-"""The overlay of a picture: box, axes, colour bar and time label around the volume."""
+"""The overlay of a picture: box, axes, colour bar, legend and time label around the volume."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -13,11 +12,11 @@ from fhash_codec.rendering.camera.box import edges, outer_edges
 from fhash_codec.rendering.camera.camera import Rays
 from fhash_codec.rendering.colour.colours import ColourMap
 from fhash_codec.rendering.picture.image import Image
+from fhash_codec.rendering.picture.layout import Layout, strips
 from fhash_codec.rendering.picture.pen import Layer, Pen
 from fhash_codec.rendering.scene.scene import Effects
-from fhash_formats.series import Coordinate
 
-__all__ = ["overlay", "time_text"]
+__all__ = ["overlay", "surrounded", "time_text"]
 
 Floats = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
@@ -27,24 +26,22 @@ def overlay(
     image: Image,
     effects: Effects,
     rays: Rays,
+    layout: Layout,
     *,
     colours: ColourMap,
-    quantity: str,
-    coords: Mapping[str, Coordinate],
     label: str = "",
 ) -> Image:
-    """Draw box, axes, colour bar and time label, as far as the effects ask for them.
+    """Draw box, axes, colour bar, legend and time label, as far as the effects ask for them.
 
     Args:
         image: the picture of the volume; returned itself if no effect asks for anything.
         effects: of the scene.
-        rays: of the picture.
+        rays: of the part of the picture that shows the volume.
+        layout: of the picture.
         colours: of the colour bar.
-        quantity: name of the colour bar, with units.
-        coords: of the axes.
         label: text of the time label.
     """
-    if not (effects.box or effects.axes or effects.colour_bar or effects.time_label):
+    if not any((effects.box, effects.axes, effects.colour_bar, effects.time_label, effects.legend)):
         return image
     height, width = image.rgba.shape[:2]
     pen = Pen(width, height, image.background)
@@ -54,22 +51,57 @@ def overlay(
         shown = edges(rays) if effects.box else outer_edges(rays)
         # The volume lies inside the box: an edge between two faces that look away lies behind all
         # of the volume, any other edge before all of it.
-        _paint_behind(picture, pen.ink, pen.lines([edge for edge in shown if edge.fronts == 0]))
-        layers.append((pen.ink, pen.lines([edge for edge in shown if edge.fronts > 0])))
-    if effects.axes:
-        # The scales have a pen of their own, so that the colour bar lies over them.
-        scales = Pen(width, height, image.background)
-        for edge in outer_edges(rays):
-            scales.scale(edge, coords["xyz"[edge.axis]], rays)
-        layers += scales.written()
-    if effects.colour_bar:
-        layers.append(pen.colour_bar(colours, quantity))
-    if effects.time_label and label:
-        pen.text((pen.size, pen.size), label, "la")
-    layers += pen.written()
+        behind = pen.lines([edge for edge in shown if edge.fronts == 0], layout.view)
+        _paint_behind(picture, pen.ink, behind)
+        before = pen.lines([edge for edge in shown if edge.fronts > 0], layout.view)
+        layers.append((pen.ink, before))
+    for text in layout.labels:
+        pen.write(text)
+    if layout.time is not None and label:
+        pen.time_label(layout.time, label)
+    layers += _around(pen, layout, colours)
     for colour, opacity in layers:
         _paint_before(picture, colour, opacity)
     return dataclasses.replace(image, rgba=picture)
+
+
+def surrounded(image: Image, effects: Effects, *, colours: ColourMap, quantity: str) -> Image:
+    """Put the colour bar and the legend of a scene beside and below a picture of several panels.
+
+    Args:
+        image: the panels; returned itself if no effect asks for anything.
+        effects: of the scene.
+        colours: of the colour bar.
+        quantity: name of the colour bar, with units.
+    """
+    wanted = Effects(colour_bar=effects.colour_bar, legend=effects.legend)
+    if wanted == Effects():
+        return image
+    height, width = image.rgba.shape[:2]
+    # The strips take their widths from the picture with them: a few rounds settle both.
+    size = (width, height)
+    for _ in range(8):
+        layout = strips(size, wanted, colours, quantity)
+        size = (width + size[0] - layout.view[2], height + size[1] - layout.view[3])
+        if layout.view[2] >= width and layout.view[3] >= height:
+            break
+    layout = strips(size, wanted, colours, quantity)
+    pen = Pen(*size, image.background)
+    picture = np.zeros((size[1], size[0], 4), dtype=np.float32)
+    picture[:height, :width] = image.rgba
+    for colour, opacity in _around(pen, layout, colours):
+        _paint_before(picture, colour, opacity)
+    return dataclasses.replace(image, rgba=picture)
+
+
+def _around(pen: Pen, layout: Layout, colours: ColourMap) -> list[Layer]:
+    """The layers of colour bar and legend, and of all texts of a pen."""
+    layers = []
+    if layout.bar is not None:
+        layers.append(pen.colour_bar(layout.bar, colours))
+    if layout.legend is not None:
+        layers.append(pen.legend(layout.legend))
+    return [*layers, *pen.written()]
 
 
 def time_text(step: float, time: float, coordinate: Coordinate) -> str:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.rendering.colour.transfer_function import TransferFunction
+from fhash_codec.rendering.picture.layout import Layout
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Scene, Shadows
 from fhash_codec.rendering.task.task import Task
 from fhash_codec.rendering.task.units import Units
@@ -22,8 +23,9 @@ class Plan:
 
     Attributes:
         scene: as given.
-        task: what is marched. Its `light` is still missing: where `shadows` or `occlusion` ask for
-            light, it is computed from the decoded frame.
+        layout: places of everything in the picture, and the part that shows the volume.
+        task: what is marched, in that part. Its `light` is still missing: where `shadows` or
+            `occlusion` ask for light, it is computed from the decoded frame.
         step: of the series; fractional between two steps.
         time: physical time.
         mode: 'cache', 'arm' or 'stream'.
@@ -39,6 +41,7 @@ class Plan:
     """
 
     scene: Scene
+    layout: Layout
     task: Task
     step: float
     time: float

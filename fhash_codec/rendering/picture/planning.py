@@ -18,6 +18,7 @@ from fhash_codec.rendering.colour.colours import parse_colour
 from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.colour.transfer_function import TransferFunction
 from fhash_codec.rendering.picture.explain import reasons
+from fhash_codec.rendering.picture.layout import lay_out, quantity_of
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.scene.scene import (
     AmbientOcclusion,
@@ -61,13 +62,16 @@ def plan_picture(
     _check(scene)
     step = _step_of(volume, scene)
     grid = Grid.of(volume.coords, scene.scale)
-    rays = Rays.of(scene.camera, grid, scene.size)
     function = _function(volume, scene, grid, histogram)
+    layout, rays = lay_out(
+        scene, grid, volume.coords, function.colours, quantity_of(volume.name, volume.units)
+    )
     lod, why_lod = _level(volume, scene, rays)
-    shadows, occlusion = _secondary_light(scene)
+    shadows, occlusion = _secondary_light(scene, grid)
     lamp = _lamp(rays, scene.effects.shading, shadows)
     units = Units.of(volume)
-    task = _task(scene, rays, function, units, lamp, lod)
+    noise = coding_noise(volume) * units.factor * grid.vertex_spacing / grid.series_spacing
+    task = _task(scene, rays, function, units, lamp, lod, noise)
     _check_ray_length(task)
     mode = _mode(scene.march)
     # Light comes from all of the volume, whether it is in view or not.
@@ -75,6 +79,7 @@ def plan_picture(
     lit = shadows is not None or occlusion is not None
     plan = Plan(
         scene=scene,
+        layout=layout,
         task=task,
         step=step,
         time=_time_of(volume, step),
@@ -158,9 +163,10 @@ def _function(
         return TransferFunction.of(
             spec,
             value_range=value_range,
-            spacing=grid.vertex_spacing,
+            spacing=grid.series_spacing,
             features=features,
             histogram=counted,
+            thinnest=grid.thinnest,
         )
 
     without = function_of(None)
@@ -203,11 +209,12 @@ def _level(volume: Volume, scene: Scene, rays: Rays) -> tuple[int, str]:
     )
 
 
-def _secondary_light(scene: Scene) -> tuple[Shadows | None, AmbientOcclusion | None]:
+def _secondary_light(scene: Scene, grid: Grid) -> tuple[Shadows | None, AmbientOcclusion | None]:
     """The shadows and the ambient occlusion of a scene, None where they would change nothing."""
     effects = scene.effects
-    if effects.maximum_intensity or scene.transfer_function.nothing:
-        # Only the volume takes light away, and only from what is drawn of it or in it.
+    if effects.maximum_intensity or scene.transfer_function.nothing or grid.flat:
+        # Only the volume takes light away, and only from what is drawn of it or in it. A plane is
+        # drawn in its colours.
         return None, None
     shadows, occlusion = effects.shadows, effects.ambient_occlusion
     return (
@@ -258,6 +265,7 @@ def _task(
     units: Units,
     lamp: Floats | None,
     lod: int,
+    noise: float,
 ) -> Task:
     """The task of a marcher, without the light that is computed from a frame."""
     effects, march = scene.effects, scene.march
@@ -269,7 +277,11 @@ def _task(
         threshold=march.threshold,
         table=table,
         lighting=None if shading is None else _lighting(shading, lamp),
-        shaded=effects.shading is not None and table is not None and not effects.maximum_intensity,
+        # The gradients of a plane lie in it: no light that falls on it would be scattered back.
+        shaded=effects.shading is not None
+        and table is not None
+        and not effects.maximum_intensity
+        and not rays.grid.flat,
         surfaces=_surfaces(effects, function, units),
         maximum=effects.maximum_intensity,
         depth="depth" in effects.buffers,
@@ -277,7 +289,21 @@ def _task(
         antialiasing=effects.antialiasing,
         jitter=effects.jitter,
         skipping=march.skipping,
+        noise=noise,
     )
+
+
+def coding_noise(volume: Volume) -> float:
+    """The difference of two neighbouring vertices that the errors of a bounded file can make.
+
+    Both vertices may be wrong by the largest error, in opposite directions. The noise is 0 for a
+    file without a bound: its errors are small where the values are smooth.
+    """
+    config = volume.container.header.get("config", {})
+    if config.get("max_error") is None and config.get("max_error_rel") is None:
+        return 0.0
+    largest = volume.container.header["quality"].get("max_abs_error")
+    return 0.0 if largest is None else 2 * float(largest)
 
 
 def _shading(effects: Effects) -> Shading | None:

@@ -21,6 +21,7 @@ __all__ = [
     "Effects",
     "Evolution",
     "Isosurface",
+    "LegendEntry",
     "Marching",
     "Scene",
     "Shading",
@@ -34,8 +35,9 @@ Point = tuple[float, float]
 
 MAX_SIDE = 16384
 """Most pixels along a side of an image."""
-VIEWS = ("iso", "xy", "xz", "yz", "yx", "zx", "zy")
-"""Names of the directions to look from, as in PyVista: `xy` has x to the right and y upwards."""
+VIEWS = ("auto", "iso", "xy", "xz", "yz", "yx", "zx", "zy")
+"""Names of the directions to look from, as in PyVista: `xy` has x to the right and y upwards.
+`auto` is `iso`, but from above for a volume with an axis of one vertex."""
 MARCHES = ("auto", "cache", "arm", "stream")
 """Names of the ways to march: through a decoded frame, or straight through the model."""
 DEVICES = ("auto", "cpu", "cuda")
@@ -54,7 +56,7 @@ class Camera(Record):
     `azimuth` and `elevation` turn the camera from there.
     """
 
-    view: str = limits("iso", "direction to look from", choices=VIEWS)
+    view: str = limits("auto", "direction to look from", choices=VIEWS)
     azimuth: float = limits(
         0.0, "degrees to turn about the upward direction", low=-36000, high=36000
     )
@@ -155,6 +157,14 @@ class Isosurface(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LegendEntry(Record):
+    """A colour and its meaning."""
+
+    text: str = limits(dataclasses.MISSING, "meaning of the colour")
+    colour: str = limits(dataclasses.MISSING, "'#rrggbb' or a name")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Effects(Record):
     """Effects of a picture: each is off unless it is named; `true` stands for its defaults."""
 
@@ -174,6 +184,7 @@ class Effects(Record):
     axes: bool = limits(False, "names and ends of the axes")
     colour_bar: bool = limits(False, "the colours and their values")
     time_label: bool = limits(False, "step and time")
+    legend: tuple[LegendEntry, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -39,7 +39,7 @@ class Phong:
             return None
         least, most = field.bricks.value_range
         low, high = (least, most) if task.table is None else (task.table.low, task.table.high)
-        span, floor = flatness(low, high, least, most)
+        span, floor = flatness(low, high, least, most, task.noise)
         return cls(
             arrays=arrays,
             lighting=lighting,

@@ -13,22 +13,25 @@ Floats = npt.NDArray[np.float64]
 
 FLATTEST = 1e-6
 """Gradient, as a share of the value range per vertex, at which shading has faded by half. The
-rounding of the values raises it.
+rounding of the values and the errors of the file raise it.
 """
 STEEPEST = 1e18
 """Largest gradient. The squares of larger ones overflow float32."""
 
 
-def flatness(low: float, high: float, least: float, most: float) -> tuple[float, float]:
+def flatness(
+    low: float, high: float, least: float, most: float, noise: float = 0.0
+) -> tuple[float, float]:
     """The range that gradients are shares of, and the gradient at which shading has faded by half.
 
     low, high: ends of the table, whose range it is.
     least, most: extreme values of the frame. Their rounding to float32 makes gradients of noise,
     which must not be lit.
+    noise: difference of two neighbouring vertices up to which it is taken for an error of coding.
     """
     span = max(high - low, (most - least) * 1e-15) or 1.0
-    noise = 4 * 2.0**-23 * max(abs(least), abs(most)) / span
-    return span, max(FLATTEST, min(noise, 1.0))
+    rounding = 4 * 2.0**-23 * max(abs(least), abs(most))
+    return span, max(FLATTEST, min(max(rounding, noise) / span, 1.0))
 
 
 def slope_scale(grid: Grid, span: float, least: float, most: float) -> Floats:

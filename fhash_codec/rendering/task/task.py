@@ -158,6 +158,7 @@ class Task:
         antialiasing: rays along a pixel's side.
         jitter: whether the first sample of each ray is shifted by a share of the ray's own.
         skipping: whether rays leap over invisible bricks.
+        noise: difference of two neighbouring vertices, in marched units, below which shading fades.
     """
 
     rays: Rays
@@ -174,6 +175,7 @@ class Task:
     antialiasing: int = 1
     jitter: bool = False
     skipping: bool = True
+    noise: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
