@@ -83,6 +83,7 @@ class Renderer:
         self.volume, self.memory, self.threads = volume, memory, threads
         self._frames: OrderedDict[Key, _DecodedFrame] = OrderedDict()
         self._histogram: Histogram | None = None
+        self._decoded_vertices = 0
         self._last_plan: tuple[Scene, Plan] | None = None
         self._background: ThreadPoolExecutor | None = None
         self._prefetch: tuple[Key, Future[_DecodedFrame]] | None = None
@@ -126,6 +127,7 @@ class Renderer:
             plan = self.plan(Scene() if scene is None else scene)
         # Networks are evaluated where rays sample them; light needs a frame all the same.
         frame_needed = plan.mode == "cache" or plan.lights or self.volume.profile == "compact"
+        self._decoded_vertices = 0
         decoded = self._frame(plan, progress) if frame_needed else None
         if upcoming is not None:
             self._start_prefetch(upcoming)
@@ -171,7 +173,10 @@ class Renderer:
             rgba=marched.rgba,
             depth=marched.depth,
             normal=marched.normal,
-            counters=complete(marched.counters, {"secondary_rays": secondary_rays}),
+            counters=complete(
+                marched.counters,
+                {"secondary_rays": secondary_rays, "decoded_vertices": self._decoded_vertices},
+            ),
             scene=plan.scene.to_dict(),
             source=volume.path.name,
             digest=volume.container.digest,
@@ -186,6 +191,7 @@ class Renderer:
             quantity=f"{volume.name}{units}",
             coords=volume.coords,
             label=label,
+            body=plan.task.body,
         )
         return replace(drawn, seconds=time.perf_counter() - begin)
 
@@ -200,6 +206,7 @@ class Renderer:
         if decoded is None or not decoded.covers(plan.region):
             decoded = _decode(self.volume, plan)
         progress("decoding", 1, 1, "")
+        self._decoded_vertices = decoded.frame.values.size
         self._keep(key, decoded)
         return decoded
 
@@ -264,6 +271,7 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
         shadows=plan.shadows,
         lamp=plan.lamp,
         ambient_occlusion=plan.occlusion,
+        body=plan.task.body,
     )
     progress("lighting", 1, 1, "")
     return replace(plan.task, light=light), light.secondary_rays

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from fhash_codec.rendering.camera.box import edges, outer_edges
 from fhash_codec.rendering.camera.camera import Rays
+from fhash_codec.rendering.camera.clip import Body
 from fhash_codec.rendering.colour.colours import ColourMap
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.picture.pen import Layer, Pen
@@ -31,6 +32,7 @@ def overlay(
     quantity: str,
     coords: Mapping[str, Coordinate],
     label: str = "",
+    body: Body | None = None,
 ) -> Image:
     """Draw box, axes, colour bar and time label, as far as the effects ask for them.
 
@@ -42,6 +44,7 @@ def overlay(
         quantity: name of the colour bar, with units.
         coords: of the axes.
         label: text of the time label.
+        body: what a clip leaves of the volume, whose edges are the box; None without one.
     """
     if not (effects.box or effects.axes or effects.colour_bar or effects.time_label):
         return image
@@ -50,7 +53,9 @@ def overlay(
     picture = image.rgba.copy()
     layers: list[Layer] = []
     if effects.box or effects.axes:
-        shown = edges(rays) if effects.box else outer_edges(rays)
+        shown = edges(rays, body) if effects.box else outer_edges(rays)
+        if body is not None and effects.box and effects.axes:
+            shown += outer_edges(rays)  # of all of the volume
         # The volume lies inside the box: an edge between two faces that look away lies behind all
         # of the volume, any other edge before all of it.
         _paint_behind(picture, pen.ink, pen.lines([edge for edge in shown if edge.fronts == 0]))

@@ -188,7 +188,13 @@ CASES = {
     "central": {"shaded": True, "antialiasing": 2},
     "jitter": {"jitter": True, "step": 1.7},
     "surfaces": {"shaded": True, "surfaces": (Surface(value=0.62, colour=WHITE, opacity=0.4),)},
-    "maximum": {"maximum": True, "depth": True},
+    "maximum": {"projection": "maximum", "depth": True},
+    "minimum": {"projection": "minimum", "depth": True},
+    "average": {"projection": "average", "depth": True, "extinctions": [1.0] * 100},
+    "attenuated": {"projection": "attenuated", "attenuation": 0.4, "depth": True},
+    "graded": {"shaded": True, "grading": GRADING},
+    "graded fog": {"grading": GRADING, "surfaces": (Surface(value=0.62, colour=WHITE, opacity=0.4),)},
+    "clipped": {"clip": CLIP},
     "narrow": {"extinctions": [0.0] * 50 + [1.0] * 3 + [0.0] * 50},
 }
 
