@@ -60,7 +60,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("animation",),
     ),
     "fhash_cli": (
-        ("options", "output", "selection"),
+        ("options", "output", "scene_types", "selection"),
         ("animation_options", "scene_options"),
         ("commands",),
         ("main",),

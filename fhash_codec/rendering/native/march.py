@@ -181,7 +181,13 @@ def _skipping(library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Brick
     distance = bricks.distance(task)
     # For the same reason no step may be longer than a cell. Rounding of places to float32 counts.
     by_cells = not (task.surfaces and task.step > 0.99 * shortest)
-    cells = cells_of(library, bricks, task, distance) if by_cells else None
+    cells = (
+        bricks.remembered(
+            ("cells", task.visibility), lambda: cells_of(library, bricks, task, distance)
+        )
+        if by_cells
+        else None
+    )
     if cells is None and np.count_nonzero(distance) < MIN_SKIPPED * distance.size:
         return _Skipping()
     return _Skipping(distance=distance, cells=cells)

@@ -26,8 +26,9 @@ class Beams:
     """The samples of many rays.
 
     Sample k of a ray lies at origin + k * pace, or at the nearest place to that at which the field
-    has values; where planes cut the box, none lies behind the place where its ray leaves. Places between samples have fractions of k. All attributes but `step` are arrays of
-    `arrays`, float64 unless said otherwise.
+    has values; where planes cut the box, none lies behind the place where its ray leaves. Places
+    between samples have fractions of k. All attributes but `step` and `cut` are arrays of `arrays`,
+    float64 unless said otherwise.
 
     Attributes:
         origin: (n, 3), place of sample 0, x, y, z in vertices of the domain.

@@ -210,6 +210,14 @@ class Task:
         return np.empty((0, 4)) if self.body is None else self.body.planes
 
     @property
+    def visibility(self) -> tuple[object, ...]:
+        """All that decides which values can be seen, as a key: table and values of surfaces."""
+        surfaces = tuple(surface.value for surface in self.surfaces)
+        if self.table is None:
+            return surfaces
+        return self.table.low, self.table.high, self.table.extinctions.tobytes(), *surfaces
+
+    @property
     def marched(self) -> Task:
         """The task with the table that samples take: that of the projection, if there is one.
 

@@ -194,7 +194,9 @@ NETWORK_SCENES: dict[str, dict[str, Any]] = {
     "average": {"effects": {"average_intensity": True}},
     "attenuated": {"effects": {"attenuated_maximum_intensity": True}},
     "graded": {"transfer_function": {"gradient_opacity": [[0, 0], [0.2, 1]]}},
-    "clipped": {"effects": {"clip": {"x": [4.3, 20], "planes": [{"normal": [0, 1, 1], "offset": 20}]}}},
+    "clipped": {
+        "effects": {"clip": {"x": [4.3, 20], "planes": [{"normal": [0, 1, 1], "offset": 20}]}}
+    },
     "central": CENTRAL,
     "unskipped": {"march": {"skipping": False}},
 }
