@@ -83,7 +83,6 @@ class Renderer:
         self.volume, self.memory, self.threads = volume, memory, threads
         self._frames: OrderedDict[Key, _DecodedFrame] = OrderedDict()
         self._histogram: Histogram | None = None
-        self._decoded_vertices = 0
         self._last_plan: tuple[Scene, Plan] | None = None
         self._background: ThreadPoolExecutor | None = None
         self._prefetch: tuple[Key, Future[_DecodedFrame]] | None = None
@@ -127,13 +126,16 @@ class Renderer:
             plan = self.plan(Scene() if scene is None else scene)
         # Networks are evaluated where rays sample them; light needs a frame all the same.
         frame_needed = plan.mode == "cache" or plan.lights or self.volume.profile == "compact"
-        self._decoded_vertices = 0
         decoded = self._frame(plan, progress) if frame_needed else None
         if upcoming is not None:
             self._start_prefetch(upcoming)
         task, secondary_rays = _lit(plan, decoded, progress)
         marched = self._march(plan, task, decoded, progress)
-        return self._finish(plan, marched, secondary_rays, begin)
+        more = {
+            "secondary_rays": secondary_rays,
+            "decoded_vertices": 0 if decoded is None else decoded.frame.values.size,
+        }
+        return self._finish(plan, marched, more, begin)
 
     def histogram(self) -> Histogram:
         """Count the values of the series: its first, middle and last step, coarse if possible."""
@@ -166,17 +168,17 @@ class Renderer:
             progress=progress,
         )
 
-    def _finish(self, plan: Plan, marched: Marched, secondary_rays: int, begin: float) -> Image:
-        """Make a picture of what was marched, with its overlay; `begin` is when rendering began."""
+    def _finish(self, plan: Plan, marched: Marched, more: dict[str, int], begin: float) -> Image:
+        """Make a picture of what was marched, with its overlay.
+
+        more: counters of what came before the march. begin: when rendering began.
+        """
         volume = self.volume
         image = Image(
             rgba=marched.rgba,
             depth=marched.depth,
             normal=marched.normal,
-            counters=complete(
-                marched.counters,
-                {"secondary_rays": secondary_rays, "decoded_vertices": self._decoded_vertices},
-            ),
+            counters=complete(marched.counters, more),
             scene=plan.scene.to_dict(),
             source=volume.path.name,
             digest=volume.container.digest,
@@ -206,7 +208,6 @@ class Renderer:
         if decoded is None or not decoded.covers(plan.region):
             decoded = _decode(self.volume, plan)
         progress("decoding", 1, 1, "")
-        self._decoded_vertices = decoded.frame.values.size
         self._keep(key, decoded)
         return decoded
 
