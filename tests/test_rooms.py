@@ -61,7 +61,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "fhash_cli": (
         ("progress_bar",),
-        ("base_command", "options", "output", "selection"),
+        ("base_command", "options", "output", "scene_types", "selection"),
         ("animation_options", "gallery", "scene_options"),
         ("commands",),
         ("main",),

@@ -33,6 +33,7 @@ class AnimationOptions:
     frames: int | None
     fps: float | None
     pictures: str | None
+    processes: int | None
     evolution: slice | None
     columns: int | None
     track: tuple[str, ...]
@@ -44,6 +45,7 @@ class AnimationOptions:
             ("--frames", self.frames),
             ("--fps", self.fps),
             ("--pictures", self.pictures),
+            ("--processes", self.processes),
         ):
             if given is not None and self.animate is None:
                 raise click.UsageError(f"{name} is of an animation: give --animate too")
@@ -84,7 +86,7 @@ def add_animation_options(command: Command) -> Command:
     @click.option(
         "--animate",
         metavar="SPEC",
-        help="steps[=A:B], time[=A:B], orbit[=DEGREES], separated by commas,"
+        help="steps[=A:B[:EVERY]], time[=A:B[:EVERY]], orbit[=DEGREES], separated by commas,"
         " or a file (TOML, JSON).",
     )
     @click.option(
@@ -98,6 +100,12 @@ def add_animation_options(command: Command) -> Command:
         metavar="NAME.png",
         type=click.Path(),
         help="Keep the pictures of a film too: NAME.0000.png and so on.",
+    )
+    @click.option(
+        "--processes",
+        type=click.IntRange(1, 256),
+        metavar="N",
+        help="Processes that render at a time; the files are the same.  [default: 1]",
     )
     @click.option(
         "--evolution",
@@ -187,6 +195,7 @@ def _animate(
             pictures=options.pictures,
             force=force,
             progress=progress,
+            processes=options.processes or 1,
         )
     except OutputExistsError as error:
         # Only the command line is wrong so far: exit code 2.

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.options import Command
+from fhash_cli.options import Command, IntervalsType
+from fhash_cli.scene_types import NumbersType, OpacityType, PlaneType, SizeType
 from fhash_cli.selection import time_of
 from fhash_formats.errors import InputError
 
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
     from fhash_codec.rendering.scene.scene import Scene
 
 __all__ = ["SceneOptions", "scene_options"]
-
-NUMBERS = {2: "A,B", 3: "X,Y,Z"}
-"""Placeholders of options that take so many numbers."""
 
 PLACES = {
     "time": "time",
@@ -50,67 +48,12 @@ PLACES = {
     "device": "march.device",
     "samples_per_pass": "march.samples_per_pass",
     "antialiasing": "effects.antialiasing",
+    "gradient_opacity": "transfer_function.gradient_opacity",
+    "attenuation": "effects.attenuated_maximum_intensity.attenuation",
+    "clip_box": "effects.clip",
+    "clip_planes": "effects.clip.planes",
 }
 """Places of a scene that an option sets, by the name of the option's parameter."""
-
-
-class NumbersType(click.ParamType[tuple[float, ...]]):
-    """A fixed count of numbers with commas between them."""
-
-    def __init__(self, count: int) -> None:
-        self.count, self.name = count, NUMBERS[count]
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[float, ...]:
-        """The numbers; the scene checks later whether their values are allowed."""
-        try:
-            numbers = tuple(float(part) for part in str(value).split(","))
-        except ValueError:
-            numbers = ()
-        if len(numbers) != self.count:
-            self.fail(
-                f"'{value}' is not {self.count} numbers with commas between them,"
-                f" such as {','.join('123'[: self.count])}",
-                param,
-                ctx,
-            )
-        return numbers
-
-
-class SizeType(click.ParamType[tuple[int, int]]):
-    """Pixels across and down, WxH, or one number for both."""
-
-    name = "WxH"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        """The two numbers."""
-        try:
-            across, _, down = str(value).lower().partition("x")
-            return int(across), int(down or across)
-        except ValueError:
-            self.fail(f"'{value}' is not a size in pixels such as 800x600", param, ctx)
-
-
-class OpacityType(click.ParamType[Any]):
-    """The name of an opacity preset, or points VALUE:OPACITY with commas between them."""
-
-    name = "NAME|V:O,..."
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The name, or a list of points."""
-        if ":" not in str(value):
-            return value
-        try:
-            return [[float(end) for end in part.split(":")] for part in str(value).split(",")]
-        except ValueError:
-            self.fail(
-                f"'{value}' is neither the name of an opacity nor points such as 0:0,1.5:0.2,2:0",
-                param,
-                ctx,
-            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,8 +162,34 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         "effects",
         metavar="NAME",
         multiple=True,
-        help="shading, shadows, ambient-occlusion, maximum-intensity, jitter, box, axes, colour-bar"
-        " or time-label; may be repeated.",
+        help="shading, shadows, ambient-occlusion, maximum-intensity, minimum-intensity,"
+        " average-intensity, attenuated-maximum-intensity, jitter, box, axes, colour-bar or"
+        " time-label; may be repeated.",
+    ),
+    click.option(
+        "--gradient-opacity",
+        type=OpacityType(named=False),
+        help="Points GRADIENT:FACTOR that opacity is multiplied by; gradients are shares of the"
+        " value range from vertex to vertex.",
+    ),
+    click.option(
+        "--attenuation",
+        type=float,
+        metavar="X",
+        help="Attenuated maximum intensity, by so much in a vertex spacing.",
+    ),
+    click.option(
+        "--clip-box",
+        type=IntervalsType(float),
+        help="Show only this part, in coordinates; an end may be left out.",
+    ),
+    click.option(
+        "--clip-plane",
+        "clip_planes",
+        type=PlaneType(),
+        multiple=True,
+        help="Show only what lies on the side of the normal, where it times the place is at least D"
+        " (or X,Y,Z,NX,NY,NZ); may be repeated.",
     ),
     click.option(
         "--isosurface",
@@ -270,8 +239,10 @@ def scene_options(command: Command) -> Command:
         given = {
             place: value
             for name, place in PLACES.items()
-            if (value := values.pop(name)) is not None
+            if (value := values.pop(name)) not in (None, ())
         }
+        if (box := given.get("effects.clip")) is not None:
+            given["effects.clip"] = _clip(box)
         buffers = [name for name in ("depth", "normal") if values.pop(name)]
         if buffers:
             given["effects.buffers"] = buffers
@@ -318,7 +289,7 @@ def _effect(name: str) -> str:
     names = [
         field.name
         for field in dataclasses.fields(Effects)
-        if field.name not in ("isosurfaces", "buffers", "antialiasing", "legend")
+        if field.name not in ("isosurfaces", "buffers", "antialiasing", "clip", "legend")
     ]
     plain = name.replace("-", "_").replace("color", "colour")
     if plain not in names:
@@ -329,6 +300,12 @@ def _effect(name: str) -> str:
             f" Known: {allowed}"
         )
     return plain
+
+
+def _clip(box: tuple[tuple[float | None, ...], ...]) -> dict[str, Any]:
+    """The settings of a Clip by the ends along z, y and x; axes without an end are left out."""
+    ends = {name: list(pair) for name, pair in zip("zyx", box, strict=True)}
+    return {name: pair for name, pair in ends.items() if pair != [None, None]}
 
 
 def _isosurface(text: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
 
-ABI_VERSION = 1
+ABI_VERSION = 2
 """Number that `fhash_codec_abi_version()` must return; it equals `FHASH_CODEC_ABI` in codec.cpp."""
 
 _KINDS = ("f32", "f64")
@@ -30,7 +30,8 @@ PROTOTYPES: Prototypes = {
     "fhash_march": (ARRAY, INTEGER, INTEGER, INTEGER, ARRAY),
     # march_bricks.cpp
     "fhash_march_bricks": (*(ARRAY,) * 3, *(INTEGER,) * 3, *(ARRAY,) * 3),
-    "fhash_march_distance": (ARRAY, ARRAY),
+    "fhash_march_distance_layers": (ARRAY, ARRAY, INTEGER, INTEGER, ARRAY),
+    "fhash_march_distance_rows": (ARRAY, ARRAY, INTEGER, INTEGER, ARRAY),
     "fhash_march_cells": (*(ARRAY,) * 4, INTEGER, ARRAY, INTEGER, INTEGER, ARRAY),
     # march_light.cpp
     "fhash_march_extinction": (

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <limits>
 
 #include "core.hpp"
@@ -11,6 +12,8 @@
 constexpr int FHASH_SURFACES = 64;  // surfaces of a picture, at most
 constexpr int FHASH_POWERS = 1024;  // intervals of the table of highlights
 constexpr int FHASH_BRICK = 4;      // cells along a brick's side
+constexpr int FHASH_PLANES = 6;     // planes that clip a picture, at most
+constexpr int FHASH_GRADES = 1024;  // intervals of the table of factors by gradient
 
 // Mirrored field by field in fhash_codec/rendering/native/structure.py. All places and directions
 // are in vertices of the frame, x, y, z.
@@ -34,7 +37,7 @@ extern "C" struct FhashMarch {
     double light_offset[3], light_scale;  // a place is at place * scale + offset in the light grid
     // The rays.
     double eye[3], right[3], up[3], forward[3];
-    double box[3][2];        // the drawn box, in which steps are counted
+    double box[3][2];        // the drawn box as it is clipped, in which steps are counted
     double seen[3][2];       // the part of the box in which the frame has values
     double spacing[3];       // length of one vertex spacing; negative on a descending axis
     std::int64_t width, height, parallel;
@@ -58,6 +61,14 @@ extern "C" struct FhashMarch {
     float* normal;           // (height, width, 3) or null
     std::int64_t central;    // whether the gradients of shading are central differences
     std::int64_t path;       // instructions: 0 the processor's, 1 at most AVX2, 2 the baseline
+    // Planes that clip the box: a place is kept where their first three numbers times the place
+    // are at least the fourth.
+    std::int64_t planes;
+    double plane[FHASH_PLANES][4];
+    // Opacity by gradient.
+    const float* grading;    // (FHASH_GRADES + 2,): factors of the extinction by gradient; or null
+    double grade_scale;      // entries of that table to a gradient of shading of 1
+    std::int64_t unlit;      // whether gradients are for opacity alone, and the volume is not shaded
 };
 
 struct FhashCell {

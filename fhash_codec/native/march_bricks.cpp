@@ -68,20 +68,24 @@ FHASH_CLONES void visible_cells(const float* values, const float* limits, int64_
     for (int i = 0; i < PLACES; i++) seen[i] = most[i] | most[i + 1] | most[i + 2] | most[i + 3];
 }
 
-// The least distance among the 13 neighbours of a brick that come before it in a sweep, or `least`.
-// way: -1 for the sweep from the first brick, 1 for that from the last.
-int32_t nearest_before(const int64_t* shape, const int32_t* distance, int64_t z, int64_t y,
-                       int64_t x, int64_t way, int32_t least) {
-    const int64_t nz = shape[0], ny = shape[1], nx = shape[2];
-    for (int n = 0; n < 13; n++) {  // 9 in the layer before, 3 in the row before, 1 in this row
-        const int64_t dz = n < 9 ? way : 0;
-        const int64_t dy = n < 9 ? n / 3 - 1 : n < 12 ? way : 0;
-        const int64_t dx = n < 9 ? n % 3 - 1 : n < 12 ? n - 10 : way;
-        const int64_t c = z + dz, r = y + dy, i = x + dx;
-        if (c < 0 || c >= nz || r < 0 || r >= ny || i < 0 || i >= nx) continue;
-        least = min(least, distance[(c * ny + r) * nx + i]);
+// The least number, over all lines at most r away, of the larger of r and the line's number there:
+// the chessboard distance along one more axis. lines: `count` of them, `stride` apart, of `length`
+// numbers. out: of line `at`.
+void spread(const int32_t* lines, int64_t count, int64_t stride, int64_t length, int64_t at,
+            int32_t* FHASH_RESTRICT out) {
+    std::memcpy(out, lines + at * stride, (size_t)length * sizeof(int32_t));
+    for (int64_t r = 1; r < count; r++) {
+        int32_t most = 0;
+        for (int64_t i = 0; i < length; i++) most = max(most, out[i]);
+        if (most <= r) return;
+        const int64_t sides[] = {at - r, at + r};
+        for (const int64_t side : sides) {
+            if (side < 0 || side >= count) continue;
+            const int32_t* const line = lines + side * stride;
+            for (int64_t i = 0; i < length; i++)
+                out[i] = min(out[i], max((int32_t)r, line[i]));
+        }
     }
-    return least;
 }
 
 // The number of bits that are set.
@@ -120,21 +124,34 @@ FHASH_EXPORT int64_t fhash_march_bricks(const float* values, const int64_t* shap
     return 0;
 }
 
-// The chessboard distance (z, y, x) to the nearest 0, by two sweeps, each from the neighbours that
-// come before in it. On entry every number is 0 or larger than any distance.
-FHASH_EXPORT int64_t fhash_march_distance(const int64_t* shape, int32_t* distance) {
+// The chessboard distance (z, y, x) to the nearest 0 is found along x and y in layers, and then
+// along z in rows of every layer. On entry every number is 0 or larger than any distance.
+// first, stop: layers. lines: a layer of scratch.
+FHASH_EXPORT int64_t fhash_march_distance_layers(const int64_t* shape, int32_t* distance,
+                                                 int64_t first, int64_t stop, int32_t* lines) {
+    const int64_t ny = shape[1], nx = shape[2];
+    for (int64_t z = first; z < stop; z++) {
+        int32_t* const layer = distance + z * ny * nx;
+        for (int64_t y = 0; y < ny; y++) {
+            int32_t* const row = layer + y * nx;
+            for (int64_t x = 1; x < nx; x++) row[x] = min(row[x], row[x - 1] + 1);
+            for (int64_t x = nx - 2; x >= 0; x--) row[x] = min(row[x], row[x + 1] + 1);
+        }
+        std::copy_n(layer, ny * nx, lines);
+        for (int64_t y = 0; y < ny; y++) spread(lines, ny, nx, nx, y, layer + y * nx);
+    }
+    return 0;
+}
+
+// The same along z, after all layers. first, stop: rows along y. lines: nz rows of scratch.
+FHASH_EXPORT int64_t fhash_march_distance_rows(const int64_t* shape, int32_t* distance,
+                                               int64_t first, int64_t stop, int32_t* lines) {
     const int64_t nz = shape[0], ny = shape[1], nx = shape[2];
-    for (int turn = 0; turn < 2; turn++) {
-        const int64_t way = turn ? 1 : -1;
-        for (int64_t zz = 0; zz < nz; zz++)
-            for (int64_t yy = 0; yy < ny; yy++)
-                for (int64_t xx = 0; xx < nx; xx++) {
-                    const int64_t z = turn ? nz - 1 - zz : zz, y = turn ? ny - 1 - yy : yy;
-                    const int64_t x = turn ? nx - 1 - xx : xx;
-                    int32_t& here = distance[(z * ny + y) * nx + x];
-                    if (here == 0) continue;
-                    here = nearest_before(shape, distance, z, y, x, way, here - 1) + 1;
-                }
+    for (int64_t y = first; y < stop; y++) {
+        for (int64_t z = 0; z < nz; z++)
+            std::copy_n(distance + (z * ny + y) * nx, nx, lines + z * nx);
+        for (int64_t z = 0; z < nz; z++)
+            spread(lines, nz, nx, nx, z, distance + (z * ny + y) * nx);
     }
     return 0;
 }

@@ -32,6 +32,11 @@ constexpr int LIT = 2;       // by what a light grid leaves of the light
 constexpr int MAXIMUM = 4;   // the largest value along each ray, instead of the volume
 constexpr int CENTRAL = 8;   // shaded by central differences
 constexpr int WIDE = 16;     // sampled by AVX-512, in frames of two columns or more
+constexpr int MINIMUM = 32;  // with MAXIMUM: of the values times -1
+constexpr int AVERAGE = 64;  // the mean along each ray, instead of the volume
+constexpr int ATTENUATED = 128;  // the largest value along each ray after what lies before it
+constexpr int GRADED = 256;      // with SHADED: the gradients decide on the opacity, too
+constexpr int PROJECTED = MAXIMUM | AVERAGE | ATTENUATED;
 
 const double ENDLESS = std::numeric_limits<double>::infinity();
 const float NONE = std::numeric_limits<float>::quiet_NaN();
@@ -39,6 +44,10 @@ const float FAR = std::numeric_limits<float>::infinity();
 
 struct Counters {
     int64_t rays = 0, passes = 0, samples = 0, gradients = 0, skips = 0;
+    void add_to(int64_t* counters) const {
+        const int64_t all[] = {rays, passes, samples, gradients, skips};
+        for (int n = 0; n < 5; n++) counters[n] += all[n];
+    }
 };
 
 // What the samples of a pass show.
@@ -66,10 +75,12 @@ FHASH_INLINE double opacity_of_share(double opacity, double share) {
 struct Phong {
     float ambient, diffuse, specular, steep;
     float floor;  // the square of that of the march
+    int unlit;
     const float* powers;
     explicit Phong(const FhashMarch& m)
         : ambient((float)m.ambient), diffuse((float)m.diffuse), specular((float)m.specular),
-          steep((float)m.steep), floor((float)(m.floor * m.floor)), powers(m.powers) {}
+          steep((float)m.steep), floor((float)(m.floor * m.floor)), unlit(m.unlit != 0),
+          powers(m.powers) {}
 };
 
 struct Lines;
@@ -97,6 +108,7 @@ template <int FLAGS> struct Packet {
     alignas(64) float at[N];                // entries of the table
     alignas(64) float value[N], alpha[N];
     alignas(64) float px[N], py[N], pz[N];  // places
+    alignas(64) float farthest[N];          // sample behind which none is taken, with planes
     alignas(64) float best[N];              // largest value so far
     alignas(64) float cr[N], cg[N], cb[N];  // colours, where WIDE
     // Numbers of samples.
@@ -114,11 +126,18 @@ template <int FLAGS> struct Packet {
     alignas(64) double from[N];                // place of `previous`, in samples
     alignas(64) double o[3][N], d[3][N], normal[3][N];
 
-    const bool whole;  // whether the frame has values in all of the drawn box
+    float low[3], high[3];  // the part of the frame that is seen, in which all samples lie
+    const bool whole;       // whether the frame has values in all of the drawn box
 
     explicit Packet(const FhashMarch& given)
         : m(given), phong(given),
-          whole(std::equal(&m.box[0][0], &m.box[0][0] + 6, &m.seen[0][0])) {}
+          whole(std::equal(&m.box[0][0], &m.box[0][0] + 6, &m.seen[0][0])) {
+        for (int c = 0; c < 3; c++) {
+            const double most = (double)m.shape[2 - c] - 1;
+            low[c] = (float)clamp(m.seen[c][0], 0.0, most);
+            high[c] = (float)clamp(m.seen[c][1], (double)low[c], most);
+        }
+    }
 
     // march_rays.hpp
     FHASH_INLINE int aim(int64_t x, int64_t y, int64_t ray);
@@ -148,19 +167,30 @@ template <int FLAGS> struct Packet {
     void cross(int l, double to, double now, Counters& counted);
     void surfaces(Counters& counted);
     void finish(Counters& counted);
-    // march.cpp
-    FHASH_INLINE int alive();
+    // march_projections.hpp
     FHASH_INLINE void keep_lost_maximum();
-    FHASH_INLINE void show_maximum(Counters& counted);
+    FHASH_INLINE void project();
+    FHASH_INLINE void end_attenuated();
+    FHASH_INLINE void show_value(int l, double entry, Counters& counted);
+    FHASH_INLINE void show_projection(Counters& counted);
+    // march_grading.hpp
+    FHASH_INLINE void grade(Counters& counted);
+    // march_draw.hpp
+    FHASH_INLINE int alive();
     FHASH_INLINE void show(Seen seen, Counters& counted);
     FHASH_INLINE void composite(Counters& counted);
     FHASH_INLINE void end_rays(float stop);
     FHASH_INLINE void march(Counters& counted);
     FHASH_INLINE void write(int64_t x, int64_t y);
 
+    // The place of a sample along an axis, in the part that is seen.
+    double place_of(int l, int c, double sample) const {
+        const double at = min(sample, (double)farthest[l]);
+        return clamp(o[c][l] + at * d[c][l], (double)low[c], (double)high[c]);
+    }
     FhashCell cell(int l, double sample) const {
-        return fhash_cell_at(m, o[0][l] + sample * d[0][l], o[1][l] + sample * d[1][l],
-                             o[2][l] + sample * d[2][l]);
+        return fhash_cell_at(m, place_of(l, 0, sample), place_of(l, 1, sample),
+                             place_of(l, 2, sample));
     }
     // The cell in which a ray enters or leaves, its place snapped onto the faces. Otherwise
     // rounding decides whether a ray meets a surface that coincides with a face.

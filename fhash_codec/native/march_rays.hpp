@@ -26,6 +26,15 @@ FHASH_INLINE void slab(const double (&faces)[2], double eye, double direction, d
     leave = min(leave, far);
 }
 
+// Narrow the part of a ray to that on one side of a plane.
+FHASH_INLINE void half_space(double distance, double approach, double& enter, double& leave) {
+    // distance: from the eye to the plane, along its normal. approach: by a unit of the ray.
+    const double at = distance / approach;
+    const double behind = distance > 0 ? ENDLESS : -ENDLESS;  // where the ray does not approach
+    enter = max(enter, approach > 0 ? at : approach < 0 ? -ENDLESS : behind);
+    leave = min(leave, approach < 0 ? at : ENDLESS);
+}
+
 // Aim at the pixels x to x + SIDE, y to y + SIDE, by the ray of this number in each. Returns how
 // many rays meet the part of the box in which the frame has values.
 template <int FLAGS> FHASH_INLINE int Packet<FLAGS>::aim(int64_t x, int64_t y, int64_t ray) {
@@ -94,6 +103,18 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::cut(Lines& lines) {
         for (int l = 0; l < N; l++)
             slab(m.seen[c], eye[l], direction[l], lines.first[l], lines.stop[l]);
     }
+    for (int64_t p = 0; p < m.planes; p++) {
+        const double(&plane)[4] = m.plane[p];
+        #pragma omp simd
+        for (int l = 0; l < N; l++) {
+            double distance = plane[3], approach = 0;
+            for (int c = 0; c < 3; c++) {
+                distance -= plane[c] * lines.eye[c][l];
+                approach += plane[c] * lines.direction[c][l];
+            }
+            half_space(distance, approach, lines.enter[l], lines.leave[l]);
+        }
+    }
 }
 
 // The samples of rays in the drawn box. Returns how many rays have one.
@@ -119,6 +140,8 @@ FHASH_INLINE int Packet<FLAGS>::count_samples(Lines& lines, int left_most, int t
         count[l] = hit && column < width && row < height ? (int)most : 0;
         entered[l] = from[l] = hit ? -share : 0;
         leaving[l] = hit ? steps - share : 0;
+        // The last sample may lie behind a plane: then it is where the ray leaves.
+        farthest[l] = m.planes > 0 && hit ? (float)(steps - share) : FAR;
         lines.share[l] = share;
         begin[l] = enter + share * m.step;
         met += count[l] > 0;
@@ -183,7 +206,7 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::reset() {
         r[l] = g[l] = b[l] = a[l] = 0;
         left[l] = 1;
         depth[l] = FAR;
-        best[l] = -FAR;
+        best[l] = FLAGS & ATTENUATED ? 0.f : -FAR;
         where[l] = quitting[l] = 0;
         previous[l] = NONE;
     }

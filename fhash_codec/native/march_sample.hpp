@@ -12,19 +12,20 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::sample(Counters& counted, 
     const float* const v = m.values;
     const float* const table = m.table;
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
-    const float mx = (float)(lx - 1), my = (float)(ly - 1), mz = (float)(lz - 1);
+    const float mx = high[0], my = high[1], mz = high[2];
+    const float nx = low[0], ny = low[1], nz = low[2];
     const float top = (float)(m.entries - 1);
     const int cx = max(lx - 2, 0), cy = max(ly - 2, 0), cz = max(lz - 2, 0);
     const int sx = lx > 1, sy = ly > 1 ? lx : 0, sz = lz > 1 ? lx * ly : 0;
-    const float low = (float)m.low, scale = (float)m.scale;
+    const float least = (float)m.low, scale = (float)m.scale;
     const float wx = (float)m.gradient[0], wy = (float)m.gradient[1], wz = (float)m.gradient[2];
     int samples = 0, some = 0, end = 0, none = 0;
     #pragma omp simd reduction(+ : samples) reduction(| : some, end, none)
     for (int l = 0; l < N; l++) {
-        const float f = (float)k[l];
-        const float x = clamp(ox[l] + f * dx[l], 0.f, mx);
-        const float y = clamp(oy[l] + f * dy[l], 0.f, my);
-        const float z = clamp(oz[l] + f * dz[l], 0.f, mz);
+        const float f = min((float)k[l], farthest[l]);
+        const float x = clamp(ox[l] + f * dx[l], nx, mx);
+        const float y = clamp(oy[l] + f * dy[l], ny, my);
+        const float z = clamp(oz[l] + f * dz[l], nz, mz);
         const int i = min((int)x, cx), j = min((int)y, cy), h = min((int)z, cz);
         const float fx = x - i, fy = y - j, fz = z - h;
         const int q = (h * ly + j) * lx + i;
@@ -38,12 +39,13 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::sample(Counters& counted, 
         const int known = here == here;
         value[l] = here;
         if (FLAGS & MAXIMUM) {
-            const int better = on[l] & (here > best[l]);
-            best[l] = better ? here : best[l];
+            const float ranked = FLAGS & MINIMUM ? -here : here;
+            const int better = on[l] & (ranked > best[l]);
+            best[l] = better ? ranked : best[l];
             where[l] = better ? k[l] : where[l];
         } else {
             // NaN becomes an entry whose opacity is not taken.
-            const float e = clamp((here - low) * scale, 0.f, top);
+            const float e = clamp((here - least) * scale, 0.f, top);
             const int t = (int)e;
             const float one = table[4 * t + 3], other = table[4 * t + 7];
             const float opacity = one + (e - t) * (other - one);

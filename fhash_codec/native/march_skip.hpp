@@ -25,10 +25,10 @@ struct Spot {
 
 template <int FLAGS>
 FHASH_INLINE Spot spot_of(const Packet<FLAGS>& p, int l, int lx, int ly, int lz, int bx, int by) {
-    const float f = (float)p.k[l], bricks = 1.f / FHASH_BRICK;
-    const int i = min((int)clamp(p.ox[l] + f * p.dx[l], 0.f, (float)(lx - 1)), max(lx - 2, 0));
-    const int j = min((int)clamp(p.oy[l] + f * p.dy[l], 0.f, (float)(ly - 1)), max(ly - 2, 0));
-    const int h = min((int)clamp(p.oz[l] + f * p.dz[l], 0.f, (float)(lz - 1)), max(lz - 2, 0));
+    const float f = min((float)p.k[l], p.farthest[l]), bricks = 1.f / FHASH_BRICK;
+    const int i = min((int)clamp(p.ox[l] + f * p.dx[l], p.low[0], p.high[0]), max(lx - 2, 0));
+    const int j = min((int)clamp(p.oy[l] + f * p.dy[l], p.low[1], p.high[1]), max(ly - 2, 0));
+    const int h = min((int)clamp(p.oz[l] + f * p.dz[l], p.low[2], p.high[2]), max(lz - 2, 0));
     const int jx = (int)((float)i * bricks), jy = (int)((float)j * bricks);
     const int jz = (int)((float)h * bricks);
     return {i, j, h, jx, jy, jz, (jz * by + jy) * bx + jx};
@@ -126,7 +126,7 @@ template <int FLAGS> bool Packet<FLAGS>::visible(int l, double sample) const {
     int at[3];
     for (int c = 0; c < 3; c++) {
         const double most = (double)m.shape[2 - c] - 1;
-        const double place = clamp(o[c][l] + sample * d[c][l], 0.0, most);
+        const double place = place_of(l, c, sample);
         at[c] = min((int)place, max((int)most - 1, 0));
     }
     const int64_t side = FHASH_BRICK, row = at[2] / side * m.bricks[1] + at[1] / side;

@@ -18,11 +18,12 @@ FHASH_WIDE __m512 between(__m512 a, __m512 b, __m512 share) {
     return _mm512_fmadd_ps(share, _mm512_sub_ps(b, a), a);
 }
 
-// A place along an axis, clamped to 0..most; what is not a number becomes 0.
-FHASH_WIDE __m512 place(const float* origin, const float* step, __m512 sample, __m512 most) {
+// A place along an axis, clamped to least..most; what is not a number becomes `least`.
+FHASH_WIDE __m512 place(const float* origin, const float* step, __m512 sample, float least,
+                        float most) {
     const __m512 way = _mm512_mul_ps(sample, _mm512_load_ps(step));
     const __m512 at = _mm512_add_ps(_mm512_load_ps(origin), way);
-    return _mm512_min_ps(_mm512_max_ps(at, _mm512_setzero_ps()), most);
+    return _mm512_min_ps(_mm512_max_ps(at, _mm512_set1_ps(least)), _mm512_set1_ps(most));
 }
 
 // The samples at which rays leave a span along an axis. It ends `across` behind `first`, for rays
@@ -75,15 +76,16 @@ template <int FLAGS> FHASH_WIDE Spots spots_of(const Packet<FLAGS>& p, __m512i k
     const FhashMarch& m = p.m;
     const int bx = (int)m.bricks[2], by = (int)m.bricks[1];
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
-    const __m512 mx = _mm512_set1_ps((float)(lx - 1)), my = _mm512_set1_ps((float)(ly - 1));
-    const __m512 mz = _mm512_set1_ps((float)(lz - 1));
     const __m512i cx = _mm512_set1_epi32(lx - 2), cy = _mm512_set1_epi32(max(ly - 2, 0));
     const __m512i cz = _mm512_set1_epi32(max(lz - 2, 0));
-    const __m512 f = _mm512_cvtepi32_ps(k);
+    const __m512 f = _mm512_min_ps(_mm512_cvtepi32_ps(k), _mm512_load_ps(p.farthest));
+    const __m512 x = place(p.ox, p.dx, f, p.low[0], p.high[0]);
+    const __m512 y = place(p.oy, p.dy, f, p.low[1], p.high[1]);
+    const __m512 z = place(p.oz, p.dz, f, p.low[2], p.high[2]);
     Spots at;
-    at.i = _mm512_min_epi32(_mm512_cvttps_epi32(place(p.ox, p.dx, f, mx)), cx);
-    at.j = _mm512_min_epi32(_mm512_cvttps_epi32(place(p.oy, p.dy, f, my)), cy);
-    at.h = _mm512_min_epi32(_mm512_cvttps_epi32(place(p.oz, p.dz, f, mz)), cz);
+    at.i = _mm512_min_epi32(_mm512_cvttps_epi32(x), cx);
+    at.j = _mm512_min_epi32(_mm512_cvttps_epi32(y), cy);
+    at.h = _mm512_min_epi32(_mm512_cvttps_epi32(z), cz);
     at.jx = _mm512_srai_epi32(at.i, 2);
     at.jy = _mm512_srai_epi32(at.j, 2);
     at.jz = _mm512_srai_epi32(at.h, 2);
@@ -218,15 +220,14 @@ template <int FLAGS>
 FHASH_AVX512 __attribute__((noinline)) void sample_wide(Packet<FLAGS>& p, Counters& counted,
                                                         Seen& seen) {
     const FhashMarch& m = p.m;
-    const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
     const __m512 zero = _mm512_setzero_ps();
     const __m512i k = _mm512_load_si512(p.k);
     const __m512i taking = _mm512_load_si512(p.on);
     const __mmask16 on = _mm512_test_epi32_mask(taking, taking);
-    const __m512 f = _mm512_cvtepi32_ps(k);
-    const __m512 x = place(p.ox, p.dx, f, _mm512_set1_ps((float)(lx - 1)));
-    const __m512 y = place(p.oy, p.dy, f, _mm512_set1_ps((float)(ly - 1)));
-    const __m512 z = place(p.oz, p.dz, f, _mm512_set1_ps((float)(lz - 1)));
+    const __m512 f = _mm512_min_ps(_mm512_cvtepi32_ps(k), _mm512_load_ps(p.farthest));
+    const __m512 x = place(p.ox, p.dx, f, p.low[0], p.high[0]);
+    const __m512 y = place(p.oy, p.dy, f, p.low[1], p.high[1]);
+    const __m512 z = place(p.oz, p.dz, f, p.low[2], p.high[2]);
     const auto [fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3] = corners_at(m, x, y, z);
     const __m512 d0 = _mm512_sub_ps(a1, a0), d1 = _mm512_sub_ps(a3, a2);
     const __m512 d2 = _mm512_sub_ps(b1, b0), d3 = _mm512_sub_ps(b3, b2);
@@ -236,8 +237,10 @@ FHASH_AVX512 __attribute__((noinline)) void sample_wide(Packet<FLAGS>& p, Counte
     const __mmask16 known = _mm512_cmp_ps_mask(here, here, _CMP_ORD_Q);
     _mm512_store_ps(p.value, here);
     if (FLAGS & MAXIMUM) {
-        const __mmask16 better = on & _mm512_cmp_ps_mask(here, _mm512_load_ps(p.best), _CMP_GT_OQ);
-        _mm512_mask_store_ps(p.best, better, here);
+        const __m512 ranked = FLAGS & MINIMUM ? _mm512_sub_ps(zero, here) : here;
+        const __m512 best = _mm512_load_ps(p.best);
+        const __mmask16 better = on & _mm512_cmp_ps_mask(ranked, best, _CMP_GT_OQ);
+        _mm512_mask_store_ps(p.best, better, ranked);
         _mm512_mask_store_epi32(p.where, better, k);
     } else {
         __m512 e = _mm512_sub_ps(here, _mm512_set1_ps((float)m.low));

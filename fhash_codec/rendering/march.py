@@ -30,10 +30,10 @@ def march(
     box is sampled. Outside a frame that is smaller than the domain nothing is seen.
 
     Surfaces are searched between the entry, the samples and the exit of a ray, and lie in front of
-    the next sample. They are drawn over a maximum.
+    the next sample. They are drawn over a projection.
 
-    The depth is where less than half of the light is left, or where the maximum is; the nearest
-    one of several rays of a pixel.
+    The depth is where less than half of the light is left, or where the maximum is, or where the
+    mean begins; the nearest one of several rays of a pixel.
 
     Args:
         frame: the values.
@@ -49,11 +49,11 @@ def march(
         raise InputError(f"a picture has {len(task.surfaces)} surfaces; allowed: {MAX_SURFACES}")
     if bricks is None:
         bricks = Bricks.of(frame)
-    if task.maximum and task.surfaces:
-        surfaces = dataclasses.replace(task, maximum=False, table=None, shaded=False)
-        maximum = dataclasses.replace(task, surfaces=())
+    if task.projection and task.surfaces:
+        surfaces = dataclasses.replace(task, projection="", table=None, shaded=False)
+        projection = dataclasses.replace(task, surfaces=())
         return _over(
-            _march(frame, surfaces, bricks, threads), _march(frame, maximum, bricks, threads)
+            _march(frame, surfaces, bricks, threads), _march(frame, projection, bricks, threads)
         )
     return _march(frame, task, bricks, threads)
 

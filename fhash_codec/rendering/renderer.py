@@ -141,7 +141,11 @@ class Renderer:
             self._start_prefetch(upcoming)
         task, secondary_rays = _lit(plan, decoded, progress)
         marched = self._march(plan, task, decoded, progress)
-        return self._finish(plan, marched, secondary_rays, begin)
+        more = {
+            "secondary_rays": secondary_rays,
+            "decoded_vertices": 0 if decoded is None else decoded.frame.values.size,
+        }
+        return self._finish(plan, marched, more, begin)
 
     def histogram(self) -> Histogram:
         """Count the values of the series: its first, middle and last step, coarse if possible."""
@@ -176,15 +180,18 @@ class Renderer:
             progress=progress,
         )
 
-    def _finish(self, plan: Plan, marched: Marched, secondary_rays: int, begin: float) -> Image:
-        """Make a picture of what was marched, with its overlay; `begin` is when rendering began."""
+    def _finish(self, plan: Plan, marched: Marched, more: dict[str, int], begin: float) -> Image:
+        """Make a picture of what was marched, with its overlay.
+
+        more: counters of what came before the march. begin: when rendering began.
+        """
         volume = self.volume
         layout = plan.layout
         image = Image(
             rgba=_placed(marched.rgba, layout, 0.0),
             depth=None if marched.depth is None else _placed(marched.depth, layout, np.inf),
             normal=None if marched.normal is None else _placed(marched.normal, layout, 0.0),
-            counters=complete(marched.counters, {"secondary_rays": secondary_rays}),
+            counters=complete(marched.counters, more),
             scene=plan.scene.to_dict(),
             source=volume.path.name,
             digest=volume.container.digest,
@@ -197,6 +204,7 @@ class Renderer:
             layout,
             colours=plan.function.colours,
             label=label,
+            body=plan.task.body,
         )
         return replace(drawn, seconds=time.perf_counter() - begin)
 
@@ -287,6 +295,7 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
         shadows=plan.shadows,
         lamp=plan.lamp,
         ambient_occlusion=plan.occlusion,
+        body=plan.task.body,
     )
     progress("lighting", 1, 1, "")
     return replace(plan.task, light=light), light.secondary_rays

@@ -44,7 +44,7 @@ class PartType(click.ParamType[str]):
     "parts",
     type=PartType(),
     multiple=True,
-    help="effects, accelerations, streams, vtk, exactness, playback or curves; repeat."
+    help="effects, accelerations, orbit, streams, vtk, exactness, playback or curves; repeat."
     " Default: all.",
 )
 @click.option(
@@ -135,6 +135,7 @@ def _tables(result: RenderBench) -> Iterator[Rows]:
     """Every table of the bench: a heading, and a row for each measurement."""
     yield _switches("effect", result.effects)
     yield _switches("acceleration", result.accelerations, psnr=True)
+    yield _switches("orbit", result.orbit)
     yield _streams(result)
     yield _beside_vtk(result)
     yield _exactness(result)

@@ -14,12 +14,14 @@ import numpy as np
 from fhash_codec.bench.machine import machine
 from fhash_codec.bench.pictures.beside_vtk import Comparison
 from fhash_codec.bench.pictures.likeness import picture_psnr
+from fhash_codec.bench.pictures.orbit import orbit
 from fhash_codec.bench.pictures.results import PARTS, Quality, RenderBench, Stream, Switch
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scene.scene import (
     AmbientOcclusion,
+    AttenuatedMaximum,
     Effects,
     Isosurface,
     Scene,
@@ -114,6 +116,7 @@ def bench_render(
         turns=turns,
         effects=results.get("effects", ()),
         accelerations=results.get("accelerations", ()),
+        orbit=results.get("orbit", ()),
         streams=results.get("streams", ()),
         against=results.get("vtk", ()),
         exactness=results.get("exactness", ()),
@@ -137,6 +140,7 @@ def _measure(
     measurements: Mapping[str, Callable[[], tuple[Any, ...]]] = {
         "effects": bench.effects,
         "accelerations": bench.accelerations,
+        "orbit": partial(orbit, bench.turns, bench.scene.size[0]),
         "streams": bench.streams,
         "vtk": lambda: beside().against(),
         "exactness": lambda: beside().exactness(),
@@ -192,6 +196,11 @@ class _Bench:
                 none, isosurfaces=(*none.isosurfaces, Isosurface(value=middle, opacity=0.4))
             ),
             "maximum intensity": replace(none, maximum_intensity=True),
+            "minimum intensity": replace(none, minimum_intensity=True),
+            "average intensity": replace(none, average_intensity=True),
+            "attenuated maximum intensity": replace(
+                none, attenuated_maximum_intensity=AttenuatedMaximum()
+            ),
             "depth buffer": replace(none, buffers=("depth",)),
             "depth and normal buffers": replace(none, buffers=("depth", "normal")),
             "jitter": replace(none, jitter=True),

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
-PARTS = ("effects", "accelerations", "streams", "vtk", "exactness", "playback", "curves")
+PARTS = ("effects", "accelerations", "orbit", "streams", "vtk", "exactness", "playback", "curves")
 """Names of the parts that can be measured."""
 
 
@@ -169,6 +169,7 @@ class RenderBench:
     refused: dict[str, str]
     machine: dict[str, Any]
     notes: tuple[str, ...]
+    orbit: tuple[Switch, ...] = ()
 
     def summary(self) -> dict[str, float]:
         """Median and smallest ratio to VTK, for unlit and lit scenes apart; empty without VTK."""
@@ -184,7 +185,7 @@ class RenderBench:
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name, the ratios of each, and "summary"."""
         values = asdict(self)
-        for name in ("effects", "accelerations", "against", "playback"):
+        for name in ("effects", "accelerations", "orbit", "against", "playback"):
             for entry, record in zip(values[name], getattr(self, name), strict=True):
                 entry["ratio"] = record.ratio
         return {**values, "summary": self.summary()}

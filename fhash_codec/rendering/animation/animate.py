@@ -7,7 +7,7 @@ import re
 import time
 import warnings
 from collections import Counter
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy.typing as npt
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.animation.animation import Animation
 from fhash_codec.rendering.animation.film import FILMS, check_film, film
+from fhash_codec.rendering.animation.workers import rendered_by_workers
 from fhash_codec.rendering.picture.image import Draw, Image
 from fhash_codec.rendering.renderer import Renderer
 from fhash_codec.rendering.scene.png_text import digest_in_png
@@ -78,6 +79,7 @@ def animate(
     force: bool = False,
     progress: Progress = silent,
     draw: Draw | None = None,
+    processes: int = 1,
 ) -> Animated:
     """Render every picture of an animation to numbered files or to a film.
 
@@ -93,12 +95,19 @@ def animate(
         force: whether to replace files.
         progress: is told about each finished picture.
         draw: renders one picture; `Renderer(volume).render` if None.
+        processes: how many render at a time, each with its share of the threads and frames of its
+            own in memory. The files are the same as with one.
 
-    Raises InputError for file names of other kinds and for what `Animation.scenes` refuses,
+    Raises InputError for file names of other kinds, for what `Animation.scenes` refuses and for
+    `draw` with several processes, FhashError where one of these ends by itself,
     OutputExistsError before anything is rendered, OutputError for what cannot be written,
     MissingDependencyError without the package for MP4.
     """
     output = Path(output)
+    if processes < 1 or (draw is not None and processes > 1):
+        raise InputError(
+            f"processes is {processes}; at least 1 is needed, and 1 where 'draw' is given"
+        )
     _check_names(output, pictures)
     is_film = output.suffix.lower() != ".png"
     begun = time.perf_counter()
@@ -115,8 +124,8 @@ def animate(
             check_output(frame.path, force, sources=[volume.path])
     _warn_of_others(paths)
     counters: Counter[str] = Counter()
-    draw = Renderer(volume).render if draw is None else draw
-    with closing(_made(frames, volume, draw, force, counters, progress)) as made:
+    with closing(_rendered(frames, volume, draw, processes)) as rendered:
+        made = _made(frames, volume, rendered, force, counters, progress)
         if is_film:
             film(output, map(_pixels, made), scene.size, animation.rate, force=force)
         else:
@@ -181,10 +190,27 @@ def _is_good(path: Path, scene: Scene, volume: Volume) -> bool:
         return False
 
 
+def _rendered(
+    frames: Sequence[_Frame], volume: Volume, draw: Draw | None, processes: int
+) -> Generator[Image, None, None]:
+    """Render the frames that are not kept, in order, here or in several processes."""
+    scenes = [frame.scene for frame in frames if not frame.kept]
+    processes = min(processes, len(scenes))
+    if processes > 1:
+        yield from rendered_by_workers(volume, scenes, processes)
+        return
+    draw = Renderer(volume).render if draw is None else draw
+    # A frame is decoded ahead only for the very next picture.
+    following = {number: after.scene for number, after in enumerate(frames[1:]) if not after.kept}
+    for number, frame in enumerate(frames):
+        if not frame.kept:
+            yield draw(frame.scene, upcoming=following.get(number))
+
+
 def _made(
     frames: Sequence[_Frame],
     volume: Volume,
-    draw: Draw,
+    rendered: Iterator[Image],
     force: bool,
     counters: Counter[str],
     progress: Progress,
@@ -198,9 +224,7 @@ def _made(
             assert frame.path is not None
             yield frame.path
         else:
-            following = frames[number + 1 : number + 2]
-            upcoming = following[0].scene if following and not following[0].kept else None
-            image = draw(frame.scene, upcoming=upcoming)
+            image = next(rendered)
             counters.update(image.counters)
             image = dataclasses.replace(
                 image,

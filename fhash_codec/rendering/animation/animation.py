@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ MAX_FRAMES = 100_000
 """Most pictures of an animation."""
 DEFAULT_FRAMES = 96
 """Pictures of an animation that does not consist of whole steps alone."""
-FORMS = "steps, steps=FIRST:LAST, time=FIRST:LAST, orbit, orbit=DEGREES"
+FORMS = "steps, steps=FIRST:LAST, steps=FIRST:LAST:EVERY, time=FIRST:LAST, orbit, orbit=DEGREES"
 """Words that an animation is written in on the command line."""
 
 
@@ -102,6 +103,13 @@ class Animation(Record):
     times: tuple[float, float] | None = limits(
         None, "first and last physical time, instead of steps", low=-1.7e308, high=1.7e308
     )
+    every: float | None = limits(
+        None,
+        "steps (or times) from one picture to the next, instead of 'frames'; the last picture is "
+        "the last one within the range",
+        low=1e-100,
+        high=1e15,
+    )
     orbit: float = limits(
         0.0, "degrees that the camera turns about the upward direction", low=-36000, high=36000
     )
@@ -112,6 +120,10 @@ class Animation(Record):
         super().__post_init__()
         if self.steps is not None and self.times is not None:
             raise InputError("animation: steps and times exclude each other")
+        if self.every is not None and self._range is None:
+            raise InputError("animation: 'every' is of steps or times; give one of them too")
+        if self.every is not None and self.frames is not None:
+            raise InputError("animation: 'frames' and 'every' exclude each other")
         given = [key.at for key in self.keys if key.at is not None]
         ascending = all(low < high for low, high in itertools.pairwise(given))
         if given and (len(given) != len(self.keys) or not ascending):
@@ -141,7 +153,8 @@ class Animation(Record):
     def parse(cls, text: str, volume: Volume) -> Animation:
         """Read an animation from words such as "steps,orbit=180", or from the file of that name.
 
-        Without a range, "steps" and "time" mean the whole series of `volume`. Raises InputError.
+        Without a range, "steps" and "time" mean the whole series of `volume`; an end that is left
+        out is that of the series. A third number is `every`. Raises InputError.
         """
         words = [word.strip().partition("=") for word in text.split(",")]
         if not all(name in ("steps", "time", "orbit") for name, _, _ in words):
@@ -171,6 +184,10 @@ class Animation(Record):
         """Number of pictures."""
         if self.frames is not None:
             return self.frames
+        if self.every is not None and self._range is not None:
+            # What is within rounding of a whole number of pictures is that number.
+            whole = abs(self._range[1] - self._range[0]) / self.every * (1 + 1e-12)
+            return min(math.floor(whole) + 1, MAX_FRAMES)
         passed = self._steps_alone
         return DEFAULT_FRAMES if passed is None else min(round(passed) + 1, MAX_FRAMES)
 
@@ -181,6 +198,18 @@ class Animation(Record):
             return self.fps
         passed = self._steps_alone
         return RESTING if passed is not None and self.count <= passed + 1 else MOVING
+
+    @property
+    def _range(self) -> tuple[float, float] | None:
+        """First and last step or time; None where time stands still or is that of keys."""
+        return self.steps if self.steps is not None else self.times
+
+    def _ends(self, given: tuple[float, float] | None) -> tuple[float, float] | None:
+        """Steps or times of the first and the last picture."""
+        if given is None or self.every is None:
+            return given
+        way = self.every if given[1] >= given[0] else -self.every
+        return given[0], given[0] + (self.count - 1) * way
 
     @property
     def _steps_alone(self) -> float | None:
@@ -213,8 +242,8 @@ class Animation(Record):
             list(zip(at, key_scenes, strict=True)),
             volume,
             scale=scene.scale,
-            steps=self.steps,
-            times=self.times,
+            steps=self._ends(self.steps),
+            times=self._ends(self.times),
             orbit=self.orbit,
         )
         shares = np.arange(self.count) / max(self.count if self.closed else self.count - 1, 1)
@@ -226,10 +255,12 @@ def _field(name: str, value: str, volume: Volume) -> dict[str, Any]:
     if name == "orbit":
         return {"orbit": float(value) if value else 360.0}
     field = "steps" if name == "steps" else "times"
-    if value:
-        first, last = value.split(":")
-        return {field: (float(first), float(last))}
-    if name == "steps":
-        return {field: (0.0, float(volume.shape[0] - 1))}
     times = volume.coords["t"].values
-    return {field: (float(times[0]), float(times[-1]))}
+    whole = (0.0, float(len(times) - 1)) if name == "steps" else (float(times[0]), float(times[-1]))
+    if not value:
+        return {field: whole}
+    first, last, *every = value.split(":")
+    if len(every) > 1:
+        raise ValueError(value)
+    ends = float(first) if first.strip() else whole[0], float(last) if last.strip() else whole[1]
+    return {field: ends} | ({"every": float(every[0])} if every else {})

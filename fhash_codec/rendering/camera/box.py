@@ -9,11 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.rendering.camera.camera import Rays
+from fhash_codec.rendering.camera.clip import Body
 
 __all__ = ["Edge", "edges", "outer_edges"]
 
 Floats = npt.NDArray[np.float64]
 
+ON_FACE = 1e-6
+"""Distance of a corner from a face of a clipped box, in vertices, that is taken for rounding."""
 NEAREST = 1e-4
 """Distance from a perspective camera at which edges are cut off, as a share of the diagonal."""
 
@@ -23,7 +26,7 @@ class Edge:
     """An edge of the box.
 
     Attributes:
-        axis: 0, 1 or 2 for an edge along x, y or z.
+        axis: 0, 1 or 2 for an edge along x, y or z; -1 for one of a clipped body.
         ends: pixels (2, 2), from the left and from the top, of the first vertex and of the last.
         fronts: number of its faces that look at the camera: 0 behind all of the volume, 1 on the
             outline, 2 before the volume.
@@ -36,8 +39,13 @@ class Edge:
     uncut: bool
 
 
-def edges(rays: Rays) -> list[Edge]:
-    """Find those of the twelve edges that lie before the camera, at least in part."""
+def edges(rays: Rays, body: Body | None = None) -> list[Edge]:
+    """Find those of the twelve edges that lie before the camera, at least in part.
+
+    body: what a clip leaves of the box, whose edges are found instead; None without a clip.
+    """
+    if body is not None:
+        return _edges_of_body(rays, body)
     bounds = rays.grid.bounds
     toward = (
         np.array([[1.0], [-1.0]]) * rays.forward
@@ -59,6 +67,28 @@ def edges(rays: Rays) -> list[Edge]:
                 pixels, _ = rays.project(clipped)
                 fronts = sum(bool(looking[face]) for face in faces)
                 seen.append(Edge(axis=axis, ends=pixels, fronts=fronts, uncut=clipped is ends))
+    return seen
+
+
+def _edges_of_body(rays: Rays, body: Body) -> list[Edge]:
+    """The edges of a clipped box before the camera: where two of its faces share two corners."""
+    normals, offsets = body.half_spaces
+    looking = normals @ rays.forward > 0 if rays.parallel else normals @ rays.eye + offsets < 0
+    corners = body.corners
+    on_face = np.abs(corners @ normals.T + offsets) < ON_FACE
+    seen = []
+    for one, other in itertools.combinations(range(len(normals)), 2):
+        along = np.cross(normals[one], normals[other])
+        shared = corners[on_face[:, one] & on_face[:, other]]
+        if len(shared) < 2 or not along.any():
+            continue
+        order = np.argsort(shared @ along)
+        ends = shared[order[[0, -1]]]
+        clipped = _clipped(rays, ends) if np.abs(ends[1] - ends[0]).max() > ON_FACE else None
+        if clipped is not None:
+            pixels, _ = rays.project(clipped)
+            fronts = int(looking[one]) + int(looking[other])
+            seen.append(Edge(axis=-1, ends=pixels, fronts=fronts, uncut=clipped is ends))
     return seen
 
 

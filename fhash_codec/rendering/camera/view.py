@@ -8,10 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
+from fhash_codec.rendering.camera.axes import Warp
 from fhash_codec.rendering.camera.camera import Rays
+from fhash_codec.rendering.camera.clip import Body, corners_of
 from fhash_codec.volume import Volume
 
-__all__ = ["part_in_view", "pixel_vertices"]
+__all__ = ["part_in_view", "part_of_body", "pixel_vertices"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -39,52 +41,79 @@ def pixel_vertices(rays: Rays) -> float:
     return 0.0 if np.array_equal(nearest, rays.eye) else width * max(depth, 0.0)
 
 
-def part_in_view(rays: Rays, volume: Volume) -> Box:
+def part_in_view(rays: Rays, volume: Volume, body: Body | None = None, margin: int = 0) -> Box:
     """Find the region (z, y, x) of vertices around what is in view, widened to whole chunks.
 
-    The region is all of the domain where that is not much more, and one vertex where nothing of the
-    volume is in view.
+    The region is all of the domain, or of what a clip leaves of it, where that is not much more,
+    and one vertex where nothing of the volume is in view.
+
+    Args:
+        rays: of the picture.
+        volume: an open container.
+        body: what a clip leaves; None without one.
+        margin: vertices around a clipped part that its samples need, too.
     """
-    domain = Box.of_shape(volume.shape[1:])
+    domain = part_of_body(volume, body, rays.grid.warp, margin)
     # Cameras at the ends of float64 overflow.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        seen = _seen(rays)
+        seen = _seen(rays, body)
     if seen is None:
         return Box.of_shape((1, 1, 1))
-    warp = rays.grid.warp
+    region = _chunks_around(seen, volume, rays.grid.warp, 0 if body is None else margin)
+    share = np.prod(region.shape) / np.prod(domain.shape)
+    return domain if share > MAX_PART else region
+
+
+def part_of_body(volume: Volume, body: Body | None, warp: Warp | None, margin: int = 0) -> Box:
+    """Find the region (z, y, x) around what a clip leaves, widened to whole chunks.
+
+    Without a clip it is the domain.
+
+    Args:
+        volume: an open container.
+        body: what a clip leaves; None without one.
+        warp: from the even grid of the picture to the vertices of the series, None if that is even.
+        margin: vertices around a clipped part that its samples need, too.
+    """
+    domain = Box.of_shape(volume.shape[1:])
+    if body is None:
+        return domain
+    return _chunks_around(body.extent, volume, warp, margin)
+
+
+def _chunks_around(extent: Floats, volume: Volume, warp: Warp | None, margin: int) -> Box:
+    """The region (z, y, x) of the chunks around places (3, 2), x, y, z, and a margin."""
     if warp is not None:
-        seen = np.stack([warp.to_series(axis, ends) for axis, ends in enumerate(seen)])
+        extent = np.stack([warp.to_series(axis, ends) for axis, ends in enumerate(extent)])
     region = []
     for low, high, length, chunk, (first, _) in zip(
-        *seen[::-1].T, volume.shape[1:], volume.chunks[1:], volume.box, strict=True
+        *extent[::-1].T, volume.shape[1:], volume.chunks[1:], volume.box, strict=True
     ):
-        start, stop = max(int(np.floor(low)), 0), min(int(np.ceil(high)) + 1, length)
+        start = min(max(int(np.floor(low)) - margin, 0), length - 1)
+        stop = min(int(np.ceil(high)) + 1 + margin, length)
         # Chunks begin at the feature bounding box.
         start = max(first + (start - first) // chunk * chunk, 0)
         stop = min(first - (first - stop) // chunk * chunk, length)
         region.append((start, max(stop, start + 1)))
-    share = np.prod([stop - start for start, stop in region]) / np.prod(volume.shape[1:])
-    return domain if share > MAX_PART else Box.of(region)
+    return Box.of(region)
 
 
-def _seen(rays: Rays) -> Floats | None:
+def _seen(rays: Rays, body: Body | None) -> Floats | None:
     """Bounds (3, 2) of the part of the box that is in view, x, y, z in vertices; None if none is.
 
-    The part is convex and bounded by at most ten planes. Its corners are the points where three
-    planes meet and that no other plane cuts off.
+    The part is convex and bounded by the planes of the box, of a clip and of the view.
     """
-    bounds = rays.grid.bounds
+    body = Body(bounds=rays.grid.bounds, planes=np.empty((0, 4))) if body is None else body
+    bounds = body.bounds
     side_normals, side_offsets = _view_planes(rays)
-    normals = np.array([*np.eye(3), *-np.eye(3), *side_normals])
-    offsets = np.array([*-bounds[:, 0], *bounds[:, 1], *side_offsets])
+    faces, distances = body.half_spaces
+    normals = np.array([*faces, *side_normals])
+    offsets = np.array([*distances, *side_offsets])
     if not (np.isfinite(normals).all() and np.isfinite(offsets).all()):
         return bounds
     tolerance = 1e-9 * float(np.abs(bounds).max() + np.abs(rays.eye).max())
-    threes = np.array(list(itertools.combinations(range(len(normals)), 3)))
-    threes = threes[np.abs(np.linalg.det(normals[threes])) >= 1e-12]
-    points = np.linalg.solve(normals[threes], -offsets[threes][..., None])[..., 0]
-    corners = list(points[np.all(points @ normals.T + offsets >= -tolerance, axis=1)])
-    if not rays.parallel and np.all((rays.eye >= bounds[:, 0]) & (rays.eye <= bounds[:, 1])):
+    corners = list(corners_of(normals, offsets, tolerance))
+    if not rays.parallel and np.all(faces @ rays.eye + distances >= 0):
         corners.append(rays.eye)
     if not corners:
         return None

@@ -33,10 +33,12 @@ class MarchInput:
         low, high: values of the table's ends, scaled likewise.
         levels: values of the surfaces, scaled likewise.
         eye, right, up, forward: camera of the rays, each (3,).
-        box: (3, 2), the drawn box, in which steps are counted.
+        box: (3, 2), the drawn box as it is clipped, in which steps are counted.
         seen: (3, 2), the part of the box in which the frame has values.
+        planes: (n, 4), planes that cut the box, as `Body` has them.
         spacing: (3,), length of one vertex spacing in the coordinates.
         gradient: (3,), factors from differences between vertices to the gradients of shading.
+        steepness: a gradient of shading of 1, in marched units per unit of the coordinates.
         floor: gradient at which shading has faded by half.
         light_offset, light_scale: a place is at place * scale + offset (3,) in the light grid.
     """
@@ -51,8 +53,10 @@ class MarchInput:
     forward: Floats
     box: Floats
     seen: Floats
+    planes: Floats
     spacing: Floats
     gradient: Floats
+    steepness: float
     floor: float
     light_offset: Floats
     light_scale: float
@@ -68,6 +72,12 @@ class MarchInput:
         low, high, least, most = map(scaling.number, (low, high, least, most))
         span, floor = flatness(low, high, least, most, scaling.width(task.noise))
         light = task.light
+        box, planes = task.bounds, task.planes
+        within = frame.bounds(grid)
+        seen = np.stack(
+            [np.maximum(within[:, 0], box[:, 0]), np.minimum(within[:, 1], box[:, 1])], axis=-1
+        )
+        seen[:, 1] = np.maximum(seen[:, 1], seen[:, 0])  # nothing, and no box that is turned over
         return cls(
             values=scaling.array(bricks.values),
             low=low,
@@ -77,10 +87,14 @@ class MarchInput:
             right=task.rays.right / stride,
             up=task.rays.up / stride,
             forward=task.rays.forward / stride,
-            box=(grid.bounds - first[:, None]) / stride,
-            seen=(frame.bounds(grid) - first[:, None]) / stride,
+            box=(box - first[:, None]) / stride,
+            seen=(seen - first[:, None]) / stride,
+            planes=np.column_stack(
+                [planes[:, :3], (planes[:, 3] - planes[:, :3] @ first) / stride]
+            ),
             spacing=grid.spacing * stride,
             gradient=slope_scale(grid, span, least, most),
+            steepness=span * scaling.unit / (stride * grid.vertex_spacing),
             floor=floor,
             light_offset=np.zeros(3) if light is None else (first - light.first) / light.cell,
             light_scale=1.0 if light is None else stride / light.cell,

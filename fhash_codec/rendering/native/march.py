@@ -17,21 +17,35 @@ import numpy.typing as npt
 from fhash_codec.rendering.native.cells import cells_of
 from fhash_codec.rendering.native.frame_task import MarchInput, empty_table
 from fhash_codec.rendering.native.structure import (
+    ATTENUATED,
+    AVERAGE,
+    GRADED,
     LIT,
+    MAX_PLANES,
     MAX_SURFACES,
     MAX_VALUES,
     MAXIMUM,
+    MINIMUM,
     POWERS,
     SHADED,
     TILE,
     March,
     box,
     numbers,
+    plane,
     surface,
 )
 from fhash_codec.rendering.task.bricks import SIDE, Bricks
 from fhash_codec.rendering.task.counters import complete
-from fhash_codec.rendering.task.task import Frame, Lighting, Marched, Table, Task, extinctions_in
+from fhash_codec.rendering.task.task import (
+    GRADES,
+    Frame,
+    Lighting,
+    Marched,
+    Table,
+    Task,
+    extinctions_in,
+)
 from fhash_formats.support.threads import in_threads, usable_threads
 
 __all__ = ["MAX_SURFACES", "MAX_VALUES", "march_native"]
@@ -50,6 +64,13 @@ than it saves.
 """
 SHARPEST = 16
 """Exponent of highlights above which their table is stretched over the cosines next to 1."""
+PROJECTIONS = {
+    "maximum": MAXIMUM,
+    "minimum": MAXIMUM | MINIMUM,
+    "average": AVERAGE,
+    "attenuated": ATTENUATED,
+}
+"""Flags of the values that rays show instead of the volume."""
 COUNTED = ("rays", "passes", "samples", "gradients", "skipped_bricks")
 """Names of the counters of `fhash_march`, in its order."""
 
@@ -68,6 +89,7 @@ def march_native(
     path: instructions of the processor that may be used: 0 all, 1 at most AVX2, 2 only those that
     every processor has. The pictures agree within rounding.
     """
+    task = task.marched
     given = MarchInput.of(frame, task, bricks)
     buffers = _Buffers.of(task)
     skipping = _skipping(library, given, task, bricks)
@@ -84,7 +106,10 @@ def march_native(
         **_lighting_fields(task.lighting),
         gradient=numbers(given.gradient),
         floor=given.floor,
-        surfaces=0 if task.maximum else len(task.surfaces),
+        **_grading_fields(given, task),
+        planes=len(given.planes),
+        plane=(ctypes.c_double * 4 * MAX_PLANES)(*map(plane, given.planes)),
+        surfaces=0 if task.projection else len(task.surfaces),
         surface=_surfaces(given, task),
         out=buffers.rgba,
         depth=buffers.depth,
@@ -130,7 +155,8 @@ class _Skipping:
     Attributes:
         distance: int32 (z, y, x), as `Bricks.distance` has it.
         cells: uint32 (z, y, x, 2), as `cells_of` has it.
-        highest: float32 (z, y, x) of bricks, the largest value, for the maximum along a ray.
+        highest: float32 (z, y, x) of bricks, the largest value, for the maximum along a ray, or the
+            smallest times -1 for the minimum.
     """
 
     distance: npt.NDArray[np.int32] | None = None
@@ -142,9 +168,11 @@ def _skipping(library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Brick
     """The parts of a frame that a task's rays may pass over."""
     if not task.skipping:
         return _Skipping()
-    if task.maximum:
+    if task.projection in ("maximum", "minimum"):
         # Scaled values have other extremes than the bricks.
-        return _Skipping(highest=bricks.high if given.values is bricks.values else None)
+        if given.values is not bricks.values:
+            return _Skipping()
+        return _Skipping(highest=bricks.high if task.projection == "maximum" else -bricks.low)
     shortest = float(np.abs(given.spacing).min())
     # A step longer than a brick could pass through one in which a surface lies, on its way from one
     # in which nothing is visible to another.
@@ -153,7 +181,13 @@ def _skipping(library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Brick
     distance = bricks.distance(task)
     # For the same reason no step may be longer than a cell. Rounding of places to float32 counts.
     by_cells = not (task.surfaces and task.step > 0.99 * shortest)
-    cells = cells_of(library, bricks, task, distance) if by_cells else None
+    cells = (
+        bricks.remembered(
+            ("cells", task.visibility), lambda: cells_of(library, bricks, task, distance)
+        )
+        if by_cells
+        else None
+    )
     if cells is None and np.count_nonzero(distance) < MIN_SKIPPED * distance.size:
         return _Skipping()
     return _Skipping(distance=distance, cells=cells)
@@ -213,6 +247,19 @@ def _ray_fields(given: MarchInput, task: Task) -> dict[str, object]:
     }
 
 
+def _grading_fields(given: MarchInput, task: Task) -> dict[str, object]:
+    """The fields of the opacity by gradient."""
+    grading = task.grading
+    if grading is None:
+        return {"grading": None, "grade_scale": 0.0, "unlit": 0}
+    factors = np.append(grading.factors, grading.factors[-1]).astype(np.float32)
+    return {
+        "grading": factors,
+        "grade_scale": GRADES * given.steepness / grading.top,
+        "unlit": not task.shaded,
+    }
+
+
 def _lighting_fields(lighting: Lighting | None) -> dict[str, object]:
     """The fields of Phong's model; without one only ambient light of strength 1."""
     if lighting is None:
@@ -240,7 +287,11 @@ def _march(
     library: ctypes.CDLL, structure: March, task: Task, threads: int | None
 ) -> dict[str, int]:
     """March all rays in several threads, into the buffers of a structure; the counters."""
-    flags = MAXIMUM if task.maximum else SHADED * task.shaded | LIT * (task.light is not None)
+    flags = SHADED * task.shaded | LIT * (task.light is not None)
+    if task.grading is not None:
+        flags |= SHADED | GRADED
+    if task.projection:
+        flags = PROJECTIONS[task.projection]
     spans = _spans(task)
     groups = count()
 
@@ -270,7 +321,7 @@ def _spans(task: Task) -> list[tuple[int, int]]:
     width, height = task.rays.size
     across, down = -(-width // TILE), -(-height // TILE)
     with np.errstate(all="ignore"):
-        pixels, depth = task.rays.project(np.array(list(product(*task.rays.grid.bounds))))
+        pixels, depth = task.rays.project(np.array(list(product(*task.bounds))))
     left, top, right, bottom = 0, 0, across, down
     if np.isfinite(pixels).all() and (task.rays.parallel or np.all(depth > 1e-6 * depth.max())):
         # Rounding is far below a pixel.

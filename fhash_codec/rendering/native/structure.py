@@ -10,16 +10,22 @@ import numpy as np
 import numpy.typing as npt
 
 __all__ = [
+    "ATTENUATED",
+    "AVERAGE",
+    "GRADED",
     "LIT",
     "MAXIMUM",
+    "MAX_PLANES",
     "MAX_SURFACES",
     "MAX_VALUES",
+    "MINIMUM",
     "POWERS",
     "SHADED",
     "TILE",
     "March",
     "box",
     "numbers",
+    "plane",
     "surface",
 ]
 
@@ -27,6 +33,8 @@ MAX_SURFACES = 64
 """Surfaces of a picture, at most: FHASH_SURFACES."""
 MAX_VALUES = 2**31 - 1
 """Values of a frame, at most: the vectors' indices have 32 bits."""
+MAX_PLANES = 6
+"""Planes that clip a picture, at most: FHASH_PLANES."""
 POWERS = 1024
 """Intervals of the table of highlights: FHASH_POWERS."""
 TILE = 16
@@ -38,10 +46,20 @@ LIT = 2
 MAXIMUM = 4
 """Flag of `fhash_march`: the largest value along each ray is drawn."""
 
+MINIMUM = 32
+"""Flag of `fhash_march`, with MAXIMUM: the smallest value along each ray is drawn."""
+AVERAGE = 64
+"""Flag of `fhash_march`: the mean along each ray is drawn."""
+ATTENUATED = 128
+"""Flag of `fhash_march`: the attenuated maximum along each ray is drawn."""
+GRADED = 256
+"""Flag of `fhash_march`, with SHADED: the gradients decide on the opacity, too."""
+
 _Three = c_double * 3
 _Pair = c_double * 2
 _Box = _Pair * 3
 _Surface = c_double * 5
+_Plane = c_double * 4
 
 
 class March(ctypes.Structure):
@@ -95,6 +113,11 @@ class March(ctypes.Structure):
         ("normal", POINTER(c_float)),
         ("central", c_int64),
         ("path", c_int64),
+        ("planes", c_int64),
+        ("plane", _Plane * MAX_PLANES),
+        ("grading", POINTER(c_float)),
+        ("grade_scale", c_double),
+        ("unlit", c_int64),
     )
 
     def __init__(self, **fields: Any) -> None:
@@ -124,3 +147,8 @@ def box(ends: npt.NDArray[np.float64]) -> ctypes.Array[Any]:
 def surface(level: float, colour: npt.ArrayLike, opacity: float) -> ctypes.Array[c_double]:
     """An isosurface: its value, red, green, blue and opacity."""
     return _Surface(level, *np.asarray(colour), opacity)
+
+
+def plane(normal_and_distance: npt.ArrayLike) -> ctypes.Array[c_double]:
+    """A plane: its normal x, y, z, and the product with it from which on places are kept."""
+    return _Plane(*np.asarray(normal_and_distance))

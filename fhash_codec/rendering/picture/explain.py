@@ -2,10 +2,28 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.volume import Volume
 
 __all__ = ["reasons"]
+
+
+PROJECTIONS = {
+    "maximum": "the largest along each ray",
+    "minimum": "the smallest along each ray",
+    "average": "the mean along each ray, where it meets values",
+    "attenuated": "the largest along each ray, after what lies before it",
+}
+"""The values that rays show, by name of the projection."""
+HOLDS = {
+    "maximum": "can hold a larger value than was met",
+    "minimum": "can hold a smaller value than was met",
+    "average": "hold values",
+    "attenuated": "hold values above the first colour's",
+}
+"""The bricks that a projection looks at."""
 
 
 def reasons(plan: Plan, volume: Volume) -> list[tuple[str, str]]:
@@ -47,6 +65,8 @@ def _extras(plan: Plan) -> list[tuple[str, str]]:
         if getattr(effects, name)
     ]
     lines = []
+    if task.body is not None:
+        lines.append(("clip", _clip_text(plan)))
     if buffers:
         lines.append(("buffers", ", ".join(buffers)))
     if around:
@@ -55,6 +75,19 @@ def _extras(plan: Plan) -> list[tuple[str, str]]:
             ("around", ", ".join(around) + f": drawn afterwards; the volume has {wide} x {tall}")
         )
     return lines
+
+
+def _clip_text(plan: Plan) -> str:
+    """What is left of the volume, in the coordinates of the series."""
+    task, grid = plan.task, plan.task.rays.grid
+    ends = (grid.origin[:, None] + task.bounds * grid.spacing[:, None]) / np.array(grid.scale)[
+        :, None
+    ]
+    box = ", ".join(
+        f"{name} {min(pair):g} to {max(pair):g}" for name, pair in zip("xyz", ends, strict=True)
+    )
+    planes = f", cut by {len(task.planes)} plane(s)" if len(task.planes) else ""
+    return f"{box}{planes}: nothing outside is decoded or marched"
 
 
 def _scale_text(plan: Plan) -> str:
@@ -91,8 +124,8 @@ def _mode_text(plan: Plan, volume: Volume) -> str:
 
 def _value_text(plan: Plan) -> str:
     task = plan.task
-    if task.maximum:
-        return "the largest along each ray"
+    if task.projection:
+        return PROJECTIONS[task.projection]
     if task.table is None:
         return f"at each sample, for {len(task.surfaces)} surface(s) alone"
     low, high = plan.function.span
@@ -106,6 +139,7 @@ def _gradient_text(plan: Plan) -> str:
         text
         for text, on in (
             ("where a sample has opacity, for shading", task.shaded),
+            ("where a sample has opacity, for opacity by gradient", task.grading is not None),
             ("on surfaces, for shading", bool(task.surfaces)),
             ("where half of the light is left, for normals", task.normal),
         )
@@ -124,6 +158,8 @@ def _secondary_text(plan: Plan) -> str:
 
 
 def _region_text(plan: Plan, volume: Volume) -> str:
+    if plan.task.body is not None:
+        return " (what the clip leaves, in whole tiles)"
     if plan.lights:
         return " (all: light comes from everywhere)"
     is_domain = all(
@@ -145,14 +181,22 @@ def _brick_text(plan: Plan) -> str:
         )
         if on
     ]
-    if task.maximum:
-        tests = ["can hold a larger value than was met", *tests[1:]]
-    few = "" if task.maximum or plan.mode != "cache" else "; all, where few could be passed over"
+    if task.projection:
+        tests = [HOLDS[task.projection], *tests[1:]]
+    few = (
+        ""
+        if task.projection in ("maximum", "minimum") or plan.mode != "cache"
+        else "; all, where few could be passed over"
+    )
     return f"only those that {' or '.join(tests)}{few}"
 
 
 def _end_text(plan: Plan) -> str:
-    threshold = plan.task.threshold
+    threshold, projection = plan.task.threshold, plan.task.projection
+    if projection == "attenuated":
+        return "where no later value can be larger"
+    if projection:
+        return "behind the volume"
     if threshold > 0:
         return f"where less than {threshold:.3g} of the light is left"
     return "behind the volume"

@@ -10,11 +10,13 @@ import numpy.typing as npt
 from fhash_codec import times
 from fhash_codec.rendering.camera.box import edges, outer_edges
 from fhash_codec.rendering.camera.camera import Rays
+from fhash_codec.rendering.camera.clip import Body
 from fhash_codec.rendering.colour.colours import ColourMap
 from fhash_codec.rendering.picture.image import Image
 from fhash_codec.rendering.picture.layout import Layout, strips
 from fhash_codec.rendering.picture.pen import Layer, Pen
 from fhash_codec.rendering.scene.scene import Effects
+from fhash_formats.series import Coordinate
 
 __all__ = ["overlay", "surrounded", "time_text"]
 
@@ -30,6 +32,7 @@ def overlay(
     *,
     colours: ColourMap,
     label: str = "",
+    body: Body | None = None,
 ) -> Image:
     """Draw box, axes, colour bar, legend and time label, as far as the effects ask for them.
 
@@ -40,6 +43,7 @@ def overlay(
         layout: of the picture.
         colours: of the colour bar.
         label: text of the time label.
+        body: what a clip leaves of the volume, whose edges are the box; None without one.
     """
     if not any((effects.box, effects.axes, effects.colour_bar, effects.time_label, effects.legend)):
         return image
@@ -48,7 +52,9 @@ def overlay(
     picture = image.rgba.copy()
     layers: list[Layer] = []
     if effects.box or effects.axes:
-        shown = edges(rays) if effects.box else outer_edges(rays)
+        shown = edges(rays, body) if effects.box else outer_edges(rays)
+        if body is not None and effects.box and effects.axes:
+            shown += outer_edges(rays)  # of all of the volume
         # The volume lies inside the box: an edge between two faces that look away lies behind all
         # of the volume, any other edge before all of it.
         behind = pen.lines([edge for edge in shown if edge.fronts == 0], layout.view)

@@ -10,12 +10,12 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset.boxes import Box
 from fhash_codec.indexing import MAX_LOD
 from fhash_codec.rendering.camera.camera import Grid, Rays
-from fhash_codec.rendering.camera.view import part_in_view, pixel_vertices
+from fhash_codec.rendering.camera.clip import Body
+from fhash_codec.rendering.camera.view import part_in_view, part_of_body, pixel_vertices
 from fhash_codec.rendering.colour.colours import parse_colour
-from fhash_codec.rendering.colour.opacity import Histogram
+from fhash_codec.rendering.colour.opacity import Histogram, about
 from fhash_codec.rendering.colour.transfer_function import TransferFunction
 from fhash_codec.rendering.picture.explain import reasons
 from fhash_codec.rendering.picture.layout import lay_out, quantity_of
@@ -28,7 +28,7 @@ from fhash_codec.rendering.scene.scene import (
     Shading,
     Shadows,
 )
-from fhash_codec.rendering.task.task import Lighting, Surface, Table, Task
+from fhash_codec.rendering.task.task import GRADES, Grading, Lighting, Surface, Table, Task
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
@@ -72,10 +72,12 @@ def plan_picture(
     units = Units.of(volume)
     noise = coding_noise(volume) * units.factor * grid.vertex_spacing / grid.series_spacing
     task = _task(scene, rays, function, units, lamp, lod, noise)
+    task = replace(task, grading=_grading(scene, volume, units, grid))
     _check_ray_length(task)
     mode = _mode(scene.march)
+    margin = _margin(task, lod)
     # Light comes from all of the volume, whether it is in view or not.
-    domain: Box = tuple((0, length) for length in volume.shape[1:])  # type: ignore[assignment]
+    domain = part_of_body(volume, task.body, grid.warp, margin)
     lit = shadows is not None or occlusion is not None
     plan = Plan(
         scene=scene,
@@ -86,7 +88,7 @@ def plan_picture(
         mode=mode,
         lod=lod,
         why_lod=why_lod,
-        region=domain if lit else part_in_view(rays, volume),
+        region=domain if lit else part_in_view(rays, volume, task.body, margin),
         function=function,
         units=units,
         shadows=shadows,
@@ -127,10 +129,22 @@ def _check(scene: Scene) -> None:
         raise InputError(
             "the scene shows nothing: 'nothing' leaves the volume out and there is no isosurface"
         )
-    if effects.maximum_intensity and nothing:
+    if len(effects.projections) > 1:
         raise InputError(
-            "maximum_intensity shows the volume, which 'nothing' leaves out; take one of them"
+            f"a picture shows one value along each ray, and the scene names "
+            f"{' and '.join(effects.projections)} intensity; leave one of them"
         )
+    for projection in effects.projections:
+        if nothing:
+            raise InputError(
+                f"{projection}_intensity shows the volume, which 'nothing' leaves out; "
+                "take one of them"
+            )
+        if scene.transfer_function.gradient_opacity:
+            raise InputError(
+                f"{projection}_intensity has no opacity that 'gradient_opacity' could change; "
+                "take one of them"
+            )
 
 
 def _step_of(volume: Volume, scene: Scene) -> float:
@@ -212,7 +226,7 @@ def _level(volume: Volume, scene: Scene, rays: Rays) -> tuple[int, str]:
 def _secondary_light(scene: Scene, grid: Grid) -> tuple[Shadows | None, AmbientOcclusion | None]:
     """The shadows and the ambient occlusion of a scene, None where they would change nothing."""
     effects = scene.effects
-    if effects.maximum_intensity or scene.transfer_function.nothing or grid.flat:
+    if effects.projections or scene.transfer_function.nothing or grid.flat:
         # Only the volume takes light away, and only from what is drawn of it or in it. A plane is
         # drawn in its colours.
         return None, None
@@ -269,7 +283,9 @@ def _task(
 ) -> Task:
     """The task of a marcher, without the light that is computed from a frame."""
     effects, march = scene.effects, scene.march
-    table = None if scene.transfer_function.nothing else _table(function, units)
+    projection = next(iter(effects.projections), "")
+    attenuated = effects.attenuated_maximum_intensity
+    table = None if scene.transfer_function.nothing else _table(function, units, bool(projection))
     shading = _shading(effects)
     return Task(
         rays=rays,
@@ -280,10 +296,14 @@ def _task(
         # The gradients of a plane lie in it: no light that falls on it would be scattered back.
         shaded=effects.shading is not None
         and table is not None
-        and not effects.maximum_intensity
+        and not projection
         and not rays.grid.flat,
         surfaces=_surfaces(effects, function, units),
-        maximum=effects.maximum_intensity,
+        projection=projection,
+        attenuation=0.0
+        if attenuated is None
+        else attenuated.attenuation / rays.grid.vertex_spacing,
+        body=None if effects.clip is None else Body.of(effects.clip, rays.grid),
         depth="depth" in effects.buffers,
         normal="normal" in effects.buffers,
         antialiasing=effects.antialiasing,
@@ -310,14 +330,57 @@ def _shading(effects: Effects) -> Shading | None:
     """The shading of what is lit, None if nothing is; isosurfaces are always lit."""
     if effects.isosurfaces:
         return effects.shading or Shading()
-    return None if effects.maximum_intensity else effects.shading
+    return None if effects.projections else effects.shading
 
 
-def _table(function: TransferFunction, units: Units) -> Table:
-    """The table of a transfer function in marched units."""
+def _table(function: TransferFunction, units: Units, whole: bool) -> Table:
+    """The table of a transfer function in marched units.
+
+    whole: whether it covers all colours, not only those of values that have an opacity.
+    """
+    if whole:
+        ends = function.colours.positions[[0, -1]]
+        function = replace(function, span=_about((float(ends[0]), float(ends[1]))))
     low, high, colours, extinctions = function.table()
     ends = units.to([low, high])
     return Table(low=float(ends[0]), high=float(ends[1]), colours=colours, extinctions=extinctions)
+
+
+def _about(ends: tuple[float, float]) -> tuple[float, float]:
+    """A range of values, widened where its ends are the same."""
+    return ends if ends[0] < ends[1] else about(ends[0])
+
+
+def _grading(scene: Scene, volume: Volume, units: Units, grid: Grid) -> Grading | None:
+    """The opacity by gradient of a scene in marched units; raises InputError for its points."""
+    points = np.array(scene.transfer_function.gradient_opacity, dtype=np.float64).reshape(-1, 2)
+    if not len(points) or scene.transfer_function.nothing:
+        return None
+    if np.any(np.diff(points[:, 0]) <= 0):
+        raise InputError(
+            "the gradients of 'gradient_opacity' do not ascend; each must be above the one before"
+        )
+    if not 0 < points[:, 1].max() <= 1:
+        raise InputError(
+            f"the factors of 'gradient_opacity' reach to {points[:, 1].max():g}; allowed: 0 to 1, "
+            "one of them above 0"
+        )
+    top = float(points[-1, 0]) or 1.0
+    low, high = _about((volume.value_range.low, volume.value_range.high))
+    ends = units.to([low, high])
+    return Grading(
+        factors=np.interp(np.linspace(0.0, top, GRADES + 1), points[:, 0], points[:, 1]),
+        top=top * float(ends[1] - ends[0]) / grid.vertex_spacing,
+    )
+
+
+def _margin(task: Task, lod: int) -> int:
+    """Vertices around a clipped part that samples in it need besides those of its cells.
+
+    Vertices of a level of detail lie so far apart, and central differences reach one further.
+    """
+    central = task.lighting is not None and task.lighting.central
+    return (1 << lod) - 1 + (1 << lod) * central
 
 
 def _surfaces(effects: Effects, function: TransferFunction, units: Units) -> tuple[Surface, ...]:

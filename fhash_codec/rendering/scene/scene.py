@@ -17,7 +17,10 @@ from fhash_formats.errors import InputError
 
 __all__ = [
     "AmbientOcclusion",
+    "AttenuatedMaximum",
     "Camera",
+    "Clip",
+    "ClipPlane",
     "Effects",
     "Evolution",
     "Isosurface",
@@ -32,6 +35,7 @@ __all__ = [
 
 Vector = tuple[float, float, float]
 Point = tuple[float, float]
+Ends = tuple[float | None, float | None]
 
 MAX_SIDE = 16384
 """Most pixels along a side of an image."""
@@ -44,6 +48,8 @@ DEVICES = ("auto", "cpu", "cuda")
 """Names of the devices that rays are marched on."""
 BUFFERS = ("depth", "normal")
 """Names of the buffers beside the colours."""
+MAX_PLANES = 6
+"""Most planes that clip a picture."""
 GRADIENTS = ("cell", "central")
 """Names of the gradients for shading."""
 
@@ -105,6 +111,13 @@ class TransferFunctionSpec(Record):
         high=1e100,
     )
     nothing: bool = limits(False, "show no volume at all, for surfaces alone")
+    gradient_opacity: tuple[Point, ...] = limits(
+        (),
+        "points [gradient, factor 0..1] that the extinction is multiplied by, linear between them; "
+        "a gradient is a share of the series' value range in the distance of two vertices",
+        low=0,
+        high=1e30,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,6 +178,80 @@ class LegendEntry(Record):
 
 
 @dataclass(frozen=True, kw_only=True)
+class AttenuatedMaximum(Record):
+    """The largest value along each ray, lessened by what lies before it.
+
+    With s = (value - low) / (high - low) of the colour map's range, clipped to 0..1, a ray shows
+    the colour at the largest s exp(-attenuation * S), where S is the integral of s along the ray up
+    to there, in vertex spacings. It is 'attenuated_mip' of napari and VisPy (vispy/visuals/
+    volume.py), but for its sum, which depends on the length of a step there. Nothing is shown where
+    no value lies above `low`.
+    """
+
+    attenuation: float = limits(
+        0.05, "of the light by the largest value, in a vertex spacing", low=1e-6, high=1e3
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipPlane(Record):
+    """A plane that cuts the volume; the side that its normal points to is kept.
+
+    It goes through `point`, or through the places whose product with the normal is `offset`.
+    """
+
+    normal: Vector = limits(
+        dataclasses.MISSING, "direction (x, y, z) towards what is kept", low=-1e100, high=1e100
+    )
+    point: Vector | None = limits(None, "a point (x, y, z) of the plane", low=-1e100, high=1e100)
+    offset: float | None = limits(
+        None, "normal times place on the plane, instead of a point", low=-1e100, high=1e100
+    )
+
+    def __post_init__(self) -> None:
+        """Check the fields, and that the plane is given once; raises InputError."""
+        super().__post_init__()
+        if (self.point is None) == (self.offset is None):
+            raise InputError("clip plane: give either a point or an offset beside the normal")
+        if not any(self.normal):
+            raise InputError("clip plane: the normal has no length; give one such as [0, 0, 1]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clip(Record):
+    """The part of the volume that is shown, in the coordinates of the series, not stretched.
+
+    Nothing outside is decoded or marched, and surfaces are cut. A sample at a cut is shaded by the
+    gradient of the values there.
+    """
+
+    x: Ends | None = limits(
+        None, "first and last x, null for an end that is not cut", low=-1e100, high=1e100
+    )
+    y: Ends | None = limits(
+        None, "first and last y, null for an end that is not cut", low=-1e100, high=1e100
+    )
+    z: Ends | None = limits(
+        None, "first and last z, null for an end that is not cut", low=-1e100, high=1e100
+    )
+    planes: tuple[ClipPlane, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the fields, and that ends ascend; raises InputError."""
+        super().__post_init__()
+        if not (self.x or self.y or self.z or self.planes):
+            raise InputError("clip cuts nothing; give ends along 'x', 'y' or 'z', or 'planes'")
+        if len(self.planes) > MAX_PLANES:
+            raise InputError(f"clip has {len(self.planes)} planes; allowed: {MAX_PLANES}")
+        for axis in "xyz":
+            low, high = getattr(self, axis) or (None, None)
+            if low is not None and high is not None and low >= high:
+                raise InputError(
+                    f"clip: {axis} is {low:g} to {high:g}; the first end must be below the second"
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Effects(Record):
     """Effects of a picture: each is off unless it is named; `true` stands for its defaults."""
 
@@ -175,6 +262,14 @@ class Effects(Record):
     maximum_intensity: bool = limits(
         False, "show the largest value along each ray instead of the volume"
     )
+    minimum_intensity: bool = limits(
+        False, "show the smallest value along each ray instead of the volume"
+    )
+    average_intensity: bool = limits(
+        False, "show the mean along each ray, where it meets values, instead of the volume"
+    )
+    attenuated_maximum_intensity: AttenuatedMaximum | None = None
+    clip: Clip | None = None
     buffers: tuple[str, ...] = limits((), "pictures beside the colours", choices=BUFFERS)
     antialiasing: int = limits(1, "rays per side of a pixel", low=1, high=8)
     jitter: bool = limits(
@@ -185,6 +280,17 @@ class Effects(Record):
     colour_bar: bool = limits(False, "the colours and their values")
     time_label: bool = limits(False, "step and time")
     legend: tuple[LegendEntry, ...] = ()
+
+    @property
+    def projections(self) -> tuple[str, ...]:
+        """Names of the values that rays show instead of the volume; a picture can have but one."""
+        kinds = {
+            "maximum": self.maximum_intensity,
+            "minimum": self.minimum_intensity,
+            "average": self.average_intensity,
+            "attenuated": self.attenuated_maximum_intensity is not None,
+        }
+        return tuple(name for name, on in kinds.items() if on)
 
 
 @dataclass(frozen=True, kw_only=True)

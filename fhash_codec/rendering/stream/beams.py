@@ -26,8 +26,9 @@ class Beams:
     """The samples of many rays.
 
     Sample k of a ray lies at origin + k * pace, or at the nearest place to that at which the field
-    has values. Places between samples have fractions of k. All attributes but `step` are arrays of
-    `arrays`, float64 unless said otherwise.
+    has values; where planes cut the box, none lies behind the place where its ray leaves. Places
+    between samples have fractions of k. All attributes but `step` and `cut` are arrays of `arrays`,
+    float64 unless said otherwise.
 
     Attributes:
         origin: (n, 3), place of sample 0, x, y, z in vertices of the domain.
@@ -40,6 +41,7 @@ class Beams:
         along: (n, 3), unit vectors in physical directions.
         step: length from one sample to the next, in units of the coordinates.
         bounds: (3, 2), box in which the field has values.
+        cut: whether planes cut the box.
     """
 
     arrays: Arrays
@@ -55,6 +57,7 @@ class Beams:
     along: Array
     step: float
     bounds: Array
+    cut: bool = False
 
     @classmethod
     def of(cls, task: Task, within: Array, rows: range, arrays: Arrays = NUMPY) -> Beams:
@@ -69,7 +72,12 @@ class Beams:
         )
         eye, direction = _lines(task.rays, number, task.antialiasing, arrays)
         spacing = arrays.array(task.rays.grid.spacing)
-        path = _paths(eye, direction, arrays.array(task.rays.grid.bounds), within, arrays)
+        box = arrays.array(task.bounds)
+        low = xp.maximum(within[:, 0], box[:, 0])
+        # Where nothing is left, nothing, and no box that is turned over.
+        high = xp.maximum(xp.minimum(within[:, 1], box[:, 1]), low)
+        within = xp.stack([low, high], axis=1)
+        path = _paths(eye, direction, box, within, arrays.array(task.planes), arrays)
         steps = (path.leave - path.enter) / task.step
         count = xp.ceil(xp.clip(steps, None, ENDLESS))
         share = shares(number, arrays) if task.jitter else arrays.full(len(number), 0.5)
@@ -94,12 +102,17 @@ class Beams:
             along=direction * spacing,
             step=task.step,
             bounds=within,
+            cut=len(task.planes) > 0,
         )
 
     def places(self, rays: Array, at: Array) -> Array:
         """Places (n, ..., 3) at samples (n, ...) of rays (n,), clipped to the field's bounds."""
         extra = (1,) * (at.ndim - 1)
         origin, pace = (ends[rays].reshape(-1, *extra, 3) for ends in (self.origin, self.pace))
+        if self.cut:
+            at = self.arrays.xp.minimum(
+                self.arrays.to_float64(at), self.leaving[rays].reshape(-1, *extra)
+            )
         return self.arrays.xp.clip(
             origin + at[..., None] * pace, self.bounds[:, 0], self.bounds[:, 1]
         )
@@ -153,15 +166,36 @@ class _Paths(NamedTuple):
     hit: Array
 
 
-def _paths(eye: Array, direction: Array, box: Array, within: Array, arrays: Arrays) -> _Paths:
-    """The paths of rays through the drawn box and the field's box (3, 2) within it."""
+def _paths(
+    eye: Array, direction: Array, box: Array, within: Array, planes: Array, arrays: Arrays
+) -> _Paths:
+    """The paths of rays through the drawn box and the field's box (3, 2) within it.
+
+    planes: (n, 4), which cut the box.
+    """
     xp = arrays.xp
     enter, leave = slab(eye, direction, box, arrays)
+    for plane in planes:
+        enter, leave = _half_space(eye, direction, plane, enter, leave, arrays)
     first, stop = slab(eye, direction, within, arrays)
     hit = (leave > enter) & (stop > first)
     first, stop = xp.maximum(first, enter), xp.minimum(stop, leave)
     enter, leave, first, stop = (xp.where(hit, end, 0.0) for end in (enter, leave, first, stop))
     return _Paths(enter, leave, first, stop, hit)
+
+
+def _half_space(
+    eye: Array, direction: Array, plane: Array, enter: Array, leave: Array, arrays: Arrays
+) -> tuple[Array, Array]:
+    """Narrow paths of rays to one side of a plane (4,)."""
+    xp, endless = arrays.xp, arrays.full((), np.inf)
+    distance = plane[3] - xp.sum(eye * plane[:3], axis=1)
+    approach = xp.sum(direction * plane[:3], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = distance / approach
+    behind = xp.where(distance > 0, endless, -endless)  # where the ray does not approach
+    first = xp.where(approach > 0, at, xp.where(approach < 0, -endless, behind))
+    return xp.maximum(enter, first), xp.minimum(leave, xp.where(approach < 0, at, endless))
 
 
 def slab(origin: Array, direction: Array, bounds: Array, arrays: Arrays) -> tuple[Array, Array]:

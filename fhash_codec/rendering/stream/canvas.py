@@ -105,19 +105,19 @@ class Canvas:
         length = xp.sqrt(xp.sum(slopes * slopes, axis=1))[:, None]
         self.normal[rays] = slopes / xp.where(length > 0, length, 1.0)
 
-    def show_peaks(self, peak: Array, at: Array) -> None:
-        """Draw the largest value along each ray, opaque, behind the surfaces that are there.
+    def show_values(self, values: Array, at: Array) -> None:
+        """Draw one value along each ray, opaque, behind the surfaces that are there.
 
-        peak: (n,), the values; rays whose value is not finite show nothing.
+        values: (n,); rays whose value is not finite show nothing.
         at: (n,), their places in samples.
         """
         assert self.palette is not None
-        (shown,) = self.arrays.nonzero(self.arrays.xp.isfinite(peak))
+        (shown,) = self.arrays.nonzero(self.arrays.xp.isfinite(values))
         if self.task.depth or self.task.normal:
             # As if surfaces of little opacity were not there.
             front = shown[self.clear[shown] >= 0.5]
             self.see(front, at[front])
-        self.colour[shown] += self.clear[shown][:, None] * self.palette.colour(peak[shown])
+        self.colour[shown] += self.clear[shown][:, None] * self.palette.colour(values[shown])
         self.clear[shown] = 0.0
 
     def _colours(self, rays: Array, events: Events, row: Array, column: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,11 +36,8 @@ class Leaping:
     def of(cls, bricks: Bricks, task: Task, first: Array, stride: float, arrays: Arrays) -> Leaping:
         """Leaping for a task: over bricks without a visible value and without a surface.
 
-        For the largest value along a ray every brick with a value matters.
+        task: with the table that samples take.
         """
-        table = task.table
-        if task.maximum and table is not None:
-            task = replace(task, table=replace(table, extinctions=np.ones_like(table.extinctions)))
         distance = bricks.distance(task)
         last = arrays.array(np.array(distance.shape[::-1]) - 1.0)
         return cls(

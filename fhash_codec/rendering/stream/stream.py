@@ -24,7 +24,9 @@ from fhash_codec.rendering.stream.beams import Beams
 from fhash_codec.rendering.stream.canvas import Canvas, Events
 from fhash_codec.rendering.stream.crossings import Crossings, crossings
 from fhash_codec.rendering.stream.fields import Field
+from fhash_codec.rendering.stream.grading import Factors
 from fhash_codec.rendering.stream.leaping import Leaping
+from fhash_codec.rendering.stream.projection import Projection
 from fhash_codec.rendering.task.arrays import Array
 from fhash_codec.rendering.task.bricks import SIDE
 from fhash_codec.rendering.task.counters import complete
@@ -53,6 +55,7 @@ def stream(
     budget: N_r, samples of a pass of adaptive marching; None for the number of rays.
     Raises InputError where the memory of a device is not enough.
     """
+    task = task.marched
     width, height = task.rays.size
     arrays, rays_of_pixel = field.arrays, task.antialiasing**2
     rows = max(1, BAND // (width * rays_of_pixel))
@@ -114,7 +117,8 @@ class _Marcher:
             is the end of the path.
         from_: (n,), the last place that was looked at, in samples.
         before: (n,), the value there. Both are NaN before a ray begins and after it leapt.
-        peak, peak_at: (n,), the largest value so far and its place, in samples.
+        projection: what rays show instead of the volume, None for the volume.
+        factors: opacity by gradient, None without it.
     """
 
     def __init__(self, field: Field, task: Task, beams: Beams) -> None:
@@ -129,13 +133,15 @@ class _Marcher:
         self.skipping = task.skipping and (short or not task.surfaces)
         # Between two samples in cells without a surface there may be a cell with one: pictures with
         # surfaces look at whole bricks.
-        by_cells = self.skipping and not task.surfaces and not task.maximum
+        by_cells = self.skipping and not task.surfaces and not task.projection
         self.cells = field.visible(self.palette) if by_cells and self.palette is not None else None
         behind = (beams.leaving > arrays.to_float64(beams.end) - 1) & (beams.end > beams.begin)
         self.end = beams.end + arrays.to_int64(behind) if task.surfaces else beams.end
+        self._one = arrays.full((), 1.0)
         self.next = arrays.copy(beams.begin)
         self.from_, self.before = arrays.copy(beams.entered), arrays.full(count, np.nan)
-        self.peak, self.peak_at = arrays.full(count, -np.inf), arrays.full(count, 0.0)
+        self.projection = Projection.of(task, count, arrays)
+        self.factors = Factors.of(task, field)
         self.counters = complete({"rays": int(arrays.xp.count_nonzero(beams.end > beams.begin))})
 
     def march(self, adaptive: bool, budget: int | None, report: Callable[[int, int], None]) -> None:
@@ -156,9 +162,11 @@ class _Marcher:
                 (self.next[alive] < self.end[alive])
                 & (self.canvas.clear[alive] >= self.task.threshold)
             ]
+            if self.projection is not None:
+                alive = alive[~self.projection.finished(alive)]
             report(total - len(alive), total)
-        if self.task.maximum:
-            self.canvas.show_peaks(self.peak, self.peak_at)
+        if self.projection is not None:
+            self.canvas.show_values(self.projection.values, self.projection.at)
 
     def _leapt(self, alive: Array) -> Array:
         """Move rays on to their next sample in a brick that matters; the rays that have one."""
@@ -192,9 +200,12 @@ class _Marcher:
         values[requested] = self._looked_up(places[requested])
         self.counters["passes"] += 1
         self.next[alive] += pace
-        if self.task.maximum:
-            self._keep_peaks(alive, sample, values)
-        if self.task.surfaces or not self.task.maximum:
+        if self.projection is not None:
+            assert self.palette is not None
+            length = self._length(alive, sample)
+            opacity = self._opacity(self.palette, alive, sample, values)
+            self.projection.add(alive, sample, values, length, opacity)
+        if self.task.surfaces or self.projection is None:
             self.canvas.add(alive, self._events(alive, sample, values))
 
     def _requested(self, within: Array, places: Array) -> Array:
@@ -215,16 +226,6 @@ class _Marcher:
             needed[:, :-1] = needed[:, :-1] | matters[:, 1:]
             needed[:, 1:] = needed[:, 1:] | matters[:, :-1]
         return within & needed
-
-    def _keep_peaks(self, alive: Array, sample: Array, values: Array) -> None:
-        """Keep the largest value of each ray, and its place, over a pass."""
-        arrays, xp = self.arrays, self.arrays.xp
-        best = xp.argmax(xp.where(xp.isnan(values), -np.inf, values), axis=1)[:, None]
-        value, at = (
-            arrays.take_along(array, best, 1)[:, 0] for array in (values, arrays.to_float64(sample))
-        )
-        larger = value > self.peak[alive]
-        self.peak[alive[larger]], self.peak_at[alive[larger]] = value[larger], at[larger]
 
     def _visible(self, places: Array) -> Array:
         """Whether places (n, 3) lie in visible cells."""
@@ -255,7 +256,7 @@ class _Marcher:
             crossed = self._crossings(alive, sample, values)
             opacity[..., :-1], at[..., :-1] = crossed.opacity, crossed.at
             which = xp.concatenate([crossed.which, which[..., -1:]], axis=2)
-        if self.palette is not None and not task.maximum:
+        if self.palette is not None and not task.projection:
             opacity[..., -1] = self._opacity(self.palette, alive, sample, values)
         return Events(
             opacity=opacity.reshape(rows, -1),
@@ -291,16 +292,22 @@ class _Marcher:
         self.before[alive], self.from_[alive] = values[:, -1], to[:, -1]
         return result
 
+    def _length(self, alive: Array, sample: Array) -> Array:
+        """Lengths (rays, samples) of steps, in steps: 1, and the rest of the path for the last."""
+        beams, xp = self.beams, self.arrays.xp
+        return xp.where(sample == beams.last[alive][:, None], beams.rest[alive][:, None], self._one)
+
     def _opacity(self, palette: Palette, alive: Array, sample: Array, values: Array) -> Array:
         """Opacities (rays, samples), 0 where there is no value. The last step may be shorter."""
         arrays, xp = self.arrays, self.arrays.xp
         row, column = arrays.nonzero(~xp.isnan(values))
-        length = (
-            xp.where(
-                sample[row, column] == self.beams.last[alive][row], self.beams.rest[alive][row], 1.0
-            )
-            * self.task.step
-        )
+        length = self._length(alive, sample)[row, column] * self.task.step
+        depth = palette.extinction(values[row, column]) * length
+        if self.factors is not None:
+            (thick,) = arrays.nonzero(depth > 0)
+            at = arrays.to_float64(sample[row, column][thick])
+            depth[thick] *= self.factors(self.beams.places(alive[row[thick]], at))
+            self.counters["gradients"] += len(thick)
         opacity = arrays.full(values.shape, 0.0)
-        opacity[row, column] = -xp.expm1(-palette.extinction(values[row, column]) * length)
+        opacity[row, column] = -xp.expm1(-depth)
         return opacity

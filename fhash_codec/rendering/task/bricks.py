@@ -7,7 +7,10 @@ the vertices between them.
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +24,7 @@ __all__ = ["SIDE", "Bricks"]
 
 Single = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
+Result = TypeVar("Result")
 
 SIDE = 4
 """Cells along a brick's side. With twice as many, a narrow interval takes twice the samples."""
@@ -30,6 +34,10 @@ ROUNDING = 2.0**-22
 """Distance of an interpolated float32 beyond the values around it, at most, as a share of the
 largest magnitude.
 """
+LAYERS = 4
+"""Layers of bricks that a thread looks at together."""
+KEPT = 6
+"""Results that bricks keep: two for each of the last transfer functions."""
 SMALL = 2**18
 """Vertices of a frame below which threads take longer to start than the work takes."""
 
@@ -37,6 +45,8 @@ SMALL = 2**18
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bricks:
     """The extreme values of a frame's bricks. One object serves every picture of the frame.
+
+    What follows from the frame and a transfer function alone is kept for the next picture.
 
     Attributes:
         values: float32 (z, y, x), contiguous, the values of the frame with NaN for infinite ones.
@@ -47,6 +57,7 @@ class Bricks:
     values: Single
     low: Single
     high: Single
+    _kept: OrderedDict[object, Any] = field(default_factory=OrderedDict, init=False, repr=False)
 
     @classmethod
     def of(cls, frame: Frame) -> Bricks:
@@ -64,33 +75,66 @@ class Bricks:
         low, high = float(self.low.min()), float(self.high.max())
         return (low, high) if low <= high else (0.0, 0.0)
 
+    def remembered(self, key: object, compute: Callable[[], Result]) -> Result:
+        """The result of a function for a key, kept from an earlier call if there was one.
+
+        The results of the last KEPT keys are kept.
+        """
+        if key in self._kept:
+            self._kept.move_to_end(key)
+        else:
+            self._kept[key] = compute()
+            while len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+        return cast(Result, self._kept[key])
+
     def matters(self, task: Task) -> Mask:
         """Whether a brick (z, y, x) has anything visible: a value with extinction, or a surface."""
-        low, high = self.low.astype(np.float64), self.high.astype(np.float64)
-        has_value = low <= high
-        low, high = np.where(has_value, low, 0.0), np.where(has_value, high, 0.0)
-        slack = ROUNDING * max(float(np.abs(low).max()), float(np.abs(high).max()))
-        visible = np.zeros(low.shape, dtype=bool)
-        if task.table is not None:
-            visible |= np.asarray(Palette.of(task.table).visible(low, high))
-        for surface in task.surfaces:
-            visible |= (low - slack <= surface.value) & (surface.value <= high + slack)
-        return visible & has_value
+        slack = ROUNDING * max(map(abs, self.value_range))
+        palette = None if task.table is None else Palette.of(task.table)
+        visible = np.empty(self.low.shape, dtype=bool)
+
+        def look(first: int) -> None:
+            """Look at layers of bricks."""
+            layers = slice(first, first + LAYERS)
+            low, high = self.low[layers].astype(np.float64), self.high[layers].astype(np.float64)
+            has_value = low <= high
+            low, high = np.where(has_value, low, 0.0), np.where(has_value, high, 0.0)
+            seen = np.zeros(low.shape, dtype=bool)
+            if palette is not None:
+                seen |= np.asarray(palette.visible(low, high))
+            for surface in task.surfaces:
+                seen |= (low - slack <= surface.value) & (surface.value <= high + slack)
+            visible[layers] = seen & has_value
+
+        _in_turn(look, range(0, len(visible), LAYERS), self.values.size)
+        return visible
 
     def distance(self, task: Task) -> npt.NDArray[np.int32]:
         """Distance of each brick from the nearest that matters: int32 (z, y, x), 0..FARTHEST.
 
-        It is counted in bricks, a diagonal step as one.
+        It is counted in bricks, a diagonal step as one. The array is kept for the next picture that
+        sees the same values, and cannot be written to.
         """
+
+        def compute() -> npt.NDArray[np.int32]:
+            distance = self._distance(task)
+            distance.flags.writeable = False
+            return distance
+
+        return self.remembered(("distance", task.visibility), compute)
+
+    def _distance(self, task: Task) -> npt.NDArray[np.int32]:
+        """The distances of `distance`, computed."""
         matters = self.matters(task)
         distance = np.where(matters, 0, FARTHEST).astype(np.int32)
         if not matters.any():
             return distance
         library = native.library()
         if library is not None:
-            library.fhash_march_distance(
-                (ctypes.c_int64 * 3)(*distance.shape), distance.ctypes.data
-            )
+            layers, rows, _ = distance.shape
+            _find_distances(library.fhash_march_distance_layers, distance, layers, self.values.size)
+            _find_distances(library.fhash_march_distance_rows, distance, rows, self.values.size)
             return distance
         near = matters
         for away in range(1, min(max(distance.shape), FARTHEST)):
@@ -124,12 +168,30 @@ def _extremes(values: Single) -> tuple[Single, Single]:
             scratch.ctypes.data,
         )
 
-    if values.size < SMALL:
-        for number in range(bricks[0]):
-            layer(number)
-    else:
-        list(in_threads(layer, range(bricks[0])))
+    _in_turn(layer, range(bricks[0]), values.size)
     return low, high
+
+
+def _find_distances(
+    function: Callable[..., object], distance: npt.NDArray[np.int32], count: int, vertices: int
+) -> None:
+    """Call one of the functions of march_bricks.cpp for distances with numbers 0 .. count - 1."""
+    shape = (ctypes.c_int64 * 3)(*distance.shape)
+
+    def find(number: int) -> None:
+        scratch = np.empty(max(distance.shape[:2]) * distance.shape[2], dtype=np.int32)
+        function(shape, distance.ctypes.data, number, number + 1, scratch.ctypes.data)
+
+    _in_turn(find, range(count), vertices)
+
+
+def _in_turn(function: Callable[[int], object], numbers: range, vertices: int) -> None:
+    """Call a function with numbers: in several threads, if the frame has enough vertices."""
+    if vertices < SMALL:
+        for number in numbers:
+            function(number)
+    else:
+        list(in_threads(function, numbers))
 
 
 def _reduced(values: Single, ufunc: np.ufunc) -> Single:

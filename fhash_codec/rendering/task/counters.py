@@ -16,6 +16,7 @@ COUNTERS: Mapping[str, str] = MappingProxyType(
         "gradients": "at lit samples and surfaces",
         "secondary_rays": "towards light and surroundings",
         "skipped_bricks": "places where rays leapt over what cannot be seen",
+        "decoded_vertices": "of the decoded frame, kept ones included",
     }
 )
 """Names of the counters and what they count."""

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid
+from fhash_codec.rendering.camera.clip import Body
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Shadows
 from fhash_codec.rendering.task.task import Frame, LightGrid, Table, extinctions_in
 from fhash_formats.errors import InputError
@@ -49,6 +50,7 @@ def light_grid(
     shadows: Shadows | None = None,
     lamp: Floats | None = None,
     ambient_occlusion: AmbientOcclusion | None = None,
+    body: Body | None = None,
 ) -> LightGrid:
     """Shares of the light that reach places of a frame, the strengths of both effects included.
 
@@ -56,10 +58,13 @@ def light_grid(
     resolution of the shadows as that allows.
 
     lamp: unit vector (x, y, z) of the coordinates towards the light, for shadows.
+    body: what a clip leaves; nothing outside it takes light away. All if None.
     Raises InputError for shadows without a lamp.
     """
     if shadows is not None and lamp is None:
         raise InputError("shadows need the direction towards a lamp")
+    if body is not None:
+        frame = _clipped(frame, body)
     resolution = shadows.resolution if shadows is not None else Shadows().resolution
     across = max(1, round(resolution / frame.stride))
     first = np.array(frame.first[::-1], dtype=np.float64)
@@ -85,6 +90,26 @@ def light_grid(
         shares[..., 1] = 1 - np.float32(ambient_occlusion.strength) * (1 - around)
         rays += points.extinction.size * len(SIDES)
     return LightGrid(shares=np.clip(shares, 0, 1), first=first, cell=cell, secondary_rays=rays)
+
+
+def _clipped(frame: Frame, body: Body) -> Frame:
+    """The vertices around a body alone, and no values at those outside it."""
+    first, stride = np.array(frame.first), frame.stride
+    low, high = body.extent[::-1].T
+    start = np.clip(np.floor((low - first) / stride), 0, np.array(frame.values.shape) - 1)
+    stop = np.clip(np.ceil((high - first) / stride) + 1, start + 1, frame.values.shape)
+    spans = [slice(int(begin), int(end)) for begin, end in zip(start, stop, strict=True)]
+    places = np.meshgrid(
+        *(
+            begin + np.arange(span.start, span.stop) * stride
+            for begin, span in zip(first, spans, strict=True)
+        ),
+        indexing="ij",
+    )
+    inside = body.holds(np.stack(places[::-1], axis=-1).astype(np.float64))
+    z, y, x = (int(begin + span.start * stride) for begin, span in zip(first, spans, strict=True))
+    values = np.where(inside, frame.values[tuple(spans)], np.float32(np.nan))
+    return Frame(values=values, first=(z, y, x), stride=stride)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

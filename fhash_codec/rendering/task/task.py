@@ -1,8 +1,9 @@
 """The task of a marcher, and its result. All marchers take one task and make one picture.
 
 Sample k of a ray lies `(k + 0.5) * step` behind the place where the ray enters the drawn box of the
-whole domain (`Grid.bounds`); with jitter `(k + a share of the ray's own) * step`. The last step is
-as long as the rest of the path, so that the steps fill the path through the box exactly.
+whole domain (`Grid.bounds`), or the part of it that a clip leaves; with jitter `(k + a share of the
+ray's own) * step`. The last step is as long as the rest of the path, so that the steps fill the
+path through the box exactly.
 
 A sample sees the trilinear value at its place, quadrilinear between time steps. A sample whose cell
 has a vertex of weight without a value sees nothing. Colour and extinction come from the table,
@@ -12,15 +13,17 @@ linear between its entries; alpha = 1 - exp(-extinction * length).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.rendering.camera.camera import Grid, Rays
+from fhash_codec.rendering.camera.clip import Body
 
 __all__ = [
     "Frame",
+    "Grading",
     "LightGrid",
     "Lighting",
     "Marched",
@@ -80,6 +83,21 @@ class Surface:
     opacity: float
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Grading:
+    """Factors of the extinction by the size of the gradient; beyond the last one it holds.
+
+    Attributes:
+        factors: float64 (GRADES + 1,), 0..1, at even gradients from 0 on, linear between them.
+        top: gradient of the last one, above 0, in marched units per unit of the coordinates.
+    """
+
+    factors: Floats
+    top: float
+
+
+GRADES = 1024
+"""Intervals of the factors of a grading: FHASH_GRADES."""
 DENSEST = 1e30
 """Largest extinction per length: its smallest part is opaque already."""
 
@@ -152,8 +170,11 @@ class Task:
         shaded: whether the volume is lit.
         light: shares of the light that shadows and surroundings leave.
         surfaces: isosurfaces.
-        maximum: whether to draw the largest value along each ray, opaque in the colour of the
-            table, instead of the volume.
+        projection: 'maximum', 'minimum', 'average' or 'attenuated' to draw that value along each
+            ray, opaque in the colour of the table, instead of the volume; '' for the volume.
+        attenuation: of the attenuated maximum, per unit of the coordinates.
+        grading: opacity by gradient, that of `lighting`, or of the cell without one.
+        body: the part of the drawn box that is marched; all of it if None.
         depth, normal: whether to fill these buffers.
         antialiasing: rays along a pixel's side.
         jitter: whether the first sample of each ray is shifted by a share of the ray's own.
@@ -169,13 +190,51 @@ class Task:
     shaded: bool = False
     light: LightGrid | None = None
     surfaces: tuple[Surface, ...] = ()
-    maximum: bool = False
+    projection: str = ""
+    attenuation: float = 0.0
+    grading: Grading | None = None
+    body: Body | None = None
     depth: bool = False
     normal: bool = False
     antialiasing: int = 1
     jitter: bool = False
     skipping: bool = True
     noise: float = 0.0
+
+    @property
+    def bounds(self) -> Floats:
+        """The box (3, 2), x, y, z, in vertices, that is drawn and in which steps are counted."""
+        return self.rays.grid.bounds if self.body is None else self.body.bounds
+
+    @property
+    def planes(self) -> Floats:
+        """The planes (n, 4) that cut the box, as `Body` has them."""
+        return np.empty((0, 4)) if self.body is None else self.body.planes
+
+    @property
+    def visibility(self) -> tuple[object, ...]:
+        """All that decides which values can be seen, as a key: table and values of surfaces."""
+        surfaces = tuple(surface.value for surface in self.surfaces)
+        if self.table is None:
+            return surfaces
+        return self.table.low, self.table.high, self.table.extinctions.tobytes(), *surfaces
+
+    @property
+    def marched(self) -> Task:
+        """The task with the table that samples take: that of the projection, if there is one.
+
+        A value counts for a projection where it has an extinction: any value for the maximum, the
+        minimum and the mean. For the attenuated maximum the extinction grows with the value.
+        """
+        if not self.projection or self.table is None:
+            return self
+        shape = self.table.extinctions.shape
+        extinctions = (
+            np.linspace(0.0, self.attenuation, *shape)
+            if self.projection == "attenuated"
+            else np.full(shape, 1 / self.step)
+        )
+        return replace(self, table=replace(self.table, extinctions=extinctions))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

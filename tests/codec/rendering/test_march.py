@@ -299,7 +299,7 @@ def test_the_maximum_is_that_of_the_samples(way: str) -> None:
         colours=np.linspace([0, 0, 0], [1, 1, 1], n, dtype=np.float32),
         extinctions=np.ones(n),
     )
-    task = task_of(values.shape, table, size=(17, 17), maximum=True, step=0.25, depth=True)
+    task = task_of(values.shape, table, size=(17, 17), projection="maximum", step=0.25, depth=True)
     marched = march(frame_of(values), task)
     everything = march(frame_of(values), replace(task, skipping=False))
     np.testing.assert_array_equal(marched.rgba, everything.rgba)
@@ -324,11 +324,14 @@ CASES = {
         ),
         "shaded": True,
     },
-    "maximum": {"maximum": True},
+    "maximum": {"projection": "maximum"},
     "maximum and surface": {
-        "maximum": True,
+        "projection": "maximum",
         "surfaces": (Surface(value=0.8, colour=WHITE, opacity=0.5),),
     },
+    "minimum": {"projection": "minimum", "depth": True},
+    "average": {"projection": "average", "depth": True},
+    "attenuated": {"projection": "attenuated", "attenuation": 0.3, "depth": True},
     "all": {"skipping": False, "shaded": True},
 }
 

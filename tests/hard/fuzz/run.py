@@ -35,7 +35,7 @@ SOURCES = ("coder", "mask", "predict", "lifting", "head", "quantise", "values")
 """Files of NATIVE that are always fuzzed."""
 CODEC_SOURCES = ("march_light",)
 """Files of CODEC that are always fuzzed."""
-MARCH = ("march", "march_bricks")
+MARCH = ("march", "march_bricks", "march_effects")
 """Files of CODEC that are fuzzed on request, without optimisation.
 
 The compiler takes one minute for them; with optimisation it takes ten.

@@ -16,7 +16,8 @@ extern "C" {
 int64_t fhash_march(const FhashMarch*, int64_t, int64_t, int64_t, int64_t*);
 int64_t fhash_march_bricks(const float*, const int64_t*, const int64_t*, int64_t, int64_t, int64_t,
                            float*, float*, float*);
-int64_t fhash_march_distance(const int64_t*, std::int32_t*);
+int64_t fhash_march_distance_layers(const int64_t*, std::int32_t*, int64_t, int64_t, std::int32_t*);
+int64_t fhash_march_distance_rows(const int64_t*, std::int32_t*, int64_t, int64_t, std::int32_t*);
 }
 
 namespace {
@@ -31,7 +32,7 @@ double number_of(Reader& in) {
 
 // The arrays to which a task points.
 struct Arrays {
-    std::vector<float> values, lowest, highest, scratch, table, light, powers, out, depth, normal;
+    std::vector<float> grading, values, lowest, highest, scratch, table, light, powers, out, depth, normal;
     std::vector<double> extinction;
     std::vector<std::int32_t> distance;
     std::vector<std::uint32_t> cells;
@@ -63,7 +64,9 @@ void make_bricks(Reader& in, Switches flags, FhashMarch& m, Arrays& arrays) {
     const std::vector<std::uint8_t> matters = repeated<std::uint8_t>(in, bricks);
     for (std::size_t i = 0; i < arrays.distance.size(); i++)
         arrays.distance[i] = matters[i] % 3 ? 0 : 255;
-    fhash_march_distance(m.bricks, arrays.distance.data());
+    std::vector<std::int32_t> lines(arrays.distance.size());
+    fhash_march_distance_layers(m.bricks, arrays.distance.data(), 0, m.bricks[0], lines.data());
+    fhash_march_distance_rows(m.bricks, arrays.distance.data(), 0, m.bricks[1], lines.data());
     arrays.cells = repeated<std::uint32_t>(in, 2 * bricks);
     m.distance = flags.on(0) ? arrays.distance.data() : nullptr;
     m.cells = flags.on(0) && flags.on(1) ? arrays.cells.data() : nullptr;
@@ -147,6 +150,13 @@ void make_march(Reader& in, Switches flags, Switches more, FhashMarch& m, Arrays
         m.surface[i][0] = number_of(in);
         for (int c = 1; c < 5; c++) m.surface[i][c] = static_cast<double>(in.byte()) / 255;
     }
+    m.planes = in.within(0, FHASH_PLANES);
+    for (int64_t i = 0; i < m.planes; i++)
+        for (double& number : m.plane[i]) number = number_of(in);
+    arrays.grading.assign(FHASH_GRADES + 2, 0.5F);
+    m.grading = arrays.grading.data();
+    m.grade_scale = std::fabs(number_of(in));
+    m.unlit = in.within(0, 1);
     arrays.out.resize(static_cast<std::size_t>(4 * m.width * m.height));
     arrays.depth.resize(arrays.out.size() / 4);
     arrays.normal.resize(3 * arrays.depth.size());
@@ -168,9 +178,12 @@ void march(Reader& in) {
     make_table(in, m, arrays);
     make_light_and_camera(in, flags, more, m, arrays);
     make_march(in, flags, more, m, arrays);
-    const bool maximum = flags.on(7);
-    const int64_t effects = maximum ? 4 : (m.light ? 2 : 0) | (more.on(7) ? 1 : 0);
-    if (maximum) m.surfaces = 0;
+    const int64_t projections[] = {4, 4 | 32, 64, 128};
+    const bool projected = flags.on(7);
+    const int64_t drawn = (m.light ? 2 : 0) | (more.on(7) ? 1 : 0);
+    const int64_t effects =
+        projected ? projections[in.within(0, 3)] : in.within(0, 1) ? drawn | 1 | 256 : drawn;
+    if (projected) m.surfaces = 0;
     int64_t counters[5] = {};
     fhash_march(&m, effects, 0, ((m.width + 15) / 16) * ((m.height + 15) / 16), counters);
 }

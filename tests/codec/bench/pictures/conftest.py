@@ -14,7 +14,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, Volume
-from fhash_codec.bench.pictures import beside_vtk, pictures
+from fhash_codec.bench.pictures import beside_vtk, orbit, pictures
 from fhash_codec.bench.pictures.pictures import bench_render
 from fhash_codec.bench.pictures.results import RenderBench
 from fhash_codec.rendering.scene.scene import Scene
@@ -39,6 +39,7 @@ def volume(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Volume]:
 def result(volume: Volume) -> RenderBench:
     """Every part measured once, with small pictures where their size is fixed."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(orbit, "SIDE", 40)
         patch.setattr(pictures, "STREAM_SIZE", 32)
         patch.setattr(beside_vtk, "FINE_SIZE", 64)
         patch.setattr(beside_vtk, "EXPLAINED_SIZE", 48)

@@ -7,17 +7,23 @@ import pytest
 
 from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid, Rays
+from fhash_codec.rendering.camera.clip import Body
 from fhash_codec.rendering.native.march import march_native
 from fhash_codec.rendering.scene.scene import Camera, Shadows
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.light import light_grid
-from fhash_codec.rendering.task.task import Frame, Lighting, Surface, Table, Task
+from fhash_codec.rendering.task.task import Frame, Grading, Lighting, Surface, Table, Task
 
 CENTRAL = Lighting(
     ambient=0.2, diffuse=0.8, specular=0.3, specular_power=8.0, lamp=None, central=True
 )
 CELL = replace(CENTRAL, central=False)
 WHITE = np.ones(3)
+GRADING = Grading(factors=np.interp(np.arange(1025), [0, 300, 900], [0, 1, 0.3]), top=0.2)
+BODY = Body(
+    bounds=np.array([[-0.5, 17.3], [-0.5, 40], [-0.5, 40]]),
+    planes=np.array([[-0.6, 0.8, 0, -4.5], [0, 0.6, -0.8, -7.25]]),
+)
 PATHS = {"quickest": 0, "AVX2": 1, "plain": 2}
 
 
@@ -188,7 +194,16 @@ CASES = {
     "central": {"shaded": True, "antialiasing": 2},
     "jitter": {"jitter": True, "step": 1.7},
     "surfaces": {"shaded": True, "surfaces": (Surface(value=0.62, colour=WHITE, opacity=0.4),)},
-    "maximum": {"maximum": True, "depth": True},
+    "maximum": {"projection": "maximum", "depth": True},
+    "minimum": {"projection": "minimum", "depth": True},
+    "average": {"projection": "average", "depth": True, "extinctions": [1.0] * 100},
+    "attenuated": {"projection": "attenuated", "attenuation": 0.4, "depth": True},
+    "graded": {"shaded": True, "grading": GRADING},
+    "graded fog": {
+        "grading": GRADING,
+        "surfaces": (Surface(value=0.62, colour=WHITE, opacity=0.4),),
+    },
+    "clipped": {"shaded": True, "body": BODY},
     "narrow": {"extinctions": [0.0] * 50 + [1.0] * 3 + [0.0] * 50},
 }
 

@@ -28,7 +28,7 @@ def test_what_no_effect_asks_for_is_not_in_the_task(volume: Volume) -> None:
     assert task.lighting is None
     assert task.light is None
     assert not planned.lights
-    on = [task.shaded, task.surfaces, task.maximum, task.depth, task.normal, task.jitter]
+    on = [task.shaded, task.surfaces, task.projection, task.depth, task.normal, task.jitter]
     assert not any(on)
     assert planned.to_dict()["gradient"] == "none: no effect asks for it"
     assert planned.to_dict()["secondary rays"] == "none: no effect asks for them"

@@ -114,6 +114,45 @@ SCENES: dict[str, dict[str, Any]] = {
     "maximum and surface": {
         "effects": {"maximum_intensity": True, "isosurfaces": [{"value": 5, "opacity": 0.5}]}
     },
+    "minimum": {"effects": {"minimum_intensity": True, "buffers": ["depth"]}},
+    "average": {"effects": {"average_intensity": True, "buffers": ["depth"]}},
+    "attenuated": {"effects": {"attenuated_maximum_intensity": {"attenuation": 0.3}}},
+    "average and surface": {
+        "effects": {"average_intensity": True, "isosurfaces": [{"value": 5, "opacity": 0.5}]}
+    },
+    "graded": {"transfer_function": {"gradient_opacity": [[0.02, 0], [0.15, 1]]}},
+    "graded and lit": {
+        "transfer_function": {"gradient_opacity": [[0, 1], [0.1, 0.2]]},
+        "effects": {
+            "shadows": True,
+            "ambient_occlusion": True,
+            "isosurfaces": [{"value": 5, "opacity": 0.5}],
+        },
+    },
+    "graded by central differences": {
+        "transfer_function": {"gradient_opacity": [[0, 0.1], [0.05, 1], [0.1, 0]]},
+        "effects": {"shading": {"gradient": "central"}},
+    },
+    "clipped": {
+        "effects": {
+            "clip": {"x": [4.3, 20], "z": [None, 11]},
+            "shading": True,
+            "buffers": ["depth", "normal"],
+        }
+    },
+    "clipped by planes": {
+        "effects": {
+            "clip": {
+                "planes": [
+                    {"normal": [1, 1, 0.5], "point": [12, 10, 9]},
+                    {"normal": [0, -1, 0], "offset": -17.5},
+                ]
+            },
+            "shadows": True,
+            "isosurfaces": [{"value": 5, "opacity": 0.5}],
+        }
+    },
+    "clipped and coarse": {"march": {"lod": 1}, "effects": {"clip": {"x": [5, 18], "y": [3, 15]}}},
     "jitter": {"effects": {"jitter": True, "antialiasing": 2}},
     "narrow": {
         "transfer_function": {"opacity": [[4, 0], [4.5, 0.9], [5, 0]]},
@@ -151,6 +190,13 @@ NETWORK_SCENES: dict[str, dict[str, Any]] = {
         }
     },
     "maximum": {"effects": {"maximum_intensity": True}},
+    "minimum": {"effects": {"minimum_intensity": True}},
+    "average": {"effects": {"average_intensity": True}},
+    "attenuated": {"effects": {"attenuated_maximum_intensity": True}},
+    "graded": {"transfer_function": {"gradient_opacity": [[0, 0], [0.2, 1]]}},
+    "clipped": {
+        "effects": {"clip": {"x": [4.3, 20], "planes": [{"normal": [0, 1, 1], "offset": 20}]}}
+    },
     "central": CENTRAL,
     "unskipped": {"march": {"skipping": False}},
 }
