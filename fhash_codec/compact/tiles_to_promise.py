@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 from math import prod
 
 from fhash_codec.compact.choices.search import SLOPE
-from fhash_codec.compact.choices.step import psnr_search, require_reach
+from fhash_codec.compact.choices.step import psnr_search, require_reach, with_step
 from fhash_codec.compact.choices.transform import refit, usual_transform
 from fhash_codec.compact.coded_table import CodedTable
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.plan import CodingPlan, plan
 from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile
-from fhash_codec.compact.tiles.coding import Outcome, code, total
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Outcome, code, total
 from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
@@ -47,6 +47,10 @@ MARGIN = 0.005
 """dB added to the PSNR in the second pass; doubled in each further one."""
 UNLIKE = 0.3
 """dB by which all tiles may be worse than the sample before the head is dropped."""
+FIRST_FINER = 1.1
+"""Factor of the first finer step where the search has missed the promise; then its square."""
+MAX_FINER = 2.0
+"""Largest such factor."""
 REFIT_RATIO = 1.5
 """Ratio by which the step must fall before the data's own bases are made anew."""
 
@@ -161,6 +165,30 @@ def _code_to_psnr(
         if aim.psnr_of(best.outcome) >= aim.min_psnr:
             break
     assert best is not None
+    return _rescued(best, aim, workers, progress)
+
+
+def _rescued(
+    best: CodedTable, aim: _Aim, workers: ThreadPoolExecutor, progress: Progress
+) -> CodedTable:
+    """Return a table that keeps the promise, by ever finer steps, where the search has missed it.
+
+    At the level of the noise of a series the PSNR hardly depends on the step, and then much.
+    """
+    table, finer = best, FIRST_FINER
+    while aim.psnr_of(table.outcome) < aim.min_psnr:
+        settings = table.plan.settings
+        require_reach(table.plan.goal, settings, table.outcome)
+        step = max(settings.step / finer, (settings.high - settings.low) * MIN_STEP_SHARE)
+        if step >= settings.step:
+            break
+        finer = min(finer**2, MAX_FINER)
+        refined = with_step(replace(settings, head=None), step, table.plan.goal)
+        if not refined.double:  # a head works in float32 only
+            refined = replace(refined, head=settings.head)
+        table = _code_all(replace(table.plan, settings=refined), workers, progress)
+        if aim.prefers(table.outcome, best.outcome):
+            best = table
     return best
 
 
