@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
+import warnings
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
 
 from fhash_codec.compact.encode import encode_compact
-from fhash_codec.compact.goal import promise
 from fhash_codec.comparison import measure
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.header import brief_quality
 from fhash_codec.paper.encode import encode_paper
 from fhash_codec.progress import Progress, silent
+from fhash_codec.promises import missed_promise, remarks
 from fhash_codec.report import report
+from fhash_codec.training.devices import choose_device
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter
-from fhash_formats.errors import InputError, QualityError
+from fhash_formats.errors import FhashWarning, InputError, QualityError
+from fhash_formats.series import Series
 from fhash_formats.support.atomic import check_output
 
 DATA_SUFFIXES = frozenset(
@@ -52,34 +55,96 @@ def encode(
     Returns the figures of the written file (see `report`). Ctrl-C during the training saves a
     checkpoint beside `path` and raises InterruptedEncodingError; the same call then continues from
     the checkpoint to the same result. Raises InputError for a source or settings that cannot be
-    encoded. Raises QualityError, with the file written and its figures in the error, if the file
-    misses what the settings promise.
+    encoded, or for a promise that is seen to be out of reach. Raises QualityError, with the figures
+    of the file in the error, if the file misses what the settings promise. It is written
+    nevertheless: as `path` where that is free; an older file stays as it is, and the new one is
+    written beside it (`missed_path`). Warns (FhashWarning) where the bulk of the values is far
+    worse than an explicit promise sounds.
     """
     config, path = config or EncodeConfig(), Path(os.path.normpath(path))
     begun = time.perf_counter()
     check_name(path)
     check_output(path, force)
+    if config.device == "cuda":
+        choose_device(config.device)  # told now, and not after the planning
     with open_source(source) as series:
         check_output(path, force, sources=[*series.files, *_mask_files(config)])
         with ContainerWriter(path, force=force) as writer:
+            measured = _Measured(writer, series, progress)
             checkpoint = None
             if config.profile == "compact":
-                header = encode_compact(writer, series, config, mask, progress)
+                header = encode_compact(writer, series, config, mask, progress, measured.complete)
             else:
                 header, checkpoint = encode_paper(writer, series, config, mask, path, progress)
-            with Volume(writer.preview(header)) as volume:
-                quality = measure(series, volume, progress)
-            header["quality"] = brief_quality(quality)
+                header = measured.complete(header)
+            missed = missed_promise(config, measured.figures(header))
+            if missed is not None and os.path.lexists(path):
+                writer.divert(missed_path(path))
+            written = writer.path
             progress("writing", 0, 1, "")
             writer.commit(header)
             progress("writing", 1, 1, "")
         if checkpoint is not None:
             checkpoint.unlink(missing_ok=True)
-    with open_volume(path) as volume:
+    with open_volume(written) as volume:
         seconds = time.perf_counter() - begun
-        figures = report(volume, quality, seconds=seconds, files=series.files)
-    _check_promise(path, config, figures)
+        figures = report(volume, measured.quality, seconds=seconds, files=series.files)
+    if missed is not None:
+        raise QualityError(_told(path, written, missed, config), figures)
+    for remark in remarks(config, figures):
+        warnings.warn(remark, FhashWarning, stacklevel=2)
     return figures
+
+
+class _Measured:
+    """Measurement of a container that is being written.
+
+    Attributes:
+        quality: the figures of the last header that was completed, as JSON values.
+    """
+
+    def __init__(self, writer: ContainerWriter, series: Series, progress: Progress) -> None:
+        self.quality: dict[str, Any] = {}
+        self._writer, self._series, self._progress = writer, series, progress
+
+    def complete(self, header: dict[str, Any]) -> dict[str, Any]:
+        """The header with the quality of the arrays written so far, as they decode."""
+        with Volume(self._writer.preview(header)) as volume:
+            self.quality = measure(self._series, volume, self._progress)
+        return {**header, "quality": brief_quality(self.quality)}
+
+    def figures(self, header: dict[str, Any]) -> dict[str, Any]:
+        """Figures that a promise is checked by; see `report`."""
+        low, high = header["value_range"]
+        raw_bytes = prod(self._series.shape) * self._series.dtype.itemsize
+        return {
+            **self.quality,
+            "quality": self.quality,
+            "data_range": high - low,
+            "ratio": raw_bytes / self._writer.size(header),
+            "promised": header["config"],
+        }
+
+
+def missed_path(path: Path) -> Path:
+    """The name of a file that misses its promise, beside an older file `path` that stays.
+
+    It is RUN.missed.fhz for RUN.fhz, or RUN.missed-2.fhz and so on where that exists.
+    """
+    number = 1
+    while True:
+        suffix = "missed" if number == 1 else f"missed-{number}"
+        other = path.with_name(f"{path.stem}.{suffix}{path.suffix}")
+        if not os.path.lexists(other):
+            return other
+        number += 1
+
+
+def _told(path: Path, written: Path, missed: str, config: EncodeConfig) -> str:
+    """The message of a missed promise: what was missed, and where the file is."""
+    where = "the file is written" if written == path else f"it is kept, the new file is {written}"
+    advice = "" if config.profile == "compact" else ". More --epochs may help"
+    return f"{path}: {missed}; {where}{advice}"
 
 
 def check_name(path: Path) -> None:
@@ -94,37 +159,3 @@ def _mask_files(config: EncodeConfig) -> list[str]:
     """Paths of the masks among the features."""
     prefix = "mask:"
     return [text.removeprefix(prefix) for text in config.features if text.startswith(prefix)]
-
-
-def _check_promise(path: Path, config: EncodeConfig, figures: dict[str, Any]) -> None:
-    """Raise QualityError if the written file misses what the settings promise."""
-    missed = _missed_bound(config, figures) or _missed_psnr(config, figures)
-    if missed is not None:
-        advice = "" if config.profile == "compact" else ". More --epochs may help"
-        raise QualityError(f"{path}: {missed}; the file is written{advice}", figures)
-
-
-def _missed_psnr(config: EncodeConfig, figures: dict[str, Any]) -> str | None:
-    """Text on a PSNR below the promised one; None if there is no such promise or it holds."""
-    promised = promise(config).get("psnr") if config.profile == "compact" else config.psnr
-    if promised is None or figures["rmse"] == 0:
-        return None
-    psnr = figures["psnr"]
-    if psnr is None:
-        return f"an unknown PSNR, {promised:g} dB were asked for"
-    if psnr < promised:
-        return f"{psnr:.2f} dB over the coreset, {promised:g} dB were asked for"
-    return None
-
-
-def _missed_bound(config: EncodeConfig, figures: dict[str, Any]) -> str | None:
-    """Text on an error beyond the promised bound; None if there is no such promise or it holds."""
-    bound = math.inf
-    if config.max_error is not None:
-        bound = config.max_error
-    elif config.max_error_rel is not None:
-        bound = config.max_error_rel * figures["data_range"]
-    largest = figures["max_abs_error"]
-    if largest is not None and largest > bound:
-        return f"a largest error of {largest:g}, at most {bound:g} was asked for"
-    return None

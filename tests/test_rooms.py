@@ -44,7 +44,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("volume_model",),
         ("indexing", "sampling", "times", "value_type"),
         ("volume",),
-        ("rendering", "report"),
+        ("promises", "rendering", "report"),
         ("comparison", "demo", "isosurface"),
         ("encoding",),
         ("selftest",),

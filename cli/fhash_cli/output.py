@@ -222,11 +222,22 @@ def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, 
     exact = report.get("rmse") == 0
     return [
         ("PSNR, coreset", "exact" if exact else number(report.get("psnr"), "dB")),
+        *_bulk_rows(report),
         ("PSNR, domain", number(report.get("psnr_domain"), "dB")),
         ("RMSE", number(report.get("rmse"), units)),
         ("largest error", number(report.get("max_abs_error"), units)),
         ("SSIM", number(report.get("ssim"), digits=5)),
     ]
+
+
+def _bulk_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The row of the PSNR within the middle 98 % of the values; none where it is not known."""
+    bulk = report.get("quality", report).get("bulk")
+    if bulk is None:
+        return []
+    low, high = apart(*bulk["range"])
+    psnr = "exact" if bulk["psnr"] is None else number(bulk["psnr"], "dB")
+    return [("PSNR, bulk", f"{psnr}, of the 98 % from {low} to {high}")]
 
 
 def loss_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:

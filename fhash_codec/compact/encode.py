@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy.typing as npt
 
-from fhash_codec.compact.coded_table import model_header, required_features, write_table
+from fhash_codec.compact.coded_table import (
+    CodedTable,
+    model_header,
+    required_features,
+    write_table,
+)
 from fhash_codec.compact.goal import promise
-from fhash_codec.compact.tiles_to_promise import code_series
+from fhash_codec.compact.tiles_to_promise import code_series, resized
+from fhash_codec.compact.tiles_to_size import ByteWindow
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Everything
-from fhash_codec.coreset.selection import select_features
+from fhash_codec.coreset.selection import FeatureSelection, select_features
 from fhash_codec.header import brief_history, describe_source, history_columns, write_series
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
@@ -22,6 +29,13 @@ from fhash_formats.container import ContainerWriter
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import Series
 
+HEADER_BYTES = 1200
+"""Bytes that a header has at least beside the description of the source, approximately."""
+STEP_BYTES = 12
+"""Approximate bytes of the figures of a step in a header."""
+WRITINGS = 4
+"""Times that a file is written at most for a promised ratio."""
+
 
 def encode_compact(
     writer: ContainerWriter,
@@ -29,10 +43,15 @@ def encode_compact(
     config: EncodeConfig,
     mask: npt.ArrayLike | None,
     progress: Progress,
+    complete: Callable[[dict[str, Any]], dict[str, Any]],
 ) -> dict[str, Any]:
-    """Code the values of a series and write them; the header without its quality.
+    """Code the values of a series and write them; the header.
+
+    For a promised ratio they are written again until the whole file has it, where a step of the
+    quantiser allows that.
 
     mask: booleans (t, z, y, x) or (z, y, x), one more feature.
+    complete: measures what is written, and returns a header with its quality.
 
     Warns (FhashWarning) where the native library is missing.
     """
@@ -45,22 +64,43 @@ def encode_compact(
         )
     begun = time.perf_counter()
     selection = select_features(series, config, progress, mask)
-    extent = selection.extent
-    table = code_series(series, selection, config, progress)
     described = write_series(
         writer,
         series,
         selection.scanned,
-        extent.key_frames,
+        selection.extent.key_frames,
         brief=True,
         everything=any(isinstance(feature, Everything) for feature in selection.features),
     )
-    write_table(writer, table)
-    seconds = round(time.perf_counter() - begun, 3) if config.timings else None
+    mark = writer.mark()
+    source = describe_source(series, selection.scanned.value_range, config)
+    overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
+    table = code_series(series, selection, config, progress, overhead=overhead)
+    for _ in range(WRITINGS):
+        write_table(writer, table)
+        seconds = round(time.perf_counter() - begun, 3) if config.timings else None
+        header = complete(source | described | _header(selection, table, config, seconds))
+        overhead = writer.size(header) - table.outcome.size
+        if config.ratio is None or ByteWindow.of(table.plan.goal, overhead).holds(table):
+            break
+        other = resized(table, overhead, progress)
+        if other.outcome.size == table.outcome.size:
+            break
+        table = other
+        writer.rewind(mark)
+    return header
+
+
+def _header(
+    selection: FeatureSelection, table: CodedTable, config: EncodeConfig, seconds: float | None
+) -> dict[str, Any]:
+    """Return what a header says beside the source and its coordinates, without the quality.
+
+    seconds: duration of the encoding; None if it is not to be told.
+    """
+    extent = selection.extent
     history = brief_history(table.plan.history, timings=config.timings)
     return {
-        **describe_source(series, selection.scanned.value_range, config),
-        **described,
         "required_features": required_features(table),
         "background": extent.background,
         "feature_bounding_box": [list(span) for span in extent.box],

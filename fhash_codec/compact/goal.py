@@ -17,6 +17,8 @@ DEFAULT_PSNR = 50.0
 """PSNR in dB that is promised where nothing is asked for."""
 DEFAULT_PSNR_BULK = 40.0
 """PSNR in dB that is promised of a wide bulk where nothing is asked for."""
+RATIO_SLACK = 1.05
+"""Factor by which a file may be smaller than a promised ratio asks for, where a step allows it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from fhash_codec.compact.choices.fillings import choose_filling
 from fhash_codec.compact.choices.head import choose_head
 from fhash_codec.compact.choices.mask import mask_levels
 from fhash_codec.compact.choices.predictor import choose_predictor
-from fhash_codec.compact.choices.step import find_step, with_step
+from fhash_codec.compact.choices.step import find_step, require_reach, with_step
 from fhash_codec.compact.choices.transform import choose_transform, refit, usual_transform
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
@@ -96,6 +96,7 @@ def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
     sample = _sample(task, tiled, settings, LOOK_VERTICES)
     settings = _with_mask(task, sample, settings, task.goal.expected_error)
     settings, outcome = find_step(sample, settings, coding, task.goal, tries=2)
+    require_reach(task.goal, settings, outcome)
     task.gains.note("start", outcome)
     return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
 

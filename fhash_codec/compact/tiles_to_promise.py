@@ -1,6 +1,6 @@
 """Coding of all tiles of a series, so that the promise is kept on the whole and not just a sample.
 
-The tiles are coded once for a bound or a size. For a PSNR they are coded again, with other steps,
+The tiles are coded once for a bound. For a PSNR or a size they are coded again, with other steps,
 until they reach it.
 """
 
@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 from math import prod
 
 from fhash_codec.compact.choices.search import SLOPE
-from fhash_codec.compact.choices.step import psnr_search
+from fhash_codec.compact.choices.step import psnr_search, require_reach, with_step
 from fhash_codec.compact.choices.transform import refit, usual_transform
 from fhash_codec.compact.coded_table import CodedTable
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.plan import CodingPlan, plan
 from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile
-from fhash_codec.compact.tiles.coding import Outcome, code, total
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Outcome, code, total
+from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
 from fhash_codec.measure.bulk import find_bulk
@@ -28,10 +29,10 @@ from fhash_codec.progress import Progress
 from fhash_formats.series import Series
 from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
 
-__all__ = ["code_series"]
+__all__ = ["code_series", "resized"]
 
 OVERHEAD_BYTES = 3000
-"""Approximate bytes of a container without its tiles; only the search for a ratio needs it."""
+"""Approximate bytes of a container without its tiles, for the sizes after each stage."""
 PASSES = 4
 """Times that all tiles are coded at most for a promise that the sample did not foretell."""
 SAFE = 1e-3
@@ -46,27 +47,44 @@ MARGIN = 0.005
 """dB added to the PSNR in the second pass; doubled in each further one."""
 UNLIKE = 0.3
 """dB by which all tiles may be worse than the sample before the head is dropped."""
+FIRST_FINER = 1.1
+"""Factor of the first finer step where the search has missed the promise; then its square."""
+MAX_FINER = 2.0
+"""Largest such factor."""
 REFIT_RATIO = 1.5
 """Ratio by which the step must fall before the data's own bases are made anew."""
 
 
 def code_series(
-    series: Series, selection: FeatureSelection, config: EncodeConfig, progress: Progress
+    series: Series,
+    selection: FeatureSelection,
+    config: EncodeConfig,
+    progress: Progress,
+    *,
+    overhead: int = OVERHEAD_BYTES,
 ) -> CodedTable:
-    """Plan and code all tiles so that the promise of the settings is kept, if it can be."""
+    """Plan and code all tiles so that the promise of the settings is kept, if it can be.
+
+    overhead: approximate bytes of the file that are no tiles; only a promised ratio needs it.
+
+    Raises InputError for a promise that is seen to be out of reach.
+    """
     value_range = selection.scanned.value_range
     raw_bytes = prod(series.shape) * (series.source_dtype or series.dtype).itemsize
     begun = time.perf_counter()
     blocks = Blocks(series, selection.extent, series.shape)
     integers = blocks.dtype.kind in "iu"
     bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
-    goal = goal_of(config, value_range, raw_bytes, OVERHEAD_BYTES, bulk, integers=integers)
+    goal = goal_of(config, value_range, raw_bytes, overhead, bulk, integers=integers)
     with thread_pool() as workers:
         coding_plan = plan(
             blocks, value_range, config, goal, OVERHEAD_BYTES, workers, progress, selection.features
         )
         if goal.psnr is None or goal.data_range == 0:
             table = _code_all(coding_plan, workers, progress)
+            if goal.size is not None:
+                window = ByteWindow.of(goal, overhead)
+                table = code_to_size(table, window, lambda plan: _code_all(plan, workers, progress))
         else:
             aim = _Aim(psnr=goal.psnr, data_range=goal.data_range, quick=config.effort == 1)
             table = _code_to_psnr(coding_plan, aim, workers, progress)
@@ -77,6 +95,17 @@ def code_series(
     }
     table = replace(table, plan=replace(table.plan, gains=[*table.plan.gains, gain]))
     return replace(table, bulk=bulk)
+
+
+def resized(table: CodedTable, overhead: int, progress: Progress) -> CodedTable:
+    """Return a table of the promised ratio, now that the bytes besides the tiles are known.
+
+    overhead: bytes of the file that are no tiles.
+    """
+    with thread_pool() as workers:
+        window = ByteWindow.of(table.plan.goal, overhead)
+        other = code_to_size(table, window, lambda plan: _code_all(plan, workers, progress))
+    return replace(other, bulk=table.bulk)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +166,30 @@ def _code_to_psnr(
         if aim.psnr_of(best.outcome) >= aim.min_psnr:
             break
     assert best is not None
+    return _rescued(best, aim, workers, progress)
+
+
+def _rescued(
+    best: CodedTable, aim: _Aim, workers: ThreadPoolExecutor, progress: Progress
+) -> CodedTable:
+    """Return a table that keeps the promise, by ever finer steps, where the search has missed it.
+
+    At the level of the noise of a series the PSNR hardly depends on the step, and then much.
+    """
+    table, finer = best, FIRST_FINER
+    while aim.psnr_of(table.outcome) < aim.min_psnr:
+        settings = table.plan.settings
+        require_reach(table.plan.goal, settings, table.outcome)
+        step = max(settings.step / finer, (settings.high - settings.low) * MIN_STEP_SHARE)
+        if step >= settings.step:
+            break
+        finer = min(finer**2, MAX_FINER)
+        refined = with_step(replace(settings, head=None), step, table.plan.goal)
+        if not refined.double:  # a head works in float32 only
+            refined = replace(refined, head=settings.head)
+        table = _code_all(replace(table.plan, settings=refined), workers, progress)
+        if aim.prefers(table.outcome, best.outcome):
+            best = table
     return best
 
 
@@ -157,6 +210,7 @@ def _search_psnr(
             best = table
         if aim.is_met(psnr, attempt):
             break
+        require_reach(coding_plan.goal, coding_plan.settings, table.outcome)
         settings = coding_plan.settings
         if psnr < aim.min_psnr - UNLIKE and attempt == 0 and settings.head is not None:
             break  # the head does not hold for all tiles

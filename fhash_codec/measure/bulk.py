@@ -94,6 +94,9 @@ def _rounded(low: float, high: float, limits: ValueRange, *, whole: bool) -> Val
 
     None if no width is left.
     """
+    low, high = max(low, limits.low), min(high, limits.high)
+    if not 0 < high - low < math.inf:
+        return None
     if whole:
         # The ends lie less than one bin outside of the whole numbers that they stand for.
         low, high = math.ceil(low), math.floor(high)

@@ -25,6 +25,11 @@ def test_from_dict_of_to_dict_is_the_same_even_through_json(config) -> None:
     assert EncodeConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
+def test_the_two_psnrs_may_be_promised_together() -> None:
+    config = EncodeConfig(psnr=50.0, psnr_bulk=40.0)
+    assert EncodeConfig.from_dict(config.to_dict()) == config
+
+
 def test_every_field_has_help() -> None:
     for name, field in EncodeConfig.__dataclass_fields__.items():
         assert field.metadata["help"], name
@@ -67,6 +72,8 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
             {"psnr": 40.0, "max_error": 1.0, "ratio": 3.0},
             "psnr and max-error and ratio are given; promise one of them",
         ),
+        ({"psnr_bulk": 40.0, "max_error": 1.0}, "psnr-bulk and max-error are given; promise one"),
+        ({"psnr_bulk": 401.0}, "psnr-bulk is 401"),
         ({"effort": 2.5}, "effort is 2.5; a whole number"),
         ({"fold": 1}, "fold is 1; allowed: 2 to 64"),
         ({"fold": 2.5}, "fold is 2.5; a whole number"),

@@ -150,6 +150,50 @@ def test_a_promise_that_is_missed_is_an_error_but_the_file_is_there(field, tmp_p
     assert figures["psnr"] > 5
 
 
+def test_a_missed_promise_replaces_nothing(field, tmp_path) -> None:
+    path, config = tmp_path / "run.fhz", EncodeConfig(profile="paper", epochs=1, width=4, psnr=150)
+    path.write_bytes(b"precious")
+    for name in ("run.missed.fhz", "run.missed-2.fhz"):
+        with pytest.raises(QualityError, match=f"it is kept, the new file is .*/{name}") as missed:
+            fhash_codec.encode(field(), path, config, force=True)
+        assert missed.value.figures["path"] == str(tmp_path / name)
+        assert missed.value.figures["bytes"] == (tmp_path / name).stat().st_size
+        assert decoded(tmp_path / name).shape == field().shape
+        assert path.read_bytes() == b"precious"
+    assert len(list(tmp_path.iterdir())) == 3
+    # A promise that is kept replaces the file, and leaves the others alone.
+    fhash_codec.encode(field(), path, FAST, force=True)
+    assert decoded(path).shape == field().shape
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+@pytest.mark.parametrize("config", [{}, {"profile": "paper"}], ids=str)
+def test_a_device_that_is_not_there_is_told_before_any_work(
+    field, tmp_path, monkeypatch, config
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    stages = []
+    with pytest.raises(InputError, match="no CUDA device"):
+        fhash_codec.encode(
+            field(),
+            tmp_path / "a.fhz",
+            EncodeConfig(device="cuda", **config),
+            progress=lambda *call: stages.append(call),
+        )
+    assert not stages
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bulk_is_measured_and_checked_in_the_profile_paper(field, tmp_path) -> None:
+    config = EncodeConfig(profile="paper", epochs=2, width=4, psnr_bulk=5.0)
+    figures = fhash_codec.encode(field(), tmp_path / "a.fhz", config)
+    assert 5 <= figures["psnr_bulk"] < 90
+    assert fhash_codec.diff(field(), tmp_path / "a.fhz")["psnr_bulk"] == figures["psnr_bulk"]
+    config = EncodeConfig(profile="paper", epochs=1, width=4, psnr_bulk=90.0)
+    with pytest.raises(QualityError, match="dB over the bulk, 90 dB were asked for"):
+        fhash_codec.encode(field(), tmp_path / "b.fhz", config)
+
+
 @BOTH
 def test_the_input_is_never_replaced(field, tmp_path, config) -> None:
     np.save(tmp_path / "a.npy", field())

@@ -33,6 +33,15 @@ def test_figures_in_a_file_are_brief_and_never_better_than_they_are() -> None:
     }
 
 
+def test_the_bulk_in_a_file_is_its_range_and_its_psnr() -> None:
+    bulk = {"psnr": 40.1234567, "rmse": 0.01, "range": [1.0, 2.5]}
+    assert brief_quality({"bulk": bulk, "per_step": []})["bulk"] == {
+        "psnr": 40.1234,
+        "range": [1.0, 2.5],
+    }
+    assert brief_quality({"bulk": None, "per_step": []})["bulk"] is None
+
+
 def test_history_in_a_file_is_brief() -> None:
     points = [{"seconds": n * 0.12345, "epoch": n, "psnr": 40.123} for n in range(1, 101)]
     brief = brief_history(points, timings=True)

@@ -147,21 +147,21 @@ def estimated_step(
     coding: Coding,
     *,
     psnr: float,
-    even_psnr: float,
+    even_psnr: float | None = None,
     data_range: float,
     workers: ThreadPoolExecutor,
 ) -> float:
     """Return the step at which the tiles of a series should reach a PSNR (dB).
 
-    even_psnr: PSNR that keeps the promise if errors are everywhere alike: more than `psnr` where
-        the coding measures a bulk that needs it.
+    even_psnr: PSNR that keeps the promise if errors are everywhere alike: more than `psnr`, the
+        default, where the coding measures a bulk that needs it.
 
     The series must be in memory, all of its vertices in the coreset, and coded in float32.
     """
     min_step = data_range * MIN_STEP_SHARE
     error = _squared_error(blocks, psnr, data_range)
     series = _sum(_tile_magnitudes(blocks, settings, workers))
-    step = series.step(_squared_error(blocks, even_psnr, data_range), min_step)
+    step = series.step(_squared_error(blocks, even_psnr or psnr, data_range), min_step)
     if math.prod(blocks.tile) > TRIAL_VERTICES:
         # Large tiles take long to code, and smaller ones tell as much.
         parts = math.prod(blocks.tile) // TRIAL_VERTICES + 1

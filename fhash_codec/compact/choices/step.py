@@ -16,13 +16,13 @@ from fhash_codec.compact.choices.search import (
     arithmetic_mean,
     cheapest,
 )
-from fhash_codec.compact.goal import Goal
+from fhash_codec.compact.goal import RATIO_SLACK, Goal
 from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.errors import InputError
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["find_step", "psnr_search", "with_step"]
+__all__ = ["find_step", "psnr_search", "require_reach", "with_step"]
 
 MAX_STEP_SHARE = 16.0
 """Largest step as a multiple of the value range: with a larger one nothing at all is coded."""
@@ -34,6 +34,10 @@ STEPS_TO_OCTAVE = 3
 """Steps per octave that are tried under a strict bound."""
 MAX_STEP_NUMBER = 15
 """Number of the largest step tried under a strict bound; step 0 is the bound itself."""
+OUT_OF_REACH = 1.0
+"""dB that the finest step must miss before a promise is called out of reach: a sample may err."""
+MIN_SIZE_SHARE = 0.8
+"""Share of the bytes that are no values below which a file cannot be: they are known roughly."""
 SLACK = 1e-6
 """Share of twice the bound by which the residual's quantum is smaller, rounding not included."""
 MAX_ROUNDING_SLACK = 0.1
@@ -81,6 +85,23 @@ def psnr_search(settings: TileSettings) -> PsnrSearch:
     return PsnrSearch(data_range * MIN_STEP_SHARE, data_range * MAX_STEP_SHARE)
 
 
+def require_reach(goal: Goal, settings: TileSettings, outcome: Outcome) -> None:
+    """Raise InputError where the finest step leaves a PSNR far below what is promised.
+
+    outcome: of the settings, on a sample or on all tiles.
+    """
+    finest = (settings.high - settings.low) * MIN_STEP_SHARE
+    if goal.psnr is None or goal.data_range == 0 or settings.step > finest * (1 + 1e-9):
+        return
+    reached = outcome.psnr(goal.data_range)
+    if reached < goal.psnr - OUT_OF_REACH:
+        raise InputError(
+            f"the promised PSNR is out of reach: {goal.psnr:.4g} dB over the whole range are "
+            f"needed, and the finest step of the quantiser gives about {reached:.4g} dB; "
+            "--max-error 0 stores every value exactly"
+        )
+
+
 def find_step(
     sample: Sample,
     settings: TileSettings,
@@ -109,7 +130,12 @@ def find_step(
             return settings, sample.run(settings, replace(coding, error=0.0))
         return _step_for_bound(sample, settings, coding, goal, goal.error, quick=tries <= 2)
     assert goal.size is not None
-    size = goal.size - goal.overhead
+    if goal.size < MIN_SIZE_SHARE * goal.overhead:
+        raise InputError(
+            f"the ratio is out of reach: it leaves {goal.size:.0f} bytes for the file, and all but "
+            f"the values take about {goal.overhead} already; ask for a smaller ratio"
+        )
+    size = max(goal.size / math.sqrt(RATIO_SLACK) - goal.overhead, 1.0)
     return _step_for_size(sample, settings, coding, size, goal.data_range, tries)
 
 
@@ -180,11 +206,6 @@ def _step_for_size(
     tries: int,
 ) -> tuple[TileSettings, Outcome]:
     """Search for the step at which the tiles take a number of bytes."""
-    if size <= 0:
-        raise InputError(
-            "the ratio leaves no room for values: the rest of the file is larger already; ask for"
-            " a smaller ratio"
-        )
     if data_range == 0:
         return settings, sample.run(settings, coding)
     data_range = max(data_range, 1e-300)

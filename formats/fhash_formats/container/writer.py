@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +36,14 @@ USUAL_CHUNK_BYTES = 2 << 20
 
 class _Abandoned(Exception):
     """A block left without `commit`: no error, but it tells `replacing` to keep nothing."""
+
+
+class Mark(NamedTuple):
+    """A state of a `ContainerWriter`: its position, and the number of members and the arrays."""
+
+    position: int
+    members: int
+    arrays: frozenset[str]
 
 
 class ContainerWriter:
@@ -253,6 +262,36 @@ class ContainerWriter:
         self._position += len(tail)
         self._stack.close()
         return self._position
+
+    def size(self, header: Mapping[str, Any]) -> int:
+        """Number of bytes of the file if it were committed with this header."""
+        return self._position + len(self._tail(header))
+
+    def mark(self) -> Mark:
+        """The arrays written so far, for `rewind`."""
+        return Mark(self._position, len(self._members), frozenset(self._arrays))
+
+    def rewind(self, mark: Mark) -> None:
+        """Drop the arrays that were written after a mark, so that others take their place."""
+        self._file.seek(mark.position)
+        self._file.truncate()
+        del self._members[mark.members :]
+        self._arrays, self._position = set(mark.arrays), mark.position
+
+    def divert(self, path: Path) -> None:
+        """Let the container take another name in the same folder, which must be free.
+
+        What the former name belongs to is left alone. Raises OutputExistsError or OutputError.
+        """
+        with ExitStack() as stack:
+            temporary = stack.enter_context(replacing(path, force=False))
+            self._file.close()
+            os.replace(self._temporary, temporary)
+            file = stack.enter_context(temporary.open("ab"))
+            former, self._stack = self._stack, stack.pop_all()
+        self.path, self._temporary, self._file = path, temporary, file
+        abandoned = _Abandoned()
+        former.__exit__(type(abandoned), abandoned, None)
 
     def _open(self, tail: bytes) -> Container:
         self._file.flush()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fhash_codec.measure.metrics import Errors, measure_quality, psnr
+from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
 
 
@@ -164,6 +165,7 @@ def test_quality_measures_the_coreset_and_the_domain() -> None:
         "psnr",
         "rmse",
         "max_abs_error",
+        "bulk",
         "ssim",
         "ssim_window",
         "psnr_domain",
@@ -177,6 +179,35 @@ def test_quality_measures_the_coreset_and_the_domain() -> None:
     # The note is of all steps so far, not of the last one, which has no PSNR here.
     assert [calls[step][3] for step in (1, 2)] == [calls[1][3]] * 2
     assert calls[3][3] == f"{figures['psnr']:.1f} dB so far"
+
+
+def test_the_bulk_is_measured_within_its_range_and_the_coreset() -> None:
+    original, decoded = frames(4, (12, 13, 14), dtype=np.float32)
+    decoded[original > 0.75] += 1.0
+    decoded[np.random.default_rng(3).random(original.shape) < 0.4] = np.nan
+    quality = measure_quality(
+        original.__getitem__, decoded.__getitem__, 4, 1.0, 0.5, bulk=ValueRange(0.25, 0.75)
+    )
+    inside = np.isfinite(decoded) & (original >= 0.25) & (original <= 0.75)
+    rmse = math.sqrt(np.mean((original - decoded)[inside].astype(float) ** 2))
+    assert quality.bulk.rmse == pytest.approx(rmse, rel=1e-5)
+    assert quality.bulk.psnr == pytest.approx(20 * math.log10(0.5 / rmse), rel=1e-6)
+    assert quality.bulk.psnr > 30 > quality.psnr
+    assert json.loads(json.dumps(quality.to_dict(), allow_nan=False))["bulk"] == {
+        "psnr": quality.bulk.psnr,
+        "rmse": quality.bulk.rmse,
+        "range": [0.25, 0.75],
+    }
+
+
+def test_a_bulk_without_error_or_without_vertices_has_no_psnr() -> None:
+    original, _ = frames(2)
+    read = original.__getitem__
+    exact = measure_quality(read, read, 2, 1.0, 0.5, bulk=ValueRange(0.25, 0.75)).bulk
+    assert (exact.psnr, exact.rmse) == (None, 0.0)
+    empty = measure_quality(read, read, 2, 1.0, 0.5, bulk=ValueRange(5.0, 6.0)).bulk
+    assert (empty.psnr, empty.rmse) == (None, None)
+    assert measure_quality(read, read, 2, 1.0, 0.5).bulk is None
 
 
 @pytest.mark.parametrize(("data_range", "value"), [(0.0, 3.0), (math.inf, 1e308)])

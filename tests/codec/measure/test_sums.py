@@ -7,7 +7,7 @@ import pytest
 
 from fhash_codec import native
 from fhash_codec.compact.choices.estimate import magnitudes
-from fhash_codec.measure.sums import range_and_sum, squared_errors
+from fhash_codec.measure.sums import error_sums, histogram, range_and_sum, squared_errors
 
 needs_native = pytest.mark.skipif(
     native.library() is None, reason="the native library was not built here"
@@ -85,17 +85,52 @@ def test_native_and_numpy_agree_bit_for_bit(monkeypatch, size, dtype, missing) -
     for choice in ("1", "0"):
         monkeypatch.setenv("FHASH_NATIVE", choice)
         seen = magnitudes(decoded.astype(np.float32))
+        counts = np.zeros(100, np.int64)
+        histogram(original, counts, scale=0.5, low=-300.0, factor=0.2)
+        bulk = (-200.0, 300.0)
         found.append(
             (
                 range_and_sum(original, 0.3),
                 squared_errors(original, decoded, None, 0.3),
                 squared_errors(original, decoded, mask, 0.3),
                 squared_errors(original.astype(np.float32), decoded.astype(np.float64), mask, 0.3),
+                error_sums(original, decoded, None, 0.3, bulk),
+                error_sums(original, decoded, mask, 0.3, bulk),
+                error_sums(
+                    original.astype(np.float32), decoded.astype(np.float64), mask, 0.3, bulk
+                ),
+                counts.tobytes(),
                 seen.counts.tobytes(),
                 seen.squares.tobytes(),
             )
         )
     assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("choice", ["1", "0"])
+@pytest.mark.parametrize("dtype", [np.float32, np.int16, np.int64])
+def test_the_bulk_is_summed_once_more(monkeypatch, choice, dtype) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", choice)
+    original = pair(20_000, np.float64)[0].astype(dtype)
+    decoded = original + np.linspace(-1, 1, original.size).astype(np.float32)
+    low, high = float(original[3]), float(original[3]) + 700  # both ends belong to it
+    sums = error_sums(original, decoded, None, 0.5, (low, high))
+    inside = (original >= low) & (original <= high)
+    errors = (original.astype(np.float64) - decoded)[inside] / 2
+    assert 0 < inside.sum() < original.size
+    assert sums.bulk_count == inside.sum()
+    assert sums.bulk_squares == pytest.approx(np.square(errors).sum(), rel=1e-12)
+    assert sums[:3] == squared_errors(original, decoded, None, 0.5)
+
+
+@pytest.mark.parametrize("choice", ["1", "0"])
+def test_values_beyond_a_histogram_go_to_its_ends(monkeypatch, choice) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", choice)
+    counts = np.zeros(4, np.int64)
+    values = np.array([[-1e300, -1, 0, 0.99], [1, 3.5, 4, 1e300], [np.nan, np.inf, -np.inf, 2]])
+    histogram(values, counts, scale=1.0, low=0.0, factor=1.0)
+    histogram(np.array([1, 2, 9], np.uint8), counts, scale=1.0, low=0.0, factor=1.0)
+    assert counts.tolist() == [4, 2, 2, 4]
 
 
 @pytest.mark.parametrize("choice", ["1", "0"])

@@ -312,3 +312,50 @@ def test_what_is_not_data_takes_few_bytes(tmp_path, samples) -> None:
         table = container.arrays["tables/level_1"].nbytes_stored
         assert container.overhead() == size - table
     assert size - table <= 4096
+
+
+def test_arrays_after_a_mark_can_be_written_anew(tmp_path, samples) -> None:
+    header = samples.header()
+    for name, rewound in (("a.fhz", False), ("b.fhz", True)):
+        with ContainerWriter(tmp_path / name) as writer:
+            fill(writer, samples, header)
+            mark = writer.mark()
+            if rewound:
+                writer.add_whole("extra/more", np.random.default_rng(0).random(5000))
+                writer.preview(header).close()
+                writer.rewind(mark)
+            writer.add_whole("extra/more", np.arange(3))
+            size = writer.size(header)
+            assert writer.commit(header) == size == (tmp_path / name).stat().st_size
+    assert (tmp_path / "a.fhz").read_bytes() == (tmp_path / "b.fhz").read_bytes()
+
+
+def test_a_diverted_container_leaves_its_former_name_alone(tmp_path, samples) -> None:
+    header, former, other = samples.header(), tmp_path / "a.fhz", tmp_path / "b.fhz"
+    former.write_bytes(b"an older output")
+    with ContainerWriter(former, force=True) as writer:
+        fill(writer, samples, header)
+        writer.divert(other)
+        assert not other.exists()
+        writer.commit(header)
+    assert former.read_bytes() == b"an older output"
+    with Container.open(other) as container:
+        container.verify()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.fhz", "b.fhz"]
+
+
+@pytest.mark.parametrize("commits", [True, False])
+def test_a_diverted_container_replaces_nothing_and_leaves_nothing(
+    tmp_path, samples, commits
+) -> None:
+    header, other = samples.header(), tmp_path / "b.fhz"
+    other.write_bytes(b"another output")
+    with ContainerWriter(tmp_path / "a.fhz") as writer:
+        fill(writer, samples, header)
+        if commits:
+            with pytest.raises(OutputExistsError):
+                writer.divert(other)
+        else:
+            writer.divert(tmp_path / "c.fhz")
+    assert [path.name for path in tmp_path.iterdir()] == ["b.fhz"]
+    assert other.read_bytes() == b"another output"
