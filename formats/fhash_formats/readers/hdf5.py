@@ -110,7 +110,7 @@ class Hdf5File:
         return packing(self.source, variable.dtype, variable.handle.attrs)
 
     def reading(self, variable: Variable) -> Read:
-        """How the values of a variable are read."""
+        """The function that reads the values of a variable."""
         if variable.members:
             return step_groups.reading([self.reading(member) for member in variable.members])
         dataset, packed = variable.handle, self.packing(variable)

@@ -129,7 +129,7 @@ class NetcdfFile:
         return found
 
     def reading(self, variable: Variable) -> Read:
-        """How the values of a variable are read."""
+        """The function that reads the values of a variable."""
         if variable.members:
             return step_groups.reading([self.reading(member) for member in variable.members])
         check_filters(self.source, self.path, variable.name)
@@ -185,7 +185,7 @@ def _named_lengths(array: xr.Variable) -> tuple[list[str], tuple[int, ...]]:
 
 
 def _labels(dimension: str, length: int, scope: Sequence[xr.Dataset]) -> Column | None:
-    """What the file stores along a dimension: its namesake, also of texts, or numbers along it."""
+    """The column along a dimension: its namesake, also of texts, else numbers along it."""
     if dimension.startswith(MADE_UP):
         return None
     for dataset in scope:

@@ -135,11 +135,11 @@ class ZarrTree:
         ]
 
     def values(self, variable: Variable) -> _Values:
-        """How the array of a variable is unpacked; of the first step where it has several."""
+        """The values of a variable's array; of the first step where it has several."""
         return _Values(self.source, variable.handle[1], raw=self.request.raw_values)
 
     def reading(self, variable: Variable) -> Read:
-        """How the values of a variable are read."""
+        """The function that reads the values of a variable."""
         if variable.members:
             return step_groups.reading([self.reading(member) for member in variable.members])
         values = self.values(variable)

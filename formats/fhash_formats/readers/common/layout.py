@@ -149,7 +149,7 @@ class Layout:
         return coords
 
     def attributes(self) -> dict[str, str]:
-        """What was selected, for the attributes of the series; nothing if nothing was."""
+        """The selection as an attribute of the series; none if nothing was selected."""
         chosen = [
             f"{label(place, self.dimensions[place])}={index}"
             for place, index in sorted(self.picked.items())

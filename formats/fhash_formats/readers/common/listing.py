@@ -1,4 +1,4 @@
-"""What a source holds, for users who see it for the first time: variables, axes, options."""
+"""The listing of a source for users who see it for the first time: variables, axes, options."""
 
 from __future__ import annotations
 
