@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.series import Series
+from fhash_formats.series import ArraySeries, Series
 
 MOST = 2.0
 """Ratio of the ranges with and without a value that is hardly ever data: -9999, -32768."""
@@ -172,11 +172,13 @@ class Extremes:
         rest = self._rest([end for end in (self._low, self._high) if end.value in suspects])
         assert rest is not None
         others = " to ".join(_shown(value, series.dtype) for value in dict.fromkeys(rest))
-        options = " ".join(f"--missing {_shown(value, series.dtype)}" for value in suspects)
+        numbers = [_shown(value, series.dtype) for value in suspects]
+        mark, keep = " ".join(f"--missing {number}" for number in numbers), "--keep-extremes"
+        if isinstance(series, ArraySeries):
+            mark, keep = f"ArraySeries(missing=[{', '.join(numbers)}])", "keep_extremes=True"
         raise InputError(
             f"{series.source}: '{series.name}' has {stands} of its vertices, and only {others}"
-            f" elsewhere; give {options} if that marks missing values,"
-            " or --keep-extremes if it is data"
+            f" elsewhere; give {mark} if that marks missing values, or {keep} if it is data"
         )
 
 

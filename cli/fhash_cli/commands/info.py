@@ -38,9 +38,13 @@ def command(path: str, source: SourceOptions, as_json: bool) -> None:
     each. The options are those of `fhash encode`.
     """
     if not _is_run(path):
+        from fhash_formats.readers.joined import files_of, is_pattern
+
         found = source.list(path)
         variables = [variable.as_dict(path) for variable in found]
-        emit({"path": path, "variables": variables}, _listing(path, variables), as_json)
+        files = len(files_of(path)) if is_pattern(path) else 1
+        text = _listing(path, files, variables)
+        emit({"path": path, "files": files, "variables": variables}, text, as_json)
         return
     import fhash_codec
 
@@ -57,15 +61,20 @@ def _is_run(path: str) -> bool:
     return place.suffix.lower() == ".fhz" or (place.is_file() and is_container(place))
 
 
-def _listing(path: str, variables: Sequence[Mapping[str, Any]]) -> str:
+def _listing(path: str, files: int, variables: Sequence[Mapping[str, Any]]) -> str:
     """The variables of a data file, each with its commands."""
     count = len(variables)
-    lines = [f"{path} holds {count} variable{'' if count == 1 else 's'}"]
+    many = f" ({files} files; shapes are of the first)" if files > 1 else ""
+    lines = [f"{path}{many} holds {count} variable{'' if count == 1 else 's'}"]
     for variable in variables:
         units = f", in {variable['units']}" if variable["units"] not in ("", "1") else ""
         extents = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
         shape = extents or "x".join(map(str, variable["shape"])) or "one value"
-        lines.append(f"\n{variable['name']}: {variable['dtype']}, {shape}{units}")
+        stored = f" stored as {variable['stored']}" if variable["stored"] else ""
+        marks = " and ".join(f"{value:.9g}" for value in variable["missing"])
+        missing = f", missing where {marks}" if marks else ""
+        dtype = variable["dtype"] + stored
+        lines.append(f"\n{variable['name']}: {dtype}, {shape}{units}{missing}")
         if variable["problem"]:
             lines.append(f"  cannot be encoded: {variable['problem']}")
         if len(variable["commands"]) > 1:

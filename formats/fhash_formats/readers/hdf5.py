@@ -112,6 +112,7 @@ class Hdf5File:
     def reading(self, variable: Variable) -> Read:
         """The function that reads the values of a variable."""
         if variable.members:
+            step_groups.require_one_type(self.source, variable, self.packing)
             return step_groups.reading([self.reading(member) for member in variable.members])
         dataset, packed = variable.handle, self.packing(variable)
         if packed is not None:
@@ -143,6 +144,13 @@ class Hdf5File:
         coords |= layout.coordinates(self.source, fitting)
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
             coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
+            step_groups.require_positions(
+                self.source,
+                variable,
+                layout,
+                coords,
+                lambda group: columns(self.tree, group),
+            )
         return coords
 
     def _attributes(self, path: str) -> Mapping[str, Any]:
@@ -190,7 +198,11 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         | layout.attributes(),
         chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks, *trailing)),
         close=file.close,
-        beside=files_beside(path, variable.handle),
+        beside=[
+            file
+            for member in variable.members or (variable,)
+            for file in files_beside(path, member.handle)
+        ],
         packing=packed,
     )
 
@@ -202,7 +214,7 @@ def list_hdf5(path: Path, request: Request) -> list[Listed]:
     source = str(path)
     with refusing(f"{source} cannot be read as HDF5"), h5py.File(path, "r") as file:
         found = Hdf5File(source, path, file, request)
-        return listing(source, found.variables, found.dimensions, request)
+        return listing(source, found.variables, found.dimensions, request, found.packing)
 
 
 def _dimension(dimension: Any, length: int, stated: Column | None) -> Dimension:

@@ -175,7 +175,7 @@ def test_the_scan_stops_with_the_value_its_share_and_the_options() -> None:
     with pytest.raises(
         InputError,
         match=rf"array: 'T' has 1e\+20 at {share:.3g} % of its vertices, and only 268\S* to 310"
-        r" elsewhere; give --missing 1e\+20 if .*, or --keep-extremes if it is data",
+        r" elsewhere; give ArraySeries\(missing=\[1e\+20\]\) if .*, or keep_extremes=True if it is",
     ):
         scan(ArraySeries(values, name="T"), silent)
     scan(ArraySeries(values, keep_extremes=True), silent)

@@ -7,6 +7,7 @@ import shlex
 import numpy as np
 import pytest
 
+from fhash_formats.readers.common.cf_packing import packing
 from fhash_formats.readers.common.layout import Dimension
 from fhash_formats.readers.common.listing import Listed, listing
 from fhash_formats.readers.common.request import RawLayout, Request
@@ -73,7 +74,7 @@ def test_a_wish_that_does_not_fit_is_the_problem() -> None:
 def test_commands_are_safe_for_a_shell(path: str) -> None:
     (first, _) = listed(variable("Step#*/my rho", 4, 12, 13, 14), variable("b", 4, 12, 13, 14))
     words = shlex.split(first.commands(path)[0])
-    assert words == ["fhash", "encode", path, "-o", "my rho.fhz", "--var", "Step#*/my rho"]
+    assert words == ["fhash", "encode", path, "-o", "myrho.fhz", "--var", "Step#*/my rho"]
 
 
 def test_every_wish_is_repeated() -> None:
@@ -92,6 +93,8 @@ def test_json_of_an_entry() -> None:
         "name": "a",
         "shape": [4, 12, 13, 14],
         "dtype": "float32",
+        "stored": "",
+        "missing": [],
         "units": "",
         "dimensions": [
             {"name": f"dim{place}", "length": length, "axis": axis}
@@ -100,3 +103,18 @@ def test_json_of_an_entry() -> None:
         "commands": ["fhash encode a.h5 -o a.fhz"],
         "problem": "",
     }
+
+
+def test_packed_values_are_listed_by_their_own_type() -> None:
+    made = packing("a", np.dtype("i2"), {"scale_factor": 0.5, "_FillValue": -9})
+    (one,) = listing("a", [variable("a", 4, 12, 13, 14)], unnamed, Request(), lambda one: made)
+    assert (one.dtype, one.stored, one.missing) == ("float64", "int16", (-9,))
+
+
+def test_outputs_of_one_source_differ() -> None:
+    found = listed(
+        variable("level_0/rho", 12, 13, 14),
+        variable("level_1/rho", 12, 13, 14),
+        variable("Step#*/T", 4, 12, 13, 14),
+    )
+    assert [one.output for one in found] == ["level_0_rho.fhz", "level_1_rho.fhz", "T.fhz"]
