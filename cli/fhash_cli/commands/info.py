@@ -62,24 +62,26 @@ def _is_run(path: str) -> bool:
 
 
 def _listing(path: str, files: int, variables: Sequence[Mapping[str, Any]]) -> str:
-    """The variables of a data file, each with its commands."""
-    count = len(variables)
+    """The variables of a data file, each with its commands; then what cannot be encoded."""
+    good = [variable for variable in variables if not variable["problem"]]
     many = f" ({files} files; shapes are of the first)" if files > 1 else ""
-    lines = [f"{path}{many} holds {count} variable{'' if count == 1 else 's'}"]
-    for variable in variables:
+    count = f"{len(good) or 'no'} variable{'' if len(good) == 1 else 's'}"
+    lines = [f"{path}{many} holds {count} to encode"]
+    for variable in good:
         units = f", in {variable['units']}" if variable["units"] not in ("", "1") else ""
-        extents = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
-        shape = extents or "x".join(map(str, variable["shape"])) or "one value"
+        shape = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
         stored = f" stored as {variable['stored']}" if variable["stored"] else ""
         marks = " and ".join(f"{value:.9g}" for value in variable["missing"])
         missing = f", missing where {marks}" if marks else ""
         dtype = variable["dtype"] + stored
         lines.append(f"\n{variable['name']}: {dtype}, {shape}{units}{missing}")
-        if variable["problem"]:
-            lines.append(f"  cannot be encoded: {variable['problem']}")
         if len(variable["commands"]) > 1:
             lines.append("  two readings are likely:")
         lines += [f"  {text}" for text in variable["commands"]]
+    others = [variable for variable in variables if variable["problem"]]
+    if others:
+        lines.append("\nnot to be encoded:")
+        lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
     return "\n".join(lines)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fhash_formats.readers.common import openpmd, step_groups
-from fhash_formats.readers.common.cf_packing import SCALING, Packing, packing
+from fhash_formats.readers.common.cf_packing import SCALING, Packing
 from fhash_formats.readers.common.failures import Stamp, refusing
 from fhash_formats.readers.common.fields import expand, reading
 from fhash_formats.readers.common.file_series import FileSeries
@@ -20,6 +20,7 @@ from fhash_formats.readers.common.hdf5_tree import (
     datasets,
     files_beside,
     own_name,
+    packing_of,
     require_filters,
     require_sources,
     units_of,
@@ -107,7 +108,7 @@ class Hdf5File:
         """The packing of the values, None where the user wants them as stored."""
         if self.request.raw_values or variable.field or variable.dtype.kind not in "iuf":
             return None
-        return packing(self.source, variable.dtype, variable.handle.attrs)
+        return packing_of(self.source, variable.handle)
 
     def reading(self, variable: Variable) -> Read:
         """The function that reads the values of a variable."""

@@ -109,9 +109,12 @@ def listing(
             output=_output(variable.name, plain.count(plain_name(variable.name)) > 1),
         )
         if not problem:
-            entry = _unpacked(entry, packed(variable))
             named = ("--var", name) if several or request.var else ()
-            entry = _read(source, entry, dimensions(variable), request, named)
+            try:
+                entry = _unpacked(entry, packed(variable))
+                entry = _read(source, entry, dimensions(variable), request, named)
+            except InputError as error:  # of attributes that make no sense
+                entry = replace(entry, problem=str(error).removeprefix(f"{source}: "))
         found.append(entry)
     return found
 
