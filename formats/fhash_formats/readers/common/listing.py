@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Callable, Sequence
@@ -72,7 +73,7 @@ class Listed:
             "shape": list(self.shape),
             "dtype": self.dtype,
             "stored": self.stored,
-            "missing": list(self.missing),
+            "missing": [value if math.isfinite(value) else str(value) for value in self.missing],
             "units": self.units,
             "dimensions": [
                 {"name": name, "length": length, "axis": axis}
@@ -205,7 +206,7 @@ def _given(request: Request) -> tuple[str, ...]:
     if request.raw_values:
         words.append("--raw-values")
     for value in request.missing:
-        words += ["--missing", f"{value:.17g}" if isinstance(value, float) else str(value)]
+        words += ["--missing", repr(value)]
     return tuple(words)
 
 
