@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.series import Series
+from fhash_formats.series import ArraySeries, Series
 
 MOST = 2.0
 """Ratio of the ranges with and without a value that is hardly ever data: -9999, -32768."""
@@ -118,10 +119,13 @@ class Extremes:
     """The two ends of the range of a series, gathered piece by piece, and the values next to them.
 
     Integers of 8 bits are passed over: their range is 255 at most, and label 127 is a label.
+
+    unlikely: values that are hardly ever data, see `Series`.
     """
 
-    def __init__(self, dtype: np.dtype[Any]) -> None:
+    def __init__(self, dtype: np.dtype[Any], unlikely: Collection[float] = ()) -> None:
         self._relevant = dtype.kind == "f" or dtype.itemsize > 1
+        self._unlikely = unlikely
         self._low, self._high = _End(low=True), _End(low=False)
         self._count = 0
 
@@ -150,8 +154,11 @@ class Extremes:
         values = [end.value for end in ends if end.value is not None]
         if left == 0:
             # all others are equal, as in a mask; only a value that is hardly ever data counts
-            return all(least_ratio(value) in (MOST, HUGE) for value in values)
-        return all(full >= least_ratio(value) * left for value in values)
+            return all(self._ratio(value) in (MOST, HUGE) for value in values)
+        return all(full >= self._ratio(value) * left for value in values)
+
+    def _ratio(self, value: float) -> float:
+        return MOST if value in self._unlikely else least_ratio(value)
 
     def _rest(self, ends: list[_End]) -> tuple[float, float] | None:
         """The range of the values without some ends; None if none is left."""
@@ -172,11 +179,13 @@ class Extremes:
         rest = self._rest([end for end in (self._low, self._high) if end.value in suspects])
         assert rest is not None
         others = " to ".join(_shown(value, series.dtype) for value in dict.fromkeys(rest))
-        options = " ".join(f"--missing {_shown(value, series.dtype)}" for value in suspects)
+        numbers = [_shown(value, series.dtype) for value in suspects]
+        mark, keep = " ".join(f"--missing {number}" for number in numbers), "--keep-extremes"
+        if isinstance(series, ArraySeries):
+            mark, keep = f"ArraySeries(missing=[{', '.join(numbers)}])", "keep_extremes=True"
         raise InputError(
             f"{series.source}: '{series.name}' has {stands} of its vertices, and only {others}"
-            f" elsewhere; give {options} if that marks missing values,"
-            " or --keep-extremes if it is data"
+            f" elsewhere; give {mark} if that marks missing values, or {keep} if it is data"
         )
 
 

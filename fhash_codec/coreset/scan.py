@@ -53,7 +53,7 @@ def scan(series: Series, progress: Progress) -> Scan:
     nobody declared (extremes.py), or if the series changed. Progress stage: "scanning".
     """
     low, high, mean = np.inf, -np.inf, Mean()
-    extremes = Extremes(series.dtype)
+    extremes = Extremes(series.dtype, series.unlikely)
     missing: dict[int, npt.NDArray[np.uint8]] = {}
     last_bits: npt.NDArray[np.uint8] | None = None
     steps = series.shape[0]

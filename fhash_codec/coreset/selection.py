@@ -20,6 +20,8 @@ from fhash_codec.coreset.scan import Scan, scan
 from fhash_codec.progress import Progress
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
+from fhash_formats.readers.common.layout import Dimension, must_select
+from fhash_formats.readers.common.roles import assign_axes, role_of_coordinate
 from fhash_formats.series import AXES, ArraySeries, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 
@@ -44,21 +46,46 @@ def open_source(source: Source) -> Iterator[Series]:
 def _array_series(source: npt.ArrayLike) -> Series:
     """The series of an array; a labelled array (xarray.DataArray) keeps its labels.
 
-    Labels are the name, units, attributes and coordinates. The axes of the array are (t, z, y, x).
+    Labels are the name, units, attributes and coordinates. The axes of the array are what the names
+    and attributes of its dimensions say, else (t, z, y, x) in this order.
     """
     dims, labels = getattr(source, "dims", None), getattr(source, "coords", None)
-    if dims is None or labels is None:
+    if dims is None or labels is None or len(dims) < 3:
         return ArraySeries(source)
+    name = str(getattr(source, "name", None) or "values")
+    values = np.asarray(source)
+    axes = _axes(name, [str(dim) for dim in dims], values.shape, labels)
     coords = {
         axis: _coordinate(str(dim), labels[dim])
-        for axis, dim in zip(AXES[-len(dims) :], dims, strict=True)
+        for axis, dim in zip(axes, dims, strict=True)
         if dim in labels and labels[dim].dtype.kind in "iufM"
     }
     attributes = json_attributes(source.attrs)  # type: ignore[union-attr]
-    name = str(getattr(source, "name", None) or "values")
-    return ArraySeries(
-        np.asarray(source), name=name, units=str(attributes.get("units", "")), coords=coords
-    )
+    present = [axis for axis in AXES if axis in axes]
+    ordered = values.transpose([axes.index(axis) for axis in present])
+    if "t" in axes:
+        absent = tuple(place for place, axis in enumerate(AXES) if axis not in axes)
+        ordered = np.expand_dims(ordered, absent)
+    return ArraySeries(ordered, name=name, units=str(attributes.get("units", "")), coords=coords)
+
+
+def _axes(name: str, dims: list[str], shape: tuple[int, ...], labels: Any) -> tuple[str, ...]:
+    """The axis of each dimension of a labelled array; raises InputError where it has others."""
+    roles = [role_of_coordinate(dim, labels[dim].attrs if dim in labels else {}) for dim in dims]
+    if not any(roles) and len(dims) <= len(AXES):
+        return AXES[-len(dims) :]
+    known = [
+        Dimension(name=dim, length=length, role=role)
+        for dim, length, role in zip(dims, shape, roles, strict=True)
+    ]
+    open_dims = [dims[place] for place in must_select(known, {})]
+    if open_dims:
+        choice = ", ".join(f"{dim}=0" for dim in open_dims)
+        raise InputError(
+            f"array '{name}' has the dimensions {', '.join(dims)}, and a series only t, z, y and"
+            f" x; select one index of the others, such as array.isel({choice})"
+        )
+    return assign_axes(f"array '{name}'", shape, roles, dims, None)
 
 
 def _coordinate(name: str, label: Any) -> Coordinate:

@@ -65,6 +65,8 @@ class Series(ABC):
             None where the frames have the type of the source.
         fill: the number that stood in the source for a missing value; None where there is none.
         keep_extremes: whether the user said that extreme values which repeat are data.
+        unlikely: values that stand for the lowest integers of the stored type, where counts are
+            unpacked; they are hardly ever data.
     """
 
     source: str
@@ -78,6 +80,7 @@ class Series(ABC):
     source_dtype: np.dtype[Any] | None = None
     fill: int | float | None = None
     keep_extremes: bool = False
+    unlikely: frozenset[float] = frozenset()
 
     @abstractmethod
     def read(self, step: int) -> npt.NDArray[Any]:
@@ -102,6 +105,11 @@ class Series(ABC):
 
     def close(self) -> None:  # noqa: B027 - a series in memory has nothing to release
         """Release the files."""
+
+    def inherit(self, series: Series) -> None:
+        """Take over what is known of the source of another series with the same values."""
+        self.source_dtype, self.fill = series.source_dtype, series.fill
+        self.keep_extremes, self.unlikely = series.keep_extremes, series.unlikely
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:
         """Yield every frame in order."""
@@ -138,8 +146,7 @@ class StepsSeries(Series):
         self.steps = tuple(steps)
         self.source, self.name, self.units = series.source, series.name, series.units
         self.dtype, self.attributes, self.files = series.dtype, series.attributes, series.files
-        self.source_dtype, self.fill = series.source_dtype, series.fill
-        self.keep_extremes = series.keep_extremes
+        self.inherit(series)
         self.shape = (len(self.steps), *series.shape[1:])
         time = series.coords["t"]
         self.coords = {

@@ -39,9 +39,13 @@ def command(path: str, source: SourceOptions, as_json: bool) -> None:
     each. The options are those of `fhash encode`.
     """
     if not _is_run(path):
+        from fhash_formats.readers.joined import files_of, is_pattern
+
         found = source.list(path)
         variables = [variable.as_dict(path) for variable in found]
-        emit({"path": path, "variables": variables}, _listing(path, variables), as_json)
+        files = len(files_of(path)) if is_pattern(path) else 1
+        text = _listing(path, files, variables)
+        emit({"path": path, "files": files, "variables": variables}, text, as_json)
         return
     import fhash_codec
 
@@ -58,20 +62,27 @@ def _is_run(path: str) -> bool:
     return place.suffix.lower() == ".fhz" or (place.is_file() and is_container(place))
 
 
-def _listing(path: str, variables: Sequence[Mapping[str, Any]]) -> str:
-    """The variables of a data file, each with its commands."""
-    count = len(variables)
-    lines = [f"{path} holds {count} variable{'' if count == 1 else 's'}"]
-    for variable in variables:
+def _listing(path: str, files: int, variables: Sequence[Mapping[str, Any]]) -> str:
+    """The variables of a data file, each with its commands; then what cannot be encoded."""
+    good = [variable for variable in variables if not variable["problem"]]
+    many = f" ({files} files; shapes are of the first)" if files > 1 else ""
+    count = f"{len(good) or 'no'} variable{'' if len(good) == 1 else 's'}"
+    lines = [f"{path}{many} holds {count} to encode"]
+    for variable in good:
         units = f", in {variable['units']}" if variable["units"] not in ("", "1") else ""
-        extents = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
-        shape = extents or "x".join(map(str, variable["shape"])) or "one value"
-        lines.append(f"\n{variable['name']}: {variable['dtype']}, {shape}{units}")
-        if variable["problem"]:
-            lines.append(f"  cannot be encoded: {variable['problem']}")
+        shape = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
+        stored = f" stored as {variable['stored']}" if variable["stored"] else ""
+        marks = " and ".join(f"{value:.9g}" for value in variable["missing"])
+        missing = f", missing where {marks}" if marks else ""
+        dtype = variable["dtype"] + stored
+        lines.append(f"\n{variable['name']}: {dtype}, {shape}{units}{missing}")
         if len(variable["commands"]) > 1:
             lines.append("  two readings are likely:")
         lines += [f"  {text}" for text in variable["commands"]]
+    others = [variable for variable in variables if variable["problem"]]
+    if others:
+        lines.append("\nnot to be encoded:")
+        lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
     return "\n".join(lines)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fhash_formats.readers.common import openpmd, step_groups
-from fhash_formats.readers.common.cf_packing import SCALING, Packing, packing
+from fhash_formats.readers.common.cf_packing import SCALING, Packing
 from fhash_formats.readers.common.failures import Stamp, refusing
 from fhash_formats.readers.common.fields import expand, reading
 from fhash_formats.readers.common.file_series import FileSeries
@@ -20,6 +20,7 @@ from fhash_formats.readers.common.hdf5_tree import (
     datasets,
     files_beside,
     own_name,
+    packing_of,
     require_filters,
     require_sources,
     units_of,
@@ -108,11 +109,12 @@ class Hdf5File:
         """The packing of the values, None where the user wants them as stored."""
         if self.request.raw_values or variable.field or variable.dtype.kind not in "iuf":
             return None
-        return packing(self.source, variable.dtype, variable.handle.attrs)
+        return packing_of(self.source, variable.handle)
 
     def reading(self, variable: Variable) -> Read:
-        """How the values of a variable are read."""
+        """The function that reads the values of a variable."""
         if variable.members:
+            step_groups.require_one_type(self.source, variable, self.packing)
             return step_groups.reading([self.reading(member) for member in variable.members])
         dataset, packed = variable.handle, self.packing(variable)
         if packed is not None:
@@ -145,6 +147,13 @@ class Hdf5File:
         coords = layout.coordinates(self.source, fitting) | named
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
             coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
+            step_groups.require_positions(
+                self.source,
+                variable,
+                layout,
+                coords,
+                lambda group: columns(self.tree, group),
+            )
         return coords
 
     def _attributes(self, path: str) -> Mapping[str, Any]:
@@ -197,7 +206,11 @@ def _series(source: str, path: Path, stamp: Stamp, file: Any, request: Request) 
         | layout.attributes(),
         chunks=layout.chunks(chunks and (*((1,) if variable.members else ()), *chunks, *trailing)),
         close=file.close,
-        beside=files_beside(path, variable.handle),
+        beside=[
+            file
+            for member in variable.members or (variable,)
+            for file in files_beside(path, member.handle)
+        ],
         packing=packed,
     )
 
@@ -209,7 +222,7 @@ def list_hdf5(path: Path, request: Request) -> list[Listed]:
     source = str(path)
     with refusing(f"{source} cannot be read as HDF5"), h5py.File(path, "r") as file:
         found = Hdf5File(source, path, file, request)
-        return listing(source, found.variables, found.dimensions, request)
+        return listing(source, found.variables, found.dimensions, request, found.packing)
 
 
 def _dimension(dimension: Any, length: int, stated: Column | None) -> Dimension:

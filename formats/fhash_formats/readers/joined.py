@@ -100,8 +100,7 @@ class JoinedSeries(Series):
         assert first is not None
         self.name, self.files = _common_name(names), tuple(dict.fromkeys(files))
         self.units, self.dtype, self.attributes = first.units, first.dtype, first.attributes
-        self.source_dtype, self.fill = first.source_dtype, first.fill
-        self.keep_extremes = first.keep_extremes
+        self.inherit(first)
         self._ends = list(accumulate(part.steps for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
         self.coords = {**first.coords, "t": times or self._times()}

@@ -44,7 +44,7 @@ def open_mask(path: str | Path, shape: Sequence[int], var: str | None = None) ->
     The file holds booleans or numbers of that shape, or of (z, y, x) for all steps alike, in any
     format that `open_series` reads. Raises InputError for another shape.
     """
-    values = open_whole(path, Request(var=var, booleans=True))
+    values = open_whole(path, Request(var=var, booleans=True, asked=False))
     if values.shape[1:] != tuple(shape[1:]) or values.shape[0] not in (1, shape[0]):
         values.close()
         raise InputError(

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fhash_formats.readers.common import step_groups
+from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.failures import Stamp, refusing
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.layout import Dimension, Layout, Read, arrange
@@ -129,9 +130,14 @@ class NetcdfFile:
             return [Dimension(name="step", length=len(variable.members), role="t"), *found]
         return found
 
+    def packing(self, variable: Variable) -> Packing | None:
+        """The packing of the values, None where the user wants them as stored."""
+        return None if self.request.raw_values else declared(self.source, self.array(variable))
+
     def reading(self, variable: Variable) -> Read:
-        """How the values of a variable are read."""
+        """The function that reads the values of a variable."""
         if variable.members:
+            step_groups.require_one_type(self.source, variable, self.packing)
             return step_groups.reading([self.reading(member) for member in variable.members])
         check_filters(self.source, self.path, variable.name)
         array = self.array(variable)
@@ -164,6 +170,13 @@ class NetcdfFile:
         )
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
             coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
+            step_groups.require_positions(
+                self.source,
+                variable,
+                layout,
+                coords,
+                lambda group: _columns(self.groups[f"/{group}"]),
+            )
         return coords
 
     def _attributes(self, path: str) -> Mapping[str, Any]:
@@ -186,7 +199,7 @@ def _named_lengths(array: xr.Variable) -> tuple[list[str], tuple[int, ...]]:
 
 
 def _labels(dimension: str, length: int, scope: Sequence[xr.Dataset]) -> Column | None:
-    """What the file stores along a dimension: its namesake, also of texts, or numbers along it."""
+    """The column along a dimension: its namesake, also of texts, else numbers along it."""
     if dimension.startswith(MADE_UP):
         return None
     for dataset in scope:
@@ -263,7 +276,7 @@ def list_netcdf(path: Path, request: Request) -> list[Listed]:
         groups = open_groups(source, path, magic_of(path))
         try:
             found = NetcdfFile(source, path, groups, request)
-            return listing(source, found.variables, found.dimensions, request)
+            return listing(source, found.variables, found.dimensions, request, found.packing)
         finally:
             close_groups(groups)
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError
 from fhash_formats.readers.common import step_groups
-from fhash_formats.readers.common.cf_packing import SCALING, packing
+from fhash_formats.readers.common.cf_packing import SCALING, Packing, packing
 from fhash_formats.readers.common.failures import FolderStamp, Stamp, refusing
 from fhash_formats.readers.common.fields import expand, reading
 from fhash_formats.readers.common.file_series import FileSeries
@@ -67,7 +67,9 @@ def list_zarr(path: Path, request: Request) -> list[Listed]:
     store, found = _open_tree(path, request)
     try:
         with refusing(f"{path} cannot be read as zarr"):
-            return listing(found.source, found.variables, found.dimensions, found.request)
+            return listing(
+                found.source, found.variables, found.dimensions, found.request, found.packing
+            )
     finally:
         store.close()
 
@@ -136,12 +138,17 @@ class ZarrTree:
         ]
 
     def values(self, variable: Variable) -> _Values:
-        """How the array of a variable is unpacked; of the first step where it has several."""
+        """The values of a variable's array; of the first step where it has several."""
         return _Values(self.source, variable.handle[1], raw=self.request.raw_values)
 
+    def packing(self, variable: Variable) -> Packing | None:
+        """The packing of the values, None where the user wants them as stored."""
+        return None if variable.field else self.values(variable).packing
+
     def reading(self, variable: Variable) -> Read:
-        """How the values of a variable are read."""
+        """The function that reads the values of a variable."""
         if variable.members:
+            step_groups.require_one_type(self.source, variable, self.packing)
             return step_groups.reading([self.reading(member) for member in variable.members])
         values = self.values(variable)
         return reading(values.read, variable, values.array.ndim)
@@ -177,12 +184,17 @@ class ZarrTree:
         )
         if variable.members and "t" in layout.axes and 0 not in layout.picked:
             coords["t"] = step_groups.times(variable.members, self._attributes, self._scalar)
+            step_groups.require_positions(self.source, variable, layout, coords, self._own_columns)
         return coords
 
     def _places(self, path: str) -> list[dict[str, Column]]:
         """Columns in the group of an array, then in the root."""
         group = parent(path)
         return [_columns(self.source, self.arrays, place) for place in dict.fromkeys([group, ""])]
+
+    def _own_columns(self, group: str) -> dict[str, Column]:
+        columns = _columns(self.source, self.arrays, group)
+        return {name.lower(): column for name, column in columns.items()}
 
     def _attributes(self, path: str) -> Mapping[str, Any]:
         return dict(self.arrays[path].attrs) if path in self.arrays else self.groups.get(path, {})
@@ -216,7 +228,7 @@ def _series(root: Path, store: Any, found: ZarrTree) -> FileSeries:
     )
     layout = arrange(found.source, variable.name, found.dimensions(variable), request)
     path, array = variable.handle
-    packed = None if variable.field else found.values(variable).packing
+    packed = found.packing(variable)
     scaled = request.raw_values and SCALING & set(array.attrs)
     # the whole hierarchy where the steps are spread over it
     folder = root if variable.members else root / path

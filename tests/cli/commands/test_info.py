@@ -123,6 +123,25 @@ def test_info_of_data_repeats_what_the_user_said(fhash: Fhash, tmp_path: Path) -
     assert words[-8:] == [*said[:-1], "1e+20"]
 
 
+def test_info_of_data_says_what_cannot_be_encoded(fhash: Fhash, tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["line"] = np.ones(4)
+        file["bad"] = np.ones((3, 4, 5), "i2")
+        file["bad"].attrs["_FillValue"] = "none"
+        file["good"] = np.ones((3, 4, 5), "i2")
+        file["good"].attrs.update({"_FillValue": np.int16(-9), "valid_min": h5py.Empty("f4")})
+        file["good"].attrs["missing_value"] = h5py.Empty("f4")
+    assert fhash("info", tmp_path / "a.h5").stdout == (
+        f"{tmp_path / 'a.h5'} holds 1 variable to encode\n\n"
+        "good: float32 stored as int16, dim0=3 (z), dim1=4 (y), dim2=5 (x), missing where -9\n"
+        f"  fhash encode {tmp_path / 'a.h5'} -o good.fhz --var good\n\n"
+        "not to be encoded:\n"
+        "  bad: the fill value 'none' is not a number; --raw-values reads the numbers as they are"
+        " stored\n"
+        "  line: 1 dimensions (4,); 3 or 4 can be read\n"
+    )
+
+
 def test_info_of_no_data_is_refused(refused: Callable[..., str], tmp_path: Path) -> None:
     assert "does not exist" in refused(2, "info", tmp_path / "missing.h5")
     (tmp_path / "a.txt").write_text("words")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import h5py
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -18,6 +21,7 @@ from fhash_codec.coreset.extremes import (
 from fhash_codec.coreset.scan import scan
 from fhash_codec.measure.value_range import pieces
 from fhash_codec.progress import silent
+from fhash_formats import open_series
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries, StepsSeries
 
@@ -175,7 +179,7 @@ def test_the_scan_stops_with_the_value_its_share_and_the_options() -> None:
     with pytest.raises(
         InputError,
         match=rf"array: 'T' has 1e\+20 at {share:.3g} % of its vertices, and only 268\S* to 310"
-        r" elsewhere; give --missing 1e\+20 if .*, or --keep-extremes if it is data",
+        r" elsewhere; give ArraySeries\(missing=\[1e\+20\]\) if .*, or keep_extremes=True if it is",
     ):
         scan(ArraySeries(values, name="T"), silent)
     scan(ArraySeries(values, keep_extremes=True), silent)
@@ -189,3 +193,18 @@ def test_integers_of_an_array_with_missing_values() -> None:
     series = ArraySeries(masked(1000 * GRID, -32768, "i2"), missing=[-32768])
     assert (series.dtype, series.source_dtype, series.fill) == (np.float32, np.int16, -32768)
     assert np.isnan(series.read(0)[MASK[0]]).all()
+
+
+def test_the_lowest_packed_integer_is_found_in_the_values_unpacked(tmp_path: Path) -> None:
+    counts = masked(4000 * GRID, -32767, "i2")[0]
+    for name, dtype in (("a", "i2"), ("b", "f4")):
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            file["sst"] = counts.astype(dtype)
+            file["sst"].attrs.update({"scale_factor": 0.01, "add_offset": 5.0})
+    words = r"'sst' has -322\.67 at .* --missing -322\.67 if"
+    with open_series(tmp_path / "a.h5") as series, pytest.raises(InputError, match=words):
+        scan(series, silent)
+    with open_series(tmp_path / "a.h5", missing=[-322.67]) as series:
+        assert scan(series, silent).value_range.low > 0
+    with open_series(tmp_path / "b.h5") as series:  # these are no counts of 16 bits
+        scan(series, silent)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import open_source, select_features
@@ -48,3 +49,37 @@ def test_times_that_are_no_axis_are_warned_of() -> None:
         selection = select_features(series, EncodeConfig(), silent)
     assert selection.extent.key_frames == (0, 1, 2)
     assert selection.scanned.finite_count == VALUES.size
+
+
+@pytest.mark.parametrize(
+    ("dims", "shape"),
+    [
+        (("time", "lat", "lon"), (3, 1, 4, 5)),
+        (("lev", "lat", "lon"), (1, 3, 4, 5)),
+        (("lon", "lat", "time"), (5, 1, 4, 3)),
+        (("a", "b", "c"), (1, 3, 4, 5)),
+    ],
+)
+def test_the_axes_of_a_labelled_array_are_those_of_its_names(
+    dims: tuple[str, ...], shape: tuple[int, ...]
+) -> None:
+    values = np.arange(60.0).reshape(3, 4, 5)
+    coords = {dim: np.arange(float(n)) + 7 for dim, n in zip(dims, values.shape, strict=True)}
+    labelled = xr.DataArray(values, dims=dims, coords=coords)
+    with open_source(labelled) as series:
+        assert series.shape == shape
+        names = [series.coords[axis].name for axis in "tzyx"]
+        assert set(dims) <= set(names)
+        axis = "tzyx"[names.index(dims[0])]
+        assert series.coords[axis].values.tolist() == [7, 8, 9]
+        stored = np.stack(list(series.frames()))
+    order = [dims.index(name) for name in names if name in dims]
+    np.testing.assert_array_equal(stored, values.transpose(order).reshape(shape))
+
+
+def test_a_labelled_array_of_members_is_refused_with_the_selection() -> None:
+    labelled = xr.DataArray(np.zeros((2, 3, 4, 5)), dims=("member", "time", "lat", "lon"))
+    with pytest.raises(InputError, match=r"array\.isel\(member=0\)"), open_source(labelled):
+        pass
+    with open_source(labelled.isel(member=0)) as series:
+        assert series.shape == (3, 1, 4, 5)

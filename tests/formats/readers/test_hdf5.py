@@ -365,3 +365,27 @@ def test_the_listing_of_a_file(tmp_path: Path) -> None:
     )
     assert warmth.options == (("--var", "run/T", "--select", "dim0=0"),)
     assert [axis for _, axis in warmth.dimensions] == ["select", "t", "z", "y", "x"]
+
+
+def test_steps_of_one_series_must_be_alike(tmp_path: Path) -> None:
+    path = write_steps(tmp_path / "a.h5", "step_{}/density", [{}, {}, {}])
+    with h5py.File(path, "a") as file:
+        file["step_8/x"] = file["step_9/x"] = np.arange(6.0)
+        file["step_10/x"] = np.arange(6.0) + 1
+    with pytest.raises(
+        InputError, match=r"step_10/density has other coordinates along x than step_8/density"
+    ):
+        open_series(path)
+    with h5py.File(path, "w") as file:
+        for step in range(2):
+            file[f"step_{step}/v"] = np.ones((3, 4, 5), "i2")
+        file["step_1/v"].attrs["_FillValue"] = np.int16(-9)
+    with pytest.raises(InputError, match=r"step_1/v has values of type float32, step_0/v of type"):
+        open_series(path)
+    assert_frames(path, np.ones((2, 3, 4, 5), "i2"), raw_values=True)
+    with h5py.File(path, "w") as file:
+        for step in range(2):
+            file[f"step_{step}/v"] = np.ones((3, 4, 5), "i2")
+            file[f"step_{step}/v"].attrs["units"] = f"{step} m"
+    with pytest.raises(InputError, match="holds 2 variables"):
+        open_series(path)

@@ -78,3 +78,8 @@ def test_other_types_and_missing_files(tmp_path: Path) -> None:
         open_mask(save(tmp_path / "m.npy", MASK.astype(complex)), MASK.shape)
     with pytest.raises(MissingInputError):
         open_mask(tmp_path / "none.npy", MASK.shape)
+
+
+def test_a_mask_is_not_asked_for_its_axes(tmp_path: Path) -> None:
+    mask = np.ones((16, 24, 24, 3), bool)
+    np.testing.assert_array_equal(open_mask(save(tmp_path / "m.npy", mask), mask.shape)(3), mask[3])

@@ -12,11 +12,12 @@ import pytest
 import xarray as xr
 from stored_series import (
     VALUES,
+    assert_frames,
     frames,
     save_netcdf,
 )
 
-from fhash_formats import open_series
+from fhash_formats import list_variables, open_series
 from fhash_formats.errors import InputError, MissingDependencyError
 
 DIMS = ("time", "lev", "lat", "lon")
@@ -276,3 +277,53 @@ def test_a_missing_filter_names_the_extra(tmp_path: Path, monkeypatch: pytest.Mo
         MissingDependencyError, match=r"v is compressed with the HDF5 filter .*fhash\[formats\]"
     ):
         open_series(path)
+
+
+def test_ensembles_are_read_by_selection(tmp_path: Path) -> None:
+    dims = ("time", "realization", "lev", "lat", "lon")
+    coords = {"realization": ["r1", "r2"], "lev": ("lev", [1000.0, 850.0, 500.0])}
+    dataset = xr.Dataset({"v": (dims, np.stack([VALUES, VALUES * 2], axis=1))}, coords=coords)
+    path = save_netcdf(tmp_path / "a.nc", dataset)
+    with pytest.raises(
+        InputError,
+        match=r"v has 5 dimensions \(time=4, realization=2, lev=3, lat=5, lon=6\), .*"
+        r"--select realization=0",
+    ):
+        open_series(path)
+    assert_frames(path, VALUES * 2, select={"realization": 1})
+    assert_frames(path, VALUES * 2, select={"realization": "r2"})
+    with open_series(path, select={"realization": "r1", "lev": 2}) as series:
+        assert series.shape == (4, 1, 5, 6)
+        assert series.coords["z"].values.tolist() == [500]
+        assert series.attributes["selection"] == "realization=0, lev=2"
+    (entry,) = list_variables(path)
+    assert entry.options == (("--select", "realization=0"),)
+    assert [axis for _, axis in entry.dimensions] == ["t", "select", "z", "y", "x"]
+
+
+def test_a_member_of_length_1_needs_no_selection(tmp_path: Path) -> None:
+    dims = ("number", "time", "lev", "lat", "lon")
+    path = save_netcdf(tmp_path / "a.nc", xr.Dataset({"v": (dims, VALUES[None])}))
+    assert_frames(path, VALUES)
+
+
+@pytest.mark.parametrize("encoding", [{}, {"dtype": "i2", "scale_factor": 0.01, "_FillValue": -9}])
+def test_raw_values_are_the_stored_ones(tmp_path: Path, encoding: dict[str, object]) -> None:
+    dataset = xr.Dataset({"v": (DIMS, np.rint(VALUES), {"units": "K"})})
+    path = save_netcdf(tmp_path / "a.nc", dataset, encoding={"v": encoding} if encoding else {})
+    with h5py.File(path) as file:
+        stored = file["v"][...]
+    assert_frames(path, stored, raw_values=True)
+    with open_series(path, raw_values=True) as series:
+        assert series.units == ("" if encoding else "K")
+
+
+def test_one_group_a_step(tmp_path: Path) -> None:
+    path = tmp_path / "a.nc"
+    for step in range(4):
+        xr.Dataset({"rho": (DIMS[1:], VALUES[step])}, attrs={"time": 0.5 * step}).to_netcdf(
+            path, mode="a" if step else "w", group=f"step_{9 + step}", engine="h5netcdf"
+        )
+    assert_frames(path, VALUES)
+    with open_series(path) as series:
+        assert series.coords["t"].values.tolist() == [0, 0.5, 1, 1.5]

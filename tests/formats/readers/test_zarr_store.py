@@ -12,15 +12,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 import zarr
 from stored_series import (
     VALUES,
+    assert_frames,
     create_zarr,
     frames,
     zipped,
 )
 
-from fhash_formats import open_series
+from fhash_formats import list_variables, open_series
 from fhash_formats.errors import InputError
 
 DIMS = ["time", "z", "y", "x"]
@@ -286,3 +288,109 @@ def test_stale_consolidated_metadata_is_not_believed(tmp_path: Path) -> None:
     got = frames(path)
     assert got.shape == (5, 3, 5, 6)
     assert (got[4] == 7).all()
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        {},
+        {"_FillValue": -9.0},
+        {"dtype": "i2", "_FillValue": -99},
+        {"dtype": "i4", "_FillValue": -99, "scale_factor": 0.5},
+        {"dtype": "i2", "scale_factor": 0.5, "add_offset": 2.0, "_FillValue": -99},
+    ],
+)
+def test_values_are_those_of_xarray(
+    tmp_path: Path, zarr_format: int, encoding: dict[str, Any]
+) -> None:
+    values = np.rint(VALUES * 10).astype("f4")
+    if "_FillValue" in encoding:
+        values[0, 1] = np.nan
+    dataset = xr.Dataset({"v": (("time", "lev", "lat", "lon"), values)})
+    path = tmp_path / "a.zarr"
+    dataset.to_zarr(path, zarr_format=zarr_format, encoding={"v": encoding}, consolidated=False)
+    with xr.open_zarr(path, consolidated=False, chunks=None) as opened:
+        expected = opened["v"].to_numpy()
+    np.testing.assert_array_equal(frames(path), expected)
+    stored = zarr.open_group(path, mode="r")["v"]
+    np.testing.assert_array_equal(frames(path, raw_values=True), stored[...])
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_an_array_of_zarrs_own_is_read_as_xarray_reads_it(tmp_path: Path, zarr_format: int) -> None:
+    # a fill value of zarr's own marks missing values for xarray in format 2, not in format 3
+    values = np.rint(VALUES * 10).astype("i2")
+    names = ["time", "lev", "lat", "lon"]
+    rest: dict[str, Any] = (
+        {"attributes": {"_ARRAY_DIMENSIONS": names}}
+        if zarr_format == 2
+        else {"dimension_names": names}
+    )
+    path = tmp_path / "a.zarr"
+    create_zarr(path, values, name="v", zarr_format=zarr_format, fill_value=3, **rest)
+    with xr.open_zarr(path, consolidated=False, chunks=None) as opened:
+        expected = opened["v"].to_numpy()
+    assert np.isnan(expected).any() == (zarr_format == 2)
+    np.testing.assert_array_equal(frames(path), expected)
+
+
+def test_units_never_stand_beside_packed_counts(tmp_path: Path) -> None:
+    attributes = {"scale_factor": 0.5, "units": "K", "long_name": "warmth"}
+    create_zarr(tmp_path / "a.zarr", np.ones((3, 4, 5), "i2"), attributes=attributes)
+    with open_series(tmp_path / "a.zarr") as series:
+        assert (series.units, series.dtype) == ("K", np.float64)
+    with open_series(tmp_path / "a.zarr", raw_values=True) as series:
+        assert (series.units, series.attributes) == ("", {"long_name": "warmth"})
+
+
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_groups_of_steps_and_members_are_read(tmp_path: Path, zarr_format: int) -> None:
+    path = tmp_path / "a.zarr"
+    root = zarr.open_group(path, mode="w", zarr_format=zarr_format)
+    for step in range(4):
+        group = root.create_group(f"data/{10 * step}")
+        group.attrs["time"] = 0.5 * step
+        array = group.create_array("rho", shape=(2, *VALUES.shape[1:]), dtype="f4")
+        array[...] = np.stack([VALUES[step], VALUES[step] * 2])
+    (entry,) = list_variables(path)
+    assert entry.name == "data/*/rho"
+    assert entry.options == (("--select", "dim1=0"),)
+    for source in (path, zipped(path, tmp_path / "b.zip")):
+        assert_frames(source, VALUES * 2, select={"dim1": 1})
+        with open_series(source, select={"dim1": 0}) as series:
+            assert series.coords["t"].values.tolist() == [0, 0.5, 1, 1.5]
+    with open_series(path, select={"dim1": 0}) as series:
+        series.read(0)
+        root["data/20/rho"][0, 0] = 7
+        with pytest.raises(InputError, match="changed while it was being read"):
+            series.check()
+
+
+@pytest.mark.filterwarnings("ignore::zarr.errors.UnstableSpecificationWarning")
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_fields_of_structured_arrays(tmp_path: Path, zarr_format: int) -> None:
+    state = np.zeros((4, 5, 6), [("rho", "f4"), ("n", "i2")])
+    state["rho"], state["n"] = np.arange(120).reshape(4, 5, 6), 7
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=zarr_format)
+    group.create_array("state", shape=state.shape, dtype=state.dtype)[...] = state
+    assert_frames(tmp_path / "a.zarr", state["rho"][None], var="state.rho")
+    assert_frames(tmp_path / "a.zarr", state["n"][None], var="state.n")
+    with pytest.raises(InputError, match=r"holds 2 variables: state\.rho .*state\.n"):
+        open_series(tmp_path / "a.zarr")
+
+
+def test_members_are_selected_by_label(tmp_path: Path) -> None:
+    dims = ("member", "time", "lev", "lat", "lon")
+    dataset = xr.Dataset(
+        {"v": (dims, np.stack([VALUES, VALUES * 2]))}, coords={"lev": [1000.0, 850.0, 500.0]}
+    )
+    path = tmp_path / "a.zarr"
+    dataset.to_zarr(path, zarr_format=3, consolidated=False)
+    create_zarr(path, np.array([3, 7]), name="member", dimension_names=["member"])
+    with pytest.raises(InputError, match=r"--select member=0 \(member has 2\)"):
+        open_series(path)
+    assert_frames(path, VALUES * 2, select={"member": "7.0"})
+    with open_series(path, select={"member": 1, "lev": "850."}) as series:
+        assert series.coords["z"].values.tolist() == [850]
+        np.testing.assert_array_equal(series.read(2)[0], VALUES[2, 1] * 2)

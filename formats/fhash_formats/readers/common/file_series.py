@@ -118,6 +118,9 @@ class FileSeries(Series):
     def _note_fills(self, packing: Packing) -> None:
         if packing.fills and not packing.scaled and self.fill is None:
             self.fill = packing.fills[0].item()
+        if packing.scaled and packing.stored.kind == "i" and packing.stored.itemsize > 1:
+            lowest = np.iinfo(packing.stored).min + np.arange(3, dtype=packing.stored)
+            self.unlikely = frozenset(packing.unpack(lowest).tolist())
         if packing.integers:
             self.source_dtype = packing.stored
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.cf_packing import packing
+from fhash_formats.readers.common.cf_packing import Packing, packing
 from fhash_formats.readers.common.positions import Column, usable
 from fhash_formats.readers.common.variables import Variable
 from fhash_formats.support.attributes import PACKING, PLUMBING, json_attributes, text_of
@@ -128,7 +128,7 @@ def columns(tree: Mapping[str, Any], group: str) -> dict[str, Column]:
 def column(path: str, dataset: Any) -> Column:
     """A dataset of at most one dimension as a Column."""
     numeric = usable(dataset.dtype)
-    packed = packing(path, dataset.dtype, dataset.attrs) if dataset.dtype.kind in "iuf" else None
+    packed = packing_of(path, dataset) if dataset.dtype.kind in "iuf" else None
 
     def read() -> Any:
         stored = dataset[()]
@@ -140,6 +140,18 @@ def column(path: str, dataset: Any) -> Column:
         read=read,
         attributes=json_attributes(dataset.attrs, without=PLUMBING | PACKING),
         numeric=numeric,
+    )
+
+
+def packing_of(source: str, dataset: Any) -> Packing:
+    """The packing of a dataset of numbers by its attributes; an empty attribute says nothing."""
+    import h5py
+
+    given = {name: dataset.attrs[name] for name in PACKING if name in dataset.attrs}
+    return packing(
+        source,
+        dataset.dtype,
+        {name: value for name, value in given.items() if not isinstance(value, h5py.Empty)},
     )
 
 

@@ -149,7 +149,7 @@ class Layout:
         return coords
 
     def attributes(self) -> dict[str, str]:
-        """What was selected, for the attributes of the series; nothing if nothing was."""
+        """The selection as an attribute of the series; none if nothing was selected."""
         chosen = [
             f"{label(place, self.dimensions[place])}={index}"
             for place, index in sorted(self.picked.items())
@@ -171,7 +171,8 @@ def arrange(source: str, name: str, dimensions: Sequence[Dimension], request: Re
         if open_places:
             raise InputError(_unselected(source, name, dimensions, picked, open_places))
     kept = [dimension for place, dimension in enumerate(dimensions) if place not in picked]
-    if request.axes is None and is_asked(dimensions, picked, selected=bool(request.select)):
+    asking = request.asked and request.axes is None
+    if asking and is_asked(dimensions, picked, selected=bool(request.select)):
         raise InputError(_question(source, name, dimensions, kept))
     if len(kept) < 2:
         raise InputError(

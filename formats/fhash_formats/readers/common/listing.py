@@ -1,13 +1,16 @@
-"""What a source holds, for users who see it for the first time: variables, axes, options."""
+"""The listing of a source for users who see it for the first time: variables, axes, options."""
 
 from __future__ import annotations
 
+import math
+import re
 import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from fhash_formats.errors import InputError
+from fhash_formats.readers.common.cf_packing import Packing
 from fhash_formats.readers.common.layout import (
     Dimension,
     arrange,
@@ -31,28 +34,35 @@ class Listed:
     Attributes:
         name: full name, as `--var` takes it.
         shape: lengths in the file's order.
-        dtype: type of the stored numbers, in words.
+        dtype: type of the values, in words.
+        stored: type of the stored numbers, where values are unpacked or missing ones become NaN;
+            "" where it is the same.
+        missing: numbers that stand for missing values in the file, by its attributes.
         units: of the values, "" where unknown.
         dimensions: name and axis of each dimension; the axis is "t", "z", "y" or "x", "select"
             where an index must be selected, and "?" where two readings are likely.
         options: for each likely reading, the options of `fhash encode` that it needs; none if the
             variable cannot be encoded.
         problem: why it cannot be encoded, "" if it can.
+        output: name of a container for it, which no other variable of the source has.
     """
 
     name: str
     shape: tuple[int, ...]
     dtype: str
+    stored: str = ""
+    missing: tuple[float, ...] = ()
     units: str = ""
     dimensions: tuple[tuple[str, str], ...] = ()
     options: tuple[tuple[str, ...], ...] = ()
     problem: str = ""
+    output: str = ""
 
     def commands(self, path: str) -> list[str]:
         """The command for each likely reading, for a shell."""
-        output = plain_name(self.name).replace("*", "").strip(".") or "run"
+        output = self.output or f"{self.name}.fhz"
         return [
-            shlex.join(["fhash", "encode", path, "-o", f"{output}.fhz", *options])
+            shlex.join(["fhash", "encode", path, "-o", output, *options])
             for options in self.options
         ]
 
@@ -62,6 +72,8 @@ class Listed:
             "name": self.name,
             "shape": list(self.shape),
             "dtype": self.dtype,
+            "stored": self.stored,
+            "missing": [value if math.isfinite(value) else str(value) for value in self.missing],
             "units": self.units,
             "dimensions": [
                 {"name": name, "length": length, "axis": axis}
@@ -77,14 +89,16 @@ def listing(
     variables: Sequence[Variable],
     dimensions: Callable[[Variable], list[Dimension]],
     request: Request,
+    packed: Callable[[Variable], Packing | None] = lambda variable: None,
 ) -> list[Listed]:
     """The variables of a file; coordinates and the members of joined ones are left out.
 
-    dimensions: of a variable that can be read.
+    dimensions, packed: dimensions and packing of a variable that can be read.
     """
     shown = [variable for variable in variables if not variable.auxiliary]
     several = sum(not variable.problem(request.booleans) for variable in shown) > 1
     found = []
+    plain = [plain_name(variable.name) for variable in shown]
     for variable in shown:
         name, problem = plain_text(variable.name), variable.problem(request.booleans)
         entry = Listed(
@@ -93,12 +107,36 @@ def listing(
             dtype=kind_of(variable.dtype),
             units=plain_text(variable.units),
             problem=problem,
+            output=_output(variable.name, plain.count(plain_name(variable.name)) > 1),
         )
         if not problem:
             named = ("--var", name) if several or request.var else ()
-            entry = _read(source, entry, dimensions(variable), request, named)
+            try:
+                entry = _unpacked(entry, packed(variable))
+                entry = _read(source, entry, dimensions(variable), request, named)
+            except InputError as error:  # of attributes that make no sense
+                entry = replace(entry, problem=str(error).removeprefix(f"{source}: "))
         found.append(entry)
     return found
+
+
+def _output(name: str, whole: bool) -> str:
+    """A name of a container for a variable, with its groups where the last part is not enough."""
+    text = name.replace("/", "_") if whole else plain_name(name)
+    return re.sub(r"[*#\s]+", "", text).strip("._") + ".fhz"
+
+
+def _unpacked(entry: Listed, packed: Packing | None) -> Listed:
+    """An entry with the type of the values instead of the stored one, and the fill values."""
+    if packed is None:
+        return entry
+    changed = packed.dtype != packed.stored
+    return replace(
+        entry,
+        dtype=kind_of(packed.dtype),
+        stored=kind_of(packed.stored) if changed else "",
+        missing=tuple(fill.item() for fill in packed.fills),
+    )
 
 
 def _read(
@@ -168,7 +206,7 @@ def _given(request: Request) -> tuple[str, ...]:
     if request.raw_values:
         words.append("--raw-values")
     for value in request.missing:
-        words += ["--missing", f"{value:.17g}" if isinstance(value, float) else str(value)]
+        words += ["--missing", repr(value)]
     return tuple(words)
 
 
@@ -181,4 +219,5 @@ def listed_series(series: Series, request: Request) -> Listed:
         units=series.units,
         dimensions=tuple((series.coords[axis].name, axis) for axis in AXES),
         options=(("--var", request.var, *_given(request)) if request.var else _given(request),),
+        output=_output(series.name, whole=False),
     )

@@ -15,8 +15,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.readers.common.layout import Read
-from fhash_formats.readers.common.variables import Variable
+from fhash_formats.errors import InputError
+from fhash_formats.readers.common.cf_packing import Packing
+from fhash_formats.readers.common.layout import Layout, Read
+from fhash_formats.readers.common.positions import Column, beside
+from fhash_formats.readers.common.variables import Variable, parent
 from fhash_formats.series import Coordinate
 from fhash_formats.support.attributes import json_attributes
 
@@ -70,8 +73,8 @@ def join(variables: Sequence[Variable], attributes: Attributes) -> list[Variable
     """The variables, and one more for each kind of array that has one group a step.
 
     Its members become auxiliary, so that they are read only where they are named. Arrays of
-    different shapes or types are no series. A single group counts where its name or its attributes
-    say that it is a step.
+    different shapes, types or units are no series. A single group counts where its name or its
+    attributes say that it is a step.
 
     attributes: attributes of a group by its path.
     """
@@ -84,7 +87,9 @@ def join(variables: Sequence[Variable], attributes: Attributes) -> list[Variable
     for template, members in kinds.items():
         members.sort(key=lambda member: member[0].number)
         first = members[0][1]
-        alike = {(member.shape, member.dtype.newbyteorder("=")) for _, member in members}
+        alike = {
+            (member.shape, member.dtype.newbyteorder("="), member.units) for _, member in members
+        }
         numbers = {place.number for place, _ in members}
         alone = len(members) == 1 and members[0][0].plain
         if len(alike) > 1 or len(numbers) < len(members):
@@ -164,6 +169,45 @@ def times(
         values=np.asarray([value for value, _ in known], np.float64),
         attributes={"units": units} if units else {},
     )
+
+
+def require_one_type(
+    source: str, variable: Variable, packing: Callable[[Variable], Packing | None]
+) -> None:
+    """Raise InputError if the steps of a variable are unpacked to different types."""
+    types = {
+        member.name: (made.dtype if made is not None else member.dtype.newbyteorder("="))
+        for member, made in ((member, packing(member)) for member in variable.members)
+    }
+    first = variable.members[0].name
+    for name, dtype in types.items():
+        if dtype != types[first]:
+            raise InputError(
+                f"{source}: {name} has values of type {dtype}, {first} of type {types[first]}; the"
+                " steps of one series must be alike, --raw-values reads the numbers as stored"
+            )
+
+
+def require_positions(
+    source: str,
+    variable: Variable,
+    layout: Layout,
+    coords: Mapping[str, Coordinate],
+    columns: Callable[[str], Mapping[str, Column]],
+) -> None:
+    """Raise InputError if a step has positions of its own that differ from those of the first.
+
+    columns: what may be a coordinate in a group, by lower-case name.
+    """
+    for member in variable.members[1:]:
+        place = columns(parent(member.name))
+        own = beside(source, layout.axes, layout.shape, [place], certain=True, tied="t")
+        for axis, coordinate in own.items():
+            if not np.array_equal(coordinate.values, coords[axis].values):
+                raise InputError(
+                    f"{source}: {member.name} has other coordinates along {axis} than"
+                    f" {variable.members[0].name}; the steps of one series must be alike"
+                )
 
 
 def reading(reads: Sequence[Read]) -> Read:
