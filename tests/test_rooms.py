@@ -60,7 +60,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("animation",),
     ),
     "fhash_cli": (
-        ("progress_bar",),
+        ("intervals", "progress_bar"),
         ("base_command", "options", "output", "selection"),
         ("animation_options", "scene_options"),
         ("commands",),

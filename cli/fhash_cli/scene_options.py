@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import json
 from collections.abc import Callable
@@ -14,6 +13,7 @@ import click
 
 from fhash_cli.options import Command
 from fhash_formats.errors import InputError
+from fhash_formats.support.suggestions import suggestion
 
 if TYPE_CHECKING:
     from fhash_codec import Volume
@@ -313,12 +313,10 @@ def _effect(name: str) -> str:
     ]
     plain = name.replace("-", "_").replace("color", "colour")
     if plain not in names:
-        near = difflib.get_close_matches(plain, names, n=1, cutoff=0.0)[0]
-        allowed = ", ".join(effect.replace("_", "-") for effect in names)
-        raise InputError(
-            f"effect '{name[:60]}' is not known; did you mean '{near.replace('_', '-')}'?"
-            f" Known: {allowed}"
-        )
+        effects = [effect.replace("_", "-") for effect in names]
+        likely = suggestion(plain.replace("_", "-"), effects)
+        known = "" if likely.startswith("known") else f" Known: {', '.join(effects)}"
+        raise InputError(f"effect '{name[:60]}' is not known; {likely}{known}")
     return plain
 
 
