@@ -49,11 +49,13 @@ def encode(
         settings name none.
     force: replace a file that exists.
 
-    Returns the figures of the written file (see `report`). Ctrl-C during the training saves a
-    checkpoint beside `path` and raises InterruptedEncodingError; the same call then continues from
-    the checkpoint to the same result. Raises InputError for a source or settings that cannot be
-    encoded. Raises QualityError, with the file written and its figures in the error, if the file
-    misses what the settings promise.
+    Returns the figures of the written file (see `report`). In the profile paper Ctrl-C during the
+    training saves a checkpoint beside `path` and raises InterruptedEncodingError; the same call
+    then continues from the checkpoint to the same result. In the profile compact nothing is kept:
+    KeyboardInterrupt passes through, and the same call starts again.
+
+    Raises InputError for a source or settings that cannot be encoded. Raises QualityError, with the
+    file written and its figures in the error, if the file misses what the settings promise.
     """
     config, path = config or EncodeConfig(), Path(os.path.normpath(path))
     begun = time.perf_counter()

@@ -121,7 +121,12 @@ class _Run:
         # The fastest counts: a step on which the machine stalled would foretell far too few.
         rate = float(plan.rates[-1])
         engine = make_engine(
-            name, architecture, coreset, np.full(3, rate), seed=plan.seed, device=device
+            name,
+            architecture,
+            coreset,
+            np.full(WARM_UP_STEPS + 1, rate),
+            seed=plan.seed,
+            device=device,
         )
         taken = []
         for chosen in self.plan.order(0)[:WARM_UP_STEPS]:
