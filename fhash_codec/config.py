@@ -7,13 +7,13 @@ one place to read and to change.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
 from fhash_formats.errors import InputError
+from fhash_formats.support.suggestions import suggestion
 
 TABLE_TYPES = ("float32", "float16", "uint8", "transform")
 """Storage of the paper profile's tables: a number type, or the transform codec."""
@@ -208,8 +208,7 @@ class EncodeConfig:
         names = [field.name for field in dataclasses.fields(cls)]
         for name in values:
             if name not in names:
-                near = difflib.get_close_matches(name, names, n=1, cutoff=0.0)
-                raise InputError(f"unknown setting '{name}'; did you mean '{near[0]}'?")
+                raise InputError(f"unknown setting '{name}'; {suggestion(name, names)}")
         arguments: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in values.items()

@@ -52,14 +52,16 @@ def encode(
         settings name none.
     force: replace a file that exists.
 
-    Returns the figures of the written file (see `report`). Ctrl-C during the training saves a
-    checkpoint beside `path` and raises InterruptedEncodingError; the same call then continues from
-    the checkpoint to the same result. Raises InputError for a source or settings that cannot be
-    encoded, or for a promise that is seen to be out of reach. Raises QualityError, with the figures
-    of the file in the error, if the file misses what the settings promise. It is written
-    nevertheless: as `path` where that is free; an older file stays as it is, and the new one is
-    written beside it (`missed_path`). Warns (FhashWarning) where the bulk of the values is far
-    worse than an explicit promise sounds.
+    Returns the figures of the written file (see `report`). In the profile paper Ctrl-C during the
+    training saves a checkpoint beside `path` and raises InterruptedEncodingError; the same call
+    then continues from the checkpoint to the same result. In the profile compact nothing is kept:
+    KeyboardInterrupt passes through, and the same call starts again.
+
+    Raises InputError for a source or settings that cannot be encoded, or for a promise that is seen
+    to be out of reach. Raises QualityError, with the figures of the file in the error, if the file
+    misses what the settings promise. It is written nevertheless: as `path` where that is free; an
+    older file stays as it is, and the new one is written beside it (`missed_path`). Warns
+    (FhashWarning) where the bulk of the values is far worse than an explicit promise sounds.
     """
     config, path = config or EncodeConfig(), Path(os.path.normpath(path))
     begun = time.perf_counter()

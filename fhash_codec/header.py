@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 from importlib.metadata import version
+from itertools import zip_longest
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -226,16 +227,13 @@ def _steps(per_step: Any) -> list[dict[str, Any]]:
     """The figures of each step, from lists by name; what another writer misshaped is left out."""
     if not isinstance(per_step, Mapping):
         return [dict(step) for step in per_step if isinstance(step, Mapping)]
-    lists = {
-        name: per_step.get(name) for name in ("psnr", "rmse", "max_abs_error") if name in per_step
-    }
-    if not all(isinstance(values, list) for values in lists.values()):
+    names = [name for name in ("psnr", "rmse", "max_abs_error") if name in per_step]
+    lists: list[Any] = [per_step[name] for name in names]
+    if not all(isinstance(values, list) for values in lists):
         return []
-    count = max((len(values) for values in lists.values()), default=0)
     return [
-        {"step": step}
-        | {name: values[step] if step < len(values) else None for name, values in lists.items()}
-        for step in range(count)
+        {"step": step, **dict(zip(names, figures, strict=True))}
+        for step, figures in enumerate(zip_longest(*lists))
     ]
 
 

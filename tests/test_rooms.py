@@ -60,7 +60,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("animation",),
     ),
     "fhash_cli": (
-        ("progress_bar",),
+        ("intervals", "progress_bar"),
         ("base_command", "options", "output", "scene_types", "selection"),
         ("animation_options", "gallery", "scene_options"),
         ("commands",),

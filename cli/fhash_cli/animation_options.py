@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.options import Command, RealRange, SliceType, check_writable
+from fhash_cli.intervals import SliceType
+from fhash_cli.options import Command, RealRange, check_writable
 from fhash_cli.output import Progress, number, table
 from fhash_cli.selection import steps_of
 from fhash_formats.errors import InputError

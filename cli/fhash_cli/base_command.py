@@ -103,6 +103,13 @@ class BaseGroup(click.Group):
 
     command_class = BaseCommand
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Refuse a line without a command by the names of the commands, not by the whole help."""
+        if not args and not ctx.resilient_parsing:
+            names = ", ".join(self.list_commands(ctx))
+            raise click.UsageError(f"Missing command; give one of {names}", ctx)
+        return super().parse_args(ctx, args)
+
 
 def _check_repeated(option: click.Option, ctx: click.Context) -> None:
     """Raise UsageError for an option that is given twice, unless that means something."""

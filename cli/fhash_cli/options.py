@@ -13,6 +13,7 @@ from typing import Any
 
 import click
 
+from fhash_cli.intervals import SliceType
 from fhash_formats.errors import InputError, OutputError
 
 Command = Callable[..., None]
@@ -43,6 +44,8 @@ def check_writable(
 class RealRange(click.FloatRange):
     """A number within limits, and no NaN, which click's own range lets through."""
 
+    name = "number"
+
     def _describe_range(self) -> str:
         """The limits in the help, in few digits and without those that nobody meets."""
         low = "" if self.min is None else f"{self.min:g}<="
@@ -57,62 +60,6 @@ class RealRange(click.FloatRange):
         if math.isnan(number):
             self.fail(f"'{value}' is not a number", param, ctx)
         return number
-
-
-class SliceType(click.ParamType[slice]):
-    """Indices as in Python, `A:B:S` with any part left out, or a single one; a step is positive."""
-
-    name = "A:B:S"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> slice:
-        """The slice that a text stands for; `-1` is `slice(-1, None)`, the last."""
-        if isinstance(value, slice):
-            return value
-        try:
-            return parse_slice(str(value))
-        except ValueError:
-            self.fail(
-                f"'{value}' is not an index or a half-open range A:B or A:B:S of indices,"
-                " such as 4, 40:50, 10: or ::2",
-                param,
-                ctx,
-            )
-
-
-class IntervalsType(click.ParamType[tuple[Any, ...]]):
-    """Three intervals `z0:z1,y0:y1,x0:x1`, of indices or (`number=float`) of positions.
-
-    An end that is left out stands for the end of the domain.
-    """
-
-    def __init__(self, number: type[int] | type[float]) -> None:
-        self.number = number
-        self.name = "z0:z1,y0:y1,x0:x1"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[Any, ...]:
-        """((z0, z1), (y0, y1), (x0, x1)), None for an end left out."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            intervals = tuple(
-                tuple(self.number(end) if end.strip() else None for end in part.split(":"))
-                for part in str(value).split(",")
-            )
-        except ValueError:
-            intervals = ()
-        if [len(interval) for interval in intervals] != [2, 2, 2]:
-            example = "0:16,:,8:24" if self.number is int else "0:0.5,:,1.5:2"
-            self.fail(
-                f"'{value}' is not z0:z1,y0:y1,x0:x1, where an end may be left out,"
-                f" such as {example}",
-                param,
-                ctx,
-            )
-        return intervals
 
 
 class SelectType(click.ParamType[tuple[str, str]]):
@@ -147,17 +94,6 @@ class NumberType(click.ParamType[float]):
             except ValueError:
                 continue
         self.fail(f"'{value}' is not a number", param, ctx)
-
-
-def parse_slice(text: str) -> slice:
-    """`A:B:S` or one index as a slice; raises ValueError."""
-    parts = [int(part) if part.strip() else None for part in text.split(":")]
-    if len(parts) == 1 and parts[0] is not None:
-        index = parts[0]
-        return slice(index, index + 1 if index != -1 else None)
-    if len(parts) not in (2, 3) or (len(parts) == 3 and parts[2] is not None and parts[2] < 1):
-        raise ValueError(text)
-    return slice(*parts)
 
 
 @dataclass(frozen=True, kw_only=True)

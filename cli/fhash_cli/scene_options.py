@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import functools
 import json
 from collections.abc import Callable
@@ -12,10 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fhash_cli.options import Command, IntervalsType
+from fhash_cli.intervals import IntervalsType
+from fhash_cli.options import Command
 from fhash_cli.scene_types import NumbersType, OpacityType, PlaneType, SizeType
 from fhash_cli.selection import time_of
 from fhash_formats.errors import InputError
+from fhash_formats.support.suggestions import suggestion
 
 if TYPE_CHECKING:
     from fhash_codec import Volume
@@ -293,12 +294,10 @@ def _effect(name: str) -> str:
     ]
     plain = name.replace("-", "_").replace("color", "colour")
     if plain not in names:
-        near = difflib.get_close_matches(plain, names, n=1, cutoff=0.0)[0]
-        allowed = ", ".join(effect.replace("_", "-") for effect in names)
-        raise InputError(
-            f"effect '{name[:60]}' is not known; did you mean '{near.replace('_', '-')}'?"
-            f" Known: {allowed}"
-        )
+        effects = [effect.replace("_", "-") for effect in names]
+        likely = suggestion(plain.replace("_", "-"), effects)
+        known = "" if likely.startswith("known") else f" Known: {', '.join(effects)}"
+        raise InputError(f"effect '{name[:60]}' is not known; {likely}{known}")
     return plain
 
 

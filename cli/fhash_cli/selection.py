@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from fhash_cli.intervals import written
 from fhash_formats.errors import RegionError
 
 if TYPE_CHECKING:
@@ -52,7 +53,11 @@ def region_of(
     roi = roi if roi is not None else ((None, None),) * 3
     z, y, x = (
         _span(
-            f"--roi along {axis}", low, high, count, f"the domain has {count} vertices along {axis}"
+            f"--roi along {axis}",
+            low,
+            high,
+            count,
+            f"the domain has {count} vertices along {axis}",
         )
         for axis, (low, high), count in zip("zyx", roi, volume.shape[1:], strict=True)
     )
@@ -119,7 +124,11 @@ def _span(what: str, low: int | None, high: int | None, count: int, allowed: str
     """Ends of low:high among `count` as Python means them, but without its clipping."""
     first = 0 if low is None else low + count if low < 0 else low
     last = count if high is None else high + count if high < 0 else high
-    if not 0 <= first < last <= count:
-        written = f"{'' if low is None else low}:{'' if high is None else high}"
-        raise RegionError(f"{what} is {written}; {allowed}, and at least one must be chosen")
-    return first, last
+    if 0 <= first < last <= count:
+        return first, last
+    if 0 <= first < count and 0 <= last <= count:
+        empty = "nothing" if first == last else "nothing, since it ends before it begins"
+        reason = f"which chooses {empty}"
+    else:
+        reason = "which leaves the series" if what == "--t" else "which is not all inside"
+    raise RegionError(f"{what} is {written(low, high)}, {reason}; {allowed}")

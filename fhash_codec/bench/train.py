@@ -26,6 +26,10 @@ from fhash_formats.errors import InputError
 
 TURNS = 3
 """Turns over which each engine's time is spread."""
+WARM_UP_STEPS = 4
+"""First steps of an engine, whose fastest foretells the number of all steps."""
+SHORTEST_STEP = 1e-6
+"""Seconds of a step at least: a clock may stand still for a short one."""
 INFER_SECONDS = 1.0
 """Seconds of evaluation in each turn."""
 
@@ -113,16 +117,24 @@ class _Run:
     ) -> None:
         self.name, self.coreset, self.plan, self.device = name, coreset, plan, device
         self.counts = np.diff(coreset.offsets)
-        # A first step, not counted, tells how many steps fit in the time; the schedule needs that.
+        # First steps, not counted, tell how many steps fit in the time; the schedule needs that.
+        # The fastest counts: a step on which the machine stalled would foretell far too few.
         rate = float(plan.rates[-1])
         engine = make_engine(
-            name, architecture, coreset, np.full(3, rate), seed=plan.seed, device=device
+            name,
+            architecture,
+            coreset,
+            np.full(WARM_UP_STEPS + 1, rate),
+            seed=plan.seed,
+            device=device,
         )
-        for chosen in self.plan.order(0)[:2]:
+        taken = []
+        for chosen in self.plan.order(0)[:WARM_UP_STEPS]:
             begun = time.perf_counter()
             engine.train(chosen)
             self._wait()
-        steps = max(1, round(seconds / (time.perf_counter() - begun)))
+            taken.append(time.perf_counter() - begun)
+        steps = max(1, round(seconds / max(min(taken), SHORTEST_STEP)))
         # Longer than that, so that turns that run faster than the first step find a rate as well.
         self.rates = np.full(8 * steps + 1, 0.0)
         self.rates[: steps + 1] = rate * (0.5 + 0.5 * np.cos(np.pi * np.arange(steps + 1) / steps))
@@ -136,17 +148,17 @@ class _Run:
     def train(self, seconds: float) -> None:
         """Go on with the training for some seconds."""
         samples, begun = 0, time.perf_counter()
-        while (spent := time.perf_counter() - begun) < seconds and self.engine.step < len(
-            self.rates
-        ) - 1:
+        last = len(self.rates) - 1
+        while (spent := time.perf_counter() - begun) < seconds and self.engine.step < last:
             epoch, batch = divmod(self.engine.step, self.plan.batches)
             if batch == 0 or samples == 0:
                 batches = self.plan.order(epoch)
             self.engine.train(batches[batch])
             self._wait()
             samples += int(self.counts[batches[batch]].sum())
-        self.seconds += spent
-        self.train_speeds.append(samples / spent)
+        if samples:  # none where the schedule has come to its end in an earlier turn
+            self.seconds += spent
+            self.train_speeds.append(samples / spent)
 
     def infer(self, seconds: float) -> None:
         """Evaluate batches of bricks for some seconds."""

@@ -210,7 +210,19 @@ REGIONS = [
     (["--roi", "0:7,:,:"], "6 vertices along z"),
     (["--roi", ":,-8:,:"], "7 vertices along y"),
     (["--roi", ":,:,5:5"], "8 vertices along x"),
-    (["--roi", "1:2"], "z0:z1,y0:y1,x0:x1"),
+    (["--roi", ":,3:1"], "chooses nothing, since it ends before it begins; the domain has 7"),
+    (["--roi", "0:16"], "--roi along z is 0:16, which is not all inside; the domain has 6"),
+    (["--roi", "6"], "--roi along z is 6, which is not all inside; the domain has 6"),
+    (["--roi", "1,2,3,4"], "4 intervals, and a region has 3 axes"),
+    (["--roi", "::2"], "'::2' has a step, which a region has not"),
+    (["--roi", "1.5"], "'1.5' is not made of indices: 1.5 is between two"),
+    (["--box", "2:1,:,:"], "'2:1' ends before it begins"),
+    (["--box", ":,:,9:4"], "'9:4' ends before it begins"),
+    (["--box", "1,2,3"], "'1' is one position, and an interval has two ends"),
+    (["--box", "-5:1"], "is -5:1; the domain has positions 0 to 2.5"),
+    (["--t", "5"], "--t is 5, which leaves the series"),
+    (["--t", "::-1"], "has the step -1, and steps go upwards"),
+    (["--t", "1.5"], "1.5 is between two"),
     (["--roi", ":,:,:", "--box", ":,:,:"], "exclude"),
     (["--box", "0:2.6,:,:"], "positions 0 to 2.5"),
     (["--box", ":,:,2:"], "positions 3 to 10"),
@@ -357,3 +369,40 @@ def test_force_never_replaces_the_input(
     assert "is the input itself" in refused(
         2, "decode", container, "-o", tmp_path / "tiny.vti", "--force"
     )
+
+
+LINES = [
+    ("info", "Missing argument 'RUN.fhz' (see 'fhash info --help')"),
+    ("bench", "Missing command; give one of "),
+    ("bench foo", "No such command 'foo'"),
+    ("completion", "Missing argument 'SHELL'. Choose from: bash, zsh, fish"),
+    ("completion csh", "Invalid value for 'SHELL': 'csh' is not one of"),
+    ("encode DATA -o x.fhz --psnr forty", "'forty' is not a valid number"),
+    ("encode DATA -o x.fhz --pnsr 40", "Did you mean '--psnr'?"),
+    ("encode DATA -o x.fhz --ratio 0.5", "0.5 is not in the range 1<=x<=1e+09"),
+    ("encode DATA -o x.fhz --var a --var b", "--var is given more than once"),
+    ("diff RUN DATA", "the data come first: fhash diff DATA RUN"),
+    ("decode RUN -o x.npy -o y.npy", "-o is given more than once"),
+    ("render RUN -o x.png --effect foo", "effect 'foo' is not known; known: shading, shadows,"),
+    ("render RUN -o x.png --effect shadng", "did you mean 'shading'?"),
+    ("render RUN -o x.png --set foo=1", "unknown setting 'foo' of scene; known: "),
+    ("render RUN -o x.png --opacity foo", "opacity 'foo' is not known; known: "),
+    ("selftest --case foo", "unknown case 'foo'; known: "),
+    ("selftest --group time", "unknown group 'time'; did you mean 'times'?"),
+]
+
+
+@pytest.mark.parametrize(("line", "words"), LINES, ids=[line for line, _ in LINES])
+def test_a_wrong_line_is_refused_with_its_true_reason(
+    refused: Refused,
+    data: Path,
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    line: str,
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = {"DATA": str(data), "RUN": str(run)}
+    message = refused(2, *(names.get(word, word) for word in line.split()))
+    assert words.replace("DATA RUN", f"{data} {run}") in message

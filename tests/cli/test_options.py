@@ -13,46 +13,10 @@ from click.testing import CliRunner, Result
 
 import fhash_codec
 from fhash_cli.commands.encode import command as encode
-from fhash_cli.options import IntervalsType, RealRange, SliceType, parse_slice
+from fhash_cli.options import RealRange
 from fhash_codec.config import EncodeConfig
 
 SMALL = ["--effort", "1", "--quiet"]
-
-
-@pytest.mark.parametrize(
-    "text", ["0", "4", "-1", "-3", "2:5", ":", "::2", "1::3", ":-2", "-4:-1", " 1 : 4 "]
-)
-def test_slice_means_what_it_means_in_python(text: str) -> None:
-    numbers = list(range(7))
-    picked = eval(f"numbers[{text}]")
-    assert numbers[parse_slice(text)] == (picked if isinstance(picked, list) else [picked])
-
-
-@pytest.mark.parametrize("text", ["", "a", "1.5", "1:2:3:4", "::0", "::-1", "1,2"])
-def test_slice_of_another_form_says_the_form(text: str) -> None:
-    with pytest.raises(click.BadParameter, match="half-open range A:B"):
-        SliceType().convert(text, None, None)
-
-
-@pytest.mark.parametrize(
-    ("text", "number", "expected"),
-    [
-        ("0:16,:,-8:", int, ((0, 16), (None, None), (-8, None))),
-        ("0.5:1e3, :2 ,-1:", float, ((0.5, 1000.0), (None, 2.0), (-1.0, None))),
-    ],
-)
-def test_intervals(
-    text: str, number: type[int] | type[float], expected: tuple[object, ...]
-) -> None:
-    assert IntervalsType(number).convert(text, None, None) == expected
-
-
-@pytest.mark.parametrize(
-    "text", ["", "1:2", "1:2,3:4", "1:2,3:4,5:6,7:8", "1,2,3", "a:b,:,:", "1:2:3,:,:", "0.5:1,:,:"]
-)
-def test_intervals_of_another_form_say_the_form(text: str) -> None:
-    with pytest.raises(click.BadParameter, match="z0:z1,y0:y1,x0:x1"):
-        IntervalsType(int).convert(text, None, None)
 
 
 @pytest.mark.parametrize("field", dataclasses.fields(EncodeConfig), ids=lambda field: field.name)

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import math
 
-from fhash_codec.header import brief_history, brief_quality, history_columns, history_points
+import pytest
+
+from fhash_codec.header import (
+    brief_history,
+    brief_quality,
+    full_header,
+    history_columns,
+    history_points,
+)
 
 
 def test_figures_in_a_file_are_brief_and_never_better_than_they_are() -> None:
@@ -71,3 +79,34 @@ def test_exact_values_have_no_psnr_in_the_history() -> None:
     assert history_columns(brief[:1]) == {"epoch": [1], "psnr": [40.0]}
     assert history_columns([]) == {}
     assert history_points(brief)[1] == {"seconds": None, "epoch": 2, "psnr": None}
+
+
+STEPS = [
+    {"step": 0, "psnr": 45.0, "rmse": 0.5, "max_abs_error": 1.0},
+    {"step": 1, "psnr": None, "rmse": 0.0, "max_abs_error": 0.0},
+]
+
+
+@pytest.mark.parametrize(
+    "per_step",
+    [STEPS, {"psnr": [45.0, None], "rmse": [0.5, 0.0], "max_abs_error": [1.0, 0.0]}],
+)
+def test_figures_of_steps_have_one_shape_whatever_the_file_has(per_step: object) -> None:
+    header = {"quality": {"psnr": 45.0, "per_step": per_step}, "history": {"epoch": [3]}}
+    assert full_header(header) == {
+        "quality": {"psnr": 45.0, "per_step": STEPS},
+        "history": [{"seconds": None, "psnr": None, "epoch": 3}],
+    }
+
+
+@pytest.mark.parametrize("per_step", [[], {}, {"psnr": 3}, [7], {"psnr": []}])
+def test_figures_of_steps_that_another_writer_misshaped_are_left_out(per_step: object) -> None:
+    assert full_header({"quality": {"per_step": per_step}})["quality"]["per_step"] == []
+
+
+def test_steps_without_some_figures_keep_the_others() -> None:
+    full = full_header({"quality": {"per_step": {"psnr": [1.0, 2.0], "rmse": [3.0]}}})
+    assert full["quality"]["per_step"] == [
+        {"step": 0, "psnr": 1.0, "rmse": 3.0},
+        {"step": 1, "psnr": 2.0, "rmse": None},
+    ]

@@ -15,7 +15,7 @@ SHELLS = ("bash", "zsh", "fish")
 
 
 @click.command("completion", cls=BaseCommand)
-@click.argument("shell", type=click.Choice(SHELLS))
+@click.argument("shell", metavar="SHELL", type=click.Choice(SHELLS))
 @click.pass_context
 def command(context: click.Context, shell: str) -> None:
     """Print code for SHELL that completes commands, options and file names on Tab.

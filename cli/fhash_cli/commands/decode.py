@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from fhash_cli.base_command import BaseCommand
+from fhash_cli.intervals import IntervalsType, SliceType
 from fhash_cli.options import (
-    IntervalsType,
-    SliceType,
     check_writable,
     force_option,
     json_option,
@@ -63,7 +62,7 @@ TYPES = (
     "--roi",
     metavar="z0:z1,y0:y1,x0:x1",
     type=IntervalsType(int),
-    help="Region in vertices, half-open as in Python.",
+    help="Region in vertices, half-open as in Python; 5 is one layer, and axes left out are whole.",
 )
 @click.option(
     "--box",

@@ -49,6 +49,8 @@ def command(
     """Compare RUN.fhz with the DATA it was made from, over all steps."""
     import fhash_codec
 
+    if data.endswith(".fhz") and not run.endswith(".fhz"):
+        raise click.UsageError(f"the data come first: fhash diff {run} {data}")
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         report = fhash_codec.diff(series, run, progress=progress)
     rows = [

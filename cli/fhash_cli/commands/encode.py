@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import glob
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +32,7 @@ from fhash_cli.output import (
     spans,
     table,
 )
-from fhash_formats.errors import QualityError
+from fhash_formats.errors import InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
@@ -60,13 +62,17 @@ def command(
     """Find the features of DATA, encode them and write them as RUN.fhz.
 
     DATA is a file of HDF5, NetCDF, numpy or raw values, a Zarr folder, or a pattern of such files
-    in quotes ('step_*.raw'). With --profile paper Ctrl-C saves a checkpoint beside RUN.fhz; the
-    same command resumes from it.
+    in quotes ('step_*.raw').
+
+    Ctrl-C leaves no file, and an older RUN.fhz as it was. With --profile paper it saves a
+    checkpoint of the training beside RUN.fhz, and the same command goes on from there; with the
+    profile compact the same command starts again.
     """
     import fhash_codec
 
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
+    before = _stamp(output)
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         missed = None
         try:
@@ -74,8 +80,30 @@ def command(
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
+        except KeyboardInterrupt:
+            raise InterruptedEncodingError(_after_interruption(output, before)) from None
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
     emit(report, table(rows), as_json, missed)
+
+
+def _stamp(path: str) -> tuple[int, int] | None:
+    """Inode and time of a file, which one that replaces it has not; None without a file."""
+    try:
+        state = os.stat(path)
+    except OSError:
+        return None
+    return state.st_ino, state.st_mtime_ns
+
+
+def _after_interruption(output: str, before: tuple[int, int] | None) -> str:
+    """A line that says what an interrupted encoding left, and what the same command will do."""
+    if _stamp(output) not in (None, before):
+        return f"interrupted after {output} was written; the file is complete"
+    left = f"{output} is not written" if before is None else f"the older {output} is unchanged"
+    folder, name = Path(output).parent, glob.escape(Path(output).name)
+    goes_on = any(folder.glob(f"{name}.*.checkpoint"))
+    again = "goes on from the checkpoint beside it" if goes_on else "starts again"
+    return f"interrupted; {left}, and the same command {again}"
 
 
 def report_rows(

@@ -5,7 +5,6 @@ Every preset becomes a list of points (value, opacity) between which the opacity
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
 
@@ -15,6 +14,7 @@ import numpy.typing as npt
 from fhash_codec.coreset.features import Interval, Isosurface, Segmentation, parse_feature
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.errors import InputError
+from fhash_formats.support.suggestions import suggestion
 
 __all__ = ["PRESETS", "Histogram", "Thinnest", "about", "opacity_preset", "raised", "shown_range"]
 
@@ -82,11 +82,9 @@ def opacity_preset(
     no feature that tells values apart.
     """
     if name not in PRESETS:
-        near = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.0)[0]
-        raise InputError(
-            f"opacity '{name[:60]}' is not known; did you mean '{near}'? "
-            f"Known: {', '.join(PRESETS)}"
-        )
+        likely = suggestion(name, PRESETS)
+        known = "" if likely.startswith("known") else f" Known: {', '.join(PRESETS)}"
+        raise InputError(f"opacity '{name[:60]}' is not known; {likely}{known}")
     if name not in ("auto", "feature"):
         return _pyvista(name, shown)
     if name == "auto" and thinnest is not None and thinnest[0] <= THIN:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.support.suggestions import suggestion
 
 __all__ = ["Record", "limits"]
 
@@ -57,10 +58,9 @@ class Record:
         names = [setting.name for setting in settings]
         for name in values:
             if name not in names:
-                near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)
                 raise InputError(
                     f"unknown setting '{str(name)[:60]}' of {cls.__name__.lower()}; "
-                    f"did you mean '{near[0]}'?"
+                    f"{suggestion(str(name), names)}"
                 )
         for setting in settings:
             if setting.name not in values and _default(setting) is dataclasses.MISSING:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from functools import cache
 
@@ -18,6 +17,7 @@ from fhash_codec.selftest.cases import (
     values,
 )
 from fhash_formats.errors import InputError
+from fhash_formats.support.suggestions import suggestion
 
 __all__ = ["cases", "choose_cases"]
 
@@ -56,5 +56,4 @@ def choose_cases(
 def _check_names(kind: str, names: Sequence[str], allowed: Sequence[str]) -> None:
     for name in names:
         if name not in allowed:
-            near = difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
-            raise InputError(f"unknown {kind} '{name}'; did you mean '{near}'?")
+            raise InputError(f"unknown {kind} '{name}'; {suggestion(name, allowed)}")

@@ -90,5 +90,19 @@ def _handled_by(
             signal.signal(number, handler)
         yield before
     finally:
-        for number, previous in before.items():
-            signal.signal(number, previous)
+        _restore(before)
+
+
+def _restore(handlers: dict[signal.Signals, Any]) -> None:
+    """Put handlers back, all of them, even where one that is back already raises on the way."""
+    remaining = list(handlers)
+    raised: BaseException | None = None
+    while remaining:
+        try:
+            while remaining:
+                signal.signal(remaining[-1], handlers[remaining[-1]])
+                remaining.pop()
+        except BaseException as error:
+            raised = error
+    if raised is not None:
+        raise raised

@@ -199,9 +199,7 @@ def test_ctrl_c_saves_a_checkpoint_and_the_same_command_ends_as_if_nothing_had_b
         "--no-timings",
         "--feature",
         "interval:2:99",
-        *PAPER,
-        "--epochs",
-        "6",
+        *("6" if word == "2" else word for word in PAPER),
         "-o",
     ]
     assert fhash(*words, tmp_path / "whole.fhz").exit_code == 0
@@ -223,3 +221,53 @@ def test_ctrl_c_saves_a_checkpoint_and_the_same_command_ends_as_if_nothing_had_b
     assert fhash(*words, tmp_path / "run.fhz").exit_code == 0
     assert (tmp_path / "run.fhz").read_bytes() == (tmp_path / "whole.fhz").read_bytes()
     assert not list(tmp_path.glob("*.checkpoint"))
+
+
+@pytest.mark.parametrize("stage", ["scanning", "planning", "coding", "measuring"])
+@pytest.mark.parametrize("older", [False, True])
+def test_ctrl_c_says_that_the_profile_compact_starts_again(
+    fhash: Fhash,
+    data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    stage: str,
+    older: bool,
+) -> None:
+    output = tmp_path / "run.fhz"
+    if older:
+        output.write_bytes(b"older")
+
+    def stop(self: Progress, now: str, *rest: Any) -> None:
+        if now == stage:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Progress, "__call__", stop)
+    result = fhash("encode", data, "-o", output, "--force", *SMALL)
+    assert (result.exit_code, result.stdout) == (130, "")
+    left = f"the older {output} is unchanged" if older else f"{output} is not written"
+    assert result.stderr == (
+        f"fhash: error: interrupted; {left}, and the same command starts again\n"
+    )
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == ([b"older"] if older else [])
+
+
+def test_ctrl_c_after_the_file_was_written_says_so(
+    fhash: Fhash, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(self: Progress, stage: str, done: int, *rest: Any) -> None:
+        if (stage, done) == ("writing", 1):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Progress, "__call__", stop)
+    output = tmp_path / "run.fhz"
+    result = fhash("encode", data, "-o", output, *SMALL)
+    assert result.exit_code == 130
+    assert "interrupted after" in result.stderr
+    assert "the file is complete" in result.stderr
+    assert fhash("verify", output).exit_code == 0
+
+
+def test_the_help_says_what_ctrl_c_leaves(fhash: Fhash) -> None:
+    text = " ".join(fhash("encode", "--help").stdout.split())
+    assert "Ctrl-C leaves no file" in text
+    assert "with the profile compact the same command starts again" in text

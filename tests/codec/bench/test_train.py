@@ -56,3 +56,19 @@ def test_there_is_no_ratio_without_the_naive_engine(series: ArraySeries) -> None
 def test_unsuitable_requests_are_refused(series: ArraySeries, request_: dict[str, Any]) -> None:
     with pytest.raises(InputError):
         bench_train(series, CONFIG, **request_)
+
+
+def test_a_machine_that_stalls_at_the_first_steps_is_measured_all_the_same(
+    series: ArraySeries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock leaps while an engine warms up; later it crawls, and the schedule runs out."""
+    ticks = count()
+    clock = SimpleNamespace(
+        perf_counter=lambda: 1000.0 * tick if (tick := next(ticks)) < 12 else 1e6 + tick / 1e6
+    )
+    monkeypatch.setattr(train, "time", clock)
+    monkeypatch.setattr(train, "INFER_SECONDS", 1e-5)
+    report = bench_train(series, CONFIG, engines=("naive",), seconds=0.01)
+    (entry,) = report["engines"]
+    assert entry["train_msamples_s"] > 0
+    assert entry["train_ratio"] == 1.0

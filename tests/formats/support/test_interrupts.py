@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from fhash_formats.support import interrupts
 from fhash_formats.support.interrupts import deferred_interrupts, signals_held
 
 
@@ -105,3 +106,28 @@ def test_deferring_in_another_thread_changes_nothing() -> None:
     thread.start()
     thread.join()
     assert seen == [False, signal.getsignal(signal.SIGINT)]
+
+
+@pytest.mark.parametrize("block", [signals_held, deferred_interrupts])
+def test_a_signal_while_handlers_are_put_back_leaves_none_replaced(
+    monkeypatch: pytest.MonkeyPatch, block: Callable[[], Any]
+) -> None:
+    before = {number: signal.getsignal(number) for number in interrupts.STOP_SIGNALS}
+    put_back, set_handler = [], signal.signal
+
+    def interrupted(number: int, handler: Any) -> Any:
+        previous = set_handler(number, handler)
+        if handler is signal.default_int_handler and not put_back:
+            put_back.append(number)
+            signal.raise_signal(signal.SIGINT)  # comes as soon as its handler is back
+        return previous
+
+    def run() -> None:
+        with block():
+            monkeypatch.setattr(interrupts.signal, "signal", interrupted)
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    monkeypatch.undo()
+    assert put_back == [signal.SIGINT]
+    assert {number: signal.getsignal(number) for number in interrupts.STOP_SIGNALS} == before
