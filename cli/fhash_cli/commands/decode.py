@@ -28,19 +28,9 @@ if TYPE_CHECKING:
     from fhash_codec import Volume
     from fhash_codec.progress import Progress as Callback
 
-TYPES = (
-    "float16",
-    "float32",
-    "float64",
-    "int8",
-    "int16",
-    "int32",
-    "int64",
-    "uint8",
-    "uint16",
-    "uint32",
-    "uint64",
-)
+TYPE_NAMES = """float16 float32 float64 int8 int16 int32 int64 uint8 uint16 uint32 uint64"""
+TYPES = tuple(TYPE_NAMES.split())
+"""Number types that values can be converted to."""
 
 
 @click.command("decode")
@@ -387,8 +377,11 @@ def _inside(
 
 
 def _rows(result: dict[str, Any], units: str) -> list[tuple[str, str]]:
+    from fhash_formats.writers.vtkhdf import needed_by
+
     return [
         *(("written", path) for path in result["paths"]),
+        *(("opens in", text) for text in needed_by(result["paths"], len(result["steps"]))),
         ("steps", listed(apart(*result["steps"]))),
         ("region", spans(result["region"])),
         ("t, z, y, x", f"{extent(result['shape'])}, {result['dtype']}"),

@@ -162,7 +162,8 @@ def _variables(
             continue
         space = _shape(extent, place)
         leading = 0 if times is None else 1
-        shape, error = dataset.shape or (), ""
+        shape: tuple[int, ...] = dataset.shape or ()
+        error = ""
         if shape[leading : leading + 3] != space or len(shape) - leading not in (3, 4):
             error = f"a shape {shape} that does not fit the grid (z, y, x) = {space}"
         components = 1 if error or len(shape) - leading == 3 else shape[-1]

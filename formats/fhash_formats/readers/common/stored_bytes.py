@@ -61,7 +61,7 @@ class PlainFile:
             file.seek(self.start + place)
             done = 0
             while done < len(view):
-                count = file.readinto(view[done:])  # type: ignore[attr-defined]
+                count = file.readinto(view[done:])
                 if not count:
                     raise InputError(f"{self.path} ends after {file.tell()} bytes; it is cut")
                 done += count
@@ -235,7 +235,7 @@ class CompressedFile:
         self._place, self._stored, self._ended = 0, b"", False
 
     def _need(self, limit: int) -> bytes:
-        """At least one and at most `limit` true bytes."""
+        """The next true bytes, at least one and at most `limit`."""
         if self._file is None:
             self._file = self.path.open("rb")
             self._file.seek(self.start)
