@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from fhash_codec import Volume
     from fhash_codec.progress import Progress as Callback
 
-TYPE_NAMES = """float16 float32 float64 int8 int16 int32 int64 uint8 uint16 uint32 uint64"""
-TYPES = tuple(TYPE_NAMES.split())
+INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
+TYPES = ("float16", "float32", "float64", *INTEGERS)
 
 
 @click.command("decode")
@@ -132,8 +132,7 @@ def command(
         frames = selection.frames(volume, statistics, progress)
         paths: list[str] = []
         if output is None:
-            for _ in frames:
-                pass
+            sum(1 for _ in frames)
         elif isosurface is not None:
             paths = _save_surface(output, isosurface, volume, selection, frames, force, run)
         else:
