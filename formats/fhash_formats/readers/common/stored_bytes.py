@@ -224,6 +224,13 @@ class CompressedFile:
 
     def readinto(self, place: int, view: memoryview) -> None:
         """Fill a view with the true bytes from `place` on; raises InputError where they end."""
+        try:
+            self._fill(place, view)
+        except BaseException:
+            self.close()
+            raise
+
+    def _fill(self, place: int, view: memoryview) -> None:
         if place < self._place or self._file is None:
             self._begin()
         while self._place < place:
