@@ -65,14 +65,10 @@ def test_render_takes_dates(fhash: Fhash, dated: Path, tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("command", ["decode", "render"])
 def test_errors_name_the_range_in_dates(
-    command: str, time: str, message: str, dated: Path, tmp_path: Path, capfd: Any
+    fhash: Fhash, command: str, time: str, message: str, dated: Path, tmp_path: Path
 ) -> None:
-    from fhash_cli.main import main
-
-    words = [command, str(dated), "--time", time, "-o", str(tmp_path / "a.png")]
-    if command == "decode":
-        words = words[:4]
-    with pytest.raises(SystemExit) as caught:
-        main(words)
-    assert caught.value.code == 2
-    assert message in capfd.readouterr().err
+    output = tmp_path / ("a.png" if command == "render" else "a.npy")
+    result = fhash(command, dated, "--time", time, "-o", output)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert not output.exists()

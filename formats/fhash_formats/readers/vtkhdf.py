@@ -212,7 +212,7 @@ def _coordinates(
         times = np.asarray(stored[()], dtype=np.float64).ravel()
     if times is not None:
         extra = json_attributes(stored.attrs)
-        kept = {key: extra[key] for key in ("units", "calendar") if key in extra}
+        kept = {key: value for key, value in extra.items() if key in ("units", "calendar")}
         coords["t"] = Coordinate(name=AXIS_NAMES["t"], values=times, attributes=kept)
     return coords
 

@@ -174,8 +174,9 @@ def _time_units(coordinate: Coordinate) -> str:
     counted = clock(coordinate.attributes)
     if counted is None:
         return "" if " since " in units else units
-    first = min(counted.epoch, *map(counted.instant, coordinate.values.tolist()))
-    modern = counted.calendar == "proleptic_gregorian" and first >= FIRST_GREGORIAN * DAY
+    instants = (counted.epoch, counted.instant(float(coordinate.values.min())))
+    changed = FIRST_GREGORIAN * DAY  # the calendars are the same from here on
+    modern = counted.calendar == "proleptic_gregorian" and all(at >= changed for at in instants)
     return units if modern or counted.calendar == "standard" else ""
 
 
