@@ -36,7 +36,7 @@ SERIES_NEEDS = "ParaView 5.12 or newer, as every .vtkhdf of several steps"
 
 
 def needed_by(paths: Sequence[str], steps: int) -> list[str]:
-    """What is needed to open outputs of so many steps: at most one text, for a .vtkhdf series."""
+    """Programs that open outputs of so many steps: at most one text, for a .vtkhdf series."""
     series = steps > 1 and any(path.lower().endswith(".vtkhdf") for path in paths)
     return [SERIES_NEEDS] if series else []
 
