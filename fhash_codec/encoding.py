@@ -28,10 +28,13 @@ from fhash_formats.errors import FhashWarning, InputError, QualityError
 from fhash_formats.series import Series
 from fhash_formats.support.atomic import check_output
 
-DATA_SUFFIXES = frozenset(
-    (".npy", ".h5", ".hdf5", ".nc", ".nc4", ".zarr", ".raw", ".vti", ".vtr", ".pvd", ".vtkhdf")
-)
-"""Suffixes of the data files that `fhash decode` writes. No container may have one of them."""
+DATA_SUFFIX_NAMES = """.npy .npz .h5 .hdf5 .hdf .he5 .nc .nc4 .netcdf .cdf .zarr .raw .vti .vtr .pvd
+.series .vtkhdf .nrrd .nhdr .mha .mhd .tif .tiff .vtp .ply"""
+DATA_SUFFIXES = frozenset(DATA_SUFFIX_NAMES.split())
+"""Suffixes of data files that are read or written. No container may have one of them.
+
+Those that say nothing of their content (.zip, .bin, .dat) are allowed.
+"""
 
 
 def encode(

@@ -42,7 +42,12 @@ def time_of(coordinate: Coordinate, text: str | float, source: str) -> float:
                 f" ({f'their units are {units!r}' if units else 'they have no units'});"
                 f" give a number {_range(coordinate)}"
             ) from None
-        time = _of_date(coordinate, found, str(text))
+        try:
+            time = _of_date(coordinate, found, str(text))
+        except InputError as error:
+            raise InputError(
+                f"{source}: time {error}; the series is {_range(coordinate)}"
+            ) from error
     if not coordinate.values.min() <= time <= coordinate.values.max():
         raise RegionError(f"{source}: time {text} is outside the series, {_range(coordinate)}")
     return time

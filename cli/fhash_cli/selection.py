@@ -43,6 +43,17 @@ def steps_at(volume: Volume, times: Sequence[str]) -> list[float]:
     return [volume.step_of_time(time_of(volume, time)) for time in times]
 
 
+def dates_of(volume: Volume, steps: Sequence[float]) -> list[str]:
+    """The dates of (fractional) steps; none where the times are no dates."""
+    from fhash_codec import times
+
+    time = volume.coords["t"]
+    if not times.is_dated(time):
+        return []
+    chosen = coordinates(volume, steps, (range(0),) * 3)["t"].values
+    return [times.time_text(time, float(value)) for value in chosen]
+
+
 def region_of(
     volume: Volume, roi: Sequence[Sequence[int | None]] | None
 ) -> tuple[Span, Span, Span]:

@@ -18,7 +18,15 @@ from fhash_cli.options import (
     run_argument,
 )
 from fhash_cli.output import Progress, apart, emit, extent, listed, number, spans, table
-from fhash_cli.selection import Span, coordinates, region_of, region_of_box, steps_at, steps_of
+from fhash_cli.selection import (
+    Span,
+    coordinates,
+    dates_of,
+    region_of,
+    region_of_box,
+    steps_at,
+    steps_of,
+)
 from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,19 +36,8 @@ if TYPE_CHECKING:
     from fhash_codec import Volume
     from fhash_codec.progress import Progress as Callback
 
-TYPES = (
-    "float16",
-    "float32",
-    "float64",
-    "int8",
-    "int16",
-    "int32",
-    "int64",
-    "uint8",
-    "uint16",
-    "uint32",
-    "uint64",
-)
+INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
+TYPES = ("float16", "float32", "float64", *INTEGERS)
 
 
 @click.command("decode", cls=BaseCommand)
@@ -135,8 +132,7 @@ def command(
         frames = selection.frames(volume, statistics, progress)
         paths: list[str] = []
         if output is None:
-            for _ in frames:
-                pass
+            sum(1 for _ in frames)
         elif isosurface is not None:
             paths = _save_surface(output, isosurface, volume, selection, frames, force, run)
         else:
@@ -149,7 +145,7 @@ def command(
             "region": [(vertices.start, vertices.stop) for vertices in selection.vertices],
             **statistics.result(),
         }
-        emit(result, table(_rows(result, volume.units)), as_json)
+        emit(result, table(_rows(result, volume)), as_json)
 
 
 def _check_output(
@@ -386,10 +382,15 @@ def _inside(
     return int(volume.occupancy(step, region).sum())
 
 
-def _rows(result: dict[str, Any], units: str) -> list[tuple[str, str]]:
+def _rows(result: dict[str, Any], volume: Volume) -> list[tuple[str, str]]:
+    from fhash_formats.writers.vtkhdf import needed_by
+
+    dates, units = dates_of(volume, result["steps"]), volume.units
     return [
         *(("written", path) for path in result["paths"]),
+        *(("opens in", text) for text in needed_by(result["paths"], len(result["steps"]))),
         ("steps", listed(apart(*result["steps"]))),
+        *([("dates", listed(dates))] if dates else []),
         ("region", spans(result["region"])),
         ("t, z, y, x", f"{extent(result['shape'])}, {result['dtype']}"),
         ("smallest", number(result["min"], units, digits=6)),

@@ -1,8 +1,9 @@
 """Readers of time-varying volumes: one file per format, and `registry` to find the right one.
 
-`hdf5`, `netcdf`, `zarr_store`, `npy` and `raw` are the formats. `joined` makes one series of many
-files, `masks` opens a mask over a series. `common/` holds what several formats share: the user's
-request, the choice of a variable and of its axes, coordinates, packed values, errors.
+`hdf5`, `netcdf`, `zarr_store`, `npy`, `raw`, `vtk_xml`, `vtkhdf`, `nrrd`, `metaimage` and `tiff`
+are the formats. `joined` makes one series of many files, `pvd` of a list of files, `masks` opens a
+mask over a series. `common/` holds what several formats share: the user's request, the choice of a
+variable and of its axes, coordinates, packed values, stored bytes, errors.
 """
 
 from fhash_formats.readers.common.listing import Listed

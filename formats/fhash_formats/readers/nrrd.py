@@ -109,7 +109,8 @@ def open_nrrd(path: Path, request: Request) -> FileSeries:
         place = len(sizes) - 1 - vector
         all_of_it = slice(0, sizes[vector])
         read = array.read((*ranges[:place], all_of_it, *ranges[place:]))
-        return read.take(component, axis=place)
+        values: npt.NDArray[Any] = read.take(component, axis=place)
+        return values
 
     units = fields.get("sample units", "").strip('" ')
     return FileSeries(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,9 +42,13 @@ class CollectionSeries(JoinedSeries):
             part = vtk_xml.open_vtk(file, request).as_asked(request)
             if part.shape[0] != 1:
                 raise InputError(f"{file} holds {part.shape[0]} steps; {path} lists one a file")
+            if "t" in part.given:
+                units.update(part.coords["t"].attributes)
             return part
 
-        times = Coordinate(name=AXIS_NAMES["t"], values=np.array([time for time, _ in entries]))
+        units: dict[str, Any] = {}
+        values = np.array([time for time, _ in entries])
+        times = Coordinate(name=AXIS_NAMES["t"], values=values, attributes=units)
         super().__init__(str(path), [file for _, file in entries], open_part, times=times)
         self._stamp = stamp
         self.files = (path, *self.files)

@@ -8,7 +8,9 @@ in them says which: `--axes z,y,x` or `--axes t,y,x` does.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError, MissingDependencyError
-from fhash_formats.readers.common.failures import Stamp, naming
+from fhash_formats.readers.common.failures import Stamp, condense, naming
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.grid import component_by_number, component_variables, lattice
 from fhash_formats.readers.common.request import Request
@@ -48,6 +50,36 @@ def _tifffile(source: str) -> Any:
         ) from error
 
 
+class _Complaints(logging.Handler):
+    """Keeps the errors that tifffile logs."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage())
+
+
+@contextmanager
+def _strictly() -> Iterator[None]:
+    """Raise InputError for what tifffile only logs: pages that are missing or damaged.
+
+    It would go on with the pages before them.
+    """
+    logger, complaints = logging.getLogger("tifffile"), _Complaints()
+    shown = logger.propagate
+    logger.addHandler(complaints)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.removeHandler(complaints)
+        logger.propagate = shown
+    if complaints.texts:
+        raise InputError(f"it is cut or damaged: {condense(Exception(complaints.texts[0]))}")
+
+
 def open_tiff(path: Path, request: Request) -> FileSeries:
     """Open the stack in a TIFF file.
 
@@ -55,10 +87,10 @@ def open_tiff(path: Path, request: Request) -> FileSeries:
     """
     source, stamp = str(path), Stamp.of(path)
     tifffile = _tifffile(source)
-    with naming(source):
+    with naming(source), _strictly():
         file = tifffile.TiffFile(path)
     try:
-        with naming(source):
+        with naming(source), _strictly():
             return _series(source, path, stamp, file, request)
     except BaseException:
         file.close()
@@ -267,7 +299,7 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> FileSer
     differ from the first.
     """
     tifffile = _tifffile(pattern)
-    with naming(str(paths[0])), tifffile.TiffFile(paths[0]) as file:
+    with naming(str(paths[0])), _strictly(), tifffile.TiffFile(paths[0]) as file:
         if len(file.series) != 1 or len(paths) == 1:
             return None
         letters, shape = str(file.series[0].axes), tuple(file.series[0].shape)
@@ -287,8 +319,7 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> FileSer
     def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
         return np.stack([_plane(tifffile, path, shape, dtype) for path in paths[ranges[0]]])
 
-    common = tifffile  # opened once more for its positions
-    with naming(str(paths[0])), common.TiffFile(paths[0]) as file:
+    with naming(str(paths[0])), tifffile.TiffFile(paths[0]) as file:
         coords = _coordinates(file, {"y": shape[0], "x": shape[1]})
     return FileSeries(
         source=pattern,
@@ -306,7 +337,7 @@ def open_pages(pattern: str, paths: Sequence[Path], request: Request) -> FileSer
 def _plane(
     tifffile: Any, path: Path, shape: tuple[int, ...], dtype: np.dtype[Any]
 ) -> npt.NDArray[Any]:
-    with naming(str(path)), tifffile.TiffFile(path) as file:
+    with naming(str(path)), _strictly(), tifffile.TiffFile(path) as file:
         found = file.series[0] if file.series else None
         if found is None or tuple(found.shape) != shape or np.dtype(found.dtype) != dtype:
             raise InputError(f"its page is not {dtype} {shape}, as that of the first file")

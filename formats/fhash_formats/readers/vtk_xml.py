@@ -278,7 +278,7 @@ def _time(grid: _Grid) -> Coordinate | None:
                 and grid.arrays.dtype(element).kind in "iuf"
             ):
                 values = grid.arrays.read(element, 1).astype(np.float64)
-                return Coordinate(name=AXIS_NAMES["t"], values=values)
+                return Coordinate(name=AXIS_NAMES["t"], values=values, attributes=_units(element))
     return None
 
 

@@ -162,7 +162,8 @@ def _variables(
             continue
         space = _shape(extent, place)
         leading = 0 if times is None else 1
-        shape, error = dataset.shape or (), ""
+        shape: tuple[int, ...] = dataset.shape or ()
+        error = ""
         if shape[leading : leading + 3] != space or len(shape) - leading not in (3, 4):
             error = f"a shape {shape} that does not fit the grid (z, y, x) = {space}"
         components = 1 if error or len(shape) - leading == 3 else shape[-1]
@@ -206,11 +207,13 @@ def _coordinates(
         number = "xyz".index(axis)
         start = first + (0.5 if array.place == "CellData" and last > first else 0.0)
         coords[axis] = lattice(axis, origin[number], spacing[number], count, first=start)
-    if times is None and "FieldData/TimeValue" in root:
-        single = np.asarray(root["FieldData/TimeValue"][()], dtype=np.float64).ravel()
-        times = single if single.size == 1 else None
+    stored = root["Steps/Values"] if times is not None else root.get("FieldData/TimeValue")
+    if times is None and stored is not None and stored.size == 1:
+        times = np.asarray(stored[()], dtype=np.float64).ravel()
     if times is not None:
-        coords["t"] = Coordinate(name=AXIS_NAMES["t"], values=times)
+        extra = json_attributes(stored.attrs)
+        kept = {key: value for key, value in extra.items() if key in ("units", "calendar")}
+        coords["t"] = Coordinate(name=AXIS_NAMES["t"], values=times, attributes=kept)
     return coords
 
 

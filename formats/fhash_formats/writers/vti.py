@@ -19,6 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
+from fhash_formats.series import Coordinate
+from fhash_formats.support.dates import DAY, FIRST_GREGORIAN, clock
 from fhash_formats.writers.common.labels import printable
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.spacing import even_spacing
@@ -85,7 +87,7 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
         _write_grid(
             temporaries[step],
             region,
-            float(region.coords["t"].values[step]),
+            _time_field(region.coords["t"], step),
             ascending,
             frame[turn],
             image=image,
@@ -104,13 +106,16 @@ def direction(values: npt.NDArray[np.float64]) -> int:
 def _write_grid(
     path: Path,
     region: Region,
-    time: float,
+    time: str,
     coords: dict[str, npt.NDArray[np.float64]],
     frame: Frame,
     *,
     image: bool,
 ) -> None:
-    """Write one step: `frame` (z, y, x) on ascending `coords`, as ImageData or RectilinearGrid."""
+    """Write one step: `frame` (z, y, x) on ascending `coords`, as ImageData or RectilinearGrid.
+
+    time: the field array of its time.
+    """
     dtype = little_endian(region.dtype)
     extent = " ".join(f"0 {length - 1}" for length in reversed(frame.shape))
     kind, place = "RectilinearGrid", ""
@@ -119,8 +124,7 @@ def _write_grid(
         spacing = " ".join(repr(even_spacing(coords[axis])) for axis in "xyz")
         kind, place = "ImageData", f' Origin="{origin}" Spacing="{spacing}"'
     name = quoteattr(printable(region.name))
-    key = '<InformationKey name="UNITS_LABEL" location="vtkDataArray">'
-    units = f"{key}{escape(printable(region.units))}</InformationKey>" if region.units else ""
+    units = _units(region.units)
     sizes = (
         [frame.size * dtype.itemsize]
         if image
@@ -128,7 +132,6 @@ def _write_grid(
     )
     # Each array follows its 64-bit size.
     offsets = [sum(sizes[:i]) + 8 * i for i in range(len(sizes))]
-    value = 'type="Float64" Name="TimeValue" NumberOfTuples="1" format="ascii"'
     grid = ""
     if not image:
         axes = zip("xyz", offsets[1:], strict=True)
@@ -136,7 +139,7 @@ def _write_grid(
     text = f"""<?xml version="1.0" encoding="UTF-8"?>
 <VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" header_type="UInt64">
 <{kind} WholeExtent="{extent}"{place}>
-<FieldData><DataArray {value}>{time!r}</DataArray></FieldData>
+<FieldData>{time}</FieldData>
 <Piece Extent="{extent}">
 <PointData Scalars={name}>
 <DataArray type="{_vtk_type(dtype)}" Name={name} format="appended" offset="0">{units}</DataArray>
@@ -155,6 +158,32 @@ _"""
             handle.write(size.to_bytes(8, "little"))
             handle.write(coords[axis].astype("<f8").tobytes())
         handle.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+def _time_field(coordinate: Coordinate, step: int) -> str:
+    """The field array TimeValue, by which VTK's programs know the time of a file."""
+    value = 'type="Float64" Name="TimeValue" NumberOfTuples="1" format="ascii"'
+    time = float(coordinate.values[step])
+    # Information keys stand behind data that are written as text.
+    return f"<DataArray {value}>{time!r}{_units(_time_units(coordinate))}</DataArray>"
+
+
+def _time_units(coordinate: Coordinate) -> str:
+    """Units of the times, "" where they are unknown, or mean nothing without their calendar."""
+    units = str(coordinate.attributes.get("units", ""))
+    counted = clock(coordinate.attributes)
+    if counted is None:
+        return "" if " since " in units else units
+    instants = (counted.epoch, counted.instant(float(coordinate.values.min())))
+    changed = FIRST_GREGORIAN * DAY  # the calendars are the same from here on
+    modern = counted.calendar == "proleptic_gregorian" and all(at >= changed for at in instants)
+    return units if modern or counted.calendar == "standard" else ""
+
+
+def _units(text: str) -> str:
+    """The information key that holds units; "" without them."""
+    key = '<InformationKey name="UNITS_LABEL" location="vtkDataArray">'
+    return f"{key}{escape(printable(text))}</InformationKey>" if text else ""
 
 
 def _axis(axis: str, offset: int) -> str:

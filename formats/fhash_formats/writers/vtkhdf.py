@@ -18,7 +18,7 @@ import numpy as np
 
 from fhash_formats.errors import InputError
 from fhash_formats.writers.common.held_file import held_hdf5
-from fhash_formats.writers.common.labels import safe_name
+from fhash_formats.writers.common.labels import hdf5_value, safe_name
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.spacing import even_spacing
 from fhash_formats.writers.common.writer import Frame, Put, Writer, chunk_shape, little_endian
@@ -33,6 +33,12 @@ SERIES_VERSION = (2, 0)
 
 SERIES_NEEDS = "ParaView 5.12 or newer, as every .vtkhdf of several steps"
 """Programs that read a file of several steps, for messages."""
+
+
+def needed_by(paths: Sequence[str], steps: int) -> list[str]:
+    """Programs that open outputs of so many steps: at most one text, for a .vtkhdf series."""
+    series = steps > 1 and any(path.lower().endswith(".vtkhdf") for path in paths)
+    return [SERIES_NEEDS] if series else []
 
 
 def _outputs(path: Path, region: Region) -> list[Path]:
@@ -104,14 +110,22 @@ def _create(root: Any, region: Region) -> Any:
         values.attrs["units"] = region.units.replace("\0", "")
     times = region.coords["t"].values.astype("<f8")
     if steps == 1:
-        group.create_group("FieldData", track_order=True).create_dataset("TimeValue", data=times)
+        holder = group.create_group("FieldData", track_order=True)
+        _describe(holder.create_dataset("TimeValue", data=times), region)
         return values
     series = group.create_group("Steps", track_order=True)
     series.attrs["NSteps"] = np.int64(steps)
-    series.create_dataset("Values", data=times)
+    _describe(series.create_dataset("Values", data=times), region)
     offsets = series.create_group("PointDataOffsets", track_order=True)
     offsets.create_dataset(name, data=np.arange(steps, dtype="<i8"))
     return values
+
+
+def _describe(times: Any, region: Region) -> None:
+    """Give a dataset of times the units and the calendar of the region's."""
+    for key in ("units", "calendar"):
+        if key in region.coords["t"].attributes:
+            times.attrs[key] = hdf5_value(str(region.coords["t"].attributes[key]))
 
 
 VTKHDF = Writer(name="VTKHDF", suffixes=(".vtkhdf",), outputs=_outputs, open=_open)

@@ -3,6 +3,7 @@ times and units, as far as the format holds them."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,6 @@ from fhash_formats.writers import Region, save_region
 EVEN = {"t": [3.5, 4.0, 9.0], "z": [2.0, 2.5], "y": [-1.0, 0.0, 1.0, 2.0], "x": [10.0, 10.5, 11.0]}
 UNEVEN = {**EVEN, "x": [10.0, 10.5, 13.0], "z": [5.0, 7.5]}
 UNITS = "days since 2001-02-03"
-KEEPS_TIME_UNITS = (".h5", ".nc", ".zarr", ".raw")
-"""VTK's formats have no place for the units of a time."""
 
 
 def region(axes: dict[str, list[float]], dtype: str) -> Region:
@@ -52,8 +51,21 @@ def test_an_export_comes_back(tmp_path: Path, suffix: str, dtype: str, steps: in
         assert (series.name, series.units) == ("wind", "m/s")
         for axis in "tzyx":
             np.testing.assert_array_equal(series.coords[axis].values, described.coords[axis].values)
-        if suffix in KEEPS_TIME_UNITS:
-            assert series.coords["t"].attributes["units"] == UNITS
+        assert series.coords["t"].attributes["units"] == UNITS
+
+
+@pytest.mark.parametrize("suffix", [".h5", ".nc", ".zarr", ".raw", ".vti", ".pvd", ".vtkhdf"])
+def test_no_date_loses_its_calendar(tmp_path: Path, suffix: str) -> None:
+    described = region(EVEN, "f4")
+    time = described.coords["t"]
+    attributes = {**time.attributes, "calendar": "noleap"}
+    coords = {**described.coords, "t": replace(time, attributes=attributes)}
+    values = np.zeros(described.shape, "f4")
+    written = save_region(tmp_path / f"out{suffix}", replace(described, coords=coords), values)
+    with open_series(written[-1]) as series:
+        found = series.coords["t"].attributes
+        assert found.get("calendar") == "noleap" or "units" not in found
+        assert ("units" in found) == (suffix not in (".vti", ".pvd"))
 
 
 @pytest.mark.parametrize("suffix", [".vti", ".vtr", ".pvd", ".vtkhdf"])
@@ -73,3 +85,15 @@ def test_numbered_files_come_back_by_a_pattern(tmp_path: Path) -> None:
     with open_series(tmp_path / "out_*.vti") as series:
         np.testing.assert_array_equal(np.stack(list(series.frames())), values)
         np.testing.assert_array_equal(series.coords["t"].values, EVEN["t"])
+
+
+def test_vtk_takes_the_time_and_its_units(tmp_path: Path) -> None:
+    xml = pytest.importorskip("vtkmodules.vtkIOXML")
+    described = region({**EVEN, "t": [4.0]}, "f4")
+    save_region(tmp_path / "out.vti", described, np.zeros(described.shape, "f4"))
+    reader = xml.vtkXMLImageDataReader()
+    reader.SetFileName(str(tmp_path / "out.vti"))
+    reader.Update()
+    array = reader.GetOutput().GetFieldData().GetArray("TimeValue")
+    assert array.GetTuple1(0) == 4.0
+    assert array.GetInformation().Get(array.UNITS_LABEL()) == UNITS

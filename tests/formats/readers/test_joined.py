@@ -187,3 +187,42 @@ def test_packing_and_missing_values_of_many_files(tmp_path: Path) -> None:
     with open_series(tmp_path / "f*.h5", missing=[missing], keep_extremes=True) as series:
         assert (series.fill, series.keep_extremes) == (missing, True)
         np.testing.assert_array_equal(np.stack(list(series.frames())), expected)
+
+
+def dated(path: Path, values: np.ndarray, time: float, units: str, calendar: str = "") -> None:
+    """One step with a time that counts since a date."""
+    h5(path, values, time=[time])
+    with h5py.File(path, "a") as file:
+        file["time"].attrs["units"] = units
+        if calendar:
+            file["time"].attrs["calendar"] = calendar
+
+
+def test_times_since_different_dates_are_counted_as_in_the_first(tmp_path: Path) -> None:
+    for step in range(4):
+        units = ("days", "hours", "seconds", "days")[step] + f" since 2001-02-{26 + step}"
+        units = units.replace("-29", "-26")
+        time = (0.0, 6.0, 7.0, 9.25)[step]
+        dated(tmp_path / f"f{step}.h5", VALUES[step], time, units, "gregorian" if step else "")
+    with open_series(tmp_path / "f*.h5") as series:
+        coordinate = series.coords["t"]
+        assert coordinate.attributes["units"] == "days since 2001-02-26"
+        np.testing.assert_array_equal(coordinate.values, [0, 1.25, 2 + 7 / 86400, 9.25])
+
+
+def test_calendars_that_differ_are_not_joined(tmp_path: Path) -> None:
+    dated(tmp_path / "f0.h5", VALUES[0], 0, "days since 2001-02-26")
+    dated(tmp_path / "f1.h5", VALUES[1], 0, "days since 2001-02-27", "noleap")
+    message = r"f1.h5 has not the units of the time in .*f0.h5: days since 2001-02-27 noleap and"
+    with pytest.raises(InputError, match=message):
+        open_series(tmp_path / "f*.h5")
+    dated(tmp_path / "f1.h5", VALUES[1], 0, "s")
+    with pytest.raises(InputError, match=r"f1.h5 has not the units of .*: s and days since"):
+        open_series(tmp_path / "f*.h5")
+
+
+def test_joined_times_must_increase_as_dates(tmp_path: Path) -> None:
+    dated(tmp_path / "f0.h5", VALUES[0], 5, "days since 2001-02-26")
+    dated(tmp_path / "f1.h5", VALUES[1], 6, "days since 2001-02-20")
+    with pytest.raises(InputError, match=r"times do not increase .*: 0 in .*f1.h5 after 5 in"):
+        open_series(tmp_path / "f*.h5")

@@ -51,7 +51,8 @@ def read_raw(paths: list[Path]) -> np.ndarray:
 
 def read_vtkhdf(paths: list[Path]) -> np.ndarray:
     with h5py.File(paths[0]) as file:
-        return np.asarray(file["VTKHDF/PointData/wind"])
+        read = np.asarray(file["VTKHDF/PointData/wind"])
+        return read if read.ndim == 4 else read[None]
 
 
 READ: dict[str, Callable[[list[Path]], np.ndarray]] = {

@@ -98,7 +98,7 @@ def sizes_of(fields: Fields) -> tuple[int, ...]:
 
 
 def words_of(fields: Fields, name: str, count: int, default: str) -> list[str]:
-    """The words of a field that has one for each dimension; `default` for each without the field."""
+    """The words of a field that has one for each dimension; `default` where it is missing."""
     words = fields[name].split() if name in fields else [default] * count
     if len(words) != count:
         raise InputError(f"its {name} are {len(words)}, its dimensions {count}")

@@ -27,6 +27,9 @@ STORED_BYTES = 2**18
 DEFLATE_RATIO = 1032
 """Largest factor by which zlib and gzip can shrink data."""
 
+GZIP = b"\x1f\x8b"
+"""First bytes of a gzip member; zlib begins with others."""
+
 LONGEST_NUMBER = 64
 """Characters of the longest number in text."""
 
@@ -61,7 +64,7 @@ class PlainFile:
             file.seek(self.start + place)
             done = 0
             while done < len(view):
-                count = file.readinto(view[done:])  # type: ignore[attr-defined]
+                count = file.readinto(view[done:])
                 if not count:
                     raise InputError(f"{self.path} ends after {file.tell()} bytes; it is cut")
                 done += count
@@ -162,16 +165,22 @@ class _Inflate:
 
     def __init__(self) -> None:
         self.inner = zlib.decompressobj(wbits=47)
+        self.gzip: bool | None = None
+        self.complete = False
 
     def __call__(self, stored: bytes, limit: int) -> tuple[bytes, bytes, bool]:
+        if self.gzip is None and stored:
+            self.gzip = stored[:1] == GZIP[:1]
+        if self.complete and stored:
+            if not self.gzip or stored[:1] != GZIP[:1]:
+                return b"", b"", True  # what follows belongs to nothing
+            self.inner, self.complete = zlib.decompressobj(wbits=47), False
+        if self.complete:
+            return b"", b"", False
         data = self.inner.decompress(stored, limit)
-        if not self.inner.eof:
-            return data, self.inner.unconsumed_tail, False
-        rest = self.inner.unused_data
-        if rest[:2] != b"\x1f\x8b":
-            return data, b"", True
-        self.inner = zlib.decompressobj(wbits=47)
-        return data, rest, False
+        self.complete = self.inner.eof
+        rest = self.inner.unused_data if self.complete else self.inner.unconsumed_tail
+        return data, rest, self.complete and not self.gzip
 
 
 class _Bunzip:
@@ -179,10 +188,12 @@ class _Bunzip:
 
     def __init__(self) -> None:
         self.inner = bz2.BZ2Decompressor()
+        self.complete = False
 
     def __call__(self, stored: bytes, limit: int) -> tuple[bytes, bytes, bool]:
         data = self.inner.decompress(stored, limit)
-        return data, b"", self.inner.eof
+        self.complete = self.inner.eof
+        return data, b"", self.complete
 
 
 KINDS: dict[str, Callable[[], Any]] = {"deflate": _Inflate, "bzip2": _Bunzip}
@@ -213,6 +224,13 @@ class CompressedFile:
 
     def readinto(self, place: int, view: memoryview) -> None:
         """Fill a view with the true bytes from `place` on; raises InputError where they end."""
+        try:
+            self._fill(place, view)
+        except BaseException:
+            self.close()
+            raise
+
+    def _fill(self, place: int, view: memoryview) -> None:
         if place < self._place or self._file is None:
             self._begin()
         while self._place < place:
@@ -222,6 +240,12 @@ class CompressedFile:
             data = self._need(min(BLOCK_BYTES, len(view) - done))
             view[done : done + len(data)] = data
             done += len(data)
+        # One byte more reads the checksum behind the last one.
+        if self._place == self.size and not self._next.complete and self._some(1):
+            raise InputError(
+                f"{self.path} cannot be decompressed: it holds more than the {self.size} bytes"
+                " that its header promises"
+            )
 
     def close(self) -> None:
         """Close the file; a further read opens it again."""
@@ -235,10 +259,24 @@ class CompressedFile:
         self._place, self._stored, self._ended = 0, b"", False
 
     def _need(self, limit: int) -> bytes:
-        """At least one and at most `limit` true bytes."""
+        """The next true bytes, at least one and at most `limit`."""
         if self._file is None:
             self._file = self.path.open("rb")
             self._file.seek(self.start)
+        data = self._some(limit)
+        if data:
+            self._place += len(data)
+            return data
+        raise InputError(
+            f"{self.path} ends after {self._place} decompressed bytes, {self.size} are needed"
+        )
+
+    def _some(self, limit: int) -> bytes:
+        """The next true bytes; none where they end.
+
+        Raises InputError for a stream that is damaged, or cut before its checksum.
+        """
+        assert self._file is not None
         while not self._ended:
             hungry = getattr(self._next.inner, "needs_input", True)
             stored = self._stored or (self._file.read(STORED_BYTES) if hungry else b"")
@@ -247,10 +285,9 @@ class CompressedFile:
             except (zlib.error, OSError, EOFError) as error:
                 raise InputError(f"{self.path} cannot be decompressed: {error}") from error
             if data:
-                self._place += len(data)
                 return bytes(data)
             if hungry and not stored:
+                if not self._next.complete:
+                    raise InputError(f"{self.path} is cut after {self._place} decompressed bytes")
                 break
-        raise InputError(
-            f"{self.path} ends after {self._place} decompressed bytes, {self.size} are needed"
-        )
+        return b""

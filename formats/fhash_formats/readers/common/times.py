@@ -53,22 +53,20 @@ def _check_exact(source: str, parts: Parts, joined: npt.NDArray[np.float64]) -> 
     common = clock(first.attributes)
     if common is None or all(_units(time) == _units(first) for _, time in parts):
         return
-    gaps = np.abs(np.diff(joined))
-    if not np.isfinite(gaps).all():
+    if not np.isfinite(joined).all():
         raise InputError(f"{source}: the times in {first_path} are not all finite")
-    gap = Fraction(float(gaps[gaps > 0].min())) * common.unit
-    place = 0
+    exact = []
     for _, time in parts:
         own = clock(time.attributes)
         assert own is not None
-        for value in time.values:
-            moved = common.instant(float(joined[place])) - own.instant(float(value))
-            if abs(moved) > LOSS * gap:
-                raise InputError(
-                    f"{source}: the times lie too close to be counted in the units of"
-                    f" {first_path} ({first.attributes.get('units')}) without loss"
-                )
-            place += 1
+        exact += [own.instant(float(value)) for value in time.values]
+    gap = min(abs(after - before) for before, after in pairwise(exact) if before != after)
+    for value, instant in zip(joined, exact, strict=True):
+        if abs(common.instant(float(value)) - instant) > LOSS * gap:
+            raise InputError(
+                f"{source}: the times lie too close to be counted in the units of {first_path}"
+                f" ({first.attributes.get('units')}) without loss"
+            )
 
 
 def _converted(

@@ -269,11 +269,18 @@ def _offsets(element: Element) -> set[int]:
 
 def _inflate_zlib(stored: bytes, size: int) -> bytes:
     inflating = zlib.decompressobj()
-    return inflating.decompress(stored, size + 1)
+    block = inflating.decompress(stored, size + 1)
+    if not inflating.eof:
+        raise EOFError("a block is cut")
+    return block
 
 
 def _inflate_lzma(stored: bytes, size: int) -> bytes:
-    return lzma.LZMADecompressor().decompress(stored, size + 1)
+    inflating = lzma.LZMADecompressor()
+    block = inflating.decompress(stored, size + 1)
+    if not inflating.eof:
+        raise EOFError("a block is cut")
+    return block
 
 
 def _inflate_lz4(stored: bytes, size: int) -> bytes:

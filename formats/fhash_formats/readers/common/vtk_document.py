@@ -61,7 +61,7 @@ class Document:
         root: its outermost element.
         appended: the byte behind the "_" that begins the appended data; None without them.
         encoding: of the appended data, "raw" or "base64".
-        size: bytes of the file.
+        size: bytes of the file up to the end of the appended data.
     """
 
     root: Element
@@ -153,6 +153,10 @@ def parse(path: Path) -> Document:
             if end < 0 or data < 0 or tag[end + 1 : data].strip():
                 raise InputError("its appended data do not begin with '_'; the file is cut")
             appended = builder.appended_tag + data + 1
+            file.seek(max(appended, size - MAX_NOTE))
+            tail = file.read()
+            end = tail.rfind(b"</AppendedData")
+            size -= len(tail) - end if end >= 0 else 0
     if builder.root is None:
         raise InputError("it holds no element")
     return Document(root=builder.root, appended=appended, encoding=builder.encoding, size=size)

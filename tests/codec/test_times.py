@@ -1,0 +1,87 @@
+"""Times as people write them: numbers, dates, parts of dates; and as they are shown."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fhash_codec.times import is_dated, number_text, time_of, time_text
+from fhash_formats.errors import InputError, RegionError
+from fhash_formats.series import Coordinate
+
+
+def times(values: list[float], units: str = "days since 2001-02-10", **more: str) -> Coordinate:
+    return Coordinate(name="time", values=np.array(values), attributes={"units": units, **more})
+
+
+HALF_DAYS = times([0, 0.5, 1, 1.5, 2])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0.75", 0.75),
+        (1.5, 1.5),
+        ("2001-02-11", 1),
+        ("2001-02-11T12:00", 1.5),
+        ("2001-02-11 06:00", 1.25),
+        ("2001-02-11T18", 1.75),
+    ],
+)
+def test_numbers_and_dates(text: str | float, expected: float) -> None:
+    assert time_of(HALF_DAYS, text, "run.fhz") == expected
+
+
+def test_a_day_with_one_step_is_that_step() -> None:
+    noon = times([0.5, 1.5, 2.5])
+    assert time_of(noon, "2001-02-11", "run.fhz") == 1.5
+    assert time_of(noon, "2001-02-10", "run.fhz") == 0.5
+    assert time_of(noon, "2001-02-11T00:00", "run.fhz") == 1
+    two = times([0.25, 1.25, 1.75, 2.25])
+    assert time_of(two, "2001-02-11", "run.fhz") == 1
+    assert time_of(times([4.5, 34.5]), "2001-03", "run.fhz") == 34.5
+
+
+def test_a_date_within_the_rounding_of_a_step_is_the_step() -> None:
+    thirds = times([1 / 3 + 1e-13, 2 / 3, 1 - 1e-13])
+    assert time_of(thirds, "2001-02-10T08:00", "run.fhz") == 1 / 3 + 1e-13
+    assert time_of(thirds, "2001-02-11", "run.fhz") == 1 - 1e-13
+
+
+def test_calendars_of_models() -> None:
+    march = times([58, 59], "days since 2000-01-01", calendar="noleap")
+    assert time_of(march, "2000-03-01", "run.fhz") == 59
+    with pytest.raises(InputError, match="'2000-02-29' is no date of the calendar noleap"):
+        time_of(march, "2000-02-29", "run.fhz")
+
+
+@pytest.mark.parametrize("text", ["2001-03-01", "2001-02-12T00:01", "3", "nan", "-inf"])
+def test_outside_names_the_range_in_dates(text: str) -> None:
+    message = r"run\.fhz: time .* is outside the series, 2001-02-10 to 2001-02-12 \(0 to 2 days"
+    with pytest.raises(RegionError, match=message):
+        time_of(HALF_DAYS, text, "run.fhz")
+
+
+def test_dates_need_a_calendar() -> None:
+    with pytest.raises(InputError, match=r"no dates \(their units are 's'\); give a number 0 to 1"):
+        time_of(times([0, 1], "s"), "2001-02-10", "run.fhz")
+    with pytest.raises(InputError, match=r"'soon' is no date; write it as .*2001-02-10 to"):
+        time_of(HALF_DAYS, "soon", "run.fhz")
+
+
+def test_texts_tell_steps_apart() -> None:
+    assert time_text(HALF_DAYS, 0.5) == "2001-02-10T12:00"
+    assert time_text(HALF_DAYS, 1) == "2001-02-11"
+    assert time_text(times([0, 1], "s"), 0.25) == "0.25 s"
+    assert time_text(times([0, 1], "1"), 0.25) == "0.25"
+    late = times([347921.001, 347921.002], "s")
+    assert number_text(late, late.values[0]) == "347921.001"
+    assert number_text(times([5], "s"), 5) == "5"
+    assert number_text(times([1e-300, 1e300], "s"), 1e300) == "1e+300"
+    assert time_text(times([0, float("nan")]), float("nan")) == "nan days since 2001-02-10"
+
+
+def test_dates_need_finite_times() -> None:
+    assert is_dated(HALF_DAYS)
+    assert not is_dated(times([0, 1], "s"))
+    assert not is_dated(times([0, float("inf")]))

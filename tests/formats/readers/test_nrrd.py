@@ -1,0 +1,216 @@
+"""NRRD: encodings, byte orders, detached files, axes and positions, and damaged files."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fhash_formats import open_series
+from fhash_formats.errors import InputError, MissingInputError
+
+RNG = np.random.default_rng(0)
+VALUES = RNG.normal(size=(4, 3, 5, 6)).astype("f4")
+PACK: dict[str, Callable[[bytes], bytes]] = {
+    "raw": bytes,
+    "gzip": gzip.compress,
+    "gz": lambda data: gzip.compress(data[:100]) + gzip.compress(data[100:]),
+    "bzip2": bz2.compress,
+}
+
+
+def write(
+    path: Path, values: np.ndarray, *lines: str, encoding: str = "raw", data: str = ""
+) -> Path:
+    """A file with the values in it, or in the file named `data` beside it."""
+    kind = {"f4": "float", "f8": "double", "u1": "uchar", "i2": "short"}[values.dtype.str[1:]]
+    sizes = " ".join(map(str, reversed(values.shape)))
+    header = [
+        "NRRD0004",
+        "# a remark",
+        f"type: {kind}",
+        f"dimension: {values.ndim}",
+        f"sizes: {sizes}",
+        f"endian: {'big' if values.dtype.byteorder == '>' else 'little'}",
+        f"encoding: {encoding}",
+        *lines,
+        *([f"data file: {data}"] if data else []),
+    ]
+    stored = (
+        "\n".join(map(repr, values.ravel().tolist())).encode()
+        if encoding == "text"
+        else PACK[encoding](values.tobytes())
+    )
+    head = ("\n".join(header) + "\n\n").encode()
+    path.write_bytes(head if data else head + stored)
+    if data:
+        (path.parent / data).write_bytes(stored)
+    return path
+
+
+def frames(path: Path, **options: Any) -> np.ndarray:
+    with open_series(path, **options) as series:
+        return np.stack(list(series.frames()))
+
+
+@pytest.mark.parametrize("data", ["", "values.bin"])
+@pytest.mark.parametrize("dtype", ["<f4", ">f4", "<f8", "u1", ">i2"])
+@pytest.mark.parametrize("encoding", ["raw", "gzip", "gz", "bzip2", "text"])
+def test_encodings_and_types(tmp_path: Path, encoding: str, dtype: str, data: str) -> None:
+    values = (VALUES * 20).astype("u1").astype(dtype) if dtype == "u1" else VALUES.astype(dtype)
+    path = write(tmp_path / "a.nrrd", values, encoding=encoding, data=data)
+    with open_series(path) as series:
+        assert series.shape == values.shape
+        assert series.dtype == values.dtype.newbyteorder("=")
+        for step in (2, 0, 3, 3, 1):  # also backwards through what is compressed
+            np.testing.assert_array_equal(series.read(step), values[step])
+        if data:
+            assert tmp_path / data in series.files
+
+
+def test_positions_and_units(tmp_path: Path) -> None:
+    lines = (
+        "kinds: space space space time",
+        "space dimension: 3",
+        "space directions: (0.5,0,0) (0,-1,0) (0,0,2) none",
+        "space origin: (1,2,3)",
+        'space units: "mm" "mm" "mm"',
+        "sample units: m/s",
+        "content: wind",
+    )
+    with open_series(write(tmp_path / "a.nrrd", VALUES, *lines)) as series:
+        assert (series.name, series.units) == ("wind", "m/s")
+        assert series.coords["x"].values.tolist() == [1, 1.5, 2, 2.5, 3, 3.5]
+        assert series.coords["y"].values.tolist() == [2, 1, 0, -1, -2]
+        assert series.coords["z"].values.tolist() == [3, 5, 7]
+        assert series.coords["t"].values.tolist() == [0, 1, 2, 3]
+        assert series.coords["x"].attributes == {"units": "mm"}
+    path = write(tmp_path / "b.nrrd", VALUES, "spacings: 1 2 4 0.25", "axis mins: 0 0 8 nan")
+    with open_series(path) as series:
+        assert series.coords["z"].values.tolist() == [8, 12, 16]
+        assert series.coords["t"].values.tolist() == [0, 0.25, 0.5, 0.75]
+
+
+@pytest.mark.parametrize(
+    ("kinds", "order"),
+    [
+        ("time domain domain domain", (3, 0, 1, 2)),
+        ("domain domain domain time", (0, 1, 2, 3)),
+        ("domain domain domain list", (0, 1, 2, 3)),
+        ("domain time domain domain", (2, 0, 1, 3)),
+    ],
+)
+def test_time_is_where_the_kinds_say(
+    tmp_path: Path, kinds: str, order: tuple[int, int, int, int]
+) -> None:
+    # the slowest dimension is the last of the kinds
+    stored = np.ascontiguousarray(VALUES.transpose(np.argsort(order)))
+    path = write(tmp_path / "a.nrrd", stored, f"kinds: {kinds}")
+    np.testing.assert_array_equal(frames(path), stored.transpose(order))
+
+
+def test_components_are_variables(tmp_path: Path) -> None:
+    vector = RNG.normal(size=(2, 5, 6, 3))
+    path = write(
+        tmp_path / "a.nrrd",
+        vector,
+        "kinds: vector domain domain domain",
+        "space dimension: 3",
+        "space directions: none (1,0,0) (0,1,0) (0,0,1)",
+    )
+    np.testing.assert_array_equal(frames(path, var="a.y")[0], vector[..., 1])
+    np.testing.assert_array_equal(frames(path, var="a.2")[0], vector[..., 2])
+    with pytest.raises(InputError, match=r"a\.x .*a\.y .*a\.z .*choose one with --var"):
+        open_series(path)
+
+
+def test_many_data_files(tmp_path: Path) -> None:
+    for step, frame in enumerate(VALUES):
+        (tmp_path / f"part{step:02}.raw").write_bytes(frame.tobytes())
+    write(tmp_path / "a.nhdr", VALUES, data="part%02d.raw 0 3 1 3")
+    np.testing.assert_array_equal(frames(tmp_path / "a.nhdr"), VALUES)
+    names = "\n".join(f"part{step:02}.raw" for step in (3, 2, 1, 0))
+    write(tmp_path / "b.nhdr", VALUES, data="LIST")
+    text = (tmp_path / "b.nhdr").read_text()
+    (tmp_path / "b.nhdr").write_text(text.rstrip("\n") + f"\n{names}\n")
+    np.testing.assert_array_equal(frames(tmp_path / "b.nhdr"), VALUES[::-1])
+    (tmp_path / "part02.raw").unlink()
+    with pytest.raises(MissingInputError, match=r"part02\.raw, which is not there"):
+        open_series(tmp_path / "a.nhdr")
+
+
+def test_bytes_and_lines_that_are_skipped(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.nhdr", VALUES, "byte skip: -1", data="v.raw")
+    (tmp_path / "v.raw").write_bytes(b"x" * 77 + VALUES.tobytes())
+    np.testing.assert_array_equal(frames(path), VALUES)
+    path = write(tmp_path / "b.nhdr", VALUES, "line skip: 2", "byte skip: 3", data="w.raw")
+    (tmp_path / "w.raw").write_bytes(b"one\ntwo\n123" + VALUES.tobytes())
+    np.testing.assert_array_equal(frames(path), VALUES)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("kinds: RGB-color domain domain domain", r"colours \(RGB-color\)"),
+        ("kinds: vector list domain domain", "two of its dimensions hold components"),
+        ("kinds: domain domain", "its kinds are 2, its dimensions 4"),
+        ("space directions: (0,1,0) (1,0,0) (0,0,1) none", "turned against the axes"),
+        ("space directions: (1,0,0)", "space directions are 1"),
+        ("sizes: 6 5 3 99999999999", "has .* bytes, its header promises"),
+        ("sizes: 6 5 -3 4", "whole numbers above 0"),
+        ("sizes: 6 5 3", "3 sizes and the dimension '4'"),
+        ("type: block", "'block', which has no numbers"),
+        ("encoding: hex", "'hex'; raw, gzip, bzip2 and text can be read"),
+        ("endian: middle", "byte order is 'middle'"),
+        ("spacings: a b c d", "'a' stands where a number is needed"),
+        ("byte skip: x", "its byte skip is 'x'"),
+        ("no colon", "the line 'no colon'"),
+    ],
+)
+def test_unsuitable_headers(tmp_path: Path, line: str, message: str) -> None:
+    path = write(tmp_path / "a.nrrd", VALUES, line)
+    with pytest.raises(InputError, match=message) as caught:
+        open_series(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("encoding", ["raw", "gzip", "bzip2", "text"])
+def test_cut_files_are_refused(tmp_path: Path, encoding: str) -> None:
+    path = write(tmp_path / "a.nrrd", VALUES, encoding=encoding)
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(InputError) as caught, open_series(path) as series:
+        list(series.frames())
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_compressed_sizes_are_checked_before_memory_is_taken(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.nrrd", VALUES, "sizes: 60000 60000 60000 4", encoding="gzip")
+    with pytest.raises(InputError, match="compressed ones cannot hold"):
+        open_series(path)
+
+
+def test_damaged_compressed_values_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.nrrd", VALUES, encoding="gzip")
+    data = bytearray(path.read_bytes())
+    data[-400:-390] = bytes(10)
+    path.write_bytes(bytes(data))
+    with pytest.raises(InputError, match="cannot be decompressed"):
+        frames(path)
+
+
+@pytest.mark.parametrize("encoding", ["raw", "gzip", "bzip2", "ascii"])
+@pytest.mark.parametrize("suffix", [".nrrd", ".nhdr"])
+def test_files_of_pynrrd(tmp_path: Path, suffix: str, encoding: str) -> None:
+    nrrd = pytest.importorskip("nrrd")
+    path = tmp_path / f"a{suffix}"
+    values = (VALUES * 100).astype("i2")
+    header = {"encoding": encoding, "kinds": ["domain"] * 3 + ["time"]}
+    nrrd.write(str(path), values.transpose(3, 2, 1, 0), header, detached_header=suffix == ".nhdr")
+    np.testing.assert_array_equal(frames(path), values)

@@ -1,0 +1,242 @@
+"""VTK's XML grids: every encoding bit for bit as VTK reads it, and files that are damaged."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import vtk_files
+
+from fhash_formats import open_series
+from fhash_formats.errors import InputError
+
+RNG = np.random.default_rng(0)
+ARRAYS = {
+    "rho": RNG.normal(size=(3, 4, 5)).astype("f4"),
+    "velocity": RNG.normal(size=(3, 4, 5, 3)),
+    "label": RNG.integers(-128, 127, (3, 4, 5)).astype("i1"),
+    "count": RNG.integers(0, 2**63, (3, 4, 5)).astype("u8"),
+}
+
+SMALL = """<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt32">
+<ImageData WholeExtent="0 2 0 1 0 0" Origin="0 0 0" Spacing="1 1 1" {grid}>
+<Piece Extent="0 2 0 1 0 0"><PointData>
+<DataArray type="Float32" Name="u" format="ascii" {array}>{values}</DataArray>
+</PointData></Piece></ImageData></VTKFile>"""
+
+
+def small(path: Path, *, grid: str = "", array: str = "", values: str = "0 1 2 3 4 5") -> Path:
+    """A plane of 2 x 3 vertices in text."""
+    path.write_text(SMALL.format(grid=grid, array=array, values=values))
+    return path
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("header", [32, 64])
+@pytest.mark.parametrize("compressor", [None, "ZLib", "LZ4", "LZMA"])
+@pytest.mark.parametrize("mode", ["ascii", "binary", "appended", "base64"])
+def test_values_are_those_of_vtk(
+    tmp_path: Path, mode: str, compressor: str | None, header: int, big: bool
+) -> None:
+    if compressor == "LZ4":
+        pytest.importorskip("lz4.block")
+    grid = vtk_files.image(ARRAYS, first=(2, -1, 0))
+    path = tmp_path / "a.vti"
+    vtk_files.write(path, grid, mode=mode, compressor=compressor, header=header, big=big)
+    for name, component in (("rho", None), ("velocity", 1), ("label", None), ("count", None)):
+        expected = vtk_files.read(path, name)
+        var = name if component is None else f"{name}.y"
+        expected = expected if component is None else expected[..., component]
+        with open_series(path, var=var) as series:
+            assert series.name == var
+            assert series.dtype == ARRAYS[name].dtype
+            assert series.read(0).tobytes() == expected.tobytes()
+            assert series.coords["t"].values.tolist() == [vtk_files.TIME]
+            assert series.coords["x"].values.tolist() == [1.0, 1.25, 1.5, 1.75, 2.0]
+            assert series.coords["y"].values.tolist() == [-1.5, -1.0, -0.5, 0.0]
+            assert series.coords["z"].values.tolist() == [2.0, 4.0, 6.0]
+
+
+def test_cells_lie_between_the_points(tmp_path: Path) -> None:
+    path = vtk_files.write(tmp_path / "a.vti", vtk_files.image(ARRAYS, cells=True))
+    with open_series(path, var="rho") as series:
+        np.testing.assert_array_equal(series.read(0), vtk_files.read(path, "rho", cells=True))
+        assert series.coords["x"].values.tolist() == [0.625, 0.875, 1.125, 1.375, 1.625]
+
+
+def test_a_layer_of_cells_lies_in_its_plane(tmp_path: Path) -> None:
+    path = vtk_files.write(
+        tmp_path / "a.vti", vtk_files.image({"u": ARRAYS["rho"][:1]}, cells=True)
+    )
+    with open_series(path) as series:
+        assert series.shape == (1, 1, 4, 5)
+        assert series.coords["z"].values.tolist() == [2.0]
+
+
+def test_components_by_name_and_by_number(tmp_path: Path) -> None:
+    path = vtk_files.write(tmp_path / "a.vti", vtk_files.image({"v": ARRAYS["velocity"]}))
+    with open_series(path, var="v.2") as series:
+        assert series.name == "v.z"
+        np.testing.assert_array_equal(series.read(0), ARRAYS["velocity"][..., 2])
+    with pytest.raises(InputError, match=r"v\.x .*v\.y .*v\.z .*choose one with --var"):
+        open_series(path)
+    with pytest.raises(InputError, match=r"has no variable 'v\.3'"):
+        open_series(path, var="v.3")
+
+
+def test_points_and_cells_of_one_name(tmp_path: Path) -> None:
+    grid = vtk_files.image({"u": ARRAYS["rho"]})
+    vtk_files.fill(grid, {"u": ARRAYS["rho"][:2, :3, :4]}, cells=True)
+    path = vtk_files.write(tmp_path / "a.vti", grid)
+    with open_series(path, var="CellData/u") as series:
+        assert (series.name, series.shape) == ("u", (1, 2, 3, 4))
+    with pytest.raises(InputError, match=r"PointData/u .*CellData/u"):
+        open_series(path, var="u")
+
+
+def test_rectilinear_grids(tmp_path: Path) -> None:
+    model = pytest.importorskip("vtkmodules.vtkCommonDataModel")
+    support = pytest.importorskip("vtkmodules.util.numpy_support")
+    grid = model.vtkRectilinearGrid()
+    grid.SetDimensions(5, 4, 3)
+    axes = {"X": [0, 1, 3, 4, 8], "Y": [-1, 0, 2, 9], "Z": [5, 6, 9]}
+    for axis, values in axes.items():
+        array = support.numpy_to_vtk(np.array(values, dtype="f8"), deep=True)
+        getattr(grid, f"Set{axis}Coordinates")(array)
+    vtk_files.fill(grid, {"u": ARRAYS["rho"]})
+    path = vtk_files.write(tmp_path / "a.vtr", grid, mode="binary", compressor="ZLib")
+    with open_series(path) as series:
+        np.testing.assert_array_equal(series.read(0), vtk_files.read(path, "u"))
+        assert [series.coords[axis.lower()].values.tolist() for axis in axes] == list(axes.values())
+
+
+def test_pieces_are_put_together(tmp_path: Path) -> None:
+    path = tmp_path / "a.vti"
+    piece = (
+        '<Piece Extent="{0} {1} 0 0 0 1"><PointData><DataArray type="Int16" Name="u"'
+        ' format="ascii">{2}</DataArray></PointData></Piece>'
+    )
+    text = '<VTKFile type="ImageData"><ImageData WholeExtent="0 3 0 0 0 1">{}</ImageData></VTKFile>'
+    both = piece.format(0, 1, "0 1 4 5") + piece.format(1, 3, "1 2 3 5 6 7")
+    path.write_text(text.format(both))
+    with open_series(path) as series:
+        assert series.read(0).tolist() == [[[0, 1, 2, 3]], [[4, 5, 6, 7]]]
+    path.write_text(text.format(piece.format(0, 1, "0 1 4 5")))
+    with open_series(path) as series, pytest.raises(InputError, match="leave 4 values"):
+        series.read(0)
+
+
+def test_units_are_read(tmp_path: Path) -> None:
+    key = '<InformationKey name="UNITS_LABEL" location="vtkDataArray">m/s</InformationKey>'
+    with open_series(small(tmp_path / "a.vti", values=f"{key}0 1 2 3 4 5")) as series:
+        assert series.units == "m/s"
+        assert series.read(0).tolist() == [[[0, 1, 2], [3, 4, 5]]]
+
+
+def test_padding_behind_the_size_is_taken(tmp_path: Path) -> None:
+    # the size encoded by itself, as some writers other than VTK do
+    text = small(tmp_path / "a.vti").read_text().replace('format="ascii"', 'format="binary"')
+    values = "GAAAAA==" + "AAAAAAAAgD8AAABAAABAQAAAgEAAAKBA"
+    (tmp_path / "a.vti").write_text(text.replace("0 1 2 3 4 5</", f"{values}</"))
+    with open_series(tmp_path / "a.vti") as series:
+        assert series.read(0).tolist() == [[[0, 1, 2], [3, 4, 5]]]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"grid": 'Direction="0 1 0 1 0 0 0 0 1"'}, "turned against the axes"),
+        ({"values": "0 1 2"}, "5 bytes of text, not 6 values"),
+        ({"values": "0 1 2 3 4 5 6"}, "7 values, not 6"),
+        ({"values": "0 1 2 3 4 x"}, "x"),
+        ({"values": "0 1 2 3 4 " + "1" * 100}, "text stands where numbers are needed"),
+        ({"array": 'NumberOfComponents="0"'}, "'0' components"),
+        ({"array": 'NumberOfComponents="2"'}, r"u\.0 .*u\.1"),
+    ],
+)
+def test_unsuitable_grids(tmp_path: Path, change: dict[str, str], message: str) -> None:
+    path = small(tmp_path / "a.vti", **change)
+    with pytest.raises(InputError, match=message) as caught, open_series(path) as series:
+        series.read(0)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('type="ImageData" ', 'type="PolyData" ', "data of the kind PolyData"),
+        ("LittleEndian", "MiddleEndian", "byte order is 'MiddleEndian'"),
+        ('UInt32">', 'UInt32" compressor="vtkOther">', "compressor is 'vtkOther'"),
+        ('WholeExtent="0 2 0 1 0 0"', 'WholeExtent="0 2 0 1"', "not six whole numbers"),
+        ('Piece Extent="0 2', 'Piece Extent="0 9', "lies outside the grid"),
+        ('WholeExtent="0 2', 'WholeExtent="0 -1', "lies outside the grid|empty grid"),
+        ("Float32", "String", "integers and floats"),
+        ("</VTKFile>", "", "cut or no XML"),
+        ("<VTKFile", "<!DOCTYPE a><VTKFile", "document type"),
+        ('Spacing="1 1 1"', 'Spacing="1 0 1"', "spacing 0.0 along y"),
+        ('Origin="0 0 0"', 'Origin="nan 0 0"', "both must be finite"),
+    ],
+)
+def test_other_files_are_refused_in_one_line(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    path = small(tmp_path / "a.vti")
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match=message) as caught, open_series(path) as series:
+        series.read(0)
+    assert "\n" not in str(caught.value)
+
+
+def _cut(data: bytes) -> bytes:
+    return data[: len(data) - 80]
+
+
+def _huge(data: bytes) -> bytes:
+    return re.sub(rb'Extent="2 6 -1 2 0 2"', b'Extent="0 99999 0 99999 0 99999"', data)
+
+
+def _flipped(data: bytes) -> bytes:
+    place = data.index(b"_", data.index(b"<AppendedData")) + 1
+    return (
+        data[:place] + bytes(byte ^ 0xFF for byte in data[place : place + 60]) + data[place + 60 :]
+    )
+
+
+@pytest.mark.parametrize("damage", [_cut, _huge, _flipped])
+@pytest.mark.parametrize("compressor", [None, "ZLib", "LZMA"])
+@pytest.mark.parametrize("mode", ["appended", "base64"])
+def test_damaged_files_end_in_one_line(
+    tmp_path: Path, mode: str, compressor: str | None, damage: Callable[[bytes], bytes]
+) -> None:
+    options: dict[str, Any] = {"mode": mode, "compressor": compressor}
+    grid = vtk_files.image({"u": ARRAYS["rho"]}, first=(2, -1, 0))
+    grid.GetFieldData().Initialize()
+    path = vtk_files.write(tmp_path / "a.vti", grid, **options)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(InputError) as caught, open_series(path) as series:
+        series.read(0)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_a_file_that_only_begins_is_refused(tmp_path: Path) -> None:
+    whole = vtk_files.write(
+        tmp_path / "a.vti", vtk_files.image({"u": ARRAYS["rho"]}), compressor="ZLib"
+    ).read_bytes()
+    for length in range(100, len(whole) - 40, 97):
+        (tmp_path / "b.vti").write_bytes(whole[:length])
+        with pytest.raises(InputError), open_series(tmp_path / "b.vti") as series:
+            series.read(0)
+
+
+def test_lz4_names_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = small(tmp_path / "a.vti")
+    path.write_text(path.read_text().replace('32">', '32" compressor="vtkLZ4DataCompressor">'))
+    monkeypatch.setitem(__import__("sys").modules, "lz4.block", None)
+    with pytest.raises(ImportError, match=r"a\.vti.* needs lz4; pip install lz4"):
+        open_series(path)
