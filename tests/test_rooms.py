@@ -60,7 +60,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("animation",),
     ),
     "fhash_cli": (
-        ("options", "output", "selection"),
+        ("conversion", "options", "output", "selection"),
         ("animation_options", "scene_options"),
         ("commands",),
         ("main",),
