@@ -61,7 +61,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "fhash_cli": (
         ("intervals", "progress_bar"),
-        ("base_command", "options", "output", "scene_types", "selection"),
+        ("base_command", "conversion", "options", "output", "scene_types", "selection"),
         ("animation_options", "gallery", "scene_options"),
         ("commands",),
         ("main",),
@@ -74,6 +74,7 @@ MAX_LINES = 400
 MAX_FUNCTION_LINES = 70
 LONG_ON_PURPOSE = {
     "formats/fhash_formats/transform/entropy/coder_portable.py": "twin of coder.cpp",
+    "formats/fhash_formats/transform/entropy/labels_portable.py": "twin of labels.cpp",
     "formats/fhash_formats/transform/entropy/mask_portable.py": "twin of mask.cpp",
     "formats/fhash_formats/transform/entropy/predict_portable.py": "twin of predict.cpp",
 }
@@ -85,6 +86,7 @@ WITHOUT_MIRROR: dict[str, str] = {
     "fhash_codec.rendering.picture.plan": "a record: picture/test_planning.py, test_explain.py",
     "fhash_codec.selftest.checks.properties": "a list of checks: selftest/test_runner.py",
     "fhash_formats.transform.entropy.coder_portable": "held against the C++: test_coder.py",
+    "fhash_formats.transform.entropy.labels_portable": "held against the C++: test_labels.py",
     "fhash_formats.transform.entropy.mask_portable": "held against the C++: test_mask.py",
     "fhash_formats.transform.entropy.predict_portable": "held against the C++: test_predict.py",
 }

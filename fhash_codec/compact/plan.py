@@ -10,6 +10,7 @@ from typing import Any
 from fhash_codec.compact.attempt import Attempt, GainLog, PlanTask
 from fhash_codec.compact.choices.estimate import estimated_size, estimated_step
 from fhash_codec.compact.choices.head import HeadHistory
+from fhash_codec.compact.choices.labels import has_labels, plan_labels
 from fhash_codec.compact.choices.step import with_step
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.goal import Goal
@@ -102,6 +103,16 @@ def plan(
     parts.begin("first guess")
     tiled = blocks.retile(tile)
     settings = first_settings(task, tiled)
+    few = goal.lossless and has_labels(task, tiled)
+    if few and (labelled := plan_labels(task, tiled, settings)) is not None:
+        progress("planning", STAGES, STAGES, "")
+        return CodingPlan(
+            blocks=labelled.sample.blocks,
+            settings=labelled.settings,
+            coding=goal.bounded(labelled.coding),
+            goal=goal,
+            gains=gains.entries,
+        )
     if _can_estimate(task, tiled, settings):
         estimated_plan = _estimated_plan(task, tiled, settings)
         parts.end()
@@ -121,7 +132,7 @@ def plan(
     return CodingPlan(
         blocks=attempt.sample.blocks,
         sample=attempt.sample,
-        settings=attempt.settings,
+        settings=replace(attempt.settings, labels=few),
         coding=goal.bounded(_final_coding(task, attempt)),
         goal=goal,
         gains=gains.entries,

@@ -45,6 +45,8 @@ GOLDENS = {
         psnr=50.0, effort=4, timings=False, features=("interval:0.5:2",)
     ),
     "compact-1.1-predictor": EncodeConfig(max_error=2.0, effort=3, timings=False),
+    "compact-1.2-clip": EncodeConfig(max_error=0.2, effort=2, timings=False),
+    "compact-1.2-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x7x9"),
     "paper-1.1-transform": EncodeConfig(
         profile="paper",
         width=8,
@@ -84,7 +86,17 @@ def fronts() -> ArraySeries:
     return ArraySeries(values, name="density", units="kg m-3", coords={"t": times})
 
 
-SERIES = {"compact-1.1-predictor": fronts}
+def basins() -> ArraySeries:
+    """Labels of regions that move, with missing ones: int8 whose fill value is -100."""
+    t, z, y, x = np.meshgrid(*(np.arange(n) for n in (5, 6, 7, 9)), indexing="ij")
+    labels = ((x + t) // 4 + 3 * (y // 4)).astype(np.float32)
+    labels[(z > 2) & (x + y < 5)] = np.nan
+    labels_of_basins = ArraySeries(labels, name="density", units="kg m-3", coords={"t": TIME})
+    labels_of_basins.source_dtype, labels_of_basins.fill = np.dtype(np.int8), -100
+    return labels_of_basins
+
+
+SERIES = {"compact-1.1-predictor": fronts, "compact-1.2-labels": basins}
 """Sources of the goldens that are not made from `series`."""
 
 

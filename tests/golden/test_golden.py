@@ -12,7 +12,14 @@ from zarr.storage import ZipStore
 import fhash_codec
 
 HERE = Path(__file__).parent
-COMPACT = ["compact-1.1-bound", "compact-1.1-mask", "compact-1.1-predictor", "compact-1.1-psnr"]
+COMPACT = [
+    "compact-1.1-bound",
+    "compact-1.1-mask",
+    "compact-1.1-predictor",
+    "compact-1.1-psnr",
+    "compact-1.2-clip",
+    "compact-1.2-labels",
+]
 NAMES = [
     "paper-1.0-plain",
     "paper-1.0-feature",

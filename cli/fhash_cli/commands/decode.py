@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from fhash_cli.base_command import BaseCommand
+from fhash_cli.conversion import NumberType, check_fill, convert
 from fhash_cli.intervals import IntervalsType, SliceType
 from fhash_cli.options import (
     check_writable,
@@ -17,7 +18,7 @@ from fhash_cli.options import (
     quiet_option,
     run_argument,
 )
-from fhash_cli.output import Progress, apart, emit, extent, listed, number, spans, table
+from fhash_cli.output import Progress, apart, emit, extent, listed, number, say, spans, table
 from fhash_cli.selection import (
     Span,
     coordinates,
@@ -96,7 +97,14 @@ TYPES = ("float16", "float32", "float64", *INTEGERS)
 @click.option(
     "--dtype",
     type=click.Choice(TYPES),
-    help="Convert the values; integers are rounded and clipped to the type's range.",
+    help="Convert the values; integers are rounded and clipped to the type's range. "
+    "Default: the type of the source for integers, else float32 or float64.",
+)
+@click.option(
+    "--fill",
+    metavar="V",
+    type=NumberType(),
+    help="Value of vertices that have none. Default: the source's own for integers, else NaN.",
 )
 @force_option
 @json_option
@@ -112,6 +120,7 @@ def command(
     isosurface: float | None,
     outside: Literal["nan", "background"],
     dtype: str | None,
+    fill: float | None,
     force: bool,
     as_json: bool,
     quiet: bool,
@@ -126,8 +135,12 @@ def command(
     if lod is not None and outside != "nan":
         raise click.UsageError("--lod has NaN outside the coreset; leave out --outside")
     _check_output(output, isosurface, dtype, force, run)
-    with fhash_codec.open(run) as volume, Progress(quiet=quiet) as progress:
-        selection = Selection.of(volume, steps, times, roi, box, lod, outside, dtype)
+    if isosurface is not None and fill is not None:
+        raise click.UsageError("--isosurface has no fill value; leave out --fill")
+    with fhash_codec.open(run, fill=fill) as volume, Progress(quiet=quiet) as progress:
+        if isosurface is not None:
+            dtype = volume.float_dtype.name
+        selection = Selection.of(volume, steps, times, roi, box, lod, outside, dtype, fill)
         statistics = Statistics()
         frames = selection.frames(volume, statistics, progress)
         paths: list[str] = []
@@ -137,6 +150,8 @@ def command(
             paths = _save_surface(output, isosurface, volume, selection, frames, force, run)
         else:
             paths = _save_region(output, volume, selection, frames, force, run)
+        if dtype is None and not quiet:
+            _say_why_floats(volume, selection)
         result = {
             "paths": paths,
             "shape": selection.shape,
@@ -146,6 +161,16 @@ def command(
             **statistics.result(),
         }
         emit(result, table(_rows(result, volume)), as_json)
+
+
+def _say_why_floats(volume: Volume, selection: Selection) -> None:
+    """One line where integers come as floats."""
+    own = volume.value_type.own
+    if own.kind in "iu" and selection.kind.kind == "f":
+        why = "between steps they are interpolated"
+        if all(float(step).is_integer() for step in selection.steps):
+            why = f"some vertices have no value; --fill V keeps {own}"
+        say(f"the integers of the source come as {selection.kind}: {why}")
 
 
 def _check_output(
@@ -177,6 +202,7 @@ class Selection:
         lod: level of detail, None for every vertex.
         outside: `nan` or `background`, the values outside the coreset.
         kind: number type of the output.
+        fill: value of vertices that have none; None for NaN.
     """
 
     steps: list[float]
@@ -185,6 +211,7 @@ class Selection:
     lod: int | None
     outside: Literal["nan", "background"]
     kind: np.dtype[Any]
+    fill: float | None
 
     @classmethod
     def of(
@@ -197,6 +224,7 @@ class Selection:
         lod: int | None,
         outside: Literal["nan", "background"],
         dtype: str | None,
+        fill: float | None,
     ) -> Selection:
         """Resolve the options; raises RegionError where they leave the series or its domain."""
         import numpy as np
@@ -209,13 +237,20 @@ class Selection:
             if lod is None
             else volume.lod_vertices(lod, region)
         )
+        whole = all(float(step).is_integer() for step in chosen)
+        kind = np.dtype(dtype or (volume.dtype if whole else volume.float_dtype))
+        own = volume.value_type.fill
+        if fill is None and own is not None and kind.kind in "iu":
+            fill = own
+        check_fill(kind, fill)
         return cls(
             steps=chosen,
             region=region,
             vertices=(z, y, x),
             lod=lod,
             outside=outside,
-            kind=np.dtype(dtype or volume.dtype),
+            kind=kind,
+            fill=fill,
         )
 
     @property
@@ -235,7 +270,10 @@ class Selection:
                 else volume.read_lod(step, self.lod, self.region)
             )
             statistics.add(frame, _inside(volume, step, self.region, frame, self.outside))
-            yield convert(frame, self.kind, filled=self.outside == "background")
+            if self.lod is None and self.kind == volume.dtype and self.kind.itemsize == 8:
+                # float64 has not every integer of 64 bits.
+                frame = volume.values(step, self.region, outside=self.outside)
+            yield convert(frame, self.kind, fill=self.fill, background=self.outside == "background")
             progress("decoding", done + 1, len(self.steps), "")
 
 
@@ -279,6 +317,7 @@ def _save_region(
         name=volume.name,
         units=volume.units,
         dtype=selection.kind,
+        fill=selection.fill if volume.value_type.has_gaps else None,
         shape=selection.shape,
         coords=coordinates(volume, selection.steps, selection.vertices),
         attributes=volume.attrs,
@@ -325,46 +364,6 @@ class Statistics:
             "mean": self.mean.value() if defined else None,
             "inside_fraction": self.inside / self.all,
         }
-
-
-def convert(
-    frame: npt.NDArray[np.floating[Any]], kind: np.dtype[Any], *, filled: bool = False
-) -> npt.NDArray[Any]:
-    """Convert a decoded frame to another number type; for integers it is rounded and clipped.
-
-    filled: vertices outside the coreset hold the background's value; NaN means a missing value.
-    Raises InputError where the type cannot hold a value.
-    """
-    import numpy as np
-
-    if kind == frame.dtype:
-        return frame
-    if kind.kind == "f":
-        with np.errstate(over="ignore"):
-            narrow = frame.astype(kind)
-        if np.isinf(narrow).any():
-            raise InputError(
-                f"a value of {float(np.nanmax(np.abs(frame))):.6g} does not fit {kind};"
-                " choose a wider type"
-            )
-        return narrow
-    if np.isnan(frame).any():
-        if filled:
-            raise InputError(
-                "the data have no value (NaN) at some vertices of the region, which"
-                f" {kind} cannot hold; take a float type"
-            )
-        raise InputError(
-            f"the region holds vertices without a value (NaN), which {kind} cannot hold;"
-            " add --outside background, or take a float type"
-        )
-    limits = np.iinfo(kind)
-    rounded = np.rint(frame.astype(np.float64))
-    # No float64 equals the largest 64-bit integer: the float of the limit lies one above it.
-    clipped = rounded >= float(limits.max)
-    integers = np.where(clipped, 0.0, np.maximum(rounded, float(limits.min))).astype(kind)
-    integers[clipped] = limits.max
-    return np.asarray(integers)
 
 
 def _inside(

@@ -58,6 +58,8 @@ def _create(root: Any, region: Region) -> Any:
     )
     for key, value in variable_attributes(region).items():
         values.attrs[key] = hdf5_value(value)
+    if region.fill is not None:
+        values.attrs["_FillValue"] = dtype.type(region.fill)
     for dimension, axis in enumerate(AXES):
         coordinate = region.coords[axis]
         scale = root.create_dataset(names[axis], data=coordinate.values.astype("<f8"))

@@ -1,6 +1,7 @@
 """Writer of NetCDF-4 by the CF conventions, through h5netcdf: a variable with four coordinates.
 
-NaN is declared as `_FillValue` of floats. NetCDF has no float16; it is stored as float32, exactly.
+NaN, or the region's fill value, is declared as `_FillValue`. NetCDF has no float16; it is stored as
+float32, exactly.
 Chunks and compression are those of `hdf5`, for the same reasons.
 """
 
@@ -62,6 +63,7 @@ def _create(root: Any, region: Region, dtype: np.dtype[Any]) -> Any:
         for key, value in coordinate_attributes(axis, coordinate).items():
             scale.attrs[key] = hdf5_value(value)
     fill = np.nan if dtype.kind == "f" else None
+    fill = fill if region.fill is None else dtype.type(region.fill)
     dimensions = tuple(names[axis] for axis in AXES)
     values = root.create_variable(
         variable, dimensions, dtype, chunks=chunk_shape(region), fillvalue=fill, **COMPRESSION

@@ -35,6 +35,21 @@ def _flush(memory: dict[str, Any], folder: Path) -> None:
         path.write_bytes(buffer.to_bytes())
 
 
+def _fill_value(region: Region) -> Any:
+    """What stands in chunks where nothing was written, and marks missing values of floats."""
+    if region.fill is not None and region.dtype.kind == "f":
+        return region.dtype.type(region.fill)
+    return np.nan if region.dtype.kind == "f" else 0
+
+
+def _attributes(region: Region) -> dict[str, Any]:
+    """The attributes of the variable; an integer that stands for no value is among them."""
+    attributes = dict(variable_attributes(region))
+    if region.fill is not None and region.dtype.kind in "iu":
+        attributes["_FillValue"] = int(region.fill)
+    return attributes
+
+
 @contextmanager
 def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) -> Iterator[Put]:
     import zarr
@@ -60,9 +75,9 @@ def _open(region: Region, outputs: Sequence[Path], temporaries: Sequence[Path]) 
         shape=region.shape,
         dtype=region.dtype,
         chunks=chunk_shape(region),
-        fill_value=np.nan if region.dtype.kind == "f" else 0,
+        fill_value=_fill_value(region),
         dimension_names=[names[axis] for axis in AXES],
-        attributes=variable_attributes(region),
+        attributes=_attributes(region),
         config={
             "write_empty_chunks": True
         },  # a chunk that is missing is then always a fault, not a frame of fill values

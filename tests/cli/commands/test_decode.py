@@ -13,7 +13,8 @@ from click.testing import Result
 
 import fhash_codec
 import fhash_formats
-from fhash_cli.commands.decode import TYPES, Statistics, convert
+from fhash_cli.commands.decode import TYPES, Statistics
+from fhash_cli.conversion import convert
 from fhash_formats.errors import InputError
 
 Fhash = Callable[..., Result]
@@ -202,7 +203,7 @@ def test_a_value_that_the_data_lack_is_not_blamed_on_an_option(
     refused: Callable[..., str], fhash: Fhash, tmp_path: Path
 ) -> None:
     with pytest.raises(InputError, match="the data have no value") as caught:
-        convert(np.array([1.0, np.nan]), np.dtype(np.uint8), filled=True)
+        convert(np.array([1.0, np.nan]), np.dtype(np.uint8), background=True)
     assert "--outside" not in str(caught.value)
     values = np.arange(120, dtype=np.float32).reshape(2, 3, 4, 5)
     values[0, 0, 0, 0] = np.nan

@@ -21,6 +21,7 @@ from fhash_formats.transform.entropy.coder import decode_integers
 from fhash_formats.transform.entropy.predict import decode_predicted, values_of
 from fhash_formats.transform.entropy.predictor import Predictor
 from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform.tile.labelled import unpack_labelled
 from fhash_formats.transform.tile.sections import (
     EXACT,
     Shape,
@@ -113,8 +114,11 @@ def _decode(
         settings = unpack_settings(stream.settings)
     if stream.flags & EXACT:
         return _decode_exact(stream, shape, kind, lod)
-    if settings is None:
+    if settings is None and not (stream.labelled and not stream.masked):
         raise DamagedFileError("a coded tile has no settings")
+    if stream.labelled:
+        return _decode_labelled(stream, shape, kind, settings, lod)
+    assert settings is not None
     largest = _check_numbers(settings, kind)
     if stream.body is None:
         values = cast(np.full(_lod_shape(shape, lod), settings.center), kind)
@@ -135,6 +139,21 @@ def _decode_exact(stream: TileStream, shape: Shape, kind: np.dtype[Any], lod: in
     values = unpack_exact(stream.body, shape, kind)
     mask = None if stream.mask is None else unpack_mask(stream.mask, zero_levels(shape))
     return values[_every(lod)] if lod else values, mask
+
+
+def _decode_labelled(
+    stream: TileStream,
+    shape: Shape,
+    kind: np.dtype[Any],
+    settings: TileSettings | None,
+    lod: int,
+) -> Decoded:
+    """The values and mask of a tile of labels."""
+    assert stream.body is not None, "a stream of labels has a body"
+    values, mask = unpack_labelled(stream.body, shape, kind, masked=stream.masked)
+    if settings is not None:
+        values = blank_unoccupied(values, mask, settings)
+    return (values[_every(lod)], None) if lod else (values, mask)
 
 
 def _decode_predicted(

@@ -25,6 +25,7 @@ from fhash_formats.transform.tile.decoding import (
     within_range,
 )
 from fhash_formats.transform.tile.filling import filled
+from fhash_formats.transform.tile.labelled import build_labelled_stream
 from fhash_formats.transform.tile.sections import (
     Shape,
     build_exact_stream,
@@ -119,9 +120,16 @@ def encode_tile(
     task = _task(values, settings, coding, in_coreset)
     if not task.values.size or (task.counted is not None and not task.counted.any()):
         return _empty_tile(task)
+    labelled = _labelled_tile(task) if settings.labels else None
+    if labelled is not None and 4 * len(labelled.data) < len(task.exact().data):
+        return labelled  # nothing else is that small
     if settings.predictor is not None and coding.error is not None:
-        return _predicted_tile(task, settings.predictor, coding.error)
-    return _transformed_tile(task)
+        coded = _predicted_tile(task, settings.predictor, coding.error)
+    else:
+        coded = _transformed_tile(task)
+    if labelled is not None and len(labelled.data) < len(coded.data):
+        return labelled
+    return coded
 
 
 def exact_tile(
@@ -220,6 +228,15 @@ def _task(values: Values, settings: TileSettings, coding: Coding, in_coreset: Ma
         counted=counted,
         missing=missing,
     )
+
+
+def _labelled_tile(task: _Task) -> CodedTile | None:
+    """A tile of labels, without loss; None for one of too many different values."""
+    data = build_labelled_stream(task.values, task.own_settings, task.occupied)
+    if data is None:
+        return None
+    decoded = blank_unoccupied(task.values.copy(), task.occupied, task.settings)
+    return CodedTile(data=data, decoded=decoded, nonzero=0)
 
 
 def _empty_tile(task: _Task) -> CodedTile:

@@ -43,6 +43,8 @@ __all__ = [
     "EMPTY",
     "EXACT",
     "FORMAT",
+    "LABELS",
+    "LABELS_MASKED",
     "MASKED",
     "MISSING",
     "OWN",
@@ -56,6 +58,7 @@ __all__ = [
     "little_endian",
     "pack_mask",
     "pack_missing",
+    "pack_settings",
     "parse_stream",
     "restore_missing",
     "section",
@@ -90,6 +93,11 @@ PREDICTED = 3 << 5
 PREDICTED_MASKED = 4 << 5
 """Format number of a stream coded by prediction, with a mask."""
 
+LABELS = 5 << 5
+"""Format number of a stream of labels."""
+LABELS_MASKED = 6 << 5
+"""Format number of a stream of labels, with a mask."""
+
 _NUMBER = 0xE0
 """Bits of the flags that hold the format number."""
 _MAX_SETTINGS = 1 << 22
@@ -106,6 +114,7 @@ class TileStream:
         flags: the first byte.
         masked: whether the format number says that there is a mask.
         predicted: whether the format number says that the integers are coded by prediction.
+        labelled: whether `body` holds a palette and labels.
         coded: whether `body` holds coded integers; otherwise it holds exact values or is None.
         digest: CRC-32 of the integers; 0 where none are coded.
         settings: the tile's own settings.
@@ -118,6 +127,7 @@ class TileStream:
     flags: int
     masked: bool
     predicted: bool
+    labelled: bool
     coded: bool
     digest: int
     settings: memoryview | None = None
@@ -157,7 +167,7 @@ def build_stream(
     """
     numbers = (PREDICTED, PREDICTED_MASKED) if predicted else (FORMAT, MASKED)
     flags = numbers[mask is not None] | (OWN if settings else 0) | (MISSING if missing else 0)
-    sections = [*_pack_settings(settings), *([missing] if missing else [])]
+    sections = [*pack_settings(settings), *([missing] if missing else [])]
     if integers is None:
         return bytes([flags | EMPTY]) + b"".join(map(section, sections))
     crc = zlib.crc32(little_endian(integers))
@@ -192,24 +202,27 @@ def parse_stream(data: bytes | memoryview) -> TileStream:
         raise DamagedFileError("a coded tile is empty")
     flags = data[0]
     number = flags & _NUMBER
-    if number not in (FORMAT, MASKED, PREDICTED, PREDICTED_MASKED):
+    labelled = number in (LABELS, LABELS_MASKED)
+    if not labelled and number not in (FORMAT, MASKED, PREDICTED, PREDICTED_MASKED):
         raise DamagedFileError(
             f"a coded tile begins with {flags:#04x}, which is no known stream format"
         )
-    masked = number in (MASKED, PREDICTED_MASKED)
+    masked = number in (MASKED, PREDICTED_MASKED, LABELS_MASKED)
+    if labelled and flags & ~_NUMBER & ~OWN:
+        raise DamagedFileError("a coded tile is of labels and something else as well")
     predicted = number in (PREDICTED, PREDICTED_MASKED)
-    coded = not flags & (EXACT | EMPTY)
+    coded = not flags & (EXACT | EMPTY) and not labelled
     if predicted and flags & (EXACT | EMPTY | RESIDUAL):
         raise DamagedFileError("a coded tile is by prediction and something else as well")
     if coded and len(data) < 5:
         raise DamagedFileError("a coded tile is cut short")
-    empty = not coded and not flags & EXACT
+    empty = not coded and not labelled and not flags & EXACT
     expected = {
         "settings": bool(flags & OWN),
         "missing": bool(flags & MISSING),
         "body": not empty,
         "residual": coded and bool(flags & RESIDUAL),
-        "mask": masked and not empty,
+        "mask": masked and not empty and not labelled,
     }
     names = [name for name, there in expected.items() if there]
     sections = list(_sections(data[5:] if coded else data[1:]))
@@ -222,7 +235,13 @@ def parse_stream(data: bytes | memoryview) -> TileStream:
         raise DamagedFileError("a coded tile has lost its missing values")
     digest = int.from_bytes(data[1:5], "little") if coded else 0
     return TileStream(
-        flags=flags, masked=masked, predicted=predicted, coded=coded, digest=digest, **by_name
+        flags=flags,
+        masked=masked,
+        predicted=predicted,
+        labelled=labelled,
+        coded=coded,
+        digest=digest,
+        **by_name,
     )
 
 
@@ -245,7 +264,7 @@ def _sections(data: memoryview) -> Iterator[memoryview]:
         position += size
 
 
-def _pack_settings(settings: TileSettings | None) -> list[bytes]:
+def pack_settings(settings: TileSettings | None) -> list[bytes]:
     """The section of a tile's own settings, if there are any: JSON, deflated."""
     if settings is None:
         return []
@@ -282,7 +301,7 @@ def build_exact_stream(
     flags = (FORMAT if occupied is None else MASKED) | EXACT | (OWN if settings else 0)
     plain = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
     planes = plain.view(np.uint8).reshape(-1, plain.dtype.itemsize).T
-    sections = [*_pack_settings(settings), zlib.compress(planes.tobytes(), 6)]
+    sections = [*pack_settings(settings), zlib.compress(planes.tobytes(), 6)]
     if occupied is not None:
         sections.append(pack_mask(occupied, zero_levels(values.shape)))
     return bytes([flags]) + b"".join(map(section, sections))

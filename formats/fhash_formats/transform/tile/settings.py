@@ -25,7 +25,7 @@ __all__ = ["TileSettings"]
 
 _REQUIRED = frozenset({"transform", "step", "center", "range"})
 """Keys of settings that have no default."""
-_KEYS = _REQUIRED | {"offsets", "double", "quantum", "head", "mask", "predictor", "clip"}
+_KEYS = _REQUIRED | {"offsets", "double", "quantum", "head", "mask", "predictor", "clip", "labels"}
 """All keys of settings."""
 _LISTS = "range is [low, high] and offsets are three whole numbers"
 """Message for a range or offsets that are no lists."""
@@ -52,6 +52,7 @@ class TileSettings:
         clip: whether decoded values are clipped to the range once more at the end, in the type of
             the array, so that neither residual nor rounding takes them beyond it. Files up to
             version 1.1 never are.
+        labels: whether tiles may be coded as labels, without loss.
     """
 
     transform: TransformSpec
@@ -66,6 +67,7 @@ class TileSettings:
     mask: MaskLevels | None = None
     predictor: Predictor | None = None
     clip: bool = False
+    labels: bool = False
 
     def __post_init__(self) -> None:
         for name in ("step", "center", "low", "high", "quantum"):
@@ -102,6 +104,7 @@ class TileSettings:
             "mask": self.mask is not None,
             "predictor": self.predictor is not None,
             "clip": self.clip,
+            "labels": self.labels,
         }
         return tuple(name for name, is_used in used.items() if is_used)
 
@@ -127,6 +130,8 @@ class TileSettings:
             result["predictor"] = self.predictor.to_dict()
         if self.clip:
             result["clip"] = True
+        if self.labels:
+            result["labels"] = True
         return result
 
     @classmethod
@@ -142,8 +147,8 @@ class TileSettings:
         offsets = values.get("offsets", [0, 0, 0])
         if not isinstance(offsets, list | tuple):
             raise InputError(_LISTS)
-        double, clip = values.get("double", False), values.get("clip", False)
-        for name, switch in (("double", double), ("clip", clip)):
+        switches = {name: values.get(name, False) for name in ("double", "clip", "labels")}
+        for name, switch in switches.items():
             if not isinstance(switch, bool):
                 raise InputError(f"{name} is true or false")
         head = _unpack_head(values.get("head"))
@@ -155,12 +160,11 @@ class TileSettings:
             low=low,
             high=high,
             offsets=tuple(offsets),
-            double=double,
+            **switches,
             quantum=values.get("quantum", 0.0),
             head=None if head is None else NeighbourHead.from_bytes(head),
             mask=None if mask is None else MaskLevels.from_dict(mask),
             predictor=None if predictor is None else Predictor.from_dict(predictor),
-            clip=clip,
         )
 
 

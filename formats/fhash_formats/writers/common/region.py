@@ -25,6 +25,8 @@ class Region:
         coords: a Coordinate for each of "t", "z", "y", "x", cut to the region and as long as the
             axis.
         attributes: attributes of the variable, JSON values.
+        fill: number of `dtype` that stands where there is no value; None where every vertex has one
+            or NaN stands there.
 
     Raises:
         InputError: one of these does not hold.
@@ -36,6 +38,7 @@ class Region:
     coords: Mapping[str, Coordinate]
     units: str = ""
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    fill: int | float | None = None
 
     def __post_init__(self) -> None:
         if not self.name:

@@ -1,0 +1,55 @@
+"""Choice of coding as labels: of values that are few, equal over regions, and kept exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import prod
+
+import numpy as np
+
+from fhash_codec.compact.attempt import Attempt, PlanTask
+from fhash_codec.compact.tiles.blocks import Blocks
+from fhash_codec.compact.tiles.coding import Coding
+from fhash_codec.compact.tiles.sample import Sample
+from fhash_codec.compact.tiles.tiling import tile_for
+from fhash_formats.transform.entropy.labels import MAX_LABELS
+from fhash_formats.transform.entropy.mask_levels import MaskLevels
+from fhash_formats.transform.tile.settings import TileSettings
+
+__all__ = ["has_labels", "plan_labels"]
+
+LOOK_VERTICES = 1 << 18
+"""Vertices that are looked at, and coded for the size estimate."""
+CLEARLY = 3
+"""Ratio of deflated tiles to tiles of labels from which on nothing else is tried."""
+SMALL_FILE_BYTES = 60_000
+"""Bytes up to which a file is read in a moment as a whole, so that it may be one tile."""
+MAX_TILE_VERTICES = 12 << 20
+"""Vertices of a tile that is chosen for its bytes alone: a larger one takes long to decode."""
+
+
+def has_labels(task: PlanTask, tiled: Blocks) -> bool:
+    """Whether any tile of a sample has few enough different values."""
+    sample = Sample(tiled, LOOK_VERTICES, task.workers)
+    return any(np.unique(tile.values).size < MAX_LABELS for tile in sample.tiles)
+
+
+def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attempt | None:
+    """Return tiles and settings for labels; None where something else might take fewer bytes."""
+    if not task.blocks.complete:
+        settings = replace(settings, mask=MaskLevels())
+    settings = replace(settings, labels=True, quantum=0.0, clip=False)
+    coding = Coding(filled=True, density=0)
+    exact = replace(coding, exact=True)
+    sample = Sample(tiled, LOOK_VERTICES, task.workers)
+    outcome = sample.run(settings, replace(coding, error=0.0))
+    if CLEARLY * outcome.size > sample.run(settings, exact).size:
+        return None
+    if task.fixed_tile is None:
+        tile = tile_for(task.blocks.shape, outcome.size)
+        shape = task.blocks.shape
+        if outcome.size <= SMALL_FILE_BYTES and prod(shape) <= MAX_TILE_VERTICES:
+            tile = shape
+        sample = Sample(task.blocks.retile(tile), LOOK_VERTICES, task.workers)
+    task.gains.note("labels", outcome)
+    return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
