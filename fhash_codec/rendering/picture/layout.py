@@ -248,7 +248,7 @@ def _bar(
         margin = letters // 2
         thick = max(8, letters)
         tall = max(16, round(BAR_HEIGHT * room))
-        marks = ticks(low, high, max(2, round(tall / (4 * size))))
+        marks = _marks(low, high, max(2, round(tall / (4 * size))))
         widest = thick + margin + max(length(text, size) for _, text in marks)
         title = wrapped(quantity, size, max(widest, TITLE_WIDTH * width)) if quantity else ()
         above = (len(title) - 0.5 + TITLE_GAP) * line_height(size)

@@ -203,3 +203,13 @@ def test_names_of_quantities() -> None:
 def test_labels_are_records_of_texts() -> None:
     layout, _ = laid_out("plain", (256, 256), Effects(axes=True))
     assert all(isinstance(label, Label) and all(label.lines) for label in layout.labels)
+
+
+def test_a_colour_bar_has_two_ticks_or_more() -> None:
+    axes = coords("plain")
+    scene = Scene(size=(256, 256), effects=Effects(colour_bar=True))
+    for low, high in ((271.0, 289.0), (0.6, 1.9), (-1.0, 1.0)):
+        colours = named_map("viridis").rescaled(low, high)
+        layout, _ = lay_out(scene, Grid.of(axes), axes, colours, "q")
+        assert layout.bar is not None
+        assert len(layout.bar.marks) >= 2
