@@ -263,6 +263,15 @@ def _bar(
     )
 
 
+def _marks(low: float, high: float, count: int) -> list[tuple[float, str]]:
+    """About `count` ticks; more are tried where fewer than two round values lie in the range."""
+    for tried in (count, 2 * count, 4 * count):
+        marks = ticks(low, high, tried)
+        if len(marks) > 1:
+            break
+    return marks
+
+
 def _legend(entries: Sequence[LegendEntry], letters: int, picture: tuple[int, int]) -> Legend:
     """The legend at the foot of a picture, in as many rows as it needs."""
     width, height = picture
