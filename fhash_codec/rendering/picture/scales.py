@@ -74,7 +74,7 @@ def scales(
 
 
 def overflow(labels: Sequence[Label], frame: Rectangle) -> tuple[float, float, float, float]:
-    """How far labels reach out of a rectangle: left, top, right, bottom, at least 0."""
+    """Lengths by which labels reach out of a rectangle: left, top, right, bottom, at least 0."""
     boxes = [label.box for label in labels]
     return (
         max([frame[0] - box[0] for box in boxes] + [0.0]),
