@@ -179,7 +179,8 @@ PICTURES = (
         series="jet",
         options=_words(
             "--size 560x420 --no-volume --isosurface 50,#d95f02 --isosurface 30,#3182bd,0.4"
-            " --scale 1,1,0.1 --azimuth -75 --antialiasing 2 --effect box --effect axes --effect time-label"
+            " --scale 1,1,0.1 --azimuth -75 --antialiasing 2 --effect box --effect axes"
+            " --effect time-label"
         ),
     ),
     Picture(
@@ -196,8 +197,8 @@ PICTURES = (
         title="Isosurfaces, one of them transparent, on a dark ground",
         series="blast",
         options=_words(
-            "--size 420x420 --t 6 --no-volume --isosurface 0.45,#e6550d"
-            " --isosurface 0.2,#9ecae1,0.35 --antialiasing 2 --background #101520 --effect box"
+            "--size 420x420 --t 6 --no-volume --isosurface 0.35,#e6550d"
+            " --isosurface 0.24,#9ecae1,0.35 --antialiasing 2 --background #101520 --effect box"
         ),
     ),
     Picture(
@@ -205,7 +206,8 @@ PICTURES = (
         title="Features in their colours, over several steps",
         series="blast",
         options=_words(
-            "--size 220x200 --evolution 1:12:3 --columns 4 --track interval:0.15:0.35 --track isosurface:0.45"
+            "--size 220x200 --evolution 1:12:3 --columns 4 --track interval:0.25:0.35"
+            " --track isosurface:0.4"
         ),
     ),
 )

@@ -91,15 +91,26 @@ def _clip_text(plan: Plan) -> str:
 
 
 def _scale_text(plan: Plan) -> str:
-    scale = plan.task.rays.grid.scale
-    if scale == (1.0, 1.0, 1.0):
-        return "those of the coordinates"
-    why = (
-        "as the scene says"
-        if plan.scene.scale is not None
-        else "an axis in other units than the rest has its vertices as far apart"
-    )
-    return f"x, y, z are stretched by {', '.join(f'{factor:.4g}' for factor in scale)}: {why}"
+    """Lengths of the axes, and how uneven and downward ones are drawn."""
+    grid = plan.task.rays.grid
+    factors = [abs(factor) for factor in grid.scale]
+    if all(factor == 1 for factor in factors):
+        text = "those of the coordinates"
+    else:
+        why = (
+            "as the scene says"
+            if plan.scene.scale is not None
+            else "an axis in other units than the rest has its vertices as far apart"
+        )
+        stretched = ", ".join(f"{factor:.4g}" for factor in factors)
+        text = f"x, y, z are stretched by {stretched}: {why}"
+    places = (None, None, None) if grid.warp is None else grid.warp.places
+    for axis, factor, uneven in zip("xyz", grid.scale, places, strict=True):
+        if uneven is not None:
+            text += f"; {axis} is uneven and resampled to {len(uneven)} even vertices"
+        if factor < 0:
+            text += f"; {axis} ascends downwards"
+    return text
 
 
 def _time_text(plan: Plan) -> str:
@@ -145,6 +156,8 @@ def _gradient_text(plan: Plan) -> str:
         )
         if on
     ]
+    if not uses and plan.scene.effects.shading is not None and task.rays.grid.flat:
+        return "none: a plane is drawn in its colours, without light"
     return "; ".join(uses) if uses else "none: no effect asks for it"
 
 

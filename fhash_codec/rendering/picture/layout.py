@@ -32,6 +32,9 @@ BAR_HEIGHT = 0.55
 """Height of a colour bar, as a share of the picture's."""
 BAR_WIDTH = 0.36
 """Width of a colour bar with its texts, as a share of the picture's, at most."""
+TITLE_GAP = 1.1
+"""Distance from the upper end of a colour bar to the middle of its name's last line, in heights
+of a line: a tick may stand at the end."""
 TITLE_WIDTH = 0.28
 """Width of the lines of a colour bar's name, as a share of the picture's, where ticks need less."""
 SMALLEST_VIEW = 0.3
@@ -245,10 +248,10 @@ def _bar(
         margin = letters // 2
         thick = max(8, letters)
         tall = max(16, round(BAR_HEIGHT * room))
-        marks = ticks(low, high, max(2, round(tall / (4 * size))))
+        marks = _marks(low, high, max(2, round(tall / (4 * size))))
         widest = thick + margin + max(length(text, size) for _, text in marks)
         title = wrapped(quantity, size, max(widest, TITLE_WIDTH * width)) if quantity else ()
-        above = len(title) * line_height(size) + size
+        above = (len(title) - 0.5 + TITLE_GAP) * line_height(size)
         tall = max(16, min(tall, round(room - above - 1.5 * size)))
         widest = max([widest, *(length(line, size) for line in title)])
         if widest + 2 * margin <= BAR_WIDTH * width and tall >= 0.35 * room:
@@ -258,6 +261,15 @@ def _bar(
     return Bar(
         box=(left, top, left + thick, top + tall), marks=tuple(marks), title=title, size=size
     )
+
+
+def _marks(low: float, high: float, count: int) -> list[tuple[float, str]]:
+    """About `count` ticks; more are tried where fewer than two round values lie in the range."""
+    for tried in (count, 2 * count, 4 * count):
+        marks = ticks(low, high, tried)
+        if len(marks) > 1:
+            break
+    return marks
 
 
 def _legend(entries: Sequence[LegendEntry], letters: int, picture: tuple[int, int]) -> Legend:

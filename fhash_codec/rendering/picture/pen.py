@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from fhash_codec.rendering.camera.box import Edge
 from fhash_codec.rendering.colour.colours import ColourMap, parse_colour
-from fhash_codec.rendering.picture.layout import Bar, Legend
+from fhash_codec.rendering.picture.layout import TITLE_GAP, Bar, Legend
 from fhash_codec.rendering.picture.lettering import (
     Label,
     fitted,
@@ -149,7 +149,7 @@ class Pen:
             canvas.fill((right, mark, right + bar.size // 4, mark + stroke), self.ink)
             self.text((right + bar.size // 4 + 2, row), text, bar.size)
         for number, line in enumerate(reversed(bar.title)):
-            self.text((left - 2, top - bar.size - number * pitch), line, bar.size)
+            self.text((left - 2, top - (number + TITLE_GAP) * pitch), line, bar.size)
         return canvas.colours, canvas.opacity
 
     def legend(self, legend: Legend) -> Layer:

@@ -26,7 +26,7 @@ Rectangle = tuple[float, float, float, float]
 
 NAME_PLACES = (0.5, 0.42, 0.58, 0.34, 0.66, 0.26, 0.74, 0.18, 0.82)
 """Places of a name along its edge, as shares of it, in the order in which they are tried."""
-NAME_DISTANCES = (0.0, 1.5, 3.5, 6.0)
+NAME_DISTANCES = (0.0, 1.5, 3.5, 6.0, 9.0)
 """Distances of a name from its usual place beside the edge, in heights of the font."""
 END_PLACES = (0.5, 1.2, 2.0, 3.0, 4.0)
 """Distances of a coordinate from its end of the edge, in heights of the font."""
@@ -74,7 +74,7 @@ def scales(
 
 
 def overflow(labels: Sequence[Label], frame: Rectangle) -> tuple[float, float, float, float]:
-    """How far labels reach out of a rectangle: left, top, right, bottom, at least 0."""
+    """Lengths by which labels reach out of a rectangle: left, top, right, bottom, at least 0."""
     boxes = [label.box for label in labels]
     return (
         max([frame[0] - box[0] for box in boxes] + [0.0]),

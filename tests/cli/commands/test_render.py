@@ -192,7 +192,7 @@ def test_outputs_are_checked_before_any_work(
 ) -> None:
     (tmp_path / "view.png").write_bytes(b"mine")
     assert "--force" in refused(2, "render", run, "-o", tmp_path / "view.png")
-    assert ".png" in refused(2, "render", run, "-o", tmp_path / "view.jpg")
+    assert ".png" in refused(2, "render", run, "-o", tmp_path / "view.gif")
     assert "does not exist" in refused(2, "render", run, "-o", tmp_path / "no" / "view.png")
     (tmp_path / "v.depth.npy").write_bytes(b"mine")
     assert "--force" in refused(2, "render", run, "-o", tmp_path / "v.png", "--depth")
@@ -225,3 +225,35 @@ def test_an_evolution_is_replayed_from_its_picture(fhash: Fhash, run: Path, tmp_
     refused = fhash("render", run, "-o", tmp_path / "d.png", "--scene", first, "--explain")
     assert refused.exit_code == 2
     assert "--explain" in refused.stderr
+
+
+@marched
+def test_a_jpeg_says_where_its_scene_may_stay(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    words = ["render", run, "-o", tmp_path / "v.jpg", "--size", "40x30"]
+    result = fhash(*words)
+    assert result.exit_code == 0
+    assert "not in a JPEG; --save-scene FILE.json keeps it" in result.stdout
+    with Pictures.open(tmp_path / "v.jpg") as picture:
+        assert (picture.format, picture.size) == ("JPEG", (40, 30))
+    clear = fhash(*words, "--background", "transparent", "--force")
+    assert clear.exit_code == 2
+    assert "cannot be transparent" in clear.stderr
+    other = fhash("render", run, "-o", tmp_path / "v.gif")
+    assert ".png, .jpg or .jpeg" in other.stderr
+
+
+@marched
+def test_tracked_features_have_a_box_and_a_legend(fhash: Fhash, run: Path, tmp_path: Path) -> None:
+    view = tmp_path / "v.png"
+    words = ["--size", "80x60", "--track", "interval:5:20", "--track", "isosurface:3=red"]
+    assert fhash("render", run, "-o", view, *words).exit_code == 0
+    effects = scene_in_png(view).effects
+    assert effects.box
+    assert [entry.text for entry in effects.legend] == [
+        "density: 5 to 20 kg m-3",
+        "density = 3 kg m-3",
+    ]
+    panels = tmp_path / "p.jpg"
+    assert fhash("render", run, "-o", panels, *words, "--evolution", "0:3").exit_code == 0
+    with Pictures.open(panels) as picture:
+        assert picture.height > 60

@@ -164,7 +164,7 @@ def test_counters_prove_the_plan(renderer: Renderer) -> None:
     shaded = renderer.render(scene(effects={"shading": True})).counters
     assert {**shaded, "gradients": 0} == plain
     assert 0 < shaded["gradients"] <= shaded["samples"]
-    assert renderer.render(scene(effects={"box": True, "time_label": True})).counters == plain
+    assert renderer.render(scene(effects={"box": True})).counters == plain
 
 
 def test_light_costs_secondary_rays_and_nothing_else(renderer: Renderer) -> None:

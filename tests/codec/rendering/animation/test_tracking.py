@@ -13,6 +13,7 @@ from fhash_codec.rendering.animation.tracking import (
     parse_tracked,
     tracking_scene,
 )
+from fhash_codec.rendering.camera.grid import Grid
 from fhash_codec.rendering.colour.transfer_function import TransferFunction
 from fhash_codec.rendering.scene.scene import (
     Isosurface,
@@ -56,13 +57,32 @@ def test_a_value_of_two_features_has_both_colours_and_the_larger_opacity(volume:
         volume,
     )
     assert scene.effects.isosurfaces == (Isosurface(value=0.9, colour="#00ff00"),)
+    # The volume is thin: three vertices along z.
+    full = 1 - (1 - 0.3) ** (8 / Grid.of(volume.coords).thinnest[1])
     function = TransferFunction.of(scene.transfer_function, value_range=(0.0, 1.0), spacing=1.0)
     np.testing.assert_allclose(
         function.colour([0.3, 0.5, 0.7]), [[1, 0, 0], [0.5, 0, 0.5], [0, 0, 1]], atol=0.01
     )
     np.testing.assert_allclose(
-        function.opacity([0.1, 0.3, 0.5, 0.7, 0.85]), [0, 0.3, 0.3, 0.3, 0], atol=1e-9
+        function.opacity([0.1, 0.3, 0.5, 0.7, 0.85]), [0, full, full, full, 0], atol=1e-9
     )
+    assert scene.effects.box
+    assert [(entry.text, entry.colour) for entry in scene.effects.legend] == [
+        (f"{volume.name}: 0.2 to 0.6", "#ff0000"),
+        (f"{volume.name}: 0.4 to 0.8", "#0000ff"),
+        (f"{volume.name} = 0.9", "#00ff00"),
+    ]
+
+
+def test_features_without_an_end_are_named_by_the_other(volume: Volume) -> None:
+    texts = ["interval:0.3:inf", "interval:-inf:0.2", "segmentation:0.4"]
+    scene = tracking_scene(SMALL, parse_tracked(texts, volume), volume)
+    name = volume.name
+    assert [entry.text for entry in scene.effects.legend] == [
+        f"{name} ≥ 0.3",
+        f"{name} ≤ 0.2",
+        f"{name} ≥ 0.4",
+    ]
 
 
 def test_isosurfaces_alone_leave_the_volume_out(volume: Volume) -> None:

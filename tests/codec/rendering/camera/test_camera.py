@@ -92,12 +92,13 @@ def test_a_stretched_grid_keeps_its_corners_apart_by_the_factors() -> None:
     np.testing.assert_allclose(Grid.of(flat, (1, 3, 7)).spacing, [0.4, 1.2, 0.8])
 
 
-def test_coordinates_that_are_not_even_are_told() -> None:
+def test_coordinates_that_are_no_places_are_told() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         grid(x=np.arange(11) + 0.009 * (np.arange(11) == 5))
-    with pytest.warns(FhashWarning, match="'x' of x are not evenly spaced"):
-        assert grid(x=np.arange(11) ** 2).spacing[0] == 10
+        assert grid(x=np.arange(11) ** 2).spacing[0] == 1
+    with pytest.warns(FhashWarning, match="'x' of x neither ascend nor descend throughout"):
+        assert grid(x=[0, 2, 1]).spacing[0] == 1
     for wrong in (
         [1.0, 1.0],
         [np.nan, 1.0],

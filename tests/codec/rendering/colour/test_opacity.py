@@ -13,6 +13,7 @@ from fhash_codec.rendering.colour.opacity import (
     PRESETS,
     SURFACE,
     opacity_preset,
+    raised,
     shown_range,
 )
 
@@ -139,3 +140,31 @@ def test_the_background_is_clear_however_small_or_large_the_values_are(scale: fl
             histogram=(edges, counts),
         )
     assert opacities == pytest.approx([BACKGROUND, 0, BACKGROUND], rel=0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("features", [(), ("interval:3:7",)])
+def test_a_plane_is_opaque(features: tuple[str, ...]) -> None:
+    assert at("auto", [-1, 0, 5, 11], features=features, thinnest=(1, 1.0)) == [1, 1, 1, 1]
+
+
+def test_up_to_eight_vertices_every_value_is_seen_as_through_eight_spacings() -> None:
+    full = 1 - (1 - BACKGROUND) ** 8
+    histogram = (np.linspace(0, 10, 11), np.array([90, 1, 1, 1, 1, 1, 1, 1, 1, 1]))
+    for vertices, length in ((2, 1.0), (8, 7.0), (8, 9.0)):
+        (opacity,) = set(at("auto", [0, 3, 10], thinnest=(vertices, length), histogram=histogram))
+        through = 1 - (1 - opacity) ** length
+        assert through == pytest.approx(max(full, 1 - (1 - BACKGROUND) ** length))
+    thick = at("auto", [0, 3, 10], thinnest=(9, 8.0), histogram=histogram)
+    assert thick == at("auto", [0, 3, 10], histogram=histogram)
+    assert thick[0] == 0
+
+
+def test_features_of_thin_volumes_are_raised_too_and_named_presets_are_not() -> None:
+    thin = at("auto", [2, 5], features=("interval:3:7",), thinnest=(3, 2.0))
+    assert thin == pytest.approx([0, 1 - (1 - INTERVAL) ** 4])
+    for name in ("linear", "feature"):
+        given = {"features": ("interval:3:7",)}
+        assert at(name, [2, 5], thinnest=(1, 1.0), **given) == at(name, [2, 5], **given)
+    points = np.array([[0.0, 0.5], [1.0, 1.0]])
+    np.testing.assert_array_equal(raised(points, (9, 2.0)), points)
+    np.testing.assert_allclose(raised(points, (8, 4.0)), [[0, 0.75], [1, 1]])

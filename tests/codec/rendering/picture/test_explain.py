@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from fhash_codec import Scene, Volume
+import fhash_codec
+from fhash_codec import EncodeConfig, Scene, Volume
 from fhash_codec.rendering.picture.planning import plan_at, plan_picture
+from fhash_formats.series import ArraySeries, Coordinate, index_coordinate
 
 TOPICS = [
     "picture",
@@ -34,7 +38,7 @@ def test_every_plan_has_the_same_topics(volume: Volume) -> None:
     more = lines(volume, effects={"buffers": ["depth"], "box": True, "time_label": True})
     assert list(more) == [*TOPICS, "buffers", "around"]
     assert more["buffers"] == "depth"
-    assert more["around"] == "box, time_label: drawn afterwards"
+    assert more["around"].startswith("box, time_label: drawn afterwards; the volume has 512 x ")
 
 
 @pytest.mark.parametrize(
@@ -72,3 +76,24 @@ def test_a_plan_moved_in_time_says_so(volume: Volume) -> None:
     assert moved.task is plan.task
     changed = {topic for topic in TOPICS if moved.to_dict()[topic] != plan.to_dict()[topic]}
     assert changed == {"time"}
+
+
+def test_places_and_planes_are_explained(tmp_path: Path) -> None:
+    def explained(values: np.ndarray, z: Coordinate, **scene: Any) -> dict[str, str]:
+        axes = {
+            axis: index_coordinate(axis, n) for axis, n in zip("tzyx", values.shape, strict=True)
+        }
+        series = ArraySeries(values, name="q", units="K", coords={**axes, "z": z})
+        fhash_codec.encode(series, tmp_path / "a.fhz", EncodeConfig(effort=1), force=True)
+        with fhash_codec.open(tmp_path / "a.fhz") as opened:
+            return lines(opened, **scene)
+
+    values = np.random.default_rng(0).random((1, 4, 9, 9)).astype(np.float32)
+    depth = Coordinate(name="depth", values=np.array([0, 1, 2, 6.0]), attributes={"units": "hPa"})
+    assert explained(values, depth)["proportions"] == (
+        "those of the coordinates; z is uneven and resampled to 7 even vertices;"
+        " z ascends downwards"
+    )
+    single = Coordinate(name="z", values=np.zeros(1))
+    lit = explained(values[:, :1], single, effects={"shading": True})
+    assert lit["gradient"] == "none: a plane is drawn in its colours, without light"

@@ -86,10 +86,34 @@ def test_an_older_picture_stays_unless_forced(tmp_path: Path, existing: str) -> 
     new.save(tmp_path / "view.png", force=True)
     assert scene_in_png(tmp_path / "view.png") == SCENE
     with pytest.raises(InputError, match=r"written as \.png"):
-        new.save(tmp_path / "view.jpg")
+        new.save(tmp_path / "view.gif")
 
 
 def test_a_notebook_shows_the_picture() -> None:
     with Pictures.open(io.BytesIO(image()._repr_png_())) as found:
         np.testing.assert_array_equal(np.asarray(found), image().to_uint8())
     assert repr(image()) == "<fhash Image 3x2 of run.fhz in 0 s>"
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".JPEG"])
+def test_a_jpeg_holds_the_pixels(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"view{suffix}"
+    rgba = np.ones((40, 60, 4), dtype=np.float32)
+    rgba[:, :30, 0] = 0
+    wide = image(rgba=rgba)
+    assert wide.save(path) == [path]
+    with Pictures.open(path) as found:
+        assert found.format == "JPEG"
+        difference = np.asarray(found).astype(int) - wide.to_uint8()
+    assert np.abs(difference).max() < 24
+    with pytest.raises(OutputExistsError):
+        wide.save(path)
+
+
+def test_other_names_and_transparent_jpegs_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"written as \.png, \.jpg or \.jpeg"):
+        image().save(tmp_path / "view.gif")
+    clear = image(scene=Scene(background="transparent").to_dict())
+    with pytest.raises(InputError, match="JPEG cannot be transparent"):
+        clear.save(tmp_path / "view.jpg")
+    assert not list(tmp_path.iterdir())

@@ -11,8 +11,9 @@ from fhash_codec.rendering.camera.box import edges
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.colour.colours import named_map
 from fhash_codec.rendering.picture.image import Image
-from fhash_codec.rendering.picture.overlay import overlay, time_text
-from fhash_codec.rendering.scene.scene import Camera, Effects, Scene
+from fhash_codec.rendering.picture.layout import Layout, lay_out
+from fhash_codec.rendering.picture.overlay import overlay, surrounded, time_text
+from fhash_codec.rendering.scene.scene import Camera, Effects, LegendEntry, Scene
 from fhash_formats.series import Coordinate
 
 COORDS = {
@@ -38,33 +39,21 @@ def drawn(
     **camera: Any,
 ) -> Image:
     rgba = np.zeros((size[1], size[0], 4), dtype=np.float32)
-    rgba[..., 3] = fill
-    image = Image(rgba=rgba, scene=Scene(background=background).to_dict())
-    rays = Rays.of(Camera(**camera), GRID, size)
-    return overlay(
-        image,
-        effects,
-        rays,
-        colours=named_map("plasma").rescaled(-3, 5),
-        quantity="speed [m/s]",
-        coords=COORDS,
-        label="step 3   t = 1 s",
-    )
+    scene = Scene(background=background, size=size, effects=effects, camera=Camera(**camera))
+    colours = named_map("plasma").rescaled(-3, 5)
+    layout, rays = lay_out(scene, GRID, COORDS, colours, "speed [m/s]")
+    left, top, width, height = layout.view
+    rgba[top : top + height, left : left + width, 3] = fill
+    image = Image(rgba=rgba, scene=scene.to_dict())
+    return overlay(image, effects, rays, layout, colours=colours, label="step 3   t = 1 s")
 
 
 def test_nothing_is_drawn_unless_asked_for() -> None:
     image = Image(rgba=np.zeros((4, 4, 4), dtype=np.float32))
-    assert (
-        overlay(
-            image,
-            Effects(),
-            Rays.of(Camera(), GRID, (4, 4)),
-            colours=named_map("grey"),
-            quantity="",
-            coords=COORDS,
-        )
-        is image
-    )
+    rays = Rays.of(Camera(), GRID, (4, 4))
+    layout = Layout(size=(4, 4), view=(0, 0, 4, 4))
+    assert overlay(image, Effects(), rays, layout, colours=named_map("grey")) is image
+    assert surrounded(image, Effects(box=True), colours=named_map("grey"), quantity="") is image
 
 
 @pytest.mark.parametrize("background", ["#ffffff", "#10121c", "transparent"])
@@ -123,6 +112,20 @@ def test_the_colour_bar_shows_the_colours_from_bottom_to_top() -> None:
     assert len(rows_high)
     assert rows_low.mean() > 180
     assert rows_high.mean() < 80
+
+
+def test_panels_get_their_bar_and_legend_outside() -> None:
+    panels = Image(rgba=np.ones((90, 200, 4), dtype=np.float32))
+    effects = Effects(
+        colour_bar=True, legend=(LegendEntry(text="a long meaning of it", colour="red"),), box=True
+    )
+    whole = surrounded(panels, effects, colours=named_map("plasma"), quantity="speed [m/s]")
+    height, width = whole.rgba.shape[:2]
+    assert height > 90
+    assert width > 200
+    assert np.all(whole.rgba[:90, :200] == 1)
+    assert whole.rgba[:90, 200:, 3].max() == 1
+    assert whole.rgba[90:, :, 3].max() == 1
 
 
 def test_the_text_of_a_time() -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import Scene, Volume
+from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.picture.plan import Plan
-from fhash_codec.rendering.picture.planning import MAX_RAYS, plan_picture
+from fhash_codec.rendering.picture.planning import MAX_RAYS, coding_noise, plan_picture
 from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import FhashWarning, InputError, RegionError
 
@@ -224,3 +224,48 @@ def test_axes_between_whose_vertices_no_ray_can_be_placed_are_refused(volume: Vo
         match=r"no ray can be placed that finely, at most 1e\+14 times; stretch the axes",
     ):
         plan(volume, scale=[8e29, 2.4e29, 1e-30])
+
+
+def encoded(path: Path, values: np.ndarray, **config: Any) -> Path:
+    fhash_codec.encode(values, path, fhash_codec.EncodeConfig(effort=1, **config))
+    return path
+
+
+@pytest.mark.parametrize("axis", [1, 2, 3])
+def test_a_plane_is_planned_opaque_unlit_and_from_above(tmp_path: Path, axis: int) -> None:
+    shape = [2, 9, 10, 11]
+    shape[axis] = 1
+    values = np.random.default_rng(0).random(shape).astype(np.float32)
+    with fhash_codec.open(encoded(tmp_path / "a.fhz", values)) as flat:
+        lit = plan(flat, effects={"shading": True, "shadows": True, "ambient_occlusion": True})
+        assert not lit.task.shaded
+        assert not lit.lights
+        assert lit.function.opacity(0.5) == 1
+        np.testing.assert_allclose(np.abs(lit.task.rays.forward), np.eye(3)[3 - axis], atol=1e-12)
+        # What the user says goes before.
+        given = plan(
+            flat, camera={"view": "iso"}, transfer_function={"opacity": [[0, 0.25], [1, 0.25]]}
+        )
+        assert given.function.opacity(0.5) == 0.25
+        assert np.count_nonzero(np.abs(given.task.rays.forward) > 0.1) == 3
+
+
+@pytest.mark.parametrize(("thickness", "seen"), [(2, True), (8, True), (9, False)])
+def test_thin_volumes_show_every_value(tmp_path: Path, thickness: int, seen: bool) -> None:
+    values = np.zeros((1, thickness, 20, 20), dtype=np.float32)
+    values[:, :, :4, :4] = np.random.default_rng(0).random((1, thickness, 4, 4))
+    with fhash_codec.open(encoded(tmp_path / "a.fhz", values)) as volume:
+        function = Renderer(volume).plan(Scene()).function
+    assert (function.opacity(0.0) > 0) is np.bool_(seen)
+    assert function.opacity(1.0) > 0
+
+
+def test_the_errors_of_a_bounded_file_are_noise(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).random((1, 12, 12, 12)).astype(np.float32)
+    for config, factor in (({"max_error": 0.1}, 2), ({"max_error_rel": 0.1}, 2), ({"psnr": 30}, 0)):
+        with fhash_codec.open(encoded(tmp_path / "a.fhz", values, **config)) as volume:
+            largest = volume.container.header["quality"]["max_abs_error"]
+            assert largest > 0.01
+            assert coding_noise(volume) == pytest.approx(factor * largest)
+            assert plan(volume).task.noise == pytest.approx(factor * largest)
+        (tmp_path / "a.fhz").unlink()

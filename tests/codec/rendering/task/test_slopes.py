@@ -32,3 +32,9 @@ def test_noise_of_rounding_is_not_lit() -> None:
     # Half of a unit in the last place of 1001 in float32, in both of two values.
     assert floor >= float(np.spacing(np.float32(1001)))
     assert flatness(5.0, 5.0, 5.0, 5.0)[0] == pytest.approx(1.0)
+
+
+def test_errors_of_coding_are_not_lit() -> None:
+    assert flatness(0.0, 4.0, 0.0, 4.0, 0.5) == (4.0, 0.125)
+    assert flatness(0.0, 4.0, 0.0, 4.0, 1e-9)[1] == FLATTEST
+    assert flatness(0.0, 4.0, 0.0, 4.0, 100.0)[1] == 1.0
