@@ -4,30 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
-
-
-class NumberType(click.ParamType[int | float]):
-    """A number; whole numbers stay exact beyond the precision of floats."""
-
-    name = "V"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> int | float:
-        """The number."""
-        for number in (int, float):
-            try:
-                return number(value)
-            except ValueError:
-                continue
-        self.fail(f"{value!r} is not a number", param, ctx)
 
 
 def check_fill(kind: np.dtype[Any], fill: float | None) -> None:

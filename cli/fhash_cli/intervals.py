@@ -14,6 +14,23 @@ AXES = 3
 """Axes of a region: z, y and x."""
 
 
+class NumberType(click.ParamType[int | float]):
+    """A number; whole numbers stay exact beyond the precision of floats."""
+
+    name = "V"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> int | float:
+        """The number."""
+        for number in (int, float):
+            try:
+                return number(value)
+            except ValueError:
+                continue
+        self.fail(f"{value!r} is not a number", param, ctx)
+
+
 class SliceType(click.ParamType[slice]):
     """Indices as in Python, `A:B:S` with any part left out, or a single one; a step is positive."""
 

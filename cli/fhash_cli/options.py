@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from fhash_cli.intervals import SliceType
+from fhash_cli.intervals import NumberType, SliceType
 from fhash_formats.errors import InputError, OutputError
 
 Command = Callable[..., None]
@@ -79,21 +79,14 @@ class SelectType(click.ParamType[tuple[str, str]]):
         return name, index
 
 
-class NumberType(click.ParamType[float]):
-    """A number, whole where it is written as one, so that integers of 64 bits stay exact."""
-
-    name = "V"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float:
-        """The number that a text stands for."""
-        for kind in (int, float):
-            try:
-                return kind(value)
-            except ValueError:
-                continue
-        self.fail(f"'{value}' is not a number", param, ctx)
+def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+    """The number that a text stands for."""
+    for kind in (int, float):
+        try:
+            return kind(value)
+        except ValueError:
+            continue
+    self.fail(f"'{value}' is not a number", param, ctx)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_cli.conversion import NumberType, check_fill, convert
+from fhash_cli.conversion import check_fill, convert
+from fhash_cli.intervals import NumberType
 from fhash_codec import EncodeConfig
 from fhash_formats import open_series
 from fhash_formats.errors import InputError

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from fhash_cli.base_command import BaseCommand
-from fhash_cli.conversion import NumberType, check_fill, convert
-from fhash_cli.intervals import IntervalsType, SliceType
+from fhash_cli.conversion import check_fill, convert
+from fhash_cli.intervals import IntervalsType, NumberType, SliceType
 from fhash_cli.options import (
     check_writable,
     force_option,
