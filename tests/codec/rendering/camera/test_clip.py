@@ -1,4 +1,4 @@
-"""What a clip leaves of the drawn box: in vertices, as a region, and as edges of a picture."""
+"""Clipped boxes: in vertices, as a region that is decoded, and as edges of a picture."""
 
 from __future__ import annotations
 

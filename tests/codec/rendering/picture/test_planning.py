@@ -242,19 +242,6 @@ def test_axes_between_whose_vertices_no_ray_can_be_placed_are_refused(volume: Vo
         plan(volume, scale=[8e29, 2.4e29, 1e-30])
 
 
-def test_a_gradient_is_a_share_of_the_range_in_the_distance_of_two_vertices(volume: Volume) -> None:
-    scene = {"transfer_function": {"gradient_opacity": [[0.1, 0.2], [0.5, 1]]}}
-    for scale in (1.0, 3.0):
-        plan = plan_picture(volume, Scene.from_dict({**scene, "scale": [scale] * 3}))
-        grading = plan.task.grading
-        assert grading is not None
-        assert grading.top == pytest.approx(
-            0.5 * (volume.value_range.high - volume.value_range.low) / scale
-        )
-        np.testing.assert_allclose(grading.factors[[0, 205, 1024]], [0.2, 0.2, 1.0], atol=1e-3)
-    assert plan_picture(volume, Scene()).task.grading is None
-
-
 def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None:
     spec = {"range": [1, 6], "opacity": [[3, 0], [4, 1], [5, 0]]}
     for effect, low in ((None, 3.0), ("minimum_intensity", 1.0), ("average_intensity", 1.0)):
