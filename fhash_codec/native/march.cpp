@@ -29,8 +29,9 @@ FHASH_KERNEL(maximum, MAXIMUM)
 }  // namespace
 
 // Add the rays of tiles first to stop (of 16 x 16 pixels, in rows) to the pictures of `march`,
-// which begin as zeros (depth: infinity). flags: SHADED, LIT, and one of those of march_effects.cpp or MAXIMUM. counters, added to: rays,
-// passes, samples, gradients, skips. Returns -1 for an input that cannot be.
+// which begin as zeros (depth: infinity). flags: SHADED, LIT, MAXIMUM, or those of
+// march_effects.cpp. counters, added to: rays, passes, samples, gradients, skips. Returns -1 for an
+// input that cannot be.
 FHASH_EXPORT int64_t fhash_march(const FhashMarch* march, int64_t flags, int64_t first,
                                  int64_t stop, int64_t* counters) {
     const FhashMarch& m = *march;

@@ -68,7 +68,7 @@ extern "C" struct FhashMarch {
     // Opacity by gradient.
     const float* grading;    // (FHASH_GRADES + 2,): factors of the extinction by gradient; or null
     double grade_scale;      // entries of that table to a gradient of shading of 1
-    std::int64_t unlit;      // whether gradients are for opacity alone, and the volume is not shaded
+    std::int64_t unlit;      // whether gradients are for opacity alone, not for shading
 };
 
 struct FhashCell {

@@ -33,9 +33,9 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::grade(Counters& counted) {
         const int n = (int)grade;
         const float factor = factors[n] + (grade - (float)n) * (factors[n + 1] - factors[n]);
         const int t = (int)at[l];
-        const float low = (float)extinctions[t], high = (float)extinctions[t + 1];
+        const float here = (float)extinctions[t], next = (float)extinctions[t + 1];
         const float length = k[l] == last[l] ? (float)rest[l] : 1.f;
-        const float depth_of = (low + (at[l] - (float)t) * (high - low)) * length * factor;
+        const float depth_of = (here + (at[l] - (float)t) * (next - here)) * length * factor;
         gradients += alpha[l] > 0;
         alpha[l] = alpha[l] > 0 ? opacity_of(depth_of) : 0.f;
     }

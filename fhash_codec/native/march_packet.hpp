@@ -136,6 +136,8 @@ template <int FLAGS> struct Packet {
             const double most = (double)m.shape[2 - c] - 1;
             low[c] = (float)clamp(m.seen[c][0], 0.0, most);
             high[c] = (float)clamp(m.seen[c][1], (double)low[c], most);
+            // Behind a clipped face lies a cell that is not seen: no sample takes its gradient.
+            if (high[c] > low[c] && high[c] < (float)most) high[c] = std::nextafterf(high[c], -1.f);
         }
     }
 
@@ -185,8 +187,8 @@ template <int FLAGS> struct Packet {
 
     // The place of a sample along an axis, in the part that is seen.
     double place_of(int l, int c, double sample) const {
-        const double at = min(sample, (double)farthest[l]);
-        return clamp(o[c][l] + at * d[c][l], (double)low[c], (double)high[c]);
+        const double nearest = min(sample, (double)farthest[l]);
+        return clamp(o[c][l] + nearest * d[c][l], (double)low[c], (double)high[c]);
     }
     FhashCell cell(int l, double sample) const {
         return fhash_cell_at(m, place_of(l, 0, sample), place_of(l, 1, sample),

@@ -7,10 +7,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
+import click
 import pytest
+from click.testing import CliRunner
 
 import fhash_codec
-from fhash_cli.scene_options import PLACES, SceneOptions
+from fhash_cli.scene_options import PLACES, SceneOptions, scene_options
 from fhash_codec.rendering.scene.scene import Scene
 from fhash_formats.errors import InputError
 
@@ -74,3 +76,34 @@ def test_effects_surfaces_and_settings_add_up() -> None:
 def test_an_unknown_effect_names_the_nearest() -> None:
     with pytest.raises(InputError, match="did you mean 'shadows'"):
         scene(effects=("shadow",))
+
+
+def test_clips_and_gradients_are_put_where_a_scene_has_them() -> None:
+    found: list[Scene] = []
+
+    @click.command()
+    @scene_options
+    def command(options: SceneOptions) -> None:
+        found.append(options.scene(VOLUME))
+
+    def parsed(*words: str) -> dict[str, object]:
+        done = CliRunner().invoke(command, words, standalone_mode=False, catch_exceptions=False)
+        assert done.exit_code == 0
+        return found[-1].to_dict()
+
+    planes = [
+        {"normal": [-1.0, 0.0, 0.0], "offset": -12.0},
+        {"normal": [0.0, 1.0, 1.0], "point": [1.0, 2.0, 3.0]},
+    ]
+    words = ("--clip-plane", "-1,0,0,-12", "--clip-plane", "1,2,3,0,1,1")
+    assert parsed(*words) == {"effects": {"clip": {"planes": planes}}}
+    assert parsed(*words, "--clip-box", ":,-2:0,:5") == {
+        "effects": {"clip": {"y": [-2.0, 0.0], "x": [None, 5.0], "planes": planes}}
+    }
+    assert parsed("--gradient-opacity", "0:0,0.1:1", "--attenuation", "0.2") == {
+        "transfer_function": {"gradient_opacity": [[0.0, 0.0], [0.1, 1.0]]},
+        "effects": {"attenuated_maximum_intensity": {"attenuation": 0.2}},
+    }
+    assert parsed("--effect", "average-intensity") == {"effects": {"average_intensity": True}}
+    with pytest.raises(InputError, match="effect 'clip' is not known"):
+        parsed("--effect", "clip")

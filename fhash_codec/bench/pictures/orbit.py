@@ -48,7 +48,8 @@ def orbit(turns: int, size: int, side: int | None = None) -> tuple[Switch, ...]:
     found = []
     for shaded in (False, True):
         tasks = [_task(side, size, 360 * turn / turns, shaded) for turn in range(turns)]
-        anew, again = [], []
+        anew: list[float] = []
+        again: list[float] = []
         pictures: list[Marched] = []
         march(frame, tasks[0], bricks=kept)
         for task in tasks:

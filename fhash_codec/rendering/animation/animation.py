@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fhash_codec.rendering.animation.timeline import Timeline
+from fhash_codec.rendering.animation.timeline import Clock, Timeline
 from fhash_codec.rendering.scene.record import Record, limits
 from fhash_codec.rendering.scene.scene import Camera, Effects, Scene, TransferFunctionSpec
 from fhash_codec.volume import Volume
@@ -246,6 +246,10 @@ class Animation(Record):
             times=self._ends(self.times),
             orbit=self.orbit,
         )
+        if self.every is not None:  # the last picture may lie before the end of the range
+            for check, ends in ((Clock.of_steps, self.steps), (Clock.of_times, self.times)):
+                if ends is not None:
+                    check(ends, volume)
         shares = np.arange(self.count) / max(self.count if self.closed else self.count - 1, 1)
         return [timeline.scene(float(share)) for share in shares]
 

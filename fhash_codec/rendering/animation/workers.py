@@ -10,8 +10,10 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+import threading
 import warnings
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -70,7 +72,8 @@ def rendered_by_workers(
                 threads=threads,
             )
             worker = context.Process(target=_work, args=(there, job), daemon=True)
-            worker.start()
+            with _interrupts_ignored():
+                worker.start()
             there.close()  # so that an end of the process is an end of the pipe
             workers.append(worker)
             ends.append(here)
@@ -86,6 +89,22 @@ def rendered_by_workers(
                 worker.join()
         for end in ends:
             end.close()
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """A context that ignores Ctrl-C; processes that start in it ignore it for ever.
+
+    Elsewhere than in the main thread, which alone may say so, nothing changes: `_work` says so too.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _received(end: Connection) -> Image:

@@ -78,7 +78,7 @@ def _extras(plan: Plan) -> list[tuple[str, str]]:
 
 
 def _clip_text(plan: Plan) -> str:
-    """What is left of the volume, in the coordinates of the series."""
+    """The part of the volume that is left, in the coordinates of the series."""
     task, grid = plan.task, plan.task.rays.grid
     ends = (grid.origin[:, None] + task.bounds * grid.spacing[:, None]) / np.array(grid.scale)[
         :, None

@@ -28,7 +28,8 @@ from fhash_codec.rendering.scene.scene import (
     Shading,
     Shadows,
 )
-from fhash_codec.rendering.task.task import GRADES, Grading, Lighting, Surface, Table, Task
+from fhash_codec.rendering.task.grading import grading_of
+from fhash_codec.rendering.task.task import Lighting, Surface, Table, Task
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
@@ -72,7 +73,7 @@ def plan_picture(
     units = Units.of(volume)
     noise = coding_noise(volume) * units.factor * grid.vertex_spacing / grid.series_spacing
     task = _task(scene, rays, function, units, lamp, lod, noise)
-    task = replace(task, grading=_grading(scene, volume, units, grid))
+    task = replace(task, grading=grading_of(scene.transfer_function, volume, units, grid))
     _check_ray_length(task)
     mode = _mode(scene.march)
     margin = _margin(task, lod)
@@ -349,29 +350,6 @@ def _table(function: TransferFunction, units: Units, whole: bool) -> Table:
 def _about(ends: tuple[float, float]) -> tuple[float, float]:
     """A range of values, widened where its ends are the same."""
     return ends if ends[0] < ends[1] else about(ends[0])
-
-
-def _grading(scene: Scene, volume: Volume, units: Units, grid: Grid) -> Grading | None:
-    """The opacity by gradient of a scene in marched units; raises InputError for its points."""
-    points = np.array(scene.transfer_function.gradient_opacity, dtype=np.float64).reshape(-1, 2)
-    if not len(points) or scene.transfer_function.nothing:
-        return None
-    if np.any(np.diff(points[:, 0]) <= 0):
-        raise InputError(
-            "the gradients of 'gradient_opacity' do not ascend; each must be above the one before"
-        )
-    if not 0 < points[:, 1].max() <= 1:
-        raise InputError(
-            f"the factors of 'gradient_opacity' reach to {points[:, 1].max():g}; allowed: 0 to 1, "
-            "one of them above 0"
-        )
-    top = float(points[-1, 0]) or 1.0
-    low, high = _about((volume.value_range.low, volume.value_range.high))
-    ends = units.to([low, high])
-    return Grading(
-        factors=np.interp(np.linspace(0.0, top, GRADES + 1), points[:, 0], points[:, 1]),
-        top=top * float(ends[1] - ends[0]) / grid.vertex_spacing,
-    )
 
 
 def _margin(task: Task, lod: int) -> int:

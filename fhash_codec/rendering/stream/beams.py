@@ -41,6 +41,8 @@ class Beams:
         along: (n, 3), unit vectors in physical directions.
         step: length from one sample to the next, in units of the coordinates.
         bounds: (3, 2), box in which the field has values.
+        inside: (3, 2), the same box, but for faces that a clip makes within the field: behind one
+            lies a cell that is not seen, and no sample takes its gradient.
         cut: whether planes cut the box.
     """
 
@@ -57,6 +59,7 @@ class Beams:
     along: Array
     step: float
     bounds: Array
+    inside: Array
     cut: bool = False
 
     @classmethod
@@ -76,6 +79,8 @@ class Beams:
         low = xp.maximum(within[:, 0], box[:, 0])
         # Where nothing is left, nothing, and no box that is turned over.
         high = xp.maximum(xp.minimum(within[:, 1], box[:, 1]), low)
+        inner = xp.maximum(xp.where(high < within[:, 1], high - NEAR / 2, high), low)
+        inside = xp.stack([low, inner], axis=1)
         within = xp.stack([low, high], axis=1)
         path = _paths(eye, direction, box, within, arrays.array(task.planes), arrays)
         steps = (path.leave - path.enter) / task.step
@@ -102,6 +107,7 @@ class Beams:
             along=direction * spacing,
             step=task.step,
             bounds=within,
+            inside=inside,
             cut=len(task.planes) > 0,
         )
 
@@ -114,7 +120,7 @@ class Beams:
                 self.arrays.to_float64(at), self.leaving[rays].reshape(-1, *extra)
             )
         return self.arrays.xp.clip(
-            origin + at[..., None] * pace, self.bounds[:, 0], self.bounds[:, 1]
+            origin + at[..., None] * pace, self.inside[:, 0], self.inside[:, 1]
         )
 
     def borders(self, rays: Array, at: Array) -> Array:

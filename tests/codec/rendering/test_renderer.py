@@ -234,3 +234,36 @@ def test_progress_is_reported(volume: Volume) -> None:
     assert said[-1][0] == "marching"
     assert all(0 <= done <= total for _, done, total in said)
     assert said[-1][1] == said[-1][2]
+
+
+@pytest.mark.parametrize("mode", ["cache", "arm"])
+@pytest.mark.parametrize("kind", ["compact", "paper"])
+def test_nothing_outside_a_clip_is_decoded_or_evaluated(
+    files: dict[str, Path], kind: str, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    regions: list[Any] = []
+    read = Volume.read
+
+    def noted(self: Volume, t: float, region: Any = None, **more: Any) -> Any:
+        regions.append(region)
+        return read(self, t, region, **more)
+
+    monkeypatch.setattr(Volume, "read", noted)
+    clip = {"z": [9, 10], "planes": [{"normal": [1, 0, 0], "offset": 5}]}
+    march = {"mode": mode, "lod": 0}
+    fog = {"opacity": "linear", "density": 0.05}
+    values = {"size": [30, 30], "march": march, "transfer_function": fog}
+    with fhash_codec.open(files[kind]) as volume:
+        whole = Renderer(volume).render(Scene.from_dict(values))
+        regions.clear()
+        part = Renderer(volume).render(Scene.from_dict({**values, "effects": {"clip": clip}}))
+        first, tile = volume.box.z[0], volume.chunks[1]
+    assert bool(regions) == (kind == "compact" or mode == "cache")
+    for region in regions:
+        low, high = region[0]
+        assert 0 <= (9 - low) < tile
+        assert low in (first, first + (9 - first) // tile * tile)
+        assert 11 <= high < 11 + tile
+    assert part.counters["decoded_vertices"] <= whole.counters["decoded_vertices"]
+    assert 0 < part.counters["samples"] < 0.5 * whole.counters["samples"]
+    assert part.counters["evaluations"] <= part.counters["samples"]

@@ -16,7 +16,8 @@ extern "C" {
 int64_t fhash_march(const FhashMarch*, int64_t, int64_t, int64_t, int64_t*);
 int64_t fhash_march_bricks(const float*, const int64_t*, const int64_t*, int64_t, int64_t, int64_t,
                            float*, float*, float*);
-int64_t fhash_march_distance_layers(const int64_t*, std::int32_t*, int64_t, int64_t, std::int32_t*);
+int64_t fhash_march_distance_layers(const int64_t*, std::int32_t*, int64_t, int64_t,
+                                    std::int32_t*);
 int64_t fhash_march_distance_rows(const int64_t*, std::int32_t*, int64_t, int64_t, std::int32_t*);
 }
 
@@ -32,7 +33,8 @@ double number_of(Reader& in) {
 
 // The arrays to which a task points.
 struct Arrays {
-    std::vector<float> grading, values, lowest, highest, scratch, table, light, powers, out, depth, normal;
+    std::vector<float> values, lowest, highest, scratch, table, light, powers, out, depth, normal;
+    std::vector<float> grading;
     std::vector<double> extinction;
     std::vector<std::int32_t> distance;
     std::vector<std::uint32_t> cells;

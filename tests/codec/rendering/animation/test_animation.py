@@ -93,6 +93,9 @@ def test_a_file_says_what_the_words_say(volume: Volume, tmp_path: Path) -> None:
     [
         ("steps=3", "malformed"),
         ("orbit=left", "malformed"),
+        ("steps=0:4:1:1", "malformed"),
+        ("steps=0:4:x", "malformed"),
+        ("steps=0:4:0", "allowed"),
         ("nowhere.toml", "no such animation"),
     ],
 )
@@ -111,6 +114,9 @@ def test_words_that_mean_nothing(words: str, part: str, volume: Volume) -> None:
         ({"keys": [{"camra": {}}]}, "did you mean 'camera'"),
         ({"steps": [0, 1], "keys": [{"step": 1}, {}]}, "not by both"),
         ({"frames": 0}, "allowed"),
+        ({"steps": [0, 4], "every": 2, "frames": 3}, "exclude each other"),
+        ({"orbit": 90, "every": 2}, "is of steps or times"),
+        ({"steps": [0, 4], "every": 0}, "allowed"),
     ],
 )
 def test_animations_that_are_none(values: dict[str, Any], part: str) -> None:
@@ -124,7 +130,34 @@ def test_nothing_changes_and_steps_outside_are_refused(volume: Volume) -> None:
     for animation in (
         Animation(steps=(0, 5)),
         Animation(times=(-1, 2)),
+        Animation(steps=(0, 5), every=4.0),
+        Animation(times=(0, 9), every=4.0),
         Animation(keys=(Key(step=9.0), Key())),
     ):
         with pytest.raises(RegionError):
             animation.scenes(SMALL, volume)
+
+
+@pytest.mark.parametrize(
+    ("words", "steps"),
+    [
+        ("steps=0:4:2", [0, 2, 4]),
+        ("steps=0:4:3", [0, 3]),
+        ("steps=4:0:2", [4, 2, 0]),
+        ("steps=::2", [0, 2, 4]),
+        ("steps=1::0.5", [1, 1.5, 2, 2.5, 3, 3.5, 4]),
+        ("steps=:3:1", [0, 1, 2, 3]),
+        ("steps=0:3:0.1", [number / 10 for number in range(31)]),
+        ("steps=2:3:5", [2]),
+    ],
+)
+def test_every_n_th_step(words: str, steps: list[float], volume: Volume) -> None:
+    animation = Animation.parse(words, volume)
+    assert [scene.step for scene in animation.scenes(SMALL, volume)] == steps
+    assert animation.rate == (8.0 if all(float(step).is_integer() for step in steps) else 24.0)
+
+
+def test_every_n_th_time_and_an_orbit(volume: Volume) -> None:
+    scenes = Animation.parse("time=0:8:3,orbit=90", volume).scenes(SMALL, volume)
+    assert [scene.time for scene in scenes] == [0, 3, 6]
+    assert [scene.camera.azimuth for scene in scenes] == [0, 45, 90]

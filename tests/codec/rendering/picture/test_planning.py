@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,21 @@ def test_the_histogram_is_asked_for_only_where_it_matters(files: dict[str, Path]
             },
             "take one",
         ),
+        (
+            {"effects": {"maximum_intensity": True, "minimum_intensity": True}},
+            "names maximum and minimum intensity; leave one of them",
+        ),
+        (
+            {
+                "transfer_function": {"gradient_opacity": [[0, 1]]},
+                "effects": {"average_intensity": True},
+            },
+            "has no opacity that 'gradient_opacity' could change",
+        ),
+        ({"transfer_function": {"gradient_opacity": [[1, 0], [0, 1]]}}, "do not ascend"),
+        ({"transfer_function": {"gradient_opacity": [[0, 0], [1, 2]]}}, "reach to 2; allowed"),
+        ({"transfer_function": {"gradient_opacity": [[0, 0], [1, 0]]}}, "one of them above 0"),
+        ({"effects": {"clip": {"x": [99, 100]}}}, "x 99 to 100 leaves nothing of the volume"),
         ({"transfer_function": {"opacity": [[0, 0], [9, 0]]}}, "shows nothing"),
         ({"transfer_function": {"density": 0}}, "shows nothing"),
         ({"background": "wite"}, "did you mean 'white'"),
@@ -269,3 +285,29 @@ def test_the_errors_of_a_bounded_file_are_noise(tmp_path: Path) -> None:
             assert coding_noise(volume) == pytest.approx(factor * largest)
             assert plan(volume).task.noise == pytest.approx(factor * largest)
         (tmp_path / "a.fhz").unlink()
+
+
+def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None:
+    spec = {"range": [1, 6], "opacity": [[3, 0], [4, 1], [5, 0]]}
+    for effect, low in ((None, 3.0), ("minimum_intensity", 1.0), ("average_intensity", 1.0)):
+        effects = {} if effect is None else {effect: True}
+        scene = Scene.from_dict({"transfer_function": spec, "effects": effects})
+        table = plan_picture(volume, scene).task.table
+        assert table is not None
+        assert table.low == pytest.approx(low)
+
+
+def test_a_clip_is_all_that_is_decoded(volume: Volume) -> None:
+    clip = {"z": [5, 7.5], "x": [9, 12]}
+    for effects in ({}, {"shadows": True}):
+        scene = Scene.from_dict({"effects": {"clip": clip, **effects}})
+        region = plan_picture(volume, scene).region
+        for (low, high), tile, ends in zip(
+            region, volume.chunks[1:], ((5, 8), (0, 23), (9, 12)), strict=True
+        ):
+            assert low == ends[0] // tile * tile
+            assert high >= ends[1] + 1
+            assert high - ends[1] <= tile
+        coarse = replace(scene, march=replace(scene.march, lod=2))
+        wide = plan_picture(volume, coarse).region
+        assert all(a <= c and d <= b for (a, b), (c, d) in zip(wide, region, strict=True))

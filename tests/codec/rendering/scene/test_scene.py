@@ -62,6 +62,22 @@ def test_a_scene_that_is_not_there(tmp_path: Path, name: str) -> None:
         ({"camra": {}}, "did you mean 'camera'"),
         ({"effects": {"shadow": True}}, "did you mean 'shadows'"),
         ({"evolution": {}}, "steps is missing"),
+        ({"effects": {"clip": True}}, "clip cuts nothing"),
+        ({"effects": {"clip": {"z": [2, 1]}}}, "z is 2 to 1; the first end must be below"),
+        ({"effects": {"clip": {"planes": [{"normal": [0, 0, 1]}]}}}, "either a point or an offset"),
+        ({"effects": {"clip": {"planes": [{"offset": 1}]}}}, "normal is missing"),
+        (
+            {"effects": {"clip": {"planes": [{"normal": [0, 0, 0], "offset": 1}]}}},
+            "the normal has no length",
+        ),
+        (
+            {"effects": {"clip": {"planes": 7 * [{"normal": [0, 0, 1], "offset": 1}]}}},
+            "clip has 7 planes; allowed: 6",
+        ),
+        (
+            {"effects": {"attenuated_maximum_intensity": {"attenuation": 0}}},
+            "attenuation is 0; allowed: 1e-06 to 1000",
+        ),
         ({"size": [0, 9]}, "size is 0; allowed: 1 to 16384"),
     ],
 )
@@ -70,3 +86,20 @@ def test_scenes_that_contradict_themselves_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         Scene.from_dict(values)
+
+
+def test_a_clip_and_projections_are_read_and_written() -> None:
+    planes = [{"normal": [0, 0, 1], "offset": 2.0}, {"point": [1, 2, 3], "normal": [1, 1, 0]}] * 3
+    values = {
+        "transfer_function": {"gradient_opacity": [[0, 0.0], [0.5, 1]]},
+        "effects": {"clip": {"x": [None, 3.5], "z": [0, None], "planes": planes}},
+    }
+    scene = Scene.from_dict(values)
+    assert Scene.from_dict(scene.to_dict()) == scene
+    assert json.loads(json.dumps(scene.to_dict())) == json.loads(json.dumps(values))
+    assert Scene.from_dict({"effects": {"clip": False}}) == Scene()
+    both = Scene.from_dict(
+        {"effects": {"average_intensity": True, "attenuated_maximum_intensity": True}}
+    )
+    assert both.effects.projections == ("average", "attenuated")
+    assert scene.effects.projections == ()
