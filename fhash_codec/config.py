@@ -167,7 +167,11 @@ class EncodeConfig:
     engine: str = option(
         "auto", "paper: training engine", choices=("auto", *ENGINES), profile="paper"
     )
-    device: str = option("auto", "where to train", choices=("auto", "cpu", "cuda"))
+    device: str = option(
+        "auto",
+        "paper: where to train; compact computes on the CPU",
+        choices=("auto", "cpu", "cuda"),
+    )
     seed: int = option(0, "seed of every random choice", low=0, high=2**63 - 1)
     timings: bool = option(
         True,
@@ -225,6 +229,12 @@ class EncodeConfig:
                     f"{_option_name(field)} belongs to --profile {profile}; "
                     f"the profile is {self.profile}"
                 )
+
+        if self.device == "cuda" and self.profile != "paper":
+            raise InputError(
+                f"device 'cuda' belongs to --profile paper; profile {self.profile} computes on "
+                "the CPU"
+            )
 
     def _check_promises(self) -> None:
         """Raise InputError if more than one promise is given."""

@@ -19,6 +19,7 @@ from fhash_codec.header import brief_quality
 from fhash_codec.paper.encode import encode_paper
 from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
+from fhash_codec.training.devices import need_torch
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter
@@ -52,13 +53,16 @@ def encode(
     Returns the figures of the written file (see `report`). Ctrl-C during the training saves a
     checkpoint beside `path` and raises InterruptedEncodingError; the same call then continues from
     the checkpoint to the same result. Raises InputError for a source or settings that cannot be
-    encoded. Raises QualityError, with the file written and its figures in the error, if the file
-    misses what the settings promise.
+    encoded, and MissingDependencyError for the profile paper without torch. Raises QualityError,
+    with the file written and its figures in the error, if the file misses what the settings
+    promise.
     """
     config, path = config or EncodeConfig(), Path(os.path.normpath(path))
     begun = time.perf_counter()
     check_name(path)
     check_output(path, force)
+    if config.profile == "paper":
+        need_torch("profile paper")
     with open_source(source) as series:
         check_output(path, force, sources=[*series.files, *_mask_files(config)])
         with ContainerWriter(path, force=force) as writer:

@@ -1,9 +1,10 @@
-"""Loader of the codec's native library: the C++ of the ray marcher and of the quality figures.
+"""Loader of the codec's native library: the C++ of the ray marcher, of the quality figures
+and of the training of heads.
 
 It is a library beside that of `fhash_formats.native`, loaded in the same way and switched off by
 the same `FHASH_NATIVE=0`. Each of the two may be missing without the other: whoever calls a
-function of a library also has a way without it. The figures then have the same bits; pictures agree
-within rounding.
+function of a library also has a way without it. Figures and heads then have the same bits; pictures
+agree within rounding.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
 
-ABI_VERSION = 1
+ABI_VERSION = 2
 """Number that `fhash_codec_abi_version()` must return; it equals `FHASH_CODEC_ABI` in codec.cpp."""
 
 _KINDS = ("f32", "f64")
@@ -41,6 +42,9 @@ PROTOTYPES: Prototypes = {
     **{f"fhash_errors_{kind}": _ERRORS for kind in _KINDS},
     **{f"fhash_ssim_{kind}": _SSIM for kind in _KINDS},
     "fhash_magnitudes": (ARRAY, INTEGER, INTEGER, ARRAY, ARRAY),
+    # train_head.cpp
+    "fhash_head_learn": (*(ARRAY,) * 10, INTEGER, INTEGER, INTEGER),
+    "fhash_head_errors": (*(ARRAY,) * 6, INTEGER, ARRAY),
 }
 """Functions of this package's library that Python calls."""
 

@@ -122,7 +122,9 @@ def train(
     measured in the same run.
     """
     from fhash_codec.config import ENGINES
+    from fhash_codec.training.devices import need_torch
 
+    need_torch("bench train")
     with source.open(data) as series, Progress(quiet=quiet) as progress:
         from fhash_codec.bench.train import bench_train
 

@@ -112,10 +112,20 @@ def _text(summary: Summary) -> str:
             )
     failures = summary.failures
     last = (
-        ["everything holds"]
+        [f"everything holds{_left_out(summary)}"]
         if summary.holds
-        else [f"what does not hold ({len(failures)}):", *failures]
+        else [f"what does not hold ({len(failures)}){_left_out(summary)}:", *failures]
     )
     return "\n".join(
         [table(groups), "", *([table(figures), ""] if len(figures) > 1 else []), *last]
+    )
+
+
+def _left_out(summary: Summary) -> str:
+    """What was left out for want of torch; nothing where torch is installed."""
+    if not summary.left_out:
+        return ""
+    return (
+        f"; {summary.left_out} settings of the profile paper are left out, since they need torch"
+        " (pip install 'fhash[train]')"
     )

@@ -13,12 +13,11 @@ from fhash_codec.bench.machine import machine
 from fhash_codec.bench.rate.measuring import Bench
 from fhash_codec.bench.rate.own import PROFILES, promised
 from fhash_codec.bench.rate.peers import peers
-from fhash_codec.bench.rate.results import PEERS, RateBench
+from fhash_codec.bench.rate.results import OWN, PEERS, RateBench
 from fhash_codec.coreset.scan import scan
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
-from fhash_codec.training.devices import choose_device
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import ArraySeries
 
 TARGETS = (35.0, 40.0, 45.0, 50.0, 60.0)
@@ -93,7 +92,10 @@ def bench_rate(
         for variant in chosen:
             bench.search(variant)
         for profile in profiles:
-            bench.search_own(settings, profile)
+            try:
+                bench.search_own(settings, profile)
+            except MissingDependencyError as error:
+                bench.refused[f"{OWN}{profile}"] = str(error)
         if speed and targets:
             nearest = min(targets, key=lambda target: (abs(target - SPEED_AT), target))
             bench.measure_speed(nearest, variants)
@@ -108,7 +110,7 @@ def bench_rate(
             speeds=tuple(bench.speeds),
             access=tuple(bench.access),
             refused=bench.refused,
-            machine=machine(choose_device("cpu")),
+            machine=machine(),
             notes=NOTES,
         )
 

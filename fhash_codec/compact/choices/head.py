@@ -6,18 +6,17 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
+from threading import Event
+from typing import NamedTuple
 
 from fhash_codec.compact.choices.head_samples import Pair
+from fhash_codec.compact.choices.head_training import TrainedHead, train_head
 from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
-from fhash_formats.errors import InputError
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
-
-if TYPE_CHECKING:
-    from fhash_codec.compact.choices.head_training import TrainedHead
 
 __all__ = ["HeadHistory", "choose_head"]
 
@@ -77,6 +76,8 @@ PERCEPTRON = Shape((12, 8), cross=False)
 """Head that competes, too: where little is to be gained, its fewer weights may win."""
 PERCEPTRON_LONGER = 2
 """Factor of the training of the perceptron, whose updates cost less."""
+TRIAL_SHARE = 0.2
+"""Share of the progress that the quick trial takes."""
 MIN_GAIN = 0.02
 """Gain in dB of the quick trial on held-out samples below which no head will pay."""
 GAIN_FACTOR = 1.2
@@ -118,7 +119,7 @@ def choose_head(
     data_range: float,
     effort: int,
     seed: int,
-    device: str,
+    progress: Callable[[float], None] | None = None,
 ) -> tuple[TileSettings, Outcome, HeadHistory]:
     """Return settings with a head and a larger step if they make the sample smaller.
 
@@ -132,11 +133,13 @@ def choose_head(
     strict: whether the promise is a bound, which all outcomes keep; else sizes are compared at
         the same PSNR.
     data_range: range of the values, in data units.
+    progress: called with the share of the trainings that is done, 0 to 1, now and then, from
+        several threads.
     """
     if outcome.size < MIN_BYTES:
         return settings, outcome, []
     wider = sample.wider(TRAINING_VERTICES)
-    training = _Training(seed=seed, device=device)
+    training = _Training(seed, progress)
     pairs = _training_pairs(wider, settings, coding)
     trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET)
     if trial is None or trial.gain_db < MIN_GAIN:
@@ -160,8 +163,13 @@ def choose_head(
 
     shapes = [Shape(widths, cross=True), PERCEPTRON] if widths else [PERCEPTRON]
     # Side by side: a training takes one processor, and so does coding a single tile.
+    training.expect(len(shapes))
     with ThreadPoolExecutor(2, thread_name_prefix="fhash-head") as workers:
-        trained_heads = list(workers.map(train, shapes))
+        try:
+            trained_heads = list(workers.map(train, shapes))
+        except BaseException:
+            training.stop()
+            raise
     candidates = [candidate for candidate in trained_heads if candidate is not None]
     return _cheapest(settings, outcome, candidates, strict=strict, data_range=data_range)
 
@@ -192,12 +200,17 @@ def _cheapest(
         if cost < lowest_cost or not history:
             psnr_without = psnr - candidate.trained.gain_db
             history = [
-                {"seconds": seconds, "epoch": update, "psnr": psnr_without + gain}
+                {"seconds": seconds, "epoch": update, "psnr": _finite(psnr_without + gain)}
                 for seconds, update, gain in candidate.trained.history
             ]
         if cost < lowest_cost:
             best, lowest_cost = (candidate.settings, candidate.outcome), cost
     return *best, history
+
+
+def _finite(psnr: float) -> float | None:
+    """Return a PSNR that the header can hold: None for that of values without an error."""
+    return psnr if math.isfinite(psnr) else None
 
 
 def _octave(tried: list[Outcome], data_range: float) -> float:
@@ -238,31 +251,50 @@ def _training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> l
     ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Training:
-    """Training of heads: the part of its options that is the same for all heads."""
+class _Stopped(Exception):
+    """Raised in a training that nobody waits for any more."""
 
-    seed: int
-    device: str
+
+class _Training:
+    """Training of heads: what is the same for all heads, how far they are, and an end to them."""
+
+    def __init__(self, seed: int, progress: Callable[[float], None] | None) -> None:
+        self._seed = seed
+        self._progress = progress
+        self._stopped = Event()
+        self._shares: dict[Shape, float] = {}
+        self._begin, self._end, self._number = 0.0, TRIAL_SHARE, 1
+
+    def expect(self, number: int) -> None:
+        """Expect so many trainings, after the trial."""
+        self._shares.clear()
+        self._begin, self._end, self._number = TRIAL_SHARE, 1.0, number
+
+    def stop(self) -> None:
+        """End the trainings in other threads as soon as they say how far they are."""
+        self._stopped.set()
 
     def run(
         self, pairs: Sequence[Pair], settings: TileSettings, shape: Shape, budget: Budget
     ) -> TrainedHead | None:
-        """Train a head; None where the decoded values are exact, so that there is no error."""
-        # torch takes seconds to import, and an effort without training does not need it.
-        from fhash_codec.compact.choices.head_training import train_head
+        """Train a head; None where there is nothing to learn."""
+        return train_head(
+            pairs,
+            low=settings.low,
+            high=settings.high,
+            hidden=shape.widths,
+            cross=shape.cross,
+            updates=budget.updates,
+            samples=budget.samples,
+            seed=self._seed,
+            progress=partial(self._report, shape),
+        )
 
-        try:
-            return train_head(
-                pairs,
-                low=settings.low,
-                high=settings.high,
-                hidden=shape.widths,
-                cross=shape.cross,
-                steps=budget.updates,
-                samples=budget.samples,
-                seed=self.seed,
-                device=self.device,
-            )
-        except InputError:
-            return None
+    def _report(self, shape: Shape, share: float) -> None:
+        """Pass on the share of a training that is done."""
+        if self._stopped.is_set():
+            raise _Stopped
+        self._shares[shape] = share
+        if self._progress is not None:
+            done = sum(self._shares.values()) / self._number
+            self._progress(self._begin + (self._end - self._begin) * done)
