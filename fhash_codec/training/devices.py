@@ -21,8 +21,10 @@ def need_torch(what: str) -> None:
     try:
         import torch  # noqa: F401
     except ImportError as error:
+        absent = isinstance(error, ModuleNotFoundError) and error.name == "torch"
+        reason = "" if absent else f" (the torch that is installed fails: {error})"
         raise MissingDependencyError(
-            f"{what} needs torch: pip install 'fhash[train]' ({error})"
+            f"{what} needs torch: pip install 'fhash[train]'{reason}"
         ) from error
 
 

@@ -61,11 +61,11 @@ class Effort:
 GAIN_BY_WIDTHS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
 """Gain in dB of a head with a cross by its widths, as a multiple of the gain of the trial head."""
 EFFORTS = {
-    5: Effort(candidates=4, budget=Budget(updates=1500, samples=200_000)),
-    6: Effort(candidates=4, budget=Budget(updates=2500, samples=200_000)),
-    7: Effort(candidates=4, budget=Budget(updates=4000, samples=400_000)),
-    8: Effort(candidates=5, budget=Budget(updates=6000, samples=400_000)),
-    9: Effort(candidates=5, budget=Budget(updates=10000, samples=400_000)),
+    5: Effort(candidates=4, budget=Budget(updates=3000, samples=200_000)),
+    6: Effort(candidates=4, budget=Budget(updates=5000, samples=200_000)),
+    7: Effort(candidates=4, budget=Budget(updates=8000, samples=400_000)),
+    8: Effort(candidates=5, budget=Budget(updates=12000, samples=400_000)),
+    9: Effort(candidates=5, budget=Budget(updates=20000, samples=400_000)),
 }
 """Effort spent on heads by the effort of the encoder; below 5 there is no head."""
 TRIAL_HEAD = Shape((8, 8), cross=True)
