@@ -173,7 +173,7 @@ def test_what_the_progress_raises_ends_the_training(front: tuple[Floats, Floats]
             [Pair(*front, None)],
             low=-1.0,
             high=2.0,
-            updates=10**9,
+            updates=5000,
             samples=4096,
             progress=interrupt,
         )
