@@ -164,7 +164,8 @@ public:
         for (int l = 0; l < LAYERS; ++l) {
             const Layer& layer = layers[l];
             for (int64_t i = 0; i < layer.outputs * layer.inputs; ++i)
-                gradient[number++] = lane_sum(&layer.weight_sums[i * LANES]) * (per_voxel / units[l]);
+                gradient[number++] =
+                    lane_sum(&layer.weight_sums[i * LANES]) * (per_voxel / units[l]);
             for (int64_t o = 0; o < layer.outputs; ++o)
                 gradient[number++] = lane_sum(&layer.bias_sums[o * LANES]) * per_voxel;
         }
@@ -219,8 +220,8 @@ bool fits(const int64_t* sizes) {
 
 // Do the updates first .. first + count - 1 of a training. Update u learns from batch u % batches.
 //
-// sizes: batches, blocks of a batch, voxels of a block, voxels looked at for each, widths of the two
-// hidden layers.
+// sizes: batches, blocks of a batch, voxels of a block, voxels looked at for each, widths of the
+// two hidden layers.
 // parameters, means, squares: weights and biases of each layer in turn, and Adam's means of them.
 // rates, roots: of each update, the learning rate and the factor of the root of the mean square,
 // both corrected for Adam's start.

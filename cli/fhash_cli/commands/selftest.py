@@ -122,7 +122,7 @@ def _text(summary: Summary) -> str:
 
 
 def _left_out(summary: Summary) -> str:
-    """What was left out for want of torch; nothing where torch is installed."""
+    """Words on the settings that were left out without torch; empty where there are none."""
     if not summary.left_out:
         return ""
     return (

@@ -13,11 +13,11 @@ from fhash_codec.bench.machine import machine
 from fhash_codec.bench.rate.measuring import Bench
 from fhash_codec.bench.rate.own import PROFILES, promised
 from fhash_codec.bench.rate.peers import peers
-from fhash_codec.bench.rate.results import OWN, PEERS, RateBench
+from fhash_codec.bench.rate.results import PEERS, RateBench
 from fhash_codec.coreset.scan import scan
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
-from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
 
 TARGETS = (35.0, 40.0, 45.0, 50.0, 60.0)
@@ -92,10 +92,7 @@ def bench_rate(
         for variant in chosen:
             bench.search(variant)
         for profile in profiles:
-            try:
-                bench.search_own(settings, profile)
-            except MissingDependencyError as error:
-                bench.refused[f"{OWN}{profile}"] = str(error)
+            bench.search_own(settings, profile)
         if speed and targets:
             nearest = min(targets, key=lambda target: (abs(target - SPEED_AT), target))
             bench.measure_speed(nearest, variants)
