@@ -177,7 +177,12 @@ class EncodeConfig:
     engine: str = option(
         "auto", "paper: training engine", choices=("auto", *ENGINES), profile="paper"
     )
-    device: str = option("auto", "where to train", choices=("auto", "cpu", "cuda"))
+    device: str = option(
+        "auto",
+        "paper: where to train",
+        choices=("auto", "cpu", "cuda"),
+        profile="paper",
+    )
     seed: int = option(0, "seed of every random choice", low=0, high=2**63 - 1)
     timings: bool = option(
         True,
@@ -228,8 +233,10 @@ class EncodeConfig:
     def _check_profile(self) -> None:
         """Raise InputError for a setting that belongs to the other profile."""
         for field in dataclasses.fields(self):
-            profile = field.metadata["profile"]
-            if profile and profile != self.profile and getattr(self, field.name) != field.default:
+            profile, value = field.metadata["profile"], getattr(self, field.name)
+            if field.name == "device" and value == "cpu":
+                continue  # where every other profile computes
+            if profile and profile != self.profile and value != field.default:
                 raise InputError(
                     f"{_option_name(field)} belongs to --profile {profile}; "
                     f"the profile is {self.profile}"

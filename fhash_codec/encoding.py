@@ -20,7 +20,7 @@ from fhash_codec.paper.encode import encode_paper
 from fhash_codec.progress import Progress, silent
 from fhash_codec.promises import missed_promise, remarks
 from fhash_codec.report import report
-from fhash_codec.training.devices import choose_device
+from fhash_codec.training.devices import choose_device, need_torch
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter
@@ -61,7 +61,8 @@ def encode(
     KeyboardInterrupt passes through, and the same call starts again.
 
     Raises InputError for a source or settings that cannot be encoded, or for a promise that is seen
-    to be out of reach. Raises QualityError, with the figures of the file in the error, if the file
+    to be out of reach, and MissingDependencyError for the profile paper without torch. Raises
+    QualityError, with the figures of the file in the error, if the file
     misses what the settings promise. It is written nevertheless: as `path` where that is free; an
     older file stays as it is, and the new one is written beside it (`missed_path`). Warns
     (FhashWarning) where the bulk of the values is far worse than an explicit promise sounds.
@@ -70,7 +71,8 @@ def encode(
     begun = time.perf_counter()
     check_name(path)
     check_output(path, force)
-    if config.device == "cuda":
+    if config.profile == "paper":
+        need_torch("profile paper")
         choose_device(config.device)  # told now, and not after the planning
     with open_source(source) as series:
         check_output(path, force, sources=[*series.files, *_mask_files(config)])

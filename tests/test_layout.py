@@ -28,8 +28,8 @@ ALLOWED = {
     "fhash_cli": {"fhash_cli", "fhash_codec", "fhash_formats"},
 }
 TORCH_FILES = re.compile(
-    r"paper/(fhash|tesseract)\.py|paper/(training|engines)/.+\.py|training/.+\.py|bench/.+\.py"
-    r"|compact/choices/head_training\.py|rendering/task/torch_arrays\.py"
+    r"paper/(fhash|tesseract)\.py|paper/(training|engines)/.+\.py|training/.+\.py|bench/train\.py"
+    r"|rendering/task/torch_arrays\.py"
 )
 """Modules of fhash_codec that train or evaluate tensors, march through them, or start training."""
 SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy")

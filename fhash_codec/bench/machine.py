@@ -6,15 +6,14 @@ import os
 import platform
 from typing import Any
 
-import torch
+from fhash_formats.support.threads import usable_threads
 
 
-def machine(device: torch.device) -> dict[str, Any]:
-    """Describe the device, processor, cores, threads and torch version of this machine."""
+def machine() -> dict[str, Any]:
+    """Describe the processor, cores and threads of this machine, which computes on its CPU."""
     return {
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+        "device": "cpu",
         "processor": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "torch": torch.__version__,
+        "threads": usable_threads(),
     }

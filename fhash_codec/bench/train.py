@@ -87,7 +87,7 @@ def bench_train(
         peak = matrix_product_rate(device)
         flops = 3 * 2 * sum(outputs * inputs for outputs, inputs in architecture.layer_shapes)
         results = [run.result(flops, peak) for run in runs]
-        used = machine(device) | {"matrix_product_gflops": peak / 1e9}
+        used = machine() | _torch_on(device) | {"matrix_product_gflops": peak / 1e9}
     naive = next((result for result in results if result["engine"] == "naive"), None)
     for result in results:
         for kind in ("train", "infer"):
@@ -100,6 +100,15 @@ def bench_train(
         "series": name,
         "samples": len(coreset.values),
         "batch_samples": len(coreset.values) / plan.batches,
+    }
+
+
+def _torch_on(device: torch.device) -> dict[str, Any]:
+    """Describe torch and the device that it computes on."""
+    return {
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
     }
 
 

@@ -186,7 +186,6 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
         data_range=goal.data_range,
         effort=config.effort,
         seed=config.seed,
-        device=config.device,
         parts=task.parts,
     )
     task.gains.note("head" if settings.head is not None else "head (left out)", outcome)

@@ -1,9 +1,10 @@
-"""Loader of the codec's native library: the C++ of the ray marcher and of the quality figures.
+"""Loader of the codec's native library: the C++ of the ray marcher, of the quality figures
+and of the training of heads.
 
 It is a library beside that of `fhash_formats.native`, loaded in the same way and switched off by
 the same `FHASH_NATIVE=0`. Each of the two may be missing without the other: whoever calls a
-function of a library also has a way without it. The figures then have the same bits; pictures agree
-within rounding.
+function of a library also has a way without it. Figures and heads then have the same bits; pictures
+agree within rounding.
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ PROTOTYPES: Prototypes = {
     **{f"fhash_histogram_{kind}": _HISTOGRAM for kind in _KINDS},
     **{f"fhash_ssim_{kind}": _SSIM for kind in _KINDS},
     "fhash_magnitudes": (ARRAY, INTEGER, INTEGER, ARRAY, ARRAY),
+    # train_head.cpp
+    "fhash_head_learn": (*(ARRAY,) * 10, INTEGER, INTEGER, INTEGER),
+    "fhash_head_errors": (*(ARRAY,) * 6, INTEGER, ARRAY),
 }
 """Functions of this package's library that Python calls."""
 

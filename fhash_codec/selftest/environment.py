@@ -11,24 +11,23 @@ from importlib.metadata import version
 
 import fhash_codec.native as codec_native
 import fhash_formats.native as formats_native
+from fhash_codec.training.devices import choose_device, has_torch
 from fhash_formats.support.threads import usable_threads
 
 __all__ = ["describe_machine", "environment"]
 
 
 def describe_machine() -> str:
-    """Versions, machine and the parts of it that are used, in one line. Loads torch."""
-    from fhash_codec.training.devices import choose_device
-
+    """Versions, machine and the parts of it that are used, in one line. Loads torch if it can."""
     facts = [
         f"fhash {version('fhash')}",
         f"Python {platform.python_version()}",
         f"numpy {version('numpy')}",
-        f"torch {version('torch')}",
+        f"torch {version('torch')}" if has_torch() else "no torch",
         f"{platform.system()} {platform.machine()}",
         f"{usable_threads()} processors",
         "native core" if native_code() else "without the native core",
-        "CUDA" if choose_device("auto").type == "cuda" else "no CUDA",
+        "CUDA" if has_torch() and choose_device("auto").type == "cuda" else "no CUDA",
     ]
     return ", ".join(facts)
 

@@ -37,6 +37,7 @@ class CaseResult:
         under: names of the settings that were tried.
         findings: the findings under all settings, each with the name of its settings in `under`.
         errors: one line for each error that kept the case, or a check of it, from finishing.
+        left_out: names of settings that were not tried, since they need torch.
     """
 
     name: str
@@ -45,6 +46,7 @@ class CaseResult:
     under: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     errors: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -79,6 +81,7 @@ class CaseResult:
             "holds": self.holds,
             "findings": [_finding_dict(finding) for finding in self.findings],
             "errors": list(self.errors),
+            "left_out": list(self.left_out),
         }
 
     @classmethod
@@ -95,9 +98,8 @@ class CaseResult:
             for values_of_finding in values["findings"]
         )
         plain = {name: values[name] for name in ("name", "group", "about")}
-        return cls(
-            **plain, under=tuple(values["under"]), findings=findings, errors=tuple(values["errors"])
-        )
+        lists = {name: tuple(values[name]) for name in ("under", "errors", "left_out")}
+        return cls(**plain, **lists, findings=findings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +125,11 @@ class Summary:
     def failures(self) -> list[str]:
         """One line for each failure, beginning with the name of the case."""
         return [f"{result.name}: {line}" for result in self.results for line in result.failures]
+
+    @property
+    def left_out(self) -> int:
+        """The number of settings that were not tried, since they need torch."""
+        return sum(len(result.left_out) for result in self.results)
 
     def worst(self) -> dict[str, tuple[CaseResult, Finding]]:
         """The finding nearest to its limit for each property, by name, with its case."""

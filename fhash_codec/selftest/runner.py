@@ -19,6 +19,7 @@ from fhash_codec.selftest.case import RUN_THREADS, Case, Check, Finding, Run
 from fhash_codec.selftest.checks.properties import COMMON_CHECKS
 from fhash_codec.selftest.environment import environment
 from fhash_codec.selftest.results import CaseResult
+from fhash_codec.training.devices import has_torch
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError, QualityError
 from fhash_formats.series import Series
@@ -39,6 +40,8 @@ def run_case(
         checks: the checks of every run, in addition to the checks of the case.
     """
     settings: Mapping[str, EncodeConfig] = {**case.settings, **(case.more if everything else {})}
+    left_out = [name for name, config in settings.items() if not _possible(config)]
+    settings = {name: config for name, config in settings.items() if name not in left_out}
     findings: list[Finding] = []
     errors: list[str] = []
     with warnings.catch_warnings():
@@ -72,7 +75,13 @@ def run_case(
         under=tuple(settings),
         findings=tuple(findings),
         errors=tuple(errors),
+        left_out=tuple(left_out),
     )
+
+
+def _possible(config: EncodeConfig) -> bool:
+    """Whether settings can be tried here: the profile paper needs torch."""
+    return config.profile != "paper" or has_torch()
 
 
 def _run(

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from threading import Lock
 
 # Between two small operations OpenMP threads spin, by default for milliseconds. On a machine in
 # shared use the spinning threads keep off the core the very threads they wait for: training runs 8
@@ -38,39 +37,3 @@ def threads_for(vertices: int) -> Iterator[int]:
         yield threads
     finally:
         torch.set_num_threads(before)
-
-
-class _SingleThreadUsers:
-    """Number of callers inside `one_thread`, and the torch threads before the first of them."""
-
-    def __init__(self) -> None:
-        self.lock = Lock()
-        self.inside = 0
-        self.threads_before = 1
-
-
-_users = _SingleThreadUsers()
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one thread inside the context.
-
-    Small batches gain little from a second thread, and wait for ever where another process holds
-    its core. Contexts of several threads may overlap: torch's number of threads is partly a
-    setting of the process, so the first context to begin saves it and the last to end restores it.
-    """
-    import torch
-
-    with _users.lock:
-        if not _users.inside:
-            _users.threads_before = torch.get_num_threads()
-        _users.inside += 1
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        with _users.lock:
-            _users.inside -= 1
-            if not _users.inside:
-                torch.set_num_threads(_users.threads_before)

@@ -123,7 +123,9 @@ def train(
     measured in the same run.
     """
     from fhash_codec.config import ENGINES
+    from fhash_codec.training.devices import need_torch
 
+    need_torch("bench train")
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         from fhash_codec.bench.train import bench_train
 

@@ -29,7 +29,6 @@ from fhash_codec.rendering.scene.scene import (
     Shadows,
     TransferFunctionSpec,
 )
-from fhash_codec.training.devices import choose_device
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError, MissingDependencyError
 
@@ -105,7 +104,7 @@ def bench_render(
     )
     bench = _Bench(volume, plain, turns, progress)
     results, refused, version = _measure(bench, parts)
-    used = machine(choose_device("cpu"))
+    used = machine()
     if version is not None:
         used["vtk"] = version
     return RenderBench(

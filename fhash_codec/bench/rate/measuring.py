@@ -33,8 +33,9 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.measure.metrics import Errors
 from fhash_codec.progress import Progress
+from fhash_codec.training.devices import need_torch
 from fhash_codec.value_type import decoded_type
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, MissingDependencyError
 from fhash_formats.series import ArraySeries
 
 TRIALS = 8
@@ -151,7 +152,13 @@ class Bench:
         return Search(measure, step=variant.step, fixed=variant.lossless)
 
     def search_own(self, settings: Mapping[str, Any], profile: str) -> None:
-        """Encode with a profile for every goal."""
+        """Encode with a profile for every goal; one that lacks a package is refused."""
+        if profile == "paper":
+            try:
+                need_torch("profile paper")
+            except MissingDependencyError as error:
+                self.refused[f"{OWN}{profile}"] = str(error)
+                return
         for goal, asked in self.goals:
             config = promised(settings, profile, goal, asked)
             self.done += 1

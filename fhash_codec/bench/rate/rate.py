@@ -17,7 +17,6 @@ from fhash_codec.bench.rate.results import PEERS, RateBench
 from fhash_codec.coreset.scan import scan
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
-from fhash_codec.training.devices import choose_device
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries
 
@@ -108,7 +107,7 @@ def bench_rate(
             speeds=tuple(bench.speeds),
             access=tuple(bench.access),
             refused=bench.refused,
-            machine=machine(choose_device("cpu")),
+            machine=machine(),
             notes=NOTES,
         )
 

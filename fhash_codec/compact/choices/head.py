@@ -8,19 +8,16 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Event
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from fhash_codec.compact.choices.head_samples import Pair
+from fhash_codec.compact.choices.head_training import TrainedHead, train_head
 from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.progress import Parts
-from fhash_formats.errors import InputError
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
-
-if TYPE_CHECKING:
-    from fhash_codec.compact.choices.head_training import TrainedHead
 
 __all__ = ["HeadHistory", "choose_head"]
 
@@ -65,11 +62,11 @@ class Effort:
 GAIN_BY_WIDTHS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
 """Gain in dB of a head with a cross by its widths, as a multiple of the gain of the trial head."""
 EFFORTS = {
-    5: Effort(candidates=4, budget=Budget(updates=1500, samples=200_000)),
-    6: Effort(candidates=4, budget=Budget(updates=2500, samples=200_000)),
-    7: Effort(candidates=4, budget=Budget(updates=4000, samples=400_000)),
-    8: Effort(candidates=5, budget=Budget(updates=6000, samples=400_000)),
-    9: Effort(candidates=5, budget=Budget(updates=10000, samples=400_000)),
+    5: Effort(candidates=4, budget=Budget(updates=3000, samples=200_000)),
+    6: Effort(candidates=4, budget=Budget(updates=5000, samples=200_000)),
+    7: Effort(candidates=4, budget=Budget(updates=8000, samples=400_000)),
+    8: Effort(candidates=5, budget=Budget(updates=12000, samples=400_000)),
+    9: Effort(candidates=5, budget=Budget(updates=20000, samples=400_000)),
 }
 """Effort spent on heads by the effort of the encoder; below 5 there is no head."""
 TRIAL_HEAD = Shape((8, 8), cross=True)
@@ -124,7 +121,6 @@ def choose_head(
     data_range: float,
     effort: int,
     seed: int,
-    device: str,
     parts: Parts | None = None,
 ) -> tuple[TileSettings, Outcome, HeadHistory]:
     """Return settings with a head and a larger step if they make the sample smaller.
@@ -144,7 +140,7 @@ def choose_head(
     if outcome.size < MIN_BYTES:
         return settings, outcome, []
     wider = sample.wider(TRAINING_VERTICES)
-    training = _Training(seed=seed, device=device)
+    training = _Training(seed=seed)
     pairs = _training_pairs(wider, settings, coding)
     parts = parts or Parts()
     tell = partial(parts.report, "training")
@@ -230,12 +226,17 @@ def _cheapest(
         if cost < lowest_cost or not history:
             psnr_without = psnr - candidate.trained.gain_db
             history = [
-                {"seconds": seconds, "epoch": update, "psnr": psnr_without + gain}
+                {"seconds": seconds, "epoch": update, "psnr": _finite(psnr_without + gain)}
                 for seconds, update, gain in candidate.trained.history
             ]
         if cost < lowest_cost:
             best, lowest_cost = (candidate.settings, candidate.outcome), cost
     return *best, history
+
+
+def _finite(psnr: float) -> float | None:
+    """Return a PSNR that the header can hold: None for that of values without an error."""
+    return psnr if math.isfinite(psnr) else None
 
 
 def _octave(tried: list[Outcome], data_range: float) -> float:
@@ -281,7 +282,6 @@ class _Training:
     """Training of heads: the part of its options that is the same for all heads."""
 
     seed: int
-    device: str
 
     def run(
         self,
@@ -291,25 +291,18 @@ class _Training:
         budget: Budget,
         progress: Callable[[float], None],
     ) -> TrainedHead | None:
-        """Train a head; None where the decoded values are exact, so that there is no error.
+        """Train a head; None where there is nothing to learn.
 
         progress: called with the share of the training that is done.
         """
-        # torch takes seconds to import, and an effort without training does not need it.
-        from fhash_codec.compact.choices.head_training import train_head
-
-        try:
-            return train_head(
-                pairs,
-                low=settings.low,
-                high=settings.high,
-                hidden=shape.widths,
-                cross=shape.cross,
-                steps=budget.updates,
-                samples=budget.samples,
-                seed=self.seed,
-                device=self.device,
-                progress=progress,
-            )
-        except InputError:
-            return None
+        return train_head(
+            pairs,
+            low=settings.low,
+            high=settings.high,
+            hidden=shape.widths,
+            cross=shape.cross,
+            updates=budget.updates,
+            samples=budget.samples,
+            seed=self.seed,
+            progress=progress,
+        )

@@ -9,16 +9,36 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
 from fhash_formats.transform.head.head_portable import centre_inputs, clip, compress
 from fhash_formats.transform.head.inputs import INPUTS, OFFSETS
 
-__all__ = ["BATCH_VOXELS", "Batches", "ErrorRange", "Pair", "Voxels", "batches", "draw"]
+__all__ = [
+    "BATCH_VOXELS",
+    "BLOCK_VOXELS",
+    "ERROR_UNIT",
+    "MAX_ERROR",
+    "Batches",
+    "ErrorRange",
+    "Pair",
+    "Voxels",
+    "batches",
+    "count_voxels",
+    "draw",
+]
 
 Floats = npt.NDArray[np.float32]
+Integers = npt.NDArray[np.int32]
 
 BATCH_VOXELS = 4096
 """Voxels of a training batch."""
+BLOCK_VOXELS = 64
+"""Voxels that the network computes together; train_head.hpp holds the same number."""
+ERROR_UNIT = 16384.0
+"""Integer steps in one sigma of a target."""
+MAX_ERROR = 1 << 24
+"""Largest magnitude of an error that a training sees, in these steps; larger ones are clipped."""
+MAX_TARGET = 1 << 30
+"""Largest magnitude of a target, in integer steps."""
 PIECE_VOXELS = 1 << 16
 """Voxels whose inputs are computed at once."""
 
@@ -55,16 +75,30 @@ class ErrorRange:
 
 @dataclass(frozen=True, kw_only=True)
 class Batches:
-    """Batches of n voxels."""
+    """Batches of n = blocks * BLOCK_VOXELS voxels."""
 
     inputs: npt.NDArray[np.int16]
-    """Inputs of the network (batches, INPUTS, voxels looked at, n)."""
-    targets: npt.NDArray[Any]
-    """Original minus decoded values (batches, n), in units of sigma."""
-    lowest: npt.NDArray[Any]
-    """Lowest useful output (batches, n), in units of sigma: a lower one is clipped."""
-    highest: npt.NDArray[Any]
-    """Highest useful output (batches, n), in units of sigma."""
+    """Inputs of the network (batches, blocks, INPUTS, voxels looked at, BLOCK_VOXELS)."""
+    targets: Integers
+    """Original minus decoded values (batches, n), in units of sigma / ERROR_UNIT."""
+    lowest: Integers
+    """Lowest useful output (batches, n), in the same unit: a lower one is clipped."""
+    highest: Integers
+    """Highest useful output (batches, n), in the same unit."""
+
+    def __len__(self) -> int:
+        return len(self.targets)
+
+
+def count_voxels(pairs: Sequence[Pair]) -> npt.NDArray[np.int64]:
+    """Return the number of voxels that count in each tile."""
+    return np.array(
+        [
+            pair.original.size if pair.counted is None else np.count_nonzero(pair.counted)
+            for pair in pairs
+        ],
+        dtype=np.int64,
+    )
 
 
 def draw(
@@ -74,16 +108,11 @@ def draw(
     low: np.float32,
     high: np.float32,
 ) -> list[Voxels]:
-    """Draw voxels that count, from each tile according to its number of them."""
-    counts = np.array(
-        [
-            pair.original.size if pair.counted is None else np.count_nonzero(pair.counted)
-            for pair in pairs
-        ],
-        dtype=np.int64,
-    )
-    if counts.sum() == 0:
-        raise InputError("a head cannot be trained: no voxel counts")
+    """Draw voxels that count, from each tile according to its number of them.
+
+    At least one must count.
+    """
+    counts = count_voxels(pairs)
     ends = np.rint(np.cumsum(counts) / counts.sum() * samples).astype(np.int64)
     drawn = []
     for pair, number in zip(pairs, np.diff(ends, prepend=0), strict=True):
@@ -111,24 +140,27 @@ def batches(
     originals = np.concatenate([voxels.originals for voxels in drawn])
     order = random.permutation(len(values))
     count = len(values) // BATCH_VOXELS
-    inputs = np.empty((count, INPUTS, len(offsets), BATCH_VOXELS), dtype=np.int16)
+    blocks = BATCH_VOXELS // BLOCK_VOXELS
+    inputs = np.empty((count * blocks, INPUTS, len(offsets), BLOCK_VOXELS), dtype=np.int16)
     first = 0
     for pair, voxels in zip(pairs, drawn, strict=True):
         for piece in _inputs(pair.decoded, voxels.places, offsets, value_range):
-            batch, slot = np.divmod(order[first : first + piece.shape[2]], BATCH_VOXELS)
-            inputs[batch, :, :, slot] = piece.transpose(2, 0, 1)
+            block, slot = np.divmod(order[first : first + piece.shape[2]], BLOCK_VOXELS)
+            inputs[block, :, :, slot] = piece.transpose(2, 0, 1)
             first += piece.shape[2]
 
-    def batched(unordered: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    def batched(unordered: npt.NDArray[np.float64]) -> Integers:
         shuffled = np.empty_like(unordered)
         shuffled[order] = unordered
-        return (shuffled / sigma).reshape(count, BATCH_VOXELS)
+        steps = np.rint(shuffled * (ERROR_UNIT / np.float64(sigma)))
+        return np.clip(steps, -MAX_TARGET, MAX_TARGET).astype(np.int32).reshape(count, BATCH_VOXELS)
 
+    wide = values.astype(np.float64)
     return Batches(
-        inputs=inputs,
-        targets=batched(originals - values),
-        lowest=batched(low - values),
-        highest=batched(high - values),
+        inputs=inputs.reshape(count, blocks, *inputs.shape[1:]),
+        targets=batched(originals - wide),
+        lowest=batched(low - wide),
+        highest=batched(high - wide),
     )
 
 

@@ -16,6 +16,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.progress import Progress, silent
+from fhash_codec.training.devices import choose_device
 from fhash_formats.errors import (
     FhashWarning,
     InputError,
@@ -116,7 +117,6 @@ class _Fitting:
         """Read the checkpoint if there is one."""
         from fhash_codec.paper.training.checkpoint import checkpoint_path, load_checkpoint
         from fhash_codec.paper.training.train import TrainingProgress
-        from fhash_codec.training.devices import choose_device
 
         self._coreset, self._architecture, self._config = coreset, architecture, config
         self._progress = progress

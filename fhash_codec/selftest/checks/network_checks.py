@@ -19,6 +19,7 @@ from fhash_codec.paper.regions import decode_region
 from fhash_codec.paper.storage import NumberType
 from fhash_codec.selftest.case import Finding, Run, as_floats
 from fhash_codec.selftest.checks.oracle import Oracle
+from fhash_codec.training.devices import choose_device
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
 
@@ -89,8 +90,6 @@ def engines(run: Run) -> Iterator[Finding]:
 
 def devices(run: Run) -> Iterator[Finding]:
     """A CUDA device trains the same network as the CPU; nothing is compared without CUDA."""
-    from fhash_codec.training.devices import choose_device
-
     try:
         choose_device("cuda")
     except InputError:

@@ -45,6 +45,7 @@ __all__ = [
     "MAX_HIDDEN",
     "MAX_WEIGHT",
     "MAX_WIDTH",
+    "SIGMA_RANGE",
     "Layer",
     "NeighbourHead",
     "layer_inputs",
@@ -59,12 +60,13 @@ MAX_CROSS_WIDTH = 14
 MAX_BIAS = 127
 """Largest magnitude of a quantised bias (8 bits)."""
 
+SIGMA_RANGE = (2.0**-100, 2.0**100)
+"""Least and greatest sigma; the inverse is an ordinary float32 as well."""
+
 _INPUT_UNIT = 512.0
 """Integer steps of an input in 1."""
 _ACTIVATION_UNIT = 128.0
 """Integer steps of an activation in 1."""
-_SIGMA_RANGE = (2.0**-100, 2.0**100)
-"""Least and greatest sigma; the inverse is an ordinary float32 as well."""
 _CROSSED = 0x82
 """First byte of a packed head with a cross, in place of the number of its hidden layers (two)."""
 _MAX_WEIGHT_BYTES = 3
@@ -153,9 +155,9 @@ class NeighbourHead:
                 "a head's sigma, low and high must be finite float32 values, "
                 f"not {self.sigma}, {self.low}, {self.high}"
             )
-        if not _SIGMA_RANGE[0] <= self.sigma <= _SIGMA_RANGE[1] or self.low > self.high:
+        if not SIGMA_RANGE[0] <= self.sigma <= SIGMA_RANGE[1] or self.low > self.high:
             raise InputError(
-                f"a head needs sigma in {_SIGMA_RANGE} and low <= high, "
+                f"a head needs sigma in {SIGMA_RANGE} and low <= high, "
                 f"not {self.sigma}, {self.low}, {self.high}"
             )
 

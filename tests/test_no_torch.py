@@ -1,0 +1,124 @@
+"""The package where torch is not installed: all but the profile paper and CUDA works."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+BLOCK = "import sys\nsys.modules['torch'] = None\n"
+"""Module that Python runs at its start: `import torch` then fails as if it were not installed."""
+SCRIPT = """
+import json, sys
+from click.testing import CliRunner
+from fhash_cli.main import program
+from fhash_codec.compact.choices import head
+
+head.TRIAL_BUDGET = head.Budget(updates=60, samples=8192)
+head.MIN_BYTES = 0
+head.EFFORTS[5] = head.Effort(candidates=4, budget=head.Budget(updates=80, samples=8192))
+for line in sys.stdin:
+    result = CliRunner().invoke(program, json.loads(line))
+    print(json.dumps([result.exit_code, result.stdout, result.stderr]))
+assert sys.modules["torch"] is None
+"""
+NEEDS = "needs torch: pip install 'fhash[train]'"
+
+
+def run(commands: list[list[str]], folder: Path) -> list[tuple[int, str, str]]:
+    """The exit code, stdout and stderr of each command, in one process without torch."""
+    site = folder / "site"
+    site.mkdir()
+    (site / "sitecustomize.py").write_text(BLOCK)
+    places = os.pathsep.join([str(site), *filter(None, sys.path)])
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        input="\n".join(json.dumps(command) for command in commands),
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": places},
+        cwd=folder,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return [tuple(json.loads(line)) for line in done.stdout.splitlines()]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("plain")
+    t, z, y, x = np.meshgrid(*map(np.arange, (3, 6, 24, 24)), indexing="ij")
+    front = x + 0.6 * y - 2 * t + 4 * np.sin(z / 5 + t / 4) - 26
+    np.save(folder / "data.npy", (1 / (1 + np.exp(-2 * front))).astype(np.float32))
+    commands = {
+        "encode": "encode data.npy -o run.fhz --json",
+        "decode": "decode run.fhz --t 1 -o step.npy",
+        "render": "render run.fhz -o step.png --size 64x64",
+        "stream": "render run.fhz -o stream.png --size 64x64 --march stream",
+        "info": "info run.fhz --json",
+        "verify": "verify run.fhz",
+        "diff": "diff data.npy run.fhz --min-psnr 50",
+        "bench rate": "bench rate data.npy --target 40 --peer none --no-speed --effort 1 --json",
+        "bench render": "bench render run.fhz --part accelerations --turns 1 --size 16 --json",
+        "selftest": "selftest --case constant-float32 --processes 1",
+        "paper": "encode data.npy -o paper.fhz --profile paper",
+        "cuda": "render run.fhz -o cuda.png --march arm --device cuda",
+        "bench train": "bench train data.npy",
+        "compact on cuda": "encode data.npy -o cuda.fhz --device cuda",
+    }
+    done = run([command.split() for command in commands.values()], folder)
+    return {"folder": folder, **dict(zip(commands, done, strict=True))}
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["encode", "decode", "render", "stream", "info", "verify", "diff", "bench rate",
+     "bench render", "selftest"],
+)  # fmt: skip
+def test_ordinary_commands_need_no_torch(results: dict[str, Any], command: str) -> None:
+    code, _, errors = results[command]
+    assert code == 0, errors
+
+
+def test_the_default_encode_trains_a_head(results: dict[str, Any]) -> None:
+    import fhash_codec
+
+    with fhash_codec.open(results["folder"] / "run.fhz") as volume:
+        assert volume.container.header["history"]["epoch"]
+
+
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [("paper", "profile paper"), ("cuda", "device 'cuda'"), ("bench train", "bench train")],
+)
+def test_what_needs_torch_says_so_in_one_line(
+    results: dict[str, Any], command: str, what: str
+) -> None:
+    code, _, errors = results[command]
+    assert code == 2
+    assert errors == f"fhash: error: {what} {NEEDS}\n"
+    assert "Traceback" not in errors
+    assert not (results["folder"] / "paper.fhz").exists()
+
+
+def test_a_device_for_compact_is_refused(results: dict[str, Any]) -> None:
+    code, _, errors = results["compact on cuda"]
+    assert code == 2
+    assert "device belongs to --profile paper" in errors
+
+
+def test_what_a_benchmark_leaves_out_is_told(results: dict[str, Any]) -> None:
+    report = json.loads(results["bench rate"][1])
+    assert NEEDS in report["refused"]["fhash paper"]
+    assert {point["codec"] for point in report["points"]} == {"fhash compact"}
+    assert "torch" not in report["machine"]
+
+
+def test_the_self_test_tells_what_it_leaves_out(results: dict[str, Any]) -> None:
+    assert "need torch (pip install 'fhash[train]')" in results["selftest"][1]
