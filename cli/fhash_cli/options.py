@@ -125,6 +125,15 @@ class SourceOptions:
 
         return list_variables(path, **self._wishes())
 
+    def refuse(self, path: str) -> None:
+        """Raise InputError if any option is given, for a path that is no data."""
+        given = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
+        if given:
+            raise InputError(
+                f"{path} is encoded already; --{given[0].replace('_', '-')} is for data that are"
+                " read"
+            )
+
     def _wishes(self) -> dict[str, Any]:
         from fhash_formats import RawLayout, parse_shape
 

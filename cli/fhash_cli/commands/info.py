@@ -49,6 +49,7 @@ def command(path: str, source: SourceOptions, as_json: bool) -> None:
         return
     import fhash_codec
 
+    source.refuse(path)
     with fhash_codec.open(path) as volume:
         info = volume.info
         emit(info, table(_rows(volume, info)), as_json)

@@ -146,3 +146,9 @@ def test_info_of_no_data_is_refused(refused: Callable[..., str], tmp_path: Path)
     assert "does not exist" in refused(2, "info", tmp_path / "missing.h5")
     (tmp_path / "a.txt").write_text("words")
     assert "no format that can be read" in refused(2, "info", tmp_path / "a.txt")
+
+
+def test_options_for_data_are_refused_for_a_run(refused: Callable[..., str], run: Path) -> None:
+    for words, name in ((["--var", "q"], "--var"), (["--missing", "-9"], "--missing")):
+        assert f"is encoded already; {name} is for data" in refused(2, "info", run, *words)
+    assert "--raw-values is for data" in refused(2, "info", run, "--raw-values")

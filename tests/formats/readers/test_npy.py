@@ -190,3 +190,11 @@ def test_npy_with_a_broken_header_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.npy").write_bytes(data)
     with pytest.raises(InputError, match=r"cannot be read as \.npy"):
         open_series(tmp_path / "a.npy")
+
+
+def test_a_complex_array_names_its_parts(tmp_path: Path) -> None:
+    wave = VALUES * (1 + 2j)
+    np.save(tmp_path / "a.npy", wave)
+    with pytest.raises(InputError, match=r"--var a\.real and --var a\.imag$"):
+        open_series(tmp_path / "a.npy")
+    assert_frames(tmp_path / "a.npy", wave.imag, var="a.imag")

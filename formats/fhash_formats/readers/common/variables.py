@@ -123,11 +123,13 @@ def choose(
         )
     if not variables:
         raise InputError(f"{source} holds no array at all")
+    # the parts of a complex array are told of by the array itself
+    found = [variable for variable in variables if not (variable.field and variable.auxiliary)]
     problems = "; ".join(
         f"{variable.name}: {variable.problem(booleans) or 'a coordinate or its bounds'}"
-        for variable in variables[:MAX_LISTED]
+        for variable in found[:MAX_LISTED]
     )
-    rest = f"; and {len(variables) - MAX_LISTED} more" if len(variables) > MAX_LISTED else ""
+    rest = f"; and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
     raise InputError(
         f"{source} holds no variable of 3 or 4 dimensions with integer or float values; found"
         f" {problems}{rest}"
