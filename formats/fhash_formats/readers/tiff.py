@@ -23,6 +23,7 @@ from fhash_formats.readers.common.failures import Stamp, condense, naming
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.grid import component_by_number, component_variables, lattice
 from fhash_formats.readers.common.request import Request
+from fhash_formats.readers.common.stored_bytes import PlainFile
 from fhash_formats.readers.common.variables import choose
 from fhash_formats.series import Coordinate
 
@@ -203,16 +204,6 @@ def _pages(
     outer = 0
     while prod(series.shape[outer:]) > per_page:
         outer += 1
-    if series.dataoffset is not None:
-        # ImageJ's large files have one page that stands for all values in a row
-        mapped = np.memmap(
-            series.parent.filehandle.path,
-            np.dtype(series.dtype).newbyteorder(series.parent.byteorder),
-            "r",
-            series.dataoffset,
-            tuple(series.shape),
-        )
-        return np.array(mapped[tuple(index)])
     numbers = np.arange(prod(series.shape[:outer])).reshape(series.shape[:outer])
     chosen = numbers[tuple(index[:outer])]
     pages = [_page(series, int(page)) for page in chosen.ravel()]
@@ -222,10 +213,19 @@ def _pages(
 
 
 def _page(series: Any, number: int) -> npt.NDArray[Any]:
-    page = series.pages[number]
-    if page is None:
-        raise InputError(f"page {number} is missing")
-    return np.asarray(page.asarray())
+    """One page; where all values lie in a row, as in ImageJ's large files, by its place in it."""
+    if series.dataoffset is None:
+        page = series.pages[number]
+        if page is None:
+            raise InputError(f"page {number} is missing")
+        return np.asarray(page.asarray())
+    shape = series.keyframe.shape
+    dtype = np.dtype(series.dtype).newbyteorder(series.parent.byteorder)
+    values = np.empty(shape, dtype)
+    path = Path(series.parent.filehandle.path)
+    stored = PlainFile(path, start=series.dataoffset + number * values.nbytes, size=values.nbytes)
+    stored.readinto(0, values.reshape(-1).view(np.uint8).data)
+    return values
 
 
 def _coordinates(file: Any, lengths: Mapping[str, int]) -> dict[str, Coordinate]:

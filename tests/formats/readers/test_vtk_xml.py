@@ -13,6 +13,7 @@ import vtk_files
 
 from fhash_formats import open_series
 from fhash_formats.errors import InputError
+from fhash_formats.readers.common.variables import SeveralVariablesError
 
 RNG = np.random.default_rng(0)
 ARRAYS = {
@@ -82,8 +83,9 @@ def test_components_by_name_and_by_number(tmp_path: Path) -> None:
     with open_series(path, var="v.2") as series:
         assert series.name == "v.z"
         np.testing.assert_array_equal(series.read(0), ARRAYS["velocity"][..., 2])
-    with pytest.raises(InputError, match=r"v\.x .*v\.y .*v\.z .*choose one with --var"):
+    with pytest.raises(SeveralVariablesError, match=r"v\.x .*v\.z .*choose one with") as caught:
         open_series(path)
+    assert caught.value.names == ("v.x", "v.y", "v.z")
     with pytest.raises(InputError, match=r"has no variable 'v\.3'"):
         open_series(path, var="v.3")
 

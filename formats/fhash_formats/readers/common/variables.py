@@ -29,6 +29,14 @@ MIN_DIMENSIONS = 3
 """Dimensions of an array that may be a series; those beyond 4 are selected (layout.py)."""
 
 
+class SeveralVariablesError(InputError):
+    """A choice between variables that is left to the user; `names` are their full names."""
+
+    def __init__(self, message: str, names: Sequence[str] = ()) -> None:
+        super().__init__(message)
+        self.names = tuple(names)
+
+
 def kind_of(dtype: np.dtype[Any]) -> str:
     """A type in words: "float32", "boolean", "text", "compound" and so on."""
     if dtype.kind == "V":
@@ -117,9 +125,10 @@ def choose(
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
-        raise InputError(
+        raise SeveralVariablesError(
             f"{source} holds {len(candidates)} variables: {_listed(candidates)}; choose one with"
-            " --var"
+            " --var",
+            [variable.name for variable in candidates],
         )
     if not variables:
         raise InputError(f"{source} holds no array at all")
