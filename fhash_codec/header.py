@@ -21,6 +21,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import Container, ContainerWriter, describe_coordinates
+from fhash_formats.container.header import MISSING
 from fhash_formats.series import AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 
@@ -33,7 +34,7 @@ MAX_POINTS = 24
 DIGITS = 6
 """Significant digits of a figure over all steps."""
 
-OUTSIDE = "outside"
+OUTSIDE = MISSING[0]
 """Value of the header's `missing`: the vertices outside the coreset are those without a value."""
 
 STEP_DIGITS = 5
