@@ -45,7 +45,7 @@ def describe_source(
     series: Series, value_range: ValueRange, config: EncodeConfig
 ) -> dict[str, Any]:
     """Header entries of a series: variable, shape and range, and a quality to be filled in."""
-    variable = {
+    variable: dict[str, Any] = {
         "name": str(series.name),
         "units": str(series.units),
         "dtype": (series.source_dtype or series.dtype).name,

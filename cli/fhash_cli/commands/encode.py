@@ -25,6 +25,7 @@ from fhash_cli.output import (
     loss_rows,
     number,
     quality_rows,
+    say,
     size,
     spans,
     table,
@@ -33,6 +34,9 @@ from fhash_formats.errors import QualityError
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
+
+MAX_LABELS = 64
+"""Range of integers up to which they may be labels."""
 
 
 @click.command("encode")
@@ -71,9 +75,17 @@ def command(
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
+    integers = (series.source_dtype or series.dtype).kind in "iu"
+    if integers and not quiet and looks_categorical(report):
+        say("few different integers: if they are labels, --max-error 0 keeps each exactly")
     emit(report, table(report_rows(report, series.units)), as_json)
     if missed is not None:
         raise missed
+
+
+def looks_categorical(report: Mapping[str, Any]) -> bool:
+    """Whether integers are so few that they may be labels, and some of them were changed."""
+    return bool(report["data_range"] <= MAX_LABELS and report["max_abs_error"])
 
 
 def report_rows(report: dict[str, Any], units: str) -> list[tuple[str, str]]:
