@@ -11,15 +11,14 @@ from fhash_codec import EncodeConfig
 
 
 def moving_regions() -> np.ndarray:
-    """Regions (6, 8, 40, 40) of sixty labels that move and do not follow an order."""
-    z, y, x = np.meshgrid(*(np.arange(n) for n in (8, 40, 40)), indexing="ij")
-    points = np.random.default_rng(0).uniform(0, 40, (60, 3))
-    frames = [
-        np.argmin(
-            [(x - u - t) ** 2 + (y - v) ** 2 + (z - w / 5) ** 2 for u, v, w in points], axis=0
-        )
-        for t in range(6)
-    ]
+    """Regions (6, 12, 48, 48) of sixty labels that move and do not follow an order."""
+    z, y, x = np.meshgrid(*(np.arange(n) for n in (12, 48, 48)), indexing="ij")
+    chance = np.random.default_rng(0)
+    points, speeds = chance.uniform(0, 48, (60, 3)), chance.normal(0, 0.7, (60, 3))
+    frames = []
+    for t in range(6):
+        u, v, w = (points + t * speeds).T[:, :, None, None, None]
+        frames.append(np.argmin((x - u) ** 2 + (y - v) ** 2 + (z - w / 4) ** 2, axis=0))
     return (np.stack(frames) * 37 % 101).astype("i2")
 
 
