@@ -22,6 +22,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import Container, ContainerWriter, describe_coordinates
+from fhash_formats.container.header import MISSING
 from fhash_formats.series import AXIS_NAMES, Coordinate, Series
 from fhash_formats.support.attributes import json_attributes
 
@@ -34,7 +35,7 @@ MAX_POINTS = 24
 DIGITS = 6
 """Significant digits of a figure over all steps."""
 
-OUTSIDE = "outside"
+OUTSIDE = MISSING[0]
 """Value of the header's `missing`: the vertices outside the coreset are those without a value."""
 
 STEP_DIGITS = 5
@@ -45,7 +46,7 @@ def describe_source(
     series: Series, value_range: ValueRange, config: EncodeConfig
 ) -> dict[str, Any]:
     """Header entries of a series: variable, shape and range, and a quality to be filled in."""
-    variable = {
+    variable: dict[str, Any] = {
         "name": str(series.name),
         "units": str(series.units),
         "dtype": (series.source_dtype or series.dtype).name,

@@ -174,7 +174,8 @@ class Volume:
         if self.dtype.kind == "f" or not float(t).is_integer():
             return filled(self.read(t, region, outside=outside), self.fill)
         read = self.read(t, region, outside=outside)
-        gaps, result = np.isnan(read), np.rint(np.nan_to_num(read)).astype(self.dtype)
+        gaps = np.isnan(read)
+        result: npt.NDArray[Any] = np.rint(np.nan_to_num(read)).astype(self.dtype)
         common = self._within_box(self._checked(region))
         if common is not None and self.dtype.itemsize == 8:
             # float64 has not every integer of 64 bits.
@@ -329,8 +330,8 @@ class Volume:
         """Interpolated values without the rounding that takes some beyond the series' range."""
         if not self._clips:
             return values
-        low, high = self.value_range.low, self.value_range.high
-        return np.clip(values, self.float_dtype.type(low), self.float_dtype.type(high))
+        low, high = map(self.float_dtype.type, (self.value_range.low, self.value_range.high))
+        return np.asarray(np.clip(values, low, high))
 
     def _checked_times(self) -> KeyTimes:
         if not strictly_monotonic(self.coords["t"].values):

@@ -197,6 +197,11 @@ def apart(*values: float) -> list[str]:
     return texts
 
 
+def _largest_error(error: float | None, units: str) -> str:
+    """The largest error; one of 0 says that nothing is lost."""
+    return "none, lossless" if error == 0 else number(error, units)
+
+
 def extent(shape: Sequence[int]) -> str:
     """A shape such as 16 x 32 x 48 x 48."""
     return " x ".join(map(str, shape))
@@ -225,7 +230,7 @@ def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, 
         *_bulk_rows(report),
         ("PSNR, domain", number(report.get("psnr_domain"), "dB")),
         ("RMSE", number(report.get("rmse"), units)),
-        ("largest error", number(report.get("max_abs_error"), units)),
+        ("largest error", _largest_error(report.get("max_abs_error"), units)),
         ("SSIM", number(report.get("ssim"), digits=5)),
     ]
 

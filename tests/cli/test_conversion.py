@@ -105,3 +105,18 @@ def test_times_between_steps_are_floats(fhash, counts, tmp_path) -> None:
     assert done.exit_code == 0
     assert "between steps they are interpolated" in done.output
     assert np.load(out).dtype == np.float32
+
+
+def test_few_integers_are_pointed_to_the_lossless_way(fhash, tmp_path) -> None:
+    labels = np.random.default_rng(0).integers(0, 65, (2, 4, 9, 10)).astype("u1")
+    np.save(tmp_path / "few.npy", labels % 65)
+    np.save(tmp_path / "more.npy", labels * 2)
+    words = ["--effort", "1", "--psnr", "20", "-o"]
+    few = fhash("encode", tmp_path / "few.npy", *words, tmp_path / "few.fhz")
+    more = fhash("encode", tmp_path / "more.npy", *words, tmp_path / "more.fhz")
+    assert "--max-error 0 keeps each exactly" in few.stderr
+    assert "--max-error 0" not in more.stderr
+    words = ["--effort", "1", "--max-error", "0.4", "-o"]
+    exact = fhash("encode", tmp_path / "few.npy", *words, tmp_path / "exact.fhz")
+    assert "--max-error 0" not in exact.stderr
+    assert "none, lossless" in exact.stdout

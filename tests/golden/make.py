@@ -46,7 +46,7 @@ GOLDENS = {
     ),
     "compact-1.1-predictor": EncodeConfig(max_error=2.0, effort=3, timings=False),
     "compact-1.2-clip": EncodeConfig(max_error=0.2, effort=2, timings=False),
-    "compact-1.2-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x7x9"),
+    "compact-1.2-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x24x30"),
     "paper-1.1-transform": EncodeConfig(
         profile="paper",
         width=8,
@@ -88,9 +88,11 @@ def fronts() -> ArraySeries:
 
 def basins() -> ArraySeries:
     """Labels of regions that move, with missing ones: int8 whose fill value is -100."""
-    t, z, y, x = np.meshgrid(*(np.arange(n) for n in (5, 6, 7, 9)), indexing="ij")
-    labels = ((x + t) // 4 + 3 * (y // 4)).astype(np.float32)
-    labels[(z > 2) & (x + y < 5)] = np.nan
+    t, z, y, x = np.meshgrid(*(np.arange(n) for n in (5, 6, 24, 30)), indexing="ij")
+    points = np.random.default_rng(0).uniform(0, 30, (12, 2))
+    distances = [(y - v) ** 2 + (x - u + t) ** 2 for v, u in points]
+    labels = (np.argmin(distances, axis=0) * 37 % 41).astype(np.float32)
+    labels[(x - 15) ** 2 + (y - 12) ** 2 > (13 - z) ** 2] = np.nan
     labels_of_basins = ArraySeries(labels, name="density", units="kg m-3", coords={"t": TIME})
     labels_of_basins.source_dtype, labels_of_basins.fill = np.dtype(np.int8), -100
     return labels_of_basins

@@ -28,6 +28,7 @@ from fhash_cli.output import (
     extent,
     loss_rows,
     quality_rows,
+    say,
     size,
     spans,
     table,
@@ -36,6 +37,9 @@ from fhash_formats.errors import InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
+
+MAX_LABELS = 64
+"""Range of integers up to which they may be labels."""
 
 
 @click.command("encode", cls=BaseCommand)
@@ -82,8 +86,16 @@ def command(
             missed, report = error, error.figures
         except KeyboardInterrupt:
             raise InterruptedEncodingError(_after_interruption(output, before)) from None
+    integers = (series.source_dtype or series.dtype).kind in "iu"
+    if integers and not quiet and looks_categorical(report):
+        say("few different integers: if they are labels, --max-error 0 keeps each exactly")
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
     emit(report, table(rows), as_json, missed)
+
+
+def looks_categorical(report: Mapping[str, Any]) -> bool:
+    """Whether integers are so few that they may be labels, and some of them were changed."""
+    return bool(report["data_range"] <= MAX_LABELS and report["max_abs_error"])
 
 
 def _stamp(path: str) -> tuple[int, int] | None:

@@ -41,7 +41,7 @@ def regions(run: Run) -> Iterator[Finding]:
     )
     part, decoded = run.volume[t, z, y, x], run.decoded[t, z, y, x]
     if part.dtype.kind != "f":
-        decoded = np.where(np.isnan(decoded), run.volume.fill, decoded).astype(part.dtype)
+        decoded = np.where(np.isnan(decoded), run.volume.fill or 0, decoded).astype(part.dtype)
     wrong += _count_unequal(part, decoded)
     yield Finding(name="region = slice", worst=float(wrong), limit=0.0, unit="values")
 

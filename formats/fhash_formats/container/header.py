@@ -37,6 +37,8 @@ QUALITY = (
     "max_abs_error_domain",
 )
 """Figures in `quality`, each a number or null."""
+MISSING = ("outside",)
+"""Values of `missing`: the vertices outside the coreset are those without a value."""
 HISTORY = ("seconds", "epoch", "psnr")
 """Figures of an entry of `history`, each a number or null."""
 CODED = "transform"
@@ -121,6 +123,10 @@ def _check_source(top: Record) -> np.dtype[Any]:
     variable.text("units")
     dtype = DTYPES[variable.choice("dtype", tuple(DTYPES))]
     variable.record("attributes")
+    if variable.has("fill"):
+        variable.number("fill")
+    if top.has("missing"):
+        top.choice("missing", MISSING)
     return dtype
 
 

@@ -145,7 +145,8 @@ template <bool DECODES> struct LabelCoder {
         const int64_t M2 = n3 + 2 * PADDING, M1 = M2 * n2, M0 = M1 * n1;
         const int64_t G2 = segments + 2, G1 = G2 * n2, G0 = G1 * n1;
         std::vector<int16_t> known((size_t)M0 * n0, NONE), nothing((size_t)M2, NONE);
-        std::vector<int16_t> segment_states((size_t)G0 * n0, NOTHING), no_states((size_t)G2, NOTHING);
+        std::vector<int16_t> segment_states((size_t)G0 * n0, NOTHING);
+        std::vector<int16_t> no_states((size_t)G2, NOTHING);
         slots[0] = state->slots.data();
         for (int i = 1; i < CONTEXTS; i++) slots[i] = slots[i - 1] + SIZES[i - 1];
         bit_slots[0] = slots[CONTEXTS - 1] + SIZES[CONTEXTS - 1];

@@ -36,7 +36,7 @@ def _flush(memory: dict[str, Any], folder: Path) -> None:
 
 
 def _fill_value(region: Region) -> Any:
-    """What stands in chunks where nothing was written, and marks missing values of floats."""
+    """The value of chunks that were not written; it also marks missing values of floats."""
     if region.fill is not None and region.dtype.kind == "f":
         return region.dtype.type(region.fill)
     return np.nan if region.dtype.kind == "f" else 0

@@ -1,0 +1,53 @@
+"""Labels are planned where nothing else could take fewer bytes, and only for exact values."""
+
+from __future__ import annotations
+
+import lzma
+
+import numpy as np
+
+import fhash_codec
+from fhash_codec import EncodeConfig
+
+
+def moving_regions() -> np.ndarray:
+    """Regions (6, 12, 48, 48) of sixty labels that move and do not follow an order."""
+    z, y, x = np.meshgrid(*(np.arange(n) for n in (12, 48, 48)), indexing="ij")
+    chance = np.random.default_rng(0)
+    points, speeds = chance.uniform(0, 48, (60, 3)), chance.normal(0, 0.7, (60, 3))
+    frames = []
+    for t in range(6):
+        u, v, w = (points + t * speeds).T[:, :, None, None, None]
+        frames.append(np.argmin((x - u) ** 2 + (y - v) ** 2 + (z - w / 4) ** 2, axis=0))
+    return (np.stack(frames) * 37 % 101).astype("i2")
+
+
+def encoded(tmp_path, values: np.ndarray, **changes) -> tuple[int, set[str], np.ndarray]:
+    path = tmp_path / "a.fhz"
+    config = EncodeConfig(timings=False, **{"max_error": 0.0, "effort": 2, **changes})
+    figures = fhash_codec.encode(values, path, config, force=True)
+    with fhash_codec.open(path) as volume:
+        return figures["bytes"], set(volume.info["required_features"]), volume[...]
+
+
+def test_labels_take_fewer_bytes_than_xz(tmp_path) -> None:
+    values = moving_regions()
+    size, features, decoded = encoded(tmp_path, values)
+    assert "labels" in features
+    np.testing.assert_array_equal(decoded, values)
+    assert size < len(lzma.compress(values.tobytes(), preset=9 | lzma.PRESET_EXTREME))
+
+
+def test_labels_in_floats_and_with_a_feature(tmp_path) -> None:
+    values = moving_regions().astype("f4")
+    values[values == values[0, 0, 0, 0]] = np.nan
+    _, features, decoded = encoded(tmp_path, values, features=("interval:10:60",), dilation=0)
+    assert {"labels", "mask"} <= features
+    inside = (values >= 10) & (values <= 60)
+    np.testing.assert_array_equal(decoded, np.where(inside, values, np.nan))
+
+
+def test_other_promises_and_many_values_need_no_labels(tmp_path) -> None:
+    assert "labels" not in encoded(tmp_path, moving_regions(), max_error=1.0, effort=1)[1]
+    noise = np.random.default_rng(0).integers(0, 9999, (2, 4, 20, 20)).astype("i2")
+    assert "labels" not in encoded(tmp_path, noise, effort=1)[1]
