@@ -233,7 +233,6 @@ class EncodeConfig:
                     f"the profile is {self.profile}"
                 )
 
-
     def _check_promises(self) -> None:
         """Raise InputError if more than one promise is given."""
         promised = [
