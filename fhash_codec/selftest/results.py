@@ -98,8 +98,13 @@ class CaseResult:
             for values_of_finding in values["findings"]
         )
         plain = {name: values[name] for name in ("name", "group", "about")}
-        lists = {name: tuple(values[name]) for name in ("under", "errors", "left_out")}
-        return cls(**plain, **lists, findings=findings)
+        return cls(
+            **plain,
+            under=tuple(values["under"]),
+            findings=findings,
+            errors=tuple(values["errors"]),
+            left_out=tuple(values["left_out"]),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

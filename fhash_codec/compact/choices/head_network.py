@@ -156,7 +156,8 @@ class Network:
         sizes = (ctypes.c_int64 * 6)(batches, blocks, block, looked_at, *self.widths)
         arrays = voxels.inputs, voxels.targets, voxels.lowest, voxels.highest
         assert all(array.flags.c_contiguous for array in arrays)
-        return [*map(_address, arrays), ctypes.cast(sizes, ctypes.c_void_p)]
+        addresses = [_address(array) for array in arrays]
+        return [*addresses, ctypes.cast(sizes, ctypes.c_void_p)]
 
 
 def _address(array: npt.NDArray[np.generic]) -> ctypes.c_void_p:

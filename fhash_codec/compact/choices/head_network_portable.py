@@ -190,16 +190,19 @@ def _forward(voxels: Batches, batch: int, layers: list[_Layer]) -> Iterator[_Pas
         outputs = (three.integers @ second) * (three.scale * (ERROR_UNIT / ACTIVATION_UNIT))
         outputs = np.rint(outputs + three.biases * ERROR_UNIT)
         at = slice(start * BLOCK_VOXELS, start * BLOCK_VOXELS + size)
-        clipped = np.maximum(outputs, voxels.lowest[batch, at])
+        clipped: Doubles = np.maximum(outputs, voxels.lowest[batch, at])
         clipped = np.minimum(clipped, voxels.highest[batch, at])
-        errors = np.clip(clipped - voxels.targets[batch, at], -MAX_ERROR, MAX_ERROR)
+        errors: Doubles = np.clip(
+            clipped - voxels.targets[batch, at], float(-MAX_ERROR), float(MAX_ERROR)
+        )
         yield _Pass(inputs, first, second, errors, np.where(clipped == outputs, errors, 0.0))
 
 
 def _activations(sums: Doubles, scale: float, biases: Doubles) -> Doubles:
     """Return the activations of a hidden layer: leaky, clipped, rounded half to even."""
     values = sums * scale + (biases * ACTIVATION_UNIT)[:, None]
-    return np.rint(np.clip(np.maximum(values, LEAK * values), -MAX_ACTIVATION, MAX_ACTIVATION))
+    leaky: Doubles = np.maximum(values, LEAK * values)
+    return np.rint(np.clip(leaky, -MAX_ACTIVATION, MAX_ACTIVATION))
 
 
 def _gradient(
