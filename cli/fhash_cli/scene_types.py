@@ -66,13 +66,10 @@ class OpacityType(click.ParamType[Any]):
         if self.named and ":" not in str(value):
             return value
         try:
-            points = [[float(end) for end in part.split(":")] for part in str(value).split(",")]
+            return [[float(end) for end in part.split(":")] for part in str(value).split(",")]
         except ValueError:
-            points = [[]]
-        if any(len(point) != 2 for point in points):
             what = "neither the name of an opacity nor" if self.named else "not"
             self.fail(f"'{value}' is {what} points such as 0:0,0.5:0.2,2:1", param, ctx)
-        return points
 
 
 class PlaneType(click.ParamType[dict[str, Any]]):

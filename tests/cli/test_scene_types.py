@@ -32,7 +32,7 @@ def test_texts_are_read(kind: click.ParamType[Any], text: str, value: Any) -> No
     [
         (NumbersType(3), "1,2", "not 3 numbers"),
         (SizeType(), "wide", "not a size"),
-        (OpacityType(), "0:0:0", "neither the name of an opacity nor points"),
+        (OpacityType(), "0:a", "neither the name of an opacity nor points"),
         (OpacityType(named=False), "linear", "not points"),
         (PlaneType(), "0,0,1", "neither a normal and an offset"),
         (PlaneType(), "a,b,c,d", "neither a normal and an offset"),
