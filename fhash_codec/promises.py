@@ -30,7 +30,7 @@ def missed_promise(config: EncodeConfig, figures: Mapping[str, Any]) -> str | No
 
 
 def remarks(config: EncodeConfig, figures: Mapping[str, Any]) -> Iterator[str]:
-    """What a user should know of a file that keeps its promise, one line each.
+    """Remarks on a file that keeps its promise, for the user, one line each.
 
     figures: of the file, as in `report`.
     """

@@ -151,7 +151,7 @@ class Errors:
             )
         bulk = None if self.bulk is None else (self.bulk.low, self.bulk.high)
         errors = error_sums(original, decoded, mask, self._scale, bulk)
-        if errors.count < 0:
+        if errors.number < 0:
             raise InputError(f"step {step}: decoded values are not finite where they are compared")
         return errors
 

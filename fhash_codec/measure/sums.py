@@ -33,7 +33,7 @@ PIECE = 1 << 14
 class ErrorSums(NamedTuple):
     """Sums over the scaled differences of counted vertices, all of them and those of the bulk."""
 
-    count: int
+    number: int
     """Number of counted vertices."""
     squares: float
     """Sum of the squares."""
@@ -97,7 +97,7 @@ def error_sums(
     scale: a power of two.
     bulk: the original values, both ends included, that are summed once more; none if None.
 
-    The count is -1 if a decoded value is not finite at a counted vertex. 64-bit integers are
+    The number is -1 if a decoded value is not finite at a counted vertex. 64-bit integers are
     compared exactly; float64 would round their differences to 0.
     """
     library = native.library()
@@ -121,7 +121,7 @@ def error_sums(
             )
         else:
             sums = _numpy_sums(source, result, counted, np.float64(scale), bulk)
-        if sums.count < 0:
+        if sums.number < 0:
             return sums
         total = _joined(total, sums)
     return total
@@ -179,7 +179,7 @@ def _native_sums(
 def _joined(first: ErrorSums, second: ErrorSums) -> ErrorSums:
     """The sums over two arrays."""
     return ErrorSums(
-        count=first.count + second.count,
+        number=first.number + second.number,
         squares=first.squares + second.squares,
         largest=max(first.largest, second.largest),
         bulk_count=first.bulk_count + second.bulk_count,
@@ -236,7 +236,7 @@ def _numpy_sums(
         with np.errstate(over="ignore"):
             squares = np.square(difference)
             sums = ErrorSums(
-                count=int(np.count_nonzero(counted)),
+                number=int(np.count_nonzero(counted)),
                 squares=_lane_sum(squares),
                 largest=max(float(difference.max()), -float(difference.min())),
             )

@@ -34,6 +34,8 @@ STEPS_TO_OCTAVE = 3
 """Steps per octave that are tried under a strict bound."""
 MAX_STEP_NUMBER = 15
 """Number of the largest step tried under a strict bound; step 0 is the bound itself."""
+FINEST_PSNR = 167.0
+"""PSNR in dB of errors spread evenly over the finest step: 20 log10(sqrt(12) / MIN_STEP_SHARE)."""
 OUT_OF_REACH = 1.0
 """dB that the finest step must miss before a promise is called out of reach: a sample may err."""
 MIN_SIZE_SHARE = 0.8
@@ -93,12 +95,11 @@ def require_reach(goal: Goal, settings: TileSettings, outcome: Outcome) -> None:
     finest = (settings.high - settings.low) * MIN_STEP_SHARE
     if goal.psnr is None or goal.data_range == 0 or settings.step > finest * (1 + 1e-9):
         return
-    reached = outcome.psnr(goal.data_range)
-    if reached < goal.psnr - OUT_OF_REACH:
+    if goal.psnr > FINEST_PSNR and outcome.psnr(goal.data_range) < goal.psnr - OUT_OF_REACH:
         raise InputError(
             f"the promised PSNR is out of reach: {goal.psnr:.4g} dB over the whole range are "
-            f"needed, and the finest step of the quantiser gives about {reached:.4g} dB; "
-            "--max-error 0 stores every value exactly"
+            f"needed, and the finest step of the quantiser gives about {FINEST_PSNR:.4g} dB at "
+            "most; --max-error 0 stores every value exactly"
         )
 
 

@@ -104,7 +104,7 @@ def code(tile: Tile, settings: TileSettings, coding: Coding) -> tuple[CodedTile,
     bulk = coding.bulk
     ends = None if bulk is None else (bulk.low, bulk.high)
     sums = error_sums(values, coded.decoded, counted, scale, ends)
-    squares, count = sums.squares, sums.count
+    squares, count = sums.squares, sums.number
     bulk_squares, bulk_count = sums.bulk_squares, sums.bulk_count
     if bulk is not None and bulk.alone:
         squares, count, bulk_squares, bulk_count = bulk_squares, bulk_count, 0.0, 0
