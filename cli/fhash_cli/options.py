@@ -79,16 +79,6 @@ class SelectType(click.ParamType[tuple[str, str]]):
         return name, index
 
 
-def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-    """The number that a text stands for."""
-    for kind in (int, float):
-        try:
-            return kind(value)
-        except ValueError:
-            continue
-    self.fail(f"'{value}' is not a number", param, ctx)
-
-
 @dataclass(frozen=True, kw_only=True)
 class SourceOptions:
     """Options that `series_options` adds: they say how to read the data."""

@@ -19,17 +19,21 @@ from fhash_codec.rendering.colour.opacity import Histogram, about
 from fhash_codec.rendering.colour.transfer_function import TransferFunction
 from fhash_codec.rendering.picture.explain import reasons
 from fhash_codec.rendering.picture.layout import lay_out, quantity_of
+from fhash_codec.rendering.picture.lighting import (
+    coding_noise,
+    lamp_of,
+    lighting_of,
+    secondary_light,
+    shading_of,
+)
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.scene.scene import (
-    AmbientOcclusion,
     Effects,
     Marching,
     Scene,
-    Shading,
-    Shadows,
 )
 from fhash_codec.rendering.task.grading import grading_of
-from fhash_codec.rendering.task.task import Lighting, Surface, Table, Task
+from fhash_codec.rendering.task.task import Surface, Table, Task
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.volume import Volume
 from fhash_formats.errors import FhashWarning, InputError
@@ -44,8 +48,6 @@ MAX_RAY_SAMPLES = 10**8
 """Most samples of a ray: more would take days, and Ctrl-C cannot stop a ray being marched."""
 MAX_RAYS = 2**26
 """Most rays of a picture: more would not fit in the memory of most machines."""
-SHOULDER = (-0.7, 1.0, 1.0)
-"""Default direction towards the light of shadows: components right, up and towards the camera."""
 
 
 def plan_picture(
@@ -68,8 +70,8 @@ def plan_picture(
         scene, grid, volume.coords, function.colours, quantity_of(volume.name, volume.units)
     )
     lod, why_lod = _level(volume, scene, rays)
-    shadows, occlusion = _secondary_light(scene, grid)
-    lamp = _lamp(rays, scene.effects.shading, shadows)
+    shadows, occlusion = secondary_light(scene, grid)
+    lamp = lamp_of(rays, scene.effects.shading, shadows)
     units = Units.of(volume)
     noise = coding_noise(volume) * units.factor * grid.vertex_spacing / grid.series_spacing
     task = _task(scene, rays, function, units, lamp, lod, noise)
@@ -224,55 +226,6 @@ def _level(volume: Volume, scene: Scene, rays: Rays) -> tuple[int, str]:
     )
 
 
-def _secondary_light(scene: Scene, grid: Grid) -> tuple[Shadows | None, AmbientOcclusion | None]:
-    """The shadows and the ambient occlusion of a scene, None where they would change nothing."""
-    effects = scene.effects
-    if effects.projections or scene.transfer_function.nothing or grid.flat:
-        # Only the volume takes light away, and only from what is drawn of it or in it. A plane is
-        # drawn in its colours.
-        return None, None
-    shadows, occlusion = effects.shadows, effects.ambient_occlusion
-    return (
-        shadows if shadows and shadows.strength > 0 else None,
-        occlusion if occlusion and occlusion.strength > 0 else None,
-    )
-
-
-def _lamp(rays: Rays, shading: Shading | None, shadows: Shadows | None) -> Floats | None:
-    """The unit vector (x, y, z) towards the light, in the coordinates.
-
-    None for the camera's light: it lies behind the camera, and its shadows cannot be seen.
-    """
-    light = shading.light if shading is not None and shading.light is not None else None
-    if shadows is not None and shadows.light is not None:
-        if light is not None and light != shadows.light:
-            raise InputError(
-                "shading and shadows name different lights; there is one lamp: "
-                "leave 'light' out of one of them"
-            )
-        light = shadows.light
-    if light is not None:
-        direction = np.array(light)
-        largest = float(np.abs(direction).max())
-        if not largest > 0:
-            raise InputError("light has no length; give a direction such as 1, 1, 2")
-        # Scaled first, since the squares of the largest numbers are beyond float64.
-        direction = direction / largest
-        return np.asarray(direction / np.linalg.norm(direction), dtype=np.float64)
-    return None if shadows is None else _shoulder_lamp(rays)
-
-
-def _shoulder_lamp(rays: Rays) -> Floats:
-    """The unit vector (x, y, z) towards the default light of shadows, beside the camera."""
-    spacing = rays.grid.spacing
-    right, up, away = (
-        axis / np.linalg.norm(axis)
-        for axis in (rays.right * spacing, rays.up * spacing, -rays.forward * spacing)
-    )
-    lamp = SHOULDER[0] * right + SHOULDER[1] * up + SHOULDER[2] * away
-    return np.asarray(lamp / np.linalg.norm(lamp), dtype=np.float64)
-
-
 def _task(
     scene: Scene,
     rays: Rays,
@@ -287,13 +240,13 @@ def _task(
     projection = next(iter(effects.projections), "")
     attenuated = effects.attenuated_maximum_intensity
     table = None if scene.transfer_function.nothing else _table(function, units, bool(projection))
-    shading = _shading(effects)
+    shading = shading_of(effects)
     return Task(
         rays=rays,
         step=march.step * (1 << lod) * rays.grid.vertex_spacing,
         threshold=march.threshold,
         table=table,
-        lighting=None if shading is None else _lighting(shading, lamp),
+        lighting=None if shading is None else lighting_of(shading, lamp),
         # The gradients of a plane lie in it: no light that falls on it would be scattered back.
         shaded=effects.shading is not None
         and table is not None
@@ -312,26 +265,6 @@ def _task(
         skipping=march.skipping,
         noise=noise,
     )
-
-
-def coding_noise(volume: Volume) -> float:
-    """The difference of two neighbouring vertices that the errors of a bounded file can make.
-
-    Both vertices may be wrong by the largest error, in opposite directions. The noise is 0 for a
-    file without a bound: its errors are small where the values are smooth.
-    """
-    config = volume.container.header.get("config", {})
-    if config.get("max_error") is None and config.get("max_error_rel") is None:
-        return 0.0
-    largest = volume.container.header["quality"].get("max_abs_error")
-    return 0.0 if largest is None else 2 * float(largest)
-
-
-def _shading(effects: Effects) -> Shading | None:
-    """The shading of what is lit, None if nothing is; isosurfaces are always lit."""
-    if effects.isosurfaces:
-        return effects.shading or Shading()
-    return None if effects.projections else effects.shading
 
 
 def _table(function: TransferFunction, units: Units, whole: bool) -> Table:
@@ -375,17 +308,6 @@ def _surfaces(effects: Effects, function: TransferFunction, units: Units) -> tup
         )
         for surface in effects.isosurfaces
         if surface.opacity > 0
-    )
-
-
-def _lighting(shading: Shading, lamp: Floats | None) -> Lighting:
-    return Lighting(
-        ambient=shading.ambient,
-        diffuse=shading.diffuse,
-        specular=shading.specular,
-        specular_power=shading.specular_power,
-        lamp=lamp,
-        central=shading.gradient == "central",
     )
 
 

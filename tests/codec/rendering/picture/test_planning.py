@@ -14,7 +14,7 @@ from fhash_codec import Renderer, Scene, Volume
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.picture.plan import Plan
-from fhash_codec.rendering.picture.planning import MAX_RAYS, coding_noise, plan_picture
+from fhash_codec.rendering.picture.planning import MAX_RAYS, plan_picture
 from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import FhashWarning, InputError, RegionError
 
@@ -274,17 +274,6 @@ def test_thin_volumes_show_every_value(tmp_path: Path, thickness: int, seen: boo
         function = Renderer(volume).plan(Scene()).function
     assert (function.opacity(0.0) > 0) is np.bool_(seen)
     assert function.opacity(1.0) > 0
-
-
-def test_the_errors_of_a_bounded_file_are_noise(tmp_path: Path) -> None:
-    values = np.random.default_rng(0).random((1, 12, 12, 12)).astype(np.float32)
-    for config, factor in (({"max_error": 0.1}, 2), ({"max_error_rel": 0.1}, 2), ({"psnr": 30}, 0)):
-        with fhash_codec.open(encoded(tmp_path / "a.fhz", values, **config)) as volume:
-            largest = volume.container.header["quality"]["max_abs_error"]
-            assert largest > 0.01
-            assert coding_noise(volume) == pytest.approx(factor * largest)
-            assert plan(volume).task.noise == pytest.approx(factor * largest)
-        (tmp_path / "a.fhz").unlink()
 
 
 def test_colours_of_a_projection_are_those_of_all_values(volume: Volume) -> None:
