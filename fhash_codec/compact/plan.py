@@ -41,6 +41,8 @@ MAX_VALUE = 1e145
 """Largest magnitude of a value whose squared errors fit float64."""
 MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
+HOPELESS = 2.0
+"""Size of the first guess, as a multiple of that of labels, from which on nothing else is tried."""
 STAGES = 4
 """Number of stages that the progress counts."""
 
@@ -102,21 +104,20 @@ def plan(
     tiled = blocks.retile(tile)
     settings = first_settings(task, tiled)
     few = goal.lossless and has_labels(task, tiled)
-    if few and (labelled := plan_labels(task, tiled, settings)) is not None:
-        progress("planning", STAGES, STAGES, "")
-        return CodingPlan(
-            blocks=labelled.sample.blocks,
-            settings=labelled.settings,
-            coding=goal.bounded(labelled.coding),
-            goal=goal,
-            gains=gains.entries,
-        )
+    if few:
+        labelled, clearly = plan_labels(task, tiled, settings)
+        if clearly:
+            progress("planning", STAGES, STAGES, "")
+            return _label_plan(task, labelled)
     if _can_estimate(task, tiled, settings):
         estimated_plan = _estimated_plan(task, tiled, settings)
         progress("planning", STAGES, STAGES, "")
         return estimated_plan
     attempt = first_guess(task, tiled, settings)
     progress("planning", 1, STAGES, "")
+    if few and labelled.outcome.size * HOPELESS < attempt.outcome.size:
+        progress("planning", STAGES, STAGES, "")
+        return _label_plan(task, labelled)
     attempt = choose_tiles(task, attempt)
     progress("planning", 2, STAGES, "")
     attempt = fill_tiles(task, attempt)
@@ -124,6 +125,8 @@ def plan(
     attempt = try_head(task, attempt)
     attempt = try_predictor(task, attempt)
     progress("planning", STAGES, STAGES, "")
+    if few and labelled.outcome.size <= attempt.outcome.size:
+        return _label_plan(task, labelled)
     return CodingPlan(
         blocks=attempt.sample.blocks,
         sample=attempt.sample,
@@ -132,6 +135,17 @@ def plan(
         goal=goal,
         gains=gains.entries,
         history=attempt.history,
+    )
+
+
+def _label_plan(task: PlanTask, labelled: Attempt) -> CodingPlan:
+    """Return the plan of a series that is coded as labels."""
+    return CodingPlan(
+        blocks=labelled.sample.blocks,
+        settings=labelled.settings,
+        coding=task.goal.bounded(labelled.coding),
+        goal=task.goal,
+        gains=task.gains.entries,
     )
 
 
