@@ -43,6 +43,8 @@ MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
 STAGES = 6
 """Number of parts of the planning that its progress counts."""
+HOPELESS = 2.0
+"""Size of the first guess, as a multiple of that of labels, from which on nothing else is tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,20 +106,19 @@ def plan(
     tiled = blocks.retile(tile)
     settings = first_settings(task, tiled)
     few = goal.lossless and has_labels(task, tiled)
-    if few and (labelled := plan_labels(task, tiled, settings)) is not None:
-        progress("planning", STAGES, STAGES, "")
-        return CodingPlan(
-            blocks=labelled.sample.blocks,
-            settings=labelled.settings,
-            coding=goal.bounded(labelled.coding),
-            goal=goal,
-            gains=gains.entries,
-        )
+    if few:
+        labelled, clearly = plan_labels(task, tiled, settings)
+        if clearly:
+            parts.end()
+            return _label_plan(task, labelled)
     if _can_estimate(task, tiled, settings):
         estimated_plan = _estimated_plan(task, tiled, settings)
         parts.end()
         return estimated_plan
     attempt = first_guess(task, tiled, settings)
+    if few and labelled.outcome.size * HOPELESS < attempt.outcome.size:
+        parts.end()
+        return _label_plan(task, labelled)
     parts.begin("tiles and transform")
     attempt = choose_tiles(task, attempt)
     parts.begin("fill values")
@@ -129,6 +130,8 @@ def plan(
     parts.begin("prediction")
     attempt = try_predictor(task, attempt)
     parts.end()
+    if few and labelled.outcome.size <= attempt.outcome.size:
+        return _label_plan(task, labelled)
     return CodingPlan(
         blocks=attempt.sample.blocks,
         sample=attempt.sample,
@@ -137,6 +140,17 @@ def plan(
         goal=goal,
         gains=gains.entries,
         history=attempt.history,
+    )
+
+
+def _label_plan(task: PlanTask, labelled: Attempt) -> CodingPlan:
+    """Return the plan of a series that is coded as labels."""
+    return CodingPlan(
+        blocks=labelled.sample.blocks,
+        settings=labelled.settings,
+        coding=task.goal.bounded(labelled.coding),
+        goal=task.goal,
+        gains=task.gains.entries,
     )
 
 
