@@ -119,16 +119,7 @@ def plan(
     if few and labelled.outcome.size * HOPELESS < attempt.outcome.size:
         parts.end()
         return _label_plan(task, labelled)
-    parts.begin("tiles and transform")
-    attempt = choose_tiles(task, attempt)
-    parts.begin("fill values")
-    attempt = fill_tiles(task, attempt)
-    parts.begin("quantiser step")
-    attempt = choose_step(task, attempt)
-    parts.begin("head")
-    attempt = try_head(task, attempt)
-    parts.begin("prediction")
-    attempt = try_predictor(task, attempt)
+    attempt = _improved(task, attempt)
     parts.end()
     if few and labelled.outcome.size <= attempt.outcome.size:
         return _label_plan(task, labelled)
@@ -141,6 +132,20 @@ def plan(
         gains=gains.entries,
         history=attempt.history,
     )
+
+
+def _improved(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return the attempt after all choices that are made by trial, in their order."""
+    for part, choose in (
+        ("tiles and transform", choose_tiles),
+        ("fill values", fill_tiles),
+        ("quantiser step", choose_step),
+        ("head", try_head),
+        ("prediction", try_predictor),
+    ):
+        task.parts.begin(part)
+        attempt = choose(task, attempt)
+    return attempt
 
 
 def _label_plan(task: PlanTask, labelled: Attempt) -> CodingPlan:
