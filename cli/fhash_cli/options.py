@@ -190,8 +190,12 @@ def series_options(command: Command) -> Command:
         metavar="x=64,y=64,z=32,t=10",
         help="Lengths of a raw file, the fastest axis first.",
     )
-    @click.option("--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8.")
-    @click.option("--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file.")
+    @click.option(
+        "--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8."
+    )
+    @click.option(
+        "--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file."
+    )
     @functools.wraps(command)
     def collected(**values: Any) -> None:
         names = [field.name for field in dataclasses.fields(SourceOptions)]
