@@ -43,6 +43,8 @@ MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
 STAGES = 6
 """Number of parts of the planning that its progress counts."""
+HOPELESS = 2.0
+"""Size of the first guess, as a multiple of that of labels, from which on nothing else is tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,31 +106,23 @@ def plan(
     tiled = blocks.retile(tile)
     settings = first_settings(task, tiled)
     few = goal.lossless and has_labels(task, tiled)
-    if few and (labelled := plan_labels(task, tiled, settings)) is not None:
-        progress("planning", STAGES, STAGES, "")
-        return CodingPlan(
-            blocks=labelled.sample.blocks,
-            settings=labelled.settings,
-            coding=goal.bounded(labelled.coding),
-            goal=goal,
-            gains=gains.entries,
-        )
+    if few:
+        labelled, clearly = plan_labels(task, tiled, settings)
+        if clearly:
+            parts.end()
+            return _label_plan(task, labelled)
     if _can_estimate(task, tiled, settings):
         estimated_plan = _estimated_plan(task, tiled, settings)
         parts.end()
         return estimated_plan
     attempt = first_guess(task, tiled, settings)
-    parts.begin("tiles and transform")
-    attempt = choose_tiles(task, attempt)
-    parts.begin("fill values")
-    attempt = fill_tiles(task, attempt)
-    parts.begin("quantiser step")
-    attempt = choose_step(task, attempt)
-    parts.begin("head")
-    attempt = try_head(task, attempt)
-    parts.begin("prediction")
-    attempt = try_predictor(task, attempt)
+    if few and labelled.outcome.size * HOPELESS < attempt.outcome.size:
+        parts.end()
+        return _label_plan(task, labelled)
+    attempt = _improved(task, attempt)
     parts.end()
+    if few and labelled.outcome.size <= attempt.outcome.size:
+        return _label_plan(task, labelled)
     return CodingPlan(
         blocks=attempt.sample.blocks,
         sample=attempt.sample,
@@ -137,6 +131,31 @@ def plan(
         goal=goal,
         gains=gains.entries,
         history=attempt.history,
+    )
+
+
+def _improved(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return the attempt after all choices that are made by trial, in their order."""
+    for part, choose in (
+        ("tiles and transform", choose_tiles),
+        ("fill values", fill_tiles),
+        ("quantiser step", choose_step),
+        ("head", try_head),
+        ("prediction", try_predictor),
+    ):
+        task.parts.begin(part)
+        attempt = choose(task, attempt)
+    return attempt
+
+
+def _label_plan(task: PlanTask, labelled: Attempt) -> CodingPlan:
+    """Return the plan of a series that is coded as labels."""
+    return CodingPlan(
+        blocks=labelled.sample.blocks,
+        settings=labelled.settings,
+        coding=task.goal.bounded(labelled.coding),
+        goal=task.goal,
+        gains=task.gains.entries,
     )
 
 

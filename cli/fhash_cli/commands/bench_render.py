@@ -87,7 +87,7 @@ def render(
     """Measure pictures of RUN.fhz: effects, accelerations, marchers, VTK's ray casters, quality.
 
     Each effect and acceleration is measured on and off; the variants of a comparison run in turns.
-    VTK comes with pip install 'fhash[vtk]'; without it the comparisons with VTK are left out.
+    VTK comes with pip install 'fhash[bench]'; without it the comparisons with VTK are left out.
     """
     if plot is not None:
         check_writable(plot, force, sources=[run])

@@ -55,7 +55,7 @@ def require_vtk() -> SimpleNamespace:
             loaded_names.update({name: getattr(loaded, name) for name in names})
     except ImportError as error:
         raise MissingDependencyError(
-            "comparing with VTK needs it: pip install 'fhash[vtk]'"
+            "comparing with VTK needs it: pip install 'fhash[bench]'"
         ) from error
     return SimpleNamespace(**loaded_names)
 

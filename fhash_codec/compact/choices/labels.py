@@ -31,11 +31,13 @@ MAX_TILE_VERTICES = 12 << 20
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
     """Whether any tile of a sample has few enough different values."""
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
-    return any(np.unique(tile.values).size < MAX_LABELS for tile in sample.tiles)
+    # Vertices that are not occupied take a label of their own.
+    most = MAX_LABELS - (not tiled.complete)
+    return any(np.unique(tile.values).size <= most for tile in sample.tiles)
 
 
-def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attempt | None:
-    """Return tiles and settings for labels; None where something else might take fewer bytes."""
+def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> tuple[Attempt, bool]:
+    """Return tiles and settings for labels, and whether nothing else can take fewer bytes."""
     if not task.blocks.complete:
         settings = replace(settings, mask=MaskLevels())
     settings = replace(settings, labels=True, quantum=0.0, clip=False)
@@ -43,8 +45,7 @@ def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
     exact = replace(coding, exact=True)
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
     outcome = sample.run(settings, replace(coding, error=0.0))
-    if CLEARLY * outcome.size > sample.run(settings, exact).size:
-        return None
+    clearly = CLEARLY * outcome.size <= sample.run(settings, exact).size
     if task.fixed_tile is None:
         tile = tile_for(task.blocks.shape, outcome.size)
         shape = task.blocks.shape
@@ -52,4 +53,4 @@ def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
             tile = shape
         sample = Sample(task.blocks.retile(tile), LOOK_VERTICES, task.workers)
     task.gains.note("labels", outcome)
-    return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
+    return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding), clearly

@@ -21,7 +21,7 @@
 #endif
 
 // glibc 2.29 gave these functions a new version, which only drops the wrapper that sets errno. The
-// old version binds to every glibc since 2.5, so that a wheel runs on RHEL 8 and its contemporaries.
+// old version binds to every glibc since 2.5, so that a wheel runs on RHEL 8, too.
 #if defined(__x86_64__) && defined(__linux__) && defined(__GLIBC__)
 __asm__(".symver exp,exp@GLIBC_2.2.5");
 __asm__(".symver log,log@GLIBC_2.2.5");

@@ -47,7 +47,7 @@ def _tifffile(source: str) -> Any:
         return importlib.import_module("tifffile")
     except ImportError as error:
         raise MissingDependencyError(
-            f"{source}: TIFF needs tifffile; pip install tifffile"
+            f"{source}: TIFF needs tifffile: pip install 'fhash[formats]'"
         ) from error
 
 

@@ -73,6 +73,4 @@ def _create(root: Any, region: Region, dtype: np.dtype[Any]) -> Any:
     return values
 
 
-NETCDF = Writer(
-    name="NetCDF", suffixes=(".nc", ".nc4"), outputs=one_output, open=_open, module="h5netcdf"
-)
+NETCDF = Writer(name="NetCDF", suffixes=(".nc", ".nc4"), outputs=one_output, open=_open)

@@ -5,14 +5,13 @@ Every output is checked first, written to temporaries, and takes its name last.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import FhashError, InputError, MissingDependencyError
+from fhash_formats.errors import FhashError, InputError
 from fhash_formats.support.atomic import check_output, replacing_all
 from fhash_formats.writers.common.region import Region
 from fhash_formats.writers.common.writer import Frame, Writer
@@ -38,7 +37,6 @@ def save_check(
     Raises:
         InputError: a suffix that no writer has, a region that the format cannot hold, or an output
             that is one of the `sources`.
-        MissingDependencyError: the format needs a library that is not installed.
         OutputExistsError: the path, or with `region` any file that goes with it, exists and `force`
             is not given.
         OutputError: no such folder, no permission, or an existing object that must not be replaced.
@@ -102,11 +100,6 @@ def _writer(path: Path) -> Writer:
     suffix = path.suffix.lower()
     for writer in WRITERS:
         if suffix in writer.suffixes:
-            if writer.module and importlib.util.find_spec(writer.module) is None:
-                raise MissingDependencyError(
-                    f"{path}: writing {writer.name} needs {writer.module}: pip install"
-                    " 'fhash[formats]'"
-                )
             return writer
     suffixes = ", ".join(suffix for writer in WRITERS for suffix in writer.suffixes)
     raise InputError(

@@ -127,5 +127,7 @@ def test_tifffile_is_named_where_it_is_missing(
 ) -> None:
     path = write(tmp_path / "a.tif", VALUES[0])
     monkeypatch.setitem(sys.modules, "tifffile", None)
-    with pytest.raises(ImportError, match=r"a\.tif: TIFF needs tifffile; pip install tifffile"):
+    with pytest.raises(
+        ImportError, match=r"a\.tif: TIFF needs tifffile: pip install 'fhash\[formats\]'"
+    ):
         open_series(path)

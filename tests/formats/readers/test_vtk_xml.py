@@ -240,5 +240,5 @@ def test_lz4_names_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     path = small(tmp_path / "a.vti")
     path.write_text(path.read_text().replace('32">', '32" compressor="vtkLZ4DataCompressor">'))
     monkeypatch.setitem(__import__("sys").modules, "lz4.block", None)
-    with pytest.raises(ImportError, match=r"a\.vti.* needs lz4; pip install lz4"):
+    with pytest.raises(ImportError, match=r"a\.vti.* needs lz4: pip install 'fhash\[formats\]'"):
         open_series(path)

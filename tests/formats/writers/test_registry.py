@@ -21,7 +21,6 @@ from fhash_formats import Region, open_series, save_check, save_region
 from fhash_formats.errors import (
     FhashError,
     InputError,
-    MissingDependencyError,
     MissingInputError,
     OutputError,
     OutputExistsError,
@@ -248,16 +247,6 @@ def test_what_can_be_refused_at_once(
 def test_a_suffix_in_capitals(tmp_path: Path) -> None:
     (path,) = save_region(str(tmp_path / "OUT.NPY"), region(), values())
     np.testing.assert_array_equal(np.load(path), values())
-
-
-def test_a_missing_library_is_named_before_any_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "h5netcdf", None)
-    with pytest.raises(
-        MissingDependencyError, match=r"NetCDF needs h5netcdf: pip install 'fhash\[formats\]'"
-    ):
-        save_check(tmp_path / "out.nc")
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

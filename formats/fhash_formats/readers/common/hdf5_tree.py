@@ -187,7 +187,7 @@ def require_filters(source: str, name: str, dataset: Any) -> None:
         except ImportError as error:
             raise MissingDependencyError(
                 f"{source}: {name} is compressed with the HDF5 filter {label}, which needs"
-                " hdf5plugin; pip install 'fhash[formats]'"
+                " hdf5plugin: pip install 'fhash[formats]'"
             ) from error
         if not h5py.h5z.filter_avail(code):
             raise InputError(

@@ -6,7 +6,6 @@ Times are not decoded, and nothing is read before it is asked for.
 from __future__ import annotations
 
 import gc
-import importlib
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.errors import InputError
 from fhash_formats.readers.common.cf_packing import Packing, packing
 from fhash_formats.readers.common.failures import condense
 from fhash_formats.readers.common.hdf5_tree import require_filters
@@ -57,12 +56,8 @@ def open_groups(
             f"{source} is NetCDF of the kind CDF-5, which cannot be read here; convert it with:"
             " nccopy -k nc4 IN OUT"
         )
-    try:
-        import xarray as xr
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{source}: NetCDF needs xarray and h5netcdf; pip install 'fhash[formats]'"
-        ) from error
+    import xarray as xr
+
     options: dict[str, Any] = {
         "decode_times": False,
         "decode_timedelta": False,
@@ -72,18 +67,7 @@ def open_groups(
         "mask_and_scale": not raw,
     }
     if head in CLASSIC:
-        try:
-            importlib.import_module("scipy")
-        except ImportError as error:
-            advice = "pip install scipy, or convert it with: nccopy -k nc4 IN OUT"
-            raise InputError(f"{source} is classic NetCDF3, which needs scipy; {advice}") from error
         return {"/": _open_classic(source, path, options)}
-    try:
-        importlib.import_module("h5netcdf")
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"{source}: NetCDF4 needs h5netcdf; pip install 'fhash[formats]'"
-        ) from error
     # dimensions without a scale get a made-up name, so that HDF5 files named .nc open too
     return xr.open_groups(path, engine="h5netcdf", phony_dims="access", **options)
 

@@ -297,7 +297,7 @@ def _compressor(name: str) -> Callable[[bytes, int], bytes] | None:
             importlib.import_module("lz4.block")
         except ImportError as error:
             raise MissingDependencyError(
-                "it is compressed with LZ4, which needs lz4; pip install lz4"
+                "it is compressed with LZ4, which needs lz4: pip install 'fhash[formats]'"
             ) from error
         return _inflate_lz4
     known = {"vtkZLibDataCompressor": _inflate_zlib, "vtkLZMADataCompressor": _inflate_lzma}

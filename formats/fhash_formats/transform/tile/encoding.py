@@ -120,16 +120,17 @@ def encode_tile(
     task = _task(values, settings, coding, in_coreset)
     if not task.values.size or (task.counted is not None and not task.counted.any()):
         return _empty_tile(task)
+    lossless: list[CodedTile] = []
     labelled = _labelled_tile(task) if settings.labels else None
-    if labelled is not None and 4 * len(labelled.data) < len(task.exact().data):
-        return labelled  # nothing else is that small
+    if labelled is not None:
+        lossless = [labelled, task.exact()]
+        if 4 * len(labelled.data) < len(lossless[1].data):
+            return labelled  # nothing else is that small
     if settings.predictor is not None and coding.error is not None:
         coded = _predicted_tile(task, settings.predictor, coding.error)
     else:
         coded = _transformed_tile(task)
-    if labelled is not None and len(labelled.data) < len(coded.data):
-        return labelled
-    return coded
+    return min([coded, *lossless], key=lambda tile: len(tile.data))
 
 
 def exact_tile(

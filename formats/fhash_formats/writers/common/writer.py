@@ -39,7 +39,6 @@ class Writer:
         open: (region, outputs, temporaries) -> context manager that gives the function for the
             frames; the temporaries stand for the outputs one by one.
         directory: whether the output is a directory.
-        module: optional library that must be installed, "" for none.
     """
 
     name: str
@@ -47,7 +46,6 @@ class Writer:
     outputs: Callable[[Path, Region], list[Path]]
     open: Callable[[Region, Sequence[Path], Sequence[Path]], AbstractContextManager[Put]]
     directory: bool = False
-    module: str = ""
 
 
 def one_output(path: Path, region: Region) -> list[Path]:
