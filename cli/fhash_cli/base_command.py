@@ -56,6 +56,8 @@ ELSEWHERE = {
     ("train", "engines"): "Comparison",
 }
 """Groups of options that mean something else in one command, by command and option."""
+WHY_ONCE = {"var": "a file RUN.fhz holds one variable, so encode each with a command of its own"}
+"""What to do instead of repeating an option, where that is not plain; by its parameter."""
 LAST = ("Output", "Run")
 """Groups that end the help, in this order."""
 OTHERS = "Further options"
@@ -116,4 +118,5 @@ def _check_repeated(option: click.Option, ctx: click.Context) -> None:
     if option.multiple or option.count or (option.is_flag and not option.secondary_opts):
         return
     name = "/".join([option.opts[-1], *option.secondary_opts])
-    raise click.UsageError(f"{name} is given more than once; give it once", ctx)
+    advice = WHY_ONCE.get(option.name or "", "give it once")
+    raise click.UsageError(f"{name} is given more than once; {advice}", ctx)

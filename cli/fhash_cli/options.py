@@ -146,34 +146,13 @@ class SourceOptions:
         }
 
 
-def once(*names: str, why: str = "", **settings: Any) -> Callable[[Command], Command]:
-    """A click option that may be given once; click itself would silently take the last one.
-
-    why: what to do instead of repeating it.
-    """
-
-    def only(context: click.Context, parameter: click.Parameter, values: tuple[Any, ...]) -> Any:
-        if len(values) > 1:
-            raise InputError(
-                f"{names[0]} is given {len(values)} times"
-                + (f"; {why}" if why else "; give it once")
-            )
-        return values[0] if values else None
-
-    decorated: Callable[[Command], Command] = click.option(
-        *names, multiple=True, callback=only, **settings
-    )
-    return decorated
-
-
 def series_options(command: Command) -> Command:
     """Add the options of SourceOptions; the command gets them as `source`."""
 
-    @once(
+    @click.option(
         "--var",
         metavar="NAME",
         help="Which variable or dataset of the file; 'state.rho' is a field of a compound type.",
-        why="a file RUN.fhz holds one variable, so encode each with a command of its own",
     )
     @click.option(
         "--select",
@@ -198,21 +177,25 @@ def series_options(command: Command) -> Command:
         is_flag=True,
         help="An extreme value that repeats, far away from all others, is data.",
     )
-    @once(
+    @click.option(
         "--axes",
         metavar="t,z,y,x",
         help="What the file's dimensions are, in its own order; letters left out have length 1.",
     )
-    @once(
+    @click.option(
         "--t", "t", type=SliceType(), help="Only these steps, half-open as in Python: 40:50, ::2."
     )
-    @once(
+    @click.option(
         "--shape",
         metavar="x=64,y=64,z=32,t=10",
         help="Lengths of a raw file, the fastest axis first.",
     )
-    @once("--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8.")
-    @once("--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file.")
+    @click.option(
+        "--dtype", metavar="NAME", help="Number type of a raw file, such as float32 or uint8."
+    )
+    @click.option(
+        "--endian", type=click.Choice(["little", "big"]), help="Byte order of a raw file."
+    )
     @functools.wraps(command)
     def collected(**values: Any) -> None:
         names = [field.name for field in dataclasses.fields(SourceOptions)]

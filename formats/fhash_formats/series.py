@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -64,6 +65,8 @@ class Series(ABC):
         source_dtype: the integer type of the source where missing values made the frames floats;
             None where the frames have the type of the source.
         fill: the number that stood in the source for a missing value; None where there is none.
+        occurring: numbers that the user named as missing, and that were met in the frames read so
+            far.
         keep_extremes: whether the user said that extreme values which repeat are data.
         unlikely: values that stand for the lowest integers of the stored type, where counts are
             unpacked; they are hardly ever data.
@@ -79,6 +82,7 @@ class Series(ABC):
     files: tuple[Path, ...] = ()
     source_dtype: np.dtype[Any] | None = None
     fill: int | float | None = None
+    occurring: AbstractSet[float] = frozenset()
     keep_extremes: bool = False
     unlikely: frozenset[float] = frozenset()
 
@@ -109,6 +113,7 @@ class Series(ABC):
     def inherit(self, series: Series) -> None:
         """Take over what is known of the source of another series with the same values."""
         self.source_dtype, self.fill = series.source_dtype, series.fill
+        self.occurring = series.occurring
         self.keep_extremes, self.unlikely = series.keep_extremes, series.unlikely
 
     def frames(self) -> Iterator[npt.NDArray[Any]]:

@@ -108,7 +108,8 @@ def test_no_option_is_in_two_groups() -> None:
 def test_a_single_value_that_is_given_twice_is_refused(
     refused: Callable[..., str], words: list[str], option: str
 ) -> None:
-    assert refused(2, *words).startswith(f"{option} is given more than once; give it once")
+    advice = "a file RUN.fhz holds one variable" if option == "--var" else "give it once"
+    assert refused(2, *words).startswith(f"{option} is given more than once; {advice}")
 
 
 def test_flags_may_be_repeated_and_lists_as_well(fhash: Fhash, run: str) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import h5py
 import pytest
 from click.testing import Result
 
@@ -119,16 +120,19 @@ def test_types_are_told_apart(value: Any, kind: str, fit: bool) -> None:
 
 def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.fhz"
-    outputs: dict[str, list[Any]] = {"encode": [], "diff": [], "info": []}
+    outputs: dict[str, list[Any]] = {"encode": [], "diff": [], "info": [], "info DATA": []}
+    with h5py.File(data) as file:
+        smallest = file["density"][...].min()
     for settings in (
         ["--effort", "2"],
-        ["--effort", "2", "--no-timings"],
+        ["--effort", "2", "--no-timings", "--missing", repr(float(smallest))],
         ["--profile", "paper", "--epochs", "1", "--width", "4"],
     ):
         words = ["encode", data, "-o", path, "--force", *settings]
         outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
         outputs["diff"].append(parsed(fhash("diff", data, path, "--json", "-q")))
         outputs["info"].append(parsed(fhash("info", path, "--json")))
+    outputs["info DATA"].append(parsed(fhash("info", data, "--missing", "-9", "--json")))
     for command, results in outputs.items():
         check(command, *results)
 

@@ -84,12 +84,12 @@ def test_an_option_that_counts_once_is_not_repeated(
 ) -> None:
     out = tmp_path / "a.fhz"
     message = refused(2, "encode", data, "-o", out, "--var", "a", "--var", "b")
-    assert message == (
-        "--var is given 2 times; a file RUN.fhz holds one variable, so encode each with a command"
-        " of its own"
+    assert message.startswith(
+        "--var is given more than once; a file RUN.fhz holds one variable, so encode each with a"
+        " command of its own"
     )
     for option, value in (("--axes", "t,z,y,x"), ("--t", "0"), ("--endian", "big")):
-        assert f"{option} is given 2 times" in refused(
+        assert f"{option} is given more than once; give it once" in refused(
             2, "encode", data, "-o", out, option, value, option, value
         )
 

@@ -15,7 +15,7 @@ from fhash_cli.options import (
     run_argument,
     series_options,
 )
-from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, table
+from fhash_cli.output import Progress, compared, emit, extent, number, quality_rows, say, table
 from fhash_formats.errors import QualityError
 
 
@@ -53,12 +53,23 @@ def command(
         raise click.UsageError(f"the data come first: fhash diff {run} {data}")
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         report = fhash_codec.diff(series, run, progress=progress)
+        fill = None if source.missing or series.fill is not None else _missing_of(run)
+    if fill is not None and not quiet:
+        say(f"{run} was encoded with --missing {fill:.9g}; add it here, or it counts as a value")
     rows = [
         ("size", compared(report, part=source.part)),
         ("steps, z, y, x", extent(report["shape"])),
         *quality_rows(report, series.units),
     ]
     emit(report, table(rows), as_json, _missed_gate(run, report, min_psnr, max_error))
+
+
+def _missing_of(run: str) -> float | None:
+    """The number that stood for a missing value in the source of a container, if any."""
+    import fhash_codec
+
+    with fhash_codec.open(run) as volume:
+        return volume.value_type.fill
 
 
 def _missed_gate(

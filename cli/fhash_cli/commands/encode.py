@@ -37,6 +37,7 @@ from fhash_formats.errors import InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
+    from fhash_formats.series import Series
 
 MAX_LABELS = 64
 """Range of integers up to which they may be labels."""
@@ -86,11 +87,19 @@ def command(
             missed, report = error, error.figures
         except KeyboardInterrupt:
             raise InterruptedEncodingError(_after_interruption(output, before)) from None
+    _say_unmet(source, series, quiet)
     integers = (series.source_dtype or series.dtype).kind in "iu"
     if integers and not quiet and looks_categorical(report):
         say("few different integers: if they are labels, --max-error 0 keeps each exactly")
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
     emit(report, table(rows), as_json, missed)
+
+
+def _say_unmet(source: SourceOptions, series: Series, quiet: bool) -> None:
+    """One line for each `--missing V` that occurs nowhere: it may be a slip."""
+    for value in source.missing:
+        if value == value and value not in series.occurring and not quiet:
+            say(f"--missing {value:.9g}: {series.source} holds no such value")
 
 
 def looks_categorical(report: Mapping[str, Any]) -> bool:

@@ -23,6 +23,9 @@ from fhash_cli.output import (
     table,
 )
 
+MIN_DIMENSIONS = 3
+"""Dimensions of an array that may be a variable; others are named in one line."""
+
 if TYPE_CHECKING:
     from fhash_codec import Volume
 
@@ -80,10 +83,15 @@ def _listing(path: str, files: int, variables: Sequence[Mapping[str, Any]]) -> s
         if len(variable["commands"]) > 1:
             lines.append("  two readings are likely:")
         lines += [f"  {text}" for text in variable["commands"]]
-    others = [variable for variable in variables if variable["problem"]]
+    rest = [variable for variable in variables if variable["problem"]]
+    others = [variable for variable in rest if len(variable["shape"]) >= MIN_DIMENSIONS]
+    small = [variable for variable in rest if len(variable["shape"]) < MIN_DIMENSIONS]
     if others:
         lines.append("\nnot to be encoded:")
         lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
+    if small:
+        names = [f"{variable['name']} {tuple(variable['shape'])}" for variable in small]
+        lines.append(f"\nbelow {MIN_DIMENSIONS} dimensions: {listed(names)}")
     return "\n".join(lines)
 
 
@@ -109,7 +117,8 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "variable",
             f"{volume.name}, {dtype}"
-            + (f", in {volume.units}" if volume.units not in ("", "1") else ""),
+            + (f", in {volume.units}" if volume.units not in ("", "1") else "")
+            + _missing(volume),
         ),
         ("t, z, y, x", extent(volume.shape)),
         *((f"  {axis}", _positions(volume, axis)) for axis in "tzyx"),
@@ -126,6 +135,12 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
         *(_compact(volume, seconds) if volume.profile == "compact" else _network(info, seconds)),
         *quality_rows(info["quality"], volume.units),
     ]
+
+
+def _missing(volume: Volume) -> str:
+    """The number that stood for a missing value in the source, where it is known."""
+    fill = volume.value_type.fill
+    return "" if fill is None else f", missing where the source had {fill:.9g}"
 
 
 def _network(info: dict[str, Any], seconds: str) -> list[tuple[str, str]]:

@@ -85,6 +85,10 @@ class Record:
             )
         except FileNotFoundError as error:
             raise MissingInputError(f"{path}: {missing}") from error
+        except UnicodeDecodeError as error:
+            raise InputError(
+                f"{path}: not {what}: it holds no text; JSON or TOML is needed"
+            ) from error
         except (OSError, ValueError, RecursionError) as error:
             if isinstance(error, InputError):
                 raise InputError(f"{path}: {error}") from error

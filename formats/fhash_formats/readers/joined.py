@@ -101,6 +101,8 @@ class JoinedSeries(Series):
         self.name, self.files = _common_name(names), tuple(dict.fromkeys(files))
         self.units, self.dtype, self.attributes = first.units, first.dtype, first.attributes
         self.inherit(first)
+        self._met = set(first.occurring)
+        self.occurring = self._met
         self._ends = list(accumulate(part.steps for part in self._parts))
         self.shape = (self._ends[-1], *first.shape[1:])
         self.coords = {**first.coords, "t": times or self._times()}
@@ -111,7 +113,10 @@ class JoinedSeries(Series):
         if self._current is None or self._current[0] != number:
             self.close()
             self._current = (number, self._reopened(self._parts[number]))
-        return self._current[1].read(step - (self._ends[number] - self._parts[number].steps))
+        part = self._current[1]
+        frame = part.read(step - (self._ends[number] - self._parts[number].steps))
+        self._met.update(part.occurring)
+        return frame
 
     def check(self) -> None:
         for part in self._parts:

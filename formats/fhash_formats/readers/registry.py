@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fhash_formats.errors import FhashError, InputError, MissingInputError
@@ -24,6 +24,7 @@ from fhash_formats.readers.common.failures import condense, refusing
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.listing import Listed, listed_series
 from fhash_formats.readers.common.request import RawLayout, Request, parse_axes, selection
+from fhash_formats.readers.common.variables import SeveralVariablesError
 from fhash_formats.readers.joined import JoinedSeries, files_of, is_pattern
 from fhash_formats.series import Series, StepsSeries
 
@@ -42,7 +43,9 @@ class Reader:
         suffixes: file name suffixes.
         matches: whether a file is of the format, from its first bytes (none for a folder) and path.
         open: opens it.
-        variables: lists what it holds; None for a format of one array, which is opened for it.
+        variables: lists what it holds; None where the file is opened for it.
+        packed: whether its values may be packed, so that `raw_values` means something.
+        selects: whether its arrays may have more dimensions than t, z, y and x.
     """
 
     name: str
@@ -50,9 +53,25 @@ class Reader:
     matches: Callable[[bytes, Path], bool]
     open: Callable[[Path, Request], FileSeries | JoinedSeries]
     variables: Callable[[Path, Request], list[Listed]] | None = None
+    packed: bool = False
+    selects: bool = False
 
     def __str__(self) -> str:
         return f"{self.name} ({' '.join(self.suffixes)})"
+
+    def refuse_unused(self, path: Path, request: Request) -> None:
+        """Raise InputError for a wish that means nothing in this format, and would be ignored."""
+        if request.select and not self.selects:
+            name, index = request.select[0]
+            raise InputError(
+                f"{path}: --select {name}={index} cannot be used, {self.name} files have no"
+                " dimensions but t, z, y and x; a component is chosen by --var, such as velocity.x"
+            )
+        if request.raw_values and not self.packed:
+            raise InputError(
+                f"{path}: --raw-values cannot be used, {self.name} files hold no packed numbers;"
+                " leave it out"
+            )
 
 
 RAW = Reader(name="raw", suffixes=(".raw", ".bin", ".dat"), matches=raw.matches, open=raw.open_raw)
@@ -62,6 +81,8 @@ ZARR = Reader(
     matches=zarr_store.matches,
     open=zarr_store.open_zarr,
     variables=zarr_store.list_zarr,
+    packed=True,
+    selects=True,
 )
 REGISTRY = (
     RAW,
@@ -74,6 +95,8 @@ REGISTRY = (
         matches=netcdf.matches,
         open=netcdf.open_netcdf,
         variables=netcdf.list_netcdf,
+        packed=True,
+        selects=True,
     ),
     Reader(
         name="HDF5",
@@ -81,6 +104,8 @@ REGISTRY = (
         matches=hdf5.matches,
         open=hdf5.open_hdf5,
         variables=hdf5.list_hdf5,
+        packed=True,
+        selects=True,
     ),
     Reader(
         name="NumPy",
@@ -88,6 +113,7 @@ REGISTRY = (
         matches=npy.matches,
         open=npy.open_npy,
         variables=npy.list_npy,
+        selects=True,
     ),
     ZARR,
     Reader(name="VTK", suffixes=vtk_xml.SUFFIXES, matches=vtk_xml.matches, open=vtk_xml.open_vtk),
@@ -191,10 +217,25 @@ def list_variables(
     )
     place = files_of(text)[0] if is_pattern(text) else Path(path)
     found = find_reader(place, request)
+    found.refuse_unused(place, request)
     if found.variables is not None:
         return found.variables(place, request)
-    with open_whole(place, request) as series:
-        return [listed_series(series, request)]
+    return _list_by_opening(place, request)
+
+
+def _list_by_opening(path: Path, request: Request) -> list[Listed]:
+    """The variables of a file that is opened for each of them."""
+    try:
+        with open_whole(path, request) as series:
+            return [listed_series(series, request)]
+    except SeveralVariablesError as error:
+        names = error.names
+    found = []
+    for name in names:
+        named = replace(request, var=name)
+        with open_whole(path, named) as series:
+            found.append(listed_series(series, named))
+    return found
 
 
 def open_whole(path: str | Path, request: Request) -> Series:
@@ -204,6 +245,7 @@ def open_whole(path: str | Path, request: Request) -> Series:
         return _open_one(Path(path), request)
     files = files_of(text)
     if all(tiff.matches(b"", file) for file in files):
+        find_reader(files[0], request).refuse_unused(files[0], request)
         pages = tiff.open_pages(text, files, request)
         if pages is not None:
             return pages.as_asked(request)
@@ -221,7 +263,9 @@ def _open_part(path: Path, request: Request) -> FileSeries:
 
 def _open_one(path: Path, request: Request) -> FileSeries | JoinedSeries:
     try:
-        series = find_reader(path, request).open(path, request)
+        reader = find_reader(path, request)
+        reader.refuse_unused(path, request)
+        series = reader.open(path, request)
         return series.as_asked(request) if isinstance(series, FileSeries) else series
     except OSError as error:  # a folder that may not be entered, wherever somebody looks into it
         if isinstance(error, FhashError):

@@ -109,3 +109,20 @@ def test_a_figure_that_is_not_defined_meets_no_gate(
 @pytest.mark.parametrize("gate", ["--min-psnr", "--max-error"])
 def test_a_gate_is_a_number(refused: Callable[..., str], gate: str, value: str) -> None:
     assert gate in refused(2, "diff", "data", "run", gate, value)
+
+
+def test_a_missing_value_is_told_of_where_it_is_forgotten(fhash: Fhash, tmp_path: Path) -> None:
+    values = np.arange(60.0, dtype=np.float32).reshape(1, 3, 4, 5)
+    values[0, 0, 0, 0] = -999
+    np.save(tmp_path / "a.npy", values)
+    data, run = tmp_path / "a.npy", tmp_path / "a.fhz"
+    words = ["--effort", "1", "--max-error", "1"]
+    result = fhash("encode", data, "-o", run, *words, "--missing", "-999", "--missing", "5.5")
+    assert result.exit_code == 0
+    assert f"--missing 5.5: {data} holds no such value" in result.stderr
+    assert "-999" not in result.stderr
+    assert "missing where the source had -999" in fhash("info", run).stdout
+    said = f"{run} was encoded with --missing -999"
+    assert said in fhash("diff", data, run).stderr
+    assert said not in fhash("diff", data, run, "--missing", "-999").stderr
+    assert said not in fhash("diff", data, run, "--quiet").stderr

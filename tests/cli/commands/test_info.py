@@ -133,12 +133,12 @@ def test_info_of_data_says_what_cannot_be_encoded(fhash: Fhash, tmp_path: Path) 
         file["good"].attrs["missing_value"] = h5py.Empty("f4")
     assert fhash("info", tmp_path / "a.h5").stdout == (
         f"{tmp_path / 'a.h5'} holds 1 variable to encode\n\n"
-        "good: float32 stored as int16, dim0=3 (z), dim1=4 (y), dim2=5 (x), missing where -9\n"
+        "good: int16, dim0=3 (z), dim1=4 (y), dim2=5 (x), missing where -9\n"
         f"  fhash encode {tmp_path / 'a.h5'} -o good.fhz --var good\n\n"
         "not to be encoded:\n"
         "  bad: the fill value 'none' is not a number; --raw-values reads the numbers as they are"
         " stored\n"
-        "  line: 1 dimensions (4,); 3 or 4 can be read\n"
+        "\nbelow 3 dimensions: line (4,)\n"
     )
 
 

@@ -248,3 +248,58 @@ def test_names_are_text_whatever_the_file_is_called(tmp_path: Path, name: str) -
     with open_series(tmp_path / name) as series:
         assert series.name.encode()[:2] == b"a?"
         np.testing.assert_array_equal(series.read(0), frame)
+
+
+def test_every_array_of_a_file_is_listed(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.vtkhdf", "w") as file:
+        root = file.create_group("VTKHDF")
+        root.attrs["Type"] = np.bytes_(b"ImageData")
+        root.attrs["WholeExtent"] = [0, 3, 0, 2, 0, 1]
+        root.attrs["Origin"], root.attrs["Spacing"] = [0.0, 0, 0], [1.0, 1, 1]
+        root["PointData/u"], root["PointData/n"] = VALUES[0], VALUES[0].astype("i2")
+    found = fhash_formats.list_variables(tmp_path / "a.vtkhdf", missing=[7])
+    assert [(one.name, one.dtype, one.missing) for one in found] == [
+        ("n", "int16", (7,)),
+        ("u", "float32", (7,)),
+    ]
+    assert found[0].options == (("--var", "n", "--missing", "7"),)
+    (one,) = fhash_formats.list_variables(tmp_path / "a.vtkhdf", var="u")
+    assert one.name == "u"
+
+
+@pytest.mark.parametrize("suffix", ["raw", "mha", "npy"])
+@pytest.mark.parametrize("pattern", [False, True])
+def test_wishes_that_a_format_has_no_use_for_are_refused(
+    tmp_path: Path, suffix: str, pattern: bool
+) -> None:
+    name = f"a_4x3x2_float32.{suffix}"
+    if suffix == "npy":
+        np.save(tmp_path / name, VALUES[0])
+    else:
+        head = b"ObjectType = Image\nNDims = 3\nDimSize = 4 3 2\nElementType = MET_FLOAT\n"
+        head += b"ElementDataFile = LOCAL\n"
+        (tmp_path / name).write_bytes((head if suffix == "mha" else b"") + VALUES[0].tobytes())
+    path = tmp_path / (f"*.{suffix}" if pattern else name)
+    open_series(path).close()
+    wishes: list[tuple[dict[str, Any], str]] = [
+        ({"raw_values": True}, "--raw-values cannot be used, .* hold no packed numbers"),
+        ({"select": {"a": 1}}, "--select a=1"),
+    ]
+    for wish, message in wishes:
+        for use in (open_series, fhash_formats.list_variables):
+            if use is open_series or suffix != "npy" or "select" not in wish:
+                with pytest.raises(InputError, match=message):
+                    use(path, **wish)
+
+
+def test_missing_numbers_that_occur_are_noted(path: Path, tmp_path: Path) -> None:
+    np.save(tmp_path / "b.npy", np.array([[[1, 2, 300]]], "i2").repeat(2, axis=0))
+    np.save(tmp_path / "c.npy", np.array([[[1, 2, -9]]], "i2").repeat(2, axis=0))
+    (tmp_path / "a.npy").unlink()
+    with open_series(tmp_path / "*.npy", missing=[300, -9, 5, 1e20], steps=slice(2)) as series:
+        assert series.occurring == set()
+        list(series.frames())
+        assert series.occurring == {300, -9}
+    with open_series(tmp_path / "b.npy", missing=[300, -9]) as series:
+        series.read(0)
+        assert series.occurring == {300}

@@ -96,6 +96,9 @@ class FileSeries(Series):
         )
         self._slab: tuple[int, npt.NDArray[Any]] | None = None
         self._missing: Packing | None = None
+        self._sought: dict[float, Any] = {}
+        self._met: set[float] = set()
+        self.occurring = self._met
         if packing is not None:
             self._note_fills(packing)
 
@@ -106,6 +109,9 @@ class FileSeries(Series):
         """
         if missing:
             self._missing = missing_values(self.source, self.dtype, missing)
+            for value in missing:
+                for fill in missing_values(self.source, self.dtype, [value]).fills:
+                    self._sought[value] = fill
             self._note_fills(self._missing)
             self.dtype = self._missing.dtype
 
@@ -169,6 +175,11 @@ class FileSeries(Series):
                 " while it was being read"
             )
         if self._missing is not None:
+            self._met.update(
+                value
+                for value, fill in self._sought.items()
+                if value not in self._met and (values == fill).any()
+            )
             values = self._missing.unpack(values.astype(self._missing.stored, copy=False))
         present = [axis for axis in AXES if axis in self._axes]
         ordered = values.transpose([self._axes.index(axis) for axis in present])

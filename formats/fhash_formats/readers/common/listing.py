@@ -35,8 +35,7 @@ class Listed:
         name: full name, as `--var` takes it.
         shape: lengths in the file's order.
         dtype: type of the values, in words.
-        stored: type of the stored numbers, where values are unpacked or missing ones become NaN;
-            "" where it is the same.
+        stored: type of the stored numbers, where values are unpacked; "" where it is the same.
         missing: numbers that stand for missing values in the file, by its attributes.
         units: of the values, "" where unknown.
         dimensions: name and axis of each dimension; the axis is "t", "z", "y" or "x", "select"
@@ -130,10 +129,11 @@ def _unpacked(entry: Listed, packed: Packing | None) -> Listed:
     """An entry with the type of the values instead of the stored one, and the fill values."""
     if packed is None:
         return entry
-    changed = packed.dtype != packed.stored
+    # integers of which some are missing decode to integers again
+    changed = packed.scaled and packed.dtype != packed.stored
     return replace(
         entry,
-        dtype=kind_of(packed.dtype),
+        dtype=kind_of(packed.dtype if packed.scaled else packed.stored),
         stored=kind_of(packed.stored) if changed else "",
         missing=tuple(fill.item() for fill in packed.fills),
     )
@@ -215,7 +215,8 @@ def listed_series(series: Series, request: Request) -> Listed:
     return Listed(
         name=series.name,
         shape=series.shape,
-        dtype=kind_of(series.dtype),
+        dtype=kind_of(series.source_dtype or series.dtype),
+        missing=request.missing,
         units=series.units,
         dimensions=tuple((series.coords[axis].name, axis) for axis in AXES),
         options=(("--var", request.var, *_given(request)) if request.var else _given(request),),

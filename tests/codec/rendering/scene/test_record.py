@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from fhash_codec.rendering.scene.record import Record, limits
+from fhash_codec.rendering.scene.scene import Scene
 from fhash_formats.errors import InputError, MissingInputError
 
 
@@ -112,3 +113,10 @@ def test_files_are_toml_or_json(tmp_path: Path) -> None:
     other.write_text('{"count": 0}')
     with pytest.raises(InputError, match=r"a\.txt: count is 0"):
         Shot.read(other, "a shot", "no shot")
+
+
+def test_bytes_are_no_record(tmp_path: Path) -> None:
+    (tmp_path / "a.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(InputError, match=r"a.h5: not a scene: it holds no text") as caught:
+        Scene.load(tmp_path / "a.h5")
+    assert "codec" not in str(caught.value)
