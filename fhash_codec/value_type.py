@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_formats.container import Container
 
@@ -85,6 +86,20 @@ def holds(dtype: np.dtype[Any], number: Number) -> bool:
     if not np.isfinite(float(number)) or number != int(number):
         return False
     return bool(limits.min <= int(number) <= limits.max)
+
+
+def rounded(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Floats as the nearest integers of a type, 0 for NaN.
+
+    The ends of 64-bit types are no floats: what rounding puts beyond them becomes the nearest float
+    within.
+    """
+    limits = np.iinfo(dtype)
+    low, high = float(limits.min), float(limits.max)
+    if int(high) > limits.max:
+        high = float(np.nextafter(high, 0))
+    wide = np.nan_to_num(values.astype(np.float64), nan=0.0)
+    return np.clip(np.rint(wide), low, high).astype(dtype)
 
 
 def _has_gaps(header: Mapping[str, Any]) -> bool:

@@ -175,7 +175,7 @@ class Volume:
             return filled(self.read(t, region, outside=outside), self.fill)
         read = self.read(t, region, outside=outside)
         gaps = np.isnan(read)
-        result: npt.NDArray[Any] = np.rint(np.nan_to_num(read)).astype(self.dtype)
+        result: npt.NDArray[Any] = rounded(read, self.dtype)
         common = self._within_box(self._checked(region))
         if common is not None and self.dtype.itemsize == 8:
             # float64 has not every integer of 64 bits.

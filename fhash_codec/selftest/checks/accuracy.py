@@ -66,7 +66,7 @@ def quality(run: Run) -> Iterator[Finding]:
             name="promised PSNR", worst=promised / reached, limit=1.0, unit="of the dB reached"
         )
     stated = run.volume.container.header["quality"]
-    worst = largest_difference(run.values, run.decoded, where)
+    worst = largest_difference(run.values, _own_values(run), where)
     if stated["max_abs_error"]:
         # The stated error is a difference of two float64, which is rounded.
         beyond = max(float(worst / Fraction(stated["max_abs_error"]) - 1), 0.0)
@@ -214,8 +214,17 @@ def _error_bound(run: Run) -> Fraction | None:
 
 def _differing(run: Run) -> float:
     """The number of coreset values that differ from the original, rounded to the decoded dtype."""
-    same = run.values.astype(run.decoded.dtype) == run.decoded
+    decoded = _own_values(run)
+    same = run.values.astype(decoded.dtype) == decoded
     return _count(~same & np.isfinite(run.decoded))
+
+
+def _own_values(run: Run) -> Values:
+    """The decoded values in the source's type: floats cannot tell all integers of 64 bits apart."""
+    volume = run.volume
+    if volume.dtype.kind == "f" or volume.value_type.has_gaps:
+        return run.decoded
+    return np.stack([volume.values(step) for step in range(volume.shape[0])])
 
 
 def _count(mask: Mask) -> float:
