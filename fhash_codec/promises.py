@@ -36,7 +36,8 @@ def remarks(config: EncodeConfig, figures: Mapping[str, Any]) -> Iterator[str]:
     """
     bulk = figures["quality"]["bulk"]
     psnr, psnr_bulk = figures["psnr"], figures["psnr_bulk"]
-    if config.psnr_bulk is None and None not in (psnr, psnr_bulk):
+    trained = config.profile == "paper" and config.psnr is None
+    if config.psnr_bulk is None and not trained and None not in (psnr, psnr_bulk):
         enough = min(DEFAULT_PSNR_BULK, psnr - FAR_BELOW)
         if psnr_bulk < enough:
             low, high = bulk["range"]

@@ -155,7 +155,7 @@ SETTINGS = [
     ),
     (["--ratio", "40", "--max-error", "0.1"], "max-error and ratio are given; promise one of them"),
     (["--ratio", "0.5"], "--ratio"),
-    (["--ratio", "1e6"], "ratio leaves no room"),
+    (["--ratio", "1e6"], "the ratio is out of reach: it leaves 0 bytes for the file"),
     (["--max-error", "-1"], "--max-error"),
     (["--max-error-rel", "2"], "--max-error-rel"),
     (["--effort", "10"], "--effort"),
@@ -373,7 +373,7 @@ def test_force_never_replaces_the_input(
 
 
 LINES = [
-    ("info", "Missing argument 'RUN.fhz' (see 'fhash info --help')"),
+    ("info", "Missing argument 'RUN.fhz|DATA' (see 'fhash info --help')"),
     ("bench", "Missing command; give one of "),
     ("bench foo", "No such command 'foo'"),
     ("completion", "Missing argument 'SHELL'. Choose from: bash, zsh, fish"),

@@ -33,7 +33,9 @@ def test_the_commands_of_the_page_give_its_pictures(
     fhash: Fhash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (plane,) = (picture for picture in PICTURES if picture.name == "plane")
-    small = replace(plane, options=(*plane.options, "--size", "256x160"))
+    words = list(plane.options)
+    words[words.index("--size") + 1] = "256x160"
+    small = replace(plane, options=tuple(words))
     monkeypatch.setattr(gallery, "PICTURES", (small,))
     monkeypatch.setattr(gallery, "GALLERY_SERIES", {"sea": gallery.GALLERY_SERIES["sea"]})
     folder = tmp_path / "g"

@@ -162,7 +162,7 @@ def test_without_a_name_the_picture_is_called_as_the_run(
         (["--opacity", "0:0,99:0"], "shows nothing"),
         (["--gradient-opacity", "0.1"], "points [gradient, factor 0..1]"),
         (["--gradient-opacity", "steep"], "not points such as"),
-        (["--clip-box", "1:0,:,:"], "z is 1 to 0; the first end must be below the second"),
+        (["--clip-box", "1:0,:,:"], "'1:0' ends before it begins"),
         (["--clip-box", ":,:,98:99"], "leaves nothing of the volume"),
         (["--clip-plane", "0,0,1"], "neither a normal and an offset"),
         (["--clip-plane", "0,0,0,1"], "the normal has no length"),

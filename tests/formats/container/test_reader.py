@@ -18,7 +18,7 @@ def test_header_comes_back(sample, samples) -> None:
         assert container.header == {
             **samples.header(),
             "format": "fhash",
-            "format_version": [1, 1],
+            "format_version": [1, 2],
             "required_features": [],
         }
         assert container.size == sample.stat().st_size

@@ -113,10 +113,10 @@ def test_the_region_is_that_of_whole_tiles_around_the_clip(volume: Volume) -> No
     for low, high in ((0, 3), (5, 9), (17.5, 19)):
         body = body_of(grid, z=[low, high])
         region = part_in_view(rays, volume, body)
-        assert region == part_of_body(volume, body)
+        assert region == part_of_body(volume, body, None)
         assert region.z[0] == low // tile[0] * tile[0]
         assert region.z[1] == min(-(-(int(np.ceil(high)) + 1) // tile[0]) * tile[0], 20)
         assert (region.y, region.x) == ((0, 24), (0, 28))
-    assert part_of_body(volume, None) == ((0, 20), (0, 24), (0, 28))
-    wider = part_of_body(volume, body_of(grid, z=[5, 7]), margin=20)
+    assert part_of_body(volume, None, None) == ((0, 20), (0, 24), (0, 28))
+    wider = part_of_body(volume, body_of(grid, z=[5, 7]), None, margin=20)
     assert wider.z == (0, 20)
