@@ -338,7 +338,7 @@ def _index(source: str, key: str, text: str, dimension: Dimension) -> int:
 
 
 def _position_of(key: str, number: int, dimension: Dimension) -> str:
-    """How to select the position that a whole number would be, where the coordinate has it."""
+    """Advice on selecting the position that a whole number is, where the coordinate has it."""
     column = dimension.column
     if column is None or not column.numeric:
         return ""
