@@ -57,7 +57,7 @@ ELSEWHERE = {
 }
 """Groups of options that mean something else in one command, by command and option."""
 WHY_ONCE = {"var": "a file RUN.fhz holds one variable, so encode each with a command of its own"}
-"""What to do instead of repeating an option, where that is not plain; by its parameter."""
+"""Advice to those who repeat an option, where it is not plain; by the name of its parameter."""
 LAST = ("Output", "Run")
 """Groups that end the help, in this order."""
 OTHERS = "Further options"

@@ -6,6 +6,7 @@ NetCDF files are HDF5 too, but have rules of their own (netcdf.py).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -221,7 +222,7 @@ def list_hdf5(path: Path, request: Request) -> list[Listed]:
 
     source = str(path)
     with refusing(f"{source} cannot be read as HDF5"), h5py.File(path, "r") as file:
-        found = Hdf5File(source, path, file, request)
+        found = Hdf5File(source, path, file, replace(request, raw_values=False))
         return listing(source, found.variables, found.dimensions, request, found.packing)
 
 

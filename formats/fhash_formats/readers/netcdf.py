@@ -9,6 +9,7 @@ steps apart, calendars of models need no date, and `units` and `calendar` stay b
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -275,7 +276,7 @@ def list_netcdf(path: Path, request: Request) -> list[Listed]:
     with quietly(), refusing(f"{source} cannot be read as NetCDF"):
         groups = open_groups(source, path, magic_of(path))
         try:
-            found = NetcdfFile(source, path, groups, request)
+            found = NetcdfFile(source, path, groups, replace(request, raw_values=False))
             return listing(source, found.variables, found.dimensions, request, found.packing)
         finally:
             close_groups(groups)

@@ -64,12 +64,10 @@ def open_zarr(path: Path, request: Request) -> FileSeries:
 
 def list_zarr(path: Path, request: Request) -> list[Listed]:
     """The variables of a zarr hierarchy."""
-    store, found = _open_tree(path, request)
+    store, found = _open_tree(path, replace(request, raw_values=False))
     try:
         with refusing(f"{path} cannot be read as zarr"):
-            return listing(
-                found.source, found.variables, found.dimensions, found.request, found.packing
-            )
+            return listing(found.source, found.variables, found.dimensions, request, found.packing)
     finally:
         store.close()
 

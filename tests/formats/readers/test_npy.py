@@ -85,7 +85,7 @@ def test_components_of_vectors_are_selected(tmp_path: Path, order: Any) -> None:
         select={"dim1": 2, "dim4": 1},
         axes="t,y,x",
     )
-    with pytest.raises(InputError, match=r"--select dim4=3 is outside 0\.\.2"):
+    with pytest.raises(InputError, match=r"--select dim4=3 is outside the indices 0\.\.2"):
         open_series(tmp_path / "a.npy", select={"dim4": 3})
     with pytest.raises(InputError, match=r"no dimension 'c'; its dimensions are dim0=4"):
         open_series(tmp_path / "a.npy", select={"c": 3})

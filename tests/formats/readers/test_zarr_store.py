@@ -391,6 +391,10 @@ def test_members_are_selected_by_label(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--select member=0 \(member has 2\)"):
         open_series(path)
     assert_frames(path, VALUES * 2, select={"member": "7.0"})
+    with pytest.raises(InputError, match=r"outside the indices 0..1; member=7.0 is the position"):
+        open_series(path, select={"member": 7})
+    with pytest.raises(InputError, match=r"outside the indices 0..1$"):
+        open_series(path, select={"member": 8})
     with open_series(path, select={"member": 1, "lev": "850."}) as series:
         assert series.coords["z"].values.tolist() == [850]
         np.testing.assert_array_equal(series.read(2)[0], VALUES[2, 1] * 2)

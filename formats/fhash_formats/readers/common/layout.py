@@ -330,8 +330,20 @@ def _index(source: str, key: str, text: str, dimension: Dimension) -> int:
     except ValueError:
         return _index_of_label(source, key, text, dimension)
     if not -dimension.length <= index < dimension.length:
-        raise InputError(f"{source}: --select {key}={text} is outside 0..{dimension.length - 1}")
+        raise InputError(
+            f"{source}: --select {key}={text} is outside the indices 0..{dimension.length - 1}"
+            + _position_of(key, index, dimension)
+        )
     return index % dimension.length
+
+
+def _position_of(key: str, number: int, dimension: Dimension) -> str:
+    """Advice on selecting the position that a whole number is, where the coordinate has it."""
+    column = dimension.column
+    if column is None or not column.numeric:
+        return ""
+    found = np.flatnonzero(column.read().reshape(-1) == number)
+    return f"; {key}={float(number)} is the position of that number" if found.size else ""
 
 
 def _index_of_label(source: str, key: str, text: str, dimension: Dimension) -> int:

@@ -92,7 +92,8 @@ def listing(
 ) -> list[Listed]:
     """The variables of a file; coordinates and the members of joined ones are left out.
 
-    dimensions, packed: dimensions and packing of a variable that can be read.
+    dimensions, packed: dimensions of a variable that can be read, and the packing that the file
+        declares, whatever the request is.
     """
     shown = [variable for variable in variables if not variable.auxiliary]
     several = sum(not variable.problem(request.booleans) for variable in shown) > 1
@@ -111,7 +112,11 @@ def listing(
         if not problem:
             named = ("--var", name) if several or request.var else ()
             try:
-                entry = _unpacked(entry, packed(variable))
+                entry = (
+                    _as_stored(entry, variable, packed)
+                    if request.raw_values
+                    else _unpacked(entry, packed(variable))
+                )
                 entry = _read(source, entry, dimensions(variable), request, named)
             except InputError as error:  # of attributes that make no sense
                 entry = replace(entry, problem=str(error).removeprefix(f"{source}: "))
@@ -137,6 +142,20 @@ def _unpacked(entry: Listed, packed: Packing | None) -> Listed:
         stored=kind_of(packed.stored) if changed else "",
         missing=tuple(fill.item() for fill in packed.fills),
     )
+
+
+def _as_stored(
+    entry: Listed, variable: Variable, packed: Callable[[Variable], Packing | None]
+) -> Listed:
+    """An entry with the stored type; counts have not the unit of the values."""
+    try:
+        declared = packed(variable)
+    except InputError:  # the attributes make no sense, and are not used
+        return entry
+    if declared is None:
+        return entry
+    units = "" if declared.scaled else entry.units
+    return replace(entry, dtype=kind_of(declared.stored), units=units)
 
 
 def _read(

@@ -113,8 +113,8 @@ def test_who_selects_time_is_still_asked_about_components() -> None:
     [
         ("4 5 6", [("dim3", "0")], "no dimension 'dim3'; its dimensions are dim0=4"),
         ("4 5 6", [("member", "0")], "no dimension 'member'"),
-        ("4 5 6", [("dim0", "4")], r"outside 0\.\.3"),
-        ("4 5 6", [("dim0", "-5")], r"outside 0\.\.3"),
+        ("4 5 6", [("dim0", "4")], r"outside the indices 0\.\.3"),
+        ("4 5 6", [("dim0", "-5")], r"outside the indices 0\.\.3"),
         ("4 5 6", [("dim0", "a")], r"no index 0\.\.3"),
         ("4 5 6", [("dim0", "1"), ("-3", "1")], "a second time"),
         ("4 5 6", [("dim0", "1"), ("dim1", "1")], "at least 2 are needed"),

@@ -26,6 +26,23 @@ def listed(*variables: Variable, request: Request | None = None) -> list[Listed]
     return listing("a.h5", variables, unnamed, request or Request())
 
 
+def test_raw_values_have_the_stored_type_and_no_unit_of_others() -> None:
+    attributes = {"scale_factor": np.float32(0.1), "_FillValue": -9}
+    one = variable("a", 4, 12, 13, 14, dtype="i2", units="K")
+    for raw, scaled, dtype, units in (
+        (True, True, "int16", ""),
+        (True, False, "int16", "K"),
+        (False, True, "float32", "K"),
+    ):
+        said = packing("a.h5", np.dtype("i2"), attributes if scaled else {"_FillValue": -9})
+        (found,) = listing(
+            "a.h5", [one], unnamed, Request(raw_values=raw), lambda _, said=said: said
+        )
+        assert (found.dtype, found.units) == (dtype, units)
+        assert found.options == ((("--raw-values",) if raw else ()),)
+        assert found.missing == (() if raw else (-9,))
+
+
 def test_one_variable_needs_no_option() -> None:
     (only,) = listed(variable("group/rho", 4, 12, 13, 14, units="kg"))
     assert (only.units, only.dtype, only.options) == ("kg", "float32", ((),))
