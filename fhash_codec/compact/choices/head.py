@@ -91,7 +91,7 @@ HISTORY_BYTES = 200
 """Bytes of the training history in the file."""
 WEIGHT_TIME = 5e-6
 """Share of the file that each weight must save to pay for the decoding time it costs."""
-TRAINING_VERTICES = 8 << 20
+TRAINING_VERTICES = 16 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
 MIN_BYTES = 2000
 """Bytes of coded tiles below which a head cannot save what it takes.
