@@ -42,7 +42,7 @@ class Budget:
     updates: int
     """Number of training updates."""
     samples: int
-    """Number of voxels that are learned from."""
+    """Number of voxels that are learned from: what few teach, often repeated, holds for few."""
 
     def times(self, factor: int) -> Budget:
         """Return a training so many times as long, with so many times as many voxels."""
@@ -62,8 +62,8 @@ class Effort:
 GAIN_BY_WIDTHS = {(3, 4): 0.67, (4, 8): 0.83, (8, 8): 1.0, (12, 12): 1.13, (14, 24): 1.22}
 """Gain in dB of a head with a cross by its widths, as a multiple of the gain of the trial head."""
 EFFORTS = {
-    5: Effort(candidates=4, budget=Budget(updates=3000, samples=200_000)),
-    6: Effort(candidates=4, budget=Budget(updates=5000, samples=200_000)),
+    5: Effort(candidates=4, budget=Budget(updates=2600, samples=400_000)),
+    6: Effort(candidates=4, budget=Budget(updates=5000, samples=400_000)),
     7: Effort(candidates=4, budget=Budget(updates=8000, samples=400_000)),
     8: Effort(candidates=5, budget=Budget(updates=12000, samples=400_000)),
     9: Effort(candidates=5, budget=Budget(updates=20000, samples=400_000)),
@@ -71,7 +71,7 @@ EFFORTS = {
 """Effort spent on heads by the effort of the encoder; below 5 there is no head."""
 TRIAL_HEAD = Shape((8, 8), cross=True)
 """Head of the quick trial."""
-TRIAL_BUDGET = Budget(updates=400, samples=80_000)
+TRIAL_BUDGET = Budget(updates=800, samples=160_000)
 """Training of the quick trial."""
 PERCEPTRON = Shape((12, 8), cross=False)
 """Head that competes, too: where little is to be gained, its fewer weights may win."""
@@ -91,7 +91,7 @@ HISTORY_BYTES = 200
 """Bytes of the training history in the file."""
 WEIGHT_TIME = 5e-6
 """Share of the file that each weight must save to pay for the decoding time it costs."""
-TRAINING_VERTICES = 8 << 20
+TRAINING_VERTICES = 16 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
 MIN_BYTES = 2000
 """Bytes of coded tiles below which a head cannot save what it takes.
