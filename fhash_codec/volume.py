@@ -20,7 +20,7 @@ from fhash_codec.indexing import Index, checked_region, coarse_vertices, expand_
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.sampling import interpolable
-from fhash_codec.value_type import ValueType
+from fhash_codec.value_type import ValueType, rounded
 from fhash_codec.volume_model import open_model
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError

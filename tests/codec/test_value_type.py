@@ -7,7 +7,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.value_type import decoded_type, holds
+from fhash_codec.value_type import decoded_type, holds, rounded
 from fhash_formats.series import ArraySeries
 
 QUICK = {"effort": 1, "timings": False}
@@ -131,3 +131,14 @@ def test_values_between_those_of_a_network_stay_floats(tmp_path) -> None:
 )
 def test_numbers_that_a_type_holds(dtype, number, held) -> None:
     assert holds(np.dtype(dtype), number) is held
+
+
+@pytest.mark.parametrize("dtype", ["i1", "u1", "i4", "i8", "u8"])
+def test_rounding_stays_within_the_type(dtype) -> None:
+    limits = np.iinfo(dtype)
+    ends = np.array([float(limits.min), float(limits.max), np.nan, 2.4, 1e300, -1e300])
+    whole = rounded(ends, np.dtype(dtype))
+    assert whole.dtype == np.dtype(dtype)
+    assert whole[0] == whole[5] == limits.min
+    assert int(whole[1]) == int(whole[4]) >= limits.max - 2 ** max(limits.bits - 53, 0)
+    assert whole[2:4].tolist() == [0, 2]
