@@ -40,6 +40,10 @@ from fhash_formats.transform.tile.settings import TileSettings
 Change = Callable[[random.Random, bytes], bytes]
 
 
+class NothingFitsError(LookupError):
+    """Raised for a file without an array of the kind that a mutation changes."""
+
+
 def documents_of(parts: Parts) -> dict[str, Any]:
     """Return the metadata of the arrays by name."""
     documents = {
@@ -61,6 +65,8 @@ def chosen(
         for name, data in parts
         if "/c/" in name and (coded is None or is_coded(documents[_array_of(name)]) == coded)
     ]
+    if not fitting:
+        raise NothingFitsError
     name, data = chance.choice(fitting)
     return _array_of(name), documents[_array_of(name)], name, data
 

@@ -53,10 +53,22 @@ def goldens() -> dict[str, tuple[bytes, Parts]]:
 
 
 def mutation(number: int) -> Mutation:
-    """Return the mutation of a number from 0 on; goldens and kinds take turns."""
-    chance = random.Random(number)
+    """Return the mutation of a number from 0 on; kinds and goldens take turns.
+
+    A golden without what a kind changes is passed over for the next one.
+    """
     names, kinds = list(goldens()), list(KINDS)
-    golden, kind = names[number % len(names)], kinds[number // len(names) % len(kinds)]
+    turn, place = divmod(number, len(kinds))
+    for passed_over in range(len(names)):
+        try:
+            return _mutation(number, names[(turn + place + passed_over) % len(names)], kinds[place])
+        except mutated_payload.NothingFitsError:
+            continue
+    raise AssertionError(f"no golden has what {kinds[place]} changes")
+
+
+def _mutation(number: int, golden: str, kind: str) -> Mutation:
+    chance = random.Random(number)
     data, parts = goldens()[golden]
     if kind in DAMAGES:
         return Mutation(

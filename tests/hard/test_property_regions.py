@@ -210,5 +210,5 @@ def test_any_series_of_any_tiles_keeps_its_bound_and_its_regions(
             ),
             default=0.0,
         )
-        rounding = max(map(abs, exact)) * np.finfo(opened.dtype).eps
+        rounding = max(map(abs, exact)) * np.finfo(opened.float_dtype).eps
         assert error <= bound * (max(exact) - min(exact)) + rounding
