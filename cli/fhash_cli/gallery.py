@@ -81,15 +81,7 @@ def _simulate(path: Path, name: str) -> None:
     from fhash_formats import Region, save_region
 
     series = GALLERY_SERIES[name].make()
-    region = Region(
-        name=series.name,
-        units=series.units,
-        dtype=series.dtype,
-        shape=series.shape,
-        coords=series.coords,
-        attributes=series.attributes,
-    )
-    save_region(path, region, series.frames(), force=True)
+    save_region(path, Region.of(series), series.frames(), force=True)
 
 
 def _run(command: click.Command, words: list[str]) -> None:

@@ -97,15 +97,7 @@ def command(
     if not quiet:
         say(f"simulating '{scene}', {SCENES[scene].help}")
     simulated = simulate(scene)
-    region = Region(
-        name=simulated.name,
-        units=simulated.units,
-        dtype=simulated.dtype,
-        shape=simulated.shape,
-        coords=simulated.coords,
-        attributes=simulated.attributes,
-    )
-    save_region(data, region, simulated.frames(), force=force)
+    save_region(data, Region.of(simulated), simulated.frames(), force=force)
 
     import fhash_codec
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError, MissingInputError
+from fhash_formats.errors import InputError
 from fhash_formats.readers.common.failures import Stamp, naming
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.grid import (
@@ -28,11 +28,11 @@ from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import assign_axes
 from fhash_formats.readers.common.stored_bytes import (
     CompressedFile,
-    ManyFiles,
     NumbersInText,
     PlainFile,
     StoredArray,
     StoredBytes,
+    in_files,
 )
 from fhash_formats.readers.common.variables import choose
 from fhash_formats.series import Coordinate
@@ -192,13 +192,8 @@ def _stored(
     else:
         names = [data]
     files = [path.parent / name for name in names]
-    for file in files:
-        if not file.is_file():
-            raise MissingInputError(f"its values are in {file}, which is not there")
-    if size % len(files):
-        raise InputError(f"its {size} bytes cannot be divided among {len(files)} files")
-    parts = [_one_file(file, fields, 0, size // len(files), dtype) for file in files]
-    return parts[0] if len(parts) == 1 else ManyFiles(parts), list(dict.fromkeys(files))
+    stored = in_files(files, size, lambda file, part: _one_file(file, fields, 0, part, dtype))
+    return stored, list(dict.fromkeys(files))
 
 
 def _numbered(words: Sequence[str], most: int) -> list[str]:

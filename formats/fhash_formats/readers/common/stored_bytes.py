@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.common.flat import FlatArray
 
 BLOCK_BYTES = 2**20
@@ -130,6 +130,28 @@ class ManyFiles:
     def close(self) -> None:
         """Close the file that is open."""
         self.parts[self._open].close()
+
+
+def in_files(
+    files: Sequence[Path], size: int, open_part: Callable[[Path, int], StoredBytes]
+) -> StoredBytes:
+    """Values that are spread evenly over one or several files.
+
+    Args:
+        files: at least one, in the order of their values.
+        size: bytes of all values.
+        open_part: opens one file, given the bytes of the values in it.
+
+    Raises MissingInputError for a file that is not there, and InputError where the values cannot be
+    divided among the files.
+    """
+    for file in files:
+        if not file.is_file():
+            raise MissingInputError(f"its values are in {file}, which is not there")
+    if size % len(files):
+        raise InputError(f"its {size} bytes cannot be divided among {len(files)} files")
+    parts = [open_part(file, size // len(files)) for file in files]
+    return parts[0] if len(parts) == 1 else ManyFiles(parts)
 
 
 class StoredArray(FlatArray):

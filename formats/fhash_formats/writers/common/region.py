@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from fhash_formats.errors import InputError
-from fhash_formats.series import Coordinate, check_coords, check_values
+from fhash_formats.series import Coordinate, Series, check_coords, check_values
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +39,18 @@ class Region:
     units: str = ""
     attributes: Mapping[str, Any] = field(default_factory=dict)
     fill: int | float | None = None
+
+    @classmethod
+    def of(cls, series: Series) -> Self:
+        """The region that is all of a series."""
+        return cls(
+            name=series.name,
+            units=series.units,
+            dtype=series.dtype,
+            shape=series.shape,
+            coords=series.coords,
+            attributes=series.attributes,
+        )
 
     def __post_init__(self) -> None:
         if not self.name:
