@@ -91,7 +91,7 @@ HISTORY_BYTES = 200
 """Bytes of the training history in the file."""
 WEIGHT_TIME = 5e-6
 """Share of the file that each weight must save to pay for the decoding time it costs."""
-TRAINING_VERTICES = 16 << 20
+TRAINING_VERTICES = 48 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
 MIN_BYTES = 2000
 """Bytes of coded tiles below which a head cannot save what it takes.
@@ -139,9 +139,8 @@ def choose_head(
     """
     if outcome.size < MIN_BYTES:
         return settings, outcome, []
-    wider = sample.wider(TRAINING_VERTICES)
     training = _Training(seed=seed)
-    pairs = _training_pairs(wider, settings, coding)
+    pairs = _training_pairs(sample, settings, coding)
     parts = parts or Parts()
     tell = partial(parts.report, "training")
     trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET, tell)
@@ -151,7 +150,7 @@ def choose_head(
     widths = _best_widths(outcome.size, gain, _octave(tried, data_range), effort)
     # A head is trained on what it will meet: coarser data, which it lifts to the quality asked for.
     coarser = replace(settings, step=settings.step * math.exp(trial.gain_db / SLOPE))
-    pairs = _training_pairs(wider, coarser, coding)
+    pairs = _training_pairs(sample.wider(TRAINING_VERTICES), coarser, coding)
     budget = EFFORTS[effort].budget
 
     def train(shape: Shape, tell: Callable[[float], None]) -> _Candidate | None:

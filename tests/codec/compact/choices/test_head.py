@@ -124,7 +124,7 @@ class AskedFor(Exception):
 class NoSample:
     """A sample that trains nothing."""
 
-    def wider(self, vertices: int) -> None:
+    def decoded(self, settings: TileSettings, coding: Coding) -> None:
         raise AskedFor
 
 
