@@ -163,7 +163,9 @@ def _grid(path: Path, kinds: tuple[str, ...] = (*KINDS, *PARALLEL_KINDS)) -> _Gr
     for part in pieces:
         inside = zip(part.extent, extent, strict=True)
         if not all(low <= first and last <= high for (first, last), (low, high) in inside):
-            raise InputError(f"a piece with the extent {part.extent} is outside the grid {extent}")
+            raise InputError(
+                f"a piece with the extent {part.extent} lies outside the grid {extent}"
+            )
     if not pieces or any(last < first for first, last in extent):
         raise InputError("it holds an empty grid")
     return _Grid(

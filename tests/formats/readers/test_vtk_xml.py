@@ -183,7 +183,7 @@ def test_a_list_of_pieces_says_less_than_they_do(tmp_path: Path) -> None:
     ("second", "message"),
     [
         (PART.format("1 3 0 0 0 0", "v", "1 2 3", ""), "array 'v' of 1 components where another"),
-        (PART.format("1 4 0 0 0 0", "u", "1 2 3 4", ""), "is outside the grid"),
+        (PART.format("1 4 0 0 0 0", "u", "1 2 3 4", ""), "lies outside the grid"),
         (PARALLEL.format(""), r"1\.vti: it holds VTK data of the kind PImageData; ImageData can"),
         ("", r"1\.vti: it is cut or no XML"),
     ],
