@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.selection import Source, open_source
@@ -18,14 +19,14 @@ from fhash_codec.report import report
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
-from fhash_formats.series import Series
+from fhash_formats.series import AXES, Series
 
 
 def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> dict[str, Any]:
     """Decode every step of the container `path` and measure it against the data.
 
-    Returns the figures of `report`. Raises InputError if the shapes differ, DamagedFileError for a
-    damaged container.
+    Returns the figures of `report` and, as "differences", the lines of `differences`. Raises
+    InputError if the shapes differ, DamagedFileError for a damaged container.
     """
     begun = time.perf_counter()
     with open_source(source) as series, open_volume(path) as volume:
@@ -34,9 +35,43 @@ def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> di
                 f"{series.source} has shape {series.shape}, {path} has {volume.shape} "
                 "in (t, z, y, x); give the same --var, --axes, --t"
             )
+        differing = differences(series, volume)
         quality = measure(series, volume, progress)
         seconds = time.perf_counter() - begun
-        return report(volume, quality, seconds=seconds, files=series.files)
+        described = report(volume, quality, seconds=seconds, files=series.files)
+        return {**described, "differences": differing}
+
+
+def differences(series: Series, volume: Volume) -> list[str]:
+    """Differences of a series and a container beside the values, one line each.
+
+    They are name and units of the variable and the positions along each axis. A name that a format
+    without names took from its file is not compared, and neither are units that are not given, nor
+    positions that are plain indices because the file has none.
+    """
+    found = []
+    if series.name != volume.name and not _is_file_name(series):
+        found.append(f"the data are of the variable {series.name}, {volume.path} of {volume.name}")
+    if series.units and volume.units and series.units != volume.units:
+        found.append(f"the data are in {series.units}, {volume.path} in {volume.units}")
+    for axis in AXES:
+        here, there = series.coords[axis].values, volume.coords[axis].values
+        if not np.array_equal(here, there, equal_nan=True) and not _is_index(here):
+            found.append(
+                f"the data have other positions along {axis} than {volume.path}"
+                f" ({here[0]:.9g} to {here[-1]:.9g}, not {there[0]:.9g} to {there[-1]:.9g})"
+            )
+    return found
+
+
+def _is_file_name(series: Series) -> bool:
+    """Whether the name of a series may come from that of its file, and says nothing of it."""
+    stem = Path(series.source).name.replace("*", "")
+    return not series.files or stem.startswith(series.name)
+
+
+def _is_index(positions: npt.NDArray[np.float64]) -> bool:
+    return bool((positions == np.arange(positions.size)).all())
 
 
 def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any]:

@@ -1,39 +1,63 @@
 """Times as people write and read them: dates where the series has a calendar, else numbers.
 
-`time_of` takes what `--time` takes; `time_text` gives what pictures and tables show.
+`time_of` takes what `--time` takes, and the dates of Python, numpy and cftime; `time_text` gives
+what pictures and tables show.
 """
 
 from __future__ import annotations
 
+import datetime
 import math
+from typing import Any, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Coordinate
-from fhash_formats.support.dates import SECOND, Clock, clock, instants
+from fhash_formats.support.dates import CALENDARS, SECOND, Clock, clock, instants
 
 DIGITS = (6, 17)
 """Fewest and most digits of a number."""
 
 
-def time_of(coordinate: Coordinate, text: str | float, source: str) -> float:
+class CalendarDate(Protocol):
+    """A date of the package cftime, which knows its calendar."""
+
+    calendar: str
+    year: int
+    month: int
+    day: int
+    hour: int
+    minute: int
+    second: int
+    microsecond: int
+
+
+Time = float | str | datetime.date | np.datetime64 | CalendarDate
+"""Numbers in the units of a coordinate, and dates; `datetime.datetime` is a `datetime.date`."""
+
+
+def time_of(coordinate: Coordinate, time: Time, source: str) -> float:
     """The time that a number or a date stands for, in the units of the coordinate.
 
-    A date is 2001-02-10T06:00, or only a part of it. A day, hour or month that holds exactly one
-    step stands for that step, any other for its beginning. A date within the rounding of a step is
-    that step.
+    A date is text as 2001-02-10T06:00, or only a part of it. A day, hour or month that holds
+    exactly one step stands for that step, any other for its beginning. A date within the rounding
+    of a step is that step. Dates of Python and numpy are taken as they read, in the calendar of
+    the coordinate; those with a time zone are turned into UTC.
 
     Args:
         coordinate: times of the steps.
-        text: a number, or a date in the calendar of the coordinate.
+        time: a number, or a date: text, `datetime`, `date`, numpy's `datetime64`, or a date of
+            cftime, whose calendar must be that of the coordinate.
         source: name of the file, for messages.
 
-    Raises InputError for text that is neither, and RegionError for a time outside the steps.
+    Raises InputError for what is neither, and RegionError for a time outside the steps.
     """
     found = clock(coordinate.attributes)
+    text = _readable(time, found, source)
     try:
-        time = float(text)
+        number = float(text)
     except ValueError:
         if found is None:
             units = coordinate.attributes.get("units")
@@ -43,14 +67,60 @@ def time_of(coordinate: Coordinate, text: str | float, source: str) -> float:
                 f" give a number {_range(coordinate)}"
             ) from None
         try:
-            time = _of_date(coordinate, found, str(text))
+            number = _of_date(coordinate, found, str(text))
         except InputError as error:
             raise InputError(
                 f"{source}: time {error}; the series is {_range(coordinate)}"
             ) from error
-    if not coordinate.values.min() <= time <= coordinate.values.max():
+    if not coordinate.values.min() <= number <= coordinate.values.max():
         raise RegionError(f"{source}: time {text} is outside the series, {_range(coordinate)}")
-    return time
+    return number
+
+
+def times_of(coordinate: Coordinate, times: Any, source: str) -> npt.NDArray[np.float64]:
+    """The times (any shape) that an array of numbers or of dates stands for, as `time_of` does.
+
+    Numbers are not compared with the steps.
+    """
+    given = np.asarray(times)
+    if given.dtype.kind in "iuf":
+        return given.astype(np.float64)
+    if given.dtype.kind not in "OMUS":
+        raise InputError(f"{source}: {given.dtype} is no type of times; give numbers or dates")
+    flat: list[Any] = [given[place] for place in np.ndindex(given.shape)]
+    single = [time_of(coordinate, time, source) for time in flat]
+    return np.array(single, np.float64).reshape(given.shape)
+
+
+def _readable(time: Time, found: Clock | None, source: str) -> str | float:
+    """A time as a number or as text: the fields of a date, as far as it has them."""
+    if isinstance(time, np.datetime64):
+        yearly = np.datetime_data(time.dtype)[0] == "Y"
+        return str(time.astype("datetime64[M]") if yearly else time)
+    if isinstance(time, datetime.datetime) and time.tzinfo is not None:
+        time = time.astimezone(datetime.UTC).replace(tzinfo=None)
+    if isinstance(time, datetime.date):
+        return time.isoformat()
+    if isinstance(time, bytes):
+        return time.decode(errors="replace")
+    calendar = getattr(time, "calendar", None)
+    if calendar is None:
+        if isinstance(time, str):
+            return time
+        try:
+            return float(time)  # type: ignore[arg-type]
+        except TypeError:
+            raise InputError(f"{source}: {time!r} is no time; give a number or a date") from None
+    usual = CALENDARS.get(str(calendar).lower())
+    if found is not None and usual != found.calendar:
+        raise InputError(
+            f"{source}: time {time} is of the calendar {calendar}, the series of {found.calendar}"
+        )
+    year = time.year  # type: ignore[union-attr]
+    if year < 1 and not getattr(time, "has_year_zero", True):
+        year += 1
+    clock_time = f"{time.hour}:{time.minute:02}:{time.second:02}.{time.microsecond:06}"  # type: ignore[union-attr]
+    return f"{year}-{time.month}-{time.day}T{clock_time}"  # type: ignore[union-attr]
 
 
 def time_text(coordinate: Coordinate, time: float) -> str:

@@ -20,6 +20,7 @@ from fhash_codec.indexing import Index, checked_region, coarse_vertices, expand_
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.sampling import interpolable
+from fhash_codec.times import Time, times_of
 from fhash_codec.value_type import ValueType, rounded
 from fhash_codec.volume_model import open_model
 from fhash_formats.container import Container
@@ -257,7 +258,7 @@ class Volume:
         y: npt.ArrayLike,
         x: npt.ArrayLike,
         t: npt.ArrayLike | None = None,
-        time: npt.ArrayLike | None = None,
+        time: npt.ArrayLike | Time | None = None,
         gradient: bool = False,
     ) -> npt.NDArray[Any] | tuple[npt.NDArray[Any], npt.NDArray[Any]]:
         """Values at points between vertices, in data units.
@@ -265,7 +266,7 @@ class Volume:
         The positions broadcast against each other.
 
         z, y, x: positions in vertices of the domain; 0 is the first vertex.
-        t: positions in steps. time: positions in the units of the series' times. One of the two.
+        t: positions in steps. time: times as `step_of_time` takes them. One of the two.
         gradient: also return derivatives (..., 4) of the value by t, z, y and x, in data units per
             step and per vertex. They are analytic, through interpolation and network. On the border
             of two cells they are those of the cell after the border.
@@ -277,7 +278,7 @@ class Volume:
         if (t is None) == (time is None):
             raise InputError("give either t (in steps) or time (in the units of the series)")
         if t is None:
-            t = self._checked_times().steps_of_times(np.asarray(time, dtype=np.float64))
+            t = self._steps_of_times(time)
         points = np.broadcast_arrays(*(np.asarray(p, dtype=np.float64) for p in (t, z, y, x)))
         shape = points[0].shape
         steps, *space = (position.ravel() for position in points)
@@ -316,13 +317,14 @@ class Volume:
         missing = self._missing_at(t)
         return result if missing is None else result & ~missing[region.slices()]
 
-    def step_of_time(self, time: float) -> float:
-        """The step at a time in the units of the series; a fraction lies between two steps.
+    def step_of_time(self, time: Time) -> float:
+        """The step at a time; a fraction lies between two steps.
 
-        Raises RegionError for a time outside the series, InputError if the series' times do not
-        strictly ascend or descend.
+        time: in the units of the series, or a date where these have a calendar; see `times.Time`.
+        Raises RegionError for a time outside the series; InputError if the series' times do not
+        strictly ascend or descend, and for a date where they are no dates.
         """
-        return self._checked_times().step_of_time(float(time))
+        return float(self._steps_of_times(time))
 
     # -- steps, regions and masks --
 
@@ -333,13 +335,11 @@ class Volume:
         low, high = map(self.float_dtype.type, (self.value_range.low, self.value_range.high))
         return np.asarray(np.clip(values, low, high))
 
-    def _checked_times(self) -> KeyTimes:
+    def _steps_of_times(self, times: Any) -> npt.NDArray[np.float64]:
         if not strictly_monotonic(self.coords["t"].values):
-            raise InputError(
-                f"{self.path}: the times of the series do not strictly ascend or descend; "
-                "ask for a step instead"
-            )
-        return self.key_times
+            what = "the times of the series do not strictly ascend or descend"
+            raise InputError(f"{self.path}: {what}; ask for a step instead")
+        return self.key_times.steps_of_times(times_of(self.coords["t"], times, str(self.path)))
 
     def _key_index(self, t: float) -> float:
         last = self.shape[0] - 1

@@ -62,7 +62,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fhash_cli": (
         ("intervals", "progress_bar"),
         ("base_command", "conversion", "options", "output", "scene_types", "selection"),
-        ("animation_options", "gallery", "scene_options"),
+        ("animation_options", "gallery", "scene_options", "source_listing"),
         ("commands",),
         ("main",),
     ),

@@ -113,7 +113,7 @@ class SourceOptions:
         """The variables at a path, as `fhash_formats.list_variables` gives them."""
         from fhash_formats import list_variables
 
-        return list_variables(path, **self._wishes())
+        return list_variables(path, steps=self.t, **self._wishes())
 
     def refuse(self, path: str) -> None:
         """Raise InputError if any option is given, for a path that is no data."""

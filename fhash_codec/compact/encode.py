@@ -16,6 +16,7 @@ from fhash_codec.compact.coded_table import (
     write_table,
 )
 from fhash_codec.compact.goal import promise
+from fhash_codec.compact.tiles.blocks import fits_memory
 from fhash_codec.compact.tiles_to_promise import code_series, resized
 from fhash_codec.compact.tiles_to_size import ByteWindow
 from fhash_codec.config import EncodeConfig
@@ -63,7 +64,7 @@ def encode_compact(
             stacklevel=3,
         )
     begun = time.perf_counter()
-    selection = select_features(series, config, progress, mask)
+    selection = select_features(series, config, progress, mask, ranked=not fits_memory(series))
     described = write_series(
         writer,
         series,

@@ -24,7 +24,7 @@ from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Outcome, code, tota
 from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
-from fhash_codec.measure.bulk import find_bulk
+from fhash_codec.measure.bulk import bulk_of_ranks, find_bulk
 from fhash_codec.progress import Progress
 from fhash_formats.series import Series
 from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
@@ -74,7 +74,10 @@ def code_series(
     begun = time.perf_counter()
     blocks = Blocks(series, selection.extent, series.shape)
     integers = blocks.dtype.kind in "iu"
-    bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
+    if blocks.in_memory or selection.ranks is None:
+        bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
+    else:  # the series was too long to be read for this alone
+        bulk = bulk_of_ranks(selection.ranks, value_range, whole=integers)
     goal = goal_of(config, value_range, raw_bytes, overhead, bulk, integers=integers)
     with thread_pool() as workers:
         coding_plan = plan(

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from fhash_codec.coreset.boxes import Box, Sizes, bounding_box, fuse
 from fhash_codec.coreset.features import Everything, Feature, dilate
 from fhash_codec.coreset.scan import Scan
+from fhash_codec.measure.ranks import Ranks
 from fhash_codec.measure.value_range import Mean
 from fhash_codec.progress import Progress
 from fhash_formats.errors import FhashWarning, InputError
@@ -62,8 +63,11 @@ def find_extent(
     features: Sequence[Feature],
     dilation: int,
     progress: Progress,
+    ranks: Ranks | None = None,
 ) -> Extent:
     """The extent of the finite vertices of the merged features, dilated, at every key frame.
+
+    ranks: gets the values of these vertices.
 
     Parameters, errors, warnings and the progress stage "selecting" as in `build_coreset`.
     """
@@ -84,6 +88,8 @@ def find_extent(
         boxes.append(bounding_box(mask))
         samples += int(np.count_nonzero(mask))
         _add_outside(outside, frame, mask, finite)
+        if ranks is not None:
+            ranks.add(frame[mask])
         progress("selecting", done + 1, len(key_frames), "")
     box = fuse(boxes)
     if box is None:

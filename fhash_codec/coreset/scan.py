@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.extremes import Extremes
+from fhash_codec.measure.ranks import Ranks
 from fhash_codec.measure.sums import range_and_sum
 from fhash_codec.measure.value_range import Mean, ValueRange, pieces, power_of_two
 from fhash_codec.progress import Progress
@@ -46,8 +47,10 @@ class Scan:
         return ~missing.reshape(shape)
 
 
-def scan(series: Series, progress: Progress) -> Scan:
+def scan(series: Series, progress: Progress, ranks: Ranks | None = None) -> Scan:
     """Scan every frame once.
+
+    ranks: gets all finite values.
 
     Raises InputError if no value at all is finite, if an extreme value looks like a fill value that
     nobody declared (extremes.py), or if the series changed. Progress stage: "scanning".
@@ -62,6 +65,8 @@ def scan(series: Series, progress: Progress) -> Scan:
         for piece in pieces(frame):
             piece_count, piece_low, piece_high = _scan_piece(piece, mean)
             extremes.add(piece, piece_count, piece_low, piece_high)
+            if ranks is not None:
+                ranks.add(piece)
             count, low, high = count + piece_count, min(low, piece_low), max(high, piece_high)
         if count < frame.size:
             bits = np.packbits(~np.isfinite(frame))

@@ -17,6 +17,7 @@ from fhash_codec.coreset.extent import Extent, find_extent
 from fhash_codec.coreset.features import Feature, Mask, resolve_features
 from fhash_codec.coreset.key_frames import select_key_frames, time_axis
 from fhash_codec.coreset.scan import Scan, scan
+from fhash_codec.measure.ranks import Ranks
 from fhash_codec.progress import Progress
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
@@ -115,36 +116,53 @@ class FeatureSelection:
         scanned: range, mean and missing values of the series.
         features: resolved, see `resolve_features`.
         extent: the key frames, and the vertices of the coreset at each of them.
+        ranks: of the values of the coreset at the key frames, where they were asked for.
     """
 
     scanned: Scan
     features: tuple[Feature, ...]
     extent: Extent
+    ranks: Ranks | None = None
 
 
 def select_features(
-    series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None = None
+    series: Series,
+    config: EncodeConfig,
+    progress: Progress,
+    mask: npt.ArrayLike | None = None,
+    *,
+    ranked: bool = False,
 ) -> FeatureSelection:
     """Scan a series, choose its key frames and find its features, one frame at a time.
 
+    ranked: whether the ranks of the values are taken in the same passes.
     mask: booleans (t, z, y, x) or (z, y, x), one more feature. It replaces the feature 'all' if the
         settings name no other.
 
     Raises InputError for settings that do not fit the series, or that select nothing. Warns of
     times that cannot serve as an axis.
     """
-    scanned, key_frames, features = resolve_selection(series, config, progress, mask)
-    return FeatureSelection(
-        scanned=scanned,
-        features=features,
-        extent=find_extent(series, scanned, key_frames, features, config.dilation, progress),
+    ranks = Ranks() if ranked else None
+    everything = "all" in config.features and (mask is None or config.features != ("all",))
+    scanned, key_frames, features = resolve_selection(
+        series, config, progress, mask, ranks if everything else None
     )
+    selected = None if everything else ranks
+    extent = find_extent(series, scanned, key_frames, features, config.dilation, progress, selected)
+    return FeatureSelection(scanned=scanned, features=features, extent=extent, ranks=ranks)
 
 
 def resolve_selection(
-    series: Series, config: EncodeConfig, progress: Progress, mask: npt.ArrayLike | None
+    series: Series,
+    config: EncodeConfig,
+    progress: Progress,
+    mask: npt.ArrayLike | None,
+    ranks: Ranks | None = None,
 ) -> tuple[Scan, tuple[int, ...], tuple[Feature, ...]]:
-    """The scan, the key frames and the resolved features of a series; see `select_features`."""
+    """The scan, the key frames and the resolved features of a series; see `select_features`.
+
+    ranks: gets all finite values.
+    """
     times = time_axis(series.coords["t"].values)
     if times is not series.coords["t"].values:
         warnings.warn(
@@ -153,7 +171,7 @@ def resolve_selection(
             FhashWarning,
             stacklevel=3,
         )
-    scanned = scan(series, progress)
+    scanned = scan(series, progress, ranks)
     key_frames = select_key_frames(config.key_frames, series, times, progress)
     features = resolve_features(config.features, series, key_frames, scanned.value_range, progress)
     if mask is not None:

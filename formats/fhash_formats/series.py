@@ -133,6 +133,11 @@ class Series(ABC):
         self.close()
 
 
+def empty_selection(steps: int) -> str:
+    """The message for a selection of no step out of some."""
+    return f"the selection of steps is empty; the series has {steps} steps"
+
+
 class StepsSeries(Series):
     """Some steps of another series, in the order given.
 
@@ -141,10 +146,7 @@ class StepsSeries(Series):
 
     def __init__(self, series: Series, steps: Sequence[int]) -> None:
         if not steps:
-            raise InputError(
-                f"{series.source}: the selection of steps is empty; "
-                f"the series has {series.shape[0]} steps"
-            )
+            raise InputError(f"{series.source}: {empty_selection(series.shape[0])}")
         for step in steps:
             series.require_step(step)
         self.series = series

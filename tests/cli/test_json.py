@@ -132,7 +132,8 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
         outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
         outputs["diff"].append(parsed(fhash("diff", data, path, "--json", "-q")))
         outputs["info"].append(parsed(fhash("info", path, "--json")))
-    outputs["info DATA"].append(parsed(fhash("info", data, "--missing", "-9", "--json")))
+    detailed = ["--var", "density", "--t", "1:", "--missing", "-9"]
+    outputs["info DATA"].append(parsed(fhash("info", data, *detailed, "--json")))
     for command, results in outputs.items():
         check(command, *results)
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import datetime as dt
+from typing import Any
+
+import cftime
 import numpy as np
 import pytest
 
-from fhash_codec.times import is_dated, number_text, time_of, time_text
+from fhash_codec.times import is_dated, number_text, time_of, time_text, times_of
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Coordinate
 
@@ -85,3 +89,69 @@ def test_dates_need_finite_times() -> None:
     assert is_dated(HALF_DAYS)
     assert not is_dated(times([0, 1], "s"))
     assert not is_dated(times([0, float("inf")]))
+
+
+@pytest.mark.parametrize(
+    ("time", "expected"),
+    [
+        (dt.datetime(2001, 2, 11, 6), 1.25),
+        (dt.datetime(2001, 2, 11, 6, tzinfo=dt.timezone(dt.timedelta(hours=6))), 1),
+        (dt.date(2001, 2, 12), 2),
+        (np.datetime64("2001-02-11T12"), 1.5),
+        (np.datetime64("2001-02-11T06:00:00.000000000"), 1.25),
+        (cftime.datetime(2001, 2, 11, 12, calendar="standard"), 1.5),
+        (cftime.datetime(2001, 2, 11, 12, calendar="gregorian"), 1.5),
+        (np.float32(0.5), 0.5),
+        (b"2001-02-11", 1),
+    ],
+    ids=str,
+)
+def test_dates_of_python_numpy_and_cftime(time: Any, expected: float) -> None:
+    assert time_of(HALF_DAYS, time, "run.fhz") == expected
+
+
+def test_a_year_of_numpy_is_its_beginning() -> None:
+    assert time_of(times([325, 326]), np.datetime64("2002"), "run.fhz") == 325
+
+
+@pytest.mark.parametrize("calendar", ["noleap", "360_day", "all_leap", "julian"])
+def test_dates_of_cftime_are_of_the_calendar_of_the_series(calendar: str) -> None:
+    dates = [cftime.datetime(2001, month, 28, 6, calendar=calendar) for month in (2, 3, 12)]
+    units = "hours since 2000-02-01"
+    counted = [float(cftime.date2num(date, units, calendar=calendar)) for date in dates]
+    coordinate = times(counted, units, calendar=calendar)
+    assert [time_of(coordinate, date, "run.fhz") for date in dates] == counted
+    other = cftime.datetime(2001, 3, 1, calendar="standard")
+    with pytest.raises(InputError, match=f"is of the calendar standard, the series of {calendar}"):
+        time_of(coordinate, other, "run.fhz")
+
+
+@pytest.mark.filterwarnings("ignore:this date/calendar/year zero convention")
+def test_years_before_the_first_are_those_of_cftime() -> None:
+    date = cftime.datetime(-1, 3, 1, calendar="standard", has_year_zero=False)
+    units = "days since 0001-01-01"
+    counted = float(cftime.date2num(date, units, calendar="standard"))
+    assert time_of(times([counted, 0], units), date, "run.fhz") == counted
+
+
+@pytest.mark.parametrize(
+    ("time", "message"),
+    [
+        (np.datetime64("NaT"), "'NaT' is no date"),
+        (None, "None is no time; give a number or a date"),
+        ([1, 2], r"\[1, 2\] is no time"),
+    ],
+    ids=str,
+)
+def test_what_is_no_time_is_refused(time: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        time_of(HALF_DAYS, time, "run.fhz")
+
+
+def test_arrays_of_times_keep_their_shape() -> None:
+    dates = np.array([["2001-02-10", "2001-02-11T12"]], "datetime64[s]")
+    for given in (dates, dates.astype(object), dates.astype(str), [[0, 1.5]]):
+        np.testing.assert_array_equal(times_of(HALF_DAYS, given, "run.fhz"), [[0, 1.5]])
+    assert times_of(HALF_DAYS, [], "run.fhz").shape == (0,)
+    with pytest.raises(InputError, match="is no type of times"):
+        times_of(HALF_DAYS, np.timedelta64(3, "h"), "run.fhz")

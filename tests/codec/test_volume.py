@@ -217,6 +217,24 @@ def test_physical_times_may_be_uneven_and_descend(tmp_path, times) -> None:
             volume.step_of_time(31.5)
 
 
+def test_dates_stand_for_times_where_the_series_has_a_calendar(tmp_path) -> None:
+    field = np.arange(2.0)[:, None, None, None] + np.zeros((1, 2, 3, 4))
+    for units in ("hours since 2001-02-10", "s"):
+        time = Coordinate(name="time", values=np.array([0.0, 12.0]), attributes={"units": units})
+        series = ArraySeries(field, coords={"t": time})
+        fhash_codec.encode(series, tmp_path / "t.fhz", EncodeConfig(effort=1), force=True)
+        dates = np.array(["2001-02-10T03:00", "2001-02-10T12:00"], "datetime64[ns]")
+        with fhash_codec.open(tmp_path / "t.fhz") as volume:
+            if units == "s":
+                with pytest.raises(InputError, match="the times are no dates"):
+                    volume.step_of_time(dates[0])
+                continue
+            assert volume.step_of_time("2001-02-10T03:00") == 0.25
+            assert volume.step_of_time(dates[0]) == 0.25
+            sampled = volume.sample(time=dates, z=1, y=1, x=1)
+            np.testing.assert_array_equal(sampled, volume.sample(t=[0.25, 1], z=1, y=1, x=1))
+
+
 def test_times_that_do_not_ascend_are_warned_of_and_steps_stand_for_them(tmp_path) -> None:
     series = ArraySeries(
         np.random.default_rng(0).random((3, 2, 3, 4)),

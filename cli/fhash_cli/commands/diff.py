@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import click
@@ -46,22 +48,46 @@ def command(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Compare RUN.fhz with the DATA it was made from, over all steps."""
+    """Compare RUN.fhz with the DATA it was made from, over all steps.
+
+    Where DATA has several variables, it is the one that RUN.fhz has the name of. Other differences
+    than of values, such as of units or positions, are told on stderr.
+    """
     import fhash_codec
 
     if data.endswith(".fhz") and not run.endswith(".fhz"):
         raise click.UsageError(f"the data come first: fhash diff {run} {data}")
-    with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
+    with Progress(quiet=quiet) as progress, _open(source, data, run, progress) as series:
         report = fhash_codec.diff(series, run, progress=progress)
         fill = None if source.missing or series.fill is not None else _missing_of(run)
     if fill is not None and not quiet:
         say(f"{run} was encoded with --missing {fill:.9g}; add it here, or it counts as a value")
+    for line in report["differences"]:
+        say(f"{data}: {line}")
     rows = [
         ("size", compared(report, part=source.part)),
         ("steps, z, y, x", extent(report["shape"])),
         *quality_rows(report, series.units),
     ]
     emit(report, table(rows), as_json, _missed_gate(run, report, min_psnr, max_error))
+
+
+def _open(
+    source: SourceOptions, data: str, run: str, progress: Callable[[str, int, int, str], None]
+) -> Any:
+    """The series of the data: of several variables, the one that the container has the name of."""
+    import fhash_codec
+    from fhash_formats.readers.common.variables import SeveralVariablesError
+
+    try:
+        return source.open(data, progress)
+    except SeveralVariablesError as error:
+        with fhash_codec.open(run) as volume:
+            name = volume.name
+        alike = [full for full in error.names if f"/{full}".endswith((f"/{name}", f".{name}"))]
+        if len(alike) != 1:
+            raise
+        return dataclasses.replace(source, var=alike[0]).open(data, progress)
 
 
 def _missing_of(run: str) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,6 @@ import click
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import SourceOptions, json_option, series_options
 from fhash_cli.output import (
-    apart,
     compared,
     emit,
     extent,
@@ -22,9 +21,7 @@ from fhash_cli.output import (
     spans,
     table,
 )
-
-MIN_DIMENSIONS = 3
-"""Dimensions of an array that may be a variable; others are named in one line."""
+from fhash_cli.source_listing import details, details_rows, listing, positions
 
 if TYPE_CHECKING:
     from fhash_codec import Volume
@@ -39,16 +36,25 @@ def command(path: str, source: SourceOptions, as_json: bool) -> None:
 
     Of RUN.fhz: variable, domain, features, network and quality. Of DATA, any source that `fhash
     encode` reads: the variables with shape, type, units and axes, and the command that encodes
-    each. The options are those of `fhash encode`.
+    each. The options are those of `fhash encode`; --var and --t choose what is told in detail.
     """
     if not _is_run(path):
+        from fhash_codec.progress import silent
         from fhash_formats.readers.joined import files_of, is_pattern
 
         found = source.list(path)
         variables = [variable.as_dict(path) for variable in found]
         files = len(files_of(path)) if is_pattern(path) else 1
-        text = _listing(path, files, variables)
-        emit({"path": path, "files": files, "variables": variables}, text, as_json)
+        result = {"path": path, "files": files, "variables": variables}
+        text = listing(path, files, variables, named=source.var is not None)
+        readings = [(entry.name, words) for entry in found for words in entry.options]
+        if len(readings) == 1 and (source.var is not None or source.t is not None):
+            ((name, words),) = readings
+            one = dataclasses.replace(source, var=name) if "--var" in words else source
+            with one.open(path, silent) as series:
+                result["series"] = details(series)
+                text += f"\n\n{table(details_rows(series))}"
+        emit(result, text, as_json)
         return
     import fhash_codec
 
@@ -64,41 +70,6 @@ def _is_run(path: str) -> bool:
 
     place = Path(path)
     return place.suffix.lower() == ".fhz" or (place.is_file() and is_container(place))
-
-
-def _listing(path: str, files: int, variables: Sequence[Mapping[str, Any]]) -> str:
-    """The variables of a data file, each with its commands; then what cannot be encoded."""
-    good = [variable for variable in variables if not variable["problem"]]
-    many = f" ({files} files; shapes are of the first)" if files > 1 else ""
-    count = f"{len(good) or 'no'} variable{'' if len(good) == 1 else 's'}"
-    lines = [f"{path}{many} holds {count} to encode"]
-    for variable in good:
-        units = f", in {variable['units']}" if variable["units"] not in ("", "1") else ""
-        shape = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
-        stored = f" stored as {variable['stored']}" if variable["stored"] else ""
-        marks = " and ".join(f"{value:.9g}" for value in variable["missing"])
-        missing = f", missing where {marks}" if marks else ""
-        dtype = variable["dtype"] + stored
-        lines.append(f"\n{variable['name']}: {dtype}, {shape}{units}{missing}")
-        if len(variable["commands"]) > 1:
-            lines.append("  two readings are likely:")
-        lines += [f"  {text}" for text in variable["commands"]]
-    rest = [variable for variable in variables if variable["problem"]]
-    others = [variable for variable in rest if len(variable["shape"]) >= MIN_DIMENSIONS]
-    small = [variable for variable in rest if len(variable["shape"]) < MIN_DIMENSIONS]
-    if others:
-        lines.append("\nnot to be encoded:")
-        lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
-    if small:
-        names = [f"{variable['name']} {tuple(variable['shape'])}" for variable in small]
-        lines.append(f"\nbelow {MIN_DIMENSIONS} dimensions: {listed(names)}")
-    return "\n".join(lines)
-
-
-def _dimension(name: str, length: int, axis: str) -> str:
-    """A dimension and what it is: "lev=17 (z)"."""
-    note = {"?": " (?)", "select": " (select one)", name: ""}.get(axis, f" ({axis})")
-    return f"{name}={length}{note}"
 
 
 def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
@@ -121,7 +92,7 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
             + _missing(volume),
         ),
         ("t, z, y, x", extent(volume.shape)),
-        *((f"  {axis}", _positions(volume, axis)) for axis in "tzyx"),
+        *((f"  {axis}", positions(volume.coords[axis], axis)) for axis in "tzyx"),
         ("features", f"{', '.join(info['features'])}; grown by {info['dilation']}"),
         (
             "coreset",
@@ -177,19 +148,3 @@ def _compact(volume: Volume, seconds: str) -> list[tuple[str, str]]:
         ("table", f"compact, {model['parameters']:,} coefficients other than 0, {head}"),
         ("tiles", f"{extent(volume.chunks)} vertices{', encoded' + seconds if seconds else ''}"),
     ]
-
-
-def _positions(volume: Volume, axis: str) -> str:
-    """Name, first and last position, and units of an axis; times as dates where they are."""
-    from fhash_codec.times import is_dated, number_text, time_text
-
-    coordinate = volume.coords[axis]
-    units = coordinate.attributes.get("units", "")
-    ends = [float(coordinate.values[0]), float(coordinate.values[-1])]
-    if axis != "t":
-        return f"{coordinate.name} {' to '.join(apart(*ends))} {units}".rstrip()
-    numbers = " to ".join(number_text(coordinate, time) for time in ends)
-    if not is_dated(coordinate):
-        return f"{coordinate.name} {numbers} {units}".rstrip()
-    dates = " to ".join(time_text(coordinate, time) for time in ends)
-    return f"{coordinate.name} {dates} ({numbers} {units})"

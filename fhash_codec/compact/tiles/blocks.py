@@ -48,6 +48,12 @@ class Tile(NamedTuple):
         return self.counted is not None and not self.counted.any()
 
 
+def fits_memory(series: Series) -> bool:
+    """Whether a whole series would stay in memory as a box of vertices."""
+    itemsize = (series.source_dtype or series.dtype).itemsize
+    return prod(series.shape) * itemsize <= MAX_BYTES_IN_MEMORY
+
+
 class _BoxInMemory:
     """Values and mask of the box over all steps once they were read, shared by all tilings."""
 

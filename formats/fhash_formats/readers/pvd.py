@@ -85,9 +85,9 @@ def open_pvd(path: Path, request: Request) -> CollectionSeries:
                 raise MissingInputError(f"{path} lists {file}, which is not there")
             with file.open("rb") as opened:
                 if not vtk_xml.matches(opened.read(4096), file):
-                    raise InputError(
-                        f"it lists {file.name}; {' and '.join(vtk_xml.SUFFIXES)} can be read"
-                    )
+                    *most, last = vtk_xml.SUFFIXES
+                    kinds = f"{', '.join(most)} and {last}"
+                    raise InputError(f"it lists {file.name}; {kinds} can be read")
     return CollectionSeries(path, stamp, entries, request)
 
 

@@ -59,6 +59,12 @@ def open_raw(path: Path, request: Request) -> FileSeries:
         missing = " and ".join(
             word for word, value in (("shape", lengths), ("type", dtype_name)) if value is None
         )
+        header = path.with_suffix(".nhdr")
+        if header.is_file():
+            raise InputError(
+                f"{source}: the {missing} of the raw values is not known; {header} may say it: give"
+                " that file instead, or --shape x=..,y=..,z=.. and --dtype"
+            )
         raise InputError(
             f"{source}: the {missing} of the raw values is not known; name the file {FORM}, or"
             " give --shape x=..,y=..,z=.. and --dtype"

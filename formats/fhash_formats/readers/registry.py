@@ -179,11 +179,7 @@ def open_series(
     if steps is None:
         return series
     try:
-        if steps.step == 0:
-            raise InputError(
-                f"{path}: the steps {steps.start}:{steps.stop}:0 have a stride of 0; it is at"
-                " least 1, or negative"
-            )
+        _check_stride(path, steps)
         return StepsSeries(series, range(*steps.indices(series.shape[0])))
     except BaseException:
         series.close()
@@ -195,6 +191,7 @@ def list_variables(
     *,
     var: str | None = None,
     axes: str | None = None,
+    steps: slice | None = None,
     raw: RawLayout | None = None,
     missing: Sequence[float] = (),
     raw_values: bool = False,
@@ -203,8 +200,9 @@ def list_variables(
     """The variables of anything that `open_series` reads, whether or not they can be encoded.
 
     The other arguments are those of `open_series`; they are wishes, and the listing says what they
-    leave open. The files of a pattern are alike: the first one is listed. Raises as `open_series`
-    does for a source that cannot be read at all.
+    leave open. `var` lists that variable alone. The files of a pattern are alike: the first one is
+    listed. Raises as `open_series` does for a source that cannot be read at all, and where no
+    variable has one of the steps.
     """
     text = str(path)
     request = Request(
@@ -218,9 +216,28 @@ def list_variables(
     place = files_of(text)[0] if is_pattern(text) else Path(path)
     found = find_reader(place, request)
     found.refuse_unused(place, request)
-    if found.variables is not None:
-        return found.variables(place, request)
-    return _list_by_opening(place, request)
+    listed = (found.variables or _list_by_opening)(place, request)
+    if steps is None:
+        return listed
+    _check_stride(path, steps)
+    chosen = [entry.of_steps(steps, whole=not is_pattern(text)) for entry in listed]
+    refused = [
+        after.problem
+        for before, after in zip(listed, chosen, strict=True)
+        if after.problem and not before.problem
+    ]
+    if refused and not any(entry.options for entry in chosen):
+        raise InputError(f"{path}: {refused[0]}")
+    return chosen
+
+
+def _check_stride(path: str | Path, steps: slice) -> None:
+    """Raise InputError for a stride of 0."""
+    if steps.step == 0:
+        raise InputError(
+            f"{path}: the steps {steps.start}:{steps.stop}:0 have a stride of 0; it is at"
+            " least 1, or negative"
+        )
 
 
 def _list_by_opening(path: Path, request: Request) -> list[Listed]:

@@ -1,5 +1,7 @@
 """VTK's XML grids, as VTK, ParaView and TTK write them: .vti (ImageData), .vtr (RectilinearGrid).
 
+Parallel programs write .pvti and .pvtr, which list the files of their pieces; these are one grid.
+
 Point data lie at the grid's points, cell data at the centres of its cells. A vector gives one
 variable for each component, such as `velocity.x`. The field array `TimeValue` is the time. numpy
 reads all encodings and compressors of VTK (`common/vtk_arrays.py`), bit for bit as VTK does.
@@ -16,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.common.failures import Stamp, naming
 from fhash_formats.readers.common.file_series import FileSeries
 from fhash_formats.readers.common.grid import (
@@ -29,12 +31,14 @@ from fhash_formats.readers.common.request import Request
 from fhash_formats.readers.common.roles import assign_axes
 from fhash_formats.readers.common.variables import Variable, choose
 from fhash_formats.readers.common.vtk_arrays import VtkArrays
-from fhash_formats.readers.common.vtk_document import Document, Element, parse
+from fhash_formats.readers.common.vtk_document import Element, parse
 from fhash_formats.series import AXIS_NAMES, Coordinate
 
-SUFFIXES = (".vti", ".vtr")
+SUFFIXES = (".vti", ".vtr", ".pvti", ".pvtr")
 SPACE = ("z", "y", "x")
 KINDS = ("ImageData", "RectilinearGrid")
+PARALLEL_KINDS = ("PImageData", "PRectilinearGrid")
+"""Kinds of files that list the files of their pieces."""
 PLACES = ("PointData", "CellData")
 GHOSTS = ("vtkGhostType", "vtkValidPointMask")
 """Arrays that say which values count, and are none themselves."""
@@ -46,7 +50,7 @@ Extent = tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
 def matches(head: bytes, path: Path) -> bool:
     """Whether this is a grid in VTK's XML, by its first element or its suffix."""
     return path.suffix.lower() in SUFFIXES or any(
-        b'<VTKFile type="' + kind.encode() in head for kind in KINDS
+        b'<VTKFile type="' + kind.encode() in head for kind in (*KINDS, *PARALLEL_KINDS)
     )
 
 
@@ -57,29 +61,46 @@ class _Array:
     Attributes:
         place: "PointData" or "CellData".
         number: its place among the arrays there, the same in every piece.
+        name: in the file, "" without one.
         components: values at one place.
     """
 
     place: str
     number: int
+    name: str
     components: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Grid:
-    """One parsed file: its kind, its arrays, its whole extent and the extents of its pieces."""
+class _Piece:
+    """A part of the grid: its extent, its element, and what reads the arrays of its file."""
 
-    document: Document
+    extent: Extent
+    element: Element
     arrays: VtkArrays
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Grid:
+    """A grid: the element that describes it, its whole extent, and its pieces.
+
+    Attributes:
+        holders: elements that may hold field data, such as the time, each with what reads them.
+        files: files of the pieces, where the grid's own file only lists them.
+    """
+
     element: Element
     extent: Extent
-    pieces: tuple[tuple[Extent, Element], ...]
+    pieces: tuple[_Piece, ...]
+    holders: tuple[tuple[Element, VtkArrays], ...]
+    files: tuple[Path, ...] = ()
 
 
 def open_vtk(path: Path, request: Request) -> FileSeries:
-    """Open the one step of a .vti or .vtr file: its only array or component, or the one named.
+    """Open the one step of a grid: its only array or component, or the one named.
 
-    Raises InputError for other kinds of VTK data, turned grids, and files that are cut or damaged.
+    Raises MissingInputError for a file of a piece that is not there; InputError for other kinds of
+    VTK data, turned grids, and files that are cut or damaged.
     """
     source, stamp = str(path), Stamp.of(path)
     with naming(source):
@@ -89,10 +110,10 @@ def open_vtk(path: Path, request: Request) -> FileSeries:
         variable = choose(source, variables, var, booleans=request.booleans)
         axes = assign_axes(source, variable.shape, list(SPACE), list(SPACE), request.axes)
         array, component = variable.handle
-        elements = [_element(piece, array) for _, piece in grid.pieces]
-        for (extent, _), element in zip(grid.pieces, elements, strict=True):
-            count = prod(_shape(extent, array.place)) * array.components
-            grid.arrays.check(element, count)
+        elements = [_element(piece.element, array) for piece in grid.pieces]
+        for piece, element in zip(grid.pieces, elements, strict=True):
+            count = prod(_shape(piece.extent, array.place)) * array.components
+            piece.arrays.check(element, count)
         coords = _positions(grid, array.place)
 
     def fetch(ranges: tuple[slice, ...]) -> npt.NDArray[Any]:
@@ -109,38 +130,62 @@ def open_vtk(path: Path, request: Request) -> FileSeries:
         stamp=stamp,
         coords=coords if axes == SPACE else {},
         attributes=_units(elements[0]),
+        beside=grid.files,
     )
 
 
-def _grid(path: Path) -> _Grid:
+def _grid(path: Path, kinds: tuple[str, ...] = (*KINDS, *PARALLEL_KINDS)) -> _Grid:
+    """The grid of a file, which must be of one of some kinds."""
     document = parse(path)
     root = document.root
     kind = root.attributes.get("type", root.name)
-    element = root.first(kind) if root.name == "VTKFile" and kind in KINDS else None
+    element = root.first(kind) if root.name == "VTKFile" and kind in kinds else None
     if element is None:
         raise InputError(
-            f"it holds VTK data of the kind {kind}; {' and '.join(KINDS)} can be read"
+            f"it holds VTK data of the kind {kind}; {' and '.join(kinds)} can be read"
             " (in ParaView, the filter ResampleToImage makes them of other data)"
         )
     extent = _extent(element.attributes.get("WholeExtent", ""))
-    pieces = []
+    arrays = VtkArrays(path, document)
+    holders, files, pieces = [(element, arrays), (root, arrays)], [], []
     for piece in element.all("Piece"):
         own = _extent(piece.attributes.get("Extent", element.attributes["WholeExtent"]))
         if any(last < first for first, last in own):
             continue
-        inside = zip(own, extent, strict=True)
+        if kind in KINDS:
+            pieces.append(_Piece(extent=own, element=piece, arrays=arrays))
+            continue
+        files.append(_file(path, piece))
+        with naming(str(files[-1])):
+            listed = _grid(files[-1], (kind[1:],))
+        pieces += listed.pieces
+        holders += listed.holders
+    for part in pieces:
+        inside = zip(part.extent, extent, strict=True)
         if not all(low <= first and last <= high for (first, last), (low, high) in inside):
-            raise InputError(f"a piece with the extent {own} lies outside the grid {extent}")
-        pieces.append((own, piece))
+            raise InputError(
+                f"a piece with the extent {part.extent} lies outside the grid {extent}"
+            )
     if not pieces or any(last < first for first, last in extent):
         raise InputError("it holds an empty grid")
     return _Grid(
-        document=document,
-        arrays=VtkArrays(path, document),
         element=element,
         extent=extent,
         pieces=tuple(pieces),
+        holders=tuple(holders),
+        files=tuple(dict.fromkeys(files)),
     )
+
+
+def _file(path: Path, piece: Element) -> Path:
+    """The file of a piece that a parallel file lists."""
+    source = piece.attributes.get("Source", "")
+    if not source:
+        raise InputError("a piece names no file")
+    file = path.parent / source
+    if not file.is_file():
+        raise MissingInputError(f"{path} lists {file}, which is not there")
+    return file
 
 
 def _extent(text: str) -> Extent:
@@ -162,11 +207,11 @@ def _shape(extent: Extent, place: str) -> tuple[int, int, int]:
 
 def _variables(grid: _Grid) -> Iterator[Variable]:
     """The arrays of all places; their place precedes a name that two places have."""
-    first = grid.pieces[0][1]
+    first = grid.pieces[0]
     found = [
         (place, number, element)
         for place in PLACES
-        for holder in first.all(place)
+        for holder in first.element.all(place)
         for number, element in enumerate(holder.all("DataArray"))
     ]
     names = [element.attributes.get("Name", "values") for _, _, element in found]
@@ -179,8 +224,13 @@ def _variables(grid: _Grid) -> Iterator[Variable]:
             name if names.count(name) == 1 else f"{place}/{name}",
             int(components),
             _shape(grid.extent, place),
-            grid.arrays.dtype(element),
-            _Array(place=place, number=number, components=int(components)),
+            first.arrays.dtype(element),
+            _Array(
+                place=place,
+                number=number,
+                name=element.attributes.get("Name", ""),
+                components=int(components),
+            ),
             given=parts,
             auxiliary=name in GHOSTS,
         )
@@ -192,17 +242,26 @@ def _element(piece: Element, array: _Array) -> Element:
     elements = [] if holder is None else list(holder.all("DataArray"))
     if array.number >= len(elements):
         raise InputError(f"a piece has {len(elements)} arrays of {array.place}, another has more")
-    return elements[array.number]
+    element = elements[array.number]
+    own = element.attributes.get("Name", "")
+    components = element.attributes.get("NumberOfComponents", "1")
+    if (own, components) != (array.name, str(array.components)):
+        raise InputError(
+            f"a piece has the array {own!r} of {components} components where another has"
+            f" {array.name!r} of {array.components}"
+        )
+    return element
 
 
 def _frame(grid: _Grid, array: _Array, component: int) -> npt.NDArray[Any]:
     """One component of an array over the whole grid, (z, y, x)."""
     shape = _shape(grid.extent, array.place)
     parts = []
-    for extent, piece in grid.pieces:
-        own = _shape(extent, array.place)
-        values = grid.arrays.read(_element(piece, array), prod(own) * array.components)
-        parts.append((extent, values.reshape(*own, array.components)[..., component]))
+    for piece in grid.pieces:
+        own = _shape(piece.extent, array.place)
+        element = _element(piece.element, array)
+        values = piece.arrays.read(element, prod(own) * array.components)
+        parts.append((piece.extent, values.reshape(*own, array.components)[..., component]))
     if len(parts) == 1 and parts[0][1].shape == shape:
         return parts[0][1]
     whole = np.empty(shape, parts[0][1].dtype)
@@ -223,7 +282,7 @@ def _frame(grid: _Grid, array: _Array, component: int) -> npt.NDArray[Any]:
 def _positions(grid: _Grid, place: str) -> dict[str, Coordinate]:
     """Coordinates of the points or of the centres of cells, and the time where the file has it."""
     shape = dict(zip(SPACE, _shape(grid.extent, place), strict=True))
-    if grid.element.name == "ImageData":
+    if grid.element.name.endswith("ImageData"):
         coords = _even(grid, shape, cells=place == "CellData")
     else:
         coords = _listed(grid, cells=place == "CellData")
@@ -232,7 +291,9 @@ def _positions(grid: _Grid, place: str) -> dict[str, Coordinate]:
 
 
 def _even(grid: _Grid, shape: dict[str, int], *, cells: bool) -> dict[str, Coordinate]:
-    attributes = grid.element.attributes
+    # A parallel file may leave out what its pieces say, such as the direction.
+    own = grid.holders[-2][0].attributes
+    attributes = {**own, **grid.element.attributes}
     origin, spacing = (
         _numbers(attributes.get(name, default), 3)
         for name, default in (("Origin", "0 0 0"), ("Spacing", "1 1 1"))
@@ -252,16 +313,16 @@ def _listed(grid: _Grid, *, cells: bool) -> dict[str, Coordinate]:
     coords = {}
     for axis, (low, high) in zip(SPACE, grid.extent, strict=True):
         values = np.full(high - low + 1, np.nan)
-        for extent, piece in grid.pieces:
-            first, last = extent[SPACE.index(axis)]
-            holder = piece.first("Coordinates")
+        for piece in grid.pieces:
+            first, last = piece.extent[SPACE.index(axis)]
+            holder = piece.element.first("Coordinates")
             elements = [] if holder is None else list(holder.all("DataArray"))
             if len(elements) != 3:
                 raise InputError(f"it has {len(elements)} arrays of coordinates, not 3")
             element = elements["xyz".index(axis)]
-            if grid.arrays.dtype(element).kind not in "iuf":
+            if piece.arrays.dtype(element).kind not in "iuf":
                 raise InputError(f"its coordinates along {axis} are no numbers")
-            values[first - low : last - low + 1] = grid.arrays.read(element, last - first + 1)
+            values[first - low : last - low + 1] = piece.arrays.read(element, last - first + 1)
         if cells and high > low:
             values = (values[:-1] + values[1:]) / 2
         coords[axis] = Coordinate(name=AXIS_NAMES[axis], values=values)
@@ -270,15 +331,20 @@ def _listed(grid: _Grid, *, cells: bool) -> dict[str, Coordinate]:
 
 def _time(grid: _Grid) -> Coordinate | None:
     """The field array TimeValue as the coordinate of the one step; None without it."""
-    for holder in (*grid.element.all("FieldData"), *grid.document.root.all("FieldData")):
-        for element in holder.all("DataArray"):
-            if (
-                element.attributes.get("Name") == "TimeValue"
-                and element.attributes.get("NumberOfTuples", "1") == "1"
-                and grid.arrays.dtype(element).kind in "iuf"
-            ):
-                values = grid.arrays.read(element, 1).astype(np.float64)
-                return Coordinate(name=AXIS_NAMES["t"], values=values, attributes=_units(element))
+    fields = (
+        (element, arrays)
+        for parent, arrays in grid.holders
+        for holder in parent.all("FieldData")
+        for element in holder.all("DataArray")
+    )
+    for element, arrays in fields:
+        if (
+            element.attributes.get("Name") == "TimeValue"
+            and element.attributes.get("NumberOfTuples", "1") == "1"
+            and arrays.dtype(element).kind in "iuf"
+        ):
+            values = arrays.read(element, 1).astype(np.float64)
+            return Coordinate(name=AXIS_NAMES["t"], values=values, attributes=_units(element))
     return None
 
 

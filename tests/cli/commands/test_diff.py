@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from click.testing import Result
@@ -126,3 +127,44 @@ def test_a_missing_value_is_told_of_where_it_is_forgotten(fhash: Fhash, tmp_path
     assert said in fhash("diff", data, run).stderr
     assert said not in fhash("diff", data, run, "--missing", "-999").stderr
     assert said not in fhash("diff", data, run, "--quiet").stderr
+
+
+def both(path: Path, **changes: dict[str, str]) -> Path:
+    with h5py.File(path, "w") as file:
+        for number, name in enumerate(["flow/u", "flow/w"]):
+            data = file.create_dataset(name, data=np.full((2, 3, 4, 5), number, "f4"))
+            data.attrs["units"] = changes.get("units", "m/s")
+        scale = file.create_dataset("flow/x", data=changes.get("x", np.arange(5.0) + 2))
+        file["flow/u"].dims[3].attach_scale(scale)
+        file["flow/w"].dims[3].attach_scale(scale)
+    return path
+
+
+def test_the_variable_is_that_of_the_container(fhash: Fhash, tmp_path: Path) -> None:
+    data, run = both(tmp_path / "a.h5"), tmp_path / "w.fhz"
+    assert fhash("encode", data, "--var", "w", "-o", run, *SMALL).exit_code == 0
+    result = fhash("diff", data, run, "--max-error", "0", "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert json.loads(result.stdout)["differences"] == []
+
+
+def test_differences_beside_the_values_are_told(
+    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
+) -> None:
+    data, run = both(tmp_path / "a.h5"), tmp_path / "w.fhz"
+    assert fhash("encode", data, "--var", "w", "-o", run, *SMALL).exit_code == 0
+    result = fhash("diff", data, run, "--var", "u")
+    assert result.exit_code == 0
+    assert "are of the variable u" in result.stderr
+    other = both(tmp_path / "b.h5", units="km/h", x=np.arange(5.0))
+    assert fhash("diff", other, run).stderr.splitlines() == [
+        f"fhash: {other}: the data are in km/h, {run} in m/s",
+    ]
+    moved = both(tmp_path / "c.h5", x=np.arange(5.0) + 1)
+    lines = json.loads(fhash("diff", moved, run, "--json").stdout)["differences"]
+    assert lines == [f"the data have other positions along x than {run} (1 to 5, not 2 to 6)"]
+    np.save(tmp_path / "named.npy", np.full((2, 3, 4, 5), 1, "f4"))
+    assert fhash("diff", tmp_path / "named.npy", run).stderr == ""
+    with h5py.File(data, "a") as file:
+        file["other/w"] = file["flow/w"][...]
+    assert "choose one with --var" in refused(2, "diff", data, run)

@@ -152,3 +152,65 @@ def test_options_for_data_are_refused_for_a_run(refused: Callable[..., str], run
     for words, name in ((["--var", "q"], "--var"), (["--missing", "-9"], "--missing")):
         assert f"is encoded already; {name} is for data" in refused(2, "info", run, *words)
     assert "--raw-values is for data" in refused(2, "info", run, "--raw-values")
+
+
+def several(path: Path) -> Path:
+    with h5py.File(path, "w") as file:
+        for number, name in enumerate(["u", "w"]):
+            file[name] = np.arange(4 * 3 * 2 * 5, dtype="f4").reshape(4, 3, 2, 5) * (number + 1)
+            file[name].attrs.update({"units": "m/s", "long_name": f"speed {name}"})
+        time = file.create_dataset("time", data=np.arange(4) * 6.0)
+        time.attrs["units"] = "hours since 2001-02-03"
+        time.make_scale("time")
+        for name in ("u", "w"):
+            file[name].dims[0].attach_scale(time)
+        file["line"] = np.ones(4)
+    return path
+
+
+def test_info_of_one_variable_is_detailed(fhash: Fhash, tmp_path: Path) -> None:
+    path = several(tmp_path / "a.h5")
+    result = fhash("info", path, "--var", "w", "--t", "1:3")
+    assert (result.exit_code, result.stderr) == (0, "")
+    for text in (
+        "w: float32, time=4 (t)",
+        "--var w --t 1:3",
+        "t, z, y, x  2 x 3 x 2 x 5",
+        "time 2001-02-03T06:00 to 2001-02-03T12:00",
+        "long_name   speed w",
+    ):
+        assert text in result.stdout
+    assert "speed u" not in result.stdout
+    assert "u: " not in result.stdout
+    parsed = json.loads(fhash("info", path, "--var", "w", "--json").stdout)
+    assert [variable["name"] for variable in parsed["variables"]] == ["w"]
+    assert parsed["series"]["coordinates"][0]["dates"] == ["2001-02-03", "2001-02-03T18:00"]
+    whole = json.loads(fhash("info", path, "--json").stdout)
+    assert "series" not in whole
+
+
+def test_info_of_a_variable_that_cannot_be_encoded_says_why(
+    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
+) -> None:
+    path = several(tmp_path / "a.h5")
+    assert "1 dimensions (4,)" in fhash("info", path, "--var", "line", "--json").stdout
+    assert "it holds u" in refused(2, "info", path, "--var", "v")
+
+
+def test_steps_are_repeated_and_checked(
+    fhash: Fhash, refused: Callable[..., str], tmp_path: Path
+) -> None:
+    path = several(tmp_path / "a.h5")
+    result = json.loads(fhash("info", path, "--t", "-2:", "--json").stdout)
+    commands = [command for entry in result["variables"] for command in entry["commands"]]
+    assert [command.split()[-2:] for command in commands] == [["--t", "-2:"]] * 2
+    assert "selection of steps is empty" in refused(2, "info", path, "--t", "4:")
+    with h5py.File(path, "a") as file:
+        file["longer"] = np.zeros((5, 3, 2, 5))
+    result = json.loads(fhash("info", path, "--t", "4:", "--json").stdout)
+    good = [entry["name"] for entry in result["variables"] if entry["commands"]]
+    assert good == ["longer"]
+    for number in range(3):
+        np.save(tmp_path / f"step_{number}.npy", np.zeros((3, 2, 5), "f4"))
+    result = fhash("info", tmp_path / "step_*.npy", "--t", "2", "--json")
+    assert json.loads(result.stdout)["series"]["shape"] == [1, 3, 2, 5]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fhash_codec.measure.bulk import MIN_SHARE, find_bulk, is_wide, whole_psnr
+from fhash_codec.measure.bulk import MIN_SHARE, bulk_of_ranks, find_bulk, is_wide, whole_psnr
+from fhash_codec.measure.ranks import Ranks
 from fhash_codec.measure.value_range import ValueRange
 
 
@@ -104,3 +105,37 @@ def test_a_wide_bulk_spans_a_share_of_the_range(share, wide) -> None:
 
 def test_the_whole_psnr_has_the_same_rmse() -> None:
     assert whole_psnr(40.0, ValueRange(1.0, 2.0), 10.0) == pytest.approx(60.0)
+
+
+@pytest.mark.parametrize("scale", [1.0, 20.0, 1e6])
+def test_ranks_give_the_bulk_in_one_pass(scale) -> None:
+    values = heavy(scale).astype(np.float32)
+    limits = ValueRange(float(values.min()), float(values.max()))
+    ranks = Ranks(4000)
+    ranks.add(values)
+    found, (low, high) = bulk_of_ranks(ranks, limits), percentiles(values)
+    assert ranks.error > 0
+    assert found.low <= low
+    assert high <= found.high
+    inside = np.count_nonzero((values >= found.low) & (values <= found.high))
+    assert 0.98 <= inside / values.size <= 0.98 + (6 * ranks.error + 100) / values.size
+    exact = Ranks()
+    exact.add(values)
+    assert bulk_of_ranks(exact, limits).low == pytest.approx(low, abs=0.001 * (high - low))
+
+
+def test_ranks_without_a_width_give_no_bulk() -> None:
+    flat, plateau, huge = Ranks(), Ranks(), Ranks()
+    assert bulk_of_ranks(flat, ValueRange(0, 1)) is None
+    plateau.add(np.repeat([3.0, 9.0], [999, 1]))
+    assert bulk_of_ranks(plateau, ValueRange(3, 9)) is None
+    huge.add(np.array([-1.7e308, 0.0, 1.0, 1.7e308]))
+    assert bulk_of_ranks(huge, ValueRange(-1.7e308, 1.7e308)) is None
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int64])
+def test_ranks_of_whole_numbers_give_whole_ends(dtype) -> None:
+    labels = np.repeat([0, 1, 2, 3, 120], [500, 300, 150, 45, 5]).astype(dtype)
+    ranks = Ranks()
+    ranks.add(labels)
+    assert bulk_of_ranks(ranks, ValueRange(0, 120), whole=True) == ValueRange(0.0, 3.0)

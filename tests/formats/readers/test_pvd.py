@@ -71,7 +71,7 @@ def test_files_of_paraview_series(tmp_path: Path) -> None:
         ([(0, 0, "step_0.vti"), (0, 1, "step_1.vti")], "step_0.vti and step_1.vti for the time 0"),
         ([("soon", 0, "step_0.vti")], "the time 'soon' is no number"),
         ([("nan", 0, "step_0.vti")], "no finite number"),
-        ([(0, 0, "mesh.vtu")], r"lists mesh\.vtu; \.vti and \.vtr can be read"),
+        ([(0, 0, "mesh.vtu")], r"lists mesh\.vtu; \.vti, \.vtr, \.pvti and \.pvtr can be read"),
         ([(0, 0, "")], "names no file"),
         ([], "lists no file"),
     ],

@@ -98,3 +98,10 @@ def test_raw_that_does_not_fit_is_refused(
     (tmp_path / name).write_bytes(VALUES.tobytes())
     with pytest.raises(InputError, match=words):
         open_series(tmp_path / name, raw=layout)
+
+
+def test_a_header_beside_it_is_named(tmp_path: Path) -> None:
+    (tmp_path / "part.raw").write_bytes(bytes(24))
+    (tmp_path / "part.nhdr").write_text("NRRD0005\n")
+    with pytest.raises(InputError, match=r"part\.nhdr may say it: give that file instead"):
+        open_series(tmp_path / "part.raw")

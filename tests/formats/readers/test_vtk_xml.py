@@ -12,7 +12,7 @@ import pytest
 import vtk_files
 
 from fhash_formats import open_series
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, MissingInputError
 from fhash_formats.readers.common.variables import SeveralVariablesError
 
 RNG = np.random.default_rng(0)
@@ -130,6 +130,70 @@ def test_pieces_are_put_together(tmp_path: Path) -> None:
     path.write_text(text.format(piece.format(0, 1, "0 1 4 5")))
     with open_series(path) as series, pytest.raises(InputError, match="leave 4 values"):
         series.read(0)
+
+
+@pytest.mark.parametrize("ghosts", [0, 1])
+def test_files_of_pieces_are_one_grid(tmp_path: Path, ghosts: int) -> None:
+    xml = pytest.importorskip("vtkmodules.vtkIOParallelXML")
+    core = pytest.importorskip("vtkmodules.vtkImagingCore")
+    support = pytest.importorskip("vtkmodules.util.numpy_support")
+    wavelet, whole = core.vtkRTAnalyticSource(), core.vtkRTAnalyticSource()
+    for source in (wavelet, whole):
+        source.SetWholeExtent(-4, 4, -3, 3, -2, 2)
+    writer = xml.vtkXMLPImageDataWriter()
+    writer.SetInputConnection(wavelet.GetOutputPort())
+    writer.SetNumberOfPieces(3)
+    writer.SetEndPiece(2)
+    writer.SetGhostLevel(ghosts)
+    writer.SetFileName(str(tmp_path / "a b.pvti"))
+    assert writer.Write() == 1
+    whole.Update()
+    values = support.vtk_to_numpy(whole.GetOutput().GetPointData().GetScalars())
+    with open_series(tmp_path / "a b.pvti", var="RTData") as series:
+        np.testing.assert_array_equal(series.read(0).ravel(), values)
+        assert series.coords["z"].values.tolist() == [-2, -1, 0, 1, 2]
+        assert len(series.files) == 4
+        (tmp_path / "a b_1.vti").write_bytes(b"")
+        with pytest.raises(InputError, match="changed while it was being read"):
+            series.read(0)
+    (tmp_path / "a b_1.vti").unlink()
+    with pytest.raises(MissingInputError, match=r"a b_1\.vti, which is not there"):
+        open_series(tmp_path / "a b.pvti", var="RTData")
+
+
+PARALLEL = """<VTKFile type="PImageData"><PImageData WholeExtent="0 3 0 0 0 0" {}>
+<Piece Extent="0 1 0 0 0 0" Source="0.vti"/><Piece Extent="1 3 0 0 0 0" Source="1.vti"/>
+</PImageData></VTKFile>"""
+PART = """<VTKFile type="ImageData"><ImageData WholeExtent="{0}" Spacing="2 1 1" {3}>
+<Piece Extent="{0}"><PointData><DataArray type="Float32" Name="{1}" format="ascii">{2}</DataArray>
+</PointData></Piece></ImageData></VTKFile>"""
+
+
+def test_a_list_of_pieces_says_less_than_they_do(tmp_path: Path) -> None:
+    turned = 'Direction="-1 0 0 0 1 0 0 0 1"'
+    (tmp_path / "a.pvti").write_text(PARALLEL.format('Origin="5 0 0" Spacing="2 1 1"'))
+    (tmp_path / "0.vti").write_text(PART.format("0 1 0 0 0 0", "u", "0 1", turned))
+    (tmp_path / "1.vti").write_text(PART.format("1 3 0 0 0 0", "u", "1 2 3", turned))
+    with open_series(tmp_path / "a.pvti") as series:
+        assert series.read(0).tolist() == [[[0, 1, 2, 3]]]
+        assert series.coords["x"].values.tolist() == [5, 3, 1, -1]
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        (PART.format("1 3 0 0 0 0", "v", "1 2 3", ""), "array 'v' of 1 components where another"),
+        (PART.format("1 4 0 0 0 0", "u", "1 2 3 4", ""), "lies outside the grid"),
+        (PARALLEL.format(""), r"1\.vti: it holds VTK data of the kind PImageData; ImageData can"),
+        ("", r"1\.vti: it is cut or no XML"),
+    ],
+)
+def test_pieces_that_do_not_fit_are_refused(tmp_path: Path, second: str, message: str) -> None:
+    (tmp_path / "a.pvti").write_text(PARALLEL.format(""))
+    (tmp_path / "0.vti").write_text(PART.format("0 1 0 0 0 0", "u", "0 1", ""))
+    (tmp_path / "1.vti").write_text(second)
+    with pytest.raises(InputError, match=message):
+        open_series(tmp_path / "a.pvti")
 
 
 def test_units_are_read(tmp_path: Path) -> None:

@@ -22,8 +22,8 @@ from fhash_formats.readers.common.layout import (
     single,
 )
 from fhash_formats.readers.common.request import Request
-from fhash_formats.readers.common.variables import Variable, kind_of, plain_name
-from fhash_formats.series import AXES, Series
+from fhash_formats.readers.common.variables import Variable, kind_of, named, plain_name
+from fhash_formats.series import AXES, Series, empty_selection
 from fhash_formats.support.attributes import plain_text
 
 
@@ -56,6 +56,21 @@ class Listed:
     options: tuple[tuple[str, ...], ...] = ()
     problem: str = ""
     output: str = ""
+
+    def of_steps(self, steps: slice, *, whole: bool) -> Listed:
+        """This variable where some steps are asked for: its commands ask for them, too.
+
+        whole: whether the lengths are those of the whole source, so that an empty selection is
+        a problem.
+        """
+        axes = [axis for _, axis in self.dimensions]
+        count = self.shape[axes.index("t")] if "t" in axes else 1
+        if self.options and whole and not range(*steps.indices(count)):
+            problem = empty_selection(count)
+            return replace(self, options=(), problem=problem)
+        parts = [steps.start, steps.stop] + ([] if steps.step is None else [steps.step])
+        text = ":".join("" if part is None else str(part) for part in parts)
+        return replace(self, options=tuple((*words, "--t", text) for words in self.options))
 
     def commands(self, path: str) -> list[str]:
         """The command for each likely reading, for a shell."""
@@ -92,13 +107,18 @@ def listing(
 ) -> list[Listed]:
     """The variables of a file; coordinates and the members of joined ones are left out.
 
+    A request that names a variable gets that one alone, whatever it is.
+
     dimensions, packed: dimensions of a variable that can be read, and the packing that the file
         declares, whatever the request is.
     """
     shown = [variable for variable in variables if not variable.auxiliary]
-    several = sum(not variable.problem(request.booleans) for variable in shown) > 1
+    good = [variable for variable in shown if not variable.problem(request.booleans)]
+    several = len(good) > 1
     found = []
     plain = [plain_name(variable.name) for variable in shown]
+    if request.var is not None:
+        shown = [named(source, variables, good or shown, request.var)]
     for variable in shown:
         name, problem = plain_text(variable.name), variable.problem(request.booleans)
         entry = Listed(
@@ -110,14 +130,14 @@ def listing(
             output=_output(variable.name, plain.count(plain_name(variable.name)) > 1),
         )
         if not problem:
-            named = ("--var", name) if several or request.var else ()
+            said = ("--var", name) if several or request.var else ()
             try:
                 entry = (
                     _as_stored(entry, variable, packed)
                     if request.raw_values
                     else _unpacked(entry, packed(variable))
                 )
-                entry = _read(source, entry, dimensions(variable), request, named)
+                entry = _read(source, entry, dimensions(variable), request, said)
             except InputError as error:  # of attributes that make no sense
                 entry = replace(entry, problem=str(error).removeprefix(f"{source}: "))
         found.append(entry)

@@ -121,7 +121,11 @@ def choose(
     if var is None:
         candidates = fitting or candidates
     if var is not None:
-        return _named(source, variables, candidates or suitable, var, booleans)
+        variable = named(source, variables, candidates or suitable, var)
+        problem = variable.problem(booleans)
+        if problem:
+            raise InputError(f"{source}: variable {variable.name} has {problem}")
+        return variable
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
@@ -155,31 +159,28 @@ def plain_name(name: str) -> str:
     return name.rpartition("/")[2]
 
 
-def _named(
-    source: str,
-    variables: Sequence[Variable],
-    candidates: Sequence[Variable],
-    var: str,
-    booleans: bool,
+def named(
+    source: str, variables: Sequence[Variable], candidates: Sequence[Variable], var: str
 ) -> Variable:
+    """The variable that `var` names, as `choose` does, whether or not it can be read.
+
+    candidates: variables that a message lists. Raises InputError for no such name, or several.
+    """
     name = var.strip("/")
-    named = [variable for variable in variables if variable.name == name]
-    named = named or [
+    found = [variable for variable in variables if variable.name == name]
+    found = found or [
         variable for variable in variables if variable.name.endswith((f"/{name}", f".{name}"))
     ]
-    if len(named) > 1:
+    if len(found) > 1:
         # a series of steps comes before each of its steps
-        named = [variable for variable in named if not variable.auxiliary] or named
-    if len(named) > 1:
+        found = [variable for variable in found if not variable.auxiliary] or found
+    if len(found) > 1:
         raise InputError(
-            f"{source}: --var {var} means {len(named)} variables: {_listed(named)}; give the whole"
+            f"{source}: --var {var} means {len(found)} variables: {_listed(found)}; give the whole"
             " name"
         )
-    if named:
-        problem = named[0].problem(booleans)
-        if problem:
-            raise InputError(f"{source}: variable {named[0].name} has {problem}")
-        return named[0]
+    if found:
+        return found[0]
     nearest = sorted(
         candidates,
         key=lambda variable: (

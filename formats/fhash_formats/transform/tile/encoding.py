@@ -43,13 +43,19 @@ from fhash_formats.transform.values.elementwise import (
     residual_of,
     within,
 )
-from fhash_formats.transform.values.quantise import dequantise, quantise
+from fhash_formats.transform.values.quantise import LARGEST, dequantise, quantise
 
 __all__ = ["CodedTile", "Coding", "encode_tile", "exact_tile"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int32]
+
+MAX_CHOSEN = 1 << 22
+"""Magnitude from which on an integer is the nearest one, and is not chosen by its cost.
+
+The choice compares coefficients in float32, which no longer holds their fractions.
+"""
 
 _END_MARGIN = 1e-4
 """Values within this share of the range from one of its ends count as lying at that end."""
@@ -266,12 +272,19 @@ def _predicted_tile(task: _Task, predictor: Predictor, error: float) -> CodedTil
 
 
 def _transformed_tile(task: _Task) -> CodedTile:
-    """A tile coded by transform; stored without loss where that cannot keep the bound."""
+    """A tile coded by transform.
+
+    It is stored without loss where that cannot keep the bound, and where the quantiser step is too
+    fine for its coefficients.
+    """
     settings, error = task.settings, task.coding.error
     transform = transform_for(settings, task.shape)
     target = _target(task, transform)
     coefficients = _free_coefficients(task, transform, target)
-    data, integers = _code(coefficients, task)
+    coded = _code(coefficients, task)
+    if coded is None:
+        return task.exact()
+    data, integers = coded
     linear = linear_values(integers, transform, settings)
     mask = task.mask_section(linear)
     base = linear if settings.head is None else settings.head.apply(linear)
@@ -328,11 +341,19 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
     return coefficients
 
 
-def _code(coefficients: Values, task: _Task) -> tuple[bytes, Integers]:
-    """The coded coefficients, and the integers that they decode to."""
+def _code(coefficients: Values, task: _Task) -> tuple[bytes, Integers] | None:
+    """The coded coefficients, and the integers that they decode to; None where one is too large."""
     table, weight = band_table(task.settings.transform, task.shape), task.coding.weight
     integers, scaled = quantise(coefficients, task.settings.step)
+    largest = max(-int(integers.min()), int(integers.max()))
+    if largest >= LARGEST:
+        return None
     coded = encode_integers(integers, table, scaled=scaled if weight > 0 else None, weight=weight)
-    if task.coding.passes > 1 and weight > 0:
-        coded = encode_integers(coded.integers, table)
+    chosen = coded.integers
+    if largest >= MAX_CHOSEN and weight > 0 and task.settings.double:
+        large = np.abs(integers) >= MAX_CHOSEN
+        nearest = np.rint(coefficients / task.settings.step).astype(np.int32)
+        chosen = np.where(large, nearest, chosen)
+    if (task.coding.passes > 1 and weight > 0) or chosen is not coded.integers:
+        coded = encode_integers(chosen, table)
     return coded.data, coded.integers

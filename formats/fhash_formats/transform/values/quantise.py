@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 
-__all__ = ["OFFSET_UNIT", "ROUNDING", "dequantise", "quantise"]
+__all__ = ["LARGEST", "OFFSET_UNIT", "ROUNDING", "dequantise", "quantise"]
 
 OFFSET_UNIT = 128
 """Units in a quantiser step, for reconstruction offsets."""

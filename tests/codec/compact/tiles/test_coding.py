@@ -10,7 +10,14 @@ import pytest
 
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Tile
-from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome, code, total
+from fhash_codec.compact.tiles.coding import (
+    MIN_STEP_SHARE,
+    OFFSETS,
+    Coding,
+    Outcome,
+    code,
+    total,
+)
 from fhash_formats.transform.tile.settings import TileSettings
 
 SHAPE = (2, 8, 12, 16)
@@ -52,3 +59,47 @@ def test_outcomes_add_up_by_their_weights() -> None:
     )
     assert total([first]) == first
     assert total([]).size == 0
+
+
+def lattice_values(kind: str) -> np.ndarray:
+    """Values of one kind, float64 (3, 12, 12, 12)."""
+    rng = np.random.default_rng(0)
+    t, z, y, x = np.mgrid[0:3, 0:12, 0:12, 0:12].astype(np.float64)
+    smooth = np.sin(t / 4 + z / 5) * np.cos(y / 6) + x / 20
+    return {
+        "smooth": smooth,
+        "far from zero": smooth + 300,
+        "noise": rng.random(x.shape),
+        "spikes": np.where(rng.random(x.shape) < 0.001, 1e3, smooth),
+        "jump": (x > 7) + 0.01 * smooth,
+        "plateau": np.where(t + z + y + x == 0, 0, 1) + 1e-3 * rng.random(x.shape),
+    }[kind]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", ["smooth", "far from zero", "noise", "spikes", "jump", "plateau"])
+def test_finer_steps_give_a_higher_psnr_to_the_finest(kind: str, dtype: type[np.floating]) -> None:
+    """The error is that of a uniform quantiser or less, within 1 dB, down to MIN_STEP_SHARE.
+
+    Beyond it coefficients do not fit the coder's integers, and tiles are exact.
+    """
+    values = lattice_values(kind).astype(dtype)
+    low, high = float(values.min()), float(values.max())
+    settings = replace(
+        SETTINGS,
+        transform=usual_transform(values.shape),
+        center=float(np.float32((low + high) / 2)),
+        low=low,
+        high=high,
+        double=True,
+    )
+    finest = -round(math.log2(MIN_STEP_SHARE))
+    before = 0.0
+    for exponent in [16, finest - 2, finest - 1, finest, finest + 6]:
+        step = (high - low) * 2.0**-exponent
+        stepped = replace(settings, step=step)
+        psnr = code(Tile(values, None), stepped, Coding())[1].psnr(high - low)
+        assert psnr >= 20 * math.log10(2.0**exponent * math.sqrt(12)) - 1
+        assert psnr > before or math.isinf(psnr)
+        before = psnr
+    assert math.isinf(before)

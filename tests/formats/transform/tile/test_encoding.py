@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from specs import spec_of
 from tiles import SETTINGS, SHAPE, same, wave
 
 from fhash_formats.transform.tile.decoding import decode_tile
-from fhash_formats.transform.tile.encoding import Coding, encode_tile, exact_tile
+from fhash_formats.transform.tile.encoding import MAX_CHOSEN, Coding, encode_tile, exact_tile
+from fhash_formats.transform.values.quantise import LARGEST
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
@@ -126,3 +128,42 @@ def test_ends_that_float32_rounds_outwards_are_kept_in_float64() -> None:
     decoded = encode_tile(values, settings, Coding()).decoded
     assert decoded.dtype == np.float64
     assert -0.7 <= decoded.min() <= decoded.max() <= -0.1
+
+
+PLAIN = replace(
+    SETTINGS,
+    transform=spec_of(("none",) * 4, (0,) * 4, SHAPE),
+    step=2.0**-4,
+    center=0.0,
+    double=True,
+    quantum=0.0,
+)
+
+
+def edge(shape: tuple[int, ...], peak: float) -> np.ndarray:
+    """Values whose one coefficient, in a transform that does nothing, is `peak` steps of PLAIN."""
+    values = np.zeros(shape)
+    values[0, 1, 2, 3] = peak * PLAIN.step
+    return values
+
+
+@pytest.mark.parametrize(("peak", "exact"), [(LARGEST - 1, False), (LARGEST, True)])
+def test_a_tile_is_exact_where_an_integer_does_not_fit(peak: float, exact: bool) -> None:
+    values = edge(SHAPE, peak)
+    values[0, 0, 0, 0] += PLAIN.step / 3  # which is lost unless the tile is exact
+    settings = replace(PLAIN, low=float(values.min()), high=float(values.max()))
+    coded = encode_tile(values, settings, Coding())
+    assert np.array_equal(coded.decoded, values) == exact
+    assert np.abs(coded.decoded - values).max() <= settings.step
+    assert same(decode_tile(coded.data, SHAPE, np.float64, settings), coded.decoded)
+
+
+@pytest.mark.parametrize("peak", [MAX_CHOSEN - 0.7, MAX_CHOSEN + 0.3, MAX_CHOSEN * 16 + 0.7])
+@pytest.mark.parametrize("weight", [0.0, 0.09])
+def test_large_integers_are_the_nearest_ones(peak: float, weight: float) -> None:
+    values = edge(SHAPE, peak)
+    settings = replace(PLAIN, low=float(values.min()), high=float(values.max()))
+    coded = encode_tile(values, settings, Coding(weight=weight))
+    error = abs(coded.decoded[0, 1, 2, 3] - values[0, 1, 2, 3]) / settings.step
+    assert error <= (0.5 if weight else 0.7) + 1e-6
+    assert same(decode_tile(coded.data, SHAPE, np.float64, settings), coded.decoded)

@@ -1,0 +1,115 @@
+"""Text about data that can be encoded: its variables, and one of them in detail."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from fhash_cli.output import apart, extent, listed
+
+MIN_DIMENSIONS = 3
+"""Dimensions of an array that may be a variable; others are named in one line."""
+
+MAX_TEXT = 300
+"""Characters of an attribute that are shown."""
+
+if TYPE_CHECKING:
+    from fhash_formats.series import Coordinate, Series
+
+
+def listing(
+    path: str, files: int, variables: Sequence[Mapping[str, Any]], *, named: bool = False
+) -> str:
+    """The variables of a data file, each with its commands; then what cannot be encoded.
+
+    named: whether the user named the only variable that is listed.
+    """
+    good = [variable for variable in variables if not variable["problem"]]
+    many = f" ({files} files; shapes are of the first)" if files > 1 else ""
+    count = f"{len(good) or 'no'} variable{'' if len(good) == 1 else 's'}"
+    lines = [f"{path}{many} holds {count} to encode"] if not named else [f"{path}{many}"]
+    for variable in good:
+        units = f", in {variable['units']}" if variable["units"] not in ("", "1") else ""
+        shape = ", ".join(_dimension(**dimension) for dimension in variable["dimensions"])
+        stored = f" stored as {variable['stored']}" if variable["stored"] else ""
+        marks = " and ".join(f"{value:.9g}" for value in variable["missing"])
+        missing = f", missing where {marks}" if marks else ""
+        dtype = variable["dtype"] + stored
+        lines.append(f"\n{variable['name']}: {dtype}, {shape}{units}{missing}")
+        if len(variable["commands"]) > 1:
+            lines.append("  two readings are likely:")
+        lines += [f"  {text}" for text in variable["commands"]]
+    rest = [variable for variable in variables if variable["problem"]]
+    others = [variable for variable in rest if len(variable["shape"]) >= MIN_DIMENSIONS]
+    small = [variable for variable in rest if len(variable["shape"]) < MIN_DIMENSIONS]
+    if others:
+        lines.append("\nnot to be encoded:")
+        lines += [f"  {variable['name']}: {variable['problem']}" for variable in others]
+    if small:
+        names = [f"{variable['name']} {tuple(variable['shape'])}" for variable in small]
+        lines.append(f"\nbelow {MIN_DIMENSIONS} dimensions: {listed(names)}")
+    return "\n".join(lines)
+
+
+def _dimension(name: str, length: int, axis: str) -> str:
+    """A dimension and what it is: "lev=17 (z)"."""
+    note = {"?": " (?)", "select": " (select one)", name: ""}.get(axis, f" ({axis})")
+    return f"{name}={length}{note}"
+
+
+def details(series: Series) -> dict[str, Any]:
+    """An open series as JSON values: shape, type, units, coordinates and attributes."""
+    from fhash_codec.times import is_dated, time_text
+    from fhash_formats.support.attributes import json_attributes
+
+    coordinates = []
+    for axis in "tzyx":
+        coordinate = series.coords[axis]
+        ends = [float(coordinate.values[0]), float(coordinate.values[-1])]
+        dated = axis == "t" and is_dated(coordinate)
+        coordinates.append(
+            {
+                "axis": axis,
+                "name": coordinate.name,
+                "first": ends[0],
+                "last": ends[1],
+                "units": str(coordinate.attributes.get("units", "")),
+                "dates": [time_text(coordinate, end) for end in ends] if dated else [],
+            }
+        )
+    return {
+        "name": series.name,
+        "shape": list(series.shape),
+        "dtype": (series.source_dtype or series.dtype).name,
+        "units": series.units,
+        "fill": series.fill,
+        "coordinates": coordinates,
+        "attributes": json_attributes(series.attributes, without=frozenset()),
+    }
+
+
+def details_rows(series: Series) -> list[tuple[str, str]]:
+    """An open series as rows of a table: shape, positions along each axis, and attributes."""
+    from fhash_formats.support.attributes import json_attributes
+
+    rows = [("t, z, y, x", extent(series.shape))]
+    rows += [(f"  {axis}", positions(series.coords[axis], axis)) for axis in "tzyx"]
+    for name, value in json_attributes(series.attributes).items():
+        text = " ".join(str(value).split())
+        rows.append((name, text if len(text) <= MAX_TEXT else text[:MAX_TEXT] + "..."))
+    return rows
+
+
+def positions(coordinate: Coordinate, axis: str) -> str:
+    """Name, first and last position, and units of an axis; times as dates where they are."""
+    from fhash_codec.times import is_dated, number_text, time_text
+
+    units = coordinate.attributes.get("units", "")
+    ends = [float(coordinate.values[0]), float(coordinate.values[-1])]
+    if axis != "t":
+        return f"{coordinate.name} {' to '.join(apart(*ends))} {units}".rstrip()
+    numbers = " to ".join(number_text(coordinate, time) for time in ends)
+    if not is_dated(coordinate):
+        return f"{coordinate.name} {numbers} {units}".rstrip()
+    dates = " to ".join(time_text(coordinate, time) for time in ends)
+    return f"{coordinate.name} {dates} ({numbers} {units})"
