@@ -25,6 +25,7 @@ from fhash_codec.compact.choices.head import (
     _side_by_side,
     choose_head,
 )
+from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.progress import Parts
@@ -131,15 +132,17 @@ class NoSample:
 @pytest.mark.parametrize("size", [0, MIN_BYTES - 1, MIN_BYTES])
 def test_no_head_is_tried_on_a_file_that_is_too_small_for_it(size: int) -> None:
     outcome = Outcome(size=size, squares=1.0, count=1, max_error=1.0)
+    transform = usual_transform((1, 1, 8, 8))
+    settings = TileSettings(transform=transform, step=1.0, center=0.0, low=0.0, high=1.0)
 
     def choose() -> Any:
         return choose_head(
-            cast(Sample, NoSample()), cast(TileSettings, None), outcome, Coding(),
+            cast(Sample, NoSample()), settings, outcome, Coding(),
             cast(Any, None), [], strict=False, data_range=1.0, effort=5, seed=0,
         )  # fmt: skip
 
     if size < MIN_BYTES:
-        assert choose() == (None, outcome, [])
+        assert choose() == (settings, outcome, [])
     else:
         with pytest.raises(AskedFor):
             choose()
