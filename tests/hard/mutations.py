@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import mutated_json
+import mutated_labels
 import mutated_payload
 import mutated_settings
 import mutated_zip
@@ -150,7 +151,7 @@ SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
     **mutated_zip.KINDS,
     **{
         name: _packed(change)
-        for module in (mutated_json, mutated_payload, mutated_settings)
+        for module in (mutated_json, mutated_payload, mutated_settings, mutated_labels)
         for name, change in module.KINDS.items()
     },
 }
