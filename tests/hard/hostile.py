@@ -30,13 +30,14 @@ HANG = 120.0
 class Report:
     """The results of all mutations.
 
-    Ends are counted by command and by kind. The worst figures are kept with the number of their
-    mutation.
+    Ends are counted by command and by kind; `met` has the goldens that each kind changed. The worst
+    figures are kept with the number of their mutation.
     """
 
     mutations: int = 0
     ends: dict[str, Counter[str]] = field(default_factory=dict)
     kinds: dict[str, Counter[str]] = field(default_factory=dict)
+    met: dict[str, set[str]] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)
     worst_seconds: tuple[float, str] = (0.0, "")
     worst_bytes: tuple[int, str] = (0, "")
@@ -45,6 +46,7 @@ class Report:
         """Add a worker's answer about one mutation."""
         self.mutations += 1
         name = f"{answer['number']} ({answer['kind']} of {answer['golden']})"
+        self.met.setdefault(answer["kind"], set()).add(answer["golden"])
         for end in answer["ends"]:
             self.ends.setdefault(end["command"], Counter())[end["end"]] += 1
             self.kinds.setdefault(answer["kind"], Counter())[end["end"]] += 1
