@@ -22,8 +22,9 @@ from typing import Any
 
 import mutations
 
-HANG = 120.0
-"""Seconds without an answer after which a worker is ended."""
+HANG = 600.0
+"""Seconds without an answer after which a worker is ended. Its processor time has a limit of its own,
+so only a worker that waits for ever takes so long, or one on a machine that is very busy."""
 
 
 @dataclass

@@ -141,7 +141,8 @@ def test_clipped_values_lie_in_their_range_and_bound(
     whole = kind.kind != "f"
     settings = TileSettings(
         transform=SPEC,
-        step=max(error, 1e-30),
+        # Coarse steps leave much to the residual, which alone can pass the ends of the range.
+        step=max(error, 1e-30) * data.draw(st.sampled_from([1, 5, 20])),
         center=(low + high) / 2,
         low=low,
         high=high,
