@@ -23,8 +23,8 @@ from typing import Any
 import mutations
 
 HANG = 600.0
-"""Seconds without an answer after which a worker is ended. Its processor time has a limit of its own,
-so only a worker that waits for ever takes so long, or one on a machine that is very busy."""
+"""Seconds without an answer after which a worker is ended: it waits for ever, since processor time
+has a limit of its own."""
 
 
 @dataclass

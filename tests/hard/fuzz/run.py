@@ -151,6 +151,7 @@ def prepare(folder: Path, every: int = 1, only: str | None = None) -> dict[str, 
         import seeds
     finally:
         sys.path.remove(str(HERE))
+    folder.mkdir(parents=True, exist_ok=True)
     seeds.write_seeds(folder / "corpus", *seeds.write_setups(folder / "setups"), every, only)
     chosen = {} if only is None else {"FHASH_FUZZ_TARGET": str(seeds.NAMES.index(only))}
     return {**os.environ, **ENVIRONMENT, **chosen, "FHASH_FUZZ_SETUPS": str(folder / "setups")}

@@ -183,7 +183,7 @@ def write_seeds(
 def label_streams() -> Iterator[tuple[tuple[int, ...], int, bytes]]:
     """Yield shapes, numbers of labels and coded labels: regions, noise and both."""
     rng = np.random.default_rng(1)
-    for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (3, 8, 8, 24)):
+    for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (3, 4, 6, 40)):
         regions = np.indices(shape).sum(0) // 5
         for most in (1, 2, 5, 17, 256):
             for noise in (0.0, 0.05, 1.0):

@@ -91,7 +91,8 @@ Labels drawn(Reader& in, const Tile& tile) {
 
 Tile tile_of(Reader& in) {
     Tile tile;
-    tile.shape = small_shape(in, 8);
+    // Rows of up to three segments.
+    for (const int64_t most : {4, 4, 6, 40}) tile.shape.push_back(in.within(1, most));
     tile.count = 1 + in.byte();
     return tile;
 }

@@ -39,9 +39,9 @@ struct Voxels {
 Voxels make_voxels(Reader& in) {
     Voxels voxels;
     const std::uint8_t widths = in.byte();
-    const int64_t most = widths < 16 ? 64 : 8;
+    const int64_t most = widths < 4 ? 64 : 6;  // large ones take long
     voxels.sizes[0] = in.within(1, 3);
-    voxels.sizes[1] = in.within(1, widths % 8 ? 2 : 64);
+    voxels.sizes[1] = in.within(1, widths % 64 ? 2 : 64);
     voxels.sizes[2] = BLOCK;
     voxels.sizes[3] = in.byte() & 1 ? 9 : 1;
     voxels.sizes[4] = in.within(1, most);
