@@ -13,6 +13,7 @@ import numpy.typing as npt
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
 from fhash_formats.container import StoredArray
+from fhash_formats.errors import DamagedFileError
 
 Positions = npt.NDArray[np.float64]
 """Coordinates of some points along one axis."""
@@ -27,6 +28,8 @@ class CompactModel:
     def __init__(self, arrays: Mapping[str, StoredArray]) -> None:
         self._arrays = arrays
         self._array = arrays["tables/level_1"]
+        # Files from before the feature `mask` have their occupancy in arrays.
+        self._older = any(name.startswith("occupancy/") for name in arrays)
         self.chunks = self._array.chunk_shape
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
@@ -48,12 +51,13 @@ class CompactModel:
         """Return the values (z, y, x) of a region of the box at a step.
 
         At a stored step they have the type of the source; between steps they are interpolated
-        linearly, in float64.
+        linearly, in float64. Raises DamagedFileError for infinities, which no table holds.
         """
         first = int(np.floor(step))
         weight = step - first
         space = tuple(slice(low, high) for low, high in region)
-        steps = self._array.read((slice(first, first + (2 if weight else 1)), *space))
+        stored = self._array.read((slice(first, first + (2 if weight else 1)), *space))
+        steps = self._without_infinities(stored)
         values: npt.NDArray[Any] = steps[0]
         if weight:
             values = values.astype(np.float64) * (1 - weight) + steps[1].astype(np.float64) * weight
@@ -88,7 +92,7 @@ class CompactModel:
                 target.append(slice(first - low, stop - low))
                 source.append(_nearest(first, stop, stride, i * n, size))
             result[tuple(target)] = chunk[np.ix_(*source)]
-        return result
+        return self._without_infinities(result)
 
     def sample(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
         """Return the values at points, quadrilinear.
@@ -143,7 +147,8 @@ class CompactModel:
         )
         space_slices = tuple(slice(*span) for span in box)
         for step in np.unique(np.concatenate([low[0], high[0]])):
-            frame = self._array.read((slice(int(step), int(step) + 1), *space_slices))[0]
+            stored = self._array.read((slice(int(step), int(step) + 1), *space_slices))[0]
+            frame = self._without_infinities(stored)
             for corner in product((0, 1), repeat=4):
                 at = [(high if up else low)[axis] for axis, up in enumerate(corner)]
                 chosen = at[0] == step
@@ -157,6 +162,18 @@ class CompactModel:
             weight = np.asarray(prod(factors))
             values += np.where(weight == 0, 0.0, weight * corners[corner])
         return values, corners, weights
+
+    def _without_infinities(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return values of the table, which are finite or NaN; raise DamagedFileError otherwise.
+
+        Outside the coreset, where no value counts, tables of older files may hold infinities. They
+        become NaN, in place.
+        """
+        if values.dtype.kind == "f" and (infinite := np.isinf(values)).any():
+            if not self._older:
+                raise DamagedFileError("the table holds infinities; the file is damaged")
+            values[infinite] = np.nan
+        return values
 
 
 def _nearest(first: int, stop: int, stride: int, start: int, size: int) -> npt.NDArray[np.int64]:

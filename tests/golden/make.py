@@ -47,6 +47,8 @@ GOLDENS = {
     "compact-1.1-predictor": EncodeConfig(max_error=2.0, effort=3, timings=False),
     "compact-1.2-clip": EncodeConfig(max_error=0.2, effort=2, timings=False),
     "compact-1.2-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x24x30"),
+    "compact-1.2-classes": EncodeConfig(max_error=0.0, effort=2, timings=False),
+    "compact-1.2-counts": EncodeConfig(max_error=4.0, effort=2, timings=False),
     "paper-1.1-transform": EncodeConfig(
         profile="paper",
         width=8,
@@ -98,7 +100,31 @@ def basins() -> ArraySeries:
     return labels_of_basins
 
 
-SERIES = {"compact-1.1-predictor": fronts, "compact-1.2-labels": basins}
+def classes() -> ArraySeries:
+    """Classes of a field as float32, without a missing value: labels without a mask."""
+    t, z, y, x = np.meshgrid(*(np.arange(n) for n in (5, 6, 12, 20)), indexing="ij")
+    numbers = np.array([-2.5, 0.125, 7.0, 1e-3], np.float32)
+    values = numbers[((x + 2 * y + z) // 9 + (y - t) // 5) % 4]
+    return ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME})
+
+
+def counts() -> ArraySeries:
+    """Counts in uint16 that reach both ends of their range, with missing ones: fill value 65535."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (5, 6, 12, 20)), indexing="ij")
+    waves = np.sin(9 * x + 2 * t) * np.cos(7 * y) * (1 + z)
+    values = np.clip(np.rint(300 + 400 * waves), 0, 900).astype(np.float32)
+    values[:, 2, 3, 4:9] = np.nan
+    series = ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME})
+    series.source_dtype, series.fill = np.dtype(np.uint16), 65535
+    return series
+
+
+SERIES = {
+    "compact-1.1-predictor": fronts,
+    "compact-1.2-classes": classes,
+    "compact-1.2-counts": counts,
+    "compact-1.2-labels": basins,
+}
 """Sources of the goldens that are not made from `series`."""
 
 

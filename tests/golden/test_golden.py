@@ -17,7 +17,9 @@ COMPACT = [
     "compact-1.1-mask",
     "compact-1.1-predictor",
     "compact-1.1-psnr",
+    "compact-1.2-classes",
     "compact-1.2-clip",
+    "compact-1.2-counts",
     "compact-1.2-labels",
 ]
 NAMES = [

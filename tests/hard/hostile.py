@@ -22,21 +22,23 @@ from typing import Any
 
 import mutations
 
-HANG = 120.0
-"""Seconds without an answer after which a worker is ended."""
+HANG = 600.0
+"""Seconds without an answer after which a worker is ended: it waits for ever, since processor time
+has a limit of its own."""
 
 
 @dataclass
 class Report:
     """The results of all mutations.
 
-    Ends are counted by command and by kind. The worst figures are kept with the number of their
-    mutation.
+    Ends are counted by command and by kind; `met` has the goldens that each kind changed. The worst
+    figures are kept with the number of their mutation.
     """
 
     mutations: int = 0
     ends: dict[str, Counter[str]] = field(default_factory=dict)
     kinds: dict[str, Counter[str]] = field(default_factory=dict)
+    met: dict[str, set[str]] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)
     worst_seconds: tuple[float, str] = (0.0, "")
     worst_bytes: tuple[int, str] = (0, "")
@@ -45,6 +47,7 @@ class Report:
         """Add a worker's answer about one mutation."""
         self.mutations += 1
         name = f"{answer['number']} ({answer['kind']} of {answer['golden']})"
+        self.met.setdefault(answer["kind"], set()).add(answer["golden"])
         for end in answer["ends"]:
             self.ends.setdefault(end["command"], Counter())[end["end"]] += 1
             self.kinds.setdefault(answer["kind"], Counter())[end["end"]] += 1

@@ -32,6 +32,7 @@ import fhash_codec
 from fhash_cli.output import describe_error, say
 from fhash_formats.container import Container
 from fhash_formats.errors import FhashError, FhashWarning
+from fhash_formats.transform.tile.settings import TileSettings
 
 MEMORY = 512 << 20
 """Bytes that the process may allocate beyond what it has before; larger allocations fail."""
@@ -204,6 +205,8 @@ class Trial:
             return f"{what}: shape {values.shape} instead of {tuple(shape)}"
         if np.isinf(values).any():
             return f"{what}: infinities"
+        if self.mutation.kind == "clip" and self._beyond(values):
+            return f"{what}: values beyond the range to which they are clipped"
         if not self.mutation.sealed:
             expected = expected_values(self.mutation.golden)
             if region is not None:
@@ -211,6 +214,23 @@ class Trial:
             if not np.array_equal(values, expected, equal_nan=True):
                 return f"{what}: values that differ from the golden's"
         return None
+
+    def _beyond(self, values: Any) -> bool:
+        """Whether values lie beyond the range to which the settings in the file clip them."""
+        with Container.open(self.path) as container:
+            fill = container.header["variable"].get("fill")
+            sharding = container.arrays["tables/level_1"]._metadata.sharding
+        assert sharding is not None
+        settings = TileSettings.from_dict(sharding.codecs[0]["configuration"])
+        if not settings.clip:
+            return False
+        # Ends are rounded to the type, as values are.
+        margin = 1.0 if values.dtype.kind != "f" else 1e-6 * max(-settings.low, settings.high, 0.0)
+        known = values[~np.isnan(values) & (values != fill)].astype(np.float64)
+        return bool(
+            known.size
+            and (known.min() < settings.low - margin or known.max() > settings.high + margin)
+        )
 
     def _sample(self) -> str | None:
         """Sample points between vertices with the API; an error ends as on the command line."""

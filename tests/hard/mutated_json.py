@@ -14,6 +14,8 @@ from typing import Any
 from containers import Parts
 from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, hostile, places
 
+from fhash_formats.container.header import KNOWN_FEATURES
+
 
 def _changed(
     chance: random.Random, parts: Parts, change: Callable[[dict[str, Any]], None], name: str = ""
@@ -149,10 +151,10 @@ def _header(chance: random.Random, parts: Parts) -> Parts:
             ]
         elif turn == 4:
             header["format_version"] = chance.choice(
-                ([1, 0], [1, 1], [1, 2], [1, 9999], [2, 0], [0, 1], [1, -1], [10**9, 0])
+                ([1, 0], [1, 1], [1, 2], [1, 3], [1, 9999], [2, 0], [0, 1], [1, -1], [10**9, 0])
             )
         elif turn == 5:
-            names = ("transform", "mask", "predictor", "cross", "novelty", "")
+            names = (*sorted(KNOWN_FEATURES), "novelty", "")
             header["required_features"] = chance.sample(names, chance.randrange(len(names)))
         elif turn == 6:
             header["features"] = chance.choice(

@@ -5,6 +5,7 @@ All checksums are correct, so the contents reach the decoders.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import random
 import struct
@@ -23,6 +24,7 @@ from fhash_formats.container.sharding import Sharding, pack_index, parse_index
 from fhash_formats.errors import FhashError
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.entropy.coder import decode_integers
+from fhash_formats.transform.entropy.labels import MAX_LABELS, decode_labels
 from fhash_formats.transform.entropy.mask import decode_mask
 from fhash_formats.transform.entropy.predict import decode_predicted
 from fhash_formats.transform.entropy.table import single_band
@@ -212,15 +214,27 @@ def _stream(chance: random.Random, parts: Parts) -> Parts:
     sharding, present, chunks = inner_chunks(document, member, data)
     at = chance.randrange(len(chunks))
     settings, shape = TileSettings.from_dict(configuration_of(document)), sharding.chunk_shape
-    chunks[at] = with_crc(_restreamed(chance, chunks[at][:-4], settings, shape))
+    dtype = np.dtype(document["data_type"])
+    chunks[at] = with_crc(_restreamed(chance, chunks[at][:-4], settings, shape, dtype))
     return replaced(parts, {member: shard_of(sharding, present, chunks)})
 
 
 def _restreamed(
-    chance: random.Random, stream: bytes, settings: TileSettings, shape: tuple[int, ...]
+    chance: random.Random,
+    stream: bytes,
+    settings: TileSettings,
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
 ) -> bytes:
     parts = parse_stream(stream)
     flags, sections = parts.flags, parts.sections()
+    if parts.labelled:
+        body = sections[-1]
+        start = 8 + int.from_bytes(body[4:8], "little")
+        sections[-1] = labelled_body(
+            body[8:start], damaged(chance, body[start:]), dtype, shape, masked=parts.masked
+        )
+        return stream[:1] + b"".join(map(section, sections))
     if not parts.coded:
         return stream[:1] + b"".join(section(damaged(chance, data)) for data in sections)
     first = bool(flags & OWN) + bool(flags & MISSING)
@@ -251,6 +265,22 @@ def _restreamed(
     except FhashError:
         digest = chance.getrandbits(32)
     return bytes([flags]) + digest.to_bytes(4, "little") + b"".join(map(section, sections))
+
+
+def labelled_body(
+    packed: bytes, coded: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], *, masked: bool
+) -> bytes:
+    """Return the section of a tile of labels, with the digest of the labels to which it decodes.
+
+    packed: the deflated palette. If its length is not that of a palette, the digest is 0.
+    """
+    with contextlib.suppress(zlib.error):
+        plain = zlib.decompressobj().decompress(packed, 1 << 20)
+        count = len(plain) // dtype.itemsize + masked
+        if 1 <= count <= MAX_LABELS:
+            digest = zlib.crc32(decode_labels(coded, count, shape).data)
+            return struct.pack("<II", digest, len(packed)) + packed + coded
+    return struct.pack("<II", 0, len(packed)) + packed + coded
 
 
 def _mask_section(

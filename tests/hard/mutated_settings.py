@@ -33,12 +33,23 @@ from mutated_payload import (
 )
 
 from fhash_formats.container.array import DTYPES
+from fhash_formats.container.header import KNOWN_FEATURES
 from fhash_formats.container.sharding import Sharding
 from fhash_formats.transform.axes.basis import Basis
 from fhash_formats.transform.entropy.coder import encode_block
 from fhash_formats.transform.entropy.predictor import passes_of
 from fhash_formats.transform.head.head import Layer, NeighbourHead, layer_inputs
-from fhash_formats.transform.tile.sections import EMPTY, EXACT, FORMAT, MASKED, OWN, PREDICTED
+from fhash_formats.transform.stream import MAX_TILE_VERTICES
+from fhash_formats.transform.tile.sections import (
+    EMPTY,
+    EXACT,
+    FORMAT,
+    LABELS,
+    LABELS_MASKED,
+    MASKED,
+    OWN,
+    PREDICTED,
+)
 
 
 def _flags(chance: random.Random, parts: Parts) -> Parts:
@@ -80,14 +91,14 @@ def _settings(chance: random.Random, parts: Parts) -> Parts:
         tuple(document["codecs"][0]["configuration"]["chunk_shape"]),
     )
     root = json.loads(dict(parts)[DOCUMENT])
-    root["attributes"]["fhash"]["required_features"] = ["transform", "mask", "predictor", "cross"]
+    root["attributes"]["fhash"]["required_features"] = sorted(KNOWN_FEATURES)
     return replaced(parts, {f"{name}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 
 def _settings_changed(
     chance: random.Random, settings: dict[str, Any], shape: tuple[int, ...]
 ) -> None:
-    turn = chance.randrange(9)
+    turn = chance.randrange(10)
     numbers = (1e-300, 1e-38, 1.2e-38, 1e-12, 1.0, 1e12, 3.3e38, 1e300, 1.7e308)
     if turn == 0:
         settings["step"] = chance.choice(numbers)
@@ -127,6 +138,9 @@ def _settings_changed(
         }
     elif turn == 7:
         settings["predictor"] = _predictor(chance)
+    elif turn == 8:
+        for name in ("clip", "labels"):
+            settings[name] = chance.choice((True, True, False, 1, None))
     else:
         holder, key = chance.choice(list(places(settings)))
         holder[key] = hostile(chance, holder[key])
@@ -223,7 +237,7 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
     elif chance.random() < 0.5:
         configuration["codecs"][0]["configuration"]["transform"] = plain
     sharding = Sharding(shard_shape=tuple(shard), chunk_shape=tuple(chunk), codecs=())
-    stream = _empty_stream(chance)
+    stream = _empty_stream(chance, prod(chunk), np.dtype(kind).itemsize)
     present = sharding.present((0, 0, 0, 0), shape)
     chunks = [with_crc(stream)] * int(present.sum())
     new = {f"tables/level_1/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)}
@@ -258,14 +272,26 @@ def _giant_shapes(
     header["model"]["levels"] = [shape]
     header["model"]["tables"] = kind
     header["coordinates"] = {name: {} for name in ("time", "z", "y", "x")}
-    header["required_features"] = ["transform", "mask", "predictor", "cross"]
+    header["required_features"] = sorted(KNOWN_FEATURES)
     return shape, chunk, [n * count for n, count in zip(chunk, counts, strict=True)]
 
 
-def _empty_stream(chance: random.Random) -> bytes:
-    """Return the stream of a tile without values: flagged as empty, or with empty sections."""
+def _empty_stream(chance: random.Random, vertices: int, itemsize: int) -> bytes:
+    """Return the stream of a tile of few bytes: empty, with empty sections, or of labels.
+
+    vertices: of the tile.
+    itemsize: bytes of a value.
+    """
     stream = bytes([chance.choice((FORMAT, MASKED)) | EMPTY])
-    if chance.random() < 0.5:
+    turn = chance.random()
+    if turn < 0.3:  # labels of one value: no byte is needed for any number of them
+        packed = zlib.compress(bytes(itemsize))
+        digest = 0
+        for start in range(0, min(vertices, MAX_TILE_VERTICES), 1 << 20):
+            digest = zlib.crc32(bytes(min(1 << 20, vertices - start)), digest)
+        body = struct.pack("<II", digest, len(packed)) + packed
+        stream = bytes([chance.choice((LABELS, LABELS, LABELS_MASKED))]) + section(body)
+    elif turn < 0.6:
         sections = [b""] * chance.choice((1, 2, 3))
         stream = (
             bytes([chance.choice((FORMAT, MASKED, PREDICTED))])

@@ -16,12 +16,16 @@ from pathlib import Path
 from typing import Any
 
 import mutated_json
+import mutated_labels
 import mutated_payload
 import mutated_settings
 import mutated_zip
 from containers import Parts, pack, unpack
 
 GOLDENS = Path(__file__).parents[1] / "golden"
+NEWEST = tuple(f"compact-1.2-{name}" for name in ("clip", "labels", "counts", "classes"))
+"""Goldens that take turns most evenly, with clipped values and with labels in turns: every kind
+soon meets both."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +49,14 @@ class Mutation:
 
 @cache
 def goldens() -> dict[str, tuple[bytes, Parts]]:
-    """Return bytes and members of each golden by name."""
-    return {
-        path.stem: (data := path.read_bytes(), unpack(data))
-        for path in sorted(GOLDENS.glob("*.fhz"))
-    }
+    """Return bytes and members of each golden by name, in the order of their turns."""
+    others = [path.stem for path in sorted(GOLDENS.glob("*.fhz")) if path.stem not in NEWEST]
+    names = []
+    for number, name in enumerate(NEWEST):
+        low, high = (n * len(others) // len(NEWEST) for n in (number, number + 1))
+        names += [name, *others[low:high]]
+    files = ((name, (GOLDENS / f"{name}.fhz").read_bytes()) for name in names)
+    return {name: (data, unpack(data)) for name, data in files}
 
 
 def mutation(number: int) -> Mutation:
@@ -150,7 +157,7 @@ SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
     **mutated_zip.KINDS,
     **{
         name: _packed(change)
-        for module in (mutated_json, mutated_payload, mutated_settings)
+        for module in (mutated_json, mutated_payload, mutated_settings, mutated_labels)
         for name, change in module.KINDS.items()
     },
 }

@@ -19,8 +19,8 @@ too large (exit code 1). If its usual picture would be empty or has no place in 
 there is nothing to show (exit code 2).""",
     "the native code under sanitizers": """\
 Coverage-guided fuzzing of the native library under address and undefined-behaviour sanitizers:
-decoders, encoders (whose output must decode to the input), transforms, heads, the marcher and its
-light.""",
+decoders, encoders (whose output must decode to the input), transforms, heads and their training,
+figures of quality, the marcher and its light.""",
     "kill -9 at an operation": """\
 The process is killed before each of its file operations. The older output stays complete, and the
 next run removes temporary files.""",

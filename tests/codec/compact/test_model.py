@@ -12,7 +12,8 @@ import numpy.typing as npt
 import pytest
 
 import fhash_codec
-from fhash_codec import EncodeConfig, InputError, RegionError
+from fhash_codec import DamagedFileError, EncodeConfig, InputError, RegionError
+from fhash_codec.compact.model import CompactModel
 
 Series = npt.NDArray[Any]
 Field = Callable[..., Series]
@@ -185,3 +186,52 @@ def test_a_paper_file_has_no_levels_of_detail(encoded: tuple[Series, Path]) -> N
         pytest.raises(InputError, match="paper has no levels of detail"),
     ):
         volume.read_lod(0, 1)
+
+
+class Table:
+    """A stored array of two steps, one tile each, that holds an infinity and a NaN."""
+
+    shape, chunk_shape = (2, 2, 3, 4), (1, 2, 3, 4)
+    dtype = np.dtype(np.float32)
+
+    def __init__(self) -> None:
+        self.values = np.arange(48, dtype=np.float32).reshape(self.shape)
+        self.values[1, 1, 2, 3], self.values[1, 0, 0, 0] = -np.inf, np.nan
+
+    def read(self, region: tuple[slice, ...]) -> Series:
+        return self.values[region].copy()
+
+    def decode_chunk(self, index: tuple[int, ...], lod: int) -> Series:
+        every = slice(None, None, 1 << lod)
+        return self.values[index[0] : index[0] + 1, every, every, every].copy()
+
+
+WHOLE = ((0, 2), (0, 3), (0, 4))
+
+
+def reads(model: CompactModel) -> list[Callable[[], Any]]:
+    """The ways to read the second step of a table, with its last vertex among those read."""
+    end = [np.array([0.9]), np.array([1.9]), np.array([2.9])]
+    return [
+        lambda: model.read(1, WHOLE, np.ones((2, 3, 4), bool)),
+        lambda: model.read(0.5, WHOLE, np.ones((2, 3, 4), bool)),
+        lambda: model.read_lod(1, 0, WHOLE),
+        lambda: model.sample(np.array([1.0]), end),
+        lambda: model.sample_with_gradient(np.array([1.0]), end)[1],
+    ]
+
+
+@pytest.mark.parametrize("way", range(5))
+def test_infinities_in_a_table_are_damage(way: int) -> None:
+    model = CompactModel({"tables/level_1": Table()})  # type: ignore[dict-item]
+    with pytest.raises(DamagedFileError, match="the table holds infinities"):
+        reads(model)[way]()
+    assert np.isnan(model.read(1, ((0, 1), (0, 3), (0, 4)), np.ones((1, 3, 4), bool))).sum() == 1
+
+
+@pytest.mark.parametrize("way", range(5))
+def test_infinities_outside_the_coreset_of_older_files_are_no_values(way: int) -> None:
+    arrays = {"tables/level_1": Table(), "occupancy/bits": Table()}
+    result = reads(CompactModel(arrays))[way]()  # type: ignore[arg-type]
+    assert np.isnan(result).any()
+    assert not np.isinf(result).any()

@@ -30,10 +30,20 @@ NATIVE = HERE.parents[2] / "formats" / "fhash_formats" / "native"
 """Sources of the file format's library."""
 CODEC = HERE.parents[2] / "fhash_codec" / "native"
 """Sources of the codec's library, which include headers of the other one."""
-TARGETS = tuple(HERE / f"{name}.cpp" for name in ("targets", "target_encode", "target_light"))
-SOURCES = ("coder", "mask", "predict", "lifting", "head", "quantise", "values")
+TARGETS = tuple(
+    HERE / f"{name}.cpp"
+    for name in (
+        "targets",
+        "target_encode",
+        "target_figures",
+        "target_labels",
+        "target_light",
+        "target_train",
+    )
+)
+SOURCES = ("coder", "mask", "predict", "labels", "lifting", "head", "quantise", "values")
 """Files of NATIVE that are always fuzzed."""
-CODEC_SOURCES = ("march_light",)
+CODEC_SOURCES = ("march_light", "quality", "train_head")
 """Files of CODEC that are always fuzzed."""
 MARCH = ("march", "march_bricks", "march_effects")
 """Files of CODEC that are fuzzed on request, without optimisation.
@@ -130,18 +140,21 @@ def _compile(command: list[str]) -> None:
         )
 
 
-def prepare(folder: Path, every: int = 1) -> dict[str, str]:
+def prepare(folder: Path, every: int = 1, only: str | None = None) -> dict[str, str]:
     """Write setups and seeds into a folder, and return the environment that the fuzzer needs.
 
-    With `every`, only every so many of the seeds of each kind are written.
+    With `every`, only every so many of the seeds of each kind are written, with `only` those of one
+    target.
     """
     sys.path.insert(0, str(HERE))
     try:
         import seeds
     finally:
         sys.path.remove(str(HERE))
-    seeds.write_seeds(folder / "corpus", *seeds.write_setups(folder / "setups"), every)
-    return {**os.environ, **ENVIRONMENT, "FHASH_FUZZ_SETUPS": str(folder / "setups")}
+    folder.mkdir(parents=True, exist_ok=True)
+    seeds.write_seeds(folder / "corpus", *seeds.write_setups(folder / "setups"), every, only)
+    chosen = {} if only is None else {"FHASH_FUZZ_TARGET": str(seeds.NAMES.index(only))}
+    return {**os.environ, **ENVIRONMENT, **chosen, "FHASH_FUZZ_SETUPS": str(folder / "setups")}
 
 
 def fuzz(
@@ -152,6 +165,7 @@ def fuzz(
     processes: int,
     seed: int = 0,
     every: int = 1,
+    only: str | None = None,
     **options: Any,
 ) -> Figures:
     """Build the fuzzer and run it.
@@ -163,12 +177,13 @@ def fuzz(
         processes: number of processes at the same time.
         seed: seed of the mutations.
         every: share of the seeds that are run: every so many of each kind.
+        only: name of the one target that is fuzzed (NAMES of seeds.py); None for all.
         **options: options of `build`.
 
     Raises CannotBuild.
     """
     binary = build(folder, **options)
-    environment = prepare(folder, every)
+    environment = prepare(folder, every, only)
     result = Figures()
     with ThreadPoolExecutor(processes) as pool:
         futures = [
@@ -243,11 +258,13 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--crashes", type=Path, help="folder for inputs that crash; kept")
     parser.add_argument("--march", action="store_true", help="the marcher as well")
+    parser.add_argument("--only", metavar="TARGET", help="one target, by its name in seeds.py")
     parser.add_argument("--repeat", type=Path, metavar="FILE", help="run this input alone")
     options = parser.parse_args()
     if options.repeat is not None:
         return repeat(options.repeat, options.march)
     kept = options.crashes or Path(tempfile.mkdtemp(prefix="fhash-fuzz-crashes-"))
+    march = options.march or options.only == "march"
     with tempfile.TemporaryDirectory(prefix="fhash-fuzz-") as folder:
         try:
             result = fuzz(
@@ -256,7 +273,8 @@ def main() -> int:
                 seconds=options.seconds,
                 processes=options.processes,
                 seed=options.seed,
-                march=options.march,
+                only=options.only,
+                march=march,
             )
         except CannotBuild as error:
             print(f"fuzz: {error}", file=sys.stderr)
@@ -265,6 +283,7 @@ def main() -> int:
     from reporting import record
 
     figures = {
+        "target": options.only or "all",
         "seconds": options.seconds,
         "processes": options.processes,
         "executions": result.executions,

@@ -20,6 +20,7 @@ from fhash_formats.container.coding import TRANSFORM
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.entropy.coder import encode_integers
+from fhash_formats.transform.entropy.labels import blank_label_state, encode_labels
 from fhash_formats.transform.entropy.mask import encode_mask, mask_prior_state
 from fhash_formats.transform.entropy.predict import blank_state, encode_predicted
 from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
@@ -29,8 +30,25 @@ from fhash_formats.transform.tile.sections import parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
 
 GOLDENS = Path(__file__).parents[2] / "golden"
-CODER, MASK, PREDICTOR, TRANSFORMS, HEAD, VALUES, ENCODE, LIGHT, MARCH = range(9)
-"""First byte of an input, which chooses the target in targets.cpp."""
+NAMES = (
+    "coder",
+    "mask",
+    "predictor",
+    "transforms",
+    "head",
+    "values",
+    "encode",
+    "light",
+    "labels",
+    "label-encoder",
+    "training",
+    "figures",
+    "march",
+)
+"""Names of the targets. The place of a name is the first byte of its inputs in targets.cpp."""
+CODER, MASK, PREDICTOR, _, _, _, ENCODE, _, LABELS, *_ = range(len(NAMES))
+WITH_SEEDS = (CODER, PREDICTOR)
+"""Targets that have seeds of their own only; those of all others are random bytes, too."""
 
 SPECS: tuple[tuple[tuple[str, int], ...], ...] = (
     (("none", 0),) * 4,
@@ -86,7 +104,7 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             data = np.ascontiguousarray(array).tobytes()
             file.write(struct.pack("<q", len(data)) + data)
 
-        for state in (prior_state(), mask_prior_state(), blank_state()):
+        for state in (prior_state(), mask_prior_state(), blank_state(), blank_label_state()):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
         file.write(struct.pack("<q", len(bands)))
@@ -102,10 +120,17 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
     return bands, passes
 
 
-def write_seeds(folder: Path, bands: list[Any], passes: list[Any], every: int = 1) -> int:
+def write_seeds(
+    folder: Path,
+    bands: list[Any],
+    passes: list[Any],
+    every: int = 1,
+    only: str | None = None,
+) -> int:
     """Write the inputs, one file each, and return their number.
 
-    With `every`, only every so many inputs of each target are written.
+    With `every`, only every so many inputs of each target are written, with `only` those of one
+    target.
     """
     folder.mkdir(parents=True, exist_ok=True)
     numbers, turns = count(), Counter[int]()
@@ -113,7 +138,7 @@ def write_seeds(folder: Path, bands: list[Any], passes: list[Any], every: int = 
 
     def put(target: int, *parts: bytes) -> None:
         turns[target] += 1
-        if (turns[target] - 1) % every == 0:
+        if only in (None, NAMES[target]) and (turns[target] - 1) % every == 0:
             (folder / f"{next(numbers):04}").write_bytes(bytes([target]) + b"".join(parts))
 
     for number, (shape, table) in enumerate(bands):
@@ -144,11 +169,27 @@ def write_seeds(folder: Path, bands: list[Any], passes: list[Any], every: int = 
         for density in (0.02, 0.5):
             coded = encode_mask(rng.random(shape) < density, nothing)
             put(MASK, bytes([*(n - 1 for n in shape), 0]), coded)
-    for target in (MASK, TRANSFORMS, HEAD, VALUES, ENCODE, LIGHT, MARCH):
+    for shape, labels, data in label_streams():
+        put(LABELS, bytes([*(n - 1 for n in shape), labels - 1]), data)
+    for target in range(len(NAMES)):
+        if target in WITH_SEEDS:
+            continue
         for _ in range(96 if target == ENCODE else 24):
             put(target, rng.bytes(400))
         put(target, bytes(300))
     return next(numbers)
+
+
+def label_streams() -> Iterator[tuple[tuple[int, ...], int, bytes]]:
+    """Yield shapes, numbers of labels and coded labels: regions, noise and both."""
+    rng = np.random.default_rng(1)
+    for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (3, 4, 6, 40)):
+        regions = np.indices(shape).sum(0) // 5
+        for most in (1, 2, 5, 17, 256):
+            for noise in (0.0, 0.05, 1.0):
+                random = rng.integers(0, most, shape)
+                labels = np.where(rng.random(shape) < noise, random, regions % most)
+                yield shape, most, encode_labels(labels.astype(np.uint8), most)
 
 
 def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int, int]]]:

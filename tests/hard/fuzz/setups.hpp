@@ -32,7 +32,7 @@ struct Passes {
 
 class Setups {
 public:
-    State coder, mask, predictor;
+    State coder, mask, predictor, labels;
     std::vector<Bands> bands;
     std::vector<Passes> passes;
 
@@ -42,7 +42,7 @@ public:
             std::fprintf(stderr, "FHASH_FUZZ_SETUPS names no file that can be read\n");
             std::exit(2);
         }
-        for (State* state : {&coder, &mask, &predictor}) {
+        for (State* state : {&coder, &mask, &predictor, &labels}) {
             get(file, state->slots);
             get(file, state->weights);
             get(file, state->simples);
@@ -79,6 +79,13 @@ private:
 inline const Setups& setups() {
     static const Setups loaded(std::getenv("FHASH_FUZZ_SETUPS"));
     return loaded;
+}
+
+// Ends the process with a message if what always holds does not.
+inline void require(bool holds, const char* what) {
+    if (holds) return;
+    std::fprintf(stderr, "%s\n", what);
+    std::abort();
 }
 
 inline std::int64_t volume(const std::vector<std::int64_t>& shape) {

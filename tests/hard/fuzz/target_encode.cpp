@@ -33,12 +33,6 @@ int64_t fhash_decode_predicted(std::int32_t*, const int64_t*, const int64_t*, co
 
 namespace {
 
-void require(bool holds, const char* what) {
-    if (holds) return;
-    std::fprintf(stderr, "%s\n", what);
-    std::abort();
-}
-
 // Calls an encoder with little room and, if that is not enough, with as much as it asked for. The
 // memory has exactly the length of the data.
 template <class F> std::vector<std::uint8_t> coded(std::size_t room, F encode) {

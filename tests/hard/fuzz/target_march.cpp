@@ -16,6 +16,8 @@ extern "C" {
 int64_t fhash_march(const FhashMarch*, int64_t, int64_t, int64_t, int64_t*);
 int64_t fhash_march_bricks(const float*, const int64_t*, const int64_t*, int64_t, int64_t, int64_t,
                            float*, float*, float*);
+int64_t fhash_march_cells(const float*, const int64_t*, const int64_t*, const float*, int64_t,
+                          const int64_t*, int64_t, int64_t, std::uint32_t*);
 int64_t fhash_march_distance_layers(const int64_t*, std::int32_t*, int64_t, int64_t,
                                     std::int32_t*);
 int64_t fhash_march_distance_rows(const int64_t*, std::int32_t*, int64_t, int64_t, std::int32_t*);
@@ -54,6 +56,23 @@ void make_values(Reader& in, FhashMarch& m, Arrays& arrays) {
     m.values = arrays.values.data();
 }
 
+// Find the visible cells of every second brick, for intervals between finite values; the others keep
+// hostile ones.
+void find_cells(Reader& in, const FhashMarch& m, Arrays& arrays) {
+    const int64_t intervals = in.within(0, 20);
+    std::vector<float> limits = in.numbers<float>(2 * intervals);
+    for (float& limit : limits) limit = std::isnan(limit) ? 0.0F : limit;
+    std::sort(limits.begin(), limits.end());
+    std::vector<int64_t> numbers;
+    for (int64_t brick = 0; brick < m.bricks[0] * m.bricks[1] * m.bricks[2]; brick += 2)
+        numbers.push_back(brick);
+    const int64_t count = static_cast<int64_t>(numbers.size());
+    const int64_t visible =
+        fhash_march_cells(m.values, m.shape, m.bricks, limits.data(), intervals, numbers.data(), 0,
+                          count, arrays.cells.data());
+    require(visible >= 0 && visible <= 64 * count, "more visible cells than there are");
+}
+
 // Bricks with hostile distances and cells; the marcher skips them or not.
 void make_bricks(Reader& in, Switches flags, FhashMarch& m, Arrays& arrays) {
     const int64_t bricks = m.bricks[0] * m.bricks[1] * m.bricks[2];
@@ -70,6 +89,7 @@ void make_bricks(Reader& in, Switches flags, FhashMarch& m, Arrays& arrays) {
     fhash_march_distance_layers(m.bricks, arrays.distance.data(), 0, m.bricks[0], lines.data());
     fhash_march_distance_rows(m.bricks, arrays.distance.data(), 0, m.bricks[1], lines.data());
     arrays.cells = repeated<std::uint32_t>(in, 2 * bricks);
+    find_cells(in, m, arrays);
     m.distance = flags.on(0) ? arrays.distance.data() : nullptr;
     m.cells = flags.on(0) && flags.on(1) ? arrays.cells.data() : nullptr;
     m.highest = flags.on(2) ? arrays.highest.data() : nullptr;
@@ -96,6 +116,18 @@ void make_table(Reader& in, FhashMarch& m, Arrays& arrays) {
     m.extinction = extinction.data();
     m.low = number_of(in);
     m.scale = in.finite<double>();
+}
+
+// A box that clips the drawn one, and what the frame has of it, as MarchInput has them.
+void clip_box(Reader& in, FhashMarch& m) {
+    for (int axis = 0; axis < 3; axis++) {
+        const double length = m.box[axis][1] - m.box[axis][0], low = m.box[axis][0];
+        const double first = in.byte() / 255.0, second = in.byte() / 255.0;
+        m.box[axis][0] = low + std::min(first, second) * length;
+        m.box[axis][1] = low + std::max(first, second) * length;
+        m.seen[axis][0] = std::max(m.seen[axis][0], m.box[axis][0]);
+        m.seen[axis][1] = std::max(std::min(m.seen[axis][1], m.box[axis][1]), m.seen[axis][0]);
+    }
 }
 
 void make_light_and_camera(Reader& in, Switches flags, Switches more, FhashMarch& m,
@@ -125,6 +157,7 @@ void make_light_and_camera(Reader& in, Switches flags, Switches more, FhashMarch
             m.box[axis][1] += in.byte();
         }
     }
+    if (in.byte() & 1) clip_box(in, m);
     m.light_scale = 1.0 / static_cast<double>(in.within(1, 8));
 }
 
@@ -141,6 +174,7 @@ void make_march(Reader& in, Switches flags, Switches more, FhashMarch& m, Arrays
     for (int axis = 0; axis < 3; axis++)
         longest += std::fabs((m.box[axis][1] - m.box[axis][0]) * m.spacing[axis]);
     m.step = longest / (1 + in.byte() * 4);
+    if (!(m.step > 0)) m.step = 1;  // a box without a length
     m.threshold = static_cast<double>(in.byte()) / 256;
     m.ambient = m.diffuse = m.specular = 0.5;
     m.steep = 1.0 + in.byte();
@@ -155,12 +189,14 @@ void make_march(Reader& in, Switches flags, Switches more, FhashMarch& m, Arrays
     m.planes = in.within(0, FHASH_PLANES);
     for (int64_t i = 0; i < m.planes; i++)
         for (double& number : m.plane[i]) number = number_of(in);
-    arrays.grading.assign(FHASH_GRADES + 2, 0.5F);
+    const std::vector<std::uint8_t> factors = in.numbers<std::uint8_t>(8);
+    for (std::size_t i = 0; i < FHASH_GRADES + 2; i++)
+        arrays.grading.push_back(static_cast<float>(factors[i / 129]) / 255);
     m.grading = arrays.grading.data();
     m.grade_scale = std::fabs(number_of(in));
     m.unlit = in.within(0, 1);
     arrays.out.resize(static_cast<std::size_t>(4 * m.width * m.height));
-    arrays.depth.resize(arrays.out.size() / 4);
+    arrays.depth.assign(arrays.out.size() / 4, std::numeric_limits<float>::infinity());
     arrays.normal.resize(3 * arrays.depth.size());
     m.out = arrays.out.data();
     m.depth = flags.on(5) ? arrays.depth.data() : nullptr;
@@ -188,4 +224,9 @@ void march(Reader& in) {
     if (projected) m.surfaces = 0;
     int64_t counters[5] = {};
     fhash_march(&m, effects, 0, ((m.width + 15) / 16) * ((m.height + 15) / 16), counters);
+    // The light that is left adds up to no more than all, whatever the values are.
+    for (std::size_t pixel = 0; pixel < arrays.depth.size(); pixel++) {
+        const float opacity = arrays.out[4 * pixel + 3];
+        require(opacity >= -1e-5F && opacity <= 1.00001F, "an opacity beyond 0 to 1");
+    }
 }

@@ -5,14 +5,19 @@
 // length, so that the address sanitizer sees every access beyond them.
 #include <algorithm>
 #include <cmath>
+#include <cstdlib>
 
 #include "reader.hpp"
 #include "setups.hpp"
 
 using std::int64_t;
 
-void round_trip(Reader& in);  // target_encode.cpp
-void light(Reader& in);       // target_light.cpp
+void round_trip(Reader& in);          // target_encode.cpp
+void light(Reader& in);               // target_light.cpp
+void decode_label_bytes(Reader& in);  // target_labels.cpp
+void label_round_trip(Reader& in);    // target_labels.cpp
+void train(Reader& in);               // target_train.cpp
+void figures(Reader& in);             // target_figures.cpp
 #if defined(FHASH_FUZZ_MARCH)
 void march(Reader& in);  // target_march.cpp
 #endif
@@ -245,14 +250,22 @@ void values(Reader& in) {
 
 }  // namespace
 
+// The number of the target that all inputs are for; -1 if their first byte chooses.
+int only_target() {
+    const char* const number = std::getenv("FHASH_FUZZ_TARGET");
+    return number ? std::atoi(number) : -1;
+}
+
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
+    static const int only = only_target();
     Reader in(data, size);
 #if defined(FHASH_FUZZ_MARCH)
-    const int targets = 9;
+    const int targets = 13;
 #else
-    const int targets = 8;
+    const int targets = 12;
 #endif
-    switch (in.byte() % targets) {
+    const int chosen = in.byte() % targets;
+    switch (only < 0 ? chosen : only) {
         case 0: decode_integers(in); break;
         case 1: decode_mask(in); break;
         case 2: decode_predicted(in); break;
@@ -261,6 +274,10 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
         case 5: values(in); break;
         case 6: round_trip(in); break;
         case 7: light(in); break;
+        case 8: decode_label_bytes(in); break;
+        case 9: label_round_trip(in); break;
+        case 10: train(in); break;
+        case 11: figures(in); break;
 #if defined(FHASH_FUZZ_MARCH)
         default: march(in);
 #endif

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -45,6 +46,17 @@ def test_the_native_code_under_sanitizers(folder: Path) -> None:
     # All seeds were run, which reach most of the code, and more inputs.
     assert figures.executions > len(list((folder / "corpus").iterdir()))
     assert figures.edges > 3000
+
+
+def test_every_target_has_a_name_and_seeds(folder: Path) -> None:
+    if not (folder / "corpus").exists():
+        run.prepare(folder, EVERY)
+    import seeds
+
+    source = (run.HERE / "targets.cpp").read_text(encoding="utf-8")
+    assert re.findall(r"targets = (\d+);", source) == [str(len(seeds.NAMES) - n) for n in (0, 1)]
+    first = {path.read_bytes()[0] for path in (folder / "corpus").iterdir()}
+    assert first == set(range(len(seeds.NAMES)))
 
 
 def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
