@@ -126,7 +126,9 @@ def plan(
     return CodingPlan(
         blocks=attempt.sample.blocks,
         sample=attempt.sample,
-        settings=replace(attempt.settings, labels=few),
+        settings=replace(
+            attempt.settings, labels=few, many_labels=few and labelled.settings.many_labels
+        ),
         coding=goal.bounded(_final_coding(task, attempt)),
         goal=goal,
         gains=gains.entries,

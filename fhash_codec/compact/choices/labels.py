@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import prod
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_codec.compact.attempt import Attempt, PlanTask
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.compact.tiles.tiling import tile_for
-from fhash_formats.transform.entropy.labels import MAX_LABELS
+from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["has_labels", "plan_labels"]
+__all__ = ["has_labels", "has_regions", "plan_labels"]
 
 LOOK_VERTICES = 1 << 18
 """Vertices that are looked at, and coded for the size estimate."""
@@ -26,21 +29,39 @@ SMALL_FILE_BYTES = 60_000
 """Bytes up to which a file is read in a moment as a whole, so that it may be one tile."""
 MAX_TILE_VERTICES = 12 << 20
 """Vertices of a tile that is chosen for its bytes alone: a larger one takes long to decode."""
+REGION_SHARE = 0.5
+"""Share of vertices with an equal neighbour from which on many different values may be labels."""
 
 
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
-    """Whether any tile of a sample has few enough different values."""
+    """Whether any tile of a sample has few enough different values, or regions of equal ones."""
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
     # Vertices that are not occupied take a label of their own.
-    most = MAX_LABELS - (not tiled.complete)
-    return any(np.unique(tile.values).size <= most for tile in sample.tiles)
+    spare = not tiled.complete
+    for tile in sample.tiles:
+        distinct = np.unique(tile.values).size
+        if distinct <= MAX_NARROW - spare:
+            return True
+        if distinct <= MAX_LABELS - spare and has_regions(tile.values):
+            return True
+    return False
+
+
+def has_regions(values: npt.NDArray[Any]) -> bool:
+    """Whether REGION_SHARE of the vertices equal the one before along t, z, y or x."""
+    equal = np.zeros(values.shape, bool)
+    for axis in range(4):
+        before, after = [[slice(None)] * 4, [slice(None)] * 4]
+        before[axis], after[axis] = slice(None, -1), slice(1, None)
+        equal[tuple(after)] |= values[tuple(after)] == values[tuple(before)]
+    return bool(equal.mean() >= REGION_SHARE)
 
 
 def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> tuple[Attempt, bool]:
     """Return tiles and settings for labels, and whether nothing else can take fewer bytes."""
     if not task.blocks.complete:
         settings = replace(settings, mask=MaskLevels())
-    settings = replace(settings, labels=True, quantum=0.0, clip=False)
+    settings = replace(settings, labels=True, many_labels=True, quantum=0.0, clip=False)
     coding = Coding(filled=True, density=0)
     exact = replace(coding, exact=True)
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
@@ -52,5 +73,14 @@ def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> tuple[
         if outcome.size <= SMALL_FILE_BYTES and prod(shape) <= MAX_TILE_VERTICES:
             tile = shape
         sample = Sample(task.blocks.retile(tile), LOOK_VERTICES, task.workers)
+    settings = replace(settings, many_labels=_may_be_many(task.value_range, sample))
     task.gains.note("labels", outcome)
     return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding), clearly
+
+
+def _may_be_many(value_range: ValueRange, sample: Sample) -> bool:
+    """Whether a tile of the series may have more than MAX_NARROW labels."""
+    most = MAX_NARROW - (not sample.blocks.complete)
+    if sample.blocks.dtype.kind in "iu" and value_range.high - value_range.low < most:
+        return False
+    return not sample.complete or any(np.unique(tile.values).size > most for tile in sample.tiles)

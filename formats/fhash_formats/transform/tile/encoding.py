@@ -233,7 +233,8 @@ def _task(values: Values, settings: TileSettings, coding: Coding, in_coreset: Ma
 
 def _labelled_tile(task: _Task) -> CodedTile | None:
     """A tile of labels, without loss; None for one of too many different values."""
-    data = build_labelled_stream(task.values, task.own_settings, task.occupied)
+    many = task.settings.many_labels
+    data = build_labelled_stream(task.values, task.own_settings, task.occupied, many=many)
     if data is None:
         return None
     decoded = blank_unoccupied(task.values.copy(), task.occupied, task.settings)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import lzma
 
 import numpy as np
+import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.compact.choices.labels import has_regions
 
 
 def moving_regions() -> np.ndarray:
@@ -51,3 +53,29 @@ def test_other_promises_and_many_values_need_no_labels(tmp_path) -> None:
     assert "labels" not in encoded(tmp_path, moving_regions(), max_error=1.0, effort=1)[1]
     noise = np.random.default_rng(0).integers(0, 9999, (2, 4, 20, 20)).astype("i2")
     assert "labels" not in encoded(tmp_path, noise, effort=1)[1]
+
+
+def grains(count: int) -> np.ndarray:
+    """Columns (3, 4, 40, 60) of `count` numbers in a random order, some of which change."""
+    chance = np.random.default_rng(1)
+    numbers = chance.permutation(count)[np.arange(600).reshape(20, 30) % count]
+    values = np.broadcast_to(numbers.repeat(2, 0).repeat(2, 1), (3, 4, 40, 60)).copy()
+    values[1:, :, 10:20, 10:30] = values[1:, :, 11:21, 10:30]
+    return values.astype("u2") * 7
+
+
+@pytest.mark.parametrize(("count", "many"), [(256, False), (257, True), (600, True)])
+def test_many_labels_need_their_feature(tmp_path, count, many) -> None:
+    values = grains(count)
+    size, features, decoded = encoded(tmp_path, values)
+    assert "labels" in features
+    assert ("many-labels" in features) is many
+    np.testing.assert_array_equal(decoded, values)
+    assert 20 * size < values.nbytes
+
+
+@pytest.mark.parametrize(("equal", "regions"), [(49, False), (50, True)])
+def test_regions_are_half_of_the_vertices_with_an_equal_neighbour(equal, regions) -> None:
+    row = np.arange(100)
+    row[1 : 2 * equal : 2] = row[: 2 * equal : 2]
+    assert has_regions(row.reshape(1, 1, 1, 100)) is regions
