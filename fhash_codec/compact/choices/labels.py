@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import prod
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fhash_codec.compact.attempt import Attempt, PlanTask
 from fhash_codec.compact.tiles.blocks import Blocks
@@ -17,9 +15,10 @@ from fhash_codec.compact.tiles.tiling import tile_for
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
+from fhash_formats.transform.tile.labelled import has_regions
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["has_labels", "has_regions", "plan_labels"]
+__all__ = ["has_labels", "plan_labels"]
 
 LOOK_VERTICES = 1 << 18
 """Vertices that are looked at, and coded for the size estimate."""
@@ -29,8 +28,6 @@ SMALL_FILE_BYTES = 60_000
 """Bytes up to which a file is read in a moment as a whole, so that it may be one tile."""
 MAX_TILE_VERTICES = 12 << 20
 """Vertices of a tile that is chosen for its bytes alone: a larger one takes long to decode."""
-REGION_SHARE = 0.5
-"""Share of vertices with an equal neighbour from which on many different values may be labels."""
 
 
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
@@ -45,16 +42,6 @@ def has_labels(task: PlanTask, tiled: Blocks) -> bool:
         if distinct <= MAX_LABELS - spare and has_regions(tile.values):
             return True
     return False
-
-
-def has_regions(values: npt.NDArray[Any]) -> bool:
-    """Whether REGION_SHARE of the vertices equal the one before along t, z, y or x."""
-    equal = np.zeros(values.shape, bool)
-    for axis in range(4):
-        before, after = [[slice(None)] * 4, [slice(None)] * 4]
-        before[axis], after[axis] = slice(None, -1), slice(1, None)
-        equal[tuple(after)] |= values[tuple(after)] == values[tuple(before)]
-    return bool(equal.mean() >= REGION_SHARE)
 
 
 def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> tuple[Attempt, bool]:

@@ -35,13 +35,25 @@ from fhash_formats.transform.tile.sections import (
 )
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["build_labelled_stream", "unpack_labelled"]
+__all__ = ["build_labelled_stream", "has_regions", "unpack_labelled"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 
+REGION_SHARE = 0.5
+"""Share of vertices with an equal neighbour from which on many different values may be labels."""
 _HEAD = 8
 """Bytes before the palette."""
+
+
+def has_regions(values: Values) -> bool:
+    """Whether REGION_SHARE of the values equal the one before along one of the four axes."""
+    equal = np.zeros(values.shape, bool)
+    for axis in range(4):
+        before, after = [[slice(None)] * 4, [slice(None)] * 4]
+        before[axis], after[axis] = slice(None, -1), slice(1, None)
+        equal[tuple(after)] |= values[tuple(after)] == values[tuple(before)]
+    return bool(equal.mean() >= REGION_SHARE)
 
 
 def build_labelled_stream(

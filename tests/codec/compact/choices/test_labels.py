@@ -9,7 +9,6 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact.choices.labels import has_regions
 
 
 def moving_regions() -> np.ndarray:
@@ -72,10 +71,3 @@ def test_many_labels_need_their_feature(tmp_path, count, many) -> None:
     assert ("many-labels" in features) is many
     np.testing.assert_array_equal(decoded, values)
     assert 20 * size < values.nbytes
-
-
-@pytest.mark.parametrize(("equal", "regions"), [(49, False), (50, True)])
-def test_regions_are_half_of_the_vertices_with_an_equal_neighbour(equal, regions) -> None:
-    row = np.arange(100)
-    row[1 : 2 * equal : 2] = row[: 2 * equal : 2]
-    assert has_regions(row.reshape(1, 1, 1, 100)) is regions

@@ -12,7 +12,7 @@ from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
-from fhash_formats.transform.tile.labelled import build_labelled_stream
+from fhash_formats.transform.tile.labelled import build_labelled_stream, has_regions
 from fhash_formats.transform.tile.sections import MANY
 
 SHAPE = (2, 4, 9, 20)
@@ -144,3 +144,10 @@ def test_damage_of_many_labels_is_an_error_or_changes_nothing() -> None:
         except DamagedFileError:
             continue
         assert same(decoded, values)
+
+
+@pytest.mark.parametrize(("equal", "regions"), [(49, False), (50, True)])
+def test_regions_are_half_of_the_vertices_with_an_equal_neighbour(equal, regions) -> None:
+    row = np.arange(100)
+    row[1 : 2 * equal : 2] = row[: 2 * equal : 2]
+    assert has_regions(row.reshape(1, 1, 1, 100)) is regions
