@@ -11,6 +11,7 @@ from fhash_codec.compact.tiles.tiling import shard_shape
 from fhash_codec.config import EncodeConfig
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import ContainerWriter
+from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["CodedTable", "model_header", "required_features", "write_table"]
 
@@ -30,8 +31,22 @@ class CodedTable:
 
 
 def write_table(writer: ContainerWriter, table: CodedTable) -> None:
-    """Write the table; its tiles also hold the mask where the coreset is not the whole box."""
+    """Write the table; its tiles also hold the mask where the coreset is not the whole box.
+
+    A single tile needs no shard, whose index and description would take some 120 bytes.
+    """
     blocks, settings = table.plan.blocks, table.plan.settings
+    if len(table.streams) == 1:
+        writer.add_array(
+            "tables/level_1",
+            shape=blocks.shape,
+            dtype=blocks.dtype,
+            chunk_shape=blocks.tile,
+            chunks=iter(table.streams),
+            dimension_names=("t", "z", "y", "x"),
+            codecs=_codecs(settings),
+        )
+        return
     writer.add_sharded(
         "tables/level_1",
         shape=blocks.shape,
@@ -40,11 +55,13 @@ def write_table(writer: ContainerWriter, table: CodedTable) -> None:
         shard_shape=shard_shape(blocks.tile, blocks.grid),
         chunks=iter(table.streams),
         dimension_names=("t", "z", "y", "x"),
-        codecs=[
-            {"name": "fhash.transform", "configuration": settings.to_dict()},
-            {"name": "crc32c"},
-        ],
+        codecs=_codecs(settings),
     )
+
+
+def _codecs(settings: TileSettings) -> list[dict[str, Any]]:
+    """Return the codecs of tiles that share their settings."""
+    return [{"name": "fhash.transform", "configuration": settings.to_dict()}, {"name": "crc32c"}]
 
 
 def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 from fhash_codec.compact.attempt import Attempt, GainLog, PlanTask
 from fhash_codec.compact.choices.estimate import estimated_size, estimated_step
 from fhash_codec.compact.choices.head import HeadHistory
-from fhash_codec.compact.choices.labels import has_labels, plan_labels
+from fhash_codec.compact.choices.labels import LabelTrial, has_labels, is_hopeless, plan_labels
 from fhash_codec.compact.choices.step import with_step
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.goal import Goal
@@ -43,8 +43,6 @@ MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
 STAGES = 6
 """Number of parts of the planning that its progress counts."""
-HOPELESS = 2.0
-"""Size of the first guess, as a multiple of that of labels, from which on nothing else is tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,28 +103,34 @@ def plan(
     parts.begin("first guess")
     tiled = blocks.retile(tile)
     settings = first_settings(task, tiled)
-    few = goal.lossless and has_labels(task, tiled)
-    if few:
-        labelled, clearly = plan_labels(task, tiled, settings)
-        if clearly:
+    trial: LabelTrial | None = None
+    if goal.lossless and has_labels(task, tiled):
+        trial = plan_labels(task, tiled, settings)
+        if trial.clearly:
             parts.end()
-            return _label_plan(task, labelled)
+            return _label_plan(task, trial.attempt)
     if _can_estimate(task, tiled, settings):
         estimated_plan = _estimated_plan(task, tiled, settings)
         parts.end()
         return estimated_plan
     attempt = first_guess(task, tiled, settings)
-    if few and labelled.outcome.size * HOPELESS < attempt.outcome.size:
+    if trial is not None and is_hopeless(
+        trial.attempt.outcome.size, attempt.outcome.size, trial.entropy
+    ):
         parts.end()
-        return _label_plan(task, labelled)
+        return _label_plan(task, trial.attempt)
     attempt = _improved(task, attempt)
     parts.end()
-    if few and labelled.outcome.size <= attempt.outcome.size:
-        return _label_plan(task, labelled)
+    settings = attempt.settings
+    if trial is not None:
+        if trial.attempt.outcome.size <= attempt.outcome.size:
+            return _label_plan(task, trial.attempt)
+        many = trial.attempt.settings.many_labels
+        settings = replace(settings, labels=True, many_labels=many)
     return CodingPlan(
         blocks=attempt.sample.blocks,
         sample=attempt.sample,
-        settings=replace(attempt.settings, labels=few),
+        settings=settings,
         coding=goal.bounded(_final_coding(task, attempt)),
         goal=goal,
         gains=gains.entries,

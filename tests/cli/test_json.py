@@ -97,7 +97,7 @@ def parsed(result: Result, code: int = 0) -> Any:
 def test_the_document_names_every_command() -> None:
     commands = {title.split()[0] for title in KEYS} - {"Errors"}
     assert commands == set(COMMANDS) - WITHOUT_JSON
-    assert {"bench train", "bench rate", "bench render"} <= KEYS.keys()
+    assert {"bench train", "bench rate", "bench labels", "bench render"} <= KEYS.keys()
 
 
 @pytest.mark.parametrize(
@@ -205,6 +205,11 @@ def test_bench_rate() -> None:
         access=(access,), refused={"ZFP": "no"}, machine={}, notes=("a",),
     )  # fmt: skip
     check("bench rate", json.loads(json.dumps(result.to_dict())))
+
+
+def test_bench_labels(fhash: Fhash) -> None:
+    words = ["bench", "labels", "--kind", "tiny grid", "--effort", "1"]
+    check("bench labels", parsed(fhash(*words, "--json", "-q")))
 
 
 def test_bench_render() -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.base_command import BaseGroup
+from fhash_cli.commands.bench_labels import labels
 from fhash_cli.commands.bench_render import render
 from fhash_cli.options import (
     RealRange,
@@ -78,6 +79,7 @@ def command() -> None:
     """Measure speed and size on this machine."""
 
 
+command.add_command(labels)
 command.add_command(render)
 
 

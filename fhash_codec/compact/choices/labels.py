@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import prod
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_codec.compact.attempt import Attempt, PlanTask
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.compact.tiles.tiling import tile_for
-from fhash_formats.transform.entropy.labels import MAX_LABELS
+from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
+from fhash_formats.transform.tile.labelled import has_regions
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["has_labels", "plan_labels"]
+__all__ = ["LabelTrial", "has_labels", "is_hopeless", "plan_labels"]
 
 LOOK_VERTICES = 1 << 18
 """Vertices that are looked at, and coded for the size estimate."""
@@ -27,24 +31,69 @@ SMALL_FILE_BYTES = 60_000
 MAX_TILE_VERTICES = 12 << 20
 """Vertices of a tile that is chosen for its bytes alone: a larger one takes long to decode."""
 
+HOPELESS = 1.25
+"""Size of the first guess, as a multiple of that of labels, from which on nothing else is tried."""
+STRUCTURELESS = 0.97
+"""Share of the values' own entropy from which on labels are taken for noise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelTrial:
+    """What coding as labels gives.
+
+    Attributes:
+        attempt: tiles and settings.
+        clearly: whether nothing else can take fewer bytes.
+        entropy: bytes of the values by how often each occurs in its tile, whatever stands around.
+    """
+
+    attempt: Attempt
+    clearly: bool
+    entropy: float
+
+
+def is_hopeless(labels: float, other: float, entropy: float) -> bool:
+    """Whether trials that begin with a first guess of `other` bytes can end below `labels` bytes.
+
+    They hardly change the size of noise, which neither way takes for anything else. Elsewhere they
+    save less, the larger the first guess is beside labels.
+
+    Args:
+        labels: bytes as labels.
+        other: bytes of the first guess.
+        entropy: see `LabelTrial`.
+    """
+    noise = labels >= STRUCTURELESS * entropy
+    return other >= (1 if noise else HOPELESS) * labels
+
 
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
-    """Whether any tile of a sample has few enough different values."""
+    """Whether any tile of a sample has few enough different values, or regions of equal ones."""
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
     # Vertices that are not occupied take a label of their own.
-    most = MAX_LABELS - (not tiled.complete)
-    return any(np.unique(tile.values).size <= most for tile in sample.tiles)
+    spare = not tiled.complete
+    for tile in sample.tiles:
+        distinct = np.unique(tile.values).size
+        if distinct <= MAX_NARROW - spare:
+            return True
+        if distinct <= MAX_LABELS - spare and has_regions(tile.values):
+            return True
+    return False
 
 
-def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> tuple[Attempt, bool]:
-    """Return tiles and settings for labels, and whether nothing else can take fewer bytes."""
+def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelTrial:
+    """Return tiles and settings for labels, and what they promise."""
     if not task.blocks.complete:
         settings = replace(settings, mask=MaskLevels())
-    settings = replace(settings, labels=True, quantum=0.0, clip=False)
+    settings = replace(settings, labels=True, many_labels=True, quantum=0.0, clip=False)
     coding = Coding(filled=True, density=0)
     exact = replace(coding, exact=True)
     sample = Sample(tiled, LOOK_VERTICES, task.workers)
     outcome = sample.run(settings, replace(coding, error=0.0))
+    entropy = sum(
+        weight * _entropy(values if counted is None else values[counted])
+        for weight, (values, counted) in zip(sample.weights, sample.tiles, strict=True)
+    )
     clearly = CLEARLY * outcome.size <= sample.run(settings, exact).size
     if task.fixed_tile is None:
         tile = tile_for(task.blocks.shape, outcome.size)
@@ -52,5 +101,21 @@ def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> tuple[
         if outcome.size <= SMALL_FILE_BYTES and prod(shape) <= MAX_TILE_VERTICES:
             tile = shape
         sample = Sample(task.blocks.retile(tile), LOOK_VERTICES, task.workers)
+    settings = replace(settings, many_labels=_may_be_many(task.value_range, sample))
     task.gains.note("labels", outcome)
-    return Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding), clearly
+    attempt = Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
+    return LabelTrial(attempt=attempt, clearly=clearly, entropy=entropy)
+
+
+def _entropy(values: npt.NDArray[Any]) -> float:
+    """Bytes of values by how often each occurs."""
+    counts = np.unique(values, return_counts=True)[1]
+    return float(-(counts * np.log2(counts / max(values.size, 1))).sum()) / 8
+
+
+def _may_be_many(value_range: ValueRange, sample: Sample) -> bool:
+    """Whether a tile of the series may have more than MAX_NARROW labels."""
+    most = MAX_NARROW - (not sample.blocks.complete)
+    if sample.blocks.dtype.kind in "iu" and value_range.high - value_range.low < most:
+        return False
+    return not sample.complete or any(np.unique(tile.values).size > most for tile in sample.tiles)

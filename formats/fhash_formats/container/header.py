@@ -20,7 +20,9 @@ FORMAT = "fhash"
 FORMAT_VERSION = (1, 2)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
-KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, "clip", "cross", "labels", "mask", "predictor"})
+KNOWN_FEATURES = frozenset(
+    {TRANSFORM_FEATURE, "clip", "cross", "labels", "many-labels", "mask", "predictor"}
+)
 """Names in `required_features` that this version understands."""
 PAPER = "paper"
 COMPACT = "compact"

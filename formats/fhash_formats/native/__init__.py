@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 7
+ABI_VERSION = 8
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -72,7 +72,9 @@ PROTOTYPES: Prototypes = {
     "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),
     # labels.cpp
     "fhash_encode_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
+    "fhash_encode_wide_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
     "fhash_decode_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
+    "fhash_decode_wide_labels": (ARRAY, INTEGER, ARRAY, *_STATE, *_SIZED),
     # predict.cpp
     "fhash_encode_predicted": (*(ARRAY,) * 4, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),
     "fhash_decode_predicted": (*(ARRAY,) * 3, *_SIZED, ARRAY, ARRAY, *_STATE, *_SIZED),

@@ -7,9 +7,13 @@
 // Where all segments around are of one label, a flag stands for SEGMENT vertices of a row. The
 // portable coder (transform/entropy/labels_portable.py) follows this file step by step and gives
 // the same bytes.
+//
+// Up to 256 labels are uint8. More of them (WIDE) are uint16; there a label chooses its estimates
+// by a hash, and a flag says whether a label is the one after the highest so far.
 #include <type_traits>
 
 #include "mixing.hpp"
+#include "rows.hpp"
 
 namespace {
 
@@ -21,29 +25,46 @@ const int TESTED = 3;            // candidates that are tested
 const int FOUND = 4;             // candidates that are looked for
 const int AROUND = 20;           // neighbours
 const int NEAR = 16;             // patterns of the four nearest neighbours
-const int SEGMENT = 16;          // vertices of a row that share a flag
-const int PADDING = 2;           // vertices without a label beside a row
-const int NONE = 256;            // label of vertices that do not exist
-const int MIXED = 257;           // state of a segment of more than one label
-const int NOTHING = 258;         // state of a segment that does not exist
+const int ALONE = 256;           // stands for a second candidate where there is one only
 const int RATE = 2;              // LEARNING_RATE of labels
 const int SIZES[CONTEXTS] = {3072, 6144, 6144, 8192, 65536, 1008, 12288, 12288};
-const int BIT_SIZES[BIT_CONTEXTS] = {256, 16384, 16384, 16384};
 const int CANDIDATE_SETS = TESTED * NEAR + TESTED * FOUND;  // sets of weights of candidates
-const int BIT_LEVELS = 8;                                   // sets of weights of bits
+const int NEXT = 10;                   // simple estimate of the label after the highest so far
+const uint32_t SCATTER = 40503;        // multiplier of hashes: 2^16 over the golden ratio
 
 // One run over labels.
-template <bool DECODES> struct LabelCoder {
+template <bool DECODES, bool WIDE> struct LabelCoder {
+    using Label = typename std::conditional<WIDE, uint16_t, uint8_t>::type;
+    using Known = typename std::conditional<WIDE, int32_t, int16_t>::type;
+    static const int NONE = WIDE ? 65536 : 256;  // label of vertices that do not exist
+    static const int MIXED = NONE + 1;           // state of a segment of more than one label
+    static const int NOTHING = NONE + 2;         // state of a segment that does not exist
+    static const int BIT_LEVELS = WIDE ? 16 : 8;  // sets of weights of bits
+    static const int BIT_SIZE = WIDE ? 65536 : 16384;  // contexts of an estimate of bits
+
     typename std::conditional<DECODES, Decoder, Encoder>::type range;
     State* state;
     Slot *slots[CONTEXTS], *bit_slots[BIT_CONTEXTS];
-    int count;  // number of labels
+    int count;        // number of labels
+    int highest = -1;  // highest label so far; only where WIDE
+
+    // Number below 256 by which a label chooses its estimates.
+    FHASH_INLINE static int key(int label) {
+        return WIDE ? (int)(((uint32_t)label * SCATTER >> 8) & 255) : label;
+    }
+
+    // Context of a bit of a label, by another label.
+    FHASH_INLINE static int beside(int label, int node) {
+        if (WIDE) return (int)(((uint32_t)label * SCATTER + (uint32_t)node) & (BIT_SIZE - 1));
+        return (label * 256 + node) & (BIT_SIZE - 1);
+    }
 
     // Code whether a vertex has candidate k of `found`. around: the labels of the neighbours.
     FHASH_INLINE int test(int bit, int k, const int* candidates, int found, const int* around) {
-        const int c = candidates[k], other = found > 1 ? candidates[k ? 0 : 1] : NONE;
+        const int other = found > 1 ? key(candidates[k ? 0 : 1]) : ALONE;
+        const int c = key(candidates[k]);
         int e[AROUND];
-        for (int i = 0; i < AROUND; i++) e[i] = around[i] == c;
+        for (int i = 0; i < AROUND; i++) e[i] = around[i] == candidates[k];
         const int near = e[0] | e[1] << 1 | e[2] << 2 | e[3] << 3;
         const int plane = e[0] | e[1] << 1 | e[4] << 2 | e[5] << 3 | e[16] << 4 | e[17] << 5;
         const int below = e[2] | e[6] << 1 | e[7] << 2 | e[8] << 3 | e[9] << 4;
@@ -68,9 +89,7 @@ template <bool DECODES> struct LabelCoder {
         for (int i = 0; i < CONTEXTS; i++) now.slots[i] = slots[i] + context[i];
         now.first = state->weights.data() + (k * NEAR + near) * SET;
         now.second = state->weights.data() + (TESTED * NEAR + k * FOUND + found - 1) * SET;
-        bit = range.code(bit, (uint32_t)mix<CONTEXTS, true>(now));
-        learn<CONTEXTS, true, RATE>(now, bit, SLOW_LIMIT);
-        return bit;
+        return code_mixed<CONTEXTS, true, RATE>(range, now, bit);
     }
 
     // Number of labels from `low` to `high` - 1 that are not among the first `tested` candidates.
@@ -82,6 +101,9 @@ template <bool DECODES> struct LabelCoder {
 
     // Code a label that is none of the first `tested` candidates, from its highest bit on.
     FHASH_INLINE int spell(int label, const int* candidates, int tested, const int* around) {
+        if (WIDE && highest + 1 < count &&
+            code_simple(range, state->simples[NEXT], label == highest + 1))
+            return highest + 1;
         int low = 0, node = 1, level = significant((uint32_t)(count - 1));
         while (level-- > 0) {
             const int middle = low + (1 << level);
@@ -91,16 +113,15 @@ template <bool DECODES> struct LabelCoder {
             else {
                 const int context[BIT_CONTEXTS] = {
                     node,
-                    ((tested ? candidates[0] : 0) * 256 + node) & 16383,
-                    (around[3] * 256 + node) & 16383,
-                    (around[2] * 256 + node) & 16383,
+                    beside(tested ? candidates[0] : 0, node),
+                    beside(around[3], node),
+                    beside(around[2], node),
                 };
                 Mixed<CONTEXTS> now;
                 for (int i = 0; i < BIT_CONTEXTS; i++) now.slots[i] = bit_slots[i] + context[i];
                 now.first = state->weights.data() + (CANDIDATE_SETS + level) * SET;
                 now.second = state->weights.data() + (CANDIDATE_SETS + BIT_LEVELS + tested) * SET;
-                bit = range.code(bit, (uint32_t)mix<BIT_CONTEXTS, true>(now));
-                learn<BIT_CONTEXTS, true, RATE>(now, bit, SLOW_LIMIT);
+                bit = code_mixed<BIT_CONTEXTS, true, RATE>(range, now, bit);
             }
             if (bit) low = middle;
             node = node * 2 + bit;
@@ -137,68 +158,49 @@ template <bool DECODES> struct LabelCoder {
     }
 
     // Code all labels (t, z, y, x), each below `count`.
-    FHASH_INLINE void run(uint8_t* labels, const int64_t* shape) {
+    FHASH_INLINE void run(Label* labels, const int64_t* shape) {
         const int n0 = (int)shape[0], n1 = (int)shape[1], n2 = (int)shape[2], n3 = (int)shape[3];
         const int segments = (n3 + SEGMENT - 1) / SEGMENT;
-        // Strides of labels, of rows with padding and of the states of segments.
+        // Strides of labels and of the states of segments.
         const int64_t S2 = n3, S1 = S2 * n2, S0 = S1 * n1;
-        const int64_t M2 = n3 + 2 * PADDING, M1 = M2 * n2, M0 = M1 * n1;
         const int64_t G2 = segments + 2, G1 = G2 * n2, G0 = G1 * n1;
-        std::vector<int16_t> known((size_t)M0 * n0, NONE), nothing((size_t)M2, NONE);
-        std::vector<int16_t> segment_states((size_t)G0 * n0, NOTHING);
-        std::vector<int16_t> no_states((size_t)G2, NOTHING);
+        PaddedRows<Known> known(shape, NONE);
+        std::vector<Known> segment_states((size_t)G0 * n0, NOTHING);
+        std::vector<Known> no_states((size_t)G2, NOTHING);
         slots[0] = state->slots.data();
         for (int i = 1; i < CONTEXTS; i++) slots[i] = slots[i - 1] + SIZES[i - 1];
         bit_slots[0] = slots[CONTEXTS - 1] + SIZES[CONTEXTS - 1];
-        for (int i = 1; i < BIT_CONTEXTS; i++) bit_slots[i] = bit_slots[i - 1] + BIT_SIZES[i - 1];
+        bit_slots[1] = bit_slots[0] + (WIDE ? BIT_SIZE : 256);
+        for (int i = 2; i < BIT_CONTEXTS; i++) bit_slots[i] = bit_slots[i - 1] + BIT_SIZE;
 
         for (int t = 0; t < n0; t++) for (int z = 0; z < n1; z++) for (int y = 0; y < n2; y++) {
             const bool has_y = y > 0, has_z = z > 0, has_t = t > 0;
-            const bool more_y = y + 1 < n2, more_z = z + 1 < n1;
-            uint8_t* const out = labels + t * S0 + z * S1 + y * S2;
-            // Rows as in mask.cpp: K this one, N along y, P along z, B along t.
-            int16_t* const K = known.data() + t * M0 + z * M1 + y * M2 + PADDING;
-            const int16_t* const none = nothing.data() + PADDING;
-            const int16_t* const N = has_y ? K - M2 : none;
-            const int16_t* const NN = y > 1 ? K - 2 * M2 : none;
-            const int16_t* const P = has_z ? K - M1 : none;
-            const int16_t* const PP = z > 1 ? K - 2 * M1 : none;
-            const int16_t* const PN = has_z && has_y ? K - M1 - M2 : none;
-            const int16_t* const PS = has_z && more_y ? K - M1 + M2 : none;
-            const int16_t* const B = has_t ? K - M0 : none;
-            const int16_t* const BB = t > 1 ? K - 2 * M0 : none;
-            const int16_t* const BN = has_t && has_y ? K - M0 - M2 : none;
-            const int16_t* const BS = has_t && more_y ? K - M0 + M2 : none;
-            const int16_t* const BP = has_t && has_z ? K - M0 - M1 : none;
-            const int16_t* const BF = has_t && more_z ? K - M0 + M1 : none;
+            Label* const out = labels + t * S0 + z * S1 + y * S2;
+            const auto [K, N, NN, P, PP, PN, PS, B, BB, BN, BS, BP, BF] = known.around(t, z, y);
             // States of the segments of this row and of the rows before it.
-            int16_t* const G = segment_states.data() + t * G0 + z * G1 + y * G2 + 1;
-            const int16_t* const no_state = no_states.data() + 1;
-            const int16_t* const GN = has_y ? G - G2 : no_state;
-            const int16_t* const GP = has_z ? G - G1 : no_state;
-            const int16_t* const GB = has_t ? G - G0 : no_state;
+            Known* const G = segment_states.data() + t * G0 + z * G1 + y * G2 + 1;
+            const Known* const no_state = no_states.data() + 1;
+            const Known* const GN = has_y ? G - G2 : no_state;
+            const Known* const GP = has_z ? G - G1 : no_state;
+            const Known* const GB = has_t ? G - G0 : no_state;
 
             for (int s = 0; s < segments; s++) {
                 const int x0 = s * SEGMENT, x1 = min(x0 + SEGMENT, n3);
                 // The state that all segments around have, as far as they exist.
                 const int near[7] = {G[s - 1], GN[s], GP[s],     GB[s],
                                      GN[s + 1], GP[s + 1], GB[s + 1]};
-                int same = NOTHING, around = 0, beside = 0;
-                for (int k = 0; k < 4; k++) {
-                    if (near[k] == NOTHING) continue;
-                    around++;
-                    same = same == NOTHING || same == near[k] ? near[k] : MIXED;
-                }
-                for (int k = 4; k < 7; k++) beside |= near[k] != NOTHING && near[k] != same;
+                int around, differing = 0;
+                const int same = common_state(near, 4, NOTHING, MIXED, around);
+                for (int k = 4; k < 7; k++) differing |= near[k] != NOTHING && near[k] != same;
                 if (same < NONE) {
                     int uniform = 1;
                     if (!DECODES) for (int x = x0; x < x1; x++) uniform &= out[x] == same;
-                    if (code_simple(range, state->simples[around * 2 + beside], uniform)) {
+                    if (code_simple(range, state->simples[around * 2 + differing], uniform)) {
                         for (int x = x0; x < x1; x++) {
-                            out[x] = (uint8_t)same;
-                            K[x] = (int16_t)same;
+                            out[x] = (Label)same;
+                            K[x] = (Known)same;
                         }
-                        G[s] = (int16_t)same;
+                        G[s] = (Known)same;
                         continue;
                     }
                 }
@@ -210,67 +212,109 @@ template <bool DECODES> struct LabelCoder {
                         BF[x],    BP[x],    K[x - 2], NN[x], PP[x],    BB[x],
                     };
                     const int label = vertex(DECODES ? 0 : out[x], neighbours);
-                    if (DECODES) out[x] = (uint8_t)label;
-                    K[x] = (int16_t)label;
+                    if (DECODES) out[x] = (Label)label;
+                    K[x] = (Known)label;
+                    if (WIDE) highest = max(highest, label);
                     if (x == x0) first = label;
                     differs |= label != first;
                 }
-                G[s] = (int16_t)(differs ? MIXED : first);
+                G[s] = (Known)(differs ? MIXED : first);
             }
         }
     }
 };
 
-FHASH_CLONES int64_t encode(LabelCoder<false>& coder, uint8_t* labels, const int64_t* shape) {
+template <class Coder, class Label>
+FHASH_INLINE int64_t run_all(Coder& coder, Label* labels, const int64_t* shape) {
     return guarded([&]() FHASH_LAMBDA -> int64_t {
         coder.run(labels, shape);
-        coder.range.finish();
         return 0;
     });
 }
-FHASH_CLONES int64_t decode(LabelCoder<true>& coder, uint8_t* labels, const int64_t* shape) {
-    return guarded([&]() FHASH_LAMBDA -> int64_t {
-        coder.run(labels, shape);
-        return 0;
+FHASH_CLONES int64_t encode(LabelCoder<false, false>& coder, uint8_t* labels,
+                            const int64_t* shape) {
+    return run_all(coder, labels, shape);
+}
+FHASH_CLONES int64_t encode(LabelCoder<false, true>& coder, uint16_t* labels,
+                            const int64_t* shape) {
+    return run_all(coder, labels, shape);
+}
+FHASH_CLONES int64_t decode(LabelCoder<true, false>& coder, uint8_t* labels,
+                            const int64_t* shape) {
+    return run_all(coder, labels, shape);
+}
+FHASH_CLONES int64_t decode(LabelCoder<true, true>& coder, uint16_t* labels,
+                            const int64_t* shape) {
+    return run_all(coder, labels, shape);
+}
+
+// The exported functions, for labels of either type.
+template <bool WIDE, class Label>
+int64_t encode_all(Label* labels, int64_t count, const int64_t* shape, const uint16_t* slots,
+                   int64_t slot_count, const int32_t* weights, int64_t weight_count,
+                   const uint16_t* simples, int64_t simple_count, uint8_t* data,
+                   int64_t capacity) {
+    return guarded([&]() -> int64_t {
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
+                                 LANES);
+        std::vector<uint8_t> out;
+        LabelCoder<false, WIDE> coder{{&out}, &state, {}, {}, (int)count};
+        const int64_t code = encode(coder, labels, shape);
+        if (code < 0) return code;
+        coder.range.finish();
+        return put(out, data, capacity);
+    });
+}
+template <bool WIDE, class Label>
+int64_t decode_all(Label* labels, int64_t count, const int64_t* shape, const uint16_t* slots,
+                   int64_t slot_count, const int32_t* weights, int64_t weight_count,
+                   const uint16_t* simples, int64_t simple_count, const uint8_t* data,
+                   int64_t size) {
+    return guarded([&]() -> int64_t {
+        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
+                                 LANES);
+        LabelCoder<true, WIDE> coder{{data, size}, &state, {}, {}, (int)count};
+        return decode(coder, labels, shape);
     });
 }
 
 }  // namespace
 
-// Encode labels (t, z, y, x), each from 0 to `count` - 1; count is 1 to 256.
+#define FHASH_LABEL_STATE                                                                          \
+    const uint16_t *slots, int64_t slot_count, const int32_t *weights, int64_t weight_count,       \
+        const uint16_t *simples, int64_t simple_count
+
+// Encode labels (t, z, y, x), each from 0 to `count` - 1; count is 1 to 256, or to 65536 for wide
+// ones. The labels are written to, but keep their values.
 //
 // slots, weights, simples: the state to begin from (transform/entropy/labels.py).
 // data: receives the bytes if they fit the capacity.
 //
 // Returns the number of bytes, or NO_MEMORY.
 FHASH_EXPORT int64_t fhash_encode_labels(uint8_t* labels, int64_t count, const int64_t* shape,
-                                         const uint16_t* slots, int64_t slot_count,
-                                         const int32_t* weights, int64_t weight_count,
-                                         const uint16_t* simples, int64_t simple_count,
-                                         uint8_t* data, int64_t capacity) {
-    return guarded([&]() -> int64_t {
-        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
-                                 LANES);
-        std::vector<uint8_t> out;
-        LabelCoder<false> coder{{&out}, &state, {}, {}, (int)count};
-        const int64_t code = encode(coder, labels, shape);
-        return code < 0 ? code : put(out, data, capacity);
-    });
+                                         FHASH_LABEL_STATE, uint8_t* data, int64_t capacity) {
+    return encode_all<false>(labels, count, shape, slots, slot_count, weights, weight_count,
+                             simples, simple_count, data, capacity);
+}
+FHASH_EXPORT int64_t fhash_encode_wide_labels(uint16_t* labels, int64_t count,
+                                              const int64_t* shape, FHASH_LABEL_STATE,
+                                              uint8_t* data, int64_t capacity) {
+    return encode_all<true>(labels, count, shape, slots, slot_count, weights, weight_count,
+                            simples, simple_count, data, capacity);
 }
 
-// Decode into labels; the other arguments are those of fhash_encode_labels. Any bytes give labels
+// Decode into labels; the other arguments are those of the functions above. Any bytes give labels
 // below `count`: the caller must check a digest.
 //
 // Returns 0 or NO_MEMORY.
 FHASH_EXPORT int64_t fhash_decode_labels(uint8_t* labels, int64_t count, const int64_t* shape,
-                                         const uint16_t* slots, int64_t slot_count,
-                                         const int32_t* weights, int64_t weight_count,
-                                         const uint16_t* simples, int64_t simple_count,
-                                         const uint8_t* data, int64_t size) {
-    return guarded([&]() -> int64_t {
-        State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
-                                 LANES);
-        LabelCoder<true> coder{{data, size}, &state, {}, {}, (int)count};
-        return decode(coder, labels, shape);
-    });
+                                         FHASH_LABEL_STATE, const uint8_t* data, int64_t size) {
+    return decode_all<false>(labels, count, shape, slots, slot_count, weights, weight_count,
+                             simples, simple_count, data, size);
+}
+FHASH_EXPORT int64_t fhash_decode_wide_labels(uint16_t* labels, int64_t count,
+                                              const int64_t* shape, FHASH_LABEL_STATE,
+                                              const uint8_t* data, int64_t size) {
+    return decode_all<true>(labels, count, shape, slots, slot_count, weights, weight_count,
+                            simples, simple_count, data, size);
 }

@@ -10,6 +10,7 @@
 #include <type_traits>
 
 #include "mixing.hpp"
+#include "rows.hpp"
 
 namespace {
 
@@ -18,8 +19,6 @@ const int LANES = 2 * CONTEXTS;  // weights of a set of the caller
 const int SET = padded(LANES);   // weights of a set as kept here
 const int LEVELS = 32, EVEN = 16;  // levels of a vertex; from EVEN on it is more likely occupied
 const int NEAR = 16;               // patterns of the four nearest bits; each has a set of weights
-const int SEGMENT = 16;            // vertices of a row that share a flag
-const int PADDING = 2;             // zeros beside a row of bits
 const int RATE = 2;                // LEARNING_RATE of masks
 const int SIZES[CONTEXTS] = {512, 1024, 4096, 2048, 2048, 1920, 2592, 4096, 4096, 2048};
 
@@ -47,12 +46,10 @@ template <bool DECODES> struct MaskCoder {
                           const int64_t* shape) {
         const int n0 = (int)shape[0], n1 = (int)shape[1], n2 = (int)shape[2], n3 = (int)shape[3];
         const int segments = (n3 + SEGMENT - 1) / SEGMENT;
-        // Strides of vertices, of marks and of the states of segments.
+        // Strides of vertices and of the states of segments.
         const int64_t S2 = n3, S1 = S2 * n2, S0 = S1 * n1;
-        const int64_t M2 = n3 + 2 * PADDING, M1 = M2 * n2, M0 = M1 * n1;
         const int64_t G2 = segments + 1, G1 = G2 * n2, G0 = G1 * n1;
-        // Marks of all vertices, and a row of zeros that stands for rows that do not exist.
-        std::vector<uint8_t> marks((size_t)M0 * n0, 0), nothing(M2, 0);
+        PaddedRows<uint8_t> marks(shape, 0);
         std::vector<uint8_t> segment_states((size_t)G0 * n0, NOTHING);
         Slot* slots[CONTEXTS];
         slots[0] = state->slots.data();
@@ -66,23 +63,7 @@ template <bool DECODES> struct MaskCoder {
             const int64_t at = t * S0 + z * S1 + y * S2;
             uint8_t* const out = mask + at;
             uint8_t* const G = segment_states.data() + t * G0 + z * G1 + y * G2 + 1;
-            // Marks of this row (K) and of the rows before it: N along y, P along z, B along t,
-            // doubled for two before. A second letter moves on: N and S by -1 and +1 along y, P and
-            // F by -1 and +1 along z.
-            uint8_t* const K = marks.data() + t * M0 + z * M1 + y * M2 + PADDING;
-            const uint8_t* const zeros = nothing.data() + PADDING;
-            const uint8_t* const N = has_y ? K - M2 : zeros;
-            const uint8_t* const NN = y > 1 ? K - 2 * M2 : zeros;
-            const uint8_t* const P = has_z ? K - M1 : zeros;
-            const uint8_t* const PP = z > 1 ? K - 2 * M1 : zeros;
-            const uint8_t* const PN = has_z && has_y ? K - M1 - M2 : zeros;
-            const uint8_t* const PS = has_z && more_y ? K - M1 + M2 : zeros;
-            const uint8_t* const B = has_t ? K - M0 : zeros;
-            const uint8_t* const BB = t > 1 ? K - 2 * M0 : zeros;
-            const uint8_t* const BN = has_t && has_y ? K - M0 - M2 : zeros;
-            const uint8_t* const BS = has_t && more_y ? K - M0 + M2 : zeros;
-            const uint8_t* const BP = has_t && has_z ? K - M0 - M1 : zeros;
-            const uint8_t* const BF = has_t && more_z ? K - M0 + M1 : zeros;
+            const auto [K, N, NN, P, PP, PN, PS, B, BB, BN, BS, BP, BF] = marks.around(t, z, y);
             // Levels of this row (A, and O for the second ones) and of the next ones along y, z, t.
             const uint8_t *const A = level + at, *const O = other + at;
             const uint8_t* const AS = more_y ? A + S2 : A;
@@ -98,14 +79,10 @@ template <bool DECODES> struct MaskCoder {
                 }
                 // The state that all segments around have, as far as they exist; where none exists,
                 // the state that the levels suggest.
-                int same = NOTHING, around = 0;
                 const int near[4] = {G[s - 1], has_y ? G[s - G2] : NOTHING,
                                      has_z ? G[s - G1] : NOTHING, has_t ? G[s - G0] : NOTHING};
-                for (int k = 0; k < 4; k++) {
-                    if (near[k] == NOTHING) continue;
-                    around++;
-                    same = same == NOTHING || same == near[k] ? near[k] : MIXED;
-                }
+                int around;
+                int same = common_state(near, 4, NOTHING, MIXED, around);
                 if (same == NOTHING)
                     same = !informed || high < 4 ? ZEROS : low > LEVELS - 5 ? ONES : MIXED;
 
@@ -162,9 +139,8 @@ template <bool DECODES> struct MaskCoder {
                     for (int i = 0; i < CONTEXTS; i++) now.slots[i] = slots[i] + context[i];
                     now.first = state->weights.data() + a * SET;
                     now.second = state->weights.data() + (LEVELS + near_bits) * SET;
-                    const int probability = mix<CONTEXTS, true>(now);
-                    const int bit = range.code(DECODES ? 0 : out[x], probability);
-                    learn<CONTEXTS, true, RATE>(now, bit, SLOW_LIMIT);
+                    const int bit =
+                        code_mixed<CONTEXTS, true, RATE>(range, now, DECODES ? 0 : out[x]);
                     if (DECODES) out[x] = (uint8_t)bit;
                     K[x] = mark(bit, a);
                     ones += bit;

@@ -309,6 +309,14 @@ FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
 
 #endif
 
+// Code a bit that N estimates predict together, and adapt them.
+template <int N, bool PAIR, int RATE, class Range, int N_MAX>
+FHASH_INLINE int code_mixed(Range& range, Mixed<N_MAX>& now, int bit) {
+    bit = range.code(bit, (uint32_t)mix<N, PAIR>(now));
+    learn<N, PAIR, RATE>(now, bit, SLOW_LIMIT);
+    return bit;
+}
+
 // The state in the caller's arrays; lanes: weights of a set there. Throws std::bad_alloc.
 inline State make_state(const uint16_t* slots, int64_t slot_count, const int32_t* weights,
                         int64_t weight_count, const uint16_t* simples, int64_t simple_count,

@@ -16,9 +16,17 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import InputError
-from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
+from fhash_formats.transform.axes.candidates import NO_TRANSFORM, candidates
+from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.tile.decoding import decode_tile, transform_for
-from fhash_formats.transform.tile.encoding import CodedTile, Coding, encode_tile, exact_tile
+from fhash_formats.transform.tile.encoding import (
+    CodedTile,
+    Coding,
+    encode_tile,
+    exact_tile,
+    labelled_tile,
+)
+from fhash_formats.transform.tile.labelled import has_regions
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.elementwise import within
@@ -37,6 +45,8 @@ _OTHER_RATIOS = (4.0, 1.6)
 
 Small steps pay for loose bounds, large ones for tight bounds.
 """
+_CLEARLY = 4
+"""Ratio of a deflated chunk to its labels from which on nothing else is tried."""
 _MAX_WINDOW = 1 << 16
 """Most values of the window on which transforms and ratios are tried."""
 _QUANTUM_SHARE = 1 - 1e-6
@@ -51,10 +61,6 @@ _MAX_SINGLE = 1e30
 """Largest magnitude of values and steps for arithmetic in float32."""
 _MIN_SINGLE = 1e-30
 """Smallest quantiser step for arithmetic in float32."""
-_MAX_DEPTHS = (1, 1, 5, 5)
-"""Most levels of a 9/7 transform along (t, z, y, x)."""
-_NO_TRANSFORM = TransformSpec(axes=(AxisTransform(kind="none"),) * 4)
-"""The shortest description of a transform."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +153,7 @@ def encode_chunk(
     tile = np.ascontiguousarray(values, dtype=supported(values.dtype)).reshape(
         tile_shape(values.shape)
     )
-    specs = _candidates(tile_shape(tile.shape)) if transform is None else (_spec_from(transform),)
+    specs = candidates(tile_shape(tile.shape)) if transform is None else (_spec_from(transform),)
     return _encode(tile, quality, specs).data if tile.size else b""
 
 
@@ -189,6 +195,12 @@ class _Task:
     reach: float
 
     @property
+    def lossless(self) -> bool:
+        """Whether the bound allows no error at all."""
+        whole = self.tile.dtype.kind != "f"
+        return self.error is not None and self.error < (1 if whole else math.ulp(0.0))
+
+    @property
     def center(self) -> float:
         """The middle of the range."""
         return float(self.low) + self.half_range
@@ -212,19 +224,29 @@ def _encode(tile: Values, quality: Quality, specs: tuple[TransformSpec, ...]) ->
     constant = _encode_constant(task)
     if constant is not None:
         return constant
+    labelled = labelled_tile(tile, many=has_regions(tile)) if task.lossless else None
+    if labelled is not None and _CLEARLY * len(labelled.data) < len(exact_tile(tile).data):
+        return labelled
+    others = [_transformed(task, specs), labelled]
+    tiles = [other for other in others if other is not None]
+    if not any(2 * len(other.data) < tile.nbytes for other in tiles):
+        tiles.insert(0, exact_tile(tile))
+    return min(tiles, key=lambda coded: len(coded.data))
+
+
+def _transformed(task: _Task, specs: tuple[TransformSpec, ...]) -> CodedTile | None:
+    """The chunk coded by transform; None where that cannot be."""
     settings = _first_settings(task, specs[0])
     if settings is None:
-        return exact_tile(tile)
+        return None
     settings = _best_settings(task, settings, specs)
-    gain = [float(norms.max()) for norms in transform_for(settings, tile_shape(tile.shape)).norms]
+    norms = transform_for(settings, tile_shape(task.tile.shape)).norms
+    gain = [float(norm.max()) for norm in norms]
     if task.half_range / settings.step * gain[0] * gain[1] > _MAX_STEPS:
-        return exact_tile(tile)
-    coding = Coding(weight=_WEIGHT, error=task.error, own_settings=True)
-    coded = encode_tile(tile, settings, coding)
-    if 2 * len(coded.data) < tile.nbytes:
-        return coded
-    exact = exact_tile(tile)
-    return exact if len(exact.data) <= len(coded.data) else coded
+        return None
+    return encode_tile(
+        task.tile, settings, Coding(weight=_WEIGHT, error=task.error, own_settings=True)
+    )
 
 
 def _task(tile: Values, quality: Quality) -> _Task | None:
@@ -260,7 +282,7 @@ def _bound(quality: Quality, low: Any, high: Any, dtype: np.dtype[Any]) -> tuple
 def _constant_tile(tile: Values, center: float) -> CodedTile:
     """A tile whose finite values all decode to one value."""
     settings = TileSettings(
-        transform=_NO_TRANSFORM, step=1.0, center=center, low=center, high=center, double=True
+        transform=NO_TRANSFORM, step=1.0, center=center, low=center, high=center, double=True
     )
     nothing = np.zeros(tile.shape, bool)
     return encode_tile(tile, settings, Coding(own_settings=True), in_coreset=nothing)
@@ -354,42 +376,6 @@ def _window(tile: Values) -> Values:
         for n, length in zip(tile.shape, lengths, strict=True)
     )
     return np.ascontiguousarray(tile[middle])
-
-
-def _candidates(shape: Shape) -> tuple[TransformSpec, ...]:
-    """The transforms to try, each once.
-
-    9/7 along all axes; then Haar, and then no transform, along the first axis longer than 1, which
-    often is time; then Haar along all axes.
-    """
-    first = next((axis for axis, n in enumerate(shape) if n > 1), None)
-    if first is None:
-        return (_NO_TRANSFORM,)
-    depths = [
-        0 if n < 2 else max(1, min(deepest, n.bit_length() - 3))
-        for n, deepest in zip(shape, _MAX_DEPTHS, strict=True)
-    ]
-    if min(shape[2:]) >= 16:
-        depths[2:] = [min(depths[2:])] * 2
-    # Few chunks are long in time: there, two levels of Haar are worth it.
-    haar_depth = min(2, shape[first].bit_length() - 1) if first < 2 else depths[first]
-    specs = (
-        _spec("9/7", depths, first, "9/7", depths[first]),
-        _spec("9/7", depths, first, "haar", haar_depth),
-        _spec("9/7", depths, first, "none", 0),
-        _spec("haar", depths, first, "haar", haar_depth),
-    )
-    return tuple(dict.fromkeys(specs))
-
-
-def _spec(
-    kind: str, depths: list[int], first: int, first_kind: str, first_depth: int
-) -> TransformSpec:
-    """A wavelet of one kind along all axes with a depth, but another kind along the first axis."""
-    kinds = [(kind if depth else "none", depth) for depth in depths]
-    kinds[first] = (first_kind, first_depth)
-    t, z, y, x = (AxisTransform(kind=name, depth=depth) for name, depth in kinds)
-    return TransformSpec(axes=(t, z, y, x))
 
 
 def _spec_from(transform: TransformSpec | Mapping[str, Any]) -> TransformSpec:

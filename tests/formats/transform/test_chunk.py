@@ -217,3 +217,32 @@ def test_no_value_leaves_the_range_of_its_chunk(dtype: str, share: float) -> Non
     coarse = encode_chunk(values, step=4 * error)
     decoded = decode_chunk(coarse, values.shape, values.dtype)
     assert values.min() <= decoded.min() <= decoded.max() <= values.max()
+
+
+def grains(count: int, dtype: str) -> npt.NDArray[Any]:
+    """Blocks of `count` numbers in a random order."""
+    numbers = np.random.default_rng(0).permutation(count)[np.arange(1200).reshape(30, 40) % count]
+    return np.broadcast_to(numbers.repeat(3, 0).repeat(3, 1), (4, 90, 120)).astype(dtype)
+
+
+@pytest.mark.parametrize("count", [60, 1200])
+@pytest.mark.parametrize(("dtype", "error"), [("i4", 0), ("u2", 0.9), ("f4", 0)])
+def test_labels_without_loss_are_coded_as_labels(count: int, dtype: str, error: float) -> None:
+    values = grains(count, dtype)
+    data = check(values, 0, max_error=error)
+    assert data[0] >> 5 == 5
+    assert 40 * len(data) < values.nbytes
+
+
+@pytest.mark.parametrize(("dtype", "error"), [("i4", 1), ("f4", 0.5)])
+def test_a_looser_bound_codes_no_labels(dtype: str, error: float) -> None:
+    assert check(grains(60, dtype), error, max_error=error)[0] >> 5 == 1
+
+
+def test_labels_keep_every_bit_of_floats() -> None:
+    values = grains(60, "f4")
+    values[values == 3] = -0.0
+    values[values == 4] = np.nan
+    values[values == 5] = np.inf
+    decoded = decode_chunk(encode_chunk(values, max_error=0), values.shape, "f4")
+    assert decoded.tobytes() == values.tobytes()

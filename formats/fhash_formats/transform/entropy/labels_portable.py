@@ -15,25 +15,29 @@ import numpy.typing as npt
 from fhash_formats.transform.entropy.mixing_portable import (
     ARRAYS,
     LISTS,
-    SLOW_LIMIT,
     Memory,
     Sequence,
     Stream,
     Tables,
-    code_bit,
+    code_mixed,
     code_simple,
     compiled,
     finish,
-    learn,
     memory_of,
-    mix,
     start_range,
 )
 from fhash_formats.transform.entropy.prior import State
+from fhash_formats.transform.entropy.rows_portable import (
+    PADDING,
+    SEGMENT,
+    Rows,
+    common_state,
+    rows_around,
+)
 
 __all__ = ["decode", "encode"]
 
-Labels = npt.NDArray[np.uint8]
+Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 CONTEXTS = 8
 """Estimates that are mixed for a decision about a candidate."""
@@ -49,26 +53,30 @@ AROUND = 20
 """Neighbours."""
 NEAR = 16
 """Patterns of the four nearest neighbours."""
-SEGMENT = 16
-"""Vertices of a row that share a flag."""
-PADDING = 2
-"""Vertices without a label at both ends of a row."""
-NONE = 256
+MAX_NARROW = 256
+"""Most labels that are coded without hashes."""
+NONE = 65536
 """Label of vertices that do not exist."""
-MIXED = 257
+ALONE = 256
+"""Stands for a second candidate where there is one only."""
+MIXED = NONE + 1
 """State of a segment of more than one label."""
-NOTHING = 258
+NOTHING = NONE + 2
 """State of a segment that does not exist."""
+NEXT = 10
+"""Simple estimate of the label after the highest so far."""
+SCATTER = 40503
+"""Multiplier of hashes: 2^16 over the golden ratio."""
 LEARNING_RATE = 2
 """Rate at which the mixing weights learn, in 1/16."""
 SIZES = (3072, 6144, 6144, 8192, 65536, 1008, 12288, 12288, 256, 16384, 16384, 16384)
 """Contexts of each estimate: of candidates, then of bits."""
-STARTS = tuple(sum(SIZES[:i]) for i in range(CONTEXTS + BIT_CONTEXTS))
-"""First slot of each estimate."""
+WIDE_SIZES = (*SIZES[:CONTEXTS], 65536, 65536, 65536, 65536)
+"""`SIZES` of more than MAX_NARROW labels."""
+STARTS = tuple(sum(SIZES[:i]) for i in range(CONTEXTS + 1))
+"""First slot of each estimate of candidates, and of the first one of bits."""
 CANDIDATE_SETS = TESTED * NEAR + TESTED * FOUND
 """Sets of weights of candidates."""
-BIT_LEVELS = 8
-"""Sets of weights of bits, by the place of the bit."""
 
 
 class Work(NamedTuple):
@@ -83,6 +91,7 @@ class Work(NamedTuple):
         around: labels of the neighbours of a vertex.
         candidates, votes: labels around a vertex, and how often they occur.
         where, inputs: of a decision, for `mix` and `learn`.
+        highest: one entry, the highest label so far.
     """
 
     labels: Sequence
@@ -93,6 +102,7 @@ class Work(NamedTuple):
     votes: Sequence
     where: Sequence
     inputs: Sequence
+    highest: Sequence
 
 
 def encode(labels: Labels, count: int, state: State) -> bytes:
@@ -105,7 +115,8 @@ def decode(data: bytes, count: int, shape: tuple[int, ...], state: State) -> Lab
     """The labels that were coded; any other bytes give some labels below `count`."""
     blank = np.zeros(int(np.prod(shape)), np.int64)
     labels = _start(True, blank, count, shape, state, data)[0]
-    return np.array(labels, dtype=np.uint8).reshape(shape)
+    dtype = np.uint8 if count <= MAX_NARROW else np.uint16
+    return np.array(labels, dtype=dtype).reshape(shape)
 
 
 def _start(
@@ -118,7 +129,8 @@ def _start(
 ) -> tuple[Sequence, Sequence]:
     """Make room and run: the labels, and the bytes."""
     helpers: tuple[Callable[..., Any], ...]
-    helpers = (_test, _allowed, _spell, _vertex, _gather, _common_state)
+    helpers = (rows_around, common_state, _key, _beside, _test, _allowed, _spell)
+    helpers += (_vertex, _gather, _states_around)
     engine = compiled(_run, helpers)
     memory = memory_of(state, engine is not None)
     n0, n1, n2, n3 = shape
@@ -128,6 +140,7 @@ def _start(
         np.full((rows + 1) * (n3 + 2 * PADDING), NONE, np.int64),
         np.full((rows + 1) * (segments + 2), NOTHING, np.int64),
         *(np.zeros(n, np.int64) for n in (AROUND, FOUND, FOUND, CONTEXTS, LANES)),
+        np.full(1, -1, np.int64),
     )
     lengths = (n0, n1, n2, n3)
     if engine is None:
@@ -138,18 +151,35 @@ def _start(
     return work.labels, out
 
 
+def _key(label: int, wide: bool) -> int:
+    """Number below 256 by which a label chooses its estimates."""
+    return (label * SCATTER >> 8) & 255 if wide else label
+
+
+def _beside(label: int, node: int, wide: bool) -> int:
+    """Context of a bit of a label, by another label."""
+    return (label * SCATTER + node) & 65535 if wide else (label * 256 + node) & 16383
+
+
 def _test(
-    bit: int, k: int, found: int, stream: Stream, memory: Memory, tables: Tables, work: Work
+    bit: int,
+    k: int,
+    found: int,
+    wide: bool,
+    stream: Stream,
+    memory: Memory,
+    tables: Tables,
+    work: Work,
 ) -> int:
     """Code whether a vertex has candidate k of `found`."""
     around, where, inputs = work.around, work.where, work.inputs
-    c = work.candidates[k]
-    other = NONE
+    candidate = work.candidates[k]
+    c, other = _key(candidate, wide), ALONE
     if found > 1:
-        other = work.candidates[0 if k > 0 else 1]
+        other = _key(work.candidates[0 if k > 0 else 1], wide)
     near = plane = below = before = second = sum_plane = sum_below = sum_before = mixed = 0
     for i in range(AROUND):
-        if around[i] != c:
+        if around[i] != candidate:
             continue
         if i < 4:
             near |= 1 << i
@@ -178,22 +208,9 @@ def _test(
     where[7] = STARTS[7] + (k << 12 | before << 5 | below)
     first = (k * NEAR + near) * LANES
     last = (TESTED * NEAR + k * FOUND + found - 1) * LANES
-    p = mix(CONTEXTS, where, inputs, first, last, memory, tables)
-    bit = code_bit(bit, p, stream)
-    learn(
-        CONTEXTS,
-        where,
-        inputs,
-        first,
-        last,
-        p,
-        bit,
-        SLOW_LIMIT,
-        LEARNING_RATE,
-        memory,
-        tables.rate,
+    return code_mixed(
+        CONTEXTS, bit, first, last, LEARNING_RATE, where, inputs, stream, memory, tables
     )
-    return bit
 
 
 def _allowed(low: int, high: int, count: int, tested: int, candidates: Sequence) -> int:
@@ -216,6 +233,13 @@ def _spell(
 ) -> int:
     """Code a label that is none of the first `tested` candidates, from its highest bit on."""
     around, candidates, where, inputs = work.around, work.candidates, work.where, work.inputs
+    wide, following = count > MAX_NARROW, work.highest[0] + 1
+    is_next = 1 if label == following else 0
+    if wide and following < count and code_simple(is_next, NEXT, stream, memory, tables.rate):
+        return int(following)
+    levels = 16 if wide else 8
+    size = 65536 if wide else 16384
+    at = STARTS[CONTEXTS] + (65536 if wide else 256)
     low, node, level = 0, 1, 0
     while (count - 1) >> level > 0:
         level += 1
@@ -228,26 +252,14 @@ def _spell(
         elif _allowed(middle, middle + (1 << level), count, tested, candidates) == 0:
             bit = 0
         else:
-            where[0] = STARTS[8] + node
-            where[1] = STARTS[9] + (((candidates[0] if tested > 0 else 0) * 256 + node) & 16383)
-            where[2] = STARTS[10] + ((around[3] * 256 + node) & 16383)
-            where[3] = STARTS[11] + ((around[2] * 256 + node) & 16383)
+            where[0] = STARTS[CONTEXTS] + node
+            where[1] = at + _beside(candidates[0] if tested > 0 else 0, node, wide)
+            where[2] = at + size + _beside(around[3], node, wide)
+            where[3] = at + 2 * size + _beside(around[2], node, wide)
             first = (CANDIDATE_SETS + level) * LANES
-            last = (CANDIDATE_SETS + BIT_LEVELS + tested) * LANES
-            p = mix(BIT_CONTEXTS, where, inputs, first, last, memory, tables)
-            bit = code_bit(bit, p, stream)
-            learn(
-                BIT_CONTEXTS,
-                where,
-                inputs,
-                first,
-                last,
-                p,
-                bit,
-                SLOW_LIMIT,
-                LEARNING_RATE,
-                memory,
-                tables.rate,
+            last = (CANDIDATE_SETS + levels + tested) * LANES
+            bit = code_mixed(
+                BIT_CONTEXTS, bit, first, last, LEARNING_RATE, where, inputs, stream, memory, tables
             )
         if bit:
             low = middle
@@ -284,42 +296,32 @@ def _vertex(
         if k == count - 1:
             return int(candidates[k])
         bit = 1 if label == candidates[k] else 0
-        if _test(bit, k, found, stream, memory, tables, work):
+        if _test(bit, k, found, count > MAX_NARROW, stream, memory, tables, work):
             return int(candidates[k])
     return _spell(label, count, tested, stream, memory, tables, work)
 
 
-def _gather(
-    x: int, t: int, z: int, y: int, r: int, shape: tuple[int, int, int, int], work: Work
-) -> None:
-    """Put the labels around vertex x of row (t, z, y), whose number is r, into `work.around`."""
-    n1, n2, n3 = shape[1], shape[2], shape[3]
-    m2 = n3 + 2 * PADDING
-    m1 = m2 * n2
-    m0 = m1 * n1
-    around, known, row = work.around, work.known, (r + 1) * m2 + PADDING
-    north = row - m2 if y > 0 else PADDING
-    below = row - m1 if z > 0 else PADDING
-    back = row - m0 if t > 0 else PADDING
-    more_y, more_z = y + 1 < n2, z + 1 < n1
-    around[0], around[1] = known[row + x - 1], known[north + x]
-    around[2], around[3] = known[below + x], known[back + x]
-    around[4], around[5] = known[north + x - 1], known[north + x + 1]
-    around[6], around[7] = known[below + x + 1], known[below + x - 1]
-    around[8] = known[(row - m1 + m2 if z > 0 and more_y else PADDING) + x]
-    around[9] = known[(row - m1 - m2 if z > 0 and y > 0 else PADDING) + x]
-    around[10], around[11] = known[back + x + 1], known[back + x - 1]
-    around[12] = known[(row - m0 + m2 if t > 0 and more_y else PADDING) + x]
-    around[13] = known[(row - m0 - m2 if t > 0 and y > 0 else PADDING) + x]
-    around[14] = known[(row - m0 + m1 if t > 0 and more_z else PADDING) + x]
-    around[15] = known[(row - m0 - m1 if t > 0 and z > 0 else PADDING) + x]
-    around[16] = known[row + x - 2]
-    around[17] = known[(row - 2 * m2 if y > 1 else PADDING) + x]
-    around[18] = known[(row - 2 * m1 if z > 1 else PADDING) + x]
-    around[19] = known[(row - 2 * m0 if t > 1 else PADDING) + x]
+def _gather(x: int, rows: Rows, work: Work) -> None:
+    """Put the labels around vertex x of a row into `work.around`."""
+    around, known = work.around, work.known
+    row, north, below, back = rows.row + x, rows.north + x, rows.below + x, rows.back + x
+    around[0], around[1], around[2], around[3] = (
+        known[row - 1],
+        known[north],
+        known[below],
+        known[back],
+    )
+    around[4], around[5] = known[north - 1], known[north + 1]
+    around[6], around[7] = known[below + 1], known[below - 1]
+    around[8], around[9] = known[rows.below_s + x], known[rows.below_n + x]
+    around[10], around[11] = known[back + 1], known[back - 1]
+    around[12], around[13] = known[rows.back_s + x], known[rows.back_n + x]
+    around[14], around[15] = known[rows.back_f + x], known[rows.back_b + x]
+    around[16], around[17] = known[row - 2], known[rows.north2 + x]
+    around[18], around[19] = known[rows.below2 + x], known[rows.back2 + x]
 
 
-def _common_state(
+def _states_around(
     s: int, t: int, z: int, y: int, r: int, shape: tuple[int, int, int, int], states: Sequence
 ) -> tuple[int, int]:
     """The state that all segments around segment s have, and the number of the flag's estimate."""
@@ -330,19 +332,13 @@ def _common_state(
     north = g - g2 if y > 0 else 1 + s
     below = g - g1 if z > 0 else 1 + s
     back = g - g0 if t > 0 else 1 + s
-    same, around, beside = NOTHING, 0, 0
-    for k in range(7):
-        near = states[g - 1]
-        if k > 0:
-            near = states[(north if k % 3 == 1 else below if k % 3 == 2 else back) + (k > 3)]
-        if near == NOTHING:
-            continue
-        if k < 4:
-            around += 1
-            same = near if same in (NOTHING, near) else MIXED
-        elif near != same:
-            beside = 1
-    return same, around * 2 + beside
+    near = (states[g - 1], states[north], states[below], states[back])
+    same, around = common_state(near, NOTHING, MIXED)
+    differing = 0
+    for state in (states[north + 1], states[below + 1], states[back + 1]):
+        if state not in (NOTHING, same):
+            differing = 1
+    return same, around * 2 + differing
 
 
 def _run(
@@ -364,11 +360,12 @@ def _run(
     labels, known, states = work.labels, work.known, work.states
     for r in range(n0 * n1 * n2):
         t, z, y = r // n2 // n1, r // n2 % n1, r % n2
-        at, row = r * n3, (r + 1) * (n3 + 2 * PADDING) + PADDING
+        rows = rows_around(t, z, y, r, shape)
+        at, row = r * n3, rows.row
         for s in range(segments):
             g = (r + 1) * (segments + 2) + 1 + s
             x0, x1 = s * SEGMENT, min((s + 1) * SEGMENT, n3)
-            same, flag = _common_state(s, t, z, y, r, shape, states)
+            same, flag = _states_around(s, t, z, y, r, shape, states)
             if same < NONE:
                 uniform = 1
                 if not decoding:
@@ -384,10 +381,11 @@ def _run(
                     continue
             first, differs = 0, False
             for x in range(x0, x1):
-                _gather(x, t, z, y, r, shape, work)
+                _gather(x, rows, work)
                 label = _vertex(labels[at + x], count, stream, memory, tables, work)
                 labels[at + x] = label
                 known[row + x] = label
+                work.highest[0] = max(work.highest[0], label)
                 if x == x0:
                     first = label
                 if label != first:

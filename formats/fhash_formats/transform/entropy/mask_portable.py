@@ -15,22 +15,26 @@ import numpy.typing as npt
 from fhash_formats.transform.entropy.mixing_portable import (
     ARRAYS,
     LISTS,
-    SLOW_LIMIT,
     Memory,
     Sequence,
     Stream,
     Tables,
-    code_bit,
+    code_mixed,
     code_simple,
     compiled,
     finish,
     keep_memory,
-    learn,
     memory_of,
-    mix,
     start_range,
 )
 from fhash_formats.transform.entropy.prior import State
+from fhash_formats.transform.entropy.rows_portable import (
+    PADDING,
+    SEGMENT,
+    Rows,
+    common_state,
+    rows_around,
+)
 
 __all__ = ["decode", "encode"]
 
@@ -45,12 +49,8 @@ LEVELS = 32
 """Levels of a vertex."""
 EVEN = 16
 """Level from which on a vertex is more likely occupied than not."""
-SEGMENT = 16
-"""Vertices of a row that share a flag."""
 NEAR = 16
 """Patterns of the four nearest bits; each has a set of weights."""
-PADDING = 2
-"""Zeros at both ends of a row of bits."""
 ZEROS = 0
 """State of a segment whose bits are all 0."""
 ONES = 1
@@ -69,28 +69,9 @@ STARTS = tuple(sum(SIZES[:i]) for i in range(CONTEXTS))
 """First slot of each estimate."""
 
 
-class Rows(NamedTuple):
-    """Places where the rows around a row begin.
+class LevelRows(NamedTuple):
+    """Places where rows of levels begin: the row itself (`at`), the next along y, z and t."""
 
-    Rows of bits (in `Work.marks`) are `row` itself, `north` and `north2` before it along y, `below`
-    and `below2` along z, `back` and `back2` along t. A suffix moves on: `_n` and `_s` by -1 and +1
-    along y, `_b` and `_f` by -1 and +1 along z. Rows of levels are `at` for the row itself, and the
-    next ones along y (`south`), z (`front`) and t (`later`).
-    """
-
-    row: int
-    north: int
-    north2: int
-    below: int
-    below2: int
-    below_n: int
-    below_s: int
-    back: int
-    back2: int
-    back_n: int
-    back_s: int
-    back_b: int
-    back_f: int
     at: int
     south: int
     front: int
@@ -138,7 +119,9 @@ def decode(data: bytes, levels: tuple[Levels, Levels], state: State) -> Mask:
 
 def _engine() -> Callable[..., Any] | None:
     """`_run` compiled, or None where numba cannot be imported."""
-    helpers = (_rows_around, _mark, _common_state, _code_flag, _code_segment)
+    helpers: tuple[Callable[..., Any], ...]
+    helpers = (rows_around, common_state, _level_rows, _mark, _states_around)
+    helpers += (_code_flag, _code_segment)
     return compiled(_run, helpers)
 
 
@@ -165,27 +148,11 @@ def _start(
     return work.bits, engine(decoding, shape, memory, ARRAYS, work, span, source)
 
 
-def _rows_around(t: int, z: int, y: int, r: int, shape: tuple[int, int, int, int]) -> Rows:
-    """The rows around the row (t, z, y), whose number is r."""
+def _level_rows(t: int, z: int, y: int, r: int, shape: tuple[int, int, int, int]) -> LevelRows:
+    """The levels of the row (t, z, y), whose number is r, and those after it."""
     n0, n1, n2, n3 = shape
-    m2 = n3 + 2 * PADDING
-    m1 = m2 * n2
-    m0 = m1 * n1
-    row, at = (r + 1) * m2 + PADDING, r * n3
-    return Rows(
-        row,
-        row - m2 if y > 0 else PADDING,
-        row - 2 * m2 if y > 1 else PADDING,
-        row - m1 if z > 0 else PADDING,
-        row - 2 * m1 if z > 1 else PADDING,
-        row - m1 - m2 if z > 0 and y > 0 else PADDING,
-        row - m1 + m2 if z > 0 and y + 1 < n2 else PADDING,
-        row - m0 if t > 0 else PADDING,
-        row - 2 * m0 if t > 1 else PADDING,
-        row - m0 - m2 if t > 0 and y > 0 else PADDING,
-        row - m0 + m2 if t > 0 and y + 1 < n2 else PADDING,
-        row - m0 - m1 if t > 0 and z > 0 else PADDING,
-        row - m0 + m1 if t > 0 and z + 1 < n1 else PADDING,
+    at = r * n3
+    return LevelRows(
         at,
         at + n3 if y + 1 < n2 else at,
         at + n3 * n2 if z + 1 < n1 else at,
@@ -200,33 +167,19 @@ def _mark(bit: int, level: int) -> int:
     return 1 if bit == 1 else 2
 
 
-def _common_state(
+def _states_around(
     g: int, t: int, z: int, y: int, shape: tuple[int, int, int, int], states: Sequence
-) -> tuple[int, int]:
-    """State that all segments around segment g have, as far as they exist; and how many exist.
-
-    The state is MIXED where they differ and NOTHING where none exists.
-    """
-    segments = (shape[3] + SEGMENT - 1) // SEGMENT
-    g2 = segments + 1
+) -> tuple[int, int, int, int]:
+    """States of the segments before segment g, along x, y, z and t."""
+    g2 = (shape[3] + SEGMENT - 1) // SEGMENT + 1
     g1 = g2 * shape[2]
     g0 = g1 * shape[1]
-    same, around = NOTHING, 0
-    for k in range(4):
-        near = NOTHING
-        if k == 0:
-            near = states[g - 1]
-        elif k == 1 and y > 0:
-            near = states[g - g2]
-        elif k == 2 and z > 0:
-            near = states[g - g1]
-        elif k == 3 and t > 0:
-            near = states[g - g0]
-        if near == NOTHING:
-            continue
-        around += 1
-        same = near if same in (NOTHING, near) else MIXED
-    return same, around
+    return (
+        states[g - 1],
+        states[g - g2] if y > 0 else NOTHING,
+        states[g - g1] if z > 0 else NOTHING,
+        states[g - g0] if t > 0 else NOTHING,
+    )
 
 
 def _code_flag(
@@ -235,7 +188,8 @@ def _code_flag(
     same: int,
     around: int,
     informed: int,
-    rows: Rows,
+    row: int,
+    at: int,
     stream: Stream,
     memory: Memory,
     rate: Sequence,
@@ -245,12 +199,12 @@ def _code_flag(
 
     Args:
         x0, x1: first vertex of the segment, and one past its last.
-        same, around: what `_common_state` returned.
+        same, around: what `common_state` returned.
         informed: whether any level of the mask is above 0.
-        rows: the rows around.
+        row, at: where the row begins in the marks, and in bits and levels.
         stream, memory, rate, work: of the run.
     """
-    bits, level, at, row = work.bits, work.level, rows.at, rows.row
+    bits, level = work.bits, work.level
     low, high = LEVELS - 1, 0
     for x in range(x0, x1):
         low = min(low, level[at + x])
@@ -282,6 +236,7 @@ def _code_segment(
     x1: int,
     n3: int,
     rows: Rows,
+    level_rows: LevelRows,
     stream: Stream,
     memory: Memory,
     tables: Tables,
@@ -294,7 +249,7 @@ def _code_segment(
     """
     bits, level, marks = work.bits, work.level, work.marks
     where, inputs = work.where, work.inputs
-    row, north, below, back, at = rows.row, rows.north, rows.below, rows.back, rows.at
+    row, north, below, back, at = rows.row, rows.north, rows.below, rows.back, level_rows.at
     ones = 0
     for x in range(x0, x1):
         a = level[at + x]
@@ -319,9 +274,9 @@ def _code_segment(
         sums = ((w + n + nw + ne) * 6 + p + pw + pe + ps + pn) * 8 + b + bw + be + bs + bn + bf + bp
         against = (a * 3 + (marks[row + x - 1] >> 1)) * 3 + (marks[north + x] >> 1)
         south, front, later = (
-            level[rows.south + x] >> 2,
-            level[rows.front + x] >> 2,
-            level[rows.later + x] >> 2,
+            level[level_rows.south + x] >> 2,
+            level[level_rows.front + x] >> 2,
+            level[level_rows.later + x] >> 2,
         )
         plane = w2 << 4 | nw << 5 | ne << 6 | n2 << 7 | pe << 8 | ps << 9 | be << 10 | bs << 11
         second = w2 << 4 | n2 << 5 | p2 << 6 | b2 << 7 | be << 8 | bs << 9 | bf << 10 | pe << 11
@@ -336,20 +291,17 @@ def _code_segment(
         where[8] = STARTS[8] + (nearest | second)
         where[9] = STARTS[9] + (half << 7 | before)
         first, second = a * LANES, (LEVELS + nearest) * LANES
-        p = mix(CONTEXTS, where, inputs, first, second, memory, tables)
-        bit = code_bit(bits[at + x], p, stream)
-        learn(
+        bit = code_mixed(
             CONTEXTS,
-            where,
-            inputs,
+            bits[at + x],
             first,
             second,
-            p,
-            bit,
-            SLOW_LIMIT,
             LEARNING_RATE,
+            where,
+            inputs,
+            stream,
             memory,
-            tables.rate,
+            tables,
         )
         bits[at + x] = bit
         marks[row + x] = _mark(bit, a)
@@ -380,16 +332,28 @@ def _run(
 
     for r in range(n0 * n1 * n2):
         t, z, y = r // n2 // n1, r // n2 % n1, r % n2
-        rows = _rows_around(t, z, y, r, shape)
+        rows = rows_around(t, z, y, r, shape)
+        levels = _level_rows(t, z, y, r, shape)
         for s in range(segments):
             g = r * (segments + 1) + 1 + s
             x0, x1 = s * SEGMENT, min((s + 1) * SEGMENT, n3)
-            same, around = _common_state(g, t, z, y, shape, work.states)
+            before = _states_around(g, t, z, y, shape, work.states)
+            same, around = common_state(before, NOTHING, MIXED)
             state = _code_flag(
-                x0, x1, same, around, informed, rows, stream, memory, tables.rate, work
+                x0,
+                x1,
+                same,
+                around,
+                informed,
+                rows.row,
+                levels.at,
+                stream,
+                memory,
+                tables.rate,
+                work,
             )
             if state == NOTHING:
-                state = _code_segment(x0, x1, n3, rows, stream, memory, tables, work)
+                state = _code_segment(x0, x1, n3, rows, levels, stream, memory, tables, work)
             work.states[g] = state
     if not decoding:
         finish(stream)

@@ -32,6 +32,7 @@ __all__ = [
     "Stream",
     "Tables",
     "code_bit",
+    "code_mixed",
     "code_simple",
     "compiled",
     "finish",
@@ -167,7 +168,7 @@ def compiled(
         return None
     numba, extending = modules
     shared: tuple[Callable[..., Any], ...]
-    shared = (code_bit, code_simple, start_range, finish, log16, mix, learn)
+    shared = (code_bit, code_simple, start_range, finish, log16, mix, learn, code_mixed)
     with _LOCK:
         if run not in _COMPILED:
             for helper in {*shared, *helpers} - _JITABLE:
@@ -338,3 +339,23 @@ def learn(
         memory.fast[at] = fast + (((target - fast) * rate[min(seen, FAST_LIMIT)]) >> 16)
         if seen < limit:
             memory.count[at] = seen + 1
+
+
+def code_mixed(
+    n: int,
+    bit: int,
+    first: int,
+    second: int,
+    learning_rate: int,
+    where: Sequence,
+    inputs: Sequence,
+    stream: Stream,
+    memory: Memory,
+    tables: Tables,
+) -> int:
+    """Code a bit that n estimates predict together, and adapt them; arguments as for `learn`."""
+    p = mix(n, where, inputs, first, second, memory, tables)
+    bit = code_bit(bit, p, stream)
+    rate = tables.rate
+    learn(n, where, inputs, first, second, p, bit, SLOW_LIMIT, learning_rate, memory, rate)
+    return bit

@@ -24,6 +24,7 @@ from fhash_formats.transform.entropy.table import single_band
 from fhash_formats.transform.tile.labelled import unpack_labelled
 from fhash_formats.transform.tile.sections import (
     EXACT,
+    MANY,
     Shape,
     TileStream,
     little_endian,
@@ -150,7 +151,8 @@ def _decode_labelled(
 ) -> Decoded:
     """The values and mask of a tile of labels."""
     assert stream.body is not None, "a stream of labels has a body"
-    values, mask = unpack_labelled(stream.body, shape, kind, masked=stream.masked)
+    many = bool(stream.flags & MANY)
+    values, mask = unpack_labelled(stream.body, shape, kind, masked=stream.masked, many=many)
     if settings is not None:
         values = blank_unoccupied(values, mask, settings)
     return (values[_every(lod)], None) if lod else (values, mask)

@@ -45,7 +45,7 @@ from fhash_formats.transform.values.elementwise import (
 )
 from fhash_formats.transform.values.quantise import LARGEST, dequantise, quantise
 
-__all__ = ["CodedTile", "Coding", "encode_tile", "exact_tile"]
+__all__ = ["CodedTile", "Coding", "encode_tile", "exact_tile", "labelled_tile"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
@@ -157,6 +157,21 @@ def exact_tile(
     return CodedTile(data=data, decoded=values.copy(), nonzero=0)
 
 
+def labelled_tile(
+    values: Values,
+    settings: TileSettings | None = None,
+    occupied: Mask | None = None,
+    *,
+    many: bool = False,
+) -> CodedTile | None:
+    """A tile stored as labels, without loss; None for one of too many different values.
+
+    The arguments are those of `exact_tile`, and `many` of `build_labelled_stream`.
+    """
+    data = build_labelled_stream(values, settings, occupied, many=many)
+    return None if data is None else CodedTile(data=data, decoded=values.copy(), nonzero=0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Task:
     """A tile to code.
@@ -239,11 +254,12 @@ def _task(values: Values, settings: TileSettings, coding: Coding, in_coreset: Ma
 
 def _labelled_tile(task: _Task) -> CodedTile | None:
     """A tile of labels, without loss; None for one of too many different values."""
-    data = build_labelled_stream(task.values, task.own_settings, task.occupied)
-    if data is None:
+    many = task.settings.many_labels
+    tile = labelled_tile(task.values, task.own_settings, task.occupied, many=many)
+    if tile is None:
         return None
-    decoded = blank_unoccupied(task.values.copy(), task.occupied, task.settings)
-    return CodedTile(data=data, decoded=decoded, nonzero=0)
+    decoded = blank_unoccupied(tile.decoded, task.occupied, task.settings)
+    return CodedTile(data=tile.data, decoded=decoded, nonzero=0)
 
 
 def _empty_tile(task: _Task) -> CodedTile:

@@ -45,6 +45,7 @@ __all__ = [
     "FORMAT",
     "LABELS",
     "LABELS_MASKED",
+    "MANY",
     "MASKED",
     "MISSING",
     "OWN",
@@ -97,6 +98,8 @@ LABELS = 5 << 5
 """Format number of a stream of labels."""
 LABELS_MASKED = 6 << 5
 """Format number of a stream of labels, with a mask."""
+MANY = 16
+"""Flag of a stream of labels that has more than 256 of them."""
 
 _NUMBER = 0xE0
 """Bits of the flags that hold the format number."""
@@ -208,7 +211,7 @@ def parse_stream(data: bytes | memoryview) -> TileStream:
             f"a coded tile begins with {flags:#04x}, which is no known stream format"
         )
     masked = number in (MASKED, PREDICTED_MASKED, LABELS_MASKED)
-    if labelled and flags & ~_NUMBER & ~OWN:
+    if labelled and flags & ~_NUMBER & ~(OWN | MANY):
         raise DamagedFileError("a coded tile is of labels and something else as well")
     predicted = number in (PREDICTED, PREDICTED_MASKED)
     coded = not flags & (EXACT | EMPTY) and not labelled

@@ -25,7 +25,9 @@ __all__ = ["TileSettings"]
 
 _REQUIRED = frozenset({"transform", "step", "center", "range"})
 """Keys of settings that have no default."""
-_KEYS = _REQUIRED | {"offsets", "double", "quantum", "head", "mask", "predictor", "clip", "labels"}
+_SWITCHES = ("double", "clip", "labels", "many_labels")
+"""Keys of settings that are true or false."""
+_KEYS = _REQUIRED | {"offsets", "quantum", "head", "mask", "predictor", *_SWITCHES}
 """All keys of settings."""
 _LISTS = "range is [low, high] and offsets are three whole numbers"
 """Message for a range or offsets that are no lists."""
@@ -53,6 +55,7 @@ class TileSettings:
             the array, so that neither residual nor rounding takes them beyond it. Files up to
             version 1.1 never are.
         labels: whether tiles may be coded as labels, without loss.
+        many_labels: whether such tiles may have 65,536 labels instead of 256; needs `labels`.
     """
 
     transform: TransformSpec
@@ -68,6 +71,7 @@ class TileSettings:
     predictor: Predictor | None = None
     clip: bool = False
     labels: bool = False
+    many_labels: bool = False
 
     def __post_init__(self) -> None:
         for name in ("step", "center", "low", "high", "quantum"):
@@ -89,6 +93,8 @@ class TileSettings:
             )
         if self.head is not None and self.double:
             raise InputError("a head works in float32 only")
+        if self.many_labels and not self.labels:
+            raise InputError("many_labels needs labels")
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -105,6 +111,7 @@ class TileSettings:
             "predictor": self.predictor is not None,
             "clip": self.clip,
             "labels": self.labels,
+            "many-labels": self.many_labels,
         }
         return tuple(name for name, is_used in used.items() if is_used)
 
@@ -132,6 +139,8 @@ class TileSettings:
             result["clip"] = True
         if self.labels:
             result["labels"] = True
+        if self.many_labels:
+            result["many_labels"] = True
         return result
 
     @classmethod
@@ -147,7 +156,7 @@ class TileSettings:
         offsets = values.get("offsets", [0, 0, 0])
         if not isinstance(offsets, list | tuple):
             raise InputError(_LISTS)
-        switches = {name: values.get(name, False) for name in ("double", "clip", "labels")}
+        switches = {name: values.get(name, False) for name in _SWITCHES}
         for name, switch in switches.items():
             if not isinstance(switch, bool):
                 raise InputError(f"{name} is true or false")

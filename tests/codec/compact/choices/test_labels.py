@@ -5,9 +5,12 @@ from __future__ import annotations
 import lzma
 
 import numpy as np
+import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.compact import plan as planning
+from fhash_codec.compact.choices.labels import is_hopeless
 
 
 def moving_regions() -> np.ndarray:
@@ -51,3 +54,53 @@ def test_other_promises_and_many_values_need_no_labels(tmp_path) -> None:
     assert "labels" not in encoded(tmp_path, moving_regions(), max_error=1.0, effort=1)[1]
     noise = np.random.default_rng(0).integers(0, 9999, (2, 4, 20, 20)).astype("i2")
     assert "labels" not in encoded(tmp_path, noise, effort=1)[1]
+
+
+def grains(count: int) -> np.ndarray:
+    """Columns (3, 4, 40, 60) of `count` numbers in a random order, some of which change."""
+    chance = np.random.default_rng(1)
+    numbers = chance.permutation(count)[np.arange(600).reshape(20, 30) % count]
+    values = np.broadcast_to(numbers.repeat(2, 0).repeat(2, 1), (3, 4, 40, 60)).copy()
+    values[1:, :, 10:20, 10:30] = values[1:, :, 11:21, 10:30]
+    return values.astype("u2") * 7
+
+
+@pytest.mark.parametrize(("count", "many"), [(256, False), (257, True), (600, True)])
+def test_many_labels_need_their_feature(tmp_path, count, many) -> None:
+    values = grains(count)
+    size, features, decoded = encoded(tmp_path, values)
+    assert "labels" in features
+    assert ("many-labels" in features) is many
+    np.testing.assert_array_equal(decoded, values)
+    assert 20 * size < values.nbytes
+
+
+@pytest.mark.parametrize(
+    ("other", "entropy", "hopeless"),
+    [
+        (125, 200, True),  # a first guess much above labels, though these found a structure
+        (124, 200, False),
+        (100, 103, True),  # noise, which no way takes for anything else
+        (99, 103, False),
+        (100, 104, False),  # labels found a little structure
+    ],
+)
+def test_trials_end_where_they_cannot_gain(other: float, entropy: float, hopeless: bool) -> None:
+    assert is_hopeless(100, other, entropy) is hopeless
+
+
+def test_noise_is_planned_without_further_trials(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(planning, "_improved", lambda *_: pytest.fail("a trial of noise"))
+    noise = np.random.default_rng(0).integers(0, 6, (2, 8, 24, 24)).astype("u1")
+    size, features, decoded = encoded(tmp_path, noise)
+    assert "labels" in features
+    np.testing.assert_array_equal(decoded, noise)
+    assert size < noise.size * np.log2(6) / 8 + 2000
+
+
+def test_smooth_values_are_tried_further(tmp_path) -> None:
+    t, z, y, x = np.indices((2, 8, 24, 24))
+    smooth = np.rint(120 + 100 * np.sin(x / 9 + t / 3) * np.cos(y / 7 + z / 5)).astype("u1")
+    size, _, decoded = encoded(tmp_path, smooth)
+    np.testing.assert_array_equal(decoded, smooth)
+    assert 3 * size < smooth.size

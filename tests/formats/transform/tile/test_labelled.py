@@ -12,7 +12,8 @@ from fhash_formats.errors import DamagedFileError
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
-from fhash_formats.transform.tile.labelled import build_labelled_stream
+from fhash_formats.transform.tile.labelled import build_labelled_stream, has_regions
+from fhash_formats.transform.tile.sections import MANY
 
 SHAPE = (2, 4, 9, 20)
 LABELLED = replace(SETTINGS, labels=True, quantum=0.0)
@@ -87,3 +88,66 @@ def test_damage_is_an_error_or_changes_nothing() -> None:
         except DamagedFileError:
             continue
         assert same(decoded, values)
+
+
+@pytest.mark.parametrize("dtype", ["u2", "i4", "u8", "f4", "f8"])
+def test_many_labels_come_back_bit_by_bit(dtype: str) -> None:
+    numbers = np.random.default_rng(0).permutation(3000)[:300].reshape(1, 1, 15, 20)
+    values = numbers.repeat(4, 2).repeat(5, 3).astype(dtype)
+    if dtype[0] == "f":
+        values[0, 0, 0, :4] = [np.nan, -0.0, np.inf, -np.inf]
+    settings = replace(LABELLED, many_labels=True)
+    coded = encode_tile(values, settings, Coding(error=0.0, keep_missing=False))
+    assert coded.data[0] == 5 << 5 | MANY
+    assert decode_tile(coded.data, values.shape, dtype, settings).tobytes() == values.tobytes()
+
+
+@pytest.mark.parametrize("count", [256, 257])
+def test_many_labels_are_those_above_256(count: int) -> None:
+    values = (np.arange(600).reshape(1, 1, 20, 30) % count).astype("i4")
+    data = build_labelled_stream(values, None, None, many=True)
+    assert data is not None
+    assert bool(data[0] & MANY) is (count > 256)
+    # The label of unoccupied vertices counts.
+    occupied = np.ones(values.shape, bool)
+    occupied[0, 0, 19] = False
+    masked = build_labelled_stream(values, None, occupied, many=True)
+    assert masked is not None
+    assert masked[0] & MANY
+    settings = replace(LABELLED, mask=MaskLevels(), many_labels=True)
+    decoded, mask = decode_tile_mask(masked, values.shape, "i4", settings)
+    np.testing.assert_array_equal(mask, occupied)
+    np.testing.assert_array_equal(decoded[mask], values[mask])
+
+
+@pytest.mark.parametrize(("count", "there"), [(65536, True), (65537, False)])
+def test_at_most_65536_many_labels(count: int, there: bool) -> None:
+    values = (np.arange(65600).reshape(1, 1, 200, 328) % count * 3).astype("i4")
+    assert (build_labelled_stream(values, None, None, many=True) is not None) is there
+
+
+def test_a_palette_of_consecutive_values_takes_few_bytes() -> None:
+    values = np.arange(40, 440, dtype="i4").reshape(1, 1, 20, 20).repeat(4, 2).repeat(4, 3)
+    data = build_labelled_stream(values, None, None, many=True)
+    assert data is not None
+    assert int.from_bytes(data[7:11], "little") < 40
+
+
+def test_damage_of_many_labels_is_an_error_or_changes_nothing() -> None:
+    values = (np.arange(280).reshape(1, 1, 14, 20) * 5).astype("i2")
+    data = build_labelled_stream(values, None, None, many=True)
+    assert data is not None
+    few = bytes([data[0] & ~MANY]) + data[1:]
+    for damaged in [few, *list(damaged_copies(data))[::7]]:
+        try:
+            decoded = decode_tile(damaged, values.shape, "i2", SETTINGS)
+        except DamagedFileError:
+            continue
+        assert same(decoded, values)
+
+
+@pytest.mark.parametrize(("equal", "regions"), [(49, False), (50, True)])
+def test_regions_are_half_of_the_vertices_with_an_equal_neighbour(equal, regions) -> None:
+    row = np.arange(100)
+    row[1 : 2 * equal : 2] = row[: 2 * equal : 2]
+    assert has_regions(row.reshape(1, 1, 1, 100)) is regions
