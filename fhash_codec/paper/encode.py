@@ -55,10 +55,10 @@ def encode_paper(
         loss = _write_coded_tables(writer, series, selection, trained, config, progress)
     else:
         write_tables(writer, architecture, coreset, trained.fine, trained.tables, config.tables)
-    write_model(writer, coreset, trained.layers)
+        write_model(writer, coreset, trained.layers)
     header = _header(series, selection, trained, config)
     if loss is not None:
-        header["required_features"] = ["transform"]
+        header["required_features"] = ["transform", "labels"]
         header["model"]["tables_loss_db"] = round(loss, 4)
     return header, trained.checkpoint
 

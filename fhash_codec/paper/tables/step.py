@@ -17,17 +17,19 @@ import numpy as np
 from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
-from fhash_codec.paper.network import Floats, Network
+from fhash_codec.paper.network import Floats, Layer, Network
 from fhash_codec.paper.storage import component_name
 from fhash_codec.paper.tables.bricks import Bricks
 from fhash_codec.paper.tables.codings import MIN_STEP, choose_codings
 from fhash_codec.paper.tables.loss import Samples
+from fhash_codec.paper.tables.small_parts import quantised_layers, write_layers, write_mask
 from fhash_codec.paper.tables.step_search import StepSearch, Window
 from fhash_codec.paper.tables.tiles import Index, LevelCoding, TiledTable, tile_shape
 from fhash_codec.paper.tables.trained_tables import TrainedTable, trained_tables
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
 from fhash_formats.support.threads import thread_pool
+from fhash_formats.transform.tile.settings import TileSettings
 
 MAX_LOSS = 0.1
 """dB that coding may cost over the samples where no PSNR is promised or the promise is lost."""
@@ -49,8 +51,14 @@ TRIALS_OF_ALL = 12
 """Steps tried on all samples."""
 TRIALS_OF_LEVEL = 6
 """Steps of one level that are tried where no step of all levels ends in the window."""
+ROUNDS_OF_LEVELS = 2
+"""Largest number of times that every level is gone through for such a step."""
 MORE_TRIALS = 20
 """Further steps tried while none has kept the allowed error."""
+LAYERS_SHARE = 0.04
+"""Share of the error that coding may add, for the quantised layers."""
+LAYER_TILES = 8
+"""About the number of tiles at which the error of the layers is measured."""
 MIN_TABLES_ERROR = 1e-20
 """Smallest mean squared error that coding may reach, for tables without any error."""
 
@@ -62,12 +70,16 @@ class CodedTables:
     Attributes:
         step: the quantiser step of the finest table, and usually of all.
         tables: the tables, finest first.
+        layers: weight and bias of each layer, as the file has them.
+        layer_settings: how the weights of each layer are coded; None for plain numbers.
         loss: dB of PSNR over the samples at the key frames that coding costs.
         error: mean squared error over the samples.
     """
 
     step: float
     tables: list[TiledTable]
+    layers: Sequence[Layer]
+    layer_settings: Sequence[TileSettings | None]
     loss: float
     error: float
 
@@ -108,7 +120,7 @@ class _Coding:
         self,
         architecture: Architecture,
         trained: Sequence[TrainedTable],
-        layers: Sequence[tuple[Floats, Floats]],
+        layers: Sequence[Layer],
         samples: Samples,
         psnr: float | None,
         workers: ThreadPoolExecutor,
@@ -117,13 +129,15 @@ class _Coding:
         self._architecture, self._trained, self._layers = architecture, trained, layers
         self._samples = samples
         self._workers, self._progress = workers, progress
-        self._network_before = self._network(trained)
         self._all, self._some = list(samples.counts), samples.choose(SAMPLE)
         progress("measuring the model", 0, 1, "")
-        self._error_before = self._error(self._network_before, self._all)
-        self._error_of_some = self._error(self._network_before, self._some)
+        self._error_before = self._error(self._network(trained), self._all)
         # All samples decide whether the promise can be kept: some may be far easier than the rest.
         self._allowed, self._width = _allowed_error(self._error_before, psnr)
+        self._quantise_layers()
+        self._network_before = self._network(trained)
+        self._error_of_all = self._error(self._network_before, self._all)
+        self._error_of_some = self._error(self._network_before, self._some)
         self._codings: list[LevelCoding] = []
         self._min_step = MIN_STEP
 
@@ -136,9 +150,21 @@ class _Coding:
         if len(self._some) < len(self._all):
             step = self._search(step, self._some, SAMPLE_WIDTH).step
         coded = self._search(step, self._all, self._width)
-        for level in range(len(self._trained)):
-            coded = self._with_larger_step(coded, level)
+        for _ in range(ROUNDS_OF_LEVELS):
+            for level in self._levels:
+                coded = self._with_larger_step(coded, level)
         return coded
+
+    def _quantise_layers(self) -> None:
+        """Replace the layers by those that the file will have."""
+        few = self._some[:: -(-len(self._some) // LAYER_TILES)]
+        before = self._error(self._network(self._trained), few)
+
+        def error(layers: Sequence[Layer]) -> float:
+            return self._error(self._network(self._trained, layers), few)
+
+        added = LAYERS_SHARE * (self._allowed - self._error_before)
+        self._layers, self._layer_settings = quantised_layers(self._layers, error, before + added)
 
     def _guess(self) -> float:
         """Return the step of a uniform quantiser with the error step^2 / 12 that adds the error.
@@ -147,7 +173,7 @@ class _Coding:
         values.
         """
         numbers = sum(prod(table.shape) for table in self._trained)
-        added = self._allowed - self._error_before
+        added = max(self._allowed - self._error_of_all, 0.0)
         return math.sqrt(12 * added * self._samples.total / numbers)
 
     def _choose_codings(self, step: float) -> None:
@@ -220,7 +246,7 @@ class _Coding:
 
     def _window(self, width: float) -> Window:
         """Return the window of a search that ends so many dB above the least allowed PSNR."""
-        return Window.of(self._error_before, self._allowed, width)
+        return Window.of(min(self._error_of_all, self._allowed), self._allowed, width)
 
     def _tiled(self, level: int, step: float) -> TiledTable:
         """Return the table of a level, to be coded with a step."""
@@ -228,27 +254,35 @@ class _Coding:
 
     def _coded(self, tables: list[TiledTable], tiles: Sequence[Index]) -> CodedTables:
         """Return coded tables with their error, which is measured on some tiles."""
-        before = self._error_before
+        error = self._error(self._network(tables), tiles)
         if tiles is not self._all:
-            before = self._error_of_some
-        # Coding adds about the same error everywhere, unlike training.
-        error = self._error_before + self._error(self._network(tables), tiles) - before
+            # Coding adds about the same error everywhere, unlike training.
+            error += self._error_of_all - self._error_of_some
         loss = 0.0
         if error > 0 and self._error_before > 0:
             loss = 10 * math.log10(error / self._error_before)
-        return CodedTables(step=tables[0].step, tables=tables, loss=loss, error=error)
+        return CodedTables(
+            step=tables[0].step,
+            tables=tables,
+            layers=self._layers,
+            layer_settings=self._layer_settings,
+            loss=loss,
+            error=error,
+        )
 
     def _error(self, network: Network, tiles: Sequence[Index]) -> float:
         """Return the mean squared error of a network at the samples of some tiles."""
         squares, count = self._samples.squares(network, tiles)
         return squares / count
 
-    def _network(self, tables: Sequence[TrainedTable | TiledTable]) -> Network:
+    def _network(
+        self, tables: Sequence[TrainedTable | TiledTable], layers: Sequence[Layer] | None = None
+    ) -> Network:
         return Network(
             levels=self._architecture.levels,
             embedding_size=self._architecture.embedding_size,
             tables=tables,
-            layers=tuple(self._layers),
+            layers=tuple(self._layers if layers is None else layers),
             box_size=self._architecture.box_size,
             key_frames=self._architecture.key_frames,
         )
@@ -264,7 +298,7 @@ def write_coded(
     psnr: float | None,
     progress: Progress,
 ) -> float:
-    """Code trained tables and write them; return the dB of PSNR that this costs.
+    """Code and write a trained model; return the dB of PSNR that this costs.
 
     The arguments are those of `code_tables`, after the container that is being written.
     """
@@ -272,6 +306,8 @@ def write_coded(
         coded = code_tables(architecture, coreset, fine, tables, layers, psnr, workers, progress)
         for level, table in enumerate(coded.tables, start=1):
             _write_table(writer, level, table)
+    write_layers(writer, coded.layers, coded.layer_settings)
+    write_mask(writer, coreset)
     return coded.loss
 
 
