@@ -101,6 +101,14 @@ class EncodeConfig:
         high=100_000,
         profile="paper",
     )
+    train_on_seconds: int = option(
+        3600,
+        "paper: time that training may take beyond its epochs where --tables transform "
+        "would miss --psnr",
+        low=0,
+        high=10**9,
+        profile="paper",
+    )
     learning_rate: float = option(
         0.01, "paper: Adam's learning rate at the start", low=1e-8, high=1.0, profile="paper"
     )

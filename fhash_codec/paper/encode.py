@@ -12,9 +12,16 @@ from fhash_codec.header import brief_history, describe_source, write_series
 from fhash_codec.paper.selection import Selection, select
 from fhash_codec.paper.storage import write_model, write_tables
 from fhash_codec.paper.training.fit import TrainedModel, train_model
+from fhash_codec.paper.training.rounds import Goal
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
 from fhash_formats.series import Series
+
+RESERVE = 0.5
+"""dB above a promised PSNR that a model should have before its tables are coded.
+
+Without them the quantiser step would have to be so small that the file is far larger.
+"""
 
 
 def encode_paper(
@@ -40,19 +47,39 @@ def encode_paper(
     """
     selection = select(series, config, progress, mask)
     coreset, architecture = selection.coreset, selection.architecture
-    trained = train_model(coreset, architecture, config, path, progress)
+    goal = _goal(selection, series, config)
+    trained = train_model(coreset, architecture, config, path, progress, goal)
     write_series(writer, series, selection.scanned, coreset.key_frames)
     loss = None
     if config.tables == "transform":
         loss = _write_coded_tables(writer, series, selection, trained, config, progress)
     else:
         write_tables(writer, architecture, coreset, trained.fine, trained.tables, config.tables)
-    write_model(writer, coreset, trained.layers)
+        write_model(writer, coreset, trained.layers)
     header = _header(series, selection, trained, config)
     if loss is not None:
-        header["required_features"] = ["transform"]
+        header["required_features"] = ["transform", "labels"]
         header["model"]["tables_loss_db"] = round(loss, 4)
     return header, trained.checkpoint
+
+
+def _goal(selection: Selection, series: Series, config: EncodeConfig) -> Goal | None:
+    """Return the quality for which the training goes on; None where nothing is to be kept."""
+    promised = _promised(selection, series, config)
+    if promised is None:
+        return None
+    seconds = float(config.train_on_seconds)
+    return Goal(psnr=promised + RESERVE, promised=promised, seconds=seconds)
+
+
+def _promised(selection: Selection, series: Series, config: EncodeConfig) -> float | None:
+    """Return the PSNR in dB that coded tables must keep at the key frames, if any.
+
+    A promised PSNR covers every time step, but training and coding see key frames only. They can
+    keep the promise only where every time step is a key frame.
+    """
+    every_step = len(selection.coreset.key_frames) == series.shape[0]
+    return config.psnr if every_step and config.tables == "transform" else None
 
 
 def _write_coded_tables(
@@ -67,9 +94,6 @@ def _write_coded_tables(
     # Only `--tables transform` needs these modules.
     from fhash_codec.paper.tables.step import write_coded
 
-    # A promised PSNR covers every time step, but the search for the quantiser step sees key frames
-    # only. It can keep the promise only where every time step is a key frame.
-    every_step = len(selection.coreset.key_frames) == series.shape[0]
     return write_coded(
         writer,
         selection.architecture,
@@ -77,7 +101,7 @@ def _write_coded_tables(
         trained.fine,
         trained.tables,
         trained.layers,
-        config.psnr if every_step else None,
+        _promised(selection, series, config),
         progress,
     )
 

@@ -78,6 +78,11 @@ class PaperModel:
 
     def _unpack(self, first: int, last: int) -> npt.NDArray[np.bool_]:
         """Return the occupancy (z, y, x) of the box at either of two key frames."""
-        stored = self._container.arrays["occupancy/bits"]
+        arrays = self._container.arrays
+        if "occupancy/mask" in arrays:
+            space = tuple(slice(0, length) for length in self._box.shape)
+            mask = arrays["occupancy/mask"].read((slice(first, last + 1), *space)) != 0
+            return np.asarray(mask[0] | mask[-1])
+        stored = arrays["occupancy/bits"]
         bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
         return unpack(between(bits[0], bits[-1]), self._box.shape)

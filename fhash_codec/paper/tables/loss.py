@@ -33,6 +33,7 @@ class Samples:
     Attributes:
         counts: number of samples of each tile that holds any, by its place, in C order.
         tile: vertices (t, z, y, x) of a tile.
+        total: number of samples of all tiles.
         sizes: vertices (t, z, y, x) of the finest level.
     """
 
@@ -45,6 +46,7 @@ class Samples:
             for keys, box in [self._keys_and_box(index)]
         }
         self.counts = {index: count for index, count in counts.items() if count}
+        self.total = sum(self.counts.values())
 
     def choose(self, samples: int) -> list[Index]:
         """Return evenly spread tiles, at least one, in C order.

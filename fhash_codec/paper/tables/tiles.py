@@ -102,6 +102,11 @@ class TiledTable:
         return result
 
     @property
+    def step(self) -> float:
+        """The quantiser step of all components."""
+        return self.coding.settings[0].step
+
+    @property
     def shard(self) -> tuple[int, ...]:
         """Vertices (t, z, y, x) of a shard."""
         return shard_shape(self.coding.tile, self.grid)

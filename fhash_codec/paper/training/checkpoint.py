@@ -28,8 +28,8 @@ MAX_NAME_BYTES = 250
 """Bytes of a checkpoint's file name, with those that a temporary name adds; systems allow 255."""
 PARTIAL_BYTES = 24
 """Bytes that a temporary name adds while the checkpoint is written."""
-UNRELATED = ("psnr", "tables", "timings")
-"""Settings that change neither the model nor the course of its training."""
+UNRELATED = ("psnr", "tables", "timings", "train_on_seconds")
+"""Settings that do not change the course of a training, but at most where it ends."""
 
 
 def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Path:

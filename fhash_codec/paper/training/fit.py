@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from math import prod
 from pathlib import Path
@@ -15,6 +15,7 @@ import numpy.typing as npt
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.training.rounds import Goal, Round, decide, extended
 from fhash_codec.progress import Progress, silent
 from fhash_codec.training.devices import choose_device
 from fhash_formats.errors import (
@@ -73,6 +74,7 @@ def train_model(
     config: EncodeConfig,
     path: Path,
     progress: Progress = silent,
+    goal: Goal | None = None,
 ) -> TrainedModel:
     """Train the model of a coreset.
 
@@ -85,6 +87,8 @@ def train_model(
         config: the settings.
         path: the output file.
         progress: called after each batch.
+        goal: quality for which the training goes on beyond its epochs, each time with a
+            FhashWarning; None to end it after them.
 
     Raises:
         TrainingError: no learning rate gives a model.
@@ -93,7 +97,7 @@ def train_model(
     """
     from fhash_codec.paper.training.train import Diverged
 
-    fitting = _Fitting(coreset, architecture, config, path, progress)
+    fitting = _Fitting(coreset, architecture, config, path, progress, goal)
     while True:
         try:
             return fitting.run()
@@ -113,13 +117,14 @@ class _Fitting:
         config: EncodeConfig,
         path: Path,
         progress: Progress,
+        goal: Goal | None,
     ) -> None:
         """Read the checkpoint if there is one."""
         from fhash_codec.paper.training.checkpoint import checkpoint_path, load_checkpoint
         from fhash_codec.paper.training.train import TrainingProgress
 
         self._coreset, self._architecture, self._config = coreset, architecture, config
-        self._progress = progress
+        self._progress, self._goal = progress, goal
         self._device: torch.device = choose_device(config.device)
         self._checkpoint = checkpoint_path(path, coreset, config)
         saved = load_checkpoint(self._checkpoint)
@@ -128,35 +133,71 @@ class _Fitting:
 
     def run(self) -> TrainedModel:
         """Train to the end of the plan. Raises Diverged where the learning rate is too high."""
-        from fhash_codec.paper.training.train import train
         from fhash_codec.training.threads import threads_for
 
         plan = self._plan()
         engine = self._engine(plan)
-        finished_before = self._reached.epoch == plan.epochs
         vertices = plan.batch_bricks * prod(self._coreset.brick_shape)
         with deferred_interrupts() as stop, threads_for(vertices):
-            save = partial(self._save, engine, stop)
-            done = train(
-                engine,
-                plan,
-                self._coreset,
-                self._reached,
-                stop=stop,
-                save=save,
-                progress=self._progress,
-            )
-            # Later work may fail or be interrupted as well. A training worth keeping is kept until
-            # the output file is complete.
-            worth_keeping = stop.asked or self._reached.seconds > KEEP_SECONDS
-            if done and not finished_before and worth_keeping:
-                save(self._reached)
+            while self._trained_to_end(engine, plan, stop):
+                further = self._next_round(engine, plan)
+                if further is None:
+                    break
+                plan = further
+                engine.rates = plan.rates
         if stop.asked:
             raise InterruptedEncodingError(
                 f"interrupted after {self._reached.epoch} of {plan.epochs} epochs; "
                 f"saved in {self._checkpoint}; the same command goes on from there"
             )
         return self._trained(engine, plan)
+
+    def _trained_to_end(self, engine: Engine, plan: TrainingPlan, stop: StopRequest) -> bool:
+        """Train to the end of a plan; return whether it was reached."""
+        from fhash_codec.paper.training.train import train
+
+        finished_before = self._reached.epoch == plan.epochs
+        save = partial(self._save, engine, stop)
+        done = train(
+            engine,
+            plan,
+            self._coreset,
+            self._reached,
+            stop=stop,
+            save=save,
+            progress=self._progress,
+        )
+        # Later work may fail or be interrupted as well. A training worth keeping is kept until
+        # the output file is complete.
+        worth_keeping = stop.asked or self._reached.seconds > KEEP_SECONDS
+        if done and not finished_before and worth_keeping:
+            save(self._reached)
+        return done
+
+    def _next_round(self, engine: Engine, plan: TrainingPlan) -> TrainingPlan | None:
+        """Return the plan with a further round; None where the training ends.
+
+        All samples are measured, once for each round. What follows is told in a warning.
+        """
+        from fhash_codec.paper.training.train import probe_psnr
+
+        if self._goal is None:
+            return None
+        psnr = probe_psnr(engine, self._coreset, np.arange(plan.bricks))
+        reached = self._reached
+        decision = decide(
+            self._goal,
+            float("inf") if psnr is None else psnr,
+            reached.epoch,
+            reached.seconds,
+            [Round(**earlier) for earlier in reached.rounds],  # type: ignore[arg-type]
+        )
+        if decision.message:
+            warnings.warn(decision.message, FhashWarning, stacklevel=4)
+        if decision.round is None:
+            return None
+        reached.rounds.append(asdict(decision.round))
+        return extended(plan, decision.round.epochs, self._config.schedule)
 
     def restart(self, error: TrainingError) -> None:
         """Begin again at a lower learning rate, with a warning.
@@ -180,7 +221,7 @@ class _Fitting:
     def _plan(self) -> TrainingPlan:
         from fhash_codec.paper.training.train import plan_training
 
-        return plan_training(
+        plan = plan_training(
             self._coreset,
             epochs=self._config.epochs,
             learning_rate=self._reached.rate(self._config.learning_rate),
@@ -188,6 +229,9 @@ class _Fitting:
             batch=self._config.batch,
             seed=self._config.seed,
         )
+        for earlier in self._reached.rounds:
+            plan = extended(plan, int(earlier["epochs"]), self._config.schedule)
+        return plan
 
     def _engine(self, plan: TrainingPlan) -> Engine:
         """Return a new engine, in the state of the checkpoint if there is one."""

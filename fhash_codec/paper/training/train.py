@@ -129,6 +129,7 @@ class TrainingProgress:
         seconds: time spent, restarts included.
         history: {seconds, epoch, psnr} after epochs; psnr is None where the error is 0.
         restarts: number of restarts, each at LOWER times the learning rate before.
+        rounds: the further rounds so far, each as the fields of `rounds.Round`.
     """
 
     epoch: int = 0
@@ -136,6 +137,7 @@ class TrainingProgress:
     seconds: float = 0.0
     history: list[dict[str, float | None]] = field(default_factory=list)
     restarts: int = 0
+    rounds: list[dict[str, float]] = field(default_factory=list)
 
     def rate(self, configured: float) -> float:
         """Return the learning rate of the first step, given the one that was configured."""

@@ -30,6 +30,8 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
     Raises DamagedFileError that names the first array that is missing or does not fit.
     """
     for name, shape, dtypes in _required_arrays(header):
+        if name == "occupancy/bits" and "occupancy/mask" in arrays:
+            continue
         if name not in arrays:
             raise DamagedFileError(f"array {name} is missing")
         _check_array(name, arrays[name], shape, dtypes)
@@ -106,14 +108,14 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
     for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
         yield f"coords/{axis}", (length,), ("float64",)
     if model["profile"] == COMPACT:
-        key_frames, *box = model["levels"][0]
+        key_frames = model["levels"][0][0]
         yield "key_frames", (key_frames,), ("int64",)
         yield (
             "occupancy/bits",
             (key_frames, occupancy_bytes(header["feature_bounding_box"])),
             ("uint8",),
         )
-        yield "occupancy/mask", (key_frames, *box), ("uint8",)
+    yield "occupancy/mask", tuple(model["levels"][0]), ("uint8",)
     yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import QualityError
+from fhash_codec import FhashWarning, QualityError
 from fhash_codec.paper.tables.step import MAX_LOSS
 from fhash_formats.container import Container
 
@@ -40,20 +40,41 @@ def test_the_loss_is_within_its_limit_and_what_is_said(pair) -> None:
             np.testing.assert_array_equal(volume.occupancy(t), other.occupancy(t))
 
 
-def test_a_promise_is_kept_and_no_more(waves, coded_config, tmp_path) -> None:
+@pytest.mark.parametrize("below", [1.0, 6.0, 10.0])
+def test_a_promise_is_kept_and_no_more(waves, coded_config, tmp_path, below) -> None:
     source = waves()
-    free = fhash_codec.encode(source, tmp_path / "a.fhz", replace(coded_config, epochs=10))
-    wanted = free["psnr"] - 6.0
-    figures = fhash_codec.encode(
-        source, tmp_path / "b.fhz", replace(coded_config, epochs=10, psnr=wanted)
-    )
-    assert wanted <= figures["psnr"] < wanted + 0.5
-    assert figures["bytes"] < 0.97 * free["bytes"]
-    assert figures["tables_loss_db"] == pytest.approx(6.0, abs=0.6)
-    with pytest.raises(QualityError) as missed:
-        fhash_codec.encode(source, tmp_path / "c.fhz", replace(coded_config, epochs=1, psnr=150.0))
-    # Out of reach anyway: then only the usual loss is taken.
+    config = replace(coded_config, epochs=10)
+    free = fhash_codec.encode(source, tmp_path / "a.fhz", config)
+    wanted = free["psnr"] - below
+    figures = fhash_codec.encode(source, tmp_path / "b.fhz", replace(config, psnr=wanted))
+    assert wanted <= figures["psnr"] < wanted + 0.1
+    assert figures["bytes"] < free["bytes"]
+    assert figures["tables_loss_db"] == pytest.approx(below + MAX_LOSS, abs=0.1)
+
+
+def test_a_promise_out_of_reach_costs_no_bytes(waves, coded_config, tmp_path) -> None:
+    config = replace(coded_config, epochs=2)
+    free = fhash_codec.encode(waves(), tmp_path / "a.fhz", config)
+    with (
+        pytest.warns(FhashWarning, match="ends at its limit of 0 more seconds: the model has"),
+        pytest.raises(QualityError, match="150 dB were asked for") as missed,
+    ):
+        fhash_codec.encode(
+            waves(), tmp_path / "b.fhz", replace(config, psnr=150.0, train_on_seconds=0)
+        )
     assert missed.value.figures["tables_loss_db"] <= MAX_LOSS + 1e-4
+    assert missed.value.figures["bytes"] <= free["bytes"] + 40  # the texts of the settings
+
+
+def test_training_goes_on_for_a_promise(waves, coded_config, tmp_path) -> None:
+    config = replace(coded_config, epochs=2)
+    free = fhash_codec.encode(waves(), tmp_path / "a.fhz", config)
+    wanted = free["psnr"] + 1.0
+    with pytest.warns(FhashWarning, match=r"training goes on for \d+ epochs"):
+        figures = fhash_codec.encode(waves(), tmp_path / "b.fhz", replace(config, psnr=wanted))
+    assert wanted <= figures["psnr"] < wanted + 0.1
+    with fhash_codec.open(tmp_path / "b.fhz") as volume:
+        assert volume.info["training"]["epochs"] > 2
 
 
 @pytest.mark.parametrize(

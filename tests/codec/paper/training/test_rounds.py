@@ -1,0 +1,87 @@
+"""Further rounds of a training: when they come, how long they are, and when they end."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fhash_codec.config import EncodeConfig
+from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.training.fit import train_model
+from fhash_codec.paper.training.rounds import MAX_DOUBLINGS, Goal, Round, decide, extended
+from fhash_formats.errors import FhashWarning
+
+GOAL = Goal(psnr=45.5, promised=45.0, seconds=100.0)
+
+
+@pytest.mark.parametrize("psnr", [45.5, 60.0, math.inf])
+def test_a_model_that_is_good_enough_is_not_trained_on(psnr) -> None:
+    decision = decide(GOAL, psnr, 20, 10.0, [])
+    assert (decision.round, decision.message) == (None, "")
+
+
+def test_a_round_doubles_the_epochs_and_says_so() -> None:
+    decision = decide(GOAL, 44.0, 20, 10.0, [])
+    assert decision.round == Round(epochs=20, psnr=44.0, seconds=10.0)
+    assert "goes on for 20 epochs: the model has 44.00 dB over all samples" in decision.message
+    assert "45 dB are promised" in decision.message
+    again = decide(GOAL, 44.8, 40, 20.0, [decision.round])
+    assert again.round == Round(epochs=40, psnr=44.8, seconds=20.0)
+
+
+@pytest.mark.parametrize(("seconds", "epochs"), [(50.0, 40), (51.0, 38), (70.0, 17), (96.0, 1)])
+def test_a_round_fits_into_the_time_that_is_left(seconds, epochs) -> None:
+    before = [Round(epochs=20, psnr=40.0, seconds=0.0)]
+    decision = decide(GOAL, 44.0, 40, seconds, before)
+    assert decision.round == Round(epochs=epochs, psnr=44.0, seconds=seconds)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 1.0])
+def test_the_limit_in_time_is_said_plainly(seconds) -> None:
+    goal = Goal(psnr=45.5, promised=45.0, seconds=seconds)
+    decision = decide(goal, 44.0, 20, 100.0, [])
+    assert decision.round is None
+    assert f"ends at its limit of {seconds:g} more seconds" in decision.message
+    assert "--train-on-seconds" in decision.message
+
+
+@pytest.mark.parametrize(("gain", "goes_on"), [(1.01, True), (0.99, False), (-1.0, False)])
+def test_a_training_that_hardly_learns_ends(gain, goes_on) -> None:
+    before = [Round(epochs=20, psnr=45.5 - MAX_DOUBLINGS - gain, seconds=1.0)]
+    decision = decide(GOAL, 45.5 - MAX_DOUBLINGS, 40, 2.0, before)
+    assert (decision.round is not None) == goes_on
+    if not goes_on:
+        assert f"brought {gain:.2f} dB" in decision.message
+
+
+def test_a_round_has_rates_of_its_own(setup, coreset) -> None:
+    plan, _ = setup(coreset)
+    longer = extended(plan, 3, "cosine")
+    assert longer.epochs == plan.epochs + 3
+    assert len(longer.rates) == longer.epochs * plan.batches + 1
+    np.testing.assert_array_equal(longer.rates[: len(plan.rates)], plan.rates)
+    further = longer.rates[len(plan.rates) :]
+    assert (np.diff(further) < 0).all()
+    assert further[0] < 0.5 * plan.rates[0]
+    assert further[-1] == pytest.approx(0, abs=1e-12)
+    assert (extended(plan, 3, "constant").rates[len(plan.rates) :] == 0.5 * plan.rates[0]).all()
+
+
+def test_a_training_goes_on_to_its_goal(coreset, tmp_path) -> None:
+    config = EncodeConfig(profile="paper", epochs=2, width=8, batch=20_000)
+    architecture = Architecture.for_box(coreset.box.shape, 3, width=8)
+    first = train_model(coreset, architecture, config, tmp_path / "a.fhz")
+    psnr = first.history[-1]["psnr"]
+    assert psnr is not None
+    goal = Goal(psnr=psnr + 2.0, promised=psnr + 1.5, seconds=1e6)
+    with pytest.warns(FhashWarning, match="training goes on"):
+        trained = train_model(coreset, architecture, config, tmp_path / "a.fhz", goal=goal)
+    reached = trained.history[-1]["psnr"]
+    assert reached is not None
+    assert reached > goal.psnr - 0.01
+    assert trained.epochs in (4, 8, 16, 32)
+    # The first epochs are those of the training without a goal.
+    assert trained.history[1]["psnr"] == pytest.approx(psnr, abs=0.01)
+    assert [point["epoch"] for point in trained.history] == list(range(1, trained.epochs + 1))
