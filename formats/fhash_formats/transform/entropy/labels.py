@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +37,8 @@ CANDIDATE_SETS = 3 * 16 + 3 * 4
 SIMPLES = 10
 """Simple estimates, those of the flags of segments; more labels have one more."""
 
-Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+Labels = npt.NDArray[Any]
+"""Labels of type uint8, or uint16 where there are more than MAX_NARROW."""
 
 
 @cache

@@ -37,7 +37,8 @@ from fhash_formats.transform.entropy.rows_portable import (
 
 __all__ = ["decode", "encode"]
 
-Labels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+Labels = npt.NDArray[Any]
+"""Labels of type uint8, or uint16 where there are more than MAX_NARROW."""
 
 CONTEXTS = 8
 """Estimates that are mixed for a decision about a candidate."""

@@ -50,9 +50,8 @@ def has_regions(values: Values) -> bool:
     """Whether REGION_SHARE of the values equal the one before along one of the four axes."""
     equal = np.zeros(values.shape, bool)
     for axis in range(4):
-        before, after = [[slice(None)] * 4, [slice(None)] * 4]
-        before[axis], after[axis] = slice(None, -1), slice(1, None)
-        equal[tuple(after)] |= values[tuple(after)] == values[tuple(before)]
+        moved, marks = np.moveaxis(values, axis, 0), np.moveaxis(equal, axis, 0)
+        marks[1:] |= moved[1:] == moved[:-1]
     return bool(equal.mean() >= REGION_SHARE)
 
 
