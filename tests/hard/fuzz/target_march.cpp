@@ -56,8 +56,8 @@ void make_values(Reader& in, FhashMarch& m, Arrays& arrays) {
     m.values = arrays.values.data();
 }
 
-// Find the visible cells of every second brick, for intervals between finite values; the others keep
-// hostile ones.
+// Find the visible cells of every second brick, for intervals between finite values; the others
+// keep hostile ones.
 void find_cells(Reader& in, const FhashMarch& m, Arrays& arrays) {
     const int64_t intervals = in.within(0, 20);
     std::vector<float> limits = in.numbers<float>(2 * intervals);
