@@ -225,5 +225,5 @@ def _spec(kinds: Sequence[tuple[str, int]], tile: Shape) -> TransformSpec:
 
 
 def _single(value: float) -> float:
-    """Return a number rounded to float32."""
-    return float(np.float32(value))
+    """Return a number rounded to float32, by the fewest digits that stand for it."""
+    return float(str(np.float32(value)))

@@ -100,10 +100,10 @@ def _weight_settings(weight: Floats, share: float) -> TileSettings | None:
         return None
     return TileSettings(
         transform=_PLAIN,
-        step=float(np.float32(share * size)),
+        step=float(str(np.float32(share * size))),
         center=0.0,
-        low=float(weight.min()),
-        high=float(weight.max()),
+        low=float(str(weight.min())),
+        high=float(str(weight.max())),
     )
 
 

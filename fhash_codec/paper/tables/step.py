@@ -208,10 +208,11 @@ class _Coding:
             trials, stage = TRIALS_OF_ALL, "coding tables"
         best: CodedTables | None = None
         for trial in range(trials + MORE_TRIALS):
-            self._progress(stage, min(trial, trials), trials, f"step {search.step:.3g}")
-            coded = self._coded([self._tiled(level, search.step) for level in self._levels], tiles)
+            step = search.step
+            self._progress(stage, min(trial, trials), trials, f"step {step:.3g}")
+            coded = self._coded([self._tiled(level, step) for level in self._levels], tiles)
             search.add(coded.error)
-            if search.best == coded.step:
+            if search.best == step:
                 best = coded
             if search.done or (best is not None and trial + 1 >= trials):
                 break
@@ -249,7 +250,8 @@ class _Coding:
         return Window.of(min(self._error_of_all, self._allowed), self._allowed, width)
 
     def _tiled(self, level: int, step: float) -> TiledTable:
-        """Return the table of a level, to be coded with a step."""
+        """Return the table of a level, to be coded with a step of a few digits."""
+        step = float(f"{step:.6g}")
         return TiledTable(self._trained[level], self._codings[level].with_step(step), self._workers)
 
     def _coded(self, tables: list[TiledTable], tiles: Sequence[Index]) -> CodedTables:
@@ -315,7 +317,7 @@ def _write_table(writer: ContainerWriter, level: int, table: TiledTable) -> None
     """Write each component of a coded table; levels count from 1."""
     coding = table.coding
     for component, (settings, mixing) in enumerate(
-        zip(coding.settings, coding.mixing.tolist(), strict=True)
+        zip(coding.settings, coding.mixing, strict=True)
     ):
         writer.add_sharded(
             component_name(level, component + 1),
@@ -325,7 +327,7 @@ def _write_table(writer: ContainerWriter, level: int, table: TiledTable) -> None
             shard_shape=table.shard,
             chunks=table.streams(component),
             dimension_names=("t", "z", "y", "x"),
-            attributes={"mixing": mixing},
+            attributes={"mixing": [float(str(number)) for number in mixing]},
             codecs=[
                 {"name": "fhash.transform", "configuration": settings.to_dict()},
                 {"name": "crc32c"},
