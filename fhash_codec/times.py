@@ -1,17 +1,19 @@
 """Times as people write and read them: dates where the series has a calendar, else numbers.
 
-`time_of` takes what `--time` takes; `time_text` gives what pictures and tables show.
+`time_of` takes what `--time` takes, `times_of` a range of times; `time_text` gives what pictures and
+tables show.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Coordinate
-from fhash_formats.support.dates import SECOND, Clock, clock, instants
+from fhash_formats.support.dates import DATE, SECOND, Clock, clock, instants
 
 DIGITS = (6, 17)
 """Fewest and most digits of a number."""
@@ -51,6 +53,68 @@ def time_of(coordinate: Coordinate, text: str | float, source: str) -> float:
     if not coordinate.values.min() <= time <= coordinate.values.max():
         raise RegionError(f"{source}: time {text} is outside the series, {_range(coordinate)}")
     return time
+
+
+def times_of(coordinate: Coordinate, text: str, source: str) -> tuple[float, float, float | None]:
+    """The first time, the last time and the time between two pictures of FIRST:LAST[:EVERY].
+
+    An end is what `time_of` takes, or nothing for that of the series. Colons within dates are told
+    from those between them: of several readings that one is taken whose dates have minutes with
+    their hours, and which has ends that are written alike.
+
+    Args:
+        coordinate: times of the steps.
+        text: the range; EVERY is a number above 0, in the units of the coordinate, or left out.
+        source: name of the file, for messages.
+
+    Raises ValueError for text that is no range, InputError for an end that is no time, and
+    RegionError for one outside the steps.
+    """
+    first, last, every = min(_readings(text), key=_oddness, default=(None, None, None))
+    if first is None or last is None:
+        raise ValueError(text)
+    values = coordinate.values
+    ends = [
+        time_of(coordinate, end, source) if end else float(values[place])
+        for end, place in ((first, 0), (last, -1))
+    ]
+    return ends[0], ends[1], None if every is None else float(every)
+
+
+def _readings(text: str) -> list[tuple[str, str, str | None]]:
+    """Every way to read FIRST:LAST[:EVERY], with ends that look like times."""
+    parts = [part.strip() for part in text.split(":")]
+    found: list[tuple[str, str, str | None]] = []
+    for middle, stop in itertools.combinations(range(1, len(parts) + 1), 2):
+        first, last = ":".join(parts[:middle]), ":".join(parts[middle:stop])
+        if stop < len(parts) - 1 or not (_is_end(first) and _is_end(last)):
+            continue
+        every = parts[stop] if stop < len(parts) else None
+        if every is None or _is_number(every) and float(every) > 0:
+            found.append((first, last, every))
+    return found
+
+
+def _oddness(reading: tuple[str, str, str | None]) -> tuple[int, bool]:
+    """Hours without minutes, and whether the two ends are not written alike."""
+    dates = [end for end in reading[:2] if end and not _is_number(end)]
+    matches = [match for end in dates if (match := DATE.fullmatch(end))]
+    bare = sum(match["hour"] is not None and match["minute"] is None for match in matches)
+    return bare, len({date.count(":") for date in dates}) > 1
+
+
+def _is_end(text: str) -> bool:
+    """Whether a text is empty, a number or in the form of a date."""
+    return not text or _is_number(text) or DATE.fullmatch(text) is not None
+
+
+def _is_number(text: str) -> bool:
+    """Whether a text is a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def time_text(coordinate: Coordinate, time: float) -> str:

@@ -88,7 +88,7 @@ def add_animation_options(command: Command) -> Command:
         "--animate",
         metavar="SPEC",
         help="steps[=A:B[:EVERY]], time[=A:B[:EVERY]], orbit[=DEGREES], separated by commas,"
-        " or a file (TOML, JSON).",
+        " or a file (TOML, JSON). Times may be dates.",
     )
     @click.option(
         "--frames", type=click.IntRange(1, 100_000), metavar="N", help="Pictures of an animation."
