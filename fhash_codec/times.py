@@ -1,7 +1,7 @@
 """Times as people write and read them: dates where the series has a calendar, else numbers.
 
-`time_of` takes what `--time` takes, `times_of` a range of times; `time_text` gives what pictures and
-tables show.
+`time_of` takes what `--time` takes, `times_of` a range of times; `time_text` gives what pictures
+and tables show.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _readings(text: str) -> list[tuple[str, str, str | None]]:
         if stop < len(parts) - 1 or not (_is_end(first) and _is_end(last)):
             continue
         every = parts[stop] if stop < len(parts) else None
-        if every is None or _is_number(every) and float(every) > 0:
+        if every is None or (_is_number(every) and float(every) > 0):
             found.append((first, last, every))
     return found
 

@@ -19,7 +19,7 @@ from fhash_codec.rendering.scene.record import Record, limits
 from fhash_codec.rendering.scene.scene import Camera, Effects, Scene, TransferFunctionSpec
 from fhash_codec.times import times_of
 from fhash_codec.volume import Volume
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, RegionError
 
 __all__ = ["Animation", "Key"]
 
@@ -164,6 +164,8 @@ class Animation(Record):
         for name, _, value in words:
             try:
                 values |= _field(name, value, volume)
+            except (InputError, RegionError):
+                raise  # they are ValueErrors, too, and say more
             except ValueError:
                 raise InputError(
                     f"animation '{text[:60]}': '{name}={value}' is malformed; "

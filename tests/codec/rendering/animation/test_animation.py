@@ -58,6 +58,9 @@ def test_times_may_be_dates(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> 
         Animation.parse("time=2001-02-11", volume)
     with pytest.raises(RegionError, match="outside the series"):
         Animation.parse("time=2001-02-11:2002-01-01", volume)
+    monkeypatch.setitem(volume.coords, "t", dataclasses.replace(dated, attributes={"units": "s"}))
+    with pytest.raises(InputError, match="the times are no dates"):
+        Animation.parse("time=2001-02-11:2002-01-01", volume)
 
 
 def test_a_whole_turn_ends_before_it_begins_again(volume: Volume) -> None:
