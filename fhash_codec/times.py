@@ -1,12 +1,13 @@
 """Times as people write and read them: dates where the series has a calendar, else numbers.
 
-`time_of` takes what `--time` takes, and the dates of Python, numpy and cftime; `time_text` gives
-what pictures and tables show.
+`time_of` takes what `--time` takes, and the dates of Python, numpy and cftime; `time_range` takes a
+range of times; `time_text` gives what pictures and tables show.
 """
 
 from __future__ import annotations
 
 import datetime
+import itertools
 import math
 from typing import Any, Protocol
 
@@ -15,7 +16,7 @@ import numpy.typing as npt
 
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Coordinate
-from fhash_formats.support.dates import CALENDARS, SECOND, Clock, clock, instants
+from fhash_formats.support.dates import CALENDARS, DATE, SECOND, Clock, clock, instants
 
 DIGITS = (6, 17)
 """Fewest and most digits of a number."""
@@ -121,6 +122,68 @@ def _readable(time: Time, found: Clock | None, source: str) -> str | float:
         year += 1
     clock_time = f"{time.hour}:{time.minute:02}:{time.second:02}.{time.microsecond:06}"  # type: ignore[union-attr]
     return f"{year}-{time.month}-{time.day}T{clock_time}"  # type: ignore[union-attr]
+
+
+def time_range(coordinate: Coordinate, text: str, source: str) -> tuple[float, float, float | None]:
+    """The first time, the last time and the time between two pictures of FIRST:LAST[:EVERY].
+
+    An end is what `time_of` takes, or nothing for that of the series. Colons within dates are told
+    from those between them: of several readings that one is taken whose dates have minutes with
+    their hours, and which has ends that are written alike.
+
+    Args:
+        coordinate: times of the steps.
+        text: the range; EVERY is a number above 0, in the units of the coordinate, or left out.
+        source: name of the file, for messages.
+
+    Raises ValueError for text that is no range, InputError for an end that is no time, and
+    RegionError for one outside the steps.
+    """
+    first, last, every = min(_readings(text), key=_oddness, default=(None, None, None))
+    if first is None or last is None:
+        raise ValueError(text)
+    values = coordinate.values
+    ends = [
+        time_of(coordinate, end, source) if end else float(values[place])
+        for end, place in ((first, 0), (last, -1))
+    ]
+    return ends[0], ends[1], None if every is None else float(every)
+
+
+def _readings(text: str) -> list[tuple[str, str, str | None]]:
+    """Every way to read FIRST:LAST[:EVERY], with ends that look like times."""
+    parts = [part.strip() for part in text.split(":")]
+    found: list[tuple[str, str, str | None]] = []
+    for middle, stop in itertools.combinations(range(1, len(parts) + 1), 2):
+        first, last = ":".join(parts[:middle]), ":".join(parts[middle:stop])
+        if stop < len(parts) - 1 or not (_is_end(first) and _is_end(last)):
+            continue
+        every = parts[stop] if stop < len(parts) else None
+        if every is None or (_is_number(every) and float(every) > 0):
+            found.append((first, last, every))
+    return found
+
+
+def _oddness(reading: tuple[str, str, str | None]) -> tuple[int, bool]:
+    """Hours without minutes, and whether the two ends are not written alike."""
+    dates = [end for end in reading[:2] if end and not _is_number(end)]
+    matches = [match for end in dates if (match := DATE.fullmatch(end))]
+    bare = sum(match["hour"] is not None and match["minute"] is None for match in matches)
+    return bare, len({date.count(":") for date in dates}) > 1
+
+
+def _is_end(text: str) -> bool:
+    """Whether a text is empty, a number or in the form of a date."""
+    return not text or _is_number(text) or DATE.fullmatch(text) is not None
+
+
+def _is_number(text: str) -> bool:
+    """Whether a text is a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def time_text(coordinate: Coordinate, time: float) -> str:

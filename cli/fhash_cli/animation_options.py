@@ -88,7 +88,7 @@ def add_animation_options(command: Command) -> Command:
         "--animate",
         metavar="SPEC",
         help="steps[=A:B[:EVERY]], time[=A:B[:EVERY]], orbit[=DEGREES], separated by commas,"
-        " or a file (TOML, JSON).",
+        " or a file (TOML, JSON). Times may be dates.",
     )
     @click.option(
         "--frames", type=click.IntRange(1, 100_000), metavar="N", help="Pictures of an animation."
@@ -106,7 +106,8 @@ def add_animation_options(command: Command) -> Command:
         "--processes",
         type=click.IntRange(1, 256),
         metavar="N",
-        help="Processes that render at a time; the files are the same.  [default: 1]",
+        help="Processes that render at a time, for films of some hundred pictures or more: one uses"
+        " all cores too, and each further one takes a second to start.  [default: 1]",
     )
     @click.option(
         "--evolution",

@@ -88,8 +88,6 @@ class SceneOptions:
             _put(values, place, value)
         if values.get("step") is not None and float(values["step"]) < 0:
             values["step"] += volume.shape[0]
-        if isinstance(values.get("time"), str):
-            values["time"] = time_of(volume, values["time"])
         for name in self.effects:
             _put(values, f"effects.{_effect(name)}", True)
         if self.isosurfaces:
@@ -101,6 +99,8 @@ class SceneOptions:
                     f"--set {setting}: write PLACE=VALUE, such as effects.shading.ambient=0.3"
                 )
             _put(values, place.strip(), _json(text))
+        if isinstance(values.get("time"), str):
+            values["time"] = time_of(volume, values["time"])
         return Scene.from_dict(values)
 
 

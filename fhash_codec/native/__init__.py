@@ -16,7 +16,7 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
 
-ABI_VERSION = 2
+ABI_VERSION = 3
 """Number that `fhash_codec_abi_version()` must return; it equals `FHASH_CODEC_ABI` in codec.cpp."""
 
 _KINDS = ("f32", "f64")
@@ -37,9 +37,13 @@ PROTOTYPES: Prototypes = {
     # march_light.cpp
     "fhash_march_extinction": (
         *(*(ARRAY,) * 3, INTEGER, REAL, REAL, INTEGER, ARRAY),
-        *(INTEGER, INTEGER, ARRAY, ARRAY),
+        *(INTEGER, INTEGER, ARRAY, ARRAY, ARRAY),
     ),
     "fhash_march_sum": (*(ARRAY,) * 3, *(INTEGER,) * 3, ARRAY),
+    # march_slopes.cpp
+    "fhash_march_smooth_layers": (*(ARRAY,) * 3, *(INTEGER,) * 3, ARRAY, ARRAY),
+    "fhash_march_smooth_rows": (*(ARRAY,) * 3, *(INTEGER,) * 3, ARRAY),
+    "fhash_march_factors": (*(ARRAY,) * 4, *(INTEGER,) * 3, ARRAY),
     # quality.cpp
     **{f"fhash_scan_{kind}": _SCAN for kind in _KINDS},
     **{f"fhash_errors_{kind}": _ERRORS for kind in _KINDS},

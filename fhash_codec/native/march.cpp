@@ -42,9 +42,10 @@ FHASH_EXPORT int64_t fhash_march(const FhashMarch* march, int64_t flags, int64_t
     if (flags & (MINIMUM | AVERAGE | ATTENUATED | GRADED))
         return fhash_march_effect(m, flags, first, stop, counters);
     Counters counted;
+    const bool differences = (flags & SHADED) && (m.central || m.smooth);
     if (flags & MAXIMUM) maximum(m, first, stop, counted);
-    else if ((flags & SHADED) && m.central && (flags & LIT)) central_lit(m, first, stop, counted);
-    else if ((flags & SHADED) && m.central) central(m, first, stop, counted);
+    else if (differences && (flags & LIT)) central_lit(m, first, stop, counted);
+    else if (differences) central(m, first, stop, counted);
     else if ((flags & SHADED) && (flags & LIT)) shaded_lit(m, first, stop, counted);
     else if (flags & LIT) lit(m, first, stop, counted);
     else if (flags & SHADED) shaded(m, first, stop, counted);

@@ -69,6 +69,7 @@ extern "C" struct FhashMarch {
     const float* grading;    // (FHASH_GRADES + 2,): factors of the extinction by gradient; or null
     double grade_scale;      // entries of that table to a gradient of shading of 1
     std::int64_t unlit;      // whether gradients are for opacity alone, not for shading
+    const float* smooth;     // (z, y, x): values whose central differences shade; or null
 };
 
 struct FhashCell {
@@ -76,8 +77,10 @@ struct FhashCell {
 };
 
 // The trilinear value at a place, clamped to the frame, and its gradient per vertex. A vertex of no
-// weight need not have a value; where it has none, the gradient has none (NaN).
-inline FhashCell fhash_cell_at(const FhashMarch& m, double x, double y, double z) {
+// weight need not have a value; where it has none, the gradient has none (NaN). values: (z, y, x) of
+// the frame's shape.
+inline FhashCell fhash_cell_in(const FhashMarch& m, const float* values, double x, double y,
+                               double z) {
     using std::max;
     using std::min;
     const int nx = (int)m.shape[2], ny = (int)m.shape[1], nz = (int)m.shape[0];
@@ -89,7 +92,7 @@ inline FhashCell fhash_cell_at(const FhashMarch& m, double x, double y, double z
     const int sx = nx > 1, sy = ny > 1 ? nx : 0;
     const std::int64_t sz = nz > 1 ? (std::int64_t)nx * ny : 0;
     const double fx = x - i, fy = y - j, fz = z - h;
-    const float* v = m.values + ((std::int64_t)h * ny + j) * nx + i;
+    const float* v = values + ((std::int64_t)h * ny + j) * nx + i;
     const double c[8] = {v[0],  v[sx],      v[sy],      v[sy + sx],
                          v[sz], v[sz + sx], v[sz + sy], v[sz + sy + sx]};
     // On a face whose vertices all have one value, exactly that value.
@@ -108,10 +111,16 @@ inline FhashCell fhash_cell_at(const FhashMarch& m, double x, double y, double z
     return {value, gx, gy, gz};
 }
 
+// The same for the values of the frame.
+inline FhashCell fhash_cell_at(const FhashMarch& m, double x, double y, double z) {
+    return fhash_cell_in(m, m.values, x, y, z);
+}
+
 // Replace the gradient of a cell by central differences: half of the difference between the values
 // one vertex on and one vertex back, clamped to the frame. Where one of them is missing, the cell's
-// gradient along that axis stays.
-inline void fhash_central(const FhashMarch& m, double x, double y, double z, FhashCell& cell) {
+// gradient along that axis stays. values: those of the frame, or smoother ones.
+inline void fhash_central(const FhashMarch& m, const float* values, double x, double y, double z,
+                          FhashCell& cell) {
     using std::max;
     using std::min;
     double at[3] = {min(max(x, 0.0), m.shape[2] - 1.0), min(max(y, 0.0), m.shape[1] - 1.0),
@@ -120,9 +129,10 @@ inline void fhash_central(const FhashMarch& m, double x, double y, double z, Fha
     for (int c = 0; c < 3; c++) {
         const double here = at[c];
         at[c] = here + 1;
-        const double behind = fhash_cell_at(m, at[0], at[1], at[2]).value;
+        const double behind = fhash_cell_in(m, values, at[0], at[1], at[2]).value;
         at[c] = here - 1;
-        const double difference = (behind - fhash_cell_at(m, at[0], at[1], at[2]).value) / 2;
+        const double before = fhash_cell_in(m, values, at[0], at[1], at[2]).value;
+        const double difference = (behind - before) / 2;
         at[c] = here;
         if (difference == difference) *slopes[c] = difference;
     }

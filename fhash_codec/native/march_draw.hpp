@@ -89,8 +89,15 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::show(Seen seen, Counters& 
     }
     if (seen.ending && seen.any) shorten();
     if (m.surfaces > 0) surfaces(counted);
-    if (seen.any && ((FLAGS & CENTRAL) || ((FLAGS & GRADED) && m.central))) slopes();
-    if (seen.any && (FLAGS & GRADED)) grade(counted);
+    const float* const lit = m.smooth ? m.smooth : m.values;
+    if (seen.any && (FLAGS & GRADED)) {
+        // Opacity by the gradients of the values themselves.
+        if (m.central) slopes(m.values);
+        grade(counted);
+        if (m.smooth && !m.unlit) slopes(m.smooth);
+    } else if (seen.any && (FLAGS & CENTRAL)) {
+        slopes(lit);
+    }
     if (seen.any) composite(counted);
     if (m.surfaces > 0) finish(counted);
     if (m.depth && (seen.any || m.surfaces > 0))

@@ -11,17 +11,19 @@ namespace {
 using std::int64_t;
 
 // Add `weight` times the extinctions of a row of values, linear between the entries of a table; a
-// missing value adds nothing. last: number of the last entry.
+// missing value adds nothing. last: number of the last entry. factors: of each extinction; or null.
 FHASH_CLONES void add_extinctions(const float* FHASH_RESTRICT row, int64_t count,
                                   const float* FHASH_RESTRICT table, float last, float low,
-                                  float scale, float weight, float* FHASH_RESTRICT sum) {
+                                  float scale, float weight, const float* factors,
+                                  float* FHASH_RESTRICT sum) {
     FHASH_INDEPENDENT
     for (int64_t i = 0; i < count; i++) {
         const float entry = (row[i] - low) * scale, least = entry > 0 ? entry : 0;
         const float at = least < last ? least : last;
         const int n = (int)at;
         const float extinction = table[n] + (at - (float)n) * (table[n + 1] - table[n]);
-        sum[i] += row[i] == row[i] ? weight * extinction : 0;
+        const float factor = factors ? factors[i] : 1;
+        sum[i] += row[i] == row[i] ? weight * extinction * factor : 0;
     }
 }
 
@@ -38,13 +40,14 @@ int64_t within(int64_t i, int64_t count) { return i < 0 ? 0 : i < count ? i : co
 
 // Extinctions at the points of a grid, which lie `cell` vertices apart: means of the vertices
 // around each, weighed by a tent. values: (z, y, x) of `shape`. table: (entries + 1,), the last one
-// twice; the entry of a value is (value - low) * scale. first, stop: layers of points. out: (z, y,
-// x) of `points`. scratch: a row of x.
+// twice; the entry of a value is (value - low) * scale. first, stop: layers of points. factors: (z,
+// y, x) of `shape`, of the extinctions at the vertices; or null. out: (z, y, x) of `points`.
+// scratch: a row of x.
 FHASH_EXPORT int64_t fhash_march_extinction(const float* values, const int64_t* shape,
                                             const float* table, int64_t entries, double low,
                                             double scale, int64_t cell, const int64_t* points,
-                                            int64_t first, int64_t stop, float* out,
-                                            float* scratch) {
+                                            int64_t first, int64_t stop, const float* factors,
+                                            float* out, float* scratch) {
     const int64_t nz = shape[0], ny = shape[1], nx = shape[2], reach = cell - 1;
     for (int64_t z = first; z < stop; z++)
         for (int64_t y = 0; y < points[1]; y++) {
@@ -55,7 +58,8 @@ FHASH_EXPORT int64_t fhash_march_extinction(const float* values, const int64_t* 
                     const double weight = (double)tent / (double)(cell * cell * cell * cell);
                     const int64_t row = within(z * cell + c, nz) * ny + within(y * cell + b, ny);
                     add_extinctions(values + row * nx, nx, table, (float)(entries - 1), (float)low,
-                                    (float)scale, (float)weight, scratch);
+                                    (float)scale, (float)weight,
+                                    factors ? factors + row * nx : nullptr, scratch);
                 }
             float* row = out + (z * points[1] + y) * points[2];
             for (int64_t x = 0; x < points[2]; x++) {

@@ -160,8 +160,8 @@ template <int FLAGS> struct Packet {
     FHASH_INLINE void sample(Counters& counted, Seen& seen);
     void shorten();
     void mend();
-    FHASH_INLINE void slopes();
-    void mend_slopes();
+    FHASH_INLINE void slopes(const float* values);
+    void mend_slopes(const float* values);
     // march_surfaces.hpp
     void see(int l, double sample, const FhashCell* cell, Counters& counted);
     FHASH_INLINE double root(int l, double level, double to, double now, Counters& counted) const;

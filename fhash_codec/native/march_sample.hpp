@@ -108,20 +108,20 @@ template <int FLAGS> void Packet<FLAGS>::mend() {
     }
 }
 
-// The trilinear value at a place within the frame.
-FHASH_INLINE float value_at(const FhashMarch& m, float x, float y, float z) {
+// The trilinear value at a place within the frame; values: (z, y, x) of the frame's shape.
+FHASH_INLINE float value_at(const FhashMarch& m, const float* values, float x, float y, float z) {
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
     const int i = min((int)x, max(lx - 2, 0)), j = min((int)y, max(ly - 2, 0));
     const int h = min((int)z, max(lz - 2, 0)), q = (h * ly + j) * lx + i;
-    return mixed(m.values, q, lx > 1, ly > 1 ? lx : 0, lz > 1 ? lx * ly : 0, x - i, y - j, z - h);
+    return mixed(values, q, lx > 1, ly > 1 ? lx : 0, lz > 1 ? lx * ly : 0, x - i, y - j, z - h);
 }
 
-// Replace the gradients by central differences, as fhash_central does.
-template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::slopes() {
+// Replace the gradients by central differences of values, as fhash_central does.
+template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::slopes(const float* values) {
     int lost = 0;
 #if defined(FHASH_AVX512)
     if constexpr (FLAGS & WIDE) {
-        lost = slopes_wide(*this);
+        lost = slopes_wide(*this, values);
     } else
 #endif
     {
@@ -132,27 +132,27 @@ template <int FLAGS> FHASH_INLINE void Packet<FLAGS>::slopes() {
         #pragma omp simd reduction(| : lost)
         for (int l = 0; l < N; l++) {
             const float x = px[l], y = py[l], z = pz[l];
-            const float east = value_at(m, min(x + 1, mx), y, z);
-            const float ex = (east - value_at(m, max(x - 1, 0.f), y, z)) * wx;
-            const float north = value_at(m, x, min(y + 1, my), z);
-            const float ey = (north - value_at(m, x, max(y - 1, 0.f), z)) * wy;
-            const float above = value_at(m, x, y, min(z + 1, mz));
-            const float ez = (above - value_at(m, x, y, max(z - 1, 0.f))) * wz;
+            const float east = value_at(m, values, min(x + 1, mx), y, z);
+            const float ex = (east - value_at(m, values, max(x - 1, 0.f), y, z)) * wx;
+            const float north = value_at(m, values, x, min(y + 1, my), z);
+            const float ey = (north - value_at(m, values, x, max(y - 1, 0.f), z)) * wy;
+            const float above = value_at(m, values, x, y, min(z + 1, mz));
+            const float ez = (above - value_at(m, values, x, y, max(z - 1, 0.f))) * wz;
             gx[l] = ex == ex ? ex : gx[l];
             gy[l] = ey == ey ? ey : gy[l];
             gz[l] = ez == ez ? ez : gz[l];
             lost |= (alpha[l] > 0) & !((ex == ex) & (ey == ey) & (ez == ez));
         }
     }
-    if (lost) mend_slopes();
+    if (lost) mend_slopes(values);
 }
 
 // Look again at the central differences of a pass, as `mend` does.
-template <int FLAGS> void Packet<FLAGS>::mend_slopes() {
+template <int FLAGS> void Packet<FLAGS>::mend_slopes(const float* values) {
     for (int l = 0; l < N; l++) {
         if (!(alpha[l] > 0)) continue;
         FhashCell here = fhash_cell_at(m, px[l], py[l], pz[l]);
-        fhash_central(m, px[l], py[l], pz[l], here);
+        fhash_central(m, values, px[l], py[l], pz[l], here);
         gx[l] = known_or_zero(here.gx * m.gradient[0]);
         gy[l] = known_or_zero(here.gy * m.gradient[1]);
         gz[l] = known_or_zero(here.gz * m.gradient[2]);

@@ -60,7 +60,8 @@ FHASH_INLINE void Packet<FLAGS>::add_surface(int l, double sample, const double*
         around = light_at(m, 1, (float)at[0], (float)at[1], (float)at[2]);
     }
     FhashCell slope = here;
-    if (m.central) fhash_central(m, at[0], at[1], at[2], slope);
+    if (m.smooth || m.central)
+        fhash_central(m, m.smooth ? m.smooth : m.values, at[0], at[1], at[2], slope);
     const float x = known_or_zero(slope.gx * m.gradient[0]);
     const float y = known_or_zero(slope.gy * m.gradient[1]);
     const float z = known_or_zero(slope.gz * m.gradient[2]);

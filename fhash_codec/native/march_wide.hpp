@@ -196,7 +196,8 @@ FHASH_AVX512 __attribute__((noinline)) int leap_wide(Packet<FLAGS>& p, Counters&
 struct Corners {
     __m512 fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3;
 };
-FHASH_WIDE Corners corners_at(const FhashMarch& m, __m512 x, __m512 y, __m512 z) {
+FHASH_WIDE Corners corners_at(const FhashMarch& m, const float* values, __m512 x, __m512 y,
+                              __m512 z) {
     const int lx = (int)m.shape[2], ly = (int)m.shape[1], lz = (int)m.shape[0];
     const int sy = ly > 1 ? lx : 0, sz = lz > 1 ? lx * ly : 0;
     const __m512i i = _mm512_min_epi32(_mm512_cvttps_epi32(x), _mm512_set1_epi32(lx - 2));
@@ -208,10 +209,10 @@ FHASH_WIDE Corners corners_at(const FhashMarch& m, __m512 x, __m512 y, __m512 z)
     c.fx = _mm512_sub_ps(x, _mm512_cvtepi32_ps(i));
     c.fy = _mm512_sub_ps(y, _mm512_cvtepi32_ps(j));
     c.fz = _mm512_sub_ps(z, _mm512_cvtepi32_ps(h));
-    pairs(m.values, q, c.a0, c.a1);
-    pairs(m.values + sy, q, c.a2, c.a3);
-    pairs(m.values + sz, q, c.b0, c.b1);
-    pairs(m.values + sz + sy, q, c.b2, c.b3);
+    pairs(values, q, c.a0, c.a1);
+    pairs(values + sy, q, c.a2, c.a3);
+    pairs(values + sz, q, c.b0, c.b1);
+    pairs(values + sz + sy, q, c.b2, c.b3);
     return c;
 }
 
@@ -228,7 +229,7 @@ FHASH_AVX512 __attribute__((noinline)) void sample_wide(Packet<FLAGS>& p, Counte
     const __m512 x = place(p.ox, p.dx, f, p.low[0], p.high[0]);
     const __m512 y = place(p.oy, p.dy, f, p.low[1], p.high[1]);
     const __m512 z = place(p.oz, p.dz, f, p.low[2], p.high[2]);
-    const auto [fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3] = corners_at(m, x, y, z);
+    const auto [fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3] = corners_at(m, m.values, x, y, z);
     const __m512 d0 = _mm512_sub_ps(a1, a0), d1 = _mm512_sub_ps(a3, a2);
     const __m512 d2 = _mm512_sub_ps(b1, b0), d3 = _mm512_sub_ps(b3, b2);
     const __m512 p0 = _mm512_fmadd_ps(fx, d0, a0), p1 = _mm512_fmadd_ps(fx, d1, a2);
@@ -281,8 +282,9 @@ FHASH_AVX512 __attribute__((noinline)) void sample_wide(Packet<FLAGS>& p, Counte
 }
 
 // The trilinear values at places within the frame.
-FHASH_WIDE __m512 values_at(const FhashMarch& m, __m512 x, __m512 y, __m512 z) {
-    const auto [fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3] = corners_at(m, x, y, z);
+FHASH_WIDE __m512 values_at(const FhashMarch& m, const float* values, __m512 x, __m512 y,
+                            __m512 z) {
+    const auto [fx, fy, fz, a0, a1, a2, a3, b0, b1, b2, b3] = corners_at(m, values, x, y, z);
     const __m512 near = between(between(a0, a1, fx), between(a2, a3, fx), fy);
     return between(near, between(between(b0, b1, fx), between(b2, b3, fx), fy), fz);
 }
@@ -298,7 +300,8 @@ FHASH_WIDE __mmask16 slope(__m512 behind, __m512 before, double factor, float* t
 
 // `slopes` by AVX-512. Returns whether a difference that is needed is missing.
 template <int FLAGS>
-FHASH_AVX512 __attribute__((noinline)) int slopes_wide(Packet<FLAGS>& p) {
+FHASH_AVX512 __attribute__((noinline)) int slopes_wide(Packet<FLAGS>& p,
+                                                        const float* values) {
     const FhashMarch& m = p.m;
     const __m512 zero = _mm512_setzero_ps(), one = _mm512_set1_ps(1.f);
     const __m512 mx = _mm512_set1_ps((float)(m.shape[2] - 1));
@@ -312,9 +315,11 @@ FHASH_AVX512 __attribute__((noinline)) int slopes_wide(Packet<FLAGS>& p) {
     const __m512 south = _mm512_max_ps(_mm512_sub_ps(y, one), zero);
     const __m512 above = _mm512_min_ps(_mm512_add_ps(z, one), mz);
     const __m512 below = _mm512_max_ps(_mm512_sub_ps(z, one), zero);
-    __mmask16 lost = slope(values_at(m, east, y, z), values_at(m, west, y, z), m.gradient[0], p.gx);
-    lost |= slope(values_at(m, x, north, z), values_at(m, x, south, z), m.gradient[1], p.gy);
-    lost |= slope(values_at(m, x, y, above), values_at(m, x, y, below), m.gradient[2], p.gz);
+    const float* const v = values;
+    __mmask16 lost =
+        slope(values_at(m, v, east, y, z), values_at(m, v, west, y, z), m.gradient[0], p.gx);
+    lost |= slope(values_at(m, v, x, north, z), values_at(m, v, x, south, z), m.gradient[1], p.gy);
+    lost |= slope(values_at(m, v, x, y, above), values_at(m, v, x, y, below), m.gradient[2], p.gz);
     return (lost & _mm512_cmp_ps_mask(alpha, zero, _CMP_GT_OQ)) != 0;
 }
 

@@ -296,6 +296,8 @@ def _lit(plan: Plan, decoded: _DecodedFrame | None, progress: Progress) -> tuple
         lamp=plan.lamp,
         ambient_occlusion=plan.occlusion,
         body=plan.task.body,
+        grading=plan.task.grading,
+        bricks=decoded.bricks,
     )
     progress("lighting", 1, 1, "")
     return replace(plan.task, light=light), light.secondary_rays

@@ -48,6 +48,20 @@ def test_every_option_sets_a_place_that_a_scene_has(place: str) -> None:
     assert "did you mean" not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("camera.azimuth=x", r"^camera\.azimuth is 'x'; a number from .* is needed: .*degrees"),
+        ("camera.zoom=-1", r"^camera\.zoom is -1; allowed: "),
+        ("effects.shading.gradient=cel", r"^effects\.shading\.gradient is 'cel'; .*'cell'\?$"),
+        ("camera.position=[1,2]", r"^camera\.position is \[1, 2\]; a list of 3, each a number,"),
+    ],
+)
+def test_a_setting_that_is_refused_is_named_with_what_it_takes(setting: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        scene(settings=(setting,))
+
+
 def test_a_negative_step_counts_from_the_end() -> None:
     assert scene(places={"step": -1.0}).step == 4
 

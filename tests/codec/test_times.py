@@ -9,7 +9,7 @@ import cftime
 import numpy as np
 import pytest
 
-from fhash_codec.times import is_dated, number_text, time_of, time_text, times_of
+from fhash_codec.times import is_dated, number_text, time_of, time_range, time_text, times_of
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Coordinate
 
@@ -155,3 +155,41 @@ def test_arrays_of_times_keep_their_shape() -> None:
     assert times_of(HALF_DAYS, [], "run.fhz").shape == (0,)
     with pytest.raises(InputError, match="is no type of times"):
         times_of(HALF_DAYS, np.timedelta64(3, "h"), "run.fhz")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0:2", (0, 2, None)),
+        (":1.5", (0, 1.5, None)),
+        ("1::0.25", (1, 2, 0.25)),
+        ("2:0:0.5", (2, 0, 0.5)),
+        ("2001-02-10:2001-02-12", (0, 2, None)),
+        ("2001-02-10:2001-02-12:0.5", (0, 2, 0.5)),
+        ("2001-02-10T06:00:2001-02-11T12:00", (0.25, 1.5, None)),
+        ("2001-02-10T06:00:2001-02-11T12:00:24", (0.25, 1.5, 24)),
+        ("2001-02-10T06:00:00:2001-02-11T12:00:00", (0.25, 1.5, None)),
+        ("2001-02-10T06:00:00:2001-02-11T12:00:00:2", (0.25, 1.5, 2)),
+        ("2001-02-10:2001-02-11T12:00", (0, 1.5, None)),
+        ("2001-02-10T12:2001-02-11T12", (0.5, 1.5, None)),
+        ("2001-02-10T12:00:", (0.5, 2, None)),
+        ("0.5:2001-02-11T12:00", (0.5, 1.5, None)),
+    ],
+)
+def test_colons_of_dates_are_told_from_those_of_ranges(
+    text: str, expected: tuple[float, float, float | None]
+) -> None:
+    assert time_range(HALF_DAYS, text, "run.fhz") == expected
+
+
+@pytest.mark.parametrize("text", ["1", "a:b", "0:1:0", "0:1:-1", "0:1:2:3", "0:1:x"])
+def test_what_is_no_range_of_times(text: str) -> None:
+    with pytest.raises(ValueError, match="^" + text):
+        time_range(HALF_DAYS, text, "run.fhz")
+
+
+def test_ends_of_a_range_are_checked_as_times_are() -> None:
+    with pytest.raises(RegionError, match="outside the series, 2001-02-10 to 2001-02-12"):
+        time_range(HALF_DAYS, "2001-02-10:2001-03-01", "run.fhz")
+    with pytest.raises(InputError, match="the times are no dates"):
+        time_range(times([0, 1], units="s"), "2001-02-10:2001-02-11", "run.fhz")

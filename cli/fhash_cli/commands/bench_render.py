@@ -44,8 +44,8 @@ class PartType(click.ParamType[str]):
     "parts",
     type=PartType(),
     multiple=True,
-    help="effects, accelerations, orbit, streams, vtk, exactness, playback or curves; repeat."
-    " Default: all.",
+    help="effects, accelerations, orbit, shell, streams, vtk, exactness, playback or curves;"
+    " repeat. Default: all.",
 )
 @click.option(
     "--size",
@@ -70,6 +70,12 @@ class PartType(click.ParamType[str]):
     type=click.Path(),
     help="Draw quality against time, and times beside VTK's.",
 )
+@click.option(
+    "--ospray",
+    metavar="PATH",
+    help="OSPRay 2 or 3 as a peer of the part shell: libospray.so, its folder, or a Python module"
+    " that holds it.",
+)
 @force_option
 @json_option
 @quiet_option
@@ -80,6 +86,7 @@ def render(
     side: int,
     turns: int,
     plot: str | None,
+    ospray: str | None,
     force: bool,
     as_json: bool,
     quiet: bool,
@@ -104,7 +111,13 @@ def render(
             require_matplotlib()
         scene = Scene() if scene_file is None else Scene.load(scene_file)
         result = bench_render(
-            volume, scene, parts=parts or PARTS, size=side, turns=turns, progress=progress
+            volume,
+            scene,
+            parts=parts or PARTS,
+            size=side,
+            turns=turns,
+            ospray=ospray,
+            progress=progress,
         )
     if plot is not None:
         from fhash_formats.support.atomic import replacing
@@ -136,6 +149,7 @@ def _tables(result: RenderBench) -> Iterator[Rows]:
     yield _switches("effect", result.effects)
     yield _switches("acceleration", result.accelerations, psnr=True)
     yield _switches("orbit", result.orbit)
+    yield _beside(result)
     yield _streams(result)
     yield _beside_vtk(result)
     yield _exactness(result)
@@ -175,6 +189,26 @@ def _streams(result: RenderBench) -> Rows:
                 number(run.largest, digits=2),
             )
             for run in result.streams
+        ),
+    ]
+
+
+def _beside(result: RenderBench) -> Rows:
+    """Time and likeness of pictures of a large volume beside those of other renderers."""
+    return [
+        ("beside", "scene", "size", "threads", "ours ms", "peer ms", "peer / ours", "PSNR"),
+        *(
+            (
+                pair.peer,
+                _lit(pair.scene, pair.shaded),
+                str(pair.size),
+                str(pair.threads),
+                _ms(pair.ours_ms),
+                _ms(pair.peer_ms),
+                number(pair.ratio, "x", digits=3),
+                _decibels(pair.psnr),
+            )
+            for pair in result.beside
         ),
     ]
 

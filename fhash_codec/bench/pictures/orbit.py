@@ -19,7 +19,7 @@ from fhash_codec.rendering.scene.scene import Camera
 from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.task import Frame, Lighting, Marched, Table, Task
 
-__all__ = ["orbit", "shell"]
+__all__ = ["orbit", "shell", "view_of_shell"]
 
 SIDE = 256
 """Vertices along each axis."""
@@ -47,7 +47,7 @@ def orbit(turns: int, size: int, side: int | None = None) -> tuple[Switch, ...]:
     kept = Bricks.of(frame)
     found = []
     for shaded in (False, True):
-        tasks = [_task(side, size, 360 * turn / turns, shaded) for turn in range(turns)]
+        tasks = [view_of_shell(side, size, 360 * turn / turns, shaded) for turn in range(turns)]
         anew: list[float] = []
         again: list[float] = []
         pictures: list[Marched] = []
@@ -71,7 +71,7 @@ def orbit(turns: int, size: int, side: int | None = None) -> tuple[Switch, ...]:
     return tuple(found)
 
 
-def _task(side: int, size: int, azimuth: float, shaded: bool) -> Task:
+def view_of_shell(side: int, size: int, azimuth: float, shaded: bool) -> Task:
     """A view of the shell, of which what lies above a tenth is seen."""
     grid = Grid(counts=(side,) * 3, origin=np.zeros(3), spacing=np.ones(3))
     values = np.linspace(0.0, 1.0, 1001)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from ctypes import CDLL
 from dataclasses import replace
 from functools import cache, partial
 from statistics import median
@@ -12,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from fhash_codec.bench.machine import machine
+from fhash_codec.bench.pictures.beside_shell import beside_shell
 from fhash_codec.bench.pictures.beside_vtk import Comparison
 from fhash_codec.bench.pictures.likeness import picture_psnr
 from fhash_codec.bench.pictures.orbit import orbit
+from fhash_codec.bench.pictures.ospray_peer import find_ospray, load_ospray
 from fhash_codec.bench.pictures.results import PARTS, Quality, RenderBench, Stream, Switch
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.picture.image import Image
@@ -31,6 +34,7 @@ from fhash_codec.rendering.scene.scene import (
 )
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.support.threads import usable_threads
 
 __all__ = ["bench_render", "in_turns"]
 
@@ -72,6 +76,7 @@ def bench_render(
     parts: Sequence[str] = PARTS,
     size: int = SIZE,
     turns: int = TURNS,
+    ospray: str | None = None,
     progress: Progress = silent,
 ) -> RenderBench:
     """Measure pictures of a volume.
@@ -83,8 +88,10 @@ def bench_render(
         parts: names of `PARTS` to measure.
         size: pixels along both sides; VTK is compared at twice the size too.
         turns: runs of each median.
+        ospray: file, folder or Python module of an OSPRay library, for the part `shell`.
 
-    Raises InputError for unknown parts, or for a size or turns that are too small. Without VTK the
+    Raises InputError for unknown parts, for a size or turns that are too small, and for an OSPRay
+    that cannot be used. Without VTK the
     result lists its parts as refused.
     """
     scene = scene or Scene()
@@ -96,6 +103,11 @@ def bench_render(
             f"{len(parts)} parts, {turns} turns, {size} pixels;"
             " at least one part, one turn and 16 pixels are needed"
         )
+    if ospray is not None and "shell" not in parts:
+        raise InputError("OSPRay is a peer of the part 'shell'; name that part too")
+    library = (
+        None if ospray is None else load_ospray(find_ospray(ospray).resolve(), usable_threads())
+    )
     plain = replace(
         scene,
         size=(size, size),
@@ -103,7 +115,7 @@ def bench_render(
         background="black",
     )
     bench = _Bench(volume, plain, turns, progress)
-    results, refused, version = _measure(bench, parts)
+    results, refused, version = _measure(bench, parts, library)
     used = machine()
     if version is not None:
         used["vtk"] = version
@@ -116,6 +128,7 @@ def bench_render(
         effects=results.get("effects", ()),
         accelerations=results.get("accelerations", ()),
         orbit=results.get("orbit", ()),
+        beside=results.get("shell", ()),
         streams=results.get("streams", ()),
         against=results.get("vtk", ()),
         exactness=results.get("exactness", ()),
@@ -128,7 +141,7 @@ def bench_render(
 
 
 def _measure(
-    bench: _Bench, parts: Sequence[str]
+    bench: _Bench, parts: Sequence[str], ospray: tuple[CDLL, str] | None
 ) -> tuple[dict[str, tuple[Any, ...]], dict[str, str], str | None]:
     """Measure the parts: results, reasons of parts that were refused, and VTK's version if used."""
 
@@ -140,6 +153,7 @@ def _measure(
         "effects": bench.effects,
         "accelerations": bench.accelerations,
         "orbit": partial(orbit, bench.turns, bench.scene.size[0]),
+        "shell": partial(beside_shell, bench.turns, bench.scene.size[0], ospray, bench.progress),
         "streams": bench.streams,
         "vtk": lambda: beside().against(),
         "exactness": lambda: beside().exactness(),

@@ -9,7 +9,17 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
-PARTS = ("effects", "accelerations", "orbit", "streams", "vtk", "exactness", "playback", "curves")
+PARTS = (
+    "effects",
+    "accelerations",
+    "orbit",
+    "shell",
+    "streams",
+    "vtk",
+    "exactness",
+    "playback",
+    "curves",
+)
 """Names of the parts that can be measured."""
 
 
@@ -85,6 +95,33 @@ class Against:
     def ratio(self) -> float:
         """Times faster than VTK."""
         return self.vtk_ms / self.ours_ms
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beside:
+    """A volume made for the bench, drawn here and by a peer in turns.
+
+    Attributes:
+        peer: name and version.
+        threads: of both.
+        ours_ms: time of marching.
+        peer_ms: time of the peer, less that of its empty window where it has one.
+        psnr: likeness of the pictures in dB, None where they are equal.
+    """
+
+    peer: str
+    scene: str
+    shaded: bool
+    size: int
+    threads: int
+    ours_ms: float
+    peer_ms: float
+    psnr: float | None
+
+    @property
+    def ratio(self) -> float:
+        """Times faster than the peer."""
+        return self.peer_ms / self.ours_ms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,6 +207,7 @@ class RenderBench:
     machine: dict[str, Any]
     notes: tuple[str, ...]
     orbit: tuple[Switch, ...] = ()
+    beside: tuple[Beside, ...] = ()
 
     def summary(self) -> dict[str, float]:
         """Median and smallest ratio to VTK, for unlit and lit scenes apart; empty without VTK."""
@@ -185,7 +223,7 @@ class RenderBench:
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name, the ratios of each, and "summary"."""
         values = asdict(self)
-        for name in ("effects", "accelerations", "orbit", "against", "playback"):
+        for name in ("effects", "accelerations", "orbit", "beside", "against", "playback"):
             for entry, record in zip(values[name], getattr(self, name), strict=True):
                 entry["ratio"] = record.ratio
         return {**values, "summary": self.summary()}

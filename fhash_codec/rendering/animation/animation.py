@@ -17,8 +17,9 @@ import numpy as np
 from fhash_codec.rendering.animation.timeline import Clock, Timeline
 from fhash_codec.rendering.scene.record import Record, limits
 from fhash_codec.rendering.scene.scene import Camera, Effects, Scene, TransferFunctionSpec
+from fhash_codec.times import time_range
 from fhash_codec.volume import Volume
-from fhash_formats.errors import InputError
+from fhash_formats.errors import InputError, RegionError
 
 __all__ = ["Animation", "Key"]
 
@@ -163,6 +164,8 @@ class Animation(Record):
         for name, _, value in words:
             try:
                 values |= _field(name, value, volume)
+            except (InputError, RegionError):
+                raise  # they are ValueErrors, too, and say more
             except ValueError:
                 raise InputError(
                     f"animation '{text[:60]}': '{name}={value}' is malformed; "
@@ -255,7 +258,10 @@ class Animation(Record):
 
 
 def _field(name: str, value: str, volume: Volume) -> dict[str, Any]:
-    """The field of an Animation that a word such as "steps=0:9" gives; raises ValueError."""
+    """The fields of an Animation that a word such as "steps=0:9" gives.
+
+    Raises ValueError for a word that is malformed, InputError and RegionError for its times.
+    """
     if name == "orbit":
         return {"orbit": float(value) if value else 360.0}
     field = "steps" if name == "steps" else "times"
@@ -263,6 +269,9 @@ def _field(name: str, value: str, volume: Volume) -> dict[str, Any]:
     whole = (0.0, float(len(times) - 1)) if name == "steps" else (float(times[0]), float(times[-1]))
     if not value:
         return {field: whole}
+    if name == "time":
+        begin, end, gap = time_range(volume.coords["t"], value, str(volume.path))
+        return {field: (begin, end)} | ({} if gap is None else {"every": gap})
     first, last, *every = value.split(":")
     if len(every) > 1:
         raise ValueError(value)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.rendering.task.bricks import Bricks
-from fhash_codec.rendering.task.slopes import flatness, slope_scale
+from fhash_codec.rendering.task.slopes import flatness, slope_scale, smoothing
 from fhash_codec.rendering.task.task import Frame, Table, Task
 
 __all__ = ["MarchInput", "empty_table"]
@@ -40,6 +40,8 @@ class MarchInput:
         gradient: (3,), factors from differences between vertices to the gradients of shading.
         steepness: a gradient of shading of 1, in marched units per unit of the coordinates.
         floor: gradient at which shading has faded by half.
+        smoothing: deviation of the Gaussian by which values are smoothed before shading, in
+            vertices; 0 for none.
         light_offset, light_scale: a place is at place * scale + offset (3,) in the light grid.
     """
 
@@ -58,6 +60,7 @@ class MarchInput:
     gradient: Floats
     steepness: float
     floor: float
+    smoothing: float
     light_offset: Floats
     light_scale: float
 
@@ -96,6 +99,7 @@ class MarchInput:
             gradient=slope_scale(grid, span, least, most),
             steepness=span * scaling.unit / (stride * grid.vertex_spacing),
             floor=floor,
+            smoothing=smoothing(span, scaling.width(task.noise)),
             light_offset=np.zeros(3) if light is None else (first - light.first) / light.cell,
             light_scale=1.0 if light is None else stride / light.cell,
         )

@@ -37,6 +37,7 @@ from fhash_codec.rendering.native.structure import (
 )
 from fhash_codec.rendering.task.bricks import SIDE, Bricks
 from fhash_codec.rendering.task.counters import complete
+from fhash_codec.rendering.task.smoothing import smoothed
 from fhash_codec.rendering.task.task import (
     GRADES,
     Frame,
@@ -106,6 +107,7 @@ def march_native(
         **_lighting_fields(task.lighting),
         gradient=numbers(given.gradient),
         floor=given.floor,
+        smooth=_smooth(given, task, bricks),
         **_grading_fields(given, task),
         planes=len(given.planes),
         plane=(ctypes.c_double * 4 * MAX_PLANES)(*map(plane, given.planes)),
@@ -183,7 +185,7 @@ def _skipping(library: ctypes.CDLL, given: MarchInput, task: Task, bricks: Brick
     by_cells = not (task.surfaces and task.step > 0.99 * shortest)
     cells = (
         bricks.remembered(
-            ("cells", task.visibility), lambda: cells_of(library, bricks, task, distance)
+            "cells", task.visibility, lambda: cells_of(library, bricks, task, distance)
         )
         if by_cells
         else None
@@ -245,6 +247,15 @@ def _ray_fields(given: MarchInput, task: Task) -> dict[str, object]:
         "threshold": task.threshold,
         "jitter": task.jitter,
     }
+
+
+def _smooth(given: MarchInput, task: Task, bricks: Bricks) -> Single | None:
+    """The smoothed values that what is lit is shaded by; None where those of the frame do."""
+    if not given.smoothing or not (task.shaded or task.surfaces):
+        return None
+    if given.values is not bricks.values:  # scaled for this task alone
+        return smoothed(given.values, given.smoothing)
+    return bricks.smoothed(given.smoothing)
 
 
 def _grading_fields(given: MarchInput, task: Task) -> dict[str, object]:

@@ -118,6 +118,7 @@ class March(ctypes.Structure):
         ("grading", POINTER(c_float)),
         ("grade_scale", c_double),
         ("unlit", c_int64),
+        ("smooth", POINTER(c_float)),
     )
 
     def __init__(self, **fields: Any) -> None:

@@ -66,6 +66,7 @@ def plan_picture(
     step = _step_of(volume, scene)
     grid = Grid.of(volume.coords, scene.scale)
     function = _function(volume, scene, grid, histogram)
+    _warn_of_unseen_surfaces(volume, scene)
     layout, rays = lay_out(
         scene, grid, volume.coords, function.colours, quantity_of(volume.name, volume.units)
     )
@@ -325,6 +326,20 @@ def _check_ray_length(task: Task) -> None:
     if samples > MAX_RAY_SAMPLES:
         raise InputError(f"{line}; at most {MAX_RAY_SAMPLES:.0e} are taken")
     warnings.warn(line, FhashWarning, stacklevel=3)
+
+
+def _warn_of_unseen_surfaces(volume: Volume, scene: Scene) -> None:
+    """Warn of isosurfaces whose values the series does not reach: nothing is drawn of them."""
+    low, high = volume.value_range.low, volume.value_range.high
+    beyond = [s.value for s in scene.effects.isosurfaces if not low <= s.value <= high]
+    if beyond:
+        units = f" {volume.units}" if volume.units else ""
+        warnings.warn(
+            f"nothing is drawn of isosurface {', '.join(f'{value:.6g}' for value in beyond)}: "
+            f"{volume.name} reaches from {low:.6g} to {high:.6g}{units}",
+            FhashWarning,
+            stacklevel=3,
+        )
 
 
 def _mode(march: Marching) -> str:

@@ -20,6 +20,32 @@ from fhash_formats.support.suggestions import suggestion
 
 __all__ = ["Record", "limits"]
 
+KINDS = {
+    float: "a number",
+    int: "a whole number",
+    bool: "true or false",
+    str: "a text",
+    type(None): "null",
+}
+"""Kinds of values that fields have, for messages."""
+
+
+class _RefusedSettingError(InputError):
+    """A setting that is not allowed.
+
+    Attributes:
+        place: of the setting, from the record that is made, such as `camera.azimuth`.
+        fault: what is wrong with it.
+    """
+
+    def __init__(self, place: str, fault: str) -> None:
+        super().__init__(f"{place} {fault}")
+        self.place, self.fault = place, fault
+
+    def within(self, name: str) -> _RefusedSettingError:
+        """The same fault, of a record that is a setting itself."""
+        return _RefusedSettingError(f"{name}.{self.place}", self.fault)
+
 
 class Record:
     """A frozen dataclass that checks each field against its annotation and its `limits`.
@@ -64,7 +90,8 @@ class Record:
                 )
         for setting in settings:
             if setting.name not in values and _default(setting) is dataclasses.MISSING:
-                raise InputError(f"{setting.name} is missing: {_description(setting)} is needed")
+                needed = _needed(setting, _hints(cls)[setting.name])
+                raise _RefusedSettingError(setting.name, f"is missing; {needed}")
         return cls(**values)
 
     @classmethod
@@ -128,11 +155,28 @@ def _default(setting: dataclasses.Field[Any]) -> Any:
     return setting.default
 
 
-def _description(setting: dataclasses.Field[Any]) -> str:
-    """The name of a field and its help, for messages."""
-    return (
-        f"'{setting.name}' ({setting.metadata.get('help', 'a table of settings, true or false')})"
-    )
+def _needed(setting: dataclasses.Field[Any], hint: Any) -> str:
+    """What a field takes, and its help, for messages."""
+    low, high = setting.metadata.get("low"), setting.metadata.get("high")
+    allowed = "" if low is None or high is None else f" from {low:g} to {high:g}"
+    told = setting.metadata.get("help")
+    return f"{_kind(hint)}{allowed} is needed" + (f": {told}" if told else "")
+
+
+def _kind(hint: Any) -> str:
+    """The kind of values of an annotation, for messages."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        kinds = [_kind(each) for each in inner if each is not type(None)]
+        return " or ".join(dict.fromkeys(kinds))
+    if origin is tuple:
+        kinds = [_kind(each) for each in inner if each is not ...]
+        if inner[-1] is ...:
+            return f"a list, each {kinds[0]},"
+        return f"a list of {len(kinds)}, each {' or '.join(dict.fromkeys(kinds))},"
+    if isinstance(hint, type) and issubclass(hint, Record):
+        return "a table of settings, true or false"
+    return KINDS.get(hint, "another value")
 
 
 def _plain(value: Any) -> Any:
@@ -144,9 +188,12 @@ def _plain(value: Any) -> Any:
 
 def _checked(setting: dataclasses.Field[Any], hint: Any, value: Any) -> Any:
     """Convert a value to the type of its field and check it; raises InputError."""
-    converted = _converted(hint, value)
+    try:
+        converted = _converted(hint, value)
+    except _RefusedSettingError as error:
+        raise error.within(setting.name) from error
     if converted is _WRONG:
-        raise InputError(f"{setting.name} is {value!r:.60}; {_description(setting)} is needed")
+        raise _RefusedSettingError(setting.name, f"is {value!r:.60}; {_needed(setting, hint)}")
     for item in converted if isinstance(converted, tuple) else (converted,):
         if isinstance(item, str):
             _check_choice(setting, item)
@@ -159,16 +206,17 @@ def _check_range(setting: dataclasses.Field[Any], number: float) -> None:
     low: float | None = setting.metadata.get("low")
     high: float | None = setting.metadata.get("high")
     if low is not None and high is not None and not low <= number <= high:
-        raise InputError(f"{setting.name} is {number:g}; allowed: {low:g} to {high:g}")
+        raise _RefusedSettingError(setting.name, f"is {number:g}; allowed: {low:g} to {high:g}")
 
 
 def _check_choice(setting: dataclasses.Field[Any], text: str) -> None:
     choices: tuple[str, ...] = setting.metadata.get("choices", ())
     if choices and text not in choices:
         near = difflib.get_close_matches(text, choices, n=1, cutoff=0.6)
-        raise InputError(
-            f"{setting.name} is '{text[:60]}'; allowed: {', '.join(choices)}"
-            + (f"; did you mean '{near[0]}'?" if near else "")
+        raise _RefusedSettingError(
+            setting.name,
+            f"is '{text[:60]}'; allowed: {', '.join(choices)}"
+            + (f"; did you mean '{near[0]}'?" if near else ""),
         )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fhash_codec.rendering.stream.beams import Beams
-from fhash_codec.rendering.stream.fields import Field, central_slopes
+from fhash_codec.rendering.stream.fields import Field
 from fhash_codec.rendering.stream.phong import LightAt, Phong
 from fhash_codec.rendering.task.arrays import Array
 from fhash_codec.rendering.task.palette import Palette
@@ -158,8 +158,4 @@ class Canvas:
     def _slopes(self, phong: Phong, places: Array) -> Array:
         """Slopes (n, 3) at places (n, 3) for shading, counted."""
         self.gradients += len(places)
-        return (
-            central_slopes(self.field, places)
-            if phong.lighting.central
-            else self.field.slopes(places)
-        )
+        return phong.slopes(places)

@@ -111,6 +111,7 @@ class FrameField:
 
     def __init__(self, frame: Frame, grid: Grid, bricks: Bricks, arrays: Arrays = NUMPY) -> None:
         self.arrays, self.bricks = arrays, bricks
+        self._frame, self._grid = frame, grid
         self.stride = float(frame.stride)
         first = np.array(frame.first[::-1], dtype=np.float64)
         counts = np.array(frame.values.shape[::-1])
@@ -125,6 +126,11 @@ class FrameField:
         with arrays.guarded():
             self._values = arrays.array(bricks.values)
         self._flat = self._values.reshape(-1)
+
+    def smoothed(self, deviation: float) -> FrameField:
+        """The field of values that a Gaussian has smoothed, as `smoothing.smoothed` has them."""
+        bricks = replace(self.bricks, values=self.bricks.smoothed(deviation))
+        return FrameField(self._frame, self._grid, bricks, self.arrays)
 
     def visible(self, palette: Palette) -> Array:
         arrays, xp = self.arrays, self.arrays.xp

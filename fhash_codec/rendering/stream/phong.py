@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import product
 
-from fhash_codec.rendering.stream.fields import Field
+from fhash_codec.rendering.stream.fields import Field, FrameField, central_slopes
 from fhash_codec.rendering.task.arrays import Array, Arrays
-from fhash_codec.rendering.task.slopes import flatness, slope_scale
+from fhash_codec.rendering.task.slopes import flatness, slope_scale, smoothing
 from fhash_codec.rendering.task.task import LightGrid, Lighting, Task
 
 __all__ = ["LightAt", "Phong"]
@@ -23,6 +23,9 @@ class Phong:
             of the table's range per vertex spacing.
         floor: gradient at which the light from a direction has faded by half, so that the noise of
             rounding is not lit.
+        field: whose gradients are taken, those of smoothed values where the noise of coding is
+            large.
+        central: whether by central differences.
     """
 
     arrays: Arrays
@@ -30,6 +33,8 @@ class Phong:
     lamp: Array | None
     scale: Array
     floor: float
+    field: Field
+    central: bool
 
     @classmethod
     def of(cls, task: Task, field: Field) -> Phong | None:
@@ -40,13 +45,22 @@ class Phong:
         least, most = field.bricks.value_range
         low, high = (least, most) if task.table is None else (task.table.low, task.table.high)
         span, floor = flatness(low, high, least, most, task.noise)
+        deviation = smoothing(span, task.noise) if isinstance(field, FrameField) else 0.0
         return cls(
             arrays=arrays,
             lighting=lighting,
             lamp=None if lighting.lamp is None else arrays.array(lighting.lamp, "float64"),
             scale=arrays.array(field.stride * slope_scale(task.rays.grid, span, least, most)),
             floor=floor,
+            field=field.smoothed(deviation)
+            if deviation and isinstance(field, FrameField)
+            else field,
+            central=lighting.central or deviation > 0,
         )
+
+    def slopes(self, places: Array) -> Array:
+        """Derivatives (n, 3) by x, y and z per vertex, for shading."""
+        return central_slopes(self.field, places) if self.central else self.field.slopes(places)
 
     def __call__(
         self, colours: Array, slopes: Array, along: Array, lamp: Array, around: Array

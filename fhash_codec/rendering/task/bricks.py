@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from fhash_codec import native
 from fhash_codec.rendering.task.palette import Palette
+from fhash_codec.rendering.task.smoothing import smoothed
 from fhash_codec.rendering.task.task import Frame, Task
 from fhash_formats.support.threads import in_threads
 
@@ -36,8 +37,8 @@ largest magnitude.
 """
 LAYERS = 4
 """Layers of bricks that a thread looks at together."""
-KEPT = 6
-"""Results that bricks keep: two for each of the last transfer functions."""
+KEPT = 3
+"""Results of each kind that bricks keep, by default: those of the last transfer functions."""
 SMALL = 2**18
 """Vertices of a frame below which threads take longer to start than the work takes."""
 
@@ -57,7 +58,7 @@ class Bricks:
     values: Single
     low: Single
     high: Single
-    _kept: OrderedDict[object, Any] = field(default_factory=OrderedDict, init=False, repr=False)
+    _kept: dict[str, OrderedDict[object, Any]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(cls, frame: Frame) -> Bricks:
@@ -75,18 +76,27 @@ class Bricks:
         low, high = float(self.low.min()), float(self.high.max())
         return (low, high) if low <= high else (0.0, 0.0)
 
-    def remembered(self, key: object, compute: Callable[[], Result]) -> Result:
-        """The result of a function for a key, kept from an earlier call if there was one.
+    def remembered(
+        self, kind: str, key: object, compute: Callable[[], Result], most: int = KEPT
+    ) -> Result:
+        """The result of a function, kept from an earlier call with the same kind and key.
 
-        The results of the last KEPT keys are kept.
+        The results of the last `most` keys of a kind are kept.
         """
-        if key in self._kept:
-            self._kept.move_to_end(key)
+        kept = self._kept.setdefault(kind, OrderedDict())
+        if key in kept:
+            kept.move_to_end(key)
         else:
-            self._kept[key] = compute()
-            while len(self._kept) > KEPT:
-                self._kept.popitem(last=False)
-        return cast(Result, self._kept[key])
+            kept[key] = compute()
+            while len(kept) > most:
+                kept.popitem(last=False)
+        return cast(Result, kept[key])
+
+    def smoothed(self, deviation: float) -> Single:
+        """The values smoothed by a Gaussian, as `smoothing.smoothed` has them, kept."""
+        return self.remembered(
+            "smoothed", deviation, lambda: smoothed(self.values, deviation), most=1
+        )
 
     def matters(self, task: Task) -> Mask:
         """Whether a brick (z, y, x) has anything visible: a value with extinction, or a surface."""
@@ -122,7 +132,7 @@ class Bricks:
             distance.flags.writeable = False
             return distance
 
-        return self.remembered(("distance", task.visibility), compute)
+        return self.remembered("distance", task.visibility, compute)
 
     def _distance(self, task: Task) -> npt.NDArray[np.int32]:
         """The distances of `distance`, computed."""

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+import ctypes
 
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.colour.opacity import about
 from fhash_codec.rendering.scene.scene import TransferFunctionSpec
@@ -11,8 +15,12 @@ from fhash_codec.rendering.task.task import GRADES, Grading
 from fhash_codec.rendering.task.units import Units
 from fhash_codec.volume import Volume
 from fhash_formats.errors import InputError
+from fhash_formats.support.threads import in_threads
 
-__all__ = ["grading_of"]
+__all__ = ["factors_at_vertices", "grading_of"]
+
+Floats = npt.NDArray[np.float64]
+Single = npt.NDArray[np.float32]
 
 
 def grading_of(
@@ -43,3 +51,53 @@ def grading_of(
         factors=np.interp(np.linspace(0.0, top, GRADES + 1), points[:, 0], points[:, 1]),
         top=top * float(ends[1] - ends[0]) / grid.vertex_spacing,
     )
+
+
+def factors_at_vertices(values: Single, grading: Grading, spacing: Floats) -> Single:
+    """Factors (z, y, x) of the extinction at the vertices of a frame, 0 where a value is missing.
+
+    Gradients are central differences. Where a neighbour is missing they are the difference to the
+    other one.
+
+    Args:
+        values: float32 (z, y, x), contiguous, in marched units.
+        grading: factors by the size of the gradient.
+        spacing: (3,), x, y, z, distance of two vertices of the frame, in the coordinates.
+    """
+    scale = np.asarray(GRADES / grading.top / np.abs(spacing), dtype=np.float64)
+    library = native.library()
+    if library is None:
+        slopes = [_slopes(values, axis) * scale[2 - axis] for axis in range(3)]
+        size = np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + slopes[2] ** 2)
+        found = np.interp(size, np.arange(GRADES + 1), grading.factors)
+        return np.where(np.isnan(values), 0, found).astype(np.float32)
+    table = np.append(grading.factors, grading.factors[-1]).astype(np.float32)
+    out = np.empty(values.shape, dtype=np.float32)
+    shape = (ctypes.c_int64 * 3)(*values.shape)
+
+    def layer(z: int) -> None:
+        library.fhash_march_factors(
+            values.ctypes.data,
+            shape,
+            scale.ctypes.data,
+            table.ctypes.data,
+            GRADES + 1,
+            z,
+            z + 1,
+            out.ctypes.data,
+        )
+
+    list(in_threads(layer, range(len(values))))
+    return out
+
+
+def _slopes(values: Single, axis: int) -> Floats:
+    """Differences per vertex along an axis, by the neighbours that are there; 0 without any."""
+    wide = values.astype(np.float64)
+    none = np.full_like(wide.take([0], axis=axis), np.nan)
+    steps = np.diff(wide, axis=axis)
+    before = np.concatenate([none, steps], axis=axis)
+    behind = np.concatenate([steps, none], axis=axis)
+    both = (before + behind) / 2
+    either = np.where(np.isnan(before), behind, before)
+    return np.nan_to_num(np.where(np.isnan(both), either, both), nan=0.0)

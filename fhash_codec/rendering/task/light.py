@@ -12,6 +12,7 @@ import ctypes
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,9 @@ from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.camera.clip import Body
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Shadows
-from fhash_codec.rendering.task.task import Frame, LightGrid, Table, extinctions_in
+from fhash_codec.rendering.task.bricks import Bricks
+from fhash_codec.rendering.task.grading import factors_at_vertices
+from fhash_codec.rendering.task.task import Frame, Grading, LightGrid, Table, extinctions_in
 from fhash_formats.errors import InputError
 from fhash_formats.support.threads import in_threads
 
@@ -28,6 +31,7 @@ __all__ = ["light_grid"]
 
 Floats = npt.NDArray[np.float64]
 Single = npt.NDArray[np.float32]
+Result = TypeVar("Result")
 
 MAX_STEPS = 16
 """Steps from a point to the end of its surroundings, at most."""
@@ -51,54 +55,104 @@ def light_grid(
     lamp: Floats | None = None,
     ambient_occlusion: AmbientOcclusion | None = None,
     body: Body | None = None,
+    grading: Grading | None = None,
+    bricks: Bricks | None = None,
 ) -> LightGrid:
     """Shares of the light that reach places of a frame, the strengths of both effects included.
+
+    The light does not depend on the camera, but for a lamp that moves with it.
 
     The points of the grid lie a whole number of the frame's vertices apart, as near to the
     resolution of the shadows as that allows.
 
     lamp: unit vector (x, y, z) of the coordinates towards the light, for shadows.
     body: what a clip leaves; nothing outside it takes light away. All if None.
+    grading: opacity by gradient; what it leaves of the extinction takes light away.
+    bricks: of the frame. They keep what the next picture needs again; None keeps nothing.
     Raises InputError for shadows without a lamp.
     """
     if shadows is not None and lamp is None:
         raise InputError("shadows need the direction towards a lamp")
-    if body is not None:
-        frame = _clipped(frame, body)
     resolution = shadows.resolution if shadows is not None else Shadows().resolution
     across = max(1, round(resolution / frame.stride))
-    first = np.array(frame.first[::-1], dtype=np.float64)
     if table is None or not table.extinctions.any():
+        first = np.array(frame.first[::-1], dtype=np.float64)
         return LightGrid(shares=np.ones((1, 1, 1, 2), dtype=np.float32), first=first, cell=1.0)
     # In lengths of a vertex: float32 has no room for those of all coordinates.
     unit = grid.vertex_spacing
     table = replace(table, extinctions=extinctions_in(table.extinctions, unit))
     cell = float(across * frame.stride)
-    points = _Points(
-        extinction=_extinction(np.ascontiguousarray(frame.values, dtype=np.float32), table, across),
-        spacing=grid.spacing,
-        cell=cell,
-        unit=unit,
+    kept = _Kept(
+        bricks,
+        (
+            *(table.low, table.high, table.extinctions.tobytes(), across, grid.spacing.tobytes()),
+            None if body is None else (body.bounds.tobytes(), body.planes.tobytes()),
+            None if grading is None else (grading.top, grading.factors.tobytes()),
+        ),
     )
-    shares = np.ones((*points.extinction.shape, 2), dtype=np.float32)
+    extinction, first = kept(
+        "extinction", (), lambda: _extinction_of(frame, grid, table, across, body, grading)
+    )
+    points = _Points(extinction=extinction, spacing=grid.spacing, cell=cell, unit=unit)
+    shares = np.ones((*extinction.shape, 2), dtype=np.float32)
     rays = 0
     if shadows is not None and lamp is not None:
-        shares[..., 0] = 1 - np.float32(shadows.strength) * (1 - points.from_lamp(lamp))
-        rays += points.extinction.size
+        passed = kept("lamp", lamp.tobytes(), lambda: points.from_lamp(lamp))
+        shares[..., 0] = 1 - np.float32(shadows.strength) * (1 - passed)
+        rays += extinction.size
     if ambient_occlusion is not None:
-        around = points.from_around(ambient_occlusion.radius)
+        radius = ambient_occlusion.radius
+        around = kept("around", radius, lambda: points.from_around(radius))
         shares[..., 1] = 1 - np.float32(ambient_occlusion.strength) * (1 - around)
-        rays += points.extinction.size * len(SIDES)
+        rays += extinction.size * len(SIDES)
     return LightGrid(shares=np.clip(shares, 0, 1), first=first, cell=cell, secondary_rays=rays)
 
 
-def _clipped(frame: Frame, body: Body) -> Frame:
-    """The vertices around a body alone, and no values at those outside it."""
+@dataclass(frozen=True)
+class _Kept:
+    """What bricks keep of the light of one transfer function; without bricks nothing is kept."""
+
+    bricks: Bricks | None
+    key: tuple[object, ...]
+
+    def __call__(self, kind: str, key: object, compute: Callable[[], Result]) -> Result:
+        """The result of a function, as `Bricks.remembered` has it; the last one of each kind."""
+        if self.bricks is None:
+            return compute()
+        return self.bricks.remembered(f"light: {kind}", (*self.key, key), compute, most=1)
+
+
+def _extinction_of(
+    frame: Frame,
+    grid: Grid,
+    table: Table,
+    across: int,
+    body: Body | None,
+    grading: Grading | None,
+) -> tuple[Single, Floats]:
+    """Extinctions on the grid with a point every `across` vertices, and the first point (x, y, z).
+
+    Gradients are those of the whole frame: a clip makes none.
+    """
+    values = np.ascontiguousarray(frame.values, dtype=np.float32)
+    factors = None
+    if grading is not None:
+        factors = factors_at_vertices(values, grading, grid.spacing * frame.stride)
+    if body is not None:
+        frame, spans = _clipped(frame, body)
+        values = np.ascontiguousarray(frame.values, dtype=np.float32)
+        factors = None if factors is None else np.ascontiguousarray(factors[spans])
+    first = np.array(frame.first[::-1], dtype=np.float64)
+    return _extinction(values, table, across, factors), first
+
+
+def _clipped(frame: Frame, body: Body) -> tuple[Frame, tuple[slice, ...]]:
+    """The vertices around a body alone, without values at those outside it, and their spans."""
     first, stride = np.array(frame.first), frame.stride
     low, high = body.extent[::-1].T
     start = np.clip(np.floor((low - first) / stride), 0, np.array(frame.values.shape) - 1)
     stop = np.clip(np.ceil((high - first) / stride) + 1, start + 1, frame.values.shape)
-    spans = [slice(int(begin), int(end)) for begin, end in zip(start, stop, strict=True)]
+    spans = tuple(slice(int(begin), int(end)) for begin, end in zip(start, stop, strict=True))
     places = np.meshgrid(
         *(
             begin + np.arange(span.start, span.stop) * stride
@@ -108,8 +162,8 @@ def _clipped(frame: Frame, body: Body) -> Frame:
     )
     inside = body.holds(np.stack(places[::-1], axis=-1).astype(np.float64))
     z, y, x = (int(begin + span.start * stride) for begin, span in zip(first, spans, strict=True))
-    values = np.where(inside, frame.values[tuple(spans)], np.float32(np.nan))
-    return Frame(values=values, first=(z, y, x), stride=stride)
+    values = np.where(inside, frame.values[spans], np.float32(np.nan))
+    return Frame(values=values, first=(z, y, x), stride=stride), spans
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -203,16 +257,16 @@ def _add_shifted(extinction: Single, offset: Floats, sums: Single) -> None:
             )
 
 
-def _extinction(values: Single, table: Table, across: int) -> Single:
+def _extinction(values: Single, table: Table, across: int, factors: Single | None = None) -> Single:
     """Extinctions on a grid with a point every `across` vertices.
 
-    Each is the mean of the vertices around the point, weighed by a tent.
+    Each is the mean of the vertices around the point, weighed by a tent, and times its factor.
     """
     points = tuple(-(-(size - 1) // across) + 1 for size in values.shape)
     library = native.library()
     last = len(table.extinctions) - 1
     if library is None:
-        return _extinction_portable(values, table, across, points)
+        return _extinction_portable(values, table, across, points, factors)
     out = np.empty(points, dtype=np.float32)
     entries = np.append(table.extinctions, table.extinctions[-1]).astype(np.float32)
     shape, sizes = (ctypes.c_int64 * 3)(*values.shape), (ctypes.c_int64 * 3)(*points)
@@ -230,6 +284,7 @@ def _extinction(values: Single, table: Table, across: int) -> Single:
             sizes,
             z,
             z + 1,
+            None if factors is None else factors.ctypes.data,
             out.ctypes.data,
             scratch.ctypes.data,
         )
@@ -239,12 +294,14 @@ def _extinction(values: Single, table: Table, across: int) -> Single:
 
 
 def _extinction_portable(
-    values: Single, table: Table, across: int, points: tuple[int, ...]
+    values: Single, table: Table, across: int, points: tuple[int, ...], factors: Single | None
 ) -> Single:
     """The extinctions of `_extinction` in numpy, within rounding; points: (z, y, x)."""
     entries = np.linspace(table.low, table.high, len(table.extinctions))
     extinction = np.interp(np.nan_to_num(values), entries, table.extinctions)
     extinction = np.where(np.isnan(values), 0, extinction)
+    if factors is not None:
+        extinction = extinction * factors
     offsets = np.arange(1 - across, across)
     weights = (across - np.abs(offsets)) / across**2
     for axis, count in enumerate(points):

@@ -79,3 +79,14 @@ def test_refuses_in_one_line(
     words: list[str], part: str, refused: Callable[..., str], run: Path
 ) -> None:
     assert part in refused(2, "bench", "render", run, "-q", *words)
+
+
+def test_a_wrong_ospray_is_refused_before_anything_is_measured(fhash: Fhash, run: Path) -> None:
+    for words, message in (
+        (["--part", "shell", "--ospray", "no_such_module"], "no OSPRay there"),
+        (["--part", "orbit", "--ospray", "no_such_module"], "the part 'shell'"),
+    ):
+        result = fhash("bench", "render", run, *QUICK, *words)
+        assert result.exit_code == 2
+        assert message in result.stderr
+        assert result.stderr.count("\n") == 1

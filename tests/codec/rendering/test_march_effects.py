@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.camera.clip import Body
 from fhash_codec.rendering.march import march
@@ -234,3 +235,71 @@ def test_a_ramp_is_as_opaque_as_the_factor_of_its_gradient_says(
         np.testing.assert_allclose(found.rgba[..., 3], expected, rtol=2e-3, atol=1e-6)
         assert found.counters["gradients"] > 0
     assert marched(values, replace(task, grading=None, shaded=False)).counters["gradients"] == 0
+
+
+def bounded(noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """A ball with an even inside (z, y, x), 0..1, and the same with errors up to half the noise."""
+    axis = np.linspace(-1, 1, 40)
+    z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
+    ball = 1 / (1 + np.exp((np.sqrt(x * x + y * y + z * z) - 0.6) / 0.08))
+    errors = np.random.default_rng(7).uniform(-noise / 2, noise / 2, ball.shape)
+    return ball, np.clip(ball + errors, 0, 1)
+
+
+@pytest.mark.parametrize("surface", [False, True])
+def test_a_bounded_file_is_as_bright_as_its_source_and_without_grain(
+    way: str, surface: bool
+) -> None:
+    source, coded = bounded(noise=0.1)
+    lighting = Lighting(ambient=0.2, diffuse=0.8, specular=0.0, specular_power=8.0, lamp=None)
+    task = task_of(
+        source.shape,
+        camera=Camera(),
+        size=(40, 40),
+        extinctions=np.clip(SHADES - 0.5, 0, None) * (not surface),
+        lighting=lighting,
+        shaded=not surface,
+        surfaces=(Surface(value=0.5, colour=WHITE, opacity=1.0),) * surface,
+    )
+    exact = marched(source, task).rgba[..., 0]
+    grained = marched(coded, task).rgba[..., 0]
+    drawn = marched(coded, replace(task, noise=0.1)).rgba[..., 0]
+    assert drawn.mean() == pytest.approx(exact.mean(), rel=0.04)
+    inner = exact > 0.5 * exact.max()
+    assert np.abs(drawn - exact)[inner].mean() < 0.5 * np.abs(grained - exact)[inner].mean()
+
+
+def test_the_opacity_by_gradient_of_a_bounded_file_is_that_of_its_values(way: str) -> None:
+    _, coded = bounded(noise=0.1)
+    grading = Grading(factors=np.linspace(0.0, 1.0, 1025), top=0.1)
+    task = task_of(coded.shape, camera=Camera(), size=(24, 24), fog=0.1, grading=grading)
+    opacity = marched(coded, replace(task, shaded=True)).rgba[..., 3]
+    noisy = marched(coded, replace(task, shaded=True, noise=0.1)).rgba[..., 3]
+    np.testing.assert_allclose(noisy, opacity, atol=1e-5)
+
+
+@pytest.mark.parametrize("central", [False, True])
+@pytest.mark.parametrize("lit", ["volume", "surface", "graded"])
+def test_both_marchers_shade_bounded_files_alike(
+    central: bool, lit: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if native.library() is None:
+        pytest.skip("no native library")
+    _, coded = bounded(noise=0.05)
+    coded[8:11, 20:24, 17:19] = np.nan
+    task = task_of(
+        coded.shape,
+        camera=Camera(azimuth=20, elevation=30),
+        size=(24, 24),
+        fog=0.1,
+        lighting=Lighting(
+            ambient=0.2, diffuse=0.7, specular=0.2, specular_power=8.0, lamp=None, central=central
+        ),
+        shaded=lit != "surface",
+        surfaces=(Surface(value=0.4, colour=WHITE, opacity=0.7),) * (lit == "surface"),
+        grading=Grading(factors=np.linspace(0.2, 1.0, 1025), top=0.1) if lit == "graded" else None,
+        noise=0.05,
+    )
+    fast = marched(coded, task)
+    monkeypatch.setenv("FHASH_NATIVE", "0")
+    np.testing.assert_allclose(fast.rgba, marched(coded, task).rgba, atol=2e-3)

@@ -48,6 +48,21 @@ def test_times_pass_evenly(volume: Volume) -> None:
     ]
 
 
+def test_times_may_be_dates(volume: Volume, monkeypatch: pytest.MonkeyPatch) -> None:
+    dated = dataclasses.replace(volume.coords["t"], attributes={"units": "days since 2001-02-10"})
+    monkeypatch.setitem(volume.coords, "t", dated)
+    animation = Animation.parse("time=2001-02-11T12:00:2001-02-14:0.5,orbit=90", volume)
+    assert (animation.times, animation.every, animation.orbit) == ((1.5, 4.0), 0.5, 90.0)
+    assert [scene.time for scene in animation.scenes(SMALL, volume)] == [1.5, 2, 2.5, 3, 3.5, 4]
+    with pytest.raises(InputError, match="'time=2001-02-11' is malformed"):
+        Animation.parse("time=2001-02-11", volume)
+    with pytest.raises(RegionError, match="outside the series"):
+        Animation.parse("time=2001-02-11:2002-01-01", volume)
+    monkeypatch.setitem(volume.coords, "t", dataclasses.replace(dated, attributes={"units": "s"}))
+    with pytest.raises(InputError, match="the times are no dates"):
+        Animation.parse("time=2001-02-11:2002-01-01", volume)
+
+
 def test_a_whole_turn_ends_before_it_begins_again(volume: Volume) -> None:
     animation = dataclasses.replace(Animation.parse("orbit", volume), frames=8)
     scene = dataclasses.replace(SMALL, camera=Camera(azimuth=10), step=2.0)

@@ -54,6 +54,15 @@ def test_each_effect_changes_its_own_part_of_the_task(volume: Volume) -> None:
     assert plan(volume, effects={"shadows": {"strength": 0}}).shadows is None
 
 
+def test_a_surface_beyond_the_values_is_told(volume: Volume) -> None:
+    low, high = volume.value_range.low, volume.value_range.high
+    for beyond in (low - 1, high + 1):
+        with pytest.warns(FhashWarning, match=rf"isosurface {beyond:.6g}: .* reaches from") as told:
+            plan(volume, effects={"isosurfaces": [{"value": beyond}, {"value": high}]})
+        assert len(told) == 1
+    plan(volume, effects={"isosurfaces": [{"value": low}, {"value": high}]})  # and no warning
+
+
 def test_shadows_light_the_volume_from_over_the_shoulder(volume: Volume) -> None:
     planned = plan(volume, effects={"shading": True, "shadows": True})
     rays, spacing = planned.task.rays, planned.task.rays.grid.spacing

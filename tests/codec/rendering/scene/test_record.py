@@ -69,9 +69,9 @@ def test_defaults_are_left_out() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({}, "count is missing: 'count' \\(number of shots\\) is needed"),
+        ({}, "count is missing; a whole number from 1 to 9 is needed: number of shots"),
         ({"count": 0}, "count is 0; allowed: 1 to 9"),
-        ({"count": 1.0}, "count is 1.0; 'count' \\(number of shots\\) is needed"),
+        ({"count": 1.0}, "^count is 1.0; a whole number from 1 to 9 is needed: number of shots$"),
         ({"count": True}, "count is True"),
         ({"count": 1, "blur": 1}, "blur is 1"),
         ({"count": 1, "place": [0]}, "place is"),
@@ -82,7 +82,11 @@ def test_defaults_are_left_out() -> None:
         ({"count": 1, "tags": ["fra"]}, "allowed: near, far; did you mean 'far'"),
         ({"count": 1, "lens": 3}, "lens is 3"),
         ({"count": 1, "lens": {"lenght": 3}}, "of lens; did you mean 'length'"),
-        ({"count": 1, "lens": {"length": 0}}, "length is 0; allowed: 1 to 1000"),
+        (
+            {"count": 1, "lens": {"length": "x"}},
+            r"^lens\.length is 'x'; a number from 1 to 1000 is needed",
+        ),
+        ({"count": 1, "lens": {"length": 0}}, r"^lens\.length is 0; allowed: 1 to 1000"),
         ({"count": 1, "bulr": True}, "unknown setting 'bulr' of shot; did you mean 'blur'"),
         ([], "shot is .*; a table of settings is needed"),
     ],

@@ -6,8 +6,10 @@ import pytest
 from fhash_codec import native
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.scene.scene import AmbientOcclusion, Shadows
+from fhash_codec.rendering.task import light as light_module
+from fhash_codec.rendering.task.bricks import Bricks
 from fhash_codec.rendering.task.light import light_grid
-from fhash_codec.rendering.task.task import Frame, Table
+from fhash_codec.rendering.task.task import GRADES, Frame, Grading, Table
 from fhash_formats.errors import InputError
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -129,3 +131,66 @@ def test_shadows_need_a_lamp() -> None:
             table_of([1.0, 1.0]),
             shadows=Shadows(),
         )
+
+
+def test_opacity_by_gradient_takes_as_little_light_as_it_draws(way) -> None:
+    # A ball of even values inside and outside: only its rim has a gradient.
+    z, y, x = np.mgrid[-15:16, -15:16, -15:16]
+    ball = np.where(np.sqrt(x * x + y * y + z * z) < 9, 1.0, 0.0)
+    settings = {"table": table_of([0.0, 0.2]), "shadows": Shadows(strength=1.0, resolution=1.0)}
+    given = frame_of(ball), grid_of(ball.shape)
+
+    def shares(factors):
+        grading = Grading(factors=np.array(factors), top=0.4)
+        return light_grid(*given, **settings, lamp=UP, grading=grading).shares[..., 0]
+
+    whole = light_grid(*given, **settings, lamp=UP).shares[..., 0]
+    np.testing.assert_allclose(shares(np.ones(GRADES + 1)), whole, atol=1e-6)
+    rim = shares(np.where(np.arange(GRADES + 1) < GRADES / 2, 0.0, 1.0))
+    inside = shares(np.where(np.arange(GRADES + 1) < GRADES / 2, 1.0, 0.0))
+    assert whole[3, 15, 15] < rim[3, 15, 15] < 1
+    # What both leave is what the whole leaves, along a way through the rim and the inside.
+    np.testing.assert_allclose(
+        rim[3, 15, 15] * inside[3, 15, 15], whole[3, 15, 15], rtol=1e-5, atol=1e-5
+    )
+    assert inside[15, 15, 3] == 1
+
+
+def test_light_is_computed_again_only_for_what_changes_it(monkeypatch) -> None:
+    values = np.random.default_rng(5).random((9, 9, 9), dtype=np.float32)
+    given, table = frame_of(values), table_of([0.0, 0.3])
+    bricks = Bricks.of(given)
+    sums, extinctions = [], []
+    for name, calls in (("_sums", sums), ("_extinction", extinctions)):
+        function = getattr(light_module, name)
+        monkeypatch.setattr(
+            light_module, name, lambda *a, f=function, calls=calls: calls.append(1) or f(*a)
+        )
+
+    def lit(lamp=UP, radius=3.0, table=table, grading=None, bricks=bricks):
+        del sums[:], extinctions[:]
+        return light_grid(
+            given,
+            grid_of(values.shape),
+            table,
+            shadows=Shadows(resolution=1.0),
+            lamp=lamp,
+            ambient_occlusion=AmbientOcclusion(radius=radius),
+            grading=grading,
+            bricks=bricks,
+        ).shares
+
+    sides = len(light_module.SIDES)
+    first = lit()
+    assert (len(extinctions), len(sums)) == (1, 1 + sides)
+    np.testing.assert_array_equal(lit(), first)
+    assert (len(extinctions), len(sums)) == (0, 0)
+    moved = lit(lamp=np.array([0.0, 1.0, 0.0]))
+    assert (len(extinctions), len(sums)) == (0, 1)
+    np.testing.assert_array_equal(moved, lit(lamp=np.array([0.0, 1.0, 0.0]), bricks=None))
+    lit(lamp=np.array([0.0, 1.0, 0.0]), radius=4.0)
+    assert (len(extinctions), len(sums)) == (0, sides)
+    lit(table=table_of([0.0, 0.4]))
+    assert (len(extinctions), len(sums)) == (1, 1 + sides)
+    lit(grading=Grading(factors=np.ones(GRADES + 1), top=1.0))
+    assert len(extinctions) == 1

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from fhash_codec.rendering.camera.camera import Grid
-from fhash_codec.rendering.task.slopes import FLATTEST, STEEPEST, flatness, slope_scale
+from fhash_codec.rendering.task.slopes import (
+    DEVIATIONS,
+    FLATTEST,
+    QUIETEST,
+    STEEPEST,
+    flatness,
+    slope_scale,
+    smoothing,
+)
 
 
 def grid(*spacing: float) -> Grid:
@@ -35,6 +43,20 @@ def test_noise_of_rounding_is_not_lit() -> None:
 
 
 def test_errors_of_coding_are_not_lit() -> None:
-    assert flatness(0.0, 4.0, 0.0, 4.0, 0.5) == (4.0, 0.125)
     assert flatness(0.0, 4.0, 0.0, 4.0, 1e-9)[1] == FLATTEST
-    assert flatness(0.0, 4.0, 0.0, 4.0, 100.0)[1] == 1.0
+    quiet = flatness(0.0, 4.0, 0.0, 4.0, 4 * QUIETEST)
+    assert quiet == (4.0, QUIETEST)
+    # Above it the noise that smoothing leaves counts, and it grows with the noise to the end.
+    floors = [flatness(0.0, 4.0, 0.0, 4.0, 4 * share)[1] for share in (0.0011, 0.02, 0.5, 100.0)]
+    assert floors == sorted(floors)
+    assert floors[0] < floors[1] <= QUIETEST * (1 + 1e-12)
+    assert floors[3] <= 1.0
+
+
+def test_values_are_smoothed_as_far_as_their_noise_needs() -> None:
+    assert smoothing(4.0, 4 * QUIETEST) == 0.0
+    assert smoothing(4.0, 4 * QUIETEST * 1.001) == DEVIATIONS[0]
+    deviations = [smoothing(4.0, 4 * share) for share in (0.003, 0.01, 0.02)]
+    assert deviations == sorted(set(deviations))
+    assert DEVIATIONS[0] < deviations[0] < deviations[2] < DEVIATIONS[1]
+    assert smoothing(4.0, 400.0) == DEVIATIONS[1]

@@ -1,0 +1,82 @@
+"""Smoother values, by whose gradients bounded files are shaded.
+
+The errors of a bounded file have no direction, and neighbouring vertices may be wrong in opposite
+directions. In the gradient of values that a Gaussian has smoothed, errors largely cancel, and what
+the values do over several vertices is left.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec import native
+from fhash_formats.support.threads import in_threads
+
+__all__ = ["smoothed"]
+
+Single = npt.NDArray[np.float32]
+
+REACH = 3.0
+"""Standard deviations after which the Gaussian ends."""
+
+
+def smoothed(values: Single, deviation: float) -> Single:
+    """Values smoothed by a Gaussian along each axis.
+
+    The pair of values on both sides of a vertex counts only where both are there; else twice the
+    value of the vertex takes its place. So values that are linear stay as they are, up to the
+    faces. A missing value stays missing.
+
+    Args:
+        values: float32 (z, y, x), contiguous, NaN where there is none.
+        deviation: standard deviation of the Gaussian, in vertices, above 0.
+    """
+    weights = _weights(deviation)
+    library = native.library()
+    if library is None:
+        for axis in (2, 1, 0):
+            values = _along(values, weights, axis)
+        return values
+    shape = (ctypes.c_int64 * 3)(*values.shape)
+    layers, rows, _ = values.shape
+    flat, out = np.empty_like(values), np.empty_like(values)
+    given = shape, weights.ctypes.data, len(weights) - 1
+
+    def layer(z: int) -> None:
+        scratch = np.empty(values.shape[1:], dtype=np.float32)
+        library.fhash_march_smooth_layers(
+            values.ctypes.data, *given, z, z + 1, flat.ctypes.data, scratch.ctypes.data
+        )
+
+    def row(y: int) -> None:
+        library.fhash_march_smooth_rows(flat.ctypes.data, *given, y, y + 1, out.ctypes.data)
+
+    list(in_threads(layer, range(layers)))
+    list(in_threads(row, range(rows)))
+    return out
+
+
+def _weights(deviation: float) -> Single:
+    """Weights of a value itself and of those 1, 2 and so on vertices away on both sides."""
+    away = np.arange(math.ceil(REACH * deviation) + 1)
+    weights = np.exp(-0.5 * (away / deviation) ** 2)
+    return np.asarray(weights / (2 * weights.sum() - weights[0]), dtype=np.float32)
+
+
+def _along(values: Single, weights: Single, axis: int) -> Single:
+    """The values smoothed along one axis, in numpy."""
+    values = np.moveaxis(values, axis, 0)
+    count = len(values)
+    out = weights[0] * values
+    for away, weight in enumerate(weights[1:], start=1):
+        pairs = 2 * values
+        if count > 2 * away:
+            both = values[: count - 2 * away] + values[2 * away :]
+            inner = pairs[away : count - away]
+            inner[...] = np.where(np.isnan(both), inner, both)
+        out += weight * pairs
+    return np.ascontiguousarray(np.moveaxis(out, 0, axis))
