@@ -77,8 +77,8 @@ struct FhashCell {
 };
 
 // The trilinear value at a place, clamped to the frame, and its gradient per vertex. A vertex of no
-// weight need not have a value; where it has none, the gradient has none (NaN). values: (z, y, x) of
-// the frame's shape.
+// weight need not have a value; where it has none, the gradient has none (NaN). values: (z, y, x)
+// of the frame's shape.
 inline FhashCell fhash_cell_in(const FhashMarch& m, const float* values, double x, double y,
                                double z) {
     using std::max;

@@ -91,9 +91,10 @@ FHASH_EXPORT int64_t fhash_march_smooth_rows(const float* values, const int64_t*
     return 0;
 }
 
-// Factors of the extinction by the size of the gradient at vertices, by central differences; 0 where
-// a value is missing. scale: x, y, z, entries of the table to a difference of 1 per vertex. table:
-// (entries + 1,), the last one twice. first, stop: layers. values, out: (z, y, x) of `shape`.
+// Factors of the extinction by the size of the gradient at vertices, by central differences; 0
+// where a value is missing. scale: x, y, z, entries of the table to a difference of 1 per vertex.
+// table: (entries + 1,), the last one twice. first, stop: layers. values, out: (z, y, x), of the
+// shape `shape`.
 FHASH_EXPORT int64_t fhash_march_factors(const float* values, const int64_t* shape,
                                          const double* scale, const float* table, int64_t entries,
                                          int64_t first, int64_t stop, float* out) {

@@ -90,7 +90,8 @@ class Record:
                 )
         for setting in settings:
             if setting.name not in values and _default(setting) is dataclasses.MISSING:
-                needed = _needed(setting, _hints(cls)[setting.name])
+                hints = _hints(cls)  # type: ignore[arg-type]
+                needed = _needed(setting, hints[setting.name])
                 raise _RefusedSettingError(setting.name, f"is missing; {needed}")
         return cls(**values)
 
@@ -156,7 +157,7 @@ def _default(setting: dataclasses.Field[Any]) -> Any:
 
 
 def _needed(setting: dataclasses.Field[Any], hint: Any) -> str:
-    """What a field takes, and its help, for messages."""
+    """The kind and range of values that a field takes, and its help, for messages."""
     low, high = setting.metadata.get("low"), setting.metadata.get("high")
     allowed = "" if low is None or high is None else f" from {low:g} to {high:g}"
     told = setting.metadata.get("help")

@@ -110,7 +110,7 @@ def light_grid(
 
 @dataclass(frozen=True)
 class _Kept:
-    """What bricks keep of the light of one transfer function; without bricks nothing is kept."""
+    """The light of one transfer function that bricks keep; without bricks nothing is kept."""
 
     bricks: Bricks | None
     key: tuple[object, ...]
