@@ -113,14 +113,21 @@ def plan(
         estimated_plan = _estimated_plan(task, tiled, settings)
         parts.end()
         return estimated_plan
+    found = _by_trial(task, tiled, settings, trial)
+    parts.end()
+    return found
+
+
+def _by_trial(
+    task: PlanTask, tiled: Blocks, settings: TileSettings, trial: LabelTrial | None
+) -> CodingPlan:
+    """Return the plan after trials of all choices, or of labels where these need fewer bytes."""
     attempt = first_guess(task, tiled, settings)
     if trial is not None and is_hopeless(
         trial.attempt.outcome.size, attempt.outcome.size, trial.entropy
     ):
-        parts.end()
         return _label_plan(task, trial.attempt)
     attempt = _improved(task, attempt)
-    parts.end()
     settings = attempt.settings
     if trial is not None:
         if trial.attempt.outcome.size <= attempt.outcome.size:
@@ -131,9 +138,9 @@ def plan(
         blocks=attempt.sample.blocks,
         sample=attempt.sample,
         settings=settings,
-        coding=goal.bounded(_final_coding(task, attempt)),
-        goal=goal,
-        gains=gains.entries,
+        coding=task.goal.bounded(_final_coding(task, attempt)),
+        goal=task.goal,
+        gains=task.gains.entries,
         history=attempt.history,
     )
 

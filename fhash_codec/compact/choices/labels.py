@@ -39,7 +39,7 @@ STRUCTURELESS = 0.97
 
 @dataclass(frozen=True, kw_only=True)
 class LabelTrial:
-    """What coding as labels gives.
+    """Outcome of coding as labels.
 
     Attributes:
         attempt: tiles and settings.

@@ -55,7 +55,7 @@ class Round:
 
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """What follows after a measurement of the model.
+    """Decision that follows a measurement of the model.
 
     Attributes:
         round: the next round; None to end the training.
