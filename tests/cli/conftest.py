@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,9 @@ import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+
+# pytest's importlib mode puts no folder of tests on the path; `source_kinds` is beside this file.
+sys.path.insert(0, str(Path(__file__).parent))
 
 SHAPE = (3, 6, 7, 8)
 SMALL = ["--effort", "1", "--quiet"]
