@@ -211,10 +211,10 @@ class _Coding:
             step = search.step
             self._progress(stage, min(trial, trials), trials, f"step {step:.3g}")
             coded = self._coded([self._tiled(level, step) for level in self._levels], tiles)
-            search.add(coded.error)
+            done = search.add(coded.error)
             if search.best == step:
                 best = coded
-            if search.done or (best is not None and trial + 1 >= trials):
+            if done or (best is not None and trial + 1 >= trials):
                 break
         return best or coded
 
@@ -225,8 +225,8 @@ class _Coding:
         """
         window = self._window(self._width)
         search = StepSearch(window, coded.tables[level].step, self._min_step)
-        search.add(coded.error)
-        if not window.has_room(coded.error) or search.done:
+        done = search.add(coded.error)
+        if done or not window.has_room(coded.error):
             return coded
         best = coded
         for trial in range(TRIALS_OF_LEVEL):
@@ -234,10 +234,10 @@ class _Coding:
             tables = list(coded.tables)
             tables[level] = self._tiled(level, search.step)
             refined = self._coded(tables, self._all)
-            search.add(refined.error)
+            done = search.add(refined.error)
             if best.error < refined.error <= window.allowed:
                 best = refined
-            if search.done:
+            if done:
                 break
         return best
 

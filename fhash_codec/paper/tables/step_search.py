@@ -54,7 +54,7 @@ class Window:
     @property
     def aim(self) -> float:
         """Error that coding should add."""
-        return self.least**AIM * self.allowed ** (1 - AIM) - self.exact
+        return float(self.least**AIM * self.allowed ** (1 - AIM)) - self.exact
 
     def has_room(self, error: float) -> bool:
         """Return whether an error keeps the promise, and a smaller file may keep it as well."""
@@ -79,8 +79,11 @@ class StepSearch:
         self._bracket = Bracket(min_step, math.inf, middle=geometric_mean)
         self._points: list[tuple[float, float]] = []
 
-    def add(self, error: float) -> None:
-        """Take up the mean squared error that `step` gave, and choose the next step."""
+    def add(self, error: float) -> bool:
+        """Take up the mean squared error that `step` gave, and choose the next step.
+
+        Returns whether the search is done.
+        """
         window, step = self._window, self.step
         kept = error <= window.allowed
         if kept and (self.best is None or step > self.best):
@@ -91,11 +94,12 @@ class StepSearch:
         at_limit = step <= self._min_step and not kept
         if window.least <= error <= window.allowed or at_limit:
             self.done = True
-            return
+            return True
         self.step = max(self._next(), self._min_step)
         self.done = self.step in (step, self.best) or self._bracket.high < CLOSEST * max(
             self._bracket.low, self._min_step
         )
+        return self.done
 
     def _next(self) -> float:
         """Return the step at which the aim should be met, inside of what was tried."""

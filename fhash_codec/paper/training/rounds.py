@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 LOWER_START = 0.5
 """Learning rate at the start of a round, as a share of that of the training."""
 MAX_DOUBLINGS = 10
-"""Largest number of further rounds, as the last one promises it, that are still worth one more."""
+"""Largest number of further rounds, by the gain of the last ones, that are worth one more."""
+WATCHED_ROUNDS = 2
+"""Rounds whose gain counts: a training may pause for one and then learn again."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,13 +87,13 @@ def decide(
     short = (
         "" if psnr < goal.promised else f", which costs bytes: {goal.psnr:g} dB would leave room"
     )
-    if rounds:
-        gain = psnr - rounds[-1].psnr
-        if gain * MAX_DOUBLINGS < goal.psnr - psnr:
-            doubled = "the last round, which doubled its epochs," if _whole(rounds) else "the last"
+    if len(rounds) >= WATCHED_ROUNDS:
+        gain = psnr - rounds[-WATCHED_ROUNDS].psnr
+        if gain * MAX_DOUBLINGS < WATCHED_ROUNDS * (goal.psnr - psnr):
             return Decision(
                 round=None,
-                message=f"training ends: {has}, {needed}{short}; {doubled} brought {gain:.2f} dB",
+                message=f"training ends: {has}, {needed}{short}; "
+                f"the last {WATCHED_ROUNDS} rounds brought {gain:.2f} dB",
             )
     begun = rounds[0].seconds if rounds else seconds
     left = goal.seconds - (seconds - begun)
@@ -123,8 +125,3 @@ def extended(plan: TrainingPlan, epochs: int, schedule: str) -> TrainingPlan:
     top = LOWER_START * plan.rates[0]
     rates = top * (0.5 + 0.5 * np.cos(np.pi * share) if schedule == "cosine" else share**0)
     return replace(plan, epochs=plan.epochs + epochs, rates=np.concatenate([plan.rates, rates]))
-
-
-def _whole(rounds: Sequence[Round]) -> bool:
-    """Return whether the last round was not cut short by the limit."""
-    return len(rounds) < 2 or rounds[-1].epochs > rounds[-2].epochs

@@ -55,6 +55,19 @@ def test_other_models_fit(tmp_path, samples, fields) -> None:
         assert container.verify() == len(arrays)
 
 
+def test_a_mask_may_stand_in_place_of_the_bits(tmp_path, samples) -> None:
+    header = samples.header()
+    arrays = samples.arrays(header)
+    del arrays["occupancy/bits"]
+    mask = np.ones(header["model"]["levels"][0], np.uint8)
+    samples.write(tmp_path / "a.fhz", header, arrays | {"occupancy/mask": mask})
+    with Container.open(tmp_path / "a.fhz") as container:
+        assert container.verify() == len(arrays) + 1
+    for other in (mask[1:], mask.astype(np.int16)):
+        with pytest.raises(InputError, match=r"array occupancy/mask is .* the header asks for"):
+            samples.write(tmp_path / "b.fhz", header, arrays | {"occupancy/mask": other})
+
+
 def test_one_step_of_one_vertex(tmp_path, samples) -> None:
     header = samples.header()
     header["domain"]["shape"] = [1, 1, 1, 1]
