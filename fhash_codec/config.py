@@ -89,7 +89,7 @@ class EncodeConfig:
         2, "paper: numbers trained at each grid corner", low=1, high=16, profile="paper"
     )
     hidden_layers: int = option(
-        1, "paper: hidden layers of the network", low=0, high=8, profile="paper"
+        2, "paper: hidden layers of the network", low=0, high=8, profile="paper"
     )
     width: int = option(
         64, "paper: neurons of each hidden layer", low=1, high=1024, profile="paper"
