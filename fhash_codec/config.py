@@ -112,7 +112,7 @@ class EncodeConfig:
     )
     batch: int = option(
         0,
-        "paper: samples per training step, 0 for a size that suits the data",
+        "paper: samples per training step, of the coreset alone; 0 for a size that suits the data",
         low=0,
         high=2**31,
         profile="paper",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from math import prod
 from statistics import median
 from typing import Any
 
@@ -77,7 +76,7 @@ def bench_train(
         batch=config.batch,
         seed=config.seed,
     )
-    with threads_for(plan.batch_bricks * prod(coreset.brick_shape)):
+    with threads_for(plan.batch_samples):
         runs = [_Run(engine, architecture, coreset, plan, seconds, device) for engine in engines]
         for turn in range(TURNS):
             for number, run in enumerate(runs):

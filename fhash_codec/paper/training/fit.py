@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from functools import partial
-from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -134,8 +133,7 @@ class _Fitting:
         plan = self._plan()
         engine = self._engine(plan)
         finished_before = self._reached.epoch == plan.epochs
-        vertices = plan.batch_bricks * prod(self._coreset.brick_shape)
-        with deferred_interrupts() as stop, threads_for(vertices):
+        with deferred_interrupts() as stop, threads_for(plan.batch_samples):
             save = partial(self._save, engine, stop)
             done = train(
                 engine,
