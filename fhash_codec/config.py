@@ -21,6 +21,9 @@ TABLE_TYPES = ("float32", "float16", "uint8", "transform")
 ENGINES = ("slab", "naive")
 """Training engines of the paper profile."""
 
+FRINGES = ("trained", "untrained")
+"""What the paper profile does with vertices in the coreset of one neighbouring key frame only."""
+
 PROMISES = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
 """Settings that promise a quality or a size; at most one of them is given, or PAIR."""
 
@@ -80,6 +83,13 @@ class EncodeConfig:
         "all",
         "paper: steps to train on, as all, every:K, auto:N (N chosen by interpolation error) "
         "or a list such as 0,4,9",
+        profile="paper",
+    )
+    fringe: str = option(
+        "trained",
+        "paper: a vertex in the coreset of one of two neighbouring key frames only is 'trained' at "
+        "both, so that values between them are right, or 'untrained' at one, as published",
+        choices=FRINGES,
         profile="paper",
     )
     fold: int = option(

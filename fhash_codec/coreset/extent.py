@@ -51,7 +51,31 @@ class Extent:
 
         key: index of a key frame.
         """
-        bits = np.unpackbits(self.packed[key], count=prod(self.domain))
+        return self._unpacked(self.packed[key])
+
+    def with_fringe(self, key: int) -> npt.NDArray[np.bool_]:
+        """Mask (z, y, x) of the vertices of the box in the coreset of a key frame or of its
+        neighbours.
+
+        Its *fringe* are those that only a neighbour has. Between two key frames a value depends on
+        both, and so does that of a vertex in the coreset of one of them.
+
+        key: index of a key frame.
+        """
+        return self._unpacked(self._packed_with_fringe(key))
+
+    def samples_with_fringe(self) -> int:
+        """Vertices of `with_fringe` over all key frames."""
+        keys = range(len(self.packed))
+        return sum(int(np.bitwise_count(self._packed_with_fringe(key)).sum()) for key in keys)
+
+    def _packed_with_fringe(self, key: int) -> npt.NDArray[np.uint8]:
+        near = self.packed[max(key - 1, 0) : key + 2]
+        return np.asarray(np.bitwise_or.reduce(near))
+
+    def _unpacked(self, packed: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+        """The vertices of the box of a packed mask of the domain."""
+        bits = np.unpackbits(packed, count=prod(self.domain))
         return bits.view(np.bool_).reshape(self.domain)[self.box.slices()]
 
 

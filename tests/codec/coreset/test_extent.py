@@ -49,3 +49,13 @@ def test_two_masks_of_one_name_are_both_selected() -> None:
     features = tuple(Mask("array", read=lambda step, end=end: end) for end in ends)
     extent = extent_of(VALUES, features)
     np.testing.assert_array_equal(extent.mask(0), ends[0] | ends[1])
+
+
+def test_the_fringe_is_what_only_a_neighbouring_key_frame_has() -> None:
+    extent = extent_of(VALUES, (Interval(0.7, 1.0),))
+    masks = [extent.mask(key) for key in range(3)]
+    grown = [extent.with_fringe(key) for key in range(3)]
+    np.testing.assert_array_equal(grown[0], masks[0] | masks[1])
+    np.testing.assert_array_equal(grown[1], masks[0] | masks[1] | masks[2])
+    np.testing.assert_array_equal(grown[2], masks[1] | masks[2])
+    assert extent.samples_with_fringe() == sum(mask.sum() for mask in grown)
