@@ -74,8 +74,8 @@ class EncodeConfig:
     )
     features: tuple[str, ...] = option(
         ("all",),
-        "what to keep: interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE or all; "
-        "repeat to merge several",
+        "what to keep: interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE or all; change:D "
+        "and onset:V, where values change by more than D or rise above V; repeat to merge several",
         option="feature",
     )
     dilation: int = option(1, "vertices by which features grow in every direction", low=0, high=64)

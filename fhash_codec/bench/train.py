@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from math import prod
 from statistics import median
 from typing import Any
 
@@ -44,7 +45,8 @@ def bench_train(
     """Measure engines on the coreset of a series.
 
     Each engine trains for `seconds` in three turns, and evaluates bricks in each. The result has
-    the keys `engines`, `machine`, `series`, `samples` and `batch_samples`. An entry of `engines`:
+    the keys `engines`, `machine`, `series`, `samples`, `batch_samples` and `brick_fill`, the share
+    of samples among the vertices of bricks. An entry of `engines`:
 
     - `train_msamples_s`, `infer_msamples_s`: coreset vertices, in 10^6 a second, medians over the
       turns.
@@ -99,6 +101,7 @@ def bench_train(
         "series": name,
         "samples": len(coreset.values),
         "batch_samples": len(coreset.values) / plan.batches,
+        "brick_fill": len(coreset.values) / (len(coreset.bricks) * prod(coreset.brick_shape)),
     }
 
 

@@ -49,6 +49,7 @@ class Coreset:
         fraction: vertices of the coreset / (key frames * vertices of the domain).
         background: mean of the finite values outside the coreset over the key frames, in data
             units; the mean of all values if none is outside.
+        apart: `occupancy` of each feature alone; empty if there is only one.
     """
 
     box: Box
@@ -62,6 +63,7 @@ class Coreset:
     occupancy: tuple[npt.NDArray[np.uint8], ...]
     fraction: float
     background: float
+    apart: tuple[tuple[npt.NDArray[np.uint8], ...], ...] = ()
 
 
 def build_coreset(
@@ -86,7 +88,8 @@ def build_coreset(
     Raises InputError if the features select nothing at all; single key frames may be empty. Warns
     of a feature that selects nothing while others do. Progress stages: "selecting", "gathering".
     """
-    extent = find_extent(series, scan, key_frames, features, dilation, progress)
+    several = len(features) > 1
+    extent = find_extent(series, scan, key_frames, features, dilation, progress, apart=several)
     box, size = extent.box, extent.box.shape
     shape = brick or brick_shape(size)
     grid = (-(-size[0] // shape[0]), -(-size[1] // shape[1]), -(-size[2] // shape[2]))
@@ -122,6 +125,10 @@ def build_coreset(
         occupancy=tuple(grids),
         fraction=extent.fraction,
         background=extent.background,
+        apart=tuple(
+            tuple(occupancy.pack(extent.mask_of(number, key)) for key in range(len(key_frames)))
+            for number in range(len(extent.apart))
+        ),
     )
 
 

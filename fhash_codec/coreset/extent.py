@@ -32,6 +32,7 @@ class Extent:
         samples: vertices of the coreset over all key frames.
         background: mean of the finite values outside the coreset over the key frames, in data
             units; the mean of all values if none is outside.
+        apart: the packed masks of each feature, by feature and key frame; empty unless asked for.
     """
 
     box: Box
@@ -40,6 +41,7 @@ class Extent:
     domain: Sizes
     samples: int
     background: float
+    apart: tuple[list[npt.NDArray[np.uint8]], ...] = ()
 
     @property
     def fraction(self) -> float:
@@ -52,6 +54,13 @@ class Extent:
         key: index of a key frame.
         """
         return self._unpacked(self.packed[key])
+
+    def mask_of(self, feature: int, key: int) -> npt.NDArray[np.bool_]:
+        """Mask (z, y, x) of the vertices of the box that are in the coreset for one feature.
+
+        feature: its number among those of `apart`. key: index of a key frame.
+        """
+        return self._unpacked(self.apart[feature][key])
 
     def with_fringe(self, key: int) -> npt.NDArray[np.bool_]:
         """Mask (z, y, x) of the vertices of the box in the coreset of a key frame or of its
@@ -86,16 +95,24 @@ def find_extent(
     features: Sequence[Feature],
     dilation: int,
     progress: Progress,
+    *,
+    apart: bool = False,
 ) -> Extent:
     """The extent of the finite vertices of the merged features, dilated, at every key frame.
 
-    Parameters, errors, warnings and the progress stage "selecting" as in `build_coreset`.
+    apart: whether to keep the masks of each feature as well.
+
+    Other parameters, errors, warnings and the progress stage "selecting" as in `build_coreset`.
     """
     z, y, x = series.shape[1:]
-    if not scan.missing and any(isinstance(feature, Everything) for feature in features):
+    everything = any(isinstance(feature, Everything) for feature in features)
+    if everything and not scan.missing and not apart:
         return _everywhere(scan, key_frames, (z, y, x), progress)
     packed: list[npt.NDArray[np.uint8]] = []
     boxes, outside, samples = [], Mean(), 0
+    packed_apart: tuple[list[npt.NDArray[np.uint8]], ...] = tuple(
+        [] for _ in (features if apart else ())
+    )
     without_vertices = set(features)
     for done, step in enumerate(key_frames):
         frame = series.read(step)
@@ -105,6 +122,8 @@ def find_extent(
         }
         mask, finite = _dilated(np.logical_or.reduce(masks), step, scan, dilation)
         packed.append(np.packbits(mask))
+        for one, packed_one in zip(masks, packed_apart, strict=False):
+            packed_one.append(np.packbits(_dilated(one, step, scan, dilation)[0]))
         boxes.append(bounding_box(mask))
         samples += int(np.count_nonzero(mask))
         _add_outside(outside, frame, mask, finite)
@@ -127,6 +146,7 @@ def find_extent(
         domain=(z, y, x),
         samples=samples,
         background=outside.value() if outside.count else scan.mean,
+        apart=packed_apart,
     )
 
 

@@ -32,12 +32,14 @@ TABLE_AXES = ("t", "z", "y", "x", "embedding")
 def write_model(
     writer: ContainerWriter, coreset: Coreset, layers: list[tuple[Floats, Floats]]
 ) -> None:
-    """Write the occupancy of a coreset, and the (weight, bias) of each layer of the MLP."""
+    """Write the occupancy of a coreset and of its features, and the layers (weight, bias)."""
     for number, (weight, bias) in enumerate(layers, start=1):
         writer.add_whole(f"mlp/weight_{number}", weight)
         writer.add_whole(f"mlp/bias_{number}", bias)
-    bits = np.stack(coreset.occupancy)
-    writer.add_whole("occupancy/bits", bits, chunk_shape=(1, bits.shape[1]))
+    names = ["occupancy/bits", *(f"occupancy/feature_{n + 1}" for n in range(len(coreset.apart)))]
+    for name, grids in zip(names, (coreset.occupancy, *coreset.apart), strict=True):
+        bits = np.stack(grids)
+        writer.add_whole(name, bits, chunk_shape=(1, bits.shape[1]))
 
 
 def write_tables(

@@ -59,3 +59,16 @@ def test_the_fringe_is_what_only_a_neighbouring_key_frame_has() -> None:
     np.testing.assert_array_equal(grown[1], masks[0] | masks[1] | masks[2])
     np.testing.assert_array_equal(grown[2], masks[1] | masks[2])
     assert extent.samples_with_fringe() == sum(mask.sum() for mask in grown)
+
+
+def test_features_are_kept_apart_where_asked_and_make_up_the_whole() -> None:
+    values = VALUES.copy()
+    values[0, 2, 3, 4] = np.nan
+    features = (Interval(0.9, 1.0), Everything(), Interval(0.0, 0.1))
+    series = ArraySeries(values)
+    extent = find_extent(series, scan(series, silent), (0, 1, 3), features, 1, silent, apart=True)
+    for key in range(3):
+        masks = [extent.mask_of(number, key) for number in range(3)]
+        np.testing.assert_array_equal(np.logical_or.reduce(masks), extent.mask(key))
+        assert masks[0].sum() < masks[1].sum()
+    assert extent_of(values, features).apart == ()
