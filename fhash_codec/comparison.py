@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.measure.between import NeighboursOf, neighbours_of
 from fhash_codec.measure.bulk import find_bulk
 from fhash_codec.measure.metrics import measure_quality
 from fhash_codec.measure.value_range import ValueRange
@@ -91,9 +92,18 @@ def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any
         volume.background,
         progress,
         bulk=_bulk(series, volume),
+        neighbours=_neighbours(series, volume),
     )
     series.check()
     return quality.to_dict()
+
+
+def _neighbours(series: Series, volume: Volume) -> NeighboursOf | None:
+    """The key frames of a series around each other step; None if every step is a key frame."""
+    times = volume.key_times
+    if len(times.key_frames) == series.shape[0]:
+        return None
+    return neighbours_of(times.key_frames, times.key_index, series.read, volume.occupancy)
 
 
 def _bulk(series: Series, volume: Volume) -> ValueRange | None:

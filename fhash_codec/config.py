@@ -21,6 +21,9 @@ TABLE_TYPES = ("float32", "float16", "uint8", "transform")
 ENGINES = ("slab", "naive")
 """Training engines of the paper profile."""
 
+FRINGES = ("trained", "untrained")
+"""What the paper profile does with vertices in the coreset of one neighbouring key frame only."""
+
 PROMISES = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
 """Settings that promise a quality or a size; at most one of them is given, or PAIR."""
 
@@ -71,8 +74,8 @@ class EncodeConfig:
     )
     features: tuple[str, ...] = option(
         ("all",),
-        "what to keep: interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE or all; "
-        "repeat to merge several",
+        "what to keep: interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE or all; change:D "
+        "and onset:V, where values change by more than D or rise above V; repeat to merge several",
         option="feature",
     )
     dilation: int = option(1, "vertices by which features grow in every direction", low=0, high=64)
@@ -82,6 +85,13 @@ class EncodeConfig:
         "or a list such as 0,4,9",
         profile="paper",
     )
+    fringe: str = option(
+        "trained",
+        "paper: a vertex in the coreset of one of two neighbouring key frames only is 'trained' at "
+        "both, so that values between them are right, or 'untrained' at one, as published",
+        choices=FRINGES,
+        profile="paper",
+    )
     fold: int = option(
         2, "paper: ratio of resolution from one level to the next", low=2, high=64, profile="paper"
     )
@@ -89,7 +99,7 @@ class EncodeConfig:
         2, "paper: numbers trained at each grid corner", low=1, high=16, profile="paper"
     )
     hidden_layers: int = option(
-        1, "paper: hidden layers of the network", low=0, high=8, profile="paper"
+        2, "paper: hidden layers of the network", low=0, high=8, profile="paper"
     )
     width: int = option(
         64, "paper: neurons of each hidden layer", low=1, high=1024, profile="paper"
@@ -120,7 +130,7 @@ class EncodeConfig:
     )
     batch: int = option(
         0,
-        "paper: samples per training step, 0 for a size that suits the data",
+        "paper: samples per training step, of the coreset alone; 0 for a size that suits the data",
         low=0,
         high=2**31,
         profile="paper",

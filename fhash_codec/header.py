@@ -149,7 +149,7 @@ def brief_quality(quality: Mapping[str, Any]) -> dict[str, Any]:
 
     quality: `metrics.Quality` as JSON values.
     """
-    brief = {
+    brief: dict[str, Any] = {
         name: _figure(name, value, DIGITS) if isinstance(value, float) else value
         for name, value in quality.items()
     }
@@ -157,6 +157,11 @@ def brief_quality(quality: Mapping[str, Any]) -> dict[str, Any]:
     if bulk is not None:
         # The RMSE follows from the two others.
         brief["bulk"] = {"psnr": _figure("psnr", bulk["psnr"], DIGITS), "range": bulk["range"]}
+    between = brief.pop("between", None)
+    if between is not None:
+        brief["between"] = {
+            name: _figure(name, value, STEP_DIGITS) for name, value in between.items()
+        }
     steps = quality["per_step"]
     brief["per_step"] = {
         name: [_figure(name, step[name], STEP_DIGITS) for step in steps]

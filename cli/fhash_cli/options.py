@@ -21,6 +21,13 @@ Command = Callable[..., None]
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 force_option = click.option("--force", is_flag=True, help="Replace an output that exists.")
 quiet_option = click.option("-q", "--quiet", is_flag=True, help="No progress on stderr.")
+feature_option = click.option(
+    "--feature",
+    "features",
+    multiple=True,
+    metavar="F",
+    help="Only this feature of the file, as `fhash info` names it; repeat for several.",
+)
 run_argument = click.argument("run", metavar="RUN.fhz", type=click.Path())
 
 

@@ -228,6 +228,7 @@ def quality_rows(report: Mapping[str, Any], units: str = "") -> list[tuple[str, 
     return [
         ("PSNR, coreset", "exact" if exact else number(report.get("psnr"), "dB")),
         *_bulk_rows(report),
+        *_between_rows(report),
         ("PSNR, domain", number(report.get("psnr_domain"), "dB")),
         ("RMSE", number(report.get("rmse"), units)),
         ("largest error", _largest_error(report.get("max_abs_error"), units)),
@@ -243,6 +244,26 @@ def _bulk_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     low, high = apart(*bulk["range"])
     psnr = "exact" if bulk["psnr"] is None else number(bulk["psnr"], "dB")
     return [("PSNR, bulk", f"{psnr}, of the 98 % from {low} to {high}")]
+
+
+def _between_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The rows of the PSNR at key frames and between them; none where every step is one."""
+    between = report.get("quality", report).get("between")
+    if between is None:
+        return []
+
+    def beside_linear(name: str) -> str:
+        linear = number(between.get(f"{name}_linear"), "dB")
+        return f"{number(between.get(name), 'dB')}; the source, interpolated, {linear}"
+
+    rows = [
+        ("  key frames", number(between.get("psnr_key_frames"), "dB")),
+        ("  between them", beside_linear("psnr")),
+    ]
+    share = between.get("fringe_fraction") or 0
+    if share:
+        rows.append(("  in one only", f"{beside_linear('psnr_fringe')}, {share:.1%} of these"))
+    return rows
 
 
 def loss_rows(model: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -28,6 +28,7 @@ PLACES = {
     "time": "time",
     "t": "step",
     "size": "size",
+    "feature": "features",
     "view": "camera.view",
     "azimuth": "camera.azimuth",
     "elevation": "camera.elevation",
@@ -149,6 +150,12 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         "--scale",
         type=NumbersType(3),
         help="Stretch the axes.  [default: one in other units is as long as the rest]",
+    ),
+    click.option(
+        "--feature",
+        multiple=True,
+        metavar="F",
+        help="Only this feature of the file, as `fhash info` names it; repeat for several.",
     ),
     click.option("--cmap", metavar="NAME", help="Colour map, or a ParaView preset (JSON)."),
     click.option(

@@ -143,3 +143,16 @@ def _span(what: str, low: int | None, high: int | None, count: int, allowed: str
     else:
         reason = "which leaves the series" if what == "--t" else "which is not all inside"
     raise RegionError(f"{what} is {written(low, high)}, {reason}; {allowed}")
+
+
+def opened(run: str, fill: float | None, features: Sequence[str]) -> Volume:
+    """An open container, with some of its features alone if any are named; see `only_features`."""
+    import fhash_codec
+    from fhash_codec.feature_volume import only_features
+
+    volume = fhash_codec.open(run, fill=fill)
+    try:
+        return only_features(volume, features) if features else volume
+    except fhash_codec.InputError:
+        volume.close()
+        raise

@@ -45,7 +45,8 @@ def bench_train(
     """Measure engines on the coreset of a series.
 
     Each engine trains for `seconds` in three turns, and evaluates bricks in each. The result has
-    the keys `engines`, `machine`, `series`, `samples` and `batch_samples`. An entry of `engines`:
+    the keys `engines`, `machine`, `series`, `samples`, `batch_samples` and `brick_fill`, the share
+    of samples among the vertices of bricks. An entry of `engines`:
 
     - `train_msamples_s`, `infer_msamples_s`: coreset vertices, in 10^6 a second, medians over the
       turns.
@@ -77,7 +78,7 @@ def bench_train(
         batch=config.batch,
         seed=config.seed,
     )
-    with threads_for(plan.batch_bricks * prod(coreset.brick_shape)):
+    with threads_for(plan.batch_samples):
         runs = [_Run(engine, architecture, coreset, plan, seconds, device) for engine in engines]
         for turn in range(TURNS):
             for number, run in enumerate(runs):
@@ -100,6 +101,7 @@ def bench_train(
         "series": name,
         "samples": len(coreset.values),
         "batch_samples": len(coreset.values) / plan.batches,
+        "brick_fill": len(coreset.values) / (len(coreset.bricks) * prod(coreset.brick_shape)),
     }
 
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fhash_codec.coreset import occupancy
 from fhash_codec.coreset.boxes import Box, Sizes
-from fhash_codec.coreset.extent import find_extent
+from fhash_codec.coreset.extent import Extent, find_extent
 from fhash_codec.coreset.features import Feature
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.progress import Progress
@@ -42,13 +42,14 @@ class Coreset:
         bricks: int32 (n, 4), one row (key index, z, y, x) in the brick grid for each brick that
             holds a sample, ascending.
         mask_bits: uint8 (n, ceil(vertices of a brick / 8)), np.packbits of each brick in C order,
-            1 = sample.
+            1 = sample. Samples are the vertices of the coreset, and of its fringe if that is asked.
         values: float32 (samples,) in [0, 1], samples only: brick by brick, in C order in a brick.
         offsets: int64 (n + 1,), the place in `values` where each brick begins, and their end.
-        occupancy: one grid per key frame, in ragged Morton order over the box, 1 = sample.
-        fraction: samples / (key frames * vertices of the domain).
+        occupancy: one grid per key frame, in ragged Morton order over the box, 1 = in the coreset.
+        fraction: vertices of the coreset / (key frames * vertices of the domain).
         background: mean of the finite values outside the coreset over the key frames, in data
             units; the mean of all values if none is outside.
+        apart: `occupancy` of each feature alone; empty if there is only one.
     """
 
     box: Box
@@ -62,6 +63,7 @@ class Coreset:
     occupancy: tuple[npt.NDArray[np.uint8], ...]
     fraction: float
     background: float
+    apart: tuple[tuple[npt.NDArray[np.uint8], ...], ...] = ()
 
 
 def build_coreset(
@@ -72,28 +74,35 @@ def build_coreset(
     dilation: int,
     progress: Progress,
     *,
+    fringe: bool = False,
     brick: Sizes | None = None,
 ) -> Coreset:
     """The coreset of a series: finite vertices of the merged features, dilated, at every key frame.
 
     features: resolved, see `resolve_features`.
     dilation: in vertices.
+    fringe: whether vertices in the coreset of a neighbouring key frame only are samples as well
+        (`Extent.with_fringe`). One without a finite value has that of the neighbour.
     brick: the shape of a brick (z, y, x); `brick_shape` of the box if None.
 
     Raises InputError if the features select nothing at all; single key frames may be empty. Warns
     of a feature that selects nothing while others do. Progress stages: "selecting", "gathering".
     """
-    extent = find_extent(series, scan, key_frames, features, dilation, progress)
-    box, samples = extent.box, extent.samples
-    size = box.shape
+    several = len(features) > 1
+    extent = find_extent(series, scan, key_frames, features, dilation, progress, apart=several)
+    box, size = extent.box, extent.box.shape
     shape = brick or brick_shape(size)
     grid = (-(-size[0] // shape[0]), -(-size[1] // shape[1]), -(-size[2] // shape[2]))
+    samples = extent.samples_with_fringe() if fringe else extent.samples
     values = np.empty(samples, dtype=np.float32)
     grids, layers, end = [], [], 0
     for key, step in enumerate(key_frames):
         mask = extent.mask(key)
         grids.append(occupancy.pack(mask))
         frame = series.read(step)[box.slices()]
+        if fringe:
+            mask = extent.with_fringe(key)
+            frame = _finite_at(mask, frame, series, extent, key)
         for layer in range(grid[0]):
             rows = slice(layer * shape[0], (layer + 1) * shape[0])
             in_coreset = tile(mask[rows], shape)
@@ -116,6 +125,10 @@ def build_coreset(
         occupancy=tuple(grids),
         fraction=extent.fraction,
         background=extent.background,
+        apart=tuple(
+            tuple(occupancy.pack(extent.mask_of(number, key)) for key in range(len(key_frames)))
+            for number in range(len(extent.apart))
+        ),
     )
 
 
@@ -135,6 +148,28 @@ def brick_shape(size: Sizes) -> Sizes:
     counts = [-(-length // 2**bit) for length, bit in zip(size, bits, strict=True)]
     z, y, x = (-(-length // count) for length, count in zip(size, counts, strict=True))
     return z, y, x
+
+
+def _finite_at(
+    mask: npt.NDArray[np.bool_],
+    frame: npt.NDArray[Scalar],
+    series: Series,
+    extent: Extent,
+    key: int,
+) -> npt.NDArray[Scalar]:
+    """A frame (z, y, x) of the box with a finite value at every vertex of a mask with fringe.
+
+    Where the series has none, it is that of the neighbouring key frame whose coreset has the
+    vertex, the one before if both have it.
+    """
+    gaps = mask & ~np.isfinite(frame)
+    for other in (key - 1, key + 1):
+        if gaps.any() and 0 <= other < len(extent.key_frames):
+            held = gaps & extent.mask(other)
+            values = series.read(extent.key_frames[other])[extent.box.slices()]
+            frame = np.where(held, values, frame)
+            gaps &= ~held
+    return frame
 
 
 def tile(layer: npt.NDArray[Scalar], shape: Sizes) -> npt.NDArray[Scalar]:

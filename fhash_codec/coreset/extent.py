@@ -33,6 +33,7 @@ class Extent:
         samples: vertices of the coreset over all key frames.
         background: mean of the finite values outside the coreset over the key frames, in data
             units; the mean of all values if none is outside.
+        apart: the packed masks of each feature, by feature and key frame; empty unless asked for.
     """
 
     box: Box
@@ -41,6 +42,7 @@ class Extent:
     domain: Sizes
     samples: int
     background: float
+    apart: tuple[list[npt.NDArray[np.uint8]], ...] = ()
 
     @property
     def fraction(self) -> float:
@@ -52,7 +54,38 @@ class Extent:
 
         key: index of a key frame.
         """
-        bits = np.unpackbits(self.packed[key], count=prod(self.domain))
+        return self._unpacked(self.packed[key])
+
+    def mask_of(self, feature: int, key: int) -> npt.NDArray[np.bool_]:
+        """Mask (z, y, x) of the vertices of the box that are in the coreset for one feature.
+
+        feature: its number among those of `apart`. key: index of a key frame.
+        """
+        return self._unpacked(self.apart[feature][key])
+
+    def with_fringe(self, key: int) -> npt.NDArray[np.bool_]:
+        """Mask (z, y, x) of the vertices of the box in the coreset of a key frame or of its
+        neighbours.
+
+        Its *fringe* are those that only a neighbour has. Between two key frames a value depends on
+        both, and so does that of a vertex in the coreset of one of them.
+
+        key: index of a key frame.
+        """
+        return self._unpacked(self._packed_with_fringe(key))
+
+    def samples_with_fringe(self) -> int:
+        """Vertices of `with_fringe` over all key frames."""
+        keys = range(len(self.packed))
+        return sum(int(np.bitwise_count(self._packed_with_fringe(key)).sum()) for key in keys)
+
+    def _packed_with_fringe(self, key: int) -> npt.NDArray[np.uint8]:
+        near = self.packed[max(key - 1, 0) : key + 2]
+        return np.asarray(np.bitwise_or.reduce(near))
+
+    def _unpacked(self, packed: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+        """The vertices of the box of a packed mask of the domain."""
+        bits = np.unpackbits(packed, count=prod(self.domain))
         return bits.view(np.bool_).reshape(self.domain)[self.box.slices()]
 
 
@@ -64,18 +97,25 @@ def find_extent(
     dilation: int,
     progress: Progress,
     ranks: Ranks | None = None,
+    *,
+    apart: bool = False,
 ) -> Extent:
     """The extent of the finite vertices of the merged features, dilated, at every key frame.
 
     ranks: gets the values of these vertices.
+    apart: whether to keep the masks of each feature as well.
 
-    Parameters, errors, warnings and the progress stage "selecting" as in `build_coreset`.
+    Other parameters, errors, warnings and the progress stage "selecting" as in `build_coreset`.
     """
     z, y, x = series.shape[1:]
-    if not scan.missing and any(isinstance(feature, Everything) for feature in features):
+    everything = any(isinstance(feature, Everything) for feature in features)
+    if everything and not scan.missing and not apart:
         return _everywhere(scan, key_frames, (z, y, x), progress)
     packed: list[npt.NDArray[np.uint8]] = []
     boxes, outside, samples = [], Mean(), 0
+    packed_apart: tuple[list[npt.NDArray[np.uint8]], ...] = tuple(
+        [] for _ in (features if apart else ())
+    )
     without_vertices = set(features)
     for done, step in enumerate(key_frames):
         frame = series.read(step)
@@ -85,6 +125,8 @@ def find_extent(
         }
         mask, finite = _dilated(np.logical_or.reduce(masks), step, scan, dilation)
         packed.append(np.packbits(mask))
+        for one, packed_one in zip(masks, packed_apart, strict=False):
+            packed_one.append(np.packbits(_dilated(one, step, scan, dilation)[0]))
         boxes.append(bounding_box(mask))
         samples += int(np.count_nonzero(mask))
         _add_outside(outside, frame, mask, finite)
@@ -109,6 +151,7 @@ def find_extent(
         domain=(z, y, x),
         samples=samples,
         background=outside.value() if outside.count else scan.mean,
+        apart=packed_apart,
     )
 
 

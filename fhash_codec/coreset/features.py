@@ -8,8 +8,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -30,8 +31,11 @@ FrameMask = npt.NDArray[np.bool_]
 OpenMask = Callable[[str, tuple[int, int, int, int]], Callable[[int], FrameMask]]
 """(path, shape of the series) -> (step -> FrameMask), as fhash_formats.readers.open_mask."""
 
-KINDS = "interval:LO:HI, isosurface:V, segmentation[:T], mask:FILE, all"
+KINDS = "interval:LO:HI, isosurface:V, segmentation[:T], change:D, onset:V, mask:FILE, all"
 """Forms of a feature, for error messages."""
+
+FramesAround = Callable[[int], Iterator[Frame]]
+"""Step -> the frames from the key frame before it to the one after it, in their order."""
 
 BINS = 1024
 """Bins of the histogram for Otsu's threshold."""
@@ -159,6 +163,62 @@ class Mask(Feature):
         return f"mask:{self.path}"
 
 
+@dataclass(frozen=True)
+class InTime(Feature):
+    """A feature in space and time: what happens at a vertex from one step to the next.
+
+    A key frame has the vertices where it happens anywhere between the key frame before and the one
+    after, so that nothing is lost between key frames.
+
+    Attributes:
+        threshold: in data units.
+        around: the frames that a step is judged by; None until `resolve_features` knows them.
+    """
+
+    threshold: float
+    around: FramesAround | None = field(default=None, compare=False, repr=False)
+
+    @abstractmethod
+    def happens(self, before: Frame, after: Frame) -> FrameMask:
+        """Mask (z, y, x) of the vertices where it happens between two neighbouring steps."""
+
+    def select(self, frame: Frame, step: int) -> FrameMask:
+        if self.around is None:
+            raise InputError(
+                f"feature '{self}' looks at other steps; resolve_features says at which"
+            )
+        selected: FrameMask = np.zeros(frame.shape, dtype=bool)
+        for before, after in pairwise(self.around(step)):
+            selected |= self.happens(before, after)
+        return selected & np.isfinite(frame)
+
+
+class Change(InTime):
+    """Vertices whose value changes by more than a threshold from one step to the next."""
+
+    def happens(self, before: Frame, after: Frame) -> FrameMask:
+        """Mask (z, y, x) of larger changes; they are computed in float64."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            change = np.abs(np.subtract(after, before, dtype=np.float64))
+        return np.isfinite(before) & np.isfinite(after) & (change > self.threshold)
+
+    def __str__(self) -> str:
+        return f"change:{_text(self.threshold)}"
+
+
+class Onset(InTime):
+    """Vertices whose value rises above a threshold from one step to the next."""
+
+    def happens(self, before: Frame, after: Frame) -> FrameMask:
+        """Mask (z, y, x) of values at or below the threshold before, and above it after."""
+        threshold = _as_frame_type(self.threshold, before)
+        rises: FrameMask = (before <= threshold) & (after > threshold)
+        return rises & np.isfinite(before) & np.isfinite(after)
+
+    def __str__(self) -> str:
+        return f"onset:{_text(self.threshold)}"
+
+
 def parse_feature(text: str) -> Feature:
     """The feature that a text such as "interval:0.2:1" names.
 
@@ -180,6 +240,13 @@ def parse_feature(text: str) -> Feature:
             return Segmentation()
         form = "segmentation or segmentation:T with a finite number T"
         return Segmentation(*_numbers(text, values, 1, form, finite=True))
+    if kind == "change":
+        (least,) = _numbers(text, values, 1, "change:D with a finite number D >= 0", finite=True)
+        if least >= 0:
+            return Change(least)
+        raise InputError(f"feature '{text}' is malformed; write change:D with D >= 0")
+    if kind == "onset":
+        return Onset(*_numbers(text, values, 1, "onset:V with a finite number V", finite=True))
     if kind == "mask" and values:
         return Mask(values)
     raise InputError(f"feature '{text}' is not known; allowed: {KINDS}")
@@ -208,6 +275,12 @@ def resolve_features(
         histogram = _histogram(series, key_frames, value_range, progress)
         by_otsu = Segmentation(otsu_threshold(histogram, edges))
         features = [by_otsu if feature == Segmentation() else feature for feature in features]
+    features = [
+        dataclasses.replace(feature, around=_frames_around(series, key_frames))
+        if isinstance(feature, InTime)
+        else feature
+        for feature in features
+    ]
     if any(isinstance(feature, Mask) for feature in features) and open_mask is None:
         from fhash_formats.readers import open_mask as open_mask_file
 
@@ -218,6 +291,25 @@ def resolve_features(
         else feature
         for feature in features
     )
+
+
+def _frames_around(series: Series, key_frames: Sequence[int]) -> FramesAround:
+    """The frames of a series that belong to a key frame.
+
+    The first key frame stands for all steps before it, and the last one for all after it. A step
+    that is no key frame has the steps beside it.
+    """
+    last = series.shape[0] - 1
+
+    def around(step: int) -> Iterator[Frame]:
+        first, end = step - 1, step + 1
+        if step in key_frames:
+            place = list(key_frames).index(step)
+            first = key_frames[place - 1] if place else 0
+            end = key_frames[place + 1] if place + 1 < len(key_frames) else last
+        return (series.read(each) for each in range(max(first, 0), min(end, last) + 1))
+
+    return around
 
 
 def otsu_threshold(counts: npt.ArrayLike, edges: npt.ArrayLike) -> float:

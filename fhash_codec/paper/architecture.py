@@ -37,13 +37,14 @@ class Architecture:
         *,
         fold: int = 2,
         embedding_size: int = 2,
-        hidden_layers: int = 1,
+        hidden_layers: int = 2,
         width: int = 64,
     ) -> Architecture:
         """Return the paper's model of a feature bounding box and a number of key frames.
 
         The defaults are the paper's (section 4.2): fold 2, embeddings of 2 numbers, and an MLP of 2
-        layers (one of them hidden) with 64 neurons.
+        layers with 64 neurons. The layers are hidden ones: the paper's counts of parameters for
+        tiny-cuda-nn, which is configured in the same words, come out with two hidden layers only.
         """
         levels = level_resolutions(box_size, key_frames, fold)
         return cls(

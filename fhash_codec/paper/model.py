@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.coreset.occupancy import between, unpack
+from fhash_codec.coreset.occupancy import Bits, between, unpack
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.paper.network import Network
 from fhash_codec.paper.points import sample_points
@@ -47,6 +47,19 @@ class PaperModel:
         """Return which vertices (z, y, x) of a region are in the coreset at either key frame."""
         return self._unpacked(first, last)[region.slices()]
 
+    def occupied_by(
+        self, features: tuple[int, ...], first: int, last: int, region: Box
+    ) -> npt.NDArray[np.bool_]:
+        """Return which vertices (z, y, x) of a region are in the coreset for some features.
+
+        Args:
+            features: their numbers, counted from 0; those of a file with several features.
+            first, last: neighbouring key frames, or the same key frame twice.
+            region: the region.
+        """
+        names = tuple(f"occupancy/feature_{number + 1}" for number in features)
+        return self._unpacked(first, last, names)[region.slices()]
+
     def read(
         self, key: float, region: Box, requested: npt.NDArray[np.bool_]
     ) -> npt.NDArray[np.float64]:
@@ -76,13 +89,20 @@ class PaperModel:
             self._range.high - self._range.low
         )
 
-    def _unpack(self, first: int, last: int) -> npt.NDArray[np.bool_]:
-        """Return the occupancy (z, y, x) of the box at either of two key frames."""
+    def _unpack(
+        self, first: int, last: int, names: tuple[str, ...] = ("occupancy/bits",)
+    ) -> npt.NDArray[np.bool_]:
+        """Return the occupancy (z, y, x) of the box in some arrays at either of two key frames."""
         arrays = self._container.arrays
-        if "occupancy/mask" in arrays:
+        if names == ("occupancy/bits",) and "occupancy/mask" in arrays:
             space = tuple(slice(0, length) for length in self._box.shape)
             mask = arrays["occupancy/mask"].read((slice(first, last + 1), *space)) != 0
             return np.asarray(mask[0] | mask[-1])
-        stored = arrays["occupancy/bits"]
-        bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
-        return unpack(between(bits[0], bits[-1]), self._box.shape)
+        merged: Bits | None = None
+        for name in names:
+            stored = arrays[name]
+            bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
+            one = between(bits[0], bits[-1])
+            merged = one if merged is None else merged | one
+        assert merged is not None, "at least one array is read"
+        return unpack(merged, self._box.shape)

@@ -49,7 +49,15 @@ def select(
         InputError: the settings do not fit the series, or they select nothing.
     """
     scanned, key_frames, features = resolve_selection(series, config, progress, mask)
-    coreset = build_coreset(series, scanned, key_frames, features, config.dilation, progress)
+    coreset = build_coreset(
+        series,
+        scanned,
+        key_frames,
+        features,
+        config.dilation,
+        progress,
+        fringe=config.fringe == "trained",
+    )
     architecture = Architecture.for_box(
         coreset.box.shape,
         len(key_frames),

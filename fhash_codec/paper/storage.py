@@ -18,6 +18,7 @@ import numpy.typing as npt
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
+from fhash_codec.paper.fringe import fringe_step, round_fringe
 from fhash_codec.paper.network import Floats, Network, TableSource
 from fhash_formats.container import Container, ContainerWriter, StoredArray
 from fhash_formats.errors import DamagedFileError, InputError
@@ -31,12 +32,14 @@ TABLE_AXES = ("t", "z", "y", "x", "embedding")
 def write_model(
     writer: ContainerWriter, coreset: Coreset, layers: list[tuple[Floats, Floats]]
 ) -> None:
-    """Write the occupancy of a coreset, and the (weight, bias) of each layer of the MLP."""
+    """Write the occupancy of a coreset and of its features, and the layers (weight, bias)."""
     for number, (weight, bias) in enumerate(layers, start=1):
         writer.add_whole(f"mlp/weight_{number}", weight)
         writer.add_whole(f"mlp/bias_{number}", bias)
-    bits = np.stack(coreset.occupancy)
-    writer.add_whole("occupancy/bits", bits, chunk_shape=(1, bits.shape[1]))
+    names = ["occupancy/bits", *(f"occupancy/feature_{n + 1}" for n in range(len(coreset.apart)))]
+    for name, grids in zip(names, (coreset.occupancy, *coreset.apart), strict=True):
+        bits = np.stack(grids)
+        writer.add_whole(name, bits, chunk_shape=(1, bits.shape[1]))
 
 
 def write_tables(
@@ -47,7 +50,7 @@ def write_tables(
     tables: list[Floats],
     kind: str,
 ) -> None:
-    """Write the tables of all levels as plain numbers.
+    """Write the tables of all levels as plain numbers, those of the fringe in few bits.
 
     Args:
         writer: the container that is being written.
@@ -61,7 +64,11 @@ def write_tables(
         InputError: the numbers do not fit in `kind`.
     """
     size = architecture.embedding_size
-    finest_frames = (finest_frame(coreset, fine, key) for key in range(architecture.key_frames))
+    keys = architecture.key_frames
+    step = fringe_step(coreset, keys, lambda key: finest_frame(coreset, fine, key))
+    finest_frames = (
+        round_fringe(coreset, key, finest_frame(coreset, fine, key), step) for key in range(keys)
+    )
     _write_table(writer, 1, (*architecture.levels[0], size), fine, finest_frames, kind)
     for number, (level, table) in enumerate(
         zip(architecture.levels[1:], tables, strict=True), start=2

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
+from fhash_codec.feature_volume import only_features
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.march import march
@@ -84,6 +85,7 @@ class Renderer:
             threads: most threads for marching; None for all processors.
         """
         self.volume, self.memory, self.threads = volume, memory, threads
+        self._whole, self._features = volume, ()
         self._frames: OrderedDict[Key, _DecodedFrame] = OrderedDict()
         self._histogram: Histogram | None = None
         self._last_plan: tuple[Scene, Plan] | None = None
@@ -95,6 +97,7 @@ class Renderer:
 
         A scene that differs from the last one only in its time takes over the rest of that plan.
         """
+        self._choose(scene.features)
         timeless = replace(scene, step=None, time=None)
         if self._last_plan is not None and self._last_plan[0] == timeless:
             return plan_at(self._last_plan[1], self.volume, scene)
@@ -134,6 +137,7 @@ class Renderer:
         begin = time.perf_counter()
         if plan is None:
             plan = self.plan(Scene() if scene is None else scene)
+        self._choose(plan.scene.features)
         # Networks are evaluated where rays sample them; light needs a frame all the same.
         frame_needed = plan.mode == "cache" or plan.lights or self.volume.profile == "compact"
         decoded = self._frame(plan, progress) if frame_needed else None
@@ -146,6 +150,15 @@ class Renderer:
             "decoded_vertices": 0 if decoded is None else decoded.frame.values.size,
         }
         return self._finish(plan, marched, more, begin)
+
+    def _choose(self, features: tuple[str, ...]) -> None:
+        """Show some features of the volume alone; all if there are none. Forget other frames."""
+        if features != self._features:
+            self._finish_prefetch()
+            chosen = only_features(self._whole, features) if features else self._whole
+            self.volume, self._features = chosen, features
+            self._frames.clear()
+            self._histogram = self._last_plan = None
 
     def histogram(self) -> Histogram:
         """Count the values of the series: its first, middle and last step, coarse if possible."""
@@ -244,6 +257,8 @@ class Renderer:
 
     def _start_prefetch(self, scene: Scene) -> None:
         """Begin to decode the frame of a scene; an error is raised when the scene is rendered."""
+        if scene.features != self._features:
+            return
         try:
             plan = self.plan(scene)
         except (FhashError, OSError):

@@ -126,7 +126,7 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     for settings in (
         ["--effort", "2"],
         ["--effort", "2", "--no-timings", "--missing", repr(float(smallest))],
-        ["--profile", "paper", "--epochs", "1", "--width", "4"],
+        ["--profile", "paper", "--epochs", "1", "--width", "4", "--key-frames", "0,2"],
     ):
         words = ["encode", data, "-o", path, "--force", *settings]
         outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))

@@ -244,3 +244,27 @@ def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_training(
     with pytest.warns(fhash_codec.FhashWarning, match="no checkpoint: no space left"):
         fhash_codec.encode(field(), tmp_path / "a.fhz", QUICK)
     assert decoded(tmp_path / "a.fhz").shape == field().shape
+
+
+def test_values_between_key_frames_are_right_where_one_of_them_has_no_coreset(tmp_path) -> None:
+    """A ball that moves: much of its coreset is that of one key frame only."""
+    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (5, 12, 12, 24)), indexing="ij")
+    ball = 1 - np.sqrt((z - 0.5) ** 2 + (y - 0.5) ** 2 + (x - 0.35 - 0.3 * t) ** 2)
+    figures = {}
+    for fringe in ("trained", "untrained"):
+        config = EncodeConfig(
+            profile="paper",
+            features=("interval:0.75:1",),
+            key_frames="0,4",
+            epochs=15,
+            width=16,
+            fringe=fringe,
+        )
+        path = tmp_path / f"{fringe}.fhz"
+        fhash_codec.encode(ball.astype(np.float32), path, config)
+        with fhash_codec.open(path) as volume:
+            figures[fringe] = volume.info["quality"]["between"]
+            assert volume.info["config"]["fringe"] == fringe
+    assert figures["trained"]["fringe_fraction"] == figures["untrained"]["fringe_fraction"] > 0.2
+    assert figures["trained"]["psnr_fringe"] > figures["untrained"]["psnr_fringe"] + 6
+    assert figures["trained"]["psnr_linear"] == figures["untrained"]["psnr_linear"]

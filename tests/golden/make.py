@@ -19,9 +19,12 @@ TOLERANCE = 1e-5
 """Tolerance of decoded values, as a fraction of the range: float32 sums in another order."""
 
 GOLDENS = {
-    "paper-1.0-plain": EncodeConfig(profile="paper", width=8, timings=False, tables="float32"),
+    "paper-1.0-plain": EncodeConfig(
+        profile="paper", hidden_layers=1, width=8, timings=False, tables="float32"
+    ),
     "paper-1.0-feature": EncodeConfig(
         profile="paper",
+        hidden_layers=1,
         width=8,
         timings=False,
         features=("interval:0.5:2", "isosurface:0"),
@@ -51,6 +54,7 @@ GOLDENS = {
     "compact-1.2-counts": EncodeConfig(max_error=4.0, effort=2, timings=False),
     "paper-1.1-transform": EncodeConfig(
         profile="paper",
+        hidden_layers=1,
         width=8,
         timings=False,
         features=("interval:0.5:2",),

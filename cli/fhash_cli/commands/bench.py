@@ -167,7 +167,8 @@ def _text(result: dict[str, Any]) -> str:
         for name, fact in result["machine"].items()
     }
     machine = ", ".join(f"{name} {fact}" for name, fact in facts.items())
-    return f"{table([header, *rows])}\n{result['samples']:,} samples; {machine}"
+    samples = f"{result['samples']:,} samples in bricks {result['brick_fill']:.0%} full"
+    return f"{table([header, *rows])}\n{samples}; {machine}"
 
 
 @command.command("rate", short_help="size, speed and access beside other codecs, at equal quality")

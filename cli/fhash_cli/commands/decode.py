@@ -13,6 +13,7 @@ from fhash_cli.conversion import check_fill, convert
 from fhash_cli.intervals import IntervalsType, NumberType, SliceType
 from fhash_cli.options import (
     check_writable,
+    feature_option,
     force_option,
     json_option,
     quiet_option,
@@ -23,6 +24,7 @@ from fhash_cli.selection import (
     Span,
     coordinates,
     dates_of,
+    opened,
     region_of,
     region_of_box,
     steps_at,
@@ -106,11 +108,13 @@ TYPES = ("float16", "float32", "float64", *INTEGERS)
     type=NumberType(),
     help="Value of vertices that have none. Default: the source's own for integers, else NaN.",
 )
+@feature_option
 @force_option
 @json_option
 @quiet_option
 def command(
     run: str,
+    features: tuple[str, ...],
     steps: slice | None,
     times: tuple[str, ...],
     roi: Sequence[Sequence[int | None]] | None,
@@ -126,8 +130,6 @@ def command(
     quiet: bool,
 ) -> None:
     """Rebuild a region of RUN.fhz; without -o, print statistics of it."""
-    import fhash_codec
-
     if steps is not None and times:
         raise click.UsageError("--t and --time exclude each other")
     if roi is not None and box is not None:
@@ -137,12 +139,11 @@ def command(
     _check_output(output, isosurface, dtype, force, run)
     if isosurface is not None and fill is not None:
         raise click.UsageError("--isosurface has no fill value; leave out --fill")
-    with fhash_codec.open(run, fill=fill) as volume, Progress(quiet=quiet) as progress:
+    with opened(run, fill, features) as volume, Progress(quiet=quiet) as progress:
         if isosurface is not None:
             dtype = volume.float_dtype.name
         selection = Selection.of(volume, steps, times, roi, box, lod, outside, dtype, fill)
-        statistics = Statistics()
-        frames = selection.frames(volume, statistics, progress)
+        frames = selection.frames(volume, statistics := Statistics(), progress)
         paths: list[str] = []
         if output is None:
             sum(1 for _ in frames)

@@ -30,6 +30,11 @@ from fhash_codec.training.adam import adam_step, catch_up
 
 CHUNK = 1 << 13
 """Samples that go through the MLP at a time: their activations stay in a core's cache."""
+FULL = 0.9
+"""Share of samples among the vertices of a batch above which all vertices go through the MLP.
+
+To pick a sample moves a few numbers; the MLP multiplies thousands for it.
+"""
 ADAM_PART = 1 << 17
 """Numbers of the flat vector that Adam moves at a time, so that they stay in the cache."""
 STATE = ("fine", "fine_mean", "fine_square", "visited", "flat", "flat_mean", "flat_square")
@@ -104,7 +109,7 @@ class SlabEngine:
         inputs = self._inputs(lattices, fine)
         scale = 2.0 / max(int(np.diff(self.coreset.offsets)[chosen].sum()), 1)
         self.gradient.zero_()
-        error, input_gradient = self._backpropagate(inputs, target, in_coreset, scale)
+        error, input_gradient = self._backpropagate_samples(inputs, target, in_coreset, scale)
         level_gradients = input_gradient.view(
             -1, self.architecture.embedding_size, len(ids), *self.coreset.brick_shape
         )
@@ -264,6 +269,25 @@ class SlabEngine:
                 activations.append(hidden)
         return activations
 
+    def _backpropagate_samples(
+        self, inputs: Tensor, target: Tensor, in_coreset: Tensor, scale: float
+    ) -> tuple[Tensor, Tensor]:
+        """Do what `_backpropagate` does, through the samples of sparse bricks alone.
+
+        Around a feature most vertices of many bricks are no samples.
+        """
+        flat_mask = in_coreset.reshape(-1)
+        samples = flat_mask.nonzero().squeeze(1)
+        if len(samples) > FULL * len(flat_mask):
+            return self._backpropagate(inputs, target, in_coreset, scale)
+        picked = self._scratch("picked inputs", len(inputs), len(samples))
+        torch.index_select(inputs, 1, samples, out=picked)
+        error, gradient = self._backpropagate(
+            picked, target.reshape(-1)[samples], flat_mask[samples], scale
+        )
+        whole = self._scratch("whole gradient", len(gradient), inputs.shape[1]).zero_()
+        return error, whole.index_copy_(1, samples, gradient)
+
     def _backpropagate(
         self, inputs: Tensor, target: Tensor, in_coreset: Tensor, scale: float
     ) -> tuple[Tensor, Tensor]:
@@ -273,8 +297,8 @@ class SlabEngine:
 
         Args:
             inputs: inputs of the MLP (levels E + 1, samples).
-            target: normalised values (bricks, vertices).
-            in_coreset: vertices that are samples (bricks, vertices), 0 or 1.
+            target: normalised values, as many as there are columns, of any shape.
+            in_coreset: which of them are samples, of the same shape, 0 or 1.
             scale: factor of the gradients.
         """
         gradient = self._scratch("gradient", self.architecture.inputs, inputs.shape[1])

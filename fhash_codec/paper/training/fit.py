@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from dataclasses import asdict, dataclass
 from functools import partial
-from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -137,8 +136,7 @@ class _Fitting:
 
         plan = self._plan()
         engine = self._engine(plan)
-        vertices = plan.batch_bricks * prod(self._coreset.brick_shape)
-        with deferred_interrupts() as stop, threads_for(vertices):
+        with deferred_interrupts() as stop, threads_for(plan.batch_samples):
             while self._trained_to_end(engine, plan, stop):
                 further = self._next_round(engine, plan)
                 if further is None:

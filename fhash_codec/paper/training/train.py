@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import log10, prod
+from math import log10
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,8 @@ from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import TrainingError
 from fhash_formats.support.interrupts import StopRequest
 
-BATCH_BRICKS = 64
-"""Usual bricks of 1024 vertices in a batch.
-
-Below 2^16 samples a step, its fixed cost shows; above, an epoch teaches less.
-"""
+BATCH_SAMPLES = 1 << 16
+"""Usual samples in a batch: with fewer, its fixed cost shows; with more, an epoch teaches less."""
 STEPS_AN_EPOCH = (20, 256)
 """Smallest and largest number of training steps in an epoch, unless a batch size is given."""
 USUAL_EPOCHS = 20
@@ -32,6 +29,8 @@ HISTORY_POINTS = 100
 """Largest number of points in the history."""
 PROBE_BRICKS = 512
 """Bricks on which the quality of an epoch is measured."""
+PROBED_AT_ONCE = 64
+"""Bricks of them that are evaluated at a time."""
 DIVERGED = 4.0
 """Mean squared error of a batch above which a training diverged, in squares of the value range.
 
@@ -65,7 +64,7 @@ class TrainingPlan:
 
     Attributes:
         epochs: passes over all bricks.
-        bricks: bricks of the coreset.
+        counts: samples of each brick of the coreset, int64 (bricks,).
         batches: random batches of an epoch.
         seed: seed of the order of the bricks.
         rates: learning rate of every training step, counted from 1, float64
@@ -73,21 +72,45 @@ class TrainingPlan:
     """
 
     epochs: int
-    bricks: int
+    counts: npt.NDArray[np.int64]
     batches: int
     seed: int
     rates: npt.NDArray[np.float64]
 
     @property
-    def batch_bricks(self) -> int:
-        """Bricks of the largest batch."""
-        return -(-self.bricks // self.batches)
+    def bricks(self) -> int:
+        """Bricks of the coreset."""
+        return len(self.counts)
+
+    @property
+    def batch_samples(self) -> int:
+        """Samples of a batch on average."""
+        return -(-int(self.counts.sum()) // self.batches)
 
     def order(self, epoch: int) -> list[npt.NDArray[np.int64]]:
-        """Return the batches of an epoch, each brick once; the seed and the epoch decide alone."""
-        return np.array_split(
-            np.random.default_rng([self.seed, epoch]).permutation(self.bricks), self.batches
-        )
+        """Return the batches of an epoch, each brick once, in an order of seed and epoch alone.
+
+        Batches are whole bricks, at least one, and differ in samples by about a brick.
+        """
+        order = np.random.default_rng([self.seed, epoch]).permutation(self.bricks)
+        return np.split(order, batch_ends(self.counts[order], self.batches))
+
+
+def batch_ends(counts: npt.NDArray[np.int64], batches: int) -> npt.NDArray[np.int64]:
+    """Return where each batch but the last ends in a list of bricks, int64 (batches - 1,).
+
+    Args:
+        counts: samples of the bricks in their order, none of them negative.
+        batches: number of batches, at most as many as there are bricks; none is empty.
+    """
+    ends = np.cumsum(counts)
+    # A brick belongs to the batch in which its middle lies. Doubled, the middles are whole numbers.
+    middles = 2 * ends - counts
+    numbers = np.arange(1, batches)
+    cuts = np.searchsorted(middles * batches, 2 * int(ends[-1]) * numbers)
+    # Each batch has a brick at least, and leaves one to each batch that follows.
+    cuts = np.maximum.accumulate(np.maximum(cuts, 1) - numbers) + numbers
+    return np.minimum(cuts, len(counts) - batches + numbers).astype(np.int64)
 
 
 def plan_training(
@@ -100,23 +123,24 @@ def plan_training(
         epochs: number of epochs; 0 for 20, or for as many as make 1000 training steps.
         learning_rate: learning rate of the first step.
         schedule: cosine lets the rate fall to zero; any other name keeps it constant.
-        batch: samples in a batch; 0 for 64 bricks where that makes 20 to 256 steps an epoch, and
-            else for the nearest size that does.
+        batch: samples in a batch, rounded to whole bricks; 0 for BATCH_SAMPLES where that makes 20
+            to 256 steps an epoch, and else for the nearest size that does.
         seed: seed of the order of the bricks.
     """
-    bricks = len(coreset.bricks)
+    counts = np.diff(coreset.offsets)
+    samples = int(counts.sum())
     if batch:
-        batches = max(1, round(bricks * prod(coreset.brick_shape) / batch))
+        batches = max(1, round(samples / batch))
     else:
         low, high = STEPS_AN_EPOCH
-        batches = min(max(-(-bricks // BATCH_BRICKS), low), high)
-    batches = min(batches, bricks)
+        batches = min(max(-(-samples // BATCH_SAMPLES), low), high)
+    batches = min(batches, len(counts))
     epochs = epochs or max(USUAL_EPOCHS, -(-USUAL_STEPS // batches))
     share = np.arange(epochs * batches + 1) / max(epochs * batches, 1)
     rates = learning_rate * (
         0.5 + 0.5 * np.cos(np.pi * share) if schedule == "cosine" else np.ones_like(share)
     )
-    return TrainingPlan(epochs=epochs, bricks=bricks, batches=batches, seed=seed, rates=rates)
+    return TrainingPlan(epochs=epochs, counts=counts, batches=batches, seed=seed, rates=rates)
 
 
 @dataclass(kw_only=True)
@@ -297,7 +321,7 @@ def probe_psnr(engine: Engine, coreset: Coreset, bricks: npt.NDArray[np.int64]) 
     samples = int(np.diff(coreset.offsets)[bricks].sum())
     error = sum(
         engine.squared_error(batch)
-        for batch in np.array_split(bricks, -(-len(bricks) // BATCH_BRICKS))
+        for batch in np.array_split(bricks, -(-len(bricks) // PROBED_AT_ONCE))
     )
     if not np.isfinite(error):
         raise Diverged(

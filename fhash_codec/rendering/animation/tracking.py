@@ -21,6 +21,7 @@ from fhash_codec.coreset.features import (
     resolve_features,
 )
 from fhash_codec.coreset.features import Isosurface as SurfaceFeature
+from fhash_codec.feature_volume import feature_names, holds_features_apart
 from fhash_codec.progress import Progress, silent
 from fhash_codec.rendering.camera.grid import Grid
 from fhash_codec.rendering.colour.colours import colour_code, parse_colour
@@ -142,7 +143,23 @@ def tracking_scene(scene: Scene, tracked: Sequence[Tracked], volume: Volume) -> 
         if filled
         else dataclasses.replace(scene.transfer_function, nothing=True)
     )
-    return dataclasses.replace(scene, transfer_function=function, effects=effects)
+    return dataclasses.replace(
+        scene,
+        transfer_function=function,
+        effects=effects,
+        features=scene.features or _held_apart(tracked, volume),
+    )
+
+
+def _held_apart(tracked: Sequence[Tracked], volume: Volume) -> tuple[str, ...]:
+    """The tracked features if the file keeps each of them apart, so that the rest is skipped.
+
+    Empty if some are not of the file: they may be anywhere in its coreset.
+    """
+    names, wanted = feature_names(volume), [str(item.feature) for item in tracked]
+    if not holds_features_apart(volume) or not set(wanted) < set(names):
+        return ()
+    return tuple(dict.fromkeys(wanted))
 
 
 def _legend(tracked: Sequence[Tracked], volume: Volume) -> list[LegendEntry]:

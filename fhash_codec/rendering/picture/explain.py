@@ -119,13 +119,22 @@ def _time_text(plan: Plan) -> str:
 
 
 def _mode_text(plan: Plan, volume: Volume) -> str:
+    chosen = plan.scene.march.mode == "auto"
     if plan.mode == "cache":
-        return "cache: decode once, then march what was decoded"
+        why = ", as is fastest on a CPU" if chosen else ""
+        lattice = (
+            "; linear between vertices, where the network (arm) has other values"
+            if volume.profile == "paper"
+            else ""
+        )
+        return f"cache: decode once, then march what was decoded{why}{lattice}"
     through = (
-        "the network, which has values of its own between vertices"
+        "the network, which has values of its own between vertices (cache is linear there)"
         if volume.profile == "paper"
-        else "the lattice"
+        else "the lattice, with the same values as cache"
     )
+    if chosen:
+        through += "; chosen for the GPU"
     if plan.mode == "stream":
         return f"stream: one sample of each ray in a pass, straight through {through}"
     budget = plan.scene.march.samples_per_pass

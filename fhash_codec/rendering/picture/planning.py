@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.feature_volume import feature_names
 from fhash_codec.indexing import MAX_LOD
 from fhash_codec.rendering.camera.camera import Grid, Rays
 from fhash_codec.rendering.camera.clip import Body
@@ -32,6 +33,8 @@ from fhash_codec.rendering.scene.scene import (
     Marching,
     Scene,
 )
+from fhash_codec.rendering.task.arrays import NUMPY
+from fhash_codec.rendering.task.devices import arrays_on
 from fhash_codec.rendering.task.grading import grading_of
 from fhash_codec.rendering.task.task import Surface, Table, Task
 from fhash_codec.rendering.task.units import Units
@@ -173,7 +176,7 @@ def _function(
 ) -> TransferFunction:
     """The transfer function of a scene; the series is counted only if the function needs it."""
     spec = scene.transfer_function
-    features = tuple(str(text) for text in volume.container.header.get("features", ()))
+    features = tuple(feature_names(volume))
     value_range = (volume.value_range.low, volume.value_range.high)
 
     def function_of(counted: Histogram | None) -> TransferFunction:
@@ -345,7 +348,12 @@ def _warn_of_unseen_surfaces(volume: Volume, scene: Scene) -> None:
 def _mode(march: Marching) -> str:
     """The way to march; raises InputError for one that the device cannot take."""
     if march.mode == "auto":
-        return "arm" if march.device == "cuda" else "cache"
+        # On a CPU a network is evaluated at some ten thousand samples while native code marches
+        # millions through a decoded frame.
+        on_gpu = march.device == "cuda" or (
+            march.device == "auto" and arrays_on(march.device) is not NUMPY
+        )
+        return "arm" if on_gpu else "cache"
     if march.mode == "cache" and march.device == "cuda":
         raise InputError(
             "march 'cache' computes on the CPU; take 'arm' or 'stream' for device 'cuda'"

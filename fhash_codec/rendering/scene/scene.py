@@ -357,6 +357,7 @@ class Scene(Record):
     time: float | None = limits(
         None, "physical time, instead of a step", low=-1.7e308, high=1.7e308
     )
+    features: tuple[str, ...] = limits((), "features of the file to be shown; all if empty")
     transfer_function: TransferFunctionSpec = TransferFunctionSpec()
     effects: Effects = Effects()
     march: Marching = Marching()

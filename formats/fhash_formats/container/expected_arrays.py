@@ -115,6 +115,11 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
             (key_frames, occupancy_bytes(header["feature_bounding_box"])),
             ("uint8",),
         )
+    else:
+        # One of each feature, where there are several; a file from before 1.2 has none.
+        bits = (model["levels"][0][0], occupancy_bytes(header["feature_bounding_box"]))
+        for number in range(1, len(header["features"]) + 1):
+            yield f"occupancy/feature_{number}", bits, ("uint8",)
     yield "occupancy/mask", tuple(model["levels"][0]), ("uint8",)
     yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 

@@ -222,3 +222,31 @@ def test_progress_has_two_stages() -> None:
 def test_a_feature_that_selects_nothing_beside_others_is_warned_of() -> None:
     with pytest.warns(FhashWarning, match="feature isosurface:99 selects nothing; the others do"):
         build(smooth(2, (5, 6, 7)), (Interval(0.2, 2.0), Isosurface(99.0)), (0, 1), 1)
+
+
+def test_the_fringe_is_sampled_and_no_part_of_the_coreset() -> None:
+    values = np.random.default_rng(1).random((3, 5, 6, 7)).astype(np.float32)
+    plain, seen = build(values, [Interval(0.8, 1.0)], dilation=0)
+    fringed, _ = build(values, [Interval(0.8, 1.0)], dilation=0, fringe=True)
+    masks = [unpack(bits, plain.box.shape) for bits in plain.occupancy]
+    for key, grown in enumerate(
+        (masks[0] | masks[1], masks[0] | masks[1] | masks[2], masks[1] | masks[2])
+    ):
+        unit = seen.value_range.to_unit(values[key])[plain.box.slices()]
+        np.testing.assert_array_equal(
+            unpack_frame(fringed, key), np.where(grown, unit, np.float32(np.nan))
+        )
+        np.testing.assert_array_equal(fringed.occupancy[key], plain.occupancy[key])
+    assert (fringed.fraction, fringed.background) == (plain.fraction, plain.background)
+
+
+def test_a_fringe_without_a_value_has_that_of_the_neighbour() -> None:
+    values = np.zeros((3, 2, 3, 4), np.float32)
+    values[0, 0], values[2, 1] = 0.75, 0.5
+    values[1] = np.nan
+    values[1, 0, 0, 0] = 1.0
+    coreset, seen = build(values, [Interval(0.25, 1.0)], dilation=0, fringe=True)
+    middle = unpack_frame(coreset, 1)
+    expected = np.stack([np.full((3, 4), 0.75), np.full((3, 4), 0.5)]).astype(np.float32)
+    expected[0, 0, 0] = 1.0
+    np.testing.assert_array_equal(middle, seen.value_range.to_unit(expected))

@@ -49,3 +49,26 @@ def test_two_masks_of_one_name_are_both_selected() -> None:
     features = tuple(Mask("array", read=lambda step, end=end: end) for end in ends)
     extent = extent_of(VALUES, features)
     np.testing.assert_array_equal(extent.mask(0), ends[0] | ends[1])
+
+
+def test_the_fringe_is_what_only_a_neighbouring_key_frame_has() -> None:
+    extent = extent_of(VALUES, (Interval(0.7, 1.0),))
+    masks = [extent.mask(key) for key in range(3)]
+    grown = [extent.with_fringe(key) for key in range(3)]
+    np.testing.assert_array_equal(grown[0], masks[0] | masks[1])
+    np.testing.assert_array_equal(grown[1], masks[0] | masks[1] | masks[2])
+    np.testing.assert_array_equal(grown[2], masks[1] | masks[2])
+    assert extent.samples_with_fringe() == sum(mask.sum() for mask in grown)
+
+
+def test_features_are_kept_apart_where_asked_and_make_up_the_whole() -> None:
+    values = VALUES.copy()
+    values[0, 2, 3, 4] = np.nan
+    features = (Interval(0.9, 1.0), Everything(), Interval(0.0, 0.1))
+    series = ArraySeries(values)
+    extent = find_extent(series, scan(series, silent), (0, 1, 3), features, 1, silent, apart=True)
+    for key in range(3):
+        masks = [extent.mask_of(number, key) for number in range(3)]
+        np.testing.assert_array_equal(np.logical_or.reduce(masks), extent.mask(key))
+        assert masks[0].sum() < masks[1].sum()
+    assert extent_of(values, features).apart == ()

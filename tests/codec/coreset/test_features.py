@@ -250,3 +250,54 @@ def test_masks_are_opened_with_the_shape_of_the_series() -> None:
     )
     assert asked == [("m.npy", (2, 3, 4, 5))]
     assert [feature.select(series.read(step), step).all() for step in (0, 1)] == [False, True]
+
+
+def happening(text: str, values: np.ndarray, key_frames: tuple[int, ...]) -> np.ndarray:
+    """Masks (key frames, z, y, x) of a feature in time."""
+    series = ArraySeries(values)
+    (feature,) = resolve_features([text], series, key_frames, ValueRange(0.0, 1.0), silent)
+    assert str(feature) == str(parse_feature(text))
+    return np.stack([feature.select(series.read(step), step) for step in key_frames])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8, np.int64])
+def test_a_change_is_at_both_its_ends_and_above_the_threshold(dtype) -> None:
+    values = np.full((5, 1, 1, 3), 100, dtype)
+    values[2:, 0, 0, 1], values[3:, 0, 0, 2] = 90, 89  # by 10, and by 11
+    masks = happening("change:10", values, (0, 1, 2, 3, 4))
+    assert not masks[..., :2].any()
+    np.testing.assert_array_equal(masks[:, 0, 0, 2], [False, False, True, True, False])
+
+
+def test_an_onset_is_a_rise_above_a_value_and_no_fall() -> None:
+    values = np.zeros((5, 1, 1, 4), np.float32)
+    values[2:, 0, 0, 1], values[2:, 0, 0, 2], values[:2, 0, 0, 3] = 0.5, 0.6, 1.0
+    masks = happening("onset:0.5", values, (0, 1, 2, 3, 4))
+    np.testing.assert_array_equal(masks.any(axis=0)[0, 0], [False, False, True, False])
+    np.testing.assert_array_equal(masks[:, 0, 0, 2], [False, True, True, False, False])
+
+
+def test_what_happens_between_key_frames_is_in_both_of_them() -> None:
+    values = np.zeros((9, 1, 1, 3), np.float32)
+    values[4, 0, 0, 1] = 1.0  # a flash that no key frame sees
+    values[8, 0, 0, 2] = 1.0
+    masks = happening("change:0.5", values, (1, 3, 6))
+    np.testing.assert_array_equal(masks[:, 0, 0, 1], [False, True, True])
+    np.testing.assert_array_equal(masks[:, 0, 0, 2], [False, False, True])
+
+
+def test_missing_values_neither_change_nor_rise() -> None:
+    values = np.zeros((3, 1, 1, 3), np.float32)
+    values[1, 0, 0, :2] = np.nan, np.inf
+    values[2, 0, 0, 2] = 1.0
+    for text in ("change:0.1", "onset:0.1"):
+        masks = happening(text, values, (0, 1, 2))
+        np.testing.assert_array_equal(masks.any(axis=0)[0, 0], [False, False, True])
+
+
+@pytest.mark.parametrize("text", ["change", "change:-1", "change:nan", "onset", "onset:inf"])
+def test_malformed_features_in_time_are_refused(text) -> None:
+    with pytest.raises(InputError, match="is malformed"):
+        parse_feature(text)
+    with pytest.raises(InputError, match="looks at other steps"):
+        parse_feature("onset:1").select(np.zeros((1, 1, 1)), 0)

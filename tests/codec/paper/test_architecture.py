@@ -28,4 +28,4 @@ def test_the_defaults_are_the_papers() -> None:
     assert architecture.sizes == architecture.levels[0] == (10, 54, 110, 200)
     assert len(architecture.levels) == 8  # ceil(log2 200)
     assert architecture.inputs == 16
-    assert architecture.layer_shapes == [(64, 16), (1, 64)]
+    assert architecture.layer_shapes == [(64, 16), (64, 64), (1, 64)]

@@ -117,3 +117,18 @@ def test_training_holds_only_what_the_bricks_reach_of_the_coarse_tables(engines_
     coarse = sum(len(table) * 2 for table in list(oracle.model.tables)[1:])
     assert 0 < len(slab.upsampling.used) < 0.6 * coarse
     assert slab.parameters().coarse.numel() == coarse
+
+
+def test_samples_alone_give_the_same_gradients_as_all_vertices_of_sparse_bricks(
+    engines_of, monkeypatch
+) -> None:
+    shape, settings = (3, 9, 20, 35), {"embedding_size": 2, "hidden_layers": 2, "low": 0.8}
+    gradients, errors = [], []
+    for full in (1.0, -1.0):
+        monkeypatch.setattr("fhash_codec.paper.engines.slab.FULL", full)
+        coreset, slab, _ = engines_of(shape, settings)
+        errors.append(float(slab.train(np.arange(len(coreset.bricks)))))
+        gradients.append(slab.gradient.clone())
+    assert errors[0] == pytest.approx(errors[1], rel=1e-6)
+    apart = (gradients[0] - gradients[1]).abs() / gradients[1].abs().max()
+    assert float(apart.max()) < 1e-5

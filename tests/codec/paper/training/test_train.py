@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
-from fhash_codec.paper.training.train import Diverged, TrainingProgress, plan_training, train
+from fhash_codec.paper.training.train import (
+    Diverged,
+    TrainingProgress,
+    batch_ends,
+    plan_training,
+    train,
+)
 from fhash_formats.errors import TrainingError
 
 
@@ -23,13 +31,40 @@ def test_every_epoch_visits_every_brick_once_in_an_order_of_its_own(setup, cores
 
 @pytest.mark.parametrize(
     ("batch", "batches"),
-    [(0, 20), (2**21, 1), (1008, 27), (5000, 5), (1, 54)],
+    [(0, 20), (2**21, 1), (1008, 26), (5000, 5), (1, 54)],
 )
 def test_batches_of_an_epoch(setup, coreset, batch, batches) -> None:
     assert len(coreset.bricks) == 54  # 3 key frames of 2 x 3 x 3 bricks of 6 x 7 x 12 vertices
+    assert len(coreset.values) == 25_920  # fewer than 54 whole bricks: the last ones are cut
     plan, _ = setup(coreset, batch=batch)
     assert plan.batches == min(batches, plan.bricks)
     assert len(plan.rates) == 4 * plan.batches + 1
+
+
+@pytest.mark.parametrize("batch", [500, 1700, 4000])
+def test_a_batch_has_as_many_samples_as_asked_however_full_the_bricks(coreset, batch) -> None:
+    counts = np.random.default_rng(0).integers(1, 505, 54)
+    sparse = replace(coreset, offsets=np.cumsum([0, *counts]))
+    plan = plan_training(
+        sparse, epochs=1, learning_rate=0.01, schedule="cosine", batch=batch, seed=5
+    )
+    batches = plan.order(0)
+    assert len(batches) == plan.batches == round(counts.sum() / batch)
+    assert plan.batch_samples == -(-counts.sum() // plan.batches)
+    assert sorted(np.concatenate(batches)) == list(range(54))
+    for chosen in batches:
+        assert abs(counts[chosen].sum() - counts.sum() / plan.batches) <= 504
+
+
+@pytest.mark.parametrize(
+    "counts", [[1] * 7, [100, 1, 1, 1, 1, 1, 1], [1, 1, 1, 1, 1, 1, 100], [0, 0, 3, 0, 0, 9, 0]]
+)
+def test_no_batch_is_empty(counts) -> None:
+    for batches in range(1, 8):
+        cuts = batch_ends(np.array(counts), batches)
+        parts = np.split(np.arange(7), cuts)
+        assert len(parts) == batches
+        assert all(len(part) for part in parts)
 
 
 @pytest.mark.parametrize(("batch", "epochs"), [(0, 50), (1, 20), (2**20, 1000)])

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec import Renderer, Scene, Volume
+from fhash_codec import EncodeConfig, Renderer, Scene, Volume
 from fhash_codec.rendering.camera.camera import Grid
 from fhash_codec.rendering.colour.opacity import Histogram
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.picture.planning import MAX_RAYS, plan_picture
+from fhash_codec.rendering.task.arrays import NUMPY
 from fhash_codec.rendering.task.units import Units
 from fhash_formats.errors import FhashWarning, InputError, RegionError
 
@@ -309,3 +310,42 @@ def test_a_clip_is_all_that_is_decoded(volume: Volume) -> None:
         coarse = replace(scene, march=replace(scene.march, lod=2))
         wide = plan_picture(volume, coarse).region
         assert all(a <= c and d <= b for (a, b), (c, d) in zip(wide, region, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("march", "gpu", "mode"),
+    [
+        ({}, True, "arm"),
+        ({}, False, "cache"),
+        ({"device": "cpu"}, True, "cache"),
+        ({"mode": "cache"}, True, "cache"),
+        ({"mode": "arm"}, False, "arm"),
+        ({"device": "cuda"}, False, "arm"),
+    ],
+)
+def test_auto_is_arm_on_a_gpu_and_cache_on_a_cpu(
+    volume: Volume, monkeypatch: pytest.MonkeyPatch, march: dict[str, str], gpu: bool, mode: str
+) -> None:
+    def arrays_on(device: str) -> object:
+        return object() if gpu and device == "auto" else NUMPY
+
+    monkeypatch.setattr("fhash_codec.rendering.picture.planning.arrays_on", arrays_on)
+    planned = plan(volume, march=march)
+    assert planned.mode == mode
+    line = planned.to_dict()["march"]
+    assert line.startswith(f"{mode}: ")
+    chosen = "mode" not in march
+    assert ("chosen for the GPU" in line) == (chosen and mode == "arm")
+    assert ("fastest on a CPU" in line) == (chosen and mode == "cache")
+
+
+@pytest.mark.parametrize(("mode", "words"), [("cache", "has other values"), ("arm", "is linear")])
+def test_a_plan_says_where_network_and_lattice_differ(
+    tmp_path: Path, volume: Volume, mode: str, words: str
+) -> None:
+    field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
+    path = tmp_path / "a.fhz"
+    fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=4))
+    with fhash_codec.open(path) as paper:
+        assert words in plan(paper, march={"mode": mode}).to_dict()["march"]
+    assert words not in plan(volume, march={"mode": mode}).to_dict()["march"]
