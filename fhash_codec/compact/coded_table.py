@@ -14,6 +14,9 @@ from fhash_formats.container import ContainerWriter
 
 __all__ = ["CodedTable", "model_header", "required_features", "write_table"]
 
+TABLE = "tables/level_1"
+"""Name of the table in the container."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CodedTable:
@@ -32,19 +35,21 @@ class CodedTable:
 def write_table(writer: ContainerWriter, table: CodedTable) -> None:
     """Write the table; its tiles also hold the mask where the coreset is not the whole box."""
     blocks, settings = table.plan.blocks, table.plan.settings
-    writer.add_sharded(
-        "tables/level_1",
-        shape=blocks.shape,
-        dtype=blocks.dtype,
-        chunk_shape=blocks.tile,
-        shard_shape=shard_shape(blocks.tile, blocks.grid),
-        chunks=iter(table.streams),
-        dimension_names=("t", "z", "y", "x"),
-        codecs=[
+    described: dict[str, Any] = {
+        "shape": blocks.shape,
+        "dtype": blocks.dtype,
+        "chunk_shape": blocks.tile,
+        "dimension_names": ("t", "z", "y", "x"),
+        "codecs": [
             {"name": "fhash.transform", "configuration": settings.to_dict()},
             {"name": "crc32c"},
         ],
-    )
+    }
+    if len(table.streams) == 1:  # a shard of one tile would cost 70 bytes more
+        writer.add_array(TABLE, chunks=table.streams, **described)
+        return
+    shards = shard_shape(blocks.tile, blocks.grid)
+    writer.add_sharded(TABLE, shard_shape=shards, chunks=iter(table.streams), **described)
 
 
 def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from itertools import product
 from math import prod
 from typing import Any
@@ -10,8 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.parts import CompactTable, head_mlp, level_count, read_coarse
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
+from fhash_codec.model_parts import Mlp, Table
 from fhash_formats.container import StoredArray
 
 Positions = npt.NDArray[np.float64]
@@ -28,6 +31,19 @@ class CompactModel:
         self._arrays = arrays
         self._array = arrays["tables/level_1"]
         self.chunks = self._array.chunk_shape
+
+    @cached_property
+    def tables(self) -> list[Table]:
+        """The tables, finest first."""
+        count = level_count(self._array.shape[1:])
+        sources = [CompactTable(self._array, halvings) for halvings in range(count)]
+        return [Table(n, source, source.dtype) for n, source in enumerate(sources, start=1)]
+
+    @cached_property
+    def mlp(self) -> Mlp:
+        """The head as an MLP."""
+        settings = self._array.settings
+        return head_mlp(None if settings is None else settings.head)
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
         """Return which vertices (z, y, x) of a region are in the coreset at both of two steps."""
@@ -66,29 +82,8 @@ class CompactModel:
 
         region: counted in coarse vertices.
         """
-        tile, stride = self._array.chunk_shape, 1 << lod
-        result = np.empty([high - low for low, high in region], dtype=self._array.dtype)
-        grid = [
-            range(low * stride // n, (high - 1) * stride // n + 1)
-            for (low, high), n in zip(region, tile[1:], strict=True)
-        ]
-        for index in product(*grid):
-            # Coarse vertices of the region that lie in the tile.
-            ends = [
-                (max(-(-i * n // stride), a), min(-(-(i + 1) * n // stride), b))
-                for i, n, (a, b) in zip(index, tile[1:], region, strict=True)
-            ]
-            if any(first >= stop for first, stop in ends):
-                continue
-            chunk = self._array.decode_chunk((step // tile[0], *index), lod)[step % tile[0]]
-            target, source = [], []
-            for i, n, (first, stop), (low, _), size in zip(
-                index, tile[1:], ends, region, chunk.shape, strict=True
-            ):
-                target.append(slice(first - low, stop - low))
-                source.append(_nearest(first, stop, stride, i * n, size))
-            result[tuple(target)] = chunk[np.ix_(*source)]
-        return result
+        array = self._array
+        return read_coarse(array, step, lod, region, array.decode_chunk, array.dtype)
 
     def sample(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
         """Return the values at points, quadrilinear.
@@ -157,16 +152,3 @@ class CompactModel:
             weight = np.asarray(prod(factors))
             values += np.where(weight == 0, 0.0, weight * corners[corner])
         return values, corners, weights
-
-
-def _nearest(first: int, stop: int, stride: int, start: int, size: int) -> npt.NDArray[np.int64]:
-    """Return the vertex of a tile's own coarse lattice that is nearest to each coarse vertex.
-
-    A tile that begins between two coarse vertices has a lattice of its own.
-
-    first, stop: range of the coarse vertices, counted from the beginning of the box.
-    start: first vertex of the tile along the axis.
-    size: vertices of the tile's own coarse lattice.
-    """
-    vertices = np.arange(first, stop) * stride - start
-    return np.minimum((vertices + stride // 2) // stride, size - 1)

@@ -112,6 +112,7 @@ def _header(
         "config": config.to_dict(),
         "training": {
             "seconds": seconds if config.timings else None,
+            "steps": trained.steps,
             "epochs": trained.epochs,
             "device": trained.device,
             **restarts,

@@ -76,15 +76,22 @@ def shard_parts(
             raise InputError(
                 f"array {name}: chunk {index} is none of shard {shard}, or was given twice"
             )
-        if isinstance(chunk, bytes):
-            coded[index] = with_crc32c(chunk)
-        else:
-            coded[index] = metadata.coder.encode(full_chunk(name, metadata, index, chunk))
+        coded[index] = coded_chunk(name, metadata, index, chunk)
     inner_chunks = [data for data in coded.values() if data is not None]
     return [
         *inner_chunks,
         pack_index([len(data) for data in inner_chunks], sharding.present(shard, metadata.shape)),
     ]
+
+
+def coded_chunk(name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: Coded) -> bytes:
+    """The bytes of a chunk with their CRC-32C, from its values or from its bytes without.
+
+    Raises InputError as `full_chunk` does.
+    """
+    if isinstance(chunk, bytes):
+        return with_crc32c(chunk)
+    return metadata.coder.encode(full_chunk(name, metadata, index, chunk))
 
 
 def full_chunk(

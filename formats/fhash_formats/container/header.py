@@ -17,7 +17,7 @@ from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 2)
+FORMAT_VERSION = (1, 3)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
 KNOWN_FEATURES = frozenset({TRANSFORM_FEATURE, "clip", "cross", "labels", "mask", "predictor"})
@@ -119,6 +119,7 @@ def _check_source(top: Record) -> np.dtype[Any]:
     encoder, variable = top.record("encoder"), top.record("variable")
     encoder.text("version")
     encoder.integer("seed", -(2**63), 2**64 - 1)
+    encoder.number_or_null("seconds")
     variable.text("name")
     variable.text("units")
     dtype = DTYPES[variable.choice("dtype", tuple(DTYPES))]
@@ -152,6 +153,8 @@ def _check_training(training: Record) -> None:
     training.number_or_null("seconds")
     training.integer("epochs", 0, MAX_LENGTH)
     training.text("device")
+    if training.has("steps"):
+        training.integer("steps", 0, MAX_LENGTH)
     if training.has("restarts"):
         training.integer("restarts", 0, MAX_LENGTH)
     training.number_or_null("learning_rate")

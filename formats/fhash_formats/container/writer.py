@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from fhash_formats.container import strict_json
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.chunks import Coded, cut, expect_end, full_chunk, shard_parts
+from fhash_formats.container.chunks import Coded, coded_chunk, cut, expect_end, shard_parts
 from fhash_formats.container.coding import Codec, plain_codecs
 from fhash_formats.container.header import FORMAT, FORMAT_VERSION
 from fhash_formats.container.hierarchy import GROUP
@@ -88,7 +88,7 @@ class ContainerWriter:
         shape: Sequence[int],
         dtype: npt.DTypeLike,
         chunk_shape: Sequence[int],
-        chunks: Iterable[npt.NDArray[Any]],
+        chunks: Iterable[Coded],
         dimension_names: Sequence[str | None] | None = None,
         attributes: Mapping[str, Any] | None = None,
         codecs: Sequence[Codec] | None = None,
@@ -101,7 +101,8 @@ class ContainerWriter:
             dtype: number type of the array and of each chunk.
             chunk_shape: shape of a full chunk.
             chunks: the chunks in C order of their grid; those at an end of the array reach as far
-                as the array does.
+                as the array does. A chunk may also be the bytes that the coder of its first codec
+                made of the full chunk, without CRC-32C.
             dimension_names: names of the axes.
             attributes: JSON values.
             codecs: a list as in Zarr's metadata; by default `bytes`, `zstd`, `crc32c`.
@@ -121,10 +122,8 @@ class ContainerWriter:
                 raise InputError(
                     f"array {name}: chunk {index} was not given; the grid has {metadata.grid}"
                 )
-            self._add(
-                f"{name}/{metadata.chunk_key(index)}",
-                [metadata.coder.encode(full_chunk(name, metadata, index, chunk))],
-            )
+            coded = coded_chunk(name, metadata, index, chunk)
+            self._add(f"{name}/{metadata.chunk_key(index)}", [coded])
         expect_end(name, metadata, remaining)
 
     def add_sharded(
