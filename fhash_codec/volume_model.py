@@ -81,5 +81,5 @@ class VolumeModel(Protocol):
 def open_model(container: Container) -> VolumeModel:
     """The model of a container; nothing is read yet."""
     if container.header["model"]["profile"] == "compact":
-        return CompactModel(container.arrays)
+        return CompactModel(container)
     return PaperModel(container)

@@ -47,6 +47,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("promises", "rendering", "report"),
         ("comparison", "demo", "isosurface"),
         ("encoding",),
+        ("plain",),
         ("selftest",),
         ("bench",),
     ),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
 from itertools import product
 from math import prod
@@ -12,10 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.parts import CompactTable, head_mlp, level_count, read_coarse
+from fhash_codec.compact.plain import PlainArray
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
 from fhash_codec.model_parts import Mlp, Table
-from fhash_formats.container import StoredArray
+from fhash_formats.container import Container
+from fhash_formats.container.header import PLAIN_FEATURE
+from fhash_formats.errors import InputError
+from fhash_formats.transform.values.elementwise import cast
 
 Positions = npt.NDArray[np.float64]
 """Coordinates of some points along one axis."""
@@ -27,22 +30,32 @@ class CompactModel:
     Its table holds values (t, z, y, x) at the vertices of the feature bounding box.
     """
 
-    def __init__(self, arrays: Mapping[str, StoredArray]) -> None:
-        self._arrays = arrays
-        self._array = arrays["tables/level_1"]
+    def __init__(self, container: Container) -> None:
+        self._arrays = container.arrays
+        self._table = self._arrays["tables/level_1"]
+        self._plain: PlainArray | None = None
+        if PLAIN_FEATURE in container.header["required_features"]:
+            self._plain = PlainArray(container.header["model"], self._arrays)
+        self._array = self._plain or self._table
         self.chunks = self._array.chunk_shape
 
     @cached_property
     def tables(self) -> list[Table]:
         """The tables, finest first."""
-        count = level_count(self._array.shape[1:])
-        sources = [CompactTable(self._array, halvings) for halvings in range(count)]
+        if self._plain is not None:
+            names = [f"tables/level_{n}" for n in range(1, len(self._arrays) + 1)]
+            stored = [self._arrays[name] for name in names if name in self._arrays]
+            return [Table(n, array, array.dtype) for n, array in enumerate(stored, start=1)]
+        count = level_count(self._table.shape[1:])
+        sources = [CompactTable(self._table, halvings) for halvings in range(count)]
         return [Table(n, source, source.dtype) for n, source in enumerate(sources, start=1)]
 
     @cached_property
     def mlp(self) -> Mlp:
         """The head as an MLP."""
-        settings = self._array.settings
+        if self._plain is not None:
+            return head_mlp(self._plain.head)
+        settings = self._table.settings
         return head_mlp(None if settings is None else settings.head)
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
@@ -53,7 +66,7 @@ class CompactModel:
             mask = self._arrays["occupancy/mask"].read((slice(first, last + 1), *space))
             return np.asarray((mask[0] & mask[-1]) != 0)
         if "occupancy/bits" not in self._arrays:
-            mask = self._array.read_mask((slice(first, last + 1), *space))
+            mask = self._table.read_mask((slice(first, last + 1), *space))
             return np.asarray(mask[0] & mask[-1])
         stored = self._arrays["occupancy/bits"]
         bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
@@ -82,8 +95,18 @@ class CompactModel:
 
         region: counted in coarse vertices.
         """
-        array = self._array
+        if self._plain is not None:
+            return self._read_plain_lod(step, lod, region)
+        array = self._table
         return read_coarse(array, step, lod, region, array.decode_chunk, array.dtype)
+
+    def _read_plain_lod(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
+        """The table of a level, in the type of the values; level 0 is the values themselves."""
+        if lod == 0:
+            return self._array.read((slice(step, step + 1), *region.slices()))[0]
+        if lod >= len(self.tables):
+            raise InputError(f"level of detail {lod}; a plain file has 0 to {len(self.tables) - 1}")
+        return cast(self.tables[lod][step, *region.slices(), 0], self._array.dtype)
 
     def sample(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
         """Return the values at points, quadrilinear.

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from untrained_heads import field, some_head, with_head
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, Volume
 from fhash_codec.coreset.occupancy import morton_index, pack
-from fhash_formats.transform.head.head import NeighbourHead
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 PAPER = ["paper-1.0-feature", "paper-1.0-linear-uint8", "paper-1.1-transform"]
@@ -26,8 +26,15 @@ def golden(request: Any) -> Iterator[Volume]:
         yield volume
 
 
-def arrays(volume: Volume) -> Any:
-    return zarr.open_group(zarr.storage.ZipStore(volume.path, mode="r"), mode="r")
+def arrays(volume: Volume) -> dict[str, Any]:
+    """Every array of a file as zarr reads it: (values, attributes)."""
+    with zarr.storage.ZipStore(volume.path, mode="r") as store:
+        members = zarr.open_group(store, mode="r").members(max_depth=None)
+        return {
+            name: (array[...], dict(array.attrs))
+            for name, array in members
+            if isinstance(array, zarr.Array)
+        }
 
 
 @pytest.mark.parametrize("name", PAPER)
@@ -36,29 +43,29 @@ def test_the_paper_shows_the_arrays_of_its_file(name: str) -> None:
         plain = arrays(volume)
         assert len(volume.tables) == len(volume.container.header["model"]["levels"])
         for table in volume.tables:
-            stored = plain[f"tables/level_{table.level}"]
+            path = f"tables/level_{table.level}"
             assert table.ndim == 5
             if name == "paper-1.1-transform":
-                components = [stored[f"component_{n}"] for n in range(1, table.shape[4] + 1)]
+                components = [plain[f"{path}/component_{n + 1}"] for n in range(table.shape[4])]
                 mixed = sum(
-                    component[...][..., None] * np.float32(component.attrs["mixing"])
-                    for component in components
+                    values[..., None] * np.float32(attributes["mixing"])
+                    for values, attributes in components
                 )
                 np.testing.assert_allclose(table[...], mixed, rtol=1e-6, atol=1e-6)
                 continue
-            numbers = stored[...]
+            numbers, attributes = plain[path]
             if numbers.dtype == np.uint8:
-                scale, offset = (np.float32(stored.attrs[key]) for key in ("scale", "offset"))
+                scale, offset = (np.float32(attributes[key]) for key in ("scale", "offset"))
                 numbers = numbers * scale + offset
             np.testing.assert_array_equal(table[...], numbers)
             assert table.dtype == numbers.dtype
         for number, (weights, biases) in enumerate(volume.mlp.layers, start=1):
-            np.testing.assert_array_equal(weights, plain[f"mlp/weight_{number}"][...])
-            np.testing.assert_array_equal(biases, plain[f"mlp/bias_{number}"][...])
-        keys = [int(step) for step in plain["key_frames"][...]]
+            np.testing.assert_array_equal(weights, plain[f"mlp/weight_{number}"][0])
+            np.testing.assert_array_equal(biases, plain[f"mlp/bias_{number}"][0])
+        keys = [int(step) for step in plain["key_frames"][0]]
         for key, step in enumerate(keys):
             bits = volume.occupancy_bits(step)
-            np.testing.assert_array_equal(bits, plain["occupancy/bits"][key])
+            np.testing.assert_array_equal(bits, plain["occupancy/bits"][0][key])
 
 
 def test_bits_are_the_mask_in_ragged_morton_order(golden: Volume) -> None:
@@ -96,11 +103,6 @@ def test_points_have_the_values_of_sample(golden: Volume) -> None:
             golden.model(np.zeros(shape))
 
 
-def field(steps: int = 2) -> np.ndarray:
-    t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (steps, 9, 30, 28)), indexing="ij")
-    return (np.tanh(30 * (x - 0.4 - 0.2 * y * t)) + 0.2 * np.sin(9 * y + 3 * z)).astype(np.float32)
-
-
 def test_a_lattice_is_the_table_and_its_low_passes(tmp_path: Path) -> None:
     values = field()
     config = EncodeConfig(effort=2, psnr=60.0, tile="2x9x15x14")
@@ -118,20 +120,12 @@ def test_a_lattice_is_the_table_and_its_low_passes(tmp_path: Path) -> None:
 
 
 def test_a_head_makes_the_values_of_the_table(tmp_path: Path) -> None:
-    from fhash_formats.transform.head.head import Layer
-
-    rng = np.random.default_rng(3)
-    layers = []
-    for rows, columns in ((4, 28), (3, 36), (1, 3)):
-        weights = rng.integers(-9, 10, (rows, columns)).astype(np.int8)
-        biases = rng.integers(-9, 10, rows).astype(np.int8)
-        layers.append(Layer(weights=weights, biases=biases, weight_scale=0.03125, bias_scale=0.5))
-    head = NeighbourHead(layers=tuple(layers), sigma=0.125, low=-2.0, high=2.0, cross=True)
+    head = some_head()
     path = with_head(tmp_path / "a.fhz", head)
     with fhash_codec.open(path) as volume:
         mlp = volume.mlp
         assert mlp.activation == "leaky"
-        assert mlp.constants == {"sigma": 0.125, "low": -2.0, "high": 2.0, "cross": 1}
+        assert mlp.constants == {"sigma": 0.125, "low": -1.5, "high": 1.25, "cross": 1}
         for layer, (weights, biases) in zip(head.layers, mlp.layers, strict=True):
             np.testing.assert_array_equal(weights, layer.weights * np.float64(layer.weight_scale))
             np.testing.assert_array_equal(biases, layer.biases * np.float64(layer.bias_scale))
@@ -141,31 +135,3 @@ def test_a_head_makes_the_values_of_the_table(tmp_path: Path) -> None:
         for start in (0, 15):  # two tiles along y: a head looks at its own tile
             tile = np.ascontiguousarray(table[:, :, start : start + 15])
             np.testing.assert_array_equal(head.apply(tile), volume[:, :, start : start + 15])
-
-
-def with_head(path: Path, head: NeighbourHead) -> Path:
-    """A file whose head was not trained: two tiles along y."""
-    from dataclasses import replace
-
-    from fhash_codec.compact import coded_table
-
-    config = EncodeConfig(effort=2, psnr=40.0, tile="2x9x15x28")
-    write = coded_table.write_table
-
-    def patched(writer: Any, table: Any) -> None:
-        settings = replace(table.plan.settings, head=head)
-        write(writer, replace(table, plan=replace(table.plan, settings=settings)))
-
-    header = coded_table.model_header
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fhash_codec.compact.encode.write_table", patched)
-        patch.setattr(
-            "fhash_codec.compact.encode.model_header",
-            lambda table, config: {**header(table, config), "head": {"hidden": [4, 3]}},
-        )
-        patch.setattr(
-            "fhash_codec.compact.encode.required_features", lambda table: ["transform", "cross"]
-        )
-        patch.setattr("fhash_codec.encoding.missed_promise", lambda *_: None)
-        fhash_codec.encode(field(), path, config)
-    return path
