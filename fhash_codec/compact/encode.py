@@ -102,7 +102,7 @@ def _header(
     seconds: duration of the encoding; None if it is not to be told.
     """
     extent = selection.extent
-    trained = table.plan.history if table.plan.settings.head is not None else []
+    trained = table.plan.history
     return {
         "encoder": {
             "version": version("fhash"),
@@ -124,7 +124,7 @@ def _header(
 
 
 def _training(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
-    """Return what a header says of the training of the head in the file, which has this history.
+    """Return what a header says of the training of the best head, which has this history.
 
     The device is "none" where nothing was trained.
     """

@@ -30,7 +30,8 @@ def predicted(
     table: npt.NDArray[Any], head: NeighbourHead | None, dtype: np.dtype[Any]
 ) -> npt.NDArray[Any]:
     """Return what the head makes of the table (t, z, y, x) of a tile, in the type of the values."""
-    return cast(table if head is None else head.apply(np.ascontiguousarray(table)), dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return cast(table if head is None else head.apply(np.ascontiguousarray(table)), dtype)
 
 
 def correction_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
@@ -53,8 +54,10 @@ def correction_of(values: npt.NDArray[Any], base: npt.NDArray[Any]) -> npt.NDArr
 def corrected(base: npt.NDArray[Any], corrections: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return predicted values with their corrections, in their own type."""
     if base.dtype.kind != "f":
-        return (base.astype(np.int64) + corrections.astype(np.int64)).astype(base.dtype)
-    return (base.astype(np.float64) + corrections).astype(base.dtype)
+        with np.errstate(invalid="ignore"):
+            return (base.astype(np.int64) + corrections.astype(np.int64)).astype(base.dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return (base.astype(np.float64) + corrections).astype(base.dtype)
 
 
 def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> NeighbourHead | None:
@@ -77,13 +80,14 @@ def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> Neig
                     bias_scale=scales[1],
                 )
             )
-        return NeighbourHead(
-            layers=tuple(layers),
-            sigma=described["sigma"],
-            low=described["low"],
-            high=described["high"],
-            cross=described["cross"],
-        )
+        with np.errstate(over="ignore"):
+            return NeighbourHead(
+                layers=tuple(layers),
+                sigma=described["sigma"],
+                low=described["low"],
+                high=described["high"],
+                cross=described["cross"],
+            )
     except (InputError, OverflowError) as error:
         raise DamagedFileError(f"the head of a plain file is damaged: {error}") from error
 
@@ -91,7 +95,8 @@ def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> Neig
 def _integers(array: StoredArray) -> tuple[npt.NDArray[np.int8], float]:
     """The whole numbers of an array of weights or biases, and their unit."""
     scale = float(array.attributes["scale"])
-    numbers = array.read().astype(np.float64) / scale
+    with np.errstate(over="ignore", invalid="ignore"):
+        numbers = array.read().astype(np.float64) / scale
     if not np.isfinite(numbers).all() or np.abs(numbers).max() > 127:
         raise DamagedFileError(f"array {array.name} has numbers that are no multiples of its scale")
     return np.rint(numbers).astype(np.int8), scale

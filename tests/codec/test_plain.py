@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +15,22 @@ from untrained_heads import some_head, with_head
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError
 from fhash_codec.plain import export_plain
-from fhash_formats.errors import OutputExistsError
+from fhash_formats.container import Container, validate_header
+from fhash_formats.container.expected_arrays import check_arrays
+from fhash_formats.errors import DamagedFileError, OutputExistsError
 
 HERE = Path(__file__).resolve().parent
-GOLDENS = sorted((HERE.parent / "golden").glob("*.fhz"))
+GOLDENS = [
+    HERE.parent / "golden" / f"{name}.fhz"
+    for name in (
+        "compact-1.1-bound",
+        "compact-1.1-mask",
+        "compact-1.1-predictor",
+        "paper-1.0-feature",
+        "paper-1.0-linear-uint8",
+        "paper-1.1-transform",
+    )
+]
 STANDARD = {"bytes", "zstd", "crc32c"}
 
 
@@ -156,3 +170,48 @@ def test_a_failure_on_the_way_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         export_plain(GOLDENS[0], tmp_path / "plain.fhz", progress=stop)
     assert list(tmp_path.iterdir()) == []
+
+
+def headed(tmp_path: Path) -> Path:
+    """A plain file with a head."""
+    path = with_head(tmp_path / "a.fhz", some_head())
+    export_plain(path, tmp_path / "plain.fhz")
+    return tmp_path / "plain.fhz"
+
+
+WRONG = {
+    "tile": lambda model: model.update(tile=[2, 9, 0, 14]),
+    "values": lambda model: model.update(values="float64"),
+    "tables": lambda model: model.update(tables="int8"),
+    "profile": lambda model: model.update(
+        profile="paper", fold=2, embedding_size=1, hidden_layers=0, width=1, tables="float32"
+    ),
+    "hidden": lambda model: model["head"].update(hidden=[4, 3, 2, 1]),
+    "cross": lambda model: model["head"].update(cross=1),
+    "sigma": lambda model: model["head"].update(sigma=None),
+}
+
+
+def test_a_header_that_does_not_fit_is_damage(tmp_path: Path) -> None:
+    with Container.open(headed(tmp_path)) as container:
+        header = container.header
+        arrays = {name: array._metadata for name, array in container.arrays.items()}
+    validate_header(header)
+    check_arrays(header, arrays)
+    for key, change in WRONG.items():
+        wrong = copy.deepcopy(header)
+        change(wrong["model"])
+        with pytest.raises(DamagedFileError, match=key):
+            validate_header(wrong)
+    for hidden, name in (([4, 2], "mlp/weight_2"), ([5, 3], "mlp/weight_1")):
+        wrong = copy.deepcopy(header)
+        wrong["model"]["head"]["hidden"] = hidden
+        with pytest.raises(DamagedFileError, match=name):
+            check_arrays(wrong, arrays)
+    for name in ("mlp/bias_3", "tables/level_2", "occupancy/bits", "coords/x", "key_frames"):
+        with pytest.raises(DamagedFileError, match=f"{name} is missing"):
+            check_arrays(header, {key: arrays[key] for key in arrays if key != name})
+    for scale in (0.0, -1.0, None):
+        worse = replace(arrays["mlp/weight_2"], attributes={"scale": scale})
+        with pytest.raises(DamagedFileError, match="scale"):
+            check_arrays(header, {**arrays, "mlp/weight_2": worse})

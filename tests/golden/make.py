@@ -47,6 +47,7 @@ GOLDENS = {
     "compact-1.1-predictor": EncodeConfig(max_error=2.0, effort=3, timings=False),
     "compact-1.2-clip": EncodeConfig(max_error=0.2, effort=2, timings=False),
     "compact-1.2-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x24x30"),
+    "compact-1.3-one-tile": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="whole"),
     "paper-1.1-transform": EncodeConfig(
         profile="paper",
         width=8,

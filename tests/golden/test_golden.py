@@ -19,6 +19,7 @@ COMPACT = [
     "compact-1.1-psnr",
     "compact-1.2-clip",
     "compact-1.2-labels",
+    "compact-1.3-one-tile",
 ]
 NAMES = [
     "paper-1.0-plain",

@@ -150,7 +150,7 @@ def _training(info: dict[str, Any]) -> str:
     training, model = info["training"], info["model"]
     told = "steps" in training
     if model["profile"] == "compact" and (not told or training["steps"] == 0):
-        return "not told" if model.get("head") else "none: there is no head"
+        return "not told" if model["head"] and not told else "none"
     steps = f"{training['steps']:,} steps, " if told else ""
     seconds = training["seconds"]
     took = "" if seconds is None else f" in {number(seconds, 's', digits=3)}"
@@ -160,9 +160,10 @@ def _training(info: dict[str, Any]) -> str:
         if rate is None
         else f"; it diverged, and came to its end at a learning rate of {rate:.3g}"
     )
+    unused = model["profile"] == "compact" and model["head"] is None
     return (
         f"{steps}{training['epochs']} epochs{took} on {training['device']},"
-        f" seed {info['encoder']['seed']}{lowered}"
+        f" seed {info['encoder']['seed']}{lowered}{'; the head was left out' if unused else ''}"
     )
 
 
