@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from fhash_codec.comparison import diff
     from fhash_codec.config import EncodeConfig
     from fhash_codec.encoding import encode
+    from fhash_codec.plain import export_plain
     from fhash_codec.rendering import render
     from fhash_codec.rendering.renderer import Renderer
     from fhash_codec.rendering.scene.scene import Scene
@@ -51,6 +52,7 @@ _MODULES = {
     "Volume": "volume",
     "diff": "comparison",
     "encode": "encoding",
+    "export_plain": "plain",
     "open": "volume",
     "render": "rendering",
 }
@@ -76,6 +78,7 @@ __all__ = [
     "Volume",
     "diff",
     "encode",
+    "export_plain",
     "open",
     "render",
 ]

@@ -118,7 +118,9 @@ class _Measured:
         """The header with the quality of the arrays written so far, as they decode."""
         with Volume(self._writer.preview(header)) as volume:
             self.quality = measure(self._series, volume, self._progress)
-        return {**header, "quality": brief_quality(self.quality)}
+        low, high = header["value_range"]
+        steps = header["domain"]["shape"][0]
+        return {**header, "quality": brief_quality(self.quality, high - low, steps)}
 
     def figures(self, header: dict[str, Any]) -> dict[str, Any]:
         """Figures that a promise is checked by; see `report`."""

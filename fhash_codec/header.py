@@ -144,10 +144,15 @@ def read_missing(container: Container, first: int, last: int) -> npt.NDArray[np.
     return bits.view(np.bool_).reshape(shape)
 
 
-def brief_quality(quality: Mapping[str, Any]) -> dict[str, Any]:
+def brief_quality(
+    quality: Mapping[str, Any], data_range: float, steps_of_series: int
+) -> dict[str, Any]:
     """Figures as a header has them: rounded to the worse side, figures of single steps as lists.
 
-    quality: `metrics.Quality` as JSON values.
+    What follows from other entries of the header is left out, and `full_header` puts it back: the
+    PSNR of a step, and the range and the steps of the SSIM where they are those of the series.
+
+    quality: `metrics.Quality` as JSON values. data_range: width of the header's value range.
     """
     brief: dict[str, Any] = {
         name: _figure(name, value, DIGITS) if isinstance(value, float) else value
@@ -165,7 +170,13 @@ def brief_quality(quality: Mapping[str, Any]) -> dict[str, Any]:
     steps = quality["per_step"]
     brief["per_step"] = {
         name: [_figure(name, step[name], STEP_DIGITS) for step in steps]
-        for name in ("psnr", "rmse", "max_abs_error")
+        for name in ("rmse", "max_abs_error")
+    }
+    usual = {"data_range": data_range, "steps": list(range(steps_of_series))}
+    brief["ssim_window"] = {
+        name: value
+        for name, value in quality["ssim_window"].items()
+        if name not in usual or value != usual[name]
     }
     return brief
 
@@ -220,27 +231,57 @@ def full_header(header: Mapping[str, Any]) -> dict[str, Any]:
     """A header with the figures of steps and of the training in one shape, whatever the file has.
 
     `quality.per_step` is a list with step, psnr, rmse and max_abs_error of each step, and `history`
-    a list of points, both as a report has them.
+    a list of points, both as a report has them. `config` has every setting.
     """
     full = {**header, "history": history_points(header.get("history", ()))}
+    full["config"] = full_config(header)
     quality = header.get("quality", {})
+    low, high = header.get("value_range", (0.0, 0.0))
     if "per_step" in quality:
-        full["quality"] = {**quality, "per_step": _steps(quality["per_step"])}
+        full["quality"] = quality = {**quality, "per_step": _steps(quality["per_step"], high - low)}
+    if isinstance(quality.get("ssim_window"), Mapping) and "domain" in header:
+        usual = {"data_range": high - low, "steps": list(range(header["domain"]["shape"][0]))}
+        full["quality"] = {**quality, "ssim_window": {**usual, **quality["ssim_window"]}}
     return full
 
 
-def _steps(per_step: Any) -> list[dict[str, Any]]:
-    """The figures of each step, from lists by name; what another writer misshaped is left out."""
+def full_config(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Every setting that a file was made with.
+
+    Files of the profile compact before version 1.3 hold only what differs from the defaults, the
+    promise included. The other settings had their defaults.
+    """
+    config = header.get("config", {})
+    profile = header.get("model", {}).get("profile", "compact")
+    return {**EncodeConfig(profile=profile).to_dict(), **config}
+
+
+def _steps(per_step: Any, data_range: float) -> list[dict[str, Any]]:
+    """The figures of each step, from lists by name; what another writer misshaped is left out.
+
+    A PSNR that is not there follows from the root of the mean squared error.
+    """
     if not isinstance(per_step, Mapping):
         return [dict(step) for step in per_step if isinstance(step, Mapping)]
     names = [name for name in ("psnr", "rmse", "max_abs_error") if name in per_step]
     lists: list[Any] = [per_step[name] for name in names]
     if not all(isinstance(values, list) for values in lists):
         return []
-    return [
+    steps = [
         {"step": step, **dict(zip(names, figures, strict=True))}
         for step, figures in enumerate(zip_longest(*lists))
     ]
+    if "psnr" not in names and "rmse" in names:
+        for entry in steps:
+            entry["psnr"] = _psnr(entry["rmse"], data_range)
+    return steps
+
+
+def _psnr(rmse: Any, data_range: float) -> float | None:
+    """The PSNR in dB of a root of the mean squared error; None where it is not finite."""
+    if not isinstance(rmse, int | float) or rmse <= 0 or data_range <= 0:
+        return None
+    return _figure("psnr", 20 * (math.log10(data_range) - math.log10(rmse)), STEP_DIGITS)
 
 
 def _figure(name: str, value: float | None, digits: int) -> float | None:

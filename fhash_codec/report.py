@@ -37,6 +37,7 @@ def report(
         tables_loss_db: dB that coded tables lose at the key frames; None for other tables.
     """
     info = volume.info
+    device = info["training"]["device"]
     source = bytes_on_disk(files)
     return {
         "path": str(volume.path),
@@ -58,7 +59,8 @@ def report(
         "parameters": info["model"]["parameters"],
         "profile": info["model"]["profile"],
         "tables_loss_db": info["model"].get("tables_loss_db"),
-        "device": info["training"]["device"],
+        # What is not trained is computed on the CPU.
+        "device": "cpu" if device == "none" else device,
         "restarts": info["training"].get("restarts", 0),
         "gains": info["model"].get("gains", []),
         "quality": quality,

@@ -43,7 +43,7 @@ class ValueType:
         stored_as_integers = (
             source.kind in "iu"
             and model["profile"] == "compact"
-            and model["tables"] == source.name
+            and model.get("values", model["tables"]) == source.name
             and model["levels"][0][0] == header["domain"]["shape"][0]
         )
         return cls(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property, partial
-from math import prod
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.card import Card
 from fhash_codec.coreset.boxes import Box, Spans
 from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
 from fhash_codec.header import OUTSIDE as OUTSIDE_IS_MISSING
@@ -44,7 +44,7 @@ def open(path: str | Path, *, fill: int | float | None = None) -> Volume:
     return Volume(Container.open(path), fill=fill)
 
 
-class Volume:
+class Volume(Card):
     """A time-varying volume in a container, read like a numpy array (t, z, y, x).
 
     Only the tiles that a request needs are decoded. Values are in data units. Vertices outside the
@@ -65,6 +65,8 @@ class Volume:
         box: the feature bounding box, in vertices of the domain.
         path: of the file.
         info: everything the file says of itself, as JSON values.
+        config, tables, mlp: the parts of the model, see `Card`, as are `occupancy_bits` and
+            `model`.
     """
 
     dims = AXES
@@ -97,11 +99,6 @@ class Volume:
         self.chunks = self._model.chunks
 
     # -- contents of the file --
-
-    @property
-    def size(self) -> int:
-        """Number of vertices over all steps."""
-        return prod(self.shape)
 
     @cached_property
     def coords(self) -> dict[str, Coordinate]:

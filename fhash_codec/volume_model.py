@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from fhash_codec.compact.model import CompactModel
 from fhash_codec.coreset.boxes import Box
+from fhash_codec.model_parts import Mlp, Table
 from fhash_codec.paper.model import PaperModel
 from fhash_formats.container import Container
 
@@ -26,6 +27,16 @@ class VolumeModel(Protocol):
     @property
     def chunks(self) -> tuple[int, ...]:
         """Vertices (t, z, y, x) that are decoded together: a read decodes at least so many."""
+        ...
+
+    @property
+    def tables(self) -> list[Table]:
+        """Tables of the levels, finest first."""
+        ...
+
+    @property
+    def mlp(self) -> Mlp:
+        """Layers behind the tables."""
         ...
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
@@ -70,5 +81,5 @@ class VolumeModel(Protocol):
 def open_model(container: Container) -> VolumeModel:
     """The model of a container; nothing is read yet."""
     if container.header["model"]["profile"] == "compact":
-        return CompactModel(container.arrays)
+        return CompactModel(container)
     return PaperModel(container)

@@ -33,7 +33,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     ),
     "Comparison": ("peer", "part", "seconds", "turns", "speed"),
     "Cases": ("all", "case", "group"),
-    "Output": ("o", "force", "report", "plot", "save-scene", "depth", "normal"),
+    "Output": ("o", "plain", "force", "report", "plot", "save-scene", "depth", "normal"),
     "Run": (
         "seed", "timings", "processes", "explain", "json", "q", "quiet", "v", "verbose", "help",
     ),

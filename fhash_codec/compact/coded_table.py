@@ -15,6 +15,9 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["CodedTable", "model_header", "required_features", "write_table"]
 
+TABLE = "tables/level_1"
+"""Name of the table in the container."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CodedTable:
@@ -36,27 +39,21 @@ def write_table(writer: ContainerWriter, table: CodedTable) -> None:
     A single tile needs no shard, whose index and description would take some 120 bytes.
     """
     blocks, settings = table.plan.blocks, table.plan.settings
-    if len(table.streams) == 1:
-        writer.add_array(
-            "tables/level_1",
-            shape=blocks.shape,
-            dtype=blocks.dtype,
-            chunk_shape=blocks.tile,
-            chunks=iter(table.streams),
-            dimension_names=("t", "z", "y", "x"),
-            codecs=_codecs(settings),
-        )
+    described: dict[str, Any] = {
+        "shape": blocks.shape,
+        "dtype": blocks.dtype,
+        "chunk_shape": blocks.tile,
+        "dimension_names": ("t", "z", "y", "x"),
+        "codecs": [
+            {"name": "fhash.transform", "configuration": settings.to_dict()},
+            {"name": "crc32c"},
+        ],
+    }
+    if len(table.streams) == 1:  # a shard of one tile would cost 70 bytes more
+        writer.add_array(TABLE, chunks=table.streams, **described)
         return
-    writer.add_sharded(
-        "tables/level_1",
-        shape=blocks.shape,
-        dtype=blocks.dtype,
-        chunk_shape=blocks.tile,
-        shard_shape=shard_shape(blocks.tile, blocks.grid),
-        chunks=iter(table.streams),
-        dimension_names=("t", "z", "y", "x"),
-        codecs=_codecs(settings),
-    )
+    shards = shard_shape(blocks.tile, blocks.grid)
+    writer.add_sharded(TABLE, shard_shape=shards, chunks=iter(table.streams), **described)
 
 
 def _codecs(settings: TileSettings) -> list[dict[str, Any]]:

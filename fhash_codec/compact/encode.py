@@ -5,10 +5,13 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
+from importlib.metadata import version
 from typing import Any
 
 import numpy.typing as npt
 
+from fhash_codec.compact.choices.head import HeadHistory
+from fhash_codec.compact.choices.head_samples import BATCH_VOXELS
 from fhash_codec.compact.coded_table import (
     CodedTable,
     model_header,
@@ -100,29 +103,47 @@ def _header(
     seconds: duration of the encoding; None if it is not to be told.
     """
     extent = selection.extent
-    history = brief_history(table.plan.history, timings=config.timings)
+    trained = table.plan.history
     return {
+        "encoder": {
+            "version": version("fhash"),
+            "seed": config.seed,
+            **({} if seconds is None else {"seconds": seconds}),
+        },
         "required_features": required_features(table),
         "background": extent.background,
         "feature_bounding_box": [list(span) for span in extent.box],
         "features": [str(feature) for feature in selection.features],
         "coreset_fraction": extent.fraction,
         "model": model_header(table, config),
-        "config": _changed_options(config)
-        | promise(config, selection.scanned.value_range, table.bulk),
+        "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": _described(table.bulk)},
-        "training": {"seconds": seconds, "epochs": 0, "device": "cpu"},
-        "history": history_columns(history),
+        "training": _training(trained, timings=config.timings),
+        "history": history_columns(brief_history(trained, timings=config.timings)),
+    }
+
+
+def _training(history: HeadHistory, *, timings: bool) -> dict[str, Any]:
+    """Return what a header says of the training of the best head, which has this history.
+
+    The device is "none" where nothing was trained.
+    """
+    if not history:
+        return {"seconds": 0 if timings else None, "steps": 0, "epochs": 0, "device": "none"}
+    last = history[-1]
+    seconds, steps, samples = last["seconds"], last["epoch"], last["samples"]
+    assert seconds is not None
+    assert steps is not None
+    assert samples is not None
+    return {
+        "seconds": round(seconds, 3) if timings else None,
+        "steps": int(steps),
+        "epochs": max(1, round(steps * BATCH_VOXELS / samples)),
+        "device": "cpu",
     }
 
 
 def _described(bulk: ValueRange | None) -> dict[str, Any] | None:
     """Return what a header says of a bulk that nothing was measured in yet."""
     return None if bulk is None else {"range": [bulk.low, bulk.high]}
-
-
-def _changed_options(config: EncodeConfig) -> dict[str, Any]:
-    """Return the options that differ from their defaults."""
-    defaults = EncodeConfig().to_dict()
-    return {name: value for name, value in config.to_dict().items() if value != defaults[name]}

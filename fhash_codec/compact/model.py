@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import cached_property
 from itertools import product
 from math import prod
 from typing import Any
@@ -10,10 +10,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.parts import CompactTable, head_mlp, level_count, read_coarse
+from fhash_codec.compact.plain import PlainArray
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
-from fhash_formats.container import StoredArray
-from fhash_formats.errors import DamagedFileError
+from fhash_codec.model_parts import Mlp, Table
+from fhash_formats.container import Container
+from fhash_formats.container.header import PLAIN_FEATURE
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.values.elementwise import cast
 
 Positions = npt.NDArray[np.float64]
 """Coordinates of some points along one axis."""
@@ -25,12 +30,35 @@ class CompactModel:
     Its table holds values (t, z, y, x) at the vertices of the feature bounding box.
     """
 
-    def __init__(self, arrays: Mapping[str, StoredArray]) -> None:
-        self._arrays = arrays
-        self._array = arrays["tables/level_1"]
+    def __init__(self, container: Container) -> None:
+        self._arrays = container.arrays
+        self._table = self._arrays["tables/level_1"]
+        self._plain: PlainArray | None = None
+        if PLAIN_FEATURE in container.header["required_features"]:
+            self._plain = PlainArray(container.header["model"], self._arrays)
+        self._array = self._plain or self._table
         # Files from before the feature `mask` have their occupancy in arrays.
-        self._older = any(name.startswith("occupancy/") for name in arrays)
+        self._older = any(name.startswith("occupancy/") for name in self._arrays)
         self.chunks = self._array.chunk_shape
+
+    @cached_property
+    def tables(self) -> list[Table]:
+        """The tables, finest first."""
+        if self._plain is not None:
+            names = [f"tables/level_{n}" for n in range(1, len(self._arrays) + 1)]
+            stored = [self._arrays[name] for name in names if name in self._arrays]
+            return [Table(n, array, array.dtype) for n, array in enumerate(stored, start=1)]
+        count = level_count(self._table.shape[1:])
+        sources = [CompactTable(self._table, halvings) for halvings in range(count)]
+        return [Table(n, source, source.dtype) for n, source in enumerate(sources, start=1)]
+
+    @cached_property
+    def mlp(self) -> Mlp:
+        """The head as an MLP."""
+        if self._plain is not None:
+            return head_mlp(self._plain.head)
+        settings = self._table.settings
+        return head_mlp(None if settings is None else settings.head)
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
         """Return which vertices (z, y, x) of a region are in the coreset at both of two steps."""
@@ -40,7 +68,7 @@ class CompactModel:
             mask = self._arrays["occupancy/mask"].read((slice(first, last + 1), *space))
             return np.asarray((mask[0] & mask[-1]) != 0)
         if "occupancy/bits" not in self._arrays:
-            mask = self._array.read_mask((slice(first, last + 1), *space))
+            mask = self._table.read_mask((slice(first, last + 1), *space))
             return np.asarray(mask[0] & mask[-1])
         stored = self._arrays["occupancy/bits"]
         bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
@@ -70,29 +98,19 @@ class CompactModel:
 
         region: counted in coarse vertices.
         """
-        tile, stride = self._array.chunk_shape, 1 << lod
-        result = np.empty([high - low for low, high in region], dtype=self._array.dtype)
-        grid = [
-            range(low * stride // n, (high - 1) * stride // n + 1)
-            for (low, high), n in zip(region, tile[1:], strict=True)
-        ]
-        for index in product(*grid):
-            # Coarse vertices of the region that lie in the tile.
-            ends = [
-                (max(-(-i * n // stride), a), min(-(-(i + 1) * n // stride), b))
-                for i, n, (a, b) in zip(index, tile[1:], region, strict=True)
-            ]
-            if any(first >= stop for first, stop in ends):
-                continue
-            chunk = self._array.decode_chunk((step // tile[0], *index), lod)[step % tile[0]]
-            target, source = [], []
-            for i, n, (first, stop), (low, _), size in zip(
-                index, tile[1:], ends, region, chunk.shape, strict=True
-            ):
-                target.append(slice(first - low, stop - low))
-                source.append(_nearest(first, stop, stride, i * n, size))
-            result[tuple(target)] = chunk[np.ix_(*source)]
-        return self._without_infinities(result)
+        if self._plain is not None:
+            return self._read_plain_lod(step, lod, region)
+        array = self._table
+        values = read_coarse(array, step, lod, region, array.decode_chunk, array.dtype)
+        return self._without_infinities(values)
+
+    def _read_plain_lod(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
+        """The table of a level, in the type of the values; level 0 is the values themselves."""
+        if lod == 0:
+            return self._array.read((slice(step, step + 1), *region.slices()))[0]
+        if lod >= len(self.tables):
+            raise InputError(f"level of detail {lod}; a plain file has 0 to {len(self.tables) - 1}")
+        return cast(self.tables[lod][step, *region.slices(), 0], self._array.dtype)
 
     def sample(self, steps: Positions, space: list[Positions]) -> npt.NDArray[np.float64]:
         """Return the values at points, quadrilinear.
@@ -174,16 +192,3 @@ class CompactModel:
                 raise DamagedFileError("the table holds infinities; the file is damaged")
             values[infinite] = np.nan
         return values
-
-
-def _nearest(first: int, stop: int, stride: int, start: int, size: int) -> npt.NDArray[np.int64]:
-    """Return the vertex of a tile's own coarse lattice that is nearest to each coarse vertex.
-
-    A tile that begins between two coarse vertices has a lattice of its own.
-
-    first, stop: range of the coarse vertices, counted from the beginning of the box.
-    start: first vertex of the tile along the axis.
-    size: vertices of the tile's own coarse lattice.
-    """
-    vertices = np.arange(first, stop) * stride - start
-    return np.minimum((vertices + stride // 2) // stride, size - 1)

@@ -136,6 +136,7 @@ def _header(
         "config": config.to_dict(),
         "training": {
             "seconds": seconds if config.timings else None,
+            "steps": trained.steps,
             "epochs": trained.epochs,
             "device": trained.device,
             **restarts,

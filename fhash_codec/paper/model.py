@@ -14,6 +14,7 @@ import numpy.typing as npt
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import Bits, between, unpack
 from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.model_parts import CORNERS, Mlp, Table
 from fhash_codec.paper.network import Network
 from fhash_codec.paper.points import sample_points
 from fhash_codec.paper.regions import decode_region
@@ -42,6 +43,19 @@ class PaperModel:
     def network(self) -> Network:
         """The network. Its tables are read on demand."""
         return load_network(self._container)
+
+    @cached_property
+    def tables(self) -> list[Table]:
+        """The tables, finest first."""
+        stored = self._container.header["model"]["tables"]
+        dtype = "float16" if stored == "float16" else "float32"
+        return [Table(n, table, dtype) for n, table in enumerate(self.network.tables, start=1)]
+
+    @cached_property
+    def mlp(self) -> Mlp:
+        """The layers of the network."""
+        weights, biases = zip(*self.network.layers, strict=True)
+        return Mlp(weights=weights, biases=biases, activation="relu", stencil=CORNERS)
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
         """Return which vertices (z, y, x) of a region are in the coreset at either key frame."""

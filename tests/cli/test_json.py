@@ -155,6 +155,9 @@ def test_demo(fhash: Fhash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_verify_and_decode(fhash: Fhash, run: Path) -> None:
     check("verify", parsed(fhash("verify", run, "--json", "-q")))
     check("decode", parsed(fhash("decode", run, "--json", "-q")))
+    plain = run.parent / "plain.fhz"
+    words = ["export", run, "-o", plain, "--plain", "--force", "--json", "-q"]
+    check("export", parsed(fhash(*words)))
 
 
 def test_render(fhash: Fhash, run: Path, tmp_path: Path) -> None:

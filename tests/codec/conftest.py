@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 def waves(

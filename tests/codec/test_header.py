@@ -6,13 +6,17 @@ import math
 
 import pytest
 
+from fhash_codec.config import EncodeConfig
 from fhash_codec.header import (
     brief_history,
     brief_quality,
+    full_config,
     full_header,
     history_columns,
     history_points,
 )
+
+NOTHING: dict[str, object] = {"per_step": [], "ssim_window": {}}
 
 
 def test_figures_in_a_file_are_brief_and_never_better_than_they_are() -> None:
@@ -27,14 +31,13 @@ def test_figures_in_a_file_are_brief_and_never_better_than_they_are() -> None:
         "ssim": None,
         "ssim_window": {"window": 11},
     }
-    assert brief_quality({**quality, "per_step": steps}) == {
+    assert brief_quality({**quality, "per_step": steps}, 1.0, 2) == {
         "psnr": 44.9999,
         "rmse": 1.23457,
         "max_abs_error": 0.123457,
         "ssim": None,
         "ssim_window": {"window": 11},
         "per_step": {
-            "psnr": [45.129, None],
             "rmse": [0.0012346, None],
             "max_abs_error": [0.25, None],
         },
@@ -43,11 +46,11 @@ def test_figures_in_a_file_are_brief_and_never_better_than_they_are() -> None:
 
 def test_the_bulk_in_a_file_is_its_range_and_its_psnr() -> None:
     bulk = {"psnr": 40.1234567, "rmse": 0.01, "range": [1.0, 2.5]}
-    assert brief_quality({"bulk": bulk, "per_step": []})["bulk"] == {
+    assert brief_quality({**NOTHING, "bulk": bulk}, 1.0, 0)["bulk"] == {
         "psnr": 40.1234,
         "range": [1.0, 2.5],
     }
-    assert brief_quality({"bulk": None, "per_step": []})["bulk"] is None
+    assert brief_quality({**NOTHING, "bulk": None}, 1.0, 0)["bulk"] is None
 
 
 def test_history_in_a_file_is_brief() -> None:
@@ -93,7 +96,9 @@ STEPS = [
 )
 def test_figures_of_steps_have_one_shape_whatever_the_file_has(per_step: object) -> None:
     header = {"quality": {"psnr": 45.0, "per_step": per_step}, "history": {"epoch": [3]}}
-    assert full_header(header) == {
+    full = full_header(header)
+    assert full.pop("config") == EncodeConfig().to_dict()
+    assert full == {
         "quality": {"psnr": 45.0, "per_step": STEPS},
         "history": [{"seconds": None, "psnr": None, "epoch": 3}],
     }
@@ -110,3 +115,35 @@ def test_steps_without_some_figures_keep_the_others() -> None:
         {"step": 0, "psnr": 1.0, "rmse": 3.0},
         {"step": 1, "psnr": 2.0, "rmse": None},
     ]
+
+
+def test_what_follows_from_the_rest_is_left_out_and_comes_back() -> None:
+    step = {"step": 0, "psnr": 39.9999999, "rmse": 0.0200000001, "max_abs_error": 0.25}
+    window = {"window": 11, "sigma": 1.5, "data_range": 2.0, "steps": [0]}
+    brief = brief_quality({"per_step": [step], "ssim_window": window}, 2.0, 1)
+    assert brief == {
+        "per_step": {"rmse": [0.020001], "max_abs_error": [0.25]},
+        "ssim_window": {"window": 11, "sigma": 1.5},
+    }
+    header = {"quality": brief, "value_range": [-1.0, 1.0], "domain": {"shape": [1, 2, 3, 4]}}
+    full = full_header(header)["quality"]
+    assert full["ssim_window"] == window
+    (entry,) = full["per_step"]
+    assert 39.99 <= entry["psnr"] <= step["psnr"]
+    other = {**window, "steps": [3], "data_range": 1.9}
+    brief = brief_quality({"per_step": [], "ssim_window": other}, 2.0, 1)
+    assert brief["ssim_window"] == other
+
+
+@pytest.mark.parametrize(("rmse", "value_range"), [(0.0, [0.0, 1.0]), (0.5, [3.0, 3.0])])
+def test_a_step_without_error_or_range_has_no_psnr(rmse: float, value_range: list[float]) -> None:
+    quality = {"per_step": {"rmse": [rmse], "max_abs_error": [1.0]}}
+    full = full_header({"quality": quality, "value_range": value_range})
+    assert full["quality"]["per_step"][0]["psnr"] is None
+
+
+def test_every_setting_is_there_whatever_the_file_has() -> None:
+    header = {"config": {"effort": 7, "later": True}, "model": {"profile": "compact"}}
+    config = full_config(header)
+    assert config.pop("later") is True
+    assert EncodeConfig.from_dict(config) == EncodeConfig(effort=7)

@@ -52,6 +52,7 @@ GOLDENS = {
     "compact-1.2-labels": EncodeConfig(max_error=0.0, effort=2, timings=False, tile="3x6x24x30"),
     "compact-1.2-classes": EncodeConfig(max_error=0.0, effort=2, timings=False),
     "compact-1.2-counts": EncodeConfig(max_error=4.0, effort=2, timings=False),
+    "compact-1.3-one-tile": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="whole"),
     "paper-1.1-transform": EncodeConfig(
         profile="paper",
         hidden_layers=1,

@@ -21,6 +21,7 @@ COMPACT = [
     "compact-1.2-clip",
     "compact-1.2-counts",
     "compact-1.2-labels",
+    "compact-1.3-one-tile",
 ]
 NAMES = [
     "paper-1.0-plain",

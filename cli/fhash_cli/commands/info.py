@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.base_command import BaseCommand
+from fhash_cli.card_rows import card_rows
 from fhash_cli.options import SourceOptions, json_option, series_options
 from fhash_cli.output import (
     compared,
@@ -30,13 +31,17 @@ if TYPE_CHECKING:
 @click.command("info", cls=BaseCommand)
 @click.argument("path", metavar="RUN.fhz|DATA", type=click.Path())
 @series_options
+@click.option("-v", "--verbose", is_flag=True, help="Every setting, level and layer of RUN.fhz.")
 @json_option
-def command(path: str, source: SourceOptions, as_json: bool) -> None:
+def command(path: str, source: SourceOptions, verbose: bool, as_json: bool) -> None:
     """Say what RUN.fhz or DATA holds.
 
-    Of RUN.fhz: variable, domain, features, network and quality. Of DATA, any source that `fhash
-    encode` reads: the variables with shape, type, units and axes, and the command that encodes
-    each. The options are those of `fhash encode`; --var and --t choose what is told in detail.
+    Of RUN.fhz: variable, domain, features, quality, and the card of its model: settings, tables,
+    network and occupancy, each with its place in the file, coding and bytes.
+
+    Of DATA, any source that `fhash encode` reads: the variables with shape, type, units and axes,
+    and the command that encodes each. The options but -v are those of `fhash encode`; --var and
+    --t choose what is told in detail.
     """
     if not _is_run(path):
         from fhash_codec.progress import silent
@@ -60,8 +65,9 @@ def command(path: str, source: SourceOptions, as_json: bool) -> None:
 
     source.refuse(path)
     with fhash_codec.open(path) as volume:
-        info = volume.info
-        emit(info, table(_rows(volume, info)), as_json)
+        info = {**volume.info, "config": volume.config, "card": volume.describe()}
+        rows = [*_rows(volume, info), *card_rows(info, verbose=verbose)]
+        emit(info, table(rows), as_json)
 
 
 def _is_run(path: str) -> bool:
@@ -73,11 +79,7 @@ def _is_run(path: str) -> bool:
 
 
 def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
-    training = info["training"]
     dtype = info["variable"]["dtype"]
-    seconds = (
-        "" if training["seconds"] is None else f" in {number(training['seconds'], 's', digits=3)}"
-    )
     return [
         (
             "file",
@@ -103,7 +105,8 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
             "key frames",
             f"{len(info['key_frames'])}: {listed([str(step) for step in info['key_frames']])}",
         ),
-        *(_compact(volume, seconds) if volume.profile == "compact" else _network(info, seconds)),
+        *(_compact(volume, info) if volume.profile == "compact" else loss_rows(info["model"])),
+        ("training", _training(info)),
         *quality_rows(info["quality"], volume.units),
     ]
 
@@ -114,37 +117,30 @@ def _missing(volume: Volume) -> str:
     return "" if fill is None else f", missing where the source had {fill:.9g}"
 
 
-def _network(info: dict[str, Any], seconds: str) -> list[tuple[str, str]]:
-    model, training = info["model"], info["training"]
+def _training(info: dict[str, Any]) -> str:
+    """The training of the model: steps, time, device; files before version 1.3 tell less."""
+    training, model = info["training"], info["model"]
+    told = "steps" in training
+    if model["profile"] == "compact" and (not told or training["steps"] == 0):
+        return "not told" if model["head"] and not told else "none"
+    steps = f"{training['steps']:,} steps, " if told else ""
+    seconds = training["seconds"]
+    took = "" if seconds is None else f" in {number(seconds, 's', digits=3)}"
     rate = training.get("learning_rate")
     lowered = (
         ""
         if rate is None
         else f"; it diverged, and came to its end at a learning rate of {rate:.3g}"
     )
-    return [
-        *loss_rows(model),
-        (
-            "network",
-            f"{model['profile']}, {len(model['levels'])} levels,"
-            f" {model['parameters']:,} parameters in {model['tables']}",
-        ),
-        (
-            "training",
-            f"{training['epochs']} epochs{seconds} on {training['device']},"
-            f" seed {info['encoder']['seed']}{lowered}",
-        ),
-    ]
-
-
-def _compact(volume: Volume, seconds: str) -> list[tuple[str, str]]:
-    model = volume.info["model"]
-    head = (
-        "no head"
-        if model["head"] is None
-        else f"head with {' and '.join(map(str, model['head']['hidden']))} neurons"
+    unused = model["profile"] == "compact" and model["head"] is None
+    return (
+        f"{steps}{training['epochs']} epochs{took} on {training['device']},"
+        f" seed {info['encoder']['seed']}{lowered}{'; the head was left out' if unused else ''}"
     )
-    return [
-        ("table", f"compact, {model['parameters']:,} coefficients other than 0, {head}"),
-        ("tiles", f"{extent(volume.chunks)} vertices{', encoded' + seconds if seconds else ''}"),
-    ]
+
+
+def _compact(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
+    encoder = info["encoder"] if "steps" in info["training"] else info["training"]
+    seconds = encoder.get("seconds")
+    took = "" if seconds is None else f", encoded in {number(seconds, 's', digits=3)}"
+    return [("tiles", f"{extent(volume.chunks)} vertices{took}")]

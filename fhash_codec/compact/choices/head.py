@@ -22,7 +22,10 @@ from fhash_formats.transform.tile.settings import TileSettings
 __all__ = ["HeadHistory", "choose_head"]
 
 HeadHistory = list[dict[str, float | None]]
-"""Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB."""
+"""Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
+
+`samples` is the number of voxels that it learns from, the same at each point.
+"""
 StepSearch = Callable[[TileSettings, list[Outcome]], tuple[TileSettings, Outcome]]
 """Search for the step that keeps the promise; it appends all outcomes on the way to the list."""
 
@@ -225,7 +228,12 @@ def _cheapest(
         if cost < lowest_cost or not history:
             psnr_without = psnr - candidate.trained.gain_db
             history = [
-                {"seconds": seconds, "epoch": update, "psnr": _finite(psnr_without + gain)}
+                {
+                    "seconds": seconds,
+                    "epoch": update,
+                    "psnr": _finite(psnr_without + gain),
+                    "samples": candidate.trained.samples,
+                }
                 for seconds, update, gain in candidate.trained.history
             ]
         if cost < lowest_cost:

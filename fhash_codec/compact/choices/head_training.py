@@ -56,6 +56,8 @@ class TrainedHead:
     """Gain in dB on held-out voxels."""
     history: tuple[tuple[float, int, float], ...]
     """Gain during the training: (seconds, update, gain in dB)."""
+    samples: int
+    """Voxels that it learned from."""
 
 
 def train_head(
@@ -109,7 +111,12 @@ def train_head(
         high=float(bounds[1]),
         cross=cross,
     )
-    return TrainedHead(head=head, gain_db=history[-1][2], history=tuple(history))
+    return TrainedHead(
+        head=head,
+        gain_db=history[-1][2],
+        history=tuple(history),
+        samples=sum(voxels.values.size for voxels in learned),
+    )
 
 
 def _sigma(drawn: Sequence[Voxels]) -> np.float32:

@@ -49,6 +49,7 @@ class TrainedModel:
         tables: coarser tables, each (buckets, E).
         layers: weight (out, in) and bias (out,) of each layer.
         epochs: epochs of the training.
+        steps: training steps, one for each batch.
         history: {seconds, epoch, psnr} after epochs.
         device: type of the device.
         checkpoint: path of the checkpoint, of no more use once the numbers are written.
@@ -60,6 +61,7 @@ class TrainedModel:
     tables: list[npt.NDArray[np.float32]]
     layers: list[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]
     epochs: int
+    steps: int
     history: list[dict[str, float | None]]
     device: str
     checkpoint: Path
@@ -278,6 +280,7 @@ class _Fitting:
             tables=[table.numpy() for table in tables],
             layers=[(weight.numpy(), bias.numpy()) for weight, bias in layers],
             epochs=plan.epochs,
+            steps=plan.epochs * plan.batches,
             history=self._reached.history,
             device=self._device.type,
             checkpoint=self._checkpoint,

@@ -152,7 +152,8 @@ class ArrayMetadata:
                 "name": "regular",
                 "configuration": {"chunk_shape": list(self.chunk_shape)},
             },
-            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            # The separator of the default encoding is "/" where none is named.
+            "chunk_key_encoding": {"name": "default"},
             "fill_value": 0.0 if self.dtype.kind == "f" else 0,
             "codecs": list(self.codecs),
         }

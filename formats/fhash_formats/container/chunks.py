@@ -85,7 +85,10 @@ def shard_parts(
 
 
 def coded_chunk(name: str, metadata: ArrayMetadata, index: Sequence[int], chunk: Coded) -> bytes:
-    """The bytes of a chunk, with their CRC-32C; errors are those of `full_chunk`."""
+    """The bytes of a chunk with their CRC-32C, from its values or from its bytes without.
+
+    Raises InputError as `full_chunk` does.
+    """
     if isinstance(chunk, bytes):
         return with_crc32c(chunk)
     return metadata.coder.encode(full_chunk(name, metadata, index, chunk))

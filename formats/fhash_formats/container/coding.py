@@ -162,6 +162,21 @@ class CheckedCoder:
         return tuple(getattr(self._coder, "features", ()))
 
     @property
+    def settings(self) -> Any:
+        """Settings that all chunks share, of a coder that has some (`TileSettings`); else None."""
+        return getattr(self._coder, "settings", None)
+
+    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+        """The full chunk before it is corrected, for a coder that tells both apart.
+
+        Raises DamagedFileError.
+        """
+        coded = self._checked(data)
+        decode = getattr(self._coder, "decode_table", None)
+        values: npt.NDArray[Any] = decode(coded, lod) if decode else self._coder.decode(coded)
+        return values
+
+    @property
     def masked(self) -> bool:
         """Whether the chunks say which of their values are occupied."""
         return bool(getattr(self._coder, "masked", False))

@@ -16,7 +16,17 @@ import numpy.typing as npt
 
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.coding import TRANSFORM
-from fhash_formats.container.header import CODED, COMPACT, PAPER, POSITIONS, TRANSFORM_FEATURE
+from fhash_formats.container.header import (
+    CODED,
+    COMPACT,
+    HEAD_CROSS,
+    HEAD_INPUTS,
+    PAPER,
+    PLAIN_FEATURE,
+    PLAIN_TABLE_TYPES,
+    POSITIONS,
+    TRANSFORM_FEATURE,
+)
 from fhash_formats.container.record import Record
 from fhash_formats.errors import DamagedFileError
 
@@ -37,6 +47,8 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
         _check_array(name, arrays[name], shape, dtypes)
         if name.startswith("tables/"):
             _check_table_attributes(name, arrays[name], header["model"])
+    if PLAIN_FEATURE in header["required_features"]:
+        _check_layers(arrays, header["model"])
     _check_array_features(header["required_features"], arrays)
     for name, shape, dtypes in _optional_arrays(header):
         if name in arrays:
@@ -63,13 +75,25 @@ def occupancy_bytes(box: Sequence[Sequence[int]]) -> int:
 
 
 def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
-    """(outputs, inputs) of each layer of the paper's network, from the header's `model`."""
+    """(outputs, inputs) of each layer of the network or the head, from the header's `model`."""
+    if model["profile"] == COMPACT:
+        return _head_shapes(model["head"])
     widths = [
         len(model["levels"]) * model["embedding_size"],
         *[model["width"]] * model["hidden_layers"],
         1,
     ]
     return [(outputs, inputs) for inputs, outputs in pairwise(widths)]
+
+
+def _head_shapes(head: Mapping[str, Any] | None) -> list[tuple[int, int]]:
+    """(outputs, inputs) of each layer of a head; none without a head."""
+    if head is None:
+        return []
+    inputs = [HEAD_INPUTS, *head["hidden"]]
+    if head["cross"]:
+        inputs[1] *= HEAD_CROSS
+    return list(zip([*head["hidden"], 1], inputs, strict=True))
 
 
 def _required_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
@@ -83,7 +107,7 @@ def _required_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
     key_frames = model["levels"][0][0]
     if not compact or key_frames < header["domain"]["shape"][0]:
         yield "key_frames", (key_frames,), ("int64",)
-    if compact:
+    if compact and PLAIN_FEATURE not in header["required_features"]:
         yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
         return
     for number, level in enumerate(model["levels"], start=1):
@@ -108,13 +132,14 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
     for axis, length in zip(POSITIONS, header["domain"]["shape"], strict=True):
         yield f"coords/{axis}", (length,), ("float64",)
     if model["profile"] == COMPACT:
-        key_frames = model["levels"][0][0]
+        key_frames, *box = model["levels"][0]
         yield "key_frames", (key_frames,), ("int64",)
         yield (
             "occupancy/bits",
             (key_frames, occupancy_bytes(header["feature_bounding_box"])),
             ("uint8",),
         )
+        yield "corrections", (key_frames, *box), PLAIN_TABLE_TYPES
     else:
         # One of each feature, where there are several; a file from before 1.2 has none.
         bits = (model["levels"][0][0], occupancy_bytes(header["feature_bounding_box"]))
@@ -142,6 +167,15 @@ def _check_table_attributes(name: str, table: ArrayMetadata, model: Mapping[str,
         attributes.need(attributes.number("scale") >= 0, "scale", "at least 0")
     if model["tables"] == CODED:
         attributes.numbers("mixing", model["embedding_size"])
+
+
+def _check_layers(arrays: Mapping[str, ArrayMetadata], model: Mapping[str, Any]) -> None:
+    """Check the units of the weights and biases of a plain head."""
+    for number in range(1, len(layer_shapes(model)) + 1):
+        for kind in ("weight", "bias"):
+            name = f"mlp/{kind}_{number}"
+            unit = Record(arrays[name].attributes, f"array {name} attribute ")
+            unit.need(unit.number("scale") > 0, "scale", "above 0")
 
 
 def _check_array_features(

@@ -17,11 +17,22 @@ from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 2)
+FORMAT_VERSION = (1, 3)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
+PLAIN_FEATURE = "plain"
+"""Feature of a file of the profile compact whose tables are plain numbers."""
 KNOWN_FEATURES = frozenset(
-    {TRANSFORM_FEATURE, "clip", "cross", "labels", "many-labels", "mask", "predictor"}
+    {
+        TRANSFORM_FEATURE,
+        PLAIN_FEATURE,
+        "clip",
+        "cross",
+        "labels",
+        "many-labels",
+        "mask",
+        "predictor",
+    }
 )
 """Names in `required_features` that this version understands."""
 PAPER = "paper"
@@ -47,6 +58,16 @@ CODED = "transform"
 """Value of `model.tables` for tables that are coded component by component."""
 TABLE_TYPES = ("float32", "float16", "uint8", CODED)
 """Values of `model.tables` in the profile paper."""
+PLAIN_TABLE_TYPES = ("float32", "float64")
+"""Values of `model.tables` in a plain file of the profile compact."""
+HEAD_INPUTS = 28
+"""Inputs of the first layer of a head."""
+HEAD_CROSS = 9
+"""Vertices at which the second layer of a head with a cross sees the first one's outputs."""
+MAX_HEAD_LAYERS = 3
+"""Hidden layers of a head."""
+MAX_HEAD_WIDTH = 64
+"""Outputs of a hidden layer of a head."""
 MAX_LEVELS = 64
 MAX_EMBEDDING = 1024
 """Numbers of an embedding."""
@@ -71,8 +92,9 @@ def validate_header(header: Mapping[str, Any]) -> None:
     top.texts("features")
     top.integer("dilation", 0, MAX_LENGTH)
     top.need(0 <= top.number("coreset_fraction") <= 1, "coreset_fraction", "a number from 0 to 1")
-    profile = _check_model(top.record("model"), shape[0], box, dtype)
-    if profile == COMPACT or header["model"]["tables"] == CODED:
+    plain = PLAIN_FEATURE in header["required_features"]
+    profile = _check_model(top.record("model"), shape[0], box, dtype, plain=plain)
+    if (profile == COMPACT and not plain) or header["model"]["tables"] == CODED:
         needed = f"{TRANSFORM_FEATURE} in the profile {COMPACT} and for tables coded by {CODED}"
         top.need(TRANSFORM_FEATURE in header["required_features"], "required_features", needed)
     if profile == COMPACT:
@@ -121,6 +143,7 @@ def _check_source(top: Record) -> np.dtype[Any]:
     encoder, variable = top.record("encoder"), top.record("variable")
     encoder.text("version")
     encoder.integer("seed", -(2**63), 2**64 - 1)
+    encoder.number_or_null("seconds")
     variable.text("name")
     variable.text("units")
     dtype = DTYPES[variable.choice("dtype", tuple(DTYPES))]
@@ -154,6 +177,8 @@ def _check_training(training: Record) -> None:
     training.number_or_null("seconds")
     training.integer("epochs", 0, MAX_LENGTH)
     training.text("device")
+    if training.has("steps"):
+        training.integer("steps", 0, MAX_LENGTH)
     if training.has("restarts"):
         training.integer("restarts", 0, MAX_LENGTH)
     training.number_or_null("learning_rate")
@@ -212,7 +237,9 @@ def _largest_decoded(source: np.dtype[Any]) -> float:
     return float(np.finfo(np.float32 if in_float32 else np.float64).max)
 
 
-def _check_model(model: Record, steps: int, box: Sequence[int], source: np.dtype[Any]) -> str:
+def _check_model(
+    model: Record, steps: int, box: Sequence[int], source: np.dtype[Any], *, plain: bool
+) -> str:
     """Check `model`; the profile.
 
     Args:
@@ -220,6 +247,7 @@ def _check_model(model: Record, steps: int, box: Sequence[int], source: np.dtype
         steps: of the domain.
         box: lengths (z, y, x) of the feature bounding box.
         source: number type of the source.
+        plain: whether the file has the feature `plain`.
     """
     profile = model.text("profile")
     if profile not in KNOWN_PROFILES:
@@ -238,11 +266,12 @@ def _check_model(model: Record, steps: int, box: Sequence[int], source: np.dtype
     else:
         model.integer("embedding_size", 1, 1)
         model.integer("parameters", 0, MAX_PARAMETERS)
-        tables = DTYPES[model.choice("tables", tuple(DTYPES))]
+        key = "values" if plain else "tables"
+        tables = DTYPES[model.choice(key, tuple(DTYPES))]
         in_float32 = _largest_decoded(source) < np.finfo(np.float64).max
         model.need(
             not (in_float32 and tables == np.float64),
-            "tables",
+            key,
             f"no float64 for a source of {source}",
         )
         model.need(
@@ -250,11 +279,19 @@ def _check_model(model: Record, steps: int, box: Sequence[int], source: np.dtype
             "head",
             "an object or null",
         )
-    _check_levels(model, profile, steps, box)
+    model.need(profile == COMPACT or not plain, "profile", f"{COMPACT} in a plain file")
+    if plain:
+        _check_plain(model)
+    _check_levels(model, steps, box)
+    model.need(
+        profile == PAPER or plain or len(model.get("levels")) == 1,
+        "levels",
+        f"one level in the profile {COMPACT}",
+    )
     return profile
 
 
-def _check_levels(model: Record, profile: str, steps: int, box: Sequence[int]) -> None:
+def _check_levels(model: Record, steps: int, box: Sequence[int]) -> None:
     """Check `model.levels`: resolutions (t, z, y, x), the finest first, that of box and steps."""
     levels = model.get("levels")
     model.need(
@@ -276,6 +313,20 @@ def _check_levels(model: Record, profile: str, steps: int, box: Sequence[int]) -
     model.need(
         levels[0][0] <= steps, "levels", f"at most the {steps} steps of the domain as key frames"
     )
-    model.need(
-        profile == PAPER or len(levels) == 1, "levels", f"one level in the profile {COMPACT}"
-    )
+
+
+def _check_plain(model: Record) -> None:
+    """Check the keys of `model` that only a plain file of the profile compact has."""
+    model.choice("tables", PLAIN_TABLE_TYPES)
+    model.integers("tile", 4, 1, MAX_LENGTH)
+    if model.get("head") is None:
+        return
+    head = model.record("head")
+    hidden = head.get("hidden")
+    count = len(hidden) if isinstance(hidden, list) else 0
+    head.need(1 <= count <= MAX_HEAD_LAYERS, "hidden", f"1 to {MAX_HEAD_LAYERS} widths")
+    head.integers("hidden", count, 1, MAX_HEAD_WIDTH)
+    for key in ("sigma", "low", "high"):
+        head.number(key)
+    head.need(isinstance(head.get("cross"), bool), "cross", "true or false")
+    head.need(not head.get("cross") or count == 2, "hidden", "2 widths of a head with a cross")

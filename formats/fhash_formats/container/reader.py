@@ -15,7 +15,7 @@ from fhash_formats.container.header import POSITIONS, validate_header
 from fhash_formats.container.hierarchy import read_hierarchy
 from fhash_formats.container.source import CountedSource, FileSource, Source
 from fhash_formats.container.stored import StoredArray, damage_named
-from fhash_formats.container.zip_checked import find_signature, read_members
+from fhash_formats.container.zip_checked import DOCUMENT, find_signature, read_members
 from fhash_formats.errors import FhashError
 from fhash_formats.series import Coordinate
 
@@ -49,6 +49,7 @@ class Container:
         digest: SHA-256 of the file's directory, hexadecimal. The directory holds a checksum of
             everything, so that files of different content have different digests.
         header: attribute "fhash" of the root (FORMAT.md).
+        header_bytes: bytes of the document that holds the header, as it lies in the file.
         arrays: StoredArray by name, in the order of the file.
     """
 
@@ -56,6 +57,7 @@ class Container:
     size: int
     digest: str
     header: dict[str, Any]
+    header_bytes: int
     arrays: Mapping[str, StoredArray]
 
     def __init__(self, path: Path, source: Source, *, cache_bytes: int = CACHE_BYTES) -> None:
@@ -78,7 +80,7 @@ class Container:
                 tree = read_hierarchy(source, members)
                 validate_header(tree.header)
                 check_arrays(tree.header, tree.arrays)
-            self.header = tree.header
+            self.header, self.header_bytes = tree.header, members[DOCUMENT].size
             self.arrays = MappingProxyType(
                 {
                     name: StoredArray(path, name, array, tree.chunks[name], source, self._cache)

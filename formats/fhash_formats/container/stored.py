@@ -26,6 +26,8 @@ SPARSE_SHARE = 4
 """Index entries are read one by one for fewer than one in SPARSE_SHARE inner chunks of a shard."""
 MASK = ":mask"
 """Suffix of an array's name for its masks in the cache."""
+TABLE = ":table"
+"""Suffix of an array's name for its chunks before their corrections in the cache."""
 
 ChunkIndex = tuple[int, ...]
 
@@ -174,14 +176,41 @@ class StoredArray:
             InputError: for a level of detail that the coder does not have.
             DamagedFileError: for a damaged chunk; the message names the member of the file.
         """
+        self._check_index(index)
+        with damage_named(self._path):
+            return self._chunk(tuple(index), lod, keep=True)
+
+    def decode_table(self, index: tuple[int, ...], lod: int = 0) -> npt.NDArray[Any]:
+        """A full chunk before the corrections that its coder makes; else as `decode_chunk`."""
+        self._check_index(index)
+        place = (self.name + TABLE, tuple(index), lod)
+        with damage_named(self._path):
+            values = self._cache.get(place)
+            if values is None:
+                values = self._decode(tuple(index), lod, table=True)[0]
+                values.flags.writeable = False
+                self._cache.put(place, values)
+        return values
+
+    @property
+    def settings(self) -> Any:
+        """Settings that all chunks share, of arrays coded by `fhash.transform`; else None."""
+        return self._metadata.coder.settings
+
+    @property
+    def coding(self) -> str:
+        """Name of the first codec, that of inner chunks where there are shards."""
+        sharding = self._metadata.sharding
+        codecs = self._metadata.codecs if sharding is None else sharding.codecs
+        return str(codecs[0]["name"])
+
+    def _check_index(self, index: tuple[int, ...]) -> None:
         if len(index) != len(self.grid) or not all(
             0 <= i < n for i, n in zip(index, self.grid, strict=True)
         ):
             raise RegionError(
                 f"{self._path}: {self.name}: chunk {index} is outside the grid {self.grid}"
             )
-        with damage_named(self._path):
-            return self._chunk(tuple(index), lod, keep=True)
 
     def verify(self, done: Callable[[], None]) -> None:
         """Read and decode the whole array straight from the file; call `done` after each chunk.
@@ -256,9 +285,12 @@ class StoredArray:
         return values, mask
 
     def _decode(
-        self, index: ChunkIndex, lod: int = 0
+        self, index: ChunkIndex, lod: int = 0, *, table: bool = False
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
-        """A full chunk straight from the file, and its mask where chunks have one."""
+        """A full chunk straight from the file, and its mask where chunks have one.
+
+        table: the chunk before its corrections, without its mask.
+        """
         sharding = self._metadata.sharding
         if sharding is None:
             member, place = self.chunks[index], ""
@@ -270,6 +302,8 @@ class StoredArray:
             data = memoryview(self._source.read(member.data_offset + offset, size))
         try:
             coder = self._metadata.coder
+            if table:
+                return coder.decode_table(data, lod), None
             return (
                 coder.decode_masked(data)
                 if self.masked and not lod

@@ -101,7 +101,7 @@ class ContainerWriter:
             dtype: number type of the array and of each chunk.
             chunk_shape: shape of a full chunk.
             chunks: the chunks in C order of their grid; those at an end of the array reach as far
-                as the array does. Each is an array, or the bytes that the coder of its first codec
+                as the array does. A chunk may also be the bytes that the coder of its first codec
                 made of the full chunk, without CRC-32C.
             dimension_names: names of the axes.
             attributes: JSON values.

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
-from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask
+from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask, decode_tile_table
 from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
@@ -85,6 +85,14 @@ class TransformCoder:
         Raises DamagedFileError.
         """
         values = decode_tile(data, self._tile_shape, self._dtype, self.settings, lod)
+        return values.reshape(values.shape[4 - len(self._shape) :])
+
+    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+        """The table of the full chunk, see `decode_tile_table`; `lod` as in `decode`.
+
+        Raises DamagedFileError.
+        """
+        values = decode_tile_table(data, self._tile_shape, self._dtype, self.settings, lod)
         return values.reshape(values.shape[4 - len(self._shape) :])
 
     def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:

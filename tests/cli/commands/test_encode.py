@@ -61,7 +61,8 @@ def test_coded_tables_are_reported_with_their_loss(
         assert (result.exit_code, result.stderr) == (0, "")
         assert ("coded, for" in result.stdout) == (name == "coded")
     info = fhash("info", tmp_path / "coded")
-    assert "in transform" in info.stdout
+    assert "tables/level_1 to tables/level_" in info.stdout
+    assert "fhash.transform" in info.stdout
     assert "of the PSNR" in info.stdout
     assert "of the PSNR" not in fhash("info", tmp_path / "plain").stdout
     model = json.loads(fhash("info", tmp_path / "coded", "--json").stdout)["model"]

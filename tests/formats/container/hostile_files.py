@@ -25,12 +25,13 @@ FULL_SIZE = 24
 OFFSET = 42
 
 
-def read_everything(path: Path) -> None:
-    """Open, verify and read."""
+def read_everything(path: Path) -> tuple[Any, dict[str, bytes]]:
+    """Open, verify and read: the header, and the bytes of each array's values."""
     with Container.open(path) as container:
         container.verify()
-        for array in container.arrays.values():
-            array.read()
+        return container.header, {
+            name: array.read().tobytes() for name, array in container.arrays.items()
+        }
 
 
 def refused(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hostile_files import refused, replaced
 
-from fhash_formats.container import Container, is_container
+from fhash_formats.container import FORMAT_VERSION, Container, is_container
 from fhash_formats.container.coding import crc32c
 
 
@@ -18,7 +18,7 @@ def test_header_comes_back(sample, samples) -> None:
         assert container.header == {
             **samples.header(),
             "format": "fhash",
-            "format_version": [1, 2],
+            "format_version": list(FORMAT_VERSION),
             "required_features": [],
         }
         assert container.size == sample.stat().st_size

@@ -43,6 +43,7 @@ __all__ = [
     "blank_unoccupied",
     "decode_tile",
     "decode_tile_mask",
+    "decode_tile_table",
     "linear_values",
     "predicted_values",
     "transform_for",
@@ -100,6 +101,35 @@ def decode_tile_mask(
     """
     values, mask = _decode(data, shape, dtype, settings, 0)
     return values, np.ones(shape, bool) if mask is None else mask
+
+
+def decode_tile_table(
+    data: bytes | memoryview,
+    shape: Shape,
+    dtype: npt.DTypeLike,
+    settings: TileSettings | None = None,
+    lod: int = 0,
+) -> Values:
+    """The table (t, z, y, x) of a tile: its values before head, residual and rounding.
+
+    They are finite, of the working type of the settings (float64 without). Where the tile is not
+    coded by transform, they are its values; `center` stands for those that are not finite.
+    Arguments and errors are those of `decode_tile`.
+    """
+    stream = parse_stream(data)
+    if stream.settings is not None:
+        settings = unpack_settings(stream.settings)
+    if settings is None or not stream.coded or stream.predicted:
+        values = _decode(data, shape, dtype, settings, lod)[0]
+        working = np.dtype(np.float64) if settings is None else settings.dtype
+        with np.errstate(over="ignore"):
+            values = values.astype(working)
+        values[~np.isfinite(values)] = 0.0 if settings is None else settings.center
+        return values
+    assert stream.body is not None
+    _check_numbers(settings, np.dtype(dtype))
+    integers, transform, _ = _transformed_integers(stream, stream.body, shape, settings)
+    return linear_values(integers, transform, settings, lod)
 
 
 def _decode(
@@ -191,6 +221,24 @@ def _decode_transformed(
 
     largest: the largest number of the type of the source and of the working type.
     """
+    integers, transform, residual = _transformed_integers(stream, body, shape, settings)
+    if lod:
+        values = cast(linear_values(integers, transform, settings, lod), kind)
+        return within_range(values, settings), None
+    linear = linear_values(integers, transform, settings)
+    mask = None if stream.mask is None else _unpack_mask(stream.mask, linear, settings)
+    base = linear if settings.head is None else settings.head.apply(linear)
+    values = corrected(base, residual, settings.quantum, kind)
+    # Without a residual the values are within the range, and finite.
+    if residual is not None and settings.quantum * 2.0**31 > largest / 2 and np.isinf(values).any():
+        raise DamagedFileError(f"a residual of a coded tile is beyond {kind}")
+    return within_range(values, settings), mask
+
+
+def _transformed_integers(
+    stream: TileStream, body: memoryview, shape: Shape, settings: TileSettings
+) -> tuple[Integers, Transform, Integers | None]:
+    """The coefficients of a tile that is coded by transform, its transform, and its residual."""
     # Built before anything is decoded: the bands of a spec that does not fit lie beyond the tile.
     try:
         transform = transform_for(settings, shape)
@@ -203,17 +251,7 @@ def _decode_transformed(
     if stream.residual is not None:
         residual = decode_integers(stream.residual, shape, single_band(shape))
     _check_digest(stream, integers, residual)
-    if lod:
-        values = cast(linear_values(integers, transform, settings, lod), kind)
-        return within_range(values, settings), None
-    linear = linear_values(integers, transform, settings)
-    mask = None if stream.mask is None else _unpack_mask(stream.mask, linear, settings)
-    base = linear if settings.head is None else settings.head.apply(linear)
-    values = corrected(base, residual, settings.quantum, kind)
-    # Without a residual the values are within the range, and finite.
-    if residual is not None and settings.quantum * 2.0**31 > largest / 2 and np.isinf(values).any():
-        raise DamagedFileError(f"a residual of a coded tile is beyond {kind}")
-    return within_range(values, settings), mask
+    return integers, transform, residual
 
 
 def _check_digest(stream: TileStream, integers: Integers, residual: Integers | None) -> None:

@@ -1,0 +1,147 @@
+"""The compact model in plain numbers (FORMAT.md, Plain files): tables, head and corrections.
+
+`PlainArray` reads such a file as if it were the coded array of a compact file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property, lru_cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_formats.container import StoredArray
+from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.head.head import Layer, NeighbourHead
+from fhash_formats.transform.values.elementwise import cast
+
+__all__ = ["PlainArray", "corrected", "correction_of", "correction_type", "head_of", "predicted"]
+
+CACHED_TILES = 8
+"""Corrected tiles that an open file keeps."""
+
+Region = tuple[slice, ...]
+
+
+def predicted(
+    table: npt.NDArray[Any], head: NeighbourHead | None, dtype: np.dtype[Any]
+) -> npt.NDArray[Any]:
+    """Return what the head makes of the table (t, z, y, x) of a tile, in the type of the values."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return cast(table if head is None else head.apply(np.ascontiguousarray(table)), dtype)
+
+
+def correction_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of the corrections of values of a type."""
+    narrow = dtype.itemsize <= 2 or dtype == np.float32
+    return np.dtype(np.float32 if narrow else np.float64)
+
+
+def correction_of(values: npt.NDArray[Any], base: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return what takes predicted to decoded values, of one type; 0 where a value is not finite."""
+    kind = correction_type(values.dtype)
+    if values.dtype.kind != "f":
+        # Modulo 2^64, so that neighbouring integers beyond 2^53 are still told apart.
+        return (values.astype(np.int64) - base.astype(np.int64)).astype(kind)
+    with np.errstate(invalid="ignore", over="ignore"):
+        difference = values.astype(np.float64) - base.astype(np.float64)
+    return np.where(np.isfinite(difference), difference, 0.0).astype(kind)
+
+
+def corrected(base: npt.NDArray[Any], corrections: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return predicted values with their corrections, in their own type."""
+    if base.dtype.kind != "f":
+        with np.errstate(invalid="ignore"):
+            return (base.astype(np.int64) + corrections.astype(np.int64)).astype(base.dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return (base.astype(np.float64) + corrections).astype(base.dtype)
+
+
+def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> NeighbourHead | None:
+    """Return the head of a plain file. Raises DamagedFileError where its arrays do not fit it."""
+    described = model["head"]
+    if described is None:
+        return None
+    layers = []
+    try:
+        for number in range(1, len(described["hidden"]) + 2):
+            integers, scales = zip(
+                *(_integers(arrays[f"mlp/{kind}_{number}"]) for kind in ("weight", "bias")),
+                strict=True,
+            )
+            layers.append(
+                Layer(
+                    weights=integers[0],
+                    biases=integers[1],
+                    weight_scale=scales[0],
+                    bias_scale=scales[1],
+                )
+            )
+        with np.errstate(over="ignore"):
+            return NeighbourHead(
+                layers=tuple(layers),
+                sigma=described["sigma"],
+                low=described["low"],
+                high=described["high"],
+                cross=described["cross"],
+            )
+    except (InputError, OverflowError) as error:
+        raise DamagedFileError(f"the head of a plain file is damaged: {error}") from error
+
+
+def _integers(array: StoredArray) -> tuple[npt.NDArray[np.int8], float]:
+    """The whole numbers of an array of weights or biases, and their unit."""
+    scale = float(array.attributes["scale"])
+    with np.errstate(over="ignore", invalid="ignore"):
+        numbers = array.read().astype(np.float64) / scale
+    if not np.isfinite(numbers).all() or np.abs(numbers).max() > 127:
+        raise DamagedFileError(f"array {array.name} has numbers that are no multiples of its scale")
+    return np.rint(numbers).astype(np.int8), scale
+
+
+class PlainArray:
+    """The values of a plain file, read as those of the coded array of a compact file."""
+
+    masked = False
+
+    def __init__(self, model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> None:
+        self._model, self._arrays = model, arrays
+        self._table = arrays["tables/level_1"]
+        self._corrections = arrays.get("corrections")
+        self.shape = self._table.shape[:4]
+        self.chunk_shape = tuple(model["tile"])
+        self.dtype = np.dtype(model["values"])
+        self._tile = lru_cache(maxsize=CACHED_TILES)(self._decode)
+
+    @cached_property
+    def head(self) -> NeighbourHead | None:
+        """The head of the file."""
+        return head_of(self._model, self._arrays)
+
+    def read(self, region: Region) -> npt.NDArray[Any]:
+        """Return the values of a region, slices (t, z, y, x) with explicit ends."""
+        result = np.empty([along.stop - along.start for along in region], self.dtype)
+        tiles = zip(region, self.chunk_shape, strict=True)
+        for index in product(*(range(a.start // n, -(-a.stop // n)) for a, n in tiles)):
+            tile = self._tile(index)
+            target, source = [], []
+            for i, along, n in zip(index, region, self.chunk_shape, strict=True):
+                low, high = max(along.start, i * n), min(along.stop, (i + 1) * n)
+                target.append(slice(low - along.start, high - along.start))
+                source.append(slice(low - i * n, high - i * n))
+            result[tuple(target)] = tile[tuple(source)]
+        return result
+
+    def _decode(self, index: tuple[int, ...]) -> npt.NDArray[Any]:
+        """The values of a tile, as far as the array reaches."""
+        region = tuple(
+            slice(i * n, min((i + 1) * n, length))
+            for i, n, length in zip(index, self.chunk_shape, self.shape, strict=True)
+        )
+        base = predicted(self._table.read((*region, slice(0, 1)))[..., 0], self.head, self.dtype)
+        return (
+            base if self._corrections is None else corrected(base, self._corrections.read(region))
+        )

@@ -1,0 +1,319 @@
+"""Export of a container in plain numbers: the same model with the standard codecs of Zarr alone.
+
+Any Zarr v3 library reads every number of such a file; FORMAT.md, Plain files, says what they mean.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from itertools import product
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.compact.plain import correction_of, correction_type, predicted
+from fhash_codec.coreset.boxes import Box
+from fhash_codec.coreset.occupancy import pack, packed_bytes
+from fhash_codec.encoding import check_name
+from fhash_codec.model_parts import Table
+from fhash_codec.progress import Progress, silent
+from fhash_codec.volume import Volume
+from fhash_codec.volume import open as open_volume
+from fhash_formats.container import ContainerWriter, StoredArray
+from fhash_formats.container.header import PLAIN_FEATURE
+from fhash_formats.errors import InputError
+from fhash_formats.series import AXIS_NAMES
+from fhash_formats.support.atomic import check_output
+from fhash_formats.support.slabs import slab_shape
+from fhash_formats.transform.head.head import NeighbourHead
+
+__all__ = ["export_plain"]
+
+CHUNK_BYTES = 2 << 20
+"""Bytes of a decoded chunk of a table that is not cut by tiles."""
+TABLE_AXES = ("t", "z", "y", "x", "embedding")
+"""Names of the axes of a table."""
+STANDARD = "bytes"
+"""First codec of arrays that any Zarr library reads."""
+
+Index = tuple[int, ...]
+
+
+def export_plain(
+    source: str | Path,
+    path: str | Path,
+    *,
+    force: bool = False,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Write the model of the container `source` in plain numbers as `path`, whole or not at all.
+
+    force: replace a file that exists.
+
+    The new file decodes to the same values, integers of any size included, and within rounding to
+    float32 or float64 where the source has corrections of floats (a bounded error). Levels of
+    detail of the profile compact are there down to a lattice of 2 vertices.
+
+    Returns `path`, its `bytes`, `source_bytes`, and the number of `arrays` and of `values` in them.
+    Raises InputError for a name of a data file or the source itself, OutputExistsError without
+    force, and OutputError where the file cannot be written.
+    """
+    path = Path(os.path.normpath(path))
+    check_name(path)
+    check_output(path, force, sources=[Path(source)])
+    with open_volume(source) as volume, ContainerWriter(path, force=force) as writer:
+        export = _Export(volume, writer, progress)
+        if volume.profile == "paper":
+            header = export.paper()
+        elif PLAIN_FEATURE in volume.container.header["required_features"]:
+            raise InputError(f"{source}: the file is plain already")
+        else:
+            header = export.compact()
+        writer.commit(header)
+        source_bytes = volume.container.size
+    with open_volume(path) as written:
+        arrays = written.container.arrays.values()
+        return {
+            "path": str(path),
+            "bytes": written.container.size,
+            "source_bytes": source_bytes,
+            "arrays": len(arrays),
+            "values": sum(prod(array.shape) for array in arrays),
+        }
+
+
+class _Export:
+    """One export: arrays are decoded and written chunk by chunk."""
+
+    def __init__(self, volume: Volume, writer: ContainerWriter, progress: Progress) -> None:
+        self._volume, self._writer, self._progress = volume, writer, progress
+        self._arrays = volume.container.arrays
+        self._header = dict(volume.container.header)
+        self._done, self._total = 0, 1
+
+    def paper(self) -> dict[str, Any]:
+        """Write a file of the profile paper: plain arrays as they are, coded tables decoded."""
+        coded = [t for t in self._volume.tables if f"tables/level_{t.level}" not in self._arrays]
+        copied = [array for array in self._arrays.values() if array.coding == STANDARD]
+        self._total = sum(prod(array.grid) for array in copied) + sum(map(_chunk_count, coded))
+        for array in copied:
+            self._copy(array)
+        for table in coded:
+            self._write_table(table)
+        tables = "float32" if coded else self._header["model"]["tables"]
+        return {
+            **self._header,
+            "model": {**self._header["model"], "tables": tables},
+            "required_features": [],
+        }
+
+    def compact(self) -> dict[str, Any]:
+        """Write a file of the profile compact: all levels, the head, bits, and corrections."""
+        volume = self._volume
+        array = self._arrays["tables/level_1"]
+        tables, settings = volume.tables, array.settings
+        head = None if settings is None else settings.head
+        tiles = prod(array.grid)
+        keys = array.shape[0]
+        self._total = 2 * tiles + keys + sum(map(_chunk_count, tables[1:]))
+        self._write_axes()
+        self._write_tiles("tables/level_1", array, tables[0].dtype, self._lattice(array))
+        for table in tables[1:]:
+            self._write_table(table)
+        self._write_head(head)
+        self._write_occupancy(keys)
+        self._write_corrections(array, head)
+        return {
+            **self._header,
+            "coordinates": {},
+            "required_features": [PLAIN_FEATURE],
+            "model": {
+                **self._header["model"],
+                "levels": [list(table.shape[:4]) for table in tables],
+                "tables": tables[0].dtype.name,
+                "values": array.dtype.name,
+                "tile": list(array.chunk_shape),
+                "head": _described(head),
+            },
+        }
+
+    def _tick(self, what: str) -> None:
+        self._done += 1
+        self._progress("exporting", self._done, self._total, what)
+
+    def _copy(self, array: StoredArray) -> None:
+        """Write an array of standard codecs as it is, chunk by chunk."""
+
+        def chunks() -> Iterator[npt.NDArray[Any]]:
+            for index in product(*map(range, array.grid)):
+                region = _region(index, array.chunk_shape, array.shape)
+                yield array.decode_chunk(index)[tuple(slice(0, a.stop - a.start) for a in region)]
+                self._tick(array.name)
+
+        self._writer.add_array(
+            array.name,
+            shape=array.shape,
+            dtype=array.dtype,
+            chunk_shape=array.chunk_shape,
+            chunks=chunks(),
+            dimension_names=array.dimension_names,
+            attributes=array.attributes,
+        )
+
+    def _write_table(self, table: Table) -> None:
+        """Write the table of a level in slabs."""
+        chunk = _chunk_shape(table)
+
+        def chunks() -> Iterator[npt.NDArray[Any]]:
+            for start in np.ndindex(*_grid(table.shape, chunk)):
+                yield table[_region(start, chunk, table.shape)]
+                self._tick(f"level {table.level}")
+
+        self._writer.add_array(
+            f"tables/level_{table.level}",
+            shape=table.shape,
+            dtype=table.dtype,
+            chunk_shape=chunk,
+            chunks=chunks(),
+            dimension_names=TABLE_AXES,
+        )
+
+    def _lattice(self, array: StoredArray) -> Callable[[Index], npt.NDArray[Any]]:
+        """The table of a tile, as far as the array reaches, with an axis of its own for E."""
+
+        def read(index: Index) -> npt.NDArray[Any]:
+            return self._table(array, index)[..., np.newaxis]
+
+        return read
+
+    def _write_tiles(
+        self,
+        name: str,
+        array: StoredArray,
+        dtype: np.dtype[Any],
+        read: Callable[[Index], npt.NDArray[Any]],
+    ) -> None:
+        """Write an array in the tiles of the coded one. read: gives a tile by its index."""
+
+        def chunks() -> Iterator[npt.NDArray[Any]]:
+            for index in product(*map(range, array.grid)):
+                yield read(index)
+                self._tick(name)
+
+        extra = (1,) if name.startswith("tables/") else ()
+        self._writer.add_array(
+            name,
+            shape=(*array.shape, *extra),
+            dtype=dtype,
+            chunk_shape=(*array.chunk_shape, *extra),
+            chunks=chunks(),
+            dimension_names=TABLE_AXES[: 4 + len(extra)],
+        )
+
+    @staticmethod
+    def _table(array: StoredArray, index: Index) -> npt.NDArray[Any]:
+        region = _region(index, array.chunk_shape, array.shape)
+        return array.decode_table(index)[tuple(slice(0, a.stop - a.start) for a in region)]
+
+    def _write_axes(self) -> None:
+        """Write positions and key frames as arrays, and the mask of missing values."""
+        for axis, stored in AXIS_NAMES.items():
+            coordinate = self._volume.coords[axis]
+            self._writer.add_whole(
+                f"coords/{stored}",
+                coordinate.values,
+                attributes={**coordinate.attributes, "name": coordinate.name},
+            )
+        key_frames = np.array(self._volume.key_times.key_frames, dtype=np.int64)
+        self._writer.add_whole("key_frames", key_frames)
+        if "missing/bits" in self._arrays:
+            self._total += prod(self._arrays["missing/bits"].grid)
+            self._copy(self._arrays["missing/bits"])
+
+    def _write_head(self, head: NeighbourHead | None) -> None:
+        """Write weights and biases as the numbers that they are; `scale` is their unit."""
+        if head is None:
+            return
+        layers = zip(head.layers, self._volume.mlp.layers, strict=True)
+        for number, (layer, (weights, biases)) in enumerate(layers, start=1):
+            for name, values, scale in (
+                ("weight", weights, layer.weight_scale),
+                ("bias", biases, layer.bias_scale),
+            ):
+                attributes = {"scale": scale}
+                self._writer.add_whole(f"mlp/{name}_{number}", values, attributes=attributes)
+
+    def _write_occupancy(self, keys: int) -> None:
+        """Write the bits of every key frame."""
+        box = self._volume.box.shape
+
+        def chunks() -> Iterator[npt.NDArray[Any]]:
+            for key in range(keys):
+                yield pack(self._volume._model.occupied(key, key, Box.of_shape(box)))[np.newaxis]
+                self._tick("occupancy")
+
+        size = packed_bytes(box)
+        self._writer.add_array(
+            "occupancy/bits",
+            shape=(keys, size),
+            dtype=np.uint8,
+            chunk_shape=(1, size),
+            chunks=chunks(),
+        )
+
+    def _write_corrections(self, array: StoredArray, head: NeighbourHead | None) -> None:
+        """Write what takes the output of the head to the decoded values, if that is anything."""
+        needed = False
+
+        def read(index: Index) -> npt.NDArray[Any]:
+            nonlocal needed
+            table = self._table(array, index)
+            region = tuple(slice(0, n) for n in table.shape)
+            values = array.decode_chunk(index)[region]
+            correction = correction_of(values, predicted(table, head, array.dtype))
+            if array.masked:
+                region = _region(index, array.chunk_shape, array.shape)
+                correction[~array.read_mask(region)] = 0
+            needed = needed or bool(correction.any())
+            return correction
+
+        mark = self._writer.mark()
+        self._write_tiles("corrections", array, correction_type(array.dtype), read)
+        if not needed:
+            self._writer.rewind(mark)
+
+
+def _described(head: NeighbourHead | None) -> dict[str, Any] | None:
+    """The object of a head in the header: all of it that is no array."""
+    if head is None:
+        return None
+    return {
+        "hidden": list(head.hidden),
+        "cross": head.cross,
+        "sigma": head.sigma,
+        "low": head.low,
+        "high": head.high,
+    }
+
+
+def _chunk_shape(table: Table) -> Index:
+    return slab_shape(table.shape, table.dtype.itemsize, CHUNK_BYTES)
+
+
+def _chunk_count(table: Table) -> int:
+    return prod(_grid(table.shape, _chunk_shape(table)))
+
+
+def _grid(shape: Index, chunk: Index) -> Index:
+    return tuple(-(-n // c) for n, c in zip(shape, chunk, strict=True))
+
+
+def _region(index: Index, chunk: Index, shape: Index) -> tuple[slice, ...]:
+    """The region of a chunk, as far as the array reaches."""
+    return tuple(
+        slice(i * c, min((i + 1) * c, n)) for i, c, n in zip(index, chunk, shape, strict=True)
+    )

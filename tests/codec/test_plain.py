@@ -1,0 +1,217 @@
+"""Plain files: standard codecs alone, every number there, the values of the file they are of."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import plain_reader
+import pytest
+import zarr
+from untrained_heads import some_head, with_head
+
+import fhash_codec
+from fhash_codec import EncodeConfig, InputError
+from fhash_codec.plain import export_plain
+from fhash_formats.container import Container, validate_header
+from fhash_formats.container.expected_arrays import check_arrays
+from fhash_formats.errors import DamagedFileError, OutputExistsError
+
+HERE = Path(__file__).resolve().parent
+GOLDENS = [
+    HERE.parent / "golden" / f"{name}.fhz"
+    for name in (
+        "compact-1.1-bound",
+        "compact-1.1-mask",
+        "compact-1.1-predictor",
+        "paper-1.0-feature",
+        "paper-1.0-linear-uint8",
+        "paper-1.1-transform",
+    )
+]
+STANDARD = {"bytes", "zstd", "crc32c"}
+
+
+def test_the_reader_is_independent_and_short() -> None:
+    text = (HERE / "plain_reader.py").read_text(encoding="utf-8")
+    assert "import fhash" not in text
+    assert "from fhash" not in text
+    assert sum(bool(line.strip()) for line in text.splitlines()) <= 80
+
+
+def check(path: Path, plain: Path) -> None:
+    """Compare a plain file with the one that it is of: by fhash, by zarr, and by the reader."""
+    with (
+        zarr.storage.ZipStore(plain, mode="r") as store,
+        fhash_codec.open(path) as volume,
+        fhash_codec.open(plain) as other,
+    ):
+        root = zarr.open_group(store, mode="r")
+        for name, array in root.members(max_depth=None):
+            if isinstance(array, zarr.Array):
+                codecs = {codec["name"] for codec in array.metadata.to_dict()["codecs"]}
+                assert codecs <= STANDARD
+                np.testing.assert_array_equal(array[...], other.container.arrays[name].read())
+        for table, again in zip(volume.tables, other.tables, strict=True):
+            np.testing.assert_array_equal(again[...], table[...])
+            stored = root[f"tables/level_{table.level}"]
+            if stored.dtype != np.uint8:
+                np.testing.assert_array_equal(stored[...], table[...])
+        for number, layer in enumerate(volume.mlp.layers, start=1):
+            for kind, values in zip(("weight", "bias"), layer, strict=True):
+                np.testing.assert_array_equal(root[f"mlp/{kind}_{number}"][...], values)
+        assert other.mlp.constants == volume.mlp.constants
+        assert (other.dtype, other.fill, other.config) == (volume.dtype, volume.fill, volume.config)
+        for axis in "tzyx":
+            np.testing.assert_array_equal(other.coords[axis].values, volume.coords[axis].values)
+        span = volume.value_range.high - volume.value_range.low
+        for key, step in enumerate(volume.key_times.key_frames):
+            np.testing.assert_array_equal(root["occupancy/bits"][key], volume.occupancy_bits(step))
+            frame = volume.read(step)
+            np.testing.assert_allclose(other.read(step), frame, rtol=0, atol=1e-6 * span)
+            box = frame[volume.box.slices()]
+            if 0 < key < table.shape[0] - 1:
+                continue
+            rebuilt = plain_reader.values(plain, key)
+            there = np.isfinite(box)
+            assert np.abs(rebuilt - box)[there].max(initial=0) <= 1e-6 * span
+            assert not np.isfinite(rebuilt[~volume.occupancy(step)[volume.box.slices()]]).any() or (
+                "missing/bits" in volume.container.arrays
+            )
+
+
+@pytest.mark.parametrize("path", GOLDENS, ids=lambda path: path.stem)
+def test_goldens_have_the_same_values_in_plain_numbers(path: Path, tmp_path: Path) -> None:
+    figures = export_plain(path, tmp_path / "plain.fhz")
+    check(path, tmp_path / "plain.fhz")
+    assert figures["bytes"] == (tmp_path / "plain.fhz").stat().st_size
+    assert figures["source_bytes"] == path.stat().st_size
+
+
+def moving(dtype: str, steps: int = 3) -> np.ndarray:
+    t, z, y, x = np.meshgrid(*(np.arange(n) for n in (steps, 7, 17, 22)), indexing="ij")
+    smooth = np.tanh((x - 8 - t - y / 3) / 2) * 90 + 20 * np.sin(y / 4 + z / 3)
+    noise = np.random.default_rng(1).normal(0, 1.5, smooth.shape)
+    return (smooth + noise).astype(dtype)
+
+
+CASES = {
+    "head": ("float32", {"psnr": 45.0}),
+    "bound": ("float32", {"max_error": 0.5}),
+    "double": ("float64", {"max_error": 1e-9}),
+    "int16": ("int16", {"psnr": 40.0, "features": ("interval:0:70",)}),
+    "uint8": ("uint8", {"max_error": 0.0}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_kinds_of_data_and_promises(case: str, tmp_path: Path) -> None:
+    dtype, settings = CASES[case]
+    path = tmp_path / "a.fhz"
+    values = moving(dtype)
+    if case == "head":
+        head = some_head(scale=0.0123291015625, sigma=0.1234130859375)
+        with_head(path, head)
+    else:
+        config = EncodeConfig(effort=3, tile="2x7x9x22", **settings)  # type: ignore[arg-type]
+        fhash_codec.encode(values, path, config)
+    export_plain(path, tmp_path / "plain.fhz")
+    check(path, tmp_path / "plain.fhz")
+
+
+def test_integers_beyond_the_doubles_come_back(tmp_path: Path) -> None:
+    big = np.array([2**62 + 1, 2**62 + 3, 2**53 + 1, 5], dtype=np.int64)
+    values = big[np.random.default_rng(0).integers(0, 4, (2, 4, 5, 6))]
+    fhash_codec.encode(values, tmp_path / "a.fhz", EncodeConfig(max_error=0.0, effort=2))
+    export_plain(tmp_path / "a.fhz", tmp_path / "plain.fhz")
+    with fhash_codec.open(tmp_path / "plain.fhz") as volume:
+        np.testing.assert_array_equal(volume[...], values)
+
+
+def test_levels_of_detail_are_the_tables(tmp_path: Path) -> None:
+    fhash_codec.encode(moving("float32"), tmp_path / "a.fhz", EncodeConfig(effort=2))
+    export_plain(tmp_path / "a.fhz", tmp_path / "plain.fhz")
+    with (
+        fhash_codec.open(tmp_path / "a.fhz") as volume,
+        fhash_codec.open(tmp_path / "plain.fhz") as other,
+    ):
+        for lod in range(len(volume.tables)):
+            np.testing.assert_array_equal(other.read_lod(1, lod), volume.read_lod(1, lod))
+        with pytest.raises(InputError, match="a plain file has 0 to 4"):
+            other.read_lod(1, 5)
+
+
+def test_a_file_that_exists_stays_without_force(tmp_path: Path) -> None:
+    path = GOLDENS[0]
+    (tmp_path / "plain.fhz").write_bytes(b"mine")
+    with pytest.raises(OutputExistsError):
+        export_plain(path, tmp_path / "plain.fhz")
+    assert (tmp_path / "plain.fhz").read_bytes() == b"mine"
+    export_plain(path, tmp_path / "plain.fhz", force=True)
+    copy = (tmp_path / "plain.fhz").read_bytes()
+    with pytest.raises(InputError):
+        export_plain(tmp_path / "plain.fhz", tmp_path / "plain.fhz", force=True)
+    with pytest.raises(InputError, match="plain already"):
+        export_plain(tmp_path / "plain.fhz", tmp_path / "again.fhz")
+    with pytest.raises(InputError, match=r"ends in \.fhz"):
+        export_plain(path, tmp_path / "plain.zarr")
+    assert (tmp_path / "plain.fhz").read_bytes() == copy
+    assert [file.name for file in tmp_path.iterdir()] == ["plain.fhz"]
+
+
+def test_a_failure_on_the_way_leaves_nothing(tmp_path: Path) -> None:
+    def stop(stage: str, done: int, total: int, note: str) -> None:
+        assert 0 < done <= total
+        if done > total // 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        export_plain(GOLDENS[0], tmp_path / "plain.fhz", progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def headed(tmp_path: Path) -> Path:
+    """A plain file with a head."""
+    path = with_head(tmp_path / "a.fhz", some_head())
+    export_plain(path, tmp_path / "plain.fhz")
+    return tmp_path / "plain.fhz"
+
+
+WRONG = {
+    "tile": lambda model: model.update(tile=[2, 9, 0, 14]),
+    "values": lambda model: model.update(values="float64"),
+    "tables": lambda model: model.update(tables="int8"),
+    "profile": lambda model: model.update(
+        profile="paper", fold=2, embedding_size=1, hidden_layers=0, width=1, tables="float32"
+    ),
+    "hidden": lambda model: model["head"].update(hidden=[4, 3, 2, 1]),
+    "cross": lambda model: model["head"].update(cross=1),
+    "sigma": lambda model: model["head"].update(sigma=None),
+}
+
+
+def test_a_header_that_does_not_fit_is_damage(tmp_path: Path) -> None:
+    with Container.open(headed(tmp_path)) as container:
+        header = container.header
+        arrays = {name: array._metadata for name, array in container.arrays.items()}
+    validate_header(header)
+    check_arrays(header, arrays)
+    for key, change in WRONG.items():
+        wrong = copy.deepcopy(header)
+        change(wrong["model"])
+        with pytest.raises(DamagedFileError, match=key):
+            validate_header(wrong)
+    for hidden, name in (([4, 2], "mlp/weight_2"), ([5, 3], "mlp/weight_1")):
+        wrong = copy.deepcopy(header)
+        wrong["model"]["head"]["hidden"] = hidden
+        with pytest.raises(DamagedFileError, match=name):
+            check_arrays(wrong, arrays)
+    for name in ("mlp/bias_3", "tables/level_2", "occupancy/bits", "coords/x", "key_frames"):
+        with pytest.raises(DamagedFileError, match=f"{name} is missing"):
+            check_arrays(header, {key: arrays[key] for key in arrays if key != name})
+    for scale in (0.0, -1.0, None):
+        worse = replace(arrays["mlp/weight_2"], attributes={"scale": scale})
+        with pytest.raises(DamagedFileError, match="scale"):
+            check_arrays(header, {**arrays, "mlp/weight_2": worse})
