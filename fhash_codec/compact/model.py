@@ -107,7 +107,8 @@ class CompactModel:
     def _read_plain_lod(self, step: int, lod: int, region: Box) -> npt.NDArray[Any]:
         """The table of a level, in the type of the values; level 0 is the values themselves."""
         if lod == 0:
-            return self._array.read((slice(step, step + 1), *region.slices()))[0]
+            frames = self._array.read((slice(step, step + 1), *region.slices()))
+            return np.asarray(frames[0])
         if lod >= len(self.tables):
             raise InputError(f"level of detail {lod}; a plain file has 0 to {len(self.tables) - 1}")
         return cast(self.tables[lod][step, *region.slices(), 0], self._array.dtype)

@@ -57,7 +57,8 @@ def corrected(base: npt.NDArray[Any], corrections: npt.NDArray[Any]) -> npt.NDAr
         with np.errstate(invalid="ignore"):
             return (base.astype(np.int64) + corrections.astype(np.int64)).astype(base.dtype)
     with np.errstate(over="ignore", invalid="ignore"):
-        return (base.astype(np.float64) + corrections).astype(base.dtype)
+        values: npt.NDArray[Any] = (base.astype(np.float64) + corrections).astype(base.dtype)
+    return values
 
 
 def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> NeighbourHead | None:

@@ -105,9 +105,10 @@ def _required_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
         if axis not in described:
             yield f"coords/{axis}", (length,), ("float64",)
     key_frames = model["levels"][0][0]
-    if not compact or key_frames < header["domain"]["shape"][0]:
+    coded = compact and PLAIN_FEATURE not in header["required_features"]
+    if not coded or key_frames < header["domain"]["shape"][0]:
         yield "key_frames", (key_frames,), ("int64",)
-    if compact and PLAIN_FEATURE not in header["required_features"]:
+    if coded:
         yield "tables/level_1", tuple(model["levels"][0]), (model["tables"],)
         return
     for number, level in enumerate(model["levels"], start=1):
