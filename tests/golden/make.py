@@ -19,7 +19,9 @@ TOLERANCE = 1e-5
 """Tolerance of decoded values, as a fraction of the range: float32 sums in another order."""
 
 GOLDENS = {
-    "paper-1.0-plain": EncodeConfig(profile="paper", hidden_layers=1, width=8, timings=False, tables="float32"),
+    "paper-1.0-plain": EncodeConfig(
+        profile="paper", hidden_layers=1, width=8, timings=False, tables="float32"
+    ),
     "paper-1.0-feature": EncodeConfig(
         profile="paper",
         hidden_layers=1,
