@@ -22,7 +22,7 @@ ENGINES = ("slab", "naive")
 """Training engines of the paper profile."""
 
 FRINGES = ("trained", "untrained")
-"""What the paper profile does with vertices in the coreset of one neighbouring key frame only."""
+"""Treatments of vertices in the coreset of one neighbouring key frame only, in profile paper."""
 
 PROMISES = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
 """Settings that promise a quality or a size; at most one of them is given, or PAIR."""

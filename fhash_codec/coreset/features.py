@@ -246,7 +246,8 @@ def parse_feature(text: str) -> Feature:
             return Change(least)
         raise InputError(f"feature '{text}' is malformed; write change:D with D >= 0")
     if kind == "onset":
-        return Onset(*_numbers(text, values, 1, "onset:V with a finite number V", finite=True))
+        (value,) = _numbers(text, values, 1, "onset:V with a finite number V", finite=True)
+        return Onset(value)
     if kind == "mask" and values:
         return Mask(values)
     raise InputError(f"feature '{text}' is not known; allowed: {KINDS}")

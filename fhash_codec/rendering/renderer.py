@@ -85,7 +85,8 @@ class Renderer:
             threads: most threads for marching; None for all processors.
         """
         self.volume, self.memory, self.threads = volume, memory, threads
-        self._whole, self._features = volume, ()
+        self._whole = volume
+        self._features: tuple[str, ...] = ()
         self._frames: OrderedDict[Key, _DecodedFrame] = OrderedDict()
         self._histogram: Histogram | None = None
         self._last_plan: tuple[Scene, Plan] | None = None
