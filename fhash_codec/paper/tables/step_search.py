@@ -16,8 +16,10 @@ AIM = 0.4
 """Place in the window at which the search aims, as a share of its width above the lower end."""
 SLOPE = 2.0
 """Usual change of the logarithm of the added error for one of the logarithm of the step."""
-MIN_SLOPE, MAX_SLOPE = 0.5, 6.0
-"""Slopes between which a secant is believed."""
+MIN_SLOPE = 0.5
+"""Smallest slope of a secant that is believed."""
+MAX_SLOPE = 6.0
+"""Largest slope of a secant that is believed."""
 MIN_SHARE = 1e-6
 """Smallest added error that counts in the search, as a share of the allowed one."""
 CLOSEST = 1 + 1e-5
