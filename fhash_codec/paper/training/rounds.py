@@ -57,7 +57,7 @@ class Round:
 
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """Decision that follows a measurement of the model.
+    """Decision of a measurement of the model: another round or the end.
 
     Attributes:
         round: the next round; None to end the training.
