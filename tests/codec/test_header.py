@@ -99,7 +99,7 @@ def test_figures_of_steps_have_one_shape_whatever_the_file_has(per_step: object)
     }
 
 
-@pytest.mark.parametrize("per_step", [[], {}, {"psnr": 3}, [7], {"psnr": []}])
+@pytest.mark.parametrize("per_step", [[], {}, {"psnr": 3}, [7], {"psnr": []}, 0.5, None, "x", True])
 def test_figures_of_steps_that_another_writer_misshaped_are_left_out(per_step: object) -> None:
     assert full_header({"quality": {"per_step": per_step}})["quality"]["per_step"] == []
 
@@ -110,3 +110,10 @@ def test_steps_without_some_figures_keep_the_others() -> None:
         {"step": 0, "psnr": 1.0, "rmse": 3.0},
         {"step": 1, "psnr": 2.0, "rmse": None},
     ]
+
+
+@pytest.mark.parametrize("other", [3, None, "text", {"a": 1}])
+def test_a_column_of_a_history_that_is_no_list_is_left_out(other: object) -> None:
+    points = history_points({"epoch": [1, 2], "psnr": [30.0, 31.0], "other": other})  # type: ignore[dict-item]
+    assert [point["psnr"] for point in points] == [30.0, 31.0]
+    assert all("other" not in point for point in points)
