@@ -218,11 +218,13 @@ def history_points(
 ) -> list[dict[str, Any]]:
     """The points of a header's training history, each with seconds, epoch and psnr.
 
-    history: a list of points (profile paper), or a list of values by name (profile compact).
+    history: a list of points (profile paper), or a list of values by name (profile compact). What
+        is no list, by another writer, is left out.
     """
     if isinstance(history, Mapping):
+        lists = {name: values for name, values in history.items() if isinstance(values, list)}
         history = [
-            dict(zip(history, point, strict=True)) for point in zip(*history.values(), strict=True)
+            dict(zip(lists, point, strict=True)) for point in zip(*lists.values(), strict=False)
         ]
     return [{"seconds": None, "psnr": None, **point} for point in history]
 
@@ -261,8 +263,10 @@ def _steps(per_step: Any, data_range: float) -> list[dict[str, Any]]:
 
     A PSNR that is not there follows from the root of the mean squared error.
     """
-    if not isinstance(per_step, Mapping):
+    if isinstance(per_step, list):
         return [dict(step) for step in per_step if isinstance(step, Mapping)]
+    if not isinstance(per_step, Mapping):
+        return []
     names = [name for name in ("psnr", "rmse", "max_abs_error") if name in per_step]
     lists: list[Any] = [per_step[name] for name in names]
     if not all(isinstance(values, list) for values in lists):

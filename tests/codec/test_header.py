@@ -104,7 +104,7 @@ def test_figures_of_steps_have_one_shape_whatever_the_file_has(per_step: object)
     }
 
 
-@pytest.mark.parametrize("per_step", [[], {}, {"psnr": 3}, [7], {"psnr": []}])
+@pytest.mark.parametrize("per_step", [[], {}, {"psnr": 3}, [7], {"psnr": []}, 0.5, None, "x", True])
 def test_figures_of_steps_that_another_writer_misshaped_are_left_out(per_step: object) -> None:
     assert full_header({"quality": {"per_step": per_step}})["quality"]["per_step"] == []
 
@@ -147,3 +147,10 @@ def test_every_setting_is_there_whatever_the_file_has() -> None:
     config = full_config(header)
     assert config.pop("later") is True
     assert EncodeConfig.from_dict(config) == EncodeConfig(effort=7)
+
+
+@pytest.mark.parametrize("other", [3, None, "text", {"a": 1}])
+def test_a_column_of_a_history_that_is_no_list_is_left_out(other: object) -> None:
+    points = history_points({"epoch": [1, 2], "psnr": [30.0, 31.0], "other": other})  # type: ignore[dict-item]
+    assert [point["psnr"] for point in points] == [30.0, 31.0]
+    assert all("other" not in point for point in points)
