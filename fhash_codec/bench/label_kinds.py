@@ -43,12 +43,12 @@ def _nearest_point(shape: Shape, points: int, speed: float, seed: int) -> npt.ND
     lengths = np.array(shape[1:])
     starts = chance.uniform(0, 1, (points, 3)) * lengths
     speeds = chance.normal(0, speed, (points, 3))
-    vertices = np.stack(np.indices(shape[1:]), axis=-1).reshape(-1, 3)
+    vertices = np.moveaxis(np.indices(shape[1:]), 0, -1).reshape(-1, 3)
     frames = [
         cKDTree(starts + step * speeds).query(vertices)[1].reshape(shape[1:])
         for step in range(shape[0])
     ]
-    return np.stack(frames).astype(np.int64)
+    return np.asarray(np.stack(frames).astype(np.int64))
 
 
 def _components() -> Labels:
@@ -56,14 +56,14 @@ def _components() -> Labels:
     from scipy.ndimage import label
 
     field = _smooth_field(SHAPE, 2.5, 1)
-    return np.stack([label(frame > 0.6)[0] for frame in field]).astype(np.int32)
+    return np.asarray(np.stack([label(frame > 0.6)[0] for frame in field]).astype(np.int32))
 
 
 def _tracked_components() -> Labels:
     """Regions above a threshold, connected in space and time: each keeps its number."""
     from scipy.ndimage import label
 
-    return np.asarray(label(_smooth_field(SHAPE, 2.0, 2) > 1.0)[0]).astype(np.uint16)
+    return np.asarray(np.asarray(label(_smooth_field(SHAPE, 2.0, 2) > 1.0)[0]).astype(np.uint16))
 
 
 def _refinement_levels() -> Labels:
@@ -71,13 +71,13 @@ def _refinement_levels() -> Labels:
     t, z, y, x = (np.asarray(axis, float) for axis in np.indices(SHAPE))
     bend = 4 * np.sin(y // 4 * 0.6) + 3 * np.cos(z // 4 * 0.9)
     distance = np.abs(x // 4 * 4 + bend - 10 - 4 * t)
-    return (4 - np.searchsorted([4.0, 9.0, 16.0, 28.0], distance)).astype(np.int8)
+    return np.asarray((4 - np.searchsorted([4.0, 9.0, 16.0, 28.0], distance)).astype(np.int8))
 
 
 def _basins() -> Labels:
     """Watersheds: the minimum to which the steepest descent from each vertex leads."""
     field = _smooth_field(SHAPE, 2.2, 3)
-    return np.stack([_descend(frame) for frame in field]).astype(np.uint16)
+    return np.asarray(np.stack([_descend(frame) for frame in field]).astype(np.uint16))
 
 
 def _descend(field: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
@@ -110,25 +110,27 @@ def _particles() -> Labels:
 def _checkerboard() -> Labels:
     """Cubes of 5 vertices in turns, which move by one vertex a step."""
     t, z, y, x = np.indices(SHAPE)
-    return ((z // 5 + y // 5 + (x + t) // 5) % 2).astype(np.uint8)
+    return np.asarray(((z // 5 + y // 5 + (x + t) // 5) % 2).astype(np.uint8))
 
 
 def _stripes() -> Labels:
     """Ascending numbers in slabs of 3 vertices, the same at each step."""
     x = np.indices(SHAPE)[3]
-    return (x // 3 * 11 + 5).astype(np.int16)
+    return np.asarray((x // 3 * 11 + 5).astype(np.int16))
 
 
 def _many() -> Labels:
     """3,000 grains of a polycrystal that drift."""
     chance = np.random.default_rng(5)
-    return chance.permutation(3000)[_nearest_point(SHAPE, 3000, 0.15, 5)].astype(np.uint16)
+    return np.asarray(
+        chance.permutation(3000)[_nearest_point(SHAPE, 3000, 0.15, 5)].astype(np.uint16)
+    )
 
 
 def _large_ids() -> Labels:
     """Global identifiers of 200 moving cells, between 1 and 2 thousand million."""
     ids = np.random.default_rng(6).integers(10**9, 2 * 10**9, 200)
-    return ids[_nearest_point(SHAPE, 200, 0.4, 6)].astype(np.int32)
+    return np.asarray(ids[_nearest_point(SHAPE, 200, 0.4, 6)].astype(np.int32))
 
 
 def _thin() -> Labels:
@@ -151,7 +153,7 @@ def _filled() -> Labels:
     land = _smooth_field(SHAPE[2:], 5.0, 10) > 0.4
     depth = np.arange(SHAPE[1])[:, None, None] - 14 + 3 * _smooth_field(SHAPE[2:], 4.0, 11)
     classes = np.digitize(_smooth_field(SHAPE, 3.0, 12), [-1.2, -0.4, 0.3, 1.1]) + 1
-    return np.where(land | (depth > 0), -9999, classes).astype(np.int16)
+    return np.asarray(np.where(land | (depth > 0), -9999, classes).astype(np.int16))
 
 
 def _domains() -> Labels:
@@ -159,31 +161,31 @@ def _domains() -> Labels:
     chance = np.random.default_rng(13)
     states = np.stack([_smooth_field(SHAPE, 1.6, 14 + k) for k in range(3)]).argmax(0)
     flips = chance.random(SHAPE) < 0.03
-    return np.where(flips, chance.integers(0, 3, SHAPE), states).astype(np.uint8)
+    return np.asarray(np.where(flips, chance.integers(0, 3, SHAPE), states).astype(np.uint8))
 
 
 def _ranks() -> Labels:
     """Numbers of 360 processors that share a grid by blocks, the same at each step."""
     _, z, y, x = np.indices(SHAPE)
-    return (z // 4 * 72 + y // 7 * 9 + x // 7).astype(np.int32)
+    return np.asarray((z // 4 * 72 + y // 7 * 9 + x // 7).astype(np.int32))
 
 
 def _flags() -> Labels:
     """Five independent yes-or-no answers as the bits of a number."""
     bits = [(_smooth_field(SHAPE, 2.5, 20 + k) > 0.3 * k) << k for k in range(5)]
-    return np.sum(bits, axis=0).astype(np.uint8)
+    return np.asarray(np.sum(bits, axis=0).astype(np.uint8))
 
 
 def _arrival() -> Labels:
     """Step at which a front reached each vertex, -1 before: values grow old and stay."""
     reached = np.floor(SHAPE[0] * (0.5 + 0.28 * _smooth_field(SHAPE[1:], 5.0, 30)))
     t = np.arange(SHAPE[0])[:, None, None, None]
-    return np.where(reached <= t, reached, -1).astype(np.int8)
+    return np.asarray(np.where(reached <= t, reached, -1).astype(np.int8))
 
 
 def _noise() -> Labels:
     """Random labels without any structure."""
-    return np.random.default_rng(31).integers(0, 6, SHAPE).astype(np.uint8)
+    return np.asarray(np.random.default_rng(31).integers(0, 6, SHAPE).astype(np.uint8))
 
 
 def _floats() -> Labels:

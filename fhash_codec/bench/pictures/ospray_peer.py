@@ -181,7 +181,11 @@ class OsprayPeer:
         densest = float(table.extinctions.max()) or 1.0
         function = self._new("TransferFunction", b"piecewiseLinear")
         self._put(function, b"color", self._data(table.colours, VEC3F))
-        self._put(function, b"opacity", self._data(np.float32(table.extinctions / densest), FLOAT))
+        self._put(
+            function,
+            b"opacity",
+            self._data(np.asarray(table.extinctions / densest, np.float32), FLOAT),
+        )
         ends = np.array([table.low, table.high], dtype=np.float32)
         library.ospSetParam(function, b"value", BOX1F, ends.ctypes.data)
         library.ospCommit(function)

@@ -140,7 +140,11 @@ def _start(
         labels,
         np.full((rows + 1) * (n3 + 2 * PADDING), NONE, np.int64),
         np.full((rows + 1) * (segments + 2), NOTHING, np.int64),
-        *(np.zeros(n, np.int64) for n in (AROUND, FOUND, FOUND, CONTEXTS, LANES)),
+        np.zeros(AROUND, np.int64),
+        np.zeros(FOUND, np.int64),
+        np.zeros(FOUND, np.int64),
+        np.zeros(CONTEXTS, np.int64),
+        np.zeros(LANES, np.int64),
         np.full(1, -1, np.int64),
     )
     lengths = (n0, n1, n2, n3)
