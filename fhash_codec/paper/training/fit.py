@@ -189,6 +189,7 @@ class _Fitting:
             self._goal,
             float("inf") if psnr is None else psnr,
             reached.epoch,
+            reached.epoch * plan.batches,
             reached.seconds,
             [Round(**earlier) for earlier in reached.rounds],  # type: ignore[arg-type]
         )

@@ -21,6 +21,8 @@ LOWER_START = 0.5
 """Learning rate at the start of a round, as a share of that of the training."""
 MAX_DOUBLINGS = 10
 """Largest number of further rounds, by the gain of the last ones, that are worth one more."""
+MIN_STEPS = 8000
+"""Training steps before which a small gain says nothing: many trainings pause at their start."""
 WATCHED_ROUNDS = 2
 """Rounds whose gain counts: a training may pause for one and then learn again."""
 
@@ -69,7 +71,7 @@ class Decision:
 
 
 def decide(
-    goal: Goal, psnr: float, epochs: int, seconds: float, rounds: Sequence[Round]
+    goal: Goal, psnr: float, epochs: int, steps: int, seconds: float, rounds: Sequence[Round]
 ) -> Decision:
     """Decide whether a training goes on.
 
@@ -77,6 +79,7 @@ def decide(
         goal: the quality that is needed, and the limit in time.
         psnr: PSNR in dB of the model over all samples; infinite for an exact one.
         epochs: finished epochs.
+        steps: training steps so far.
         seconds: seconds of training so far.
         rounds: the further rounds so far.
     """
@@ -87,7 +90,7 @@ def decide(
     short = (
         "" if psnr < goal.promised else f", which costs bytes: {goal.psnr:g} dB would leave room"
     )
-    if len(rounds) >= WATCHED_ROUNDS:
+    if len(rounds) >= WATCHED_ROUNDS and steps >= MIN_STEPS:
         gain = psnr - rounds[-WATCHED_ROUNDS].psnr
         if gain * MAX_DOUBLINGS < WATCHED_ROUNDS * (goal.psnr - psnr):
             return Decision(

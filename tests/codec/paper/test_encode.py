@@ -13,7 +13,7 @@ class Reached(Exception):
     """Raised instead of coding the tables."""
 
 
-@pytest.mark.parametrize(("key_frames", "promised"), [("all", 40.0), ("0,2", None)])
+@pytest.mark.parametrize(("key_frames", "promised"), [("all", 1.0), ("0,2", None)])
 def test_tables_get_the_promise_only_if_every_step_is_a_key_frame(
     tmp_path, monkeypatch, key_frames, promised
 ) -> None:
@@ -26,7 +26,7 @@ def test_tables_get_the_promise_only_if_every_step_is_a_key_frame(
 
     monkeypatch.setattr("fhash_codec.paper.tables.step.write_coded", write_coded)
     config = EncodeConfig(
-        profile="paper", epochs=1, width=8, tables="transform", psnr=40.0, key_frames=key_frames
+        profile="paper", epochs=1, width=8, tables="transform", psnr=1.0, key_frames=key_frames
     )
     field = np.random.default_rng(0).random((3, 4, 5, 6), dtype=np.float32)
     with pytest.raises(Reached):

@@ -10,7 +10,14 @@ import pytest
 from fhash_codec.config import EncodeConfig
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.training.fit import train_model
-from fhash_codec.paper.training.rounds import MAX_DOUBLINGS, Goal, Round, decide, extended
+from fhash_codec.paper.training.rounds import (
+    MAX_DOUBLINGS,
+    MIN_STEPS,
+    Goal,
+    Round,
+    decide,
+    extended,
+)
 from fhash_formats.errors import FhashWarning
 
 GOAL = Goal(psnr=45.5, promised=45.0, seconds=100.0)
@@ -18,30 +25,30 @@ GOAL = Goal(psnr=45.5, promised=45.0, seconds=100.0)
 
 @pytest.mark.parametrize("psnr", [45.5, 60.0, math.inf])
 def test_a_model_that_is_good_enough_is_not_trained_on(psnr) -> None:
-    decision = decide(GOAL, psnr, 20, 10.0, [])
+    decision = decide(GOAL, psnr, 20, MIN_STEPS, 10.0, [])
     assert (decision.round, decision.message) == (None, "")
 
 
 def test_a_round_doubles_the_epochs_and_says_so() -> None:
-    decision = decide(GOAL, 44.0, 20, 10.0, [])
+    decision = decide(GOAL, 44.0, 20, MIN_STEPS, 10.0, [])
     assert decision.round == Round(epochs=20, psnr=44.0, seconds=10.0)
     assert "goes on for 20 epochs: the model has 44.00 dB over all samples" in decision.message
     assert "45 dB are promised" in decision.message
-    again = decide(GOAL, 44.8, 40, 20.0, [decision.round])
+    again = decide(GOAL, 44.8, 40, MIN_STEPS, 20.0, [decision.round])
     assert again.round == Round(epochs=40, psnr=44.8, seconds=20.0)
 
 
 @pytest.mark.parametrize(("seconds", "epochs"), [(50.0, 40), (51.0, 38), (70.0, 17), (96.0, 1)])
 def test_a_round_fits_into_the_time_that_is_left(seconds, epochs) -> None:
     before = [Round(epochs=20, psnr=40.0, seconds=0.0)]
-    decision = decide(GOAL, 44.0, 40, seconds, before)
+    decision = decide(GOAL, 44.0, 40, MIN_STEPS, seconds, before)
     assert decision.round == Round(epochs=epochs, psnr=44.0, seconds=seconds)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 1.0])
 def test_the_limit_in_time_is_said_plainly(seconds) -> None:
     goal = Goal(psnr=45.5, promised=45.0, seconds=seconds)
-    decision = decide(goal, 44.0, 20, 100.0, [])
+    decision = decide(goal, 44.0, 20, MIN_STEPS, 100.0, [])
     assert decision.round is None
     assert f"ends at its limit of {seconds:g} more seconds" in decision.message
     assert "--train-on-seconds" in decision.message
@@ -52,9 +59,10 @@ def test_a_training_that_hardly_learns_in_two_rounds_ends(gain, goes_on) -> None
     psnr = 45.5 - MAX_DOUBLINGS
     first = Round(epochs=20, psnr=psnr - gain, seconds=1.0)
     # One round may bring nothing.
-    assert decide(GOAL, psnr - gain, 40, 2.0, [first]).round is not None
+    assert decide(GOAL, psnr - gain, 40, MIN_STEPS, 2.0, [first]).round is not None
     last = Round(epochs=40, psnr=psnr, seconds=2.0)
-    decision = decide(GOAL, psnr, 80, 4.0, [first, last])
+    assert decide(GOAL, psnr, 80, MIN_STEPS - 1, 4.0, [first, last]).round is not None
+    decision = decide(GOAL, psnr, 80, MIN_STEPS, 4.0, [first, last])
     assert (decision.round is not None) == goes_on
     if not goes_on:
         assert f"the last 2 rounds brought {gain:.2f} dB" in decision.message
