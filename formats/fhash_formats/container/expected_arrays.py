@@ -76,7 +76,7 @@ def occupancy_bytes(box: Sequence[Sequence[int]]) -> int:
 
 def layer_shapes(model: Mapping[str, Any]) -> list[tuple[int, int]]:
     """(outputs, inputs) of each layer of the network or the head, from the header's `model`."""
-    if model["profile"] == COMPACT:
+    if model.get("profile") == COMPACT:
         return _head_shapes(model["head"])
     widths = [
         len(model["levels"]) * model["embedding_size"],
