@@ -1,4 +1,4 @@
-"""Readings of a series that does not stay in memory: each pass has a purpose of its own."""
+"""Reads of a series that does not stay in memory: each pass has a purpose of its own."""
 
 from __future__ import annotations
 
