@@ -29,7 +29,7 @@ from fhash_formats.series import Series
 from fhash_formats.support.atomic import check_output
 
 DATA_SUFFIX_NAMES = """.npy .npz .h5 .hdf5 .hdf .he5 .nc .nc4 .netcdf .cdf .zarr .raw .vti .vtr .pvd
-.series .vtkhdf .nrrd .nhdr .mha .mhd .tif .tiff .vtp .ply"""
+.pvti .pvtr .series .vtkhdf .nrrd .nhdr .mha .mhd .tif .tiff .vtp .ply"""
 DATA_SUFFIXES = frozenset(DATA_SUFFIX_NAMES.split())
 """Suffixes of data files that are read or written. No container may have one of them.
 

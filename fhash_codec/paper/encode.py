@@ -58,7 +58,7 @@ def encode_paper(
         write_model(writer, coreset, trained.layers)
     header = _header(series, selection, trained, config)
     if loss is not None:
-        header["required_features"] = ["transform", "labels"]
+        header["required_features"] = ["transform", "labels", "coded-occupancy"]
         header["model"]["tables_loss_db"] = round(loss, 4)
     return header, trained.checkpoint
 

@@ -146,7 +146,7 @@ if sys.argv[1] == "decode":
     name = "read"
 else:
     from fhash_formats.container import ContainerWriter as Slow
-    name = "add_array" if "paper" in sys.argv else "add_sharded"
+    name = "add_array"  # of a paper file, and of a compact one of a single tile
 def sleeping(*_, **__):
     print("ready", file=sys.stderr, flush=True)
     time.sleep(60)

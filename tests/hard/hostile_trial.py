@@ -32,7 +32,6 @@ import fhash_codec
 from fhash_cli.output import describe_error, say
 from fhash_formats.container import Container
 from fhash_formats.errors import FhashError, FhashWarning
-from fhash_formats.transform.tile.settings import TileSettings
 
 MEMORY = 512 << 20
 """Bytes that the process may allocate beyond what it has before; larger allocations fail."""
@@ -219,9 +218,8 @@ class Trial:
         """Whether values lie beyond the range to which the settings in the file clip them."""
         with Container.open(self.path) as container:
             fill = container.header["variable"].get("fill")
-            sharding = container.arrays["tables/level_1"]._metadata.sharding
-        assert sharding is not None
-        settings = TileSettings.from_dict(sharding.codecs[0]["configuration"])
+            settings = container.arrays["tables/level_1"].settings
+        assert settings is not None
         if not settings.clip:
             return False
         # Ends are rounded to the type, as values are.

@@ -77,8 +77,16 @@ def _array_of(member: str) -> str:
     return member[: member.rindex("/c/")]
 
 
-def is_coded(document: dict[str, Any]) -> bool:
+class OneTile(Sharding):
+    """Stands for the sharding of an array of one tile, which has no shard and no index."""
+
+
+def is_sharded(document: dict[str, Any]) -> bool:
     return bool(document["codecs"][0]["name"] == "sharding_indexed")
+
+
+def is_coded(document: dict[str, Any]) -> bool:
+    return is_sharded(document) or bool(document["codecs"][0]["name"] == "fhash.transform")
 
 
 def replaced(parts: Parts, new: dict[str, bytes]) -> Parts:
@@ -113,7 +121,9 @@ def inner_chunks(
     CRC-32C."""
     metadata = ArrayMetadata.from_dict(document)
     sharding = metadata.sharding
-    assert sharding is not None
+    if sharding is None:
+        tile = metadata.chunk_shape
+        return OneTile(shard_shape=tile, chunk_shape=tile, codecs=()), np.ones(1, bool), [data]
     shard = tuple(int(i) for i in member[member.rindex("/c/") + 3 :].split("/"))
     present = sharding.present(shard, metadata.shape)
     index = parse_index(data[-sharding.index_bytes :], present, len(data) - sharding.index_bytes)
@@ -121,6 +131,8 @@ def inner_chunks(
 
 
 def shard_of(sharding: Sharding, present: np.ndarray[Any, Any], chunks: list[bytes]) -> bytes:
+    if isinstance(sharding, OneTile):
+        return b"".join(chunks)
     return b"".join(chunks) + pack_index([len(chunk) for chunk in chunks], present)
 
 
@@ -138,10 +150,11 @@ def bytes_changed(chance: random.Random, parts: Parts) -> Parts:
 def _index(chance: random.Random, parts: Parts) -> Parts:
     """Change the index of a shard: entries overlap, point into the index, or lie outside or are
     missing."""
-    coded = [name for name, document in documents_of(parts).items() if is_coded(document)]
-    if not coded:
+    if not any(is_coded(document) for document in documents_of(parts).values()):
         return bytes_changed(chance, parts)
     _, document, member, data = chosen(chance, parts, True)
+    if not is_sharded(document):
+        return bytes_changed(chance, parts)
     sharding, _, _ = inner_chunks(document, member, data)
     start = len(data) - sharding.index_bytes
     table = list(struct.unpack(f"<{2 * prod(sharding.counts)}Q", data[start:-4]))
@@ -197,10 +210,17 @@ def values_changed(chance: random.Random, parts: Parts) -> Parts:
 
 
 def configuration_of(document: dict[str, Any]) -> dict[str, Any]:
-    configuration: dict[str, Any] = document["codecs"][0]["configuration"]["codecs"][0][
-        "configuration"
-    ]
+    first = document["codecs"][0]["configuration"]
+    configuration: dict[str, Any] = (
+        first["codecs"][0]["configuration"] if is_sharded(document) else first
+    )
     return configuration
+
+
+def tile_of(document: dict[str, Any]) -> tuple[int, ...]:
+    """Return the shape of a coded tile."""
+    place = document["codecs"][0] if is_sharded(document) else document["chunk_grid"]
+    return tuple(place["configuration"]["chunk_shape"])
 
 
 def _stream(chance: random.Random, parts: Parts) -> Parts:

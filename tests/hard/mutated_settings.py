@@ -29,6 +29,7 @@ from mutated_payload import (
     replaced,
     section,
     shard_of,
+    tile_of,
     values_changed,
 )
 
@@ -88,7 +89,7 @@ def _settings(chance: random.Random, parts: Parts) -> Parts:
     _settings_changed(
         chance,
         configuration_of(document),
-        tuple(document["codecs"][0]["configuration"]["chunk_shape"]),
+        tile_of(document),
     )
     root = json.loads(dict(parts)[DOCUMENT])
     root["attributes"]["fhash"]["required_features"] = sorted(KNOWN_FEATURES)

@@ -94,9 +94,9 @@ def test_any_history_is_stored_and_read(points: list[dict[str, Any]], timings: b
 @given(figures=st.lists(FIGURE, min_size=3, max_size=3), largest=st.floats(0))
 def test_any_quality_is_stored_and_printed(figures: list[Any], largest: float) -> None:
     step = {"step": 0, "psnr": figures[0], "rmse": figures[1], "max_abs_error": largest}
-    quality = {"psnr": figures[2], "max_abs_error": largest, "per_step": [step]}
+    quality = {"psnr": figures[2], "max_abs_error": largest, "per_step": [step], "ssim_window": {}}
     finite = plain_json(quality)
-    strict_json.dumps(plain_json(brief_quality(finite)), "it")
+    strict_json.dumps(plain_json(brief_quality(finite, 1.0, 1)), "it")
     with contextlib.redirect_stdout(io.StringIO()) as printed:
         emit({"quality": quality, "data_range": math.inf}, "", as_json=True)
     assert json.loads(printed.getvalue(), parse_constant=lambda name: 1 / 0)["data_range"] is None

@@ -6,14 +6,17 @@ It tells the error that coding the tables makes, and how much each embedding mat
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import product
 from math import fsum
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_codec.compact.tiles.sample import spread_order
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
+from fhash_codec.coreset.occupancy import unpack
 from fhash_codec.paper.network import Floats, Network
 from fhash_codec.paper.points import input_slopes
 from fhash_codec.paper.regions import decode_region
@@ -21,6 +24,8 @@ from fhash_codec.paper.tables.bricks import Bricks
 from fhash_codec.paper.tables.tiles import Index
 from fhash_formats.transform.tile.sections import Shape
 
+MAX_FRAMES = 8
+"""Unpacked masks of key frames that are kept."""
 SLOPE_TILES = 16
 """About the number of tiles at which derivatives are taken."""
 SLOPE_POINTS = 1024
@@ -38,10 +43,11 @@ class Samples:
     """
 
     def __init__(self, coreset: Coreset, bricks: Bricks, tile: Shape) -> None:
-        self._bricks = bricks
+        self._bricks, self._coreset = bricks, coreset
+        self._occupied = lru_cache(maxsize=MAX_FRAMES)(self._unpacked)
         self.tile, self.sizes = tile, (len(coreset.key_frames), *coreset.box.shape)
         counts = {
-            index: sum(int(np.count_nonzero(bricks.mask(key, box))) for key in keys)
+            index: sum(int(np.count_nonzero(self._mask(key, box))) for key in keys)
             for index in sorted(self._touched(coreset))
             for keys, box in [self._keys_and_box(index)]
         }
@@ -70,7 +76,7 @@ class Samples:
         for index in tiles:
             keys, box = self._keys_and_box(index)
             for key in keys:
-                in_coreset = self._bricks.mask(key, box)
+                in_coreset = self._mask(key, box)
                 if in_coreset.any():
                     frame = decode_region(network, key, box, requested=in_coreset)
                     decoded = np.clip(frame[in_coreset].astype(np.float64), 0.0, 1.0)
@@ -87,12 +93,19 @@ class Samples:
         slopes = []
         for index in tiles[:: -(-len(tiles) // SLOPE_TILES)]:
             keys, box = self._keys_and_box(index)
-            points = np.argwhere(np.stack([self._bricks.mask(key, box) for key in keys]))
+            points = np.argwhere(np.stack([self._mask(key, box) for key in keys]))
             points = points[:: -(-len(points) // SLOPE_POINTS)] + np.array(
                 [keys[0], *(low for low, _ in box)]
             )
             slopes.append(input_slopes(network, points.T.astype(np.float64)))
         return np.concatenate(slopes, axis=1)
+
+    def _mask(self, key: int, box: Box) -> npt.NDArray[np.bool_]:
+        """Return which vertices of a region are in the coreset of a key frame, without fringe."""
+        return self._bricks.mask(key, box) & self._occupied(key)[box.slices()]
+
+    def _unpacked(self, key: int) -> npt.NDArray[np.bool_]:
+        return unpack(self._coreset.occupancy[key], self._coreset.box.shape)
 
     def _touched(self, coreset: Coreset) -> set[Index]:
         """Return the places of the tiles that some brick of the coreset touches."""

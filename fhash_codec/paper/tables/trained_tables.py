@@ -7,7 +7,6 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.coreset import occupancy
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
@@ -95,7 +94,8 @@ def trained_tables(
     size, levels = architecture.embedding_size, architecture.levels
     needed = [np.zeros(level, bool) for level in levels[1:]]
     for key in range(architecture.key_frames):
-        in_coreset = occupancy.unpack(coreset.occupancy[key], architecture.box_size)
+        # Samples of the fringe need their embeddings as well.
+        in_coreset = bricks.mask(key, Box.of((0, n) for n in architecture.box_size))
         for level, level_needed in zip(levels[1:], needed, strict=True):
             around = in_coreset
             for axis in range(3):

@@ -27,6 +27,7 @@ KNOWN_FEATURES = frozenset(
         TRANSFORM_FEATURE,
         PLAIN_FEATURE,
         "clip",
+        "coded-occupancy",
         "cross",
         "labels",
         "many-labels",

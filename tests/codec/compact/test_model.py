@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,8 @@ import pytest
 import fhash_codec
 from fhash_codec import DamagedFileError, EncodeConfig, InputError, RegionError
 from fhash_codec.compact.model import CompactModel
+from fhash_codec.coreset.boxes import Box
+from fhash_formats.container import Container
 
 Series = npt.NDArray[Any]
 Field = Callable[..., Series]
@@ -188,6 +191,10 @@ def test_a_paper_file_has_no_levels_of_detail(encoded: tuple[Series, Path]) -> N
         volume.read_lod(0, 1)
 
 
+HEADER = {"required_features": ["transform"]}
+"""The part of a header, of a file that is not plain, that a model needs."""
+
+
 class Table:
     """A stored array of two steps, one tile each, that holds an infinity and a NaN."""
 
@@ -206,7 +213,12 @@ class Table:
         return self.values[index[0] : index[0] + 1, every, every, every].copy()
 
 
-WHOLE = ((0, 2), (0, 3), (0, 4))
+WHOLE = Box.of([(0, 2), (0, 3), (0, 4)])
+
+
+def model_of(arrays: dict[str, Table]) -> CompactModel:
+    """Return the model of a container that holds these arrays alone."""
+    return CompactModel(cast(Container, SimpleNamespace(arrays=arrays, header=HEADER)))
 
 
 def reads(model: CompactModel) -> list[Callable[[], Any]]:
@@ -223,7 +235,7 @@ def reads(model: CompactModel) -> list[Callable[[], Any]]:
 
 @pytest.mark.parametrize("way", range(5))
 def test_infinities_in_a_table_are_damage(way: int) -> None:
-    model = CompactModel({"tables/level_1": Table()})  # type: ignore[dict-item]
+    model = model_of({"tables/level_1": Table()})
     with pytest.raises(DamagedFileError, match="the table holds infinities"):
         reads(model)[way]()
     assert np.isnan(model.read(1, ((0, 1), (0, 3), (0, 4)), np.ones((1, 3, 4), bool))).sum() == 1
@@ -232,6 +244,6 @@ def test_infinities_in_a_table_are_damage(way: int) -> None:
 @pytest.mark.parametrize("way", range(5))
 def test_infinities_outside_the_coreset_of_older_files_are_no_values(way: int) -> None:
     arrays = {"tables/level_1": Table(), "occupancy/bits": Table()}
-    result = reads(CompactModel(arrays))[way]()  # type: ignore[arg-type]
+    result = reads(model_of(arrays))[way]()
     assert np.isnan(result).any()
     assert not np.isinf(result).any()

@@ -13,6 +13,7 @@ class Reached(Exception):
     """Raised instead of coding the tables."""
 
 
+@pytest.mark.filterwarnings("ignore:training goes on")
 @pytest.mark.parametrize(("key_frames", "promised"), [("all", 1.0), ("0,2", None)])
 def test_tables_get_the_promise_only_if_every_step_is_a_key_frame(
     tmp_path, monkeypatch, key_frames, promised
