@@ -1,4 +1,4 @@
-"""Basic indexing as numpy has it, for a volume (t, z, y, x) that is decoded and not in memory."""
+"""Basic indexing as numpy has it, for what is decoded and not in memory: a volume or a table."""
 
 from __future__ import annotations
 
@@ -18,8 +18,12 @@ Index = int | slice | EllipsisType
 """One part of an index."""
 
 
-def expand_index(index: Index | tuple[Index, ...]) -> list[int | slice]:
-    """One integer or slice per axis (t, z, y, x): full slices replace `...` and missing axes.
+def expand_index(
+    index: Index | tuple[Index, ...], axes: Sequence[str] = AXES, what: str = "a volume"
+) -> list[int | slice]:
+    """One integer or slice per axis: full slices replace `...` and missing axes.
+
+    axes: names of the axes. what: what is indexed, for messages.
 
     Raises RegionError for other kinds of indices, and for too many parts.
     """
@@ -29,26 +33,31 @@ def expand_index(index: Index | tuple[Index, ...]) -> list[int | slice]:
             isinstance(part, bool) or not isinstance(part, int | np.integer | slice)
         ):
             raise RegionError(
-                "a volume is indexed by integers, slices and '...', "
+                f"{what} is indexed by integers, slices and '...', "
                 f"not by {type(part).__name__}; take np.asarray of it for more"
             )
     ellipses = [number for number, part in enumerate(parts) if part is Ellipsis]
-    if len(ellipses) > 1 or len(parts) - len(ellipses) > len(AXES):
-        raise RegionError(f"a volume has 4 axes (t, z, y, x); the index has {len(parts)} parts")
+    if len(ellipses) > 1 or len(parts) - len(ellipses) > len(axes):
+        names = ", ".join(axes)
+        raise RegionError(
+            f"{what} has {len(axes)} axes ({names}); the index has {len(parts)} parts"
+        )
     at = ellipses[0] if ellipses else len(parts)
-    fill = [slice(None)] * (len(AXES) - len(parts) + len(ellipses))
+    fill = [slice(None)] * (len(axes) - len(parts) + len(ellipses))
     expanded = [*parts[:at], *fill, *parts[at + len(ellipses) :]]
     return [part for part in expanded if part is not Ellipsis]
 
 
-def index_ranges(parts: Sequence[int | slice], shape: Sequence[int]) -> list[range]:
+def index_ranges(
+    parts: Sequence[int | slice], shape: Sequence[int], axes: Sequence[str] = AXES
+) -> list[range]:
     """The positions along each axis that an expanded index names.
 
     Raises RegionError for an integer outside its axis.
     """
     return [
         _positions(part, length, axis)
-        for part, length, axis in zip(parts, shape, AXES, strict=True)
+        for part, length, axis in zip(parts, shape, axes, strict=True)
     ]
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import EllipsisType
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import RegionError
+from fhash_codec.indexing import Index, expand_index, index_ranges
+from fhash_formats.series import AXES
 
 __all__ = ["CORNERS", "NEIGHBOURS", "Mlp", "Table", "TableSource", "ceil_halvings"]
 
@@ -19,8 +19,8 @@ CORNERS = "corners"
 NEIGHBOURS = "neighbours"
 """Stencil of the profile compact: a vertex of level 1 and its neighbours."""
 
-Part = int | slice | EllipsisType
-"""One part of an index."""
+TABLE_AXES = (*AXES, "embedding")
+"""Names of the axes of a table."""
 
 
 class TableSource(Protocol):
@@ -55,10 +55,10 @@ class Table:
         self.shape = tuple(int(n) for n in source.shape)
         self.dtype = np.dtype(dtype)
 
-    def __getitem__(self, index: Part | tuple[Part, ...]) -> npt.NDArray[Any]:
+    def __getitem__(self, index: Index | tuple[Index, ...]) -> npt.NDArray[Any]:
         """Numbers by integers, slices and `...`. Raises RegionError for other indices."""
-        parts = _expanded(index if isinstance(index, tuple) else (index,), self.shape)
-        ranges = [_positions(part, n) for part, n in zip(parts, self.shape, strict=True)]
+        parts = expand_index(index, TABLE_AXES, "a table")
+        ranges = index_ranges(parts, self.shape, TABLE_AXES)
         if not all(ranges):
             values = np.empty([len(positions) for positions in ranges], self.dtype)
         else:
@@ -119,31 +119,3 @@ class Mlp:
 def ceil_halvings(shape: Sequence[int], halvings: int) -> tuple[int, ...]:
     """Vertices (z, y, x) after some halvings, each rounded up."""
     return tuple(-(-n // (1 << halvings)) for n in shape)
-
-
-def _expanded(parts: tuple[Part, ...], shape: tuple[int, ...]) -> list[int | slice]:
-    """One integer or slice for each axis. Raises RegionError for other kinds or too many."""
-    for part in parts:
-        known = isinstance(part, int | np.integer | slice) and not isinstance(part, bool)
-        if part is not Ellipsis and not known:
-            raise RegionError(
-                "a table is indexed by integers, slices and '...', "
-                f"not by {type(part).__name__}; take np.asarray of it for more"
-            )
-    dots = [number for number, part in enumerate(parts) if part is Ellipsis]
-    if len(dots) > 1 or len(parts) - len(dots) > len(shape):
-        raise RegionError(
-            f"a table has {len(shape)} axes (t, z, y, x, embedding); the index has {len(parts)}"
-        )
-    at = dots[0] if dots else len(parts)
-    full = [slice(None)] * (len(shape) - len(parts) + len(dots))
-    joined: list[Part] = [*parts[:at], *full, *parts[at + len(dots) :]]
-    return [part for part in joined if not isinstance(part, EllipsisType)]
-
-
-def _positions(part: int | slice, length: int) -> range:
-    if isinstance(part, slice):
-        return range(length)[part]
-    if not -length <= part < length:
-        raise RegionError(f"index {part} is outside an axis of {length}")
-    return range(part % length, part % length + 1)

@@ -19,7 +19,7 @@ from fhash_codec.compact.plain import correction_of, correction_type, predicted
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import pack, packed_bytes
 from fhash_codec.encoding import check_name
-from fhash_codec.model_parts import Table
+from fhash_codec.model_parts import TABLE_AXES, Table
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
@@ -28,17 +28,15 @@ from fhash_formats.container.header import PLAIN_FEATURE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES
 from fhash_formats.support.atomic import check_output
-from fhash_formats.support.slabs import slab_shape
+from fhash_formats.support.slabs import chunk_region, slab_shape
 from fhash_formats.transform.head.head import NeighbourHead
 
 __all__ = ["export_plain"]
 
 CHUNK_BYTES = 2 << 20
 """Bytes of a decoded chunk of a table that is not cut by tiles."""
-TABLE_AXES = ("t", "z", "y", "x", "embedding")
-"""Names of the axes of a table."""
-STANDARD = "bytes"
-"""First codec of arrays that any Zarr library reads."""
+MASK = "occupancy/mask"
+"""Array of a coded occupancy, in whose place plain files have bits."""
 
 Index = tuple[int, ...]
 
@@ -96,14 +94,19 @@ class _Export:
         self._done, self._total = 0, 1
 
     def paper(self) -> dict[str, Any]:
-        """Write a file of the profile paper: plain arrays as they are, coded tables decoded."""
+        """Write a file of the profile paper: arrays decoded, tables and occupancy whole."""
         coded = [t for t in self._volume.tables if f"tables/level_{t.level}" not in self._arrays]
-        copied = [array for array in self._arrays.values() if array.coding == STANDARD]
-        self._total = sum(prod(array.grid) for array in copied) + sum(map(_chunk_count, coded))
+        rewritten = (*(f"tables/level_{table.level}/" for table in coded), MASK)
+        copied = [a for name, a in self._arrays.items() if not name.startswith(rewritten)]
+        keys = len(self._volume.key_times.key_frames) if MASK in self._arrays else 0
+        self._total = sum(prod(array.grid) for array in copied) + keys
+        self._total += sum(map(_chunk_count, coded))
         for array in copied:
             self._copy(array)
         for table in coded:
             self._write_table(table)
+        if keys:
+            self._write_occupancy(keys)
         tables = "float32" if coded else self._header["model"]["tables"]
         return {
             **self._header,
@@ -146,11 +149,11 @@ class _Export:
         self._progress("exporting", self._done, self._total, what)
 
     def _copy(self, array: StoredArray) -> None:
-        """Write an array of standard codecs as it is, chunk by chunk."""
+        """Write the values of an array as plain numbers, chunk by chunk."""
 
         def chunks() -> Iterator[npt.NDArray[Any]]:
             for index in product(*map(range, array.grid)):
-                region = _region(index, array.chunk_shape, array.shape)
+                region = chunk_region(index, array.chunk_shape, array.shape)
                 yield array.decode_chunk(index)[tuple(slice(0, a.stop - a.start) for a in region)]
                 self._tick(array.name)
 
@@ -170,7 +173,7 @@ class _Export:
 
         def chunks() -> Iterator[npt.NDArray[Any]]:
             for start in np.ndindex(*_grid(table.shape, chunk)):
-                yield table[_region(start, chunk, table.shape)]
+                yield table[chunk_region(start, chunk, table.shape)]
                 self._tick(f"level {table.level}")
 
         self._writer.add_array(
@@ -216,7 +219,7 @@ class _Export:
 
     @staticmethod
     def _table(array: StoredArray, index: Index) -> npt.NDArray[Any]:
-        region = _region(index, array.chunk_shape, array.shape)
+        region = chunk_region(index, array.chunk_shape, array.shape)
         return array.decode_table(index)[tuple(slice(0, a.stop - a.start) for a in region)]
 
     def _write_axes(self) -> None:
@@ -276,7 +279,7 @@ class _Export:
             values = array.decode_chunk(index)[region]
             correction = correction_of(values, predicted(table, head, array.dtype))
             if array.masked:
-                region = _region(index, array.chunk_shape, array.shape)
+                region = chunk_region(index, array.chunk_shape, array.shape)
                 correction[~array.read_mask(region)] = 0
             needed = needed or bool(correction.any())
             return correction
@@ -310,10 +313,3 @@ def _chunk_count(table: Table) -> int:
 
 def _grid(shape: Index, chunk: Index) -> Index:
     return tuple(-(-n // c) for n, c in zip(shape, chunk, strict=True))
-
-
-def _region(index: Index, chunk: Index, shape: Index) -> tuple[slice, ...]:
-    """The region of a chunk, as far as the array reaches."""
-    return tuple(
-        slice(i * c, min((i + 1) * c, n)) for i, c, n in zip(index, chunk, shape, strict=True)
-    )

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from fhash_formats.errors import InputError, RegionError
 from fhash_formats.series import Coordinate
 from fhash_formats.support.dates import CALENDARS, DATE, SECOND, Clock, clock, instants
+from fhash_formats.support.numbers import is_number
 
 DIGITS = (6, 17)
 """Fewest and most digits of a number."""
@@ -159,14 +160,14 @@ def _readings(text: str) -> list[tuple[str, str, str | None]]:
         if stop < len(parts) - 1 or not (_is_end(first) and _is_end(last)):
             continue
         every = parts[stop] if stop < len(parts) else None
-        if every is None or (_is_number(every) and float(every) > 0):
+        if every is None or (is_number(every) and float(every) > 0):
             found.append((first, last, every))
     return found
 
 
 def _oddness(reading: tuple[str, str, str | None]) -> tuple[int, bool]:
     """Hours without minutes, and whether the two ends are not written alike."""
-    dates = [end for end in reading[:2] if end and not _is_number(end)]
+    dates = [end for end in reading[:2] if end and not is_number(end)]
     matches = [match for end in dates if (match := DATE.fullmatch(end))]
     bare = sum(match["hour"] is not None and match["minute"] is None for match in matches)
     return bare, len({date.count(":") for date in dates}) > 1
@@ -174,16 +175,7 @@ def _oddness(reading: tuple[str, str, str | None]) -> tuple[int, bool]:
 
 def _is_end(text: str) -> bool:
     """Whether a text is empty, a number or in the form of a date."""
-    return not text or _is_number(text) or DATE.fullmatch(text) is not None
-
-
-def _is_number(text: str) -> bool:
-    """Whether a text is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    return not text or is_number(text) or DATE.fullmatch(text) is not None
 
 
 def time_text(coordinate: Coordinate, time: float) -> str:

@@ -71,10 +71,7 @@ def _tables(
     where = f"{paths}, {stored[0]['coding']}, {size(total)}"
     rows = [("tables", f"{first}; {numbers}; {where}; {parameters}")]
     if verbose:
-        rows += [
-            (f"  level {level['level']}", f"{extent(level['shape'])}; {_place(level)}")
-            for level in levels
-        ]
+        rows += _each("level", levels)
     return rows
 
 
@@ -90,11 +87,15 @@ def _mlp(layers: list[dict[str, Any]], *, verbose: bool) -> list[tuple[str, str]
         place = f"{stored[0]['path']} to {stored[-1]['path']}, {stored[0]['coding']}, {total}"
     rows = [("MLP", f"{widths}, {layers[0]['activation']}; {place}")]
     if verbose:
-        rows += [
-            (f"  layer {layer['layer']}", f"{extent(layer['shape'])}; {_place(layer)}")
-            for layer in layers
-        ]
+        rows += _each("layer", layers)
     return rows
+
+
+def _each(what: str, parts: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """A row for each level or layer: shape and place."""
+    return [
+        (f"  {what} {part[what]}", f"{extent(part['shape'])}; {_place(part)}") for part in parts
+    ]
 
 
 def _widths(layers: list[dict[str, Any]]) -> list[int]:

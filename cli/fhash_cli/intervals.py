@@ -10,6 +10,8 @@ from typing import Any
 
 import click
 
+from fhash_formats.support.numbers import is_number
+
 AXES = 3
 """Axes of a region: z, y and x."""
 
@@ -116,7 +118,7 @@ def parse_slice(text: str) -> slice:
     words = [part.strip() for part in text.split(":")]
     for word in words:
         if word and not _is_integer(word):
-            kind = "is between two" if _is_number(word) else "is no number"
+            kind = "is between two" if is_number(word) else "is no number"
             raise ValueError(f"is not made of indices: {word} {kind}")
     if not any(words) and len(words) == 1:
         raise ValueError("is empty")
@@ -142,18 +144,10 @@ def _position(text: str) -> float | None:
     """An end of an interval of positions; None if it is left out."""
     if not text.strip():
         return None
-    if not _is_number(text) or math.isnan(float(text)):
+    if not is_number(text) or math.isnan(float(text)):
         raise ValueError(f"'{text}' is no position")
     return float(text)
 
 
 def _is_integer(text: str) -> bool:
     return text.lstrip("+-").isdecimal() and text.lstrip("+-").isascii() and len(text) < 20
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.intervals import IntervalsType
-from fhash_cli.options import Command
+from fhash_cli.options import Command, feature_option
 from fhash_cli.scene_types import NumbersType, OpacityType, PlaneType, SizeType
 from fhash_cli.selection import time_of
 from fhash_formats.errors import InputError
@@ -28,7 +28,7 @@ PLACES = {
     "time": "time",
     "t": "step",
     "size": "size",
-    "feature": "features",
+    "features": "features",
     "view": "camera.view",
     "azimuth": "camera.azimuth",
     "elevation": "camera.elevation",
@@ -151,12 +151,7 @@ OPTIONS: tuple[Callable[[Command], Command], ...] = (
         type=NumbersType(3),
         help="Stretch the axes.  [default: one in other units is as long as the rest]",
     ),
-    click.option(
-        "--feature",
-        multiple=True,
-        metavar="F",
-        help="Only this feature of the file, as `fhash info` names it; repeat for several.",
-    ),
+    feature_option,
     click.option("--cmap", metavar="NAME", help="Colour map, or a ParaView preset (JSON)."),
     click.option(
         "--opacity",

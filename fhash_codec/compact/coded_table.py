@@ -11,7 +11,7 @@ from fhash_codec.compact.tiles.tiling import shard_shape
 from fhash_codec.config import EncodeConfig
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container import ContainerWriter
-from fhash_formats.transform.tile.settings import TileSettings
+from fhash_formats.container.coding import transform_codecs
 
 __all__ = ["CodedTable", "model_header", "required_features", "write_table"]
 
@@ -44,21 +44,13 @@ def write_table(writer: ContainerWriter, table: CodedTable) -> None:
         "dtype": blocks.dtype,
         "chunk_shape": blocks.tile,
         "dimension_names": ("t", "z", "y", "x"),
-        "codecs": [
-            {"name": "fhash.transform", "configuration": settings.to_dict()},
-            {"name": "crc32c"},
-        ],
+        "codecs": transform_codecs(settings),
     }
     if len(table.streams) == 1:  # a shard of one tile would cost 70 bytes more
         writer.add_array(TABLE, chunks=table.streams, **described)
         return
     shards = shard_shape(blocks.tile, blocks.grid)
     writer.add_sharded(TABLE, shard_shape=shards, chunks=iter(table.streams), **described)
-
-
-def _codecs(settings: TileSettings) -> list[dict[str, Any]]:
-    """Return the codecs of tiles that share their settings."""
-    return [{"name": "fhash.transform", "configuration": settings.to_dict()}, {"name": "crc32c"}]
 
 
 def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:

@@ -45,9 +45,9 @@ class CompactModel:
     def tables(self) -> list[Table]:
         """The tables, finest first."""
         if self._plain is not None:
-            names = [f"tables/level_{n}" for n in range(1, len(self._arrays) + 1)]
-            stored = [self._arrays[name] for name in names if name in self._arrays]
-            return [Table(n, array, array.dtype) for n, array in enumerate(stored, start=1)]
+            levels = range(1, self._plain.levels + 1)
+            stored = {n: self._arrays[f"tables/level_{n}"] for n in levels}
+            return [Table(n, array, array.dtype) for n, array in stored.items()]
         count = level_count(self._table.shape[1:])
         sources = [CompactTable(self._table, halvings) for halvings in range(count)]
         return [Table(n, source, source.dtype) for n, source in enumerate(sources, start=1)]

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from fhash_formats.container import StoredArray
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.slabs import chunk_region
 from fhash_formats.transform.head.head import Layer, NeighbourHead
 from fhash_formats.transform.values.elementwise import cast
 
@@ -69,18 +70,10 @@ def head_of(model: Mapping[str, Any], arrays: Mapping[str, StoredArray]) -> Neig
     layers = []
     try:
         for number in range(1, len(described["hidden"]) + 2):
-            integers, scales = zip(
-                *(_integers(arrays[f"mlp/{kind}_{number}"]) for kind in ("weight", "bias")),
-                strict=True,
+            weights, biases = (
+                _integers(arrays[f"mlp/{kind}_{number}"]) for kind in ("weight", "bias")
             )
-            layers.append(
-                Layer(
-                    weights=integers[0],
-                    biases=integers[1],
-                    weight_scale=scales[0],
-                    bias_scale=scales[1],
-                )
-            )
+            layers.append(Layer.of(weights, biases))
         with np.errstate(over="ignore"):
             return NeighbourHead(
                 layers=tuple(layers),
@@ -117,6 +110,11 @@ class PlainArray:
         self.dtype = np.dtype(model["values"])
         self._tile = lru_cache(maxsize=CACHED_TILES)(self._decode)
 
+    @property
+    def levels(self) -> int:
+        """Number of levels."""
+        return len(self._model["levels"])
+
     @cached_property
     def head(self) -> NeighbourHead | None:
         """The head of the file."""
@@ -138,10 +136,7 @@ class PlainArray:
 
     def _decode(self, index: tuple[int, ...]) -> npt.NDArray[Any]:
         """The values of a tile, as far as the array reaches."""
-        region = tuple(
-            slice(i * n, min((i + 1) * n, length))
-            for i, n, length in zip(index, self.chunk_shape, self.shape, strict=True)
-        )
+        region = chunk_region(index, self.chunk_shape, self.shape)
         base = predicted(self._table.read((*region, slice(0, 1)))[..., 0], self.head, self.dtype)
         return (
             base if self._corrections is None else corrected(base, self._corrections.read(region))

@@ -58,7 +58,9 @@ def encode_paper(
         write_model(writer, coreset, trained.layers)
     header = _header(series, selection, trained, config)
     if loss is not None:
-        header["required_features"] = ["transform", "labels", "coded-occupancy"]
+        from fhash_codec.paper.tables.small_parts import MASK_FEATURES
+
+        header["required_features"] = ["transform", *MASK_FEATURES]
         header["model"]["tables_loss_db"] = round(loss, 4)
     return header, trained.checkpoint
 

@@ -121,6 +121,19 @@ def test_kinds_of_data_and_promises(case: str, tmp_path: Path) -> None:
     check(path, tmp_path / "plain.fhz")
 
 
+def test_coded_masks_and_weights_of_the_paper_come_back(tmp_path: Path) -> None:
+    config = EncodeConfig(
+        profile="paper", epochs=1, width=32, tables="transform", features=("interval:0:70",)
+    )
+    fhash_codec.encode(moving("float32"), tmp_path / "a.fhz", config)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        coded = {"occupancy/mask", "mlp/weight_2"}
+        arrays = volume.container.arrays
+        assert all(arrays[name].coding != "bytes" for name in coded)
+    export_plain(tmp_path / "a.fhz", tmp_path / "plain.fhz")
+    check(tmp_path / "a.fhz", tmp_path / "plain.fhz")
+
+
 def test_integers_beyond_the_doubles_come_back(tmp_path: Path) -> None:
     big = np.array([2**62 + 1, 2**62 + 3, 2**53 + 1, 5], dtype=np.int64)
     values = big[np.random.default_rng(0).integers(0, 4, (2, 4, 5, 6))]

@@ -28,7 +28,7 @@ from fhash_codec import native
 from fhash_codec.compact.choices import head_network_portable as portable
 from fhash_codec.compact.choices.head_network_portable import BETA1, BETA2, MAX_INTEGERS
 from fhash_codec.compact.choices.head_samples import Batches
-from fhash_formats.transform.head.head import Layer, layer_inputs
+from fhash_formats.transform.head.head import Layer, Scaled, layer_inputs
 
 __all__ = ["Network", "adam_factors"]
 
@@ -130,23 +130,11 @@ class Network:
     def layers(self) -> tuple[Layer, ...]:
         """Return the layers as the file holds them."""
         layers = []
-        for weights, biases in portable.layer_arrays(self.parameters, self.widths, self.looked_at):
-            scales = [
-                portable.file_scale(values, most)
-                for values, most in zip((weights, biases), MAX_INTEGERS, strict=True)
-            ]
-            integers = [
-                portable.integers(values, scale, most).astype(np.int8)
-                for values, scale, most in zip((weights, biases), scales, MAX_INTEGERS, strict=True)
-            ]
-            layers.append(
-                Layer(
-                    weights=integers[0],
-                    biases=integers[1],
-                    weight_scale=scales[0],
-                    bias_scale=scales[1],
-                )
+        for arrays in portable.layer_arrays(self.parameters, self.widths, self.looked_at):
+            weights, biases = (
+                _as_in_file(values, most) for values, most in zip(arrays, MAX_INTEGERS, strict=True)
             )
+            layers.append(Layer.of(weights, biases))
         return tuple(layers)
 
     def _arguments(self, voxels: Batches) -> Sequence[ctypes.c_void_p]:
@@ -158,6 +146,12 @@ class Network:
         assert all(array.flags.c_contiguous for array in arrays)
         addresses = [_address(array) for array in arrays]
         return [*addresses, ctypes.cast(sizes, ctypes.c_void_p)]
+
+
+def _as_in_file(values: Doubles, most: int) -> Scaled:
+    """Return weights or biases as the integers of the file, at most `most` either way."""
+    scale = portable.file_scale(values, most)
+    return portable.integers(values, scale, most).astype(np.int8), scale
 
 
 def _address(array: npt.NDArray[np.generic]) -> ctypes.c_void_p:

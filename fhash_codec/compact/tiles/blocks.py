@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from fhash_codec.coreset.extent import Extent
 from fhash_formats.series import Series
+from fhash_formats.support.slabs import chunk_region
 from fhash_formats.transform.tile.sections import Shape
 
 Values = npt.NDArray[Any]
@@ -108,14 +109,11 @@ class Blocks:
         Otherwise only one thread may, in C order, because just the last layer in t is kept.
         """
         layer = self._layer(index[0])
-        spans = [
-            slice(i * n, min((i + 1) * n, length))
-            for i, n, length in zip(index[1:], self.tile[1:], self.shape[1:], strict=True)
-        ]
-        values = layer.values[:, spans[0], spans[1], spans[2]]
+        region = (slice(None), *chunk_region(index[1:], self.tile[1:], self.shape[1:]))
+        values = layer.values[region]
         in_coreset = None
         if layer.counted is not None:
-            in_coreset = layer.counted[:, spans[0], spans[1], spans[2]]
+            in_coreset = layer.counted[region]
         padding = [(0, n - m) for n, m in zip(self.tile, values.shape, strict=True)]
         if not any(after for _, after in padding):
             if in_coreset is None or in_coreset.all():

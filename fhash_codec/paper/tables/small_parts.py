@@ -16,7 +16,7 @@ from fhash_codec.coreset import occupancy
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats, Layer
 from fhash_formats.container import ContainerWriter
-from fhash_formats.container.coding import Codec
+from fhash_formats.container.coding import transform_codecs
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
 from fhash_formats.transform.tile.settings import TileSettings
@@ -27,7 +27,7 @@ WEIGHT_STEPS = tuple(2.0**-power for power in range(2, 13))
 """Quantiser steps tried for the weights of a matrix, as shares of their root mean square."""
 MASK_VERTICES = 4 << 20
 """Vertices of a chunk of the occupancy; a frame is read by decoding one chunk."""
-MASK_FEATURES = ("labels",)
+MASK_FEATURES = ("labels", "coded-occupancy")
 """Features of the format that the coded occupancy needs of a reader."""
 
 _PLAIN = TransformSpec.from_dict(dict.fromkeys("tzyx", "none"))
@@ -65,7 +65,7 @@ def write_layers(
 ) -> None:
     """Write the layers of `quantised_layers`."""
     for number, ((weight, bias), how) in enumerate(zip(layers, settings, strict=True), start=1):
-        codecs = None if how is None else _codecs(how)
+        codecs = None if how is None else transform_codecs(how)
         writer.add_whole(f"mlp/weight_{number}", weight, codecs=codecs)
         writer.add_whole(f"mlp/bias_{number}", bias)
 
@@ -87,7 +87,7 @@ def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
             for i in starts
         ),
         dimension_names=("t", "z", "y", "x"),
-        codecs=_codecs(
+        codecs=transform_codecs(
             TileSettings(transform=_PLAIN, step=1.0, center=0.0, low=0.0, high=1.0, labels=True)
         ),
     )
@@ -112,11 +112,3 @@ def _decoded(weight: Floats, settings: TileSettings) -> Floats:
     shape = weight.shape
     tile = encode_tile(weight.reshape(1, 1, *shape), settings, Coding())
     return np.ascontiguousarray(tile.decoded.reshape(shape))
-
-
-def _codecs(settings: TileSettings) -> list[Codec]:
-    """Return the codecs of an array that is coded with some settings."""
-    return [
-        {"name": "fhash.transform", "configuration": settings.to_dict()},
-        {"name": "crc32c"},
-    ]

@@ -28,6 +28,7 @@ from fhash_codec.paper.tables.tiles import Index, LevelCoding, TiledTable, tile_
 from fhash_codec.paper.tables.trained_tables import TrainedTable, trained_tables
 from fhash_codec.progress import Progress
 from fhash_formats.container import ContainerWriter
+from fhash_formats.container.coding import transform_codecs
 from fhash_formats.support.threads import thread_pool
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -328,10 +329,7 @@ def _write_table(writer: ContainerWriter, level: int, table: TiledTable) -> None
             chunks=table.streams(component),
             dimension_names=("t", "z", "y", "x"),
             attributes={"mixing": [float(str(number)) for number in mixing]},
-            codecs=[
-                {"name": "fhash.transform", "configuration": settings.to_dict()},
-                {"name": "crc32c"},
-            ],
+            codecs=transform_codecs(settings),
         )
 
 

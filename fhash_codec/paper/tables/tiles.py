@@ -22,6 +22,7 @@ from fhash_codec.paper.storage import mix_components
 from fhash_codec.paper.tables.trained_tables import Mask, Region, TrainedTable
 from fhash_formats.container import shard_shape
 from fhash_formats.container.cache import ChunkCache
+from fhash_formats.support.slabs import chunk_region
 from fhash_formats.transform.tile.decoding import decode_tile
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
 from fhash_formats.transform.tile.sections import Shape
@@ -180,10 +181,7 @@ def tile_region(index: Index, tile: Shape, shape: Sequence[int]) -> Region:
         tile: vertices of a tile.
         shape: lengths of the axes of the table; those after x are ignored.
     """
-    return tuple(
-        slice(i * n, min((i + 1) * n, length))
-        for i, n, length in zip(index, tile, shape, strict=False)
-    )
+    return chunk_region(index, tile, shape[: len(tile)])
 
 
 def components_of(

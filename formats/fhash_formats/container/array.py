@@ -14,6 +14,7 @@ import numpy as np
 from fhash_formats.container.coding import CheckedCoder, chunk_coder
 from fhash_formats.container.sharding import Sharding, parse_sharding
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
+from fhash_formats.support.slabs import chunk_region
 
 DTYPES = {
     name: np.dtype(name)
@@ -138,8 +139,7 @@ class ArrayMetadata:
 
     def inner_region(self, index: Sequence[int]) -> tuple[slice, ...]:
         """The region of the array that an inner chunk holds, cut at the array's end."""
-        spans = zip(index, self.inner_shape, self.shape, strict=True)
-        return tuple(slice(i * chunk, min((i + 1) * chunk, n)) for i, chunk, n in spans)
+        return chunk_region(index, self.inner_shape, self.shape)
 
     def to_dict(self) -> dict[str, Any]:
         """The array's zarr.json as JSON values."""

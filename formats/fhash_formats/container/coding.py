@@ -11,7 +11,7 @@ import inspect
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from math import prod
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,9 @@ from fhash_formats.errors import (
     MissingDependencyError,
     UnsupportedFileError,
 )
+
+if TYPE_CHECKING:
+    from fhash_formats.transform.tile.settings import TileSettings
 
 Codec = Mapping[str, Any]
 """A codec as Zarr v3 names it: {"name": str, "configuration": {...}}."""
@@ -131,6 +134,11 @@ ARRAY_CODECS: dict[str, Callable[[Sequence[Codec], np.dtype[Any], tuple[int, ...
     TRANSFORM: _transform_coder,
 }
 """Coder by the name of the first codec; the coder is given all codecs but the last, `crc32c`."""
+
+
+def transform_codecs(settings: TileSettings) -> list[Codec]:
+    """The codecs of an array whose tiles share some settings."""
+    return [{"name": TRANSFORM, "configuration": settings.to_dict()}, CRC32C]
 
 
 class CheckedCoder:

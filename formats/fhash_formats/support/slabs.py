@@ -1,4 +1,4 @@
-"""Chunk shapes of a bounded size."""
+"""Chunks of arrays: shapes of a bounded size, and the region that a chunk covers."""
 
 from __future__ import annotations
 
@@ -23,3 +23,17 @@ def slab_shape(shape: Sequence[int], itemsize: int, limit: int) -> tuple[int, ..
         slabs = -(-length // max(1, limit // max(1, layer_bytes)))
         chunk[axis] = -(-length // max(1, slabs))
     return tuple(chunk)
+
+
+def chunk_region(
+    index: Sequence[int], chunk: Sequence[int], shape: Sequence[int]
+) -> tuple[slice, ...]:
+    """The region of an array that a chunk covers, cut at the array's end.
+
+    Args:
+        index: place of the chunk in the grid of chunks.
+        chunk: shape of a full chunk.
+        shape: of the array.
+    """
+    spans = zip(index, chunk, shape, strict=True)
+    return tuple(slice(i * n, min((i + 1) * n, length)) for i, n, length in spans)

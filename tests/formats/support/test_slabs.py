@@ -1,14 +1,15 @@
-"""Chunks: bounded, equal, and cut along leading axes first."""
+"""Chunks: bounded, equal, cut along leading axes first; their regions tile the array."""
 
 from __future__ import annotations
 
 from math import prod
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fhash_formats.support.slabs import slab_shape
+from fhash_formats.support.slabs import chunk_region, slab_shape
 
 
 @pytest.mark.parametrize(
@@ -39,3 +40,12 @@ def test_slabs_keep_the_limit_and_use_it(shape: list[int], itemsize: int, limit:
     assert size <= limit
     assert all(1 <= part <= whole for part, whole in zip(chunk, shape, strict=True))
     assert size == prod(shape) * itemsize or size > limit / 4
+
+
+@given(st.lists(st.tuples(st.integers(1, 9), st.integers(1, 5)), min_size=1, max_size=3))
+def test_regions_of_chunks_tile_the_array(axes: list[tuple[int, int]]) -> None:
+    shape, chunk = (tuple(column) for column in zip(*axes, strict=True))
+    covered = np.zeros(shape, dtype=int)
+    for index in np.ndindex(*(-(-n // c) for n, c in axes)):
+        covered[chunk_region(index, chunk, shape)] += 1
+    np.testing.assert_array_equal(covered, 1)

@@ -23,7 +23,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -88,6 +88,10 @@ def layer_inputs(hidden: Sequence[int], cross: bool) -> list[int]:
     return inputs
 
 
+Scaled = tuple[npt.NDArray[np.int8], float]
+"""Whole numbers and the scale that they are multiples of."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layer:
     """One layer: outputs = weight_scale * weights @ inputs + bias_scale * biases.
@@ -103,6 +107,13 @@ class Layer:
     biases: npt.NDArray[np.int8]
     weight_scale: float
     bias_scale: float
+
+    @classmethod
+    def of(cls, weights: Scaled, biases: Scaled) -> Self:
+        """The layer of its numbers, each with their scale."""
+        return cls(
+            weights=weights[0], biases=biases[0], weight_scale=weights[1], bias_scale=biases[1]
+        )
 
 
 class _Constants(NamedTuple):
