@@ -17,6 +17,7 @@ from fhash_codec.header import full_config
 from fhash_codec.model_parts import Mlp, Table
 from fhash_codec.volume_model import VolumeModel
 from fhash_formats.container import Container
+from fhash_formats.container.apart import HEAD_ARRAY, MASK_ARRAY
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES
 
@@ -110,7 +111,10 @@ class Card:
                 "layer": number,
                 "shape": list(weights.shape),
                 "activation": self.mlp.activation if number < count else "linear",
-                **self._place(f"mlp/weight_{number}", "packed in the codec of tables/level_1"),
+                **self._place(
+                    HEAD_ARRAY if HEAD_ARRAY in self.container.arrays else f"mlp/weight_{number}",
+                    "packed in the codec of tables/level_1",
+                ),
             }
             for number, weights in enumerate(self.mlp.weights, start=1)
         ]
@@ -118,7 +122,7 @@ class Card:
     def _describe_occupancy(self) -> dict[str, Any]:
         """The bits of all key frames, or what stands in their place."""
         shape = [self.tables[0].shape[0], packed_bytes(self.box.shape)]
-        for name in ("occupancy/bits", "occupancy/mask"):
+        for name in ("occupancy/bits", MASK_ARRAY):
             if name in self.container.arrays:
                 return {"shape": shape, **self._place(name, "")}
         masked = self.container.arrays["tables/level_1"].masked

@@ -27,12 +27,12 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("writers",),
     ),
     "fhash_formats.transform": (
-        ("values",),
+        ("apart", "values"),
         ("entropy",),
         ("axes", "head"),
         ("tile",),
-        ("chunk", "stream"),
-        ("numcodecs_codec", "zarr_codec"),
+        ("chunk", "parts", "stream"),
+        ("numcodecs_codec", "zarr_codec", "zarr_parts"),
     ),
     "fhash_codec": (
         ("config", "native", "progress"),

@@ -1,22 +1,18 @@
-"""The coded table of a compact file, and how it and its description are written."""
+"""The coded table of a compact file, and what the header says of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from fhash_codec.compact.plan import CodingPlan
 from fhash_codec.compact.tiles.coding import Outcome
-from fhash_codec.compact.tiles.tiling import shard_shape
 from fhash_codec.config import EncodeConfig
 from fhash_codec.measure.value_range import ValueRange
-from fhash_formats.container import ContainerWriter
-from fhash_formats.container.coding import transform_codecs
+from fhash_formats.container.table_parts import TableParts
 
-__all__ = ["CodedTable", "model_header", "required_features", "write_table"]
-
-TABLE = "tables/level_1"
-"""Name of the table in the container."""
+__all__ = ["CodedTable", "model_header"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,25 +28,17 @@ class CodedTable:
     bulk: ValueRange | None = None
     """Bulk of the values that count, in data units; None if they have none."""
 
-
-def write_table(writer: ContainerWriter, table: CodedTable) -> None:
-    """Write the table; its tiles also hold the mask where the coreset is not the whole box.
-
-    A single tile needs no shard, whose index and description would take some 120 bytes.
-    """
-    blocks, settings = table.plan.blocks, table.plan.settings
-    described: dict[str, Any] = {
-        "shape": blocks.shape,
-        "dtype": blocks.dtype,
-        "chunk_shape": blocks.tile,
-        "dimension_names": ("t", "z", "y", "x"),
-        "codecs": transform_codecs(settings),
-    }
-    if len(table.streams) == 1:  # a shard of one tile would cost 70 bytes more
-        writer.add_array(TABLE, chunks=table.streams, **described)
-        return
-    shards = shard_shape(blocks.tile, blocks.grid)
-    writer.add_sharded(TABLE, shard_shape=shards, chunks=iter(table.streams), **described)
+    @cached_property
+    def parts(self) -> TableParts:
+        """The arrays that the container has of the table."""
+        blocks = self.plan.blocks
+        return TableParts(
+            shape=blocks.shape,
+            dtype=blocks.dtype,
+            tile=blocks.tile,
+            settings=self.plan.settings,
+            streams=self.streams,
+        )
 
 
 def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:
@@ -71,8 +59,3 @@ def model_header(table: CodedTable, config: EncodeConfig) -> dict[str, Any]:
             for gain in table.plan.gains
         ],
     }
-
-
-def required_features(table: CodedTable) -> list[str]:
-    """Return the features of the format that a reader of the file must know."""
-    return ["transform", *table.plan.settings.features]

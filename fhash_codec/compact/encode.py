@@ -15,8 +15,6 @@ from fhash_codec.compact.choices.head_samples import BATCH_VOXELS
 from fhash_codec.compact.coded_table import (
     CodedTable,
     model_header,
-    required_features,
-    write_table,
 )
 from fhash_codec.compact.goal import promise
 from fhash_codec.compact.tiles.blocks import fits_memory
@@ -81,7 +79,7 @@ def encode_compact(
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
     table = code_series(series, selection, config, progress, overhead=overhead)
     for _ in range(WRITINGS):
-        write_table(writer, table)
+        table.parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
         header = complete(source | described | _header(selection, table, config, seconds))
         overhead = writer.size(header) - table.outcome.size
@@ -110,7 +108,7 @@ def _header(
             "seed": config.seed,
             **({} if seconds is None else {"seconds": seconds}),
         },
-        "required_features": required_features(table),
+        "required_features": table.parts.features,
         "background": extent.background,
         "feature_bounding_box": [list(span) for span in extent.box],
         "features": [str(feature) for feature in selection.features],

@@ -37,8 +37,10 @@ class CompactModel:
         if PLAIN_FEATURE in container.header["required_features"]:
             self._plain = PlainArray(container.header["model"], self._arrays)
         self._array = self._plain or self._table
-        # Files from before the feature `mask` have their occupancy in arrays.
-        self._older = any(name.startswith("occupancy/") for name in self._arrays)
+        # Files from before the feature `mask` have their occupancy in arrays that are plain.
+        self._older = not self._table.masked and any(
+            name.startswith("occupancy/") for name in self._arrays
+        )
         self.chunks = self._array.chunk_shape
 
     @cached_property
@@ -64,10 +66,10 @@ class CompactModel:
         """Return which vertices (z, y, x) of a region are in the coreset at both of two steps."""
         # Between steps both count: a value is no better than the two it lies between.
         space = tuple(slice(low, high) for low, high in region)
-        if "occupancy/mask" in self._arrays:
+        if "occupancy/mask" in self._arrays and not self._table.masked:
             mask = self._arrays["occupancy/mask"].read((slice(first, last + 1), *space))
             return np.asarray((mask[0] & mask[-1]) != 0)
-        if "occupancy/bits" not in self._arrays:
+        if self._table.masked or "occupancy/bits" not in self._arrays:
             mask = self._table.read_mask((slice(first, last + 1), *space))
             return np.asarray(mask[0] & mask[-1])
         stored = self._arrays["occupancy/bits"]

@@ -11,7 +11,7 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact import coded_table
+from fhash_codec.compact.tiles_to_promise import code_series
 from fhash_formats.transform.head.head import Layer, NeighbourHead
 
 
@@ -23,22 +23,14 @@ def field(steps: int = 2) -> np.ndarray:
 def with_head(path: Path, head: NeighbourHead) -> Path:
     """A file whose head was not trained: two tiles along y."""
     config = EncodeConfig(effort=2, psnr=40.0, tile="2x9x15x28")
-    write = coded_table.write_table
 
-    def patched(writer: Any, table: Any) -> None:
+    def patched(*args: Any, **options: Any) -> Any:
+        table = code_series(*args, **options)
         settings = replace(table.plan.settings, head=head)
-        write(writer, replace(table, plan=replace(table.plan, settings=settings)))
+        return replace(table, plan=replace(table.plan, settings=settings))
 
-    header = coded_table.model_header
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fhash_codec.compact.encode.write_table", patched)
-        patch.setattr(
-            "fhash_codec.compact.encode.model_header",
-            lambda table, config: {**header(table, config), "head": {"hidden": [4, 3]}},
-        )
-        patch.setattr(
-            "fhash_codec.compact.encode.required_features", lambda table: ["transform", "cross"]
-        )
+        patch.setattr("fhash_codec.compact.encode.code_series", patched)
         patch.setattr("fhash_codec.encoding.missed_promise", lambda *_: None)
         fhash_codec.encode(field(), path, config)
     return path

@@ -101,6 +101,12 @@ class ArrayMetadata:
         return chunk_coder(codecs, self.dtype, self.inner_shape)
 
     @property
+    def coding(self) -> str:
+        """Name of the first codec of inner chunks."""
+        codecs = self.codecs if self.sharding is None else self.sharding.codecs
+        return str(codecs[0]["name"])
+
+    @property
     def inner_shape(self) -> tuple[int, ...]:
         """Shape of an inner chunk, the least that is decoded."""
         return self.chunk_shape if self.sharding is None else self.sharding.chunk_shape

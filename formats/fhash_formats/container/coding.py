@@ -51,13 +51,14 @@ class ChunkCoder(Protocol):
 
     - A coder that can decode with less detail has `decode(data, lod)`; level of detail 0 is all.
     - A coder whose chunks say which values are occupied has `masked` True and
-      `decode_masked(data)`, which returns values and mask.
+      `decode_masked(data)`, which returns values and mask. Masks may lie in an array of their own:
+      `join(data, mask)` makes the chunk that has its mask itself.
     """
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The bytes of a full chunk."""
 
-    def decode(self, data: memoryview) -> npt.NDArray[Any]:
+    def decode(self, data: memoryview | bytes) -> npt.NDArray[Any]:
         """The full chunk in native byte order; it may be read-only."""
 
 
@@ -96,7 +97,7 @@ class PlainCoder:
         data: bytes = compress(np.ascontiguousarray(chunk, dtype=self._stored), self._level)
         return data
 
-    def decode(self, data: memoryview) -> npt.NDArray[Any]:
+    def decode(self, data: memoryview | bytes) -> npt.NDArray[Any]:
         """The full chunk; raises DamagedFileError for data that are not a full chunk."""
         from numcodecs.zstd import decompress
 
@@ -128,10 +129,34 @@ def _transform_coder(
     return TransformCoder(codecs, dtype, shape)
 
 
+def _head_coder(
+    codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> ChunkCoder:
+    """The coder of `fhash.head`."""
+    from fhash_formats.transform.parts import HeadCoder
+
+    return HeadCoder(codecs, dtype, shape)
+
+
+def _mask_coder(
+    codecs: Sequence[Codec], dtype: np.dtype[Any], shape: tuple[int, ...]
+) -> ChunkCoder:
+    """The coder of `fhash.mask`."""
+    from fhash_formats.transform.parts import MaskCoder
+
+    return MaskCoder(codecs, dtype, shape)
+
+
 TRANSFORM = "fhash.transform"
+HEAD = "fhash.head"
+"""Codec of the head of a table, see `apart`."""
+MASK = "fhash.mask"
+"""Codec of the masks of a table's tiles, see `apart`."""
 ARRAY_CODECS: dict[str, Callable[[Sequence[Codec], np.dtype[Any], tuple[int, ...]], ChunkCoder]] = {
     "bytes": PlainCoder,
     TRANSFORM: _transform_coder,
+    HEAD: _head_coder,
+    MASK: _mask_coder,
 }
 """Coder by the name of the first codec; the coder is given all codecs but the last, `crc32c`."""
 
@@ -151,13 +176,17 @@ class CheckedCoder:
         """The bytes of a full chunk and their CRC-32C."""
         return with_crc32c(self._coder.encode(chunk))
 
-    def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+    def decode(
+        self, data: memoryview, lod: int = 0, mask: memoryview | None = None
+    ) -> npt.NDArray[Any]:
         """The full chunk at a level of detail; 0 is all of it.
+
+        mask: the chunk's mask where it lies in an array of its own, without its CRC-32C.
 
         Raises DamagedFileError for damaged data, and InputError for another level of detail of a
         coder that has none.
         """
-        coded = self._checked(data)
+        coded = self._whole(data, mask)
         if lod == 0:
             return self._coder.decode(coded)
         if lod < 0 or "lod" not in inspect.signature(self._coder.decode).parameters:
@@ -174,12 +203,14 @@ class CheckedCoder:
         """Settings that all chunks share, of a coder that has some (`TileSettings`); else None."""
         return getattr(self._coder, "settings", None)
 
-    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+    def decode_table(
+        self, data: memoryview, lod: int = 0, mask: memoryview | None = None
+    ) -> npt.NDArray[Any]:
         """The full chunk before it is corrected, for a coder that tells both apart.
 
         Raises DamagedFileError.
         """
-        coded = self._checked(data)
+        coded = self._whole(data, mask)
         decode = getattr(self._coder, "decode_table", None)
         values: npt.NDArray[Any] = decode(coded, lod) if decode else self._coder.decode(coded)
         return values
@@ -189,18 +220,21 @@ class CheckedCoder:
         """Whether the chunks say which of their values are occupied."""
         return bool(getattr(self._coder, "masked", False))
 
-    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+    def decode_masked(
+        self, data: memoryview, mask: memoryview | None = None
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
         """The full chunk and its mask, for a coder that is `masked`; raises DamagedFileError."""
-        values, mask = self._coder.decode_masked(self._checked(data))  # type: ignore[attr-defined]
-        return values, mask
+        coded = self._whole(data, mask)
+        values, occupied = self._coder.decode_masked(coded)  # type: ignore[attr-defined]
+        return values, occupied
 
-    def _checked(self, data: memoryview) -> memoryview:
-        if len(data) < _CRC.size:
-            raise DamagedFileError(f"{len(data)} bytes are too few for a CRC-32C")
-        coded = data[: -_CRC.size]
-        if crc32c(coded) != _CRC.unpack(data[-_CRC.size :])[0]:
-            raise DamagedFileError("its CRC-32C differs, the data are damaged")
-        return coded
+    def _whole(self, data: memoryview, mask: memoryview | None) -> memoryview | bytes:
+        """The checked bytes of a chunk, with its mask put behind them."""
+        coded = without_crc32c(data)
+        if mask is None:
+            return coded
+        joined: bytes = self._coder.join(coded, mask)  # type: ignore[attr-defined]
+        return joined
 
 
 def chunk_coder(
@@ -234,7 +268,17 @@ def with_crc32c(data: bytes) -> bytes:
     return data + _CRC.pack(crc32c(data))
 
 
-def zstd_content_size(data: memoryview) -> int | None:
+def without_crc32c(data: memoryview) -> memoryview:
+    """`data` without the CRC-32C at their end; raises DamagedFileError where it differs."""
+    if len(data) < _CRC.size:
+        raise DamagedFileError(f"{len(data)} bytes are too few for a CRC-32C")
+    coded = data[: -_CRC.size]
+    if crc32c(coded) != _CRC.unpack(data[-_CRC.size :])[0]:
+        raise DamagedFileError("its CRC-32C differs, the data are damaged")
+    return coded
+
+
+def zstd_content_size(data: memoryview | bytes) -> int | None:
     """The content size in the header of a zstd frame; None where the header has none.
 
     Raises DamagedFileError for data that do not begin with such a header (RFC 8878, 3.1.1.1).

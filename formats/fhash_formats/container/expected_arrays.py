@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.container.apart import MASK_ARRAY, TABLE
 from fhash_formats.container.array import ArrayMetadata
-from fhash_formats.container.coding import TRANSFORM
+from fhash_formats.container.coding import MASK, TRANSFORM
 from fhash_formats.container.header import (
     CODED,
     COMPACT,
@@ -53,6 +54,8 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
     for name, shape, dtypes in _optional_arrays(header):
         if name in arrays:
             _check_array(name, arrays[name], shape, dtypes)
+    if MASK_ARRAY in arrays and arrays[MASK_ARRAY].coding == MASK:
+        _check_masks(arrays[MASK_ARRAY], arrays[TABLE])
     for axis in POSITIONS:
         name = f"coords/{axis}"
         if name in arrays and "name" in arrays[name].attributes:
@@ -170,6 +173,15 @@ def _check_table_attributes(name: str, table: ArrayMetadata, model: Mapping[str,
         attributes.numbers("mixing", model["embedding_size"])
 
 
+def _check_masks(masks: ArrayMetadata, table: ArrayMetadata) -> None:
+    """Check that there is one mask for each tile of a table."""
+    if masks.shape != table.shape or masks.inner_shape != table.inner_shape:
+        raise DamagedFileError(
+            f"array {MASK_ARRAY} has shape {masks.shape} in chunks of {masks.inner_shape}; "
+            f"its table has {table.shape} in tiles of {table.inner_shape}"
+        )
+
+
 def _check_layers(arrays: Mapping[str, ArrayMetadata], model: Mapping[str, Any]) -> None:
     """Check the units of the weights and biases of a plain head."""
     for number in range(1, len(layer_shapes(model)) + 1):
@@ -185,7 +197,7 @@ def _check_array_features(
     """Check that the header requires every feature that a reader of the arrays must know."""
     if TRANSFORM_FEATURE not in required_features:
         for name, array in arrays.items():
-            if array.sharding is not None or array.codecs[0]["name"] == TRANSFORM:
+            if array.sharding is not None or array.coding == TRANSFORM:
                 raise DamagedFileError(
                     f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, "
                     "which the header does not require"

@@ -17,7 +17,7 @@ from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 3)
+FORMAT_VERSION = (1, 4)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
 PLAIN_FEATURE = "plain"
@@ -26,6 +26,7 @@ KNOWN_FEATURES = frozenset(
     {
         TRANSFORM_FEATURE,
         PLAIN_FEATURE,
+        "apart",
         "clip",
         "coded-occupancy",
         "cross",

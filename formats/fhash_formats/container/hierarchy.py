@@ -6,13 +6,16 @@ Every member must have a place in the hierarchy, and every array must have all o
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
 from typing import Any
 
 from fhash_formats.container import strict_json
+from fhash_formats.container.apart import inline
 from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
+from fhash_formats.container.coding import without_crc32c
 from fhash_formats.container.layout import Member
 from fhash_formats.container.source import Source
 from fhash_formats.container.zip_checked import DOCUMENT, read_member
@@ -20,6 +23,9 @@ from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 GROUP: dict[str, Any] = {"zarr_format": 3, "node_type": "group"}
 """The zarr.json of a group without attributes."""
+
+MAX_HEAD_BYTES = 1 << 20
+"""Bytes of a packed head that a reader accepts; the largest has some 20 thousand."""
 
 _CHUNK = re.compile(r"(.+)/(c(?:/[0-9]+)+)")
 
@@ -47,32 +53,33 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     if DOCUMENT not in members:
         raise DamagedFileError(f"member {DOCUMENT} is missing")
     groups: dict[str, Mapping[str, Any]] = {}
-    arrays: dict[str, ArrayMetadata] = {}
+    documents: dict[str, Mapping[str, Any]] = {}
     chunk_members: list[tuple[str, str, Member]] = []
     for name, member in members.items():
         node, _, file_name = name.rpartition("/")
         if file_name == DOCUMENT:
             document = _read_document(source, member)
-            if isinstance(document, ArrayMetadata):
-                arrays[node] = document
+            if document["node_type"] == "array":
+                documents[node] = document
             else:
-                groups[node] = document
+                groups[node] = document.get("attributes", {})
         elif match := _CHUNK.fullmatch(name):
             chunk_members.append((match[1], match[2], member))
         else:
             raise DamagedFileError(f"member {name} belongs to no array")
     if "" not in groups or not isinstance(groups[""].get("fhash"), dict):
         raise DamagedFileError(f"member {DOCUMENT} is not the group of an fhash container")
-    for node in [*arrays, *groups]:
+    for node in [*documents, *groups]:
         if node and node.rpartition("/")[0] not in groups:
             raise DamagedFileError(f"member {node}/{DOCUMENT} lies in no group")
+    arrays = _read_arrays(source, members, documents)
     return Hierarchy(
         header=groups[""]["fhash"], arrays=arrays, chunks=_place_chunks(arrays, chunk_members)
     )
 
 
-def _read_document(source: Source, member: Member) -> ArrayMetadata | Mapping[str, Any]:
-    """The metadata of an array or the attributes of a group."""
+def _read_document(source: Source, member: Member) -> Mapping[str, Any]:
+    """The zarr.json of a group, checked, or of an array."""
     # Checked before reading: the data of a chunk may be that large, metadata may not.
     if max(member.sizes) > strict_json.MAX_BYTES:
         raise DamagedFileError(
@@ -80,16 +87,47 @@ def _read_document(source: Source, member: Member) -> ArrayMetadata | Mapping[st
             f"the limit is {strict_json.MAX_BYTES}"
         )
     data = read_member(source, member)
-    try:
+    with member_named(member.name):
         values = strict_json.loads(data)
         if values.get("zarr_format") != 3 or values.get("node_type") not in ("array", "group"):
             raise UnsupportedFileError("not the metadata of a Zarr v3 array or group")
-        if values["node_type"] == "array":
-            return ArrayMetadata.from_dict(values)
-        check_keys(values, {*GROUP, "attributes"})
-        return attributes_of(values)
+        if values["node_type"] == "group":
+            check_keys(values, {*GROUP, "attributes"})
+            attributes_of(values)
+        return values
+
+
+def _read_arrays(
+    source: Source, members: Mapping[str, Member], documents: Mapping[str, Mapping[str, Any]]
+) -> dict[str, ArrayMetadata]:
+    """The metadata of all arrays by name. Raises errors that name the member."""
+
+    def only_chunk(name: str) -> bytes:
+        chunk = f"{name}/c/0"
+        if chunk not in members:
+            raise DamagedFileError(f"member {chunk} is missing")
+        if members[chunk].size > MAX_HEAD_BYTES:
+            raise DamagedFileError(
+                f"member {chunk}: {members[chunk].size} bytes of a head; "
+                f"the limit is {MAX_HEAD_BYTES}"
+            )
+        with member_named(chunk):
+            return bytes(without_crc32c(read_member(source, members[chunk])))
+
+    arrays = {}
+    for name, document in inline(documents, only_chunk).items():
+        with member_named(f"{name}/{DOCUMENT}"):
+            arrays[name] = ArrayMetadata.from_dict(document)
+    return arrays
+
+
+@contextmanager
+def member_named(name: str) -> Iterator[None]:
+    """A block whose errors about a file begin with the name of a member."""
+    try:
+        yield
     except DamagedFileError as error:
-        raise type(error)(f"member {member.name}: {error}") from error
+        raise type(error)(f"member {name}: {error}") from error
 
 
 def _place_chunks(
@@ -104,10 +142,8 @@ def _place_chunks(
     for name, key, member in members:
         if name not in arrays:
             raise DamagedFileError(f"member {member.name} belongs to no array")
-        try:
+        with member_named(member.name):
             chunks[name][arrays[name].parse_key(key)] = member
-        except DamagedFileError as error:
-            raise DamagedFileError(f"member {member.name}: {error}") from error
     for name, metadata in arrays.items():
         # Names are unique and indices lie within the grid, so an equal count means that no chunk
         # is missing.

@@ -8,11 +8,14 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any
 
+from fhash_formats.container.apart import MASK_ARRAY, TABLE
 from fhash_formats.container.cache import ChunkCache
+from fhash_formats.container.coding import MASK
 from fhash_formats.container.coordinates import described_coordinate
 from fhash_formats.container.expected_arrays import check_arrays, check_key_frames
 from fhash_formats.container.header import POSITIONS, validate_header
-from fhash_formats.container.hierarchy import read_hierarchy
+from fhash_formats.container.hierarchy import Hierarchy, read_hierarchy
+from fhash_formats.container.mask_array import MaskArray
 from fhash_formats.container.source import CountedSource, FileSource, Source
 from fhash_formats.container.stored import StoredArray, damage_named
 from fhash_formats.container.zip_checked import DOCUMENT, find_signature, read_members
@@ -81,12 +84,7 @@ class Container:
                 validate_header(tree.header)
                 check_arrays(tree.header, tree.arrays)
             self.header, self.header_bytes = tree.header, members[DOCUMENT].size
-            self.arrays = MappingProxyType(
-                {
-                    name: StoredArray(path, name, array, tree.chunks[name], source, self._cache)
-                    for name, array in tree.arrays.items()
-                }
-            )
+            self.arrays = MappingProxyType(self._stored_arrays(tree))
             if "key_frames" in self.arrays:
                 key_frames = self.arrays["key_frames"].read()
                 with damage_named(path):
@@ -106,6 +104,19 @@ class Container:
             UnsupportedFileError: for a newer format.
         """
         return cls(Path(path), FileSource(Path(path)), cache_bytes=cache_bytes)
+
+    def _stored_arrays(self, tree: Hierarchy) -> dict[str, StoredArray]:
+        """The arrays by name; a table knows the array of its masks."""
+        arrays = {}
+        for name, metadata in tree.arrays.items():
+            kind = MaskArray if metadata.coding == MASK else StoredArray
+            arrays[name] = kind(
+                self.path, name, metadata, tree.chunks[name], self._source, self._cache
+            )
+        masks = arrays.get(MASK_ARRAY)
+        if isinstance(masks, MaskArray):
+            masks.attach(arrays[TABLE])
+        return arrays
 
     @property
     def bytes_read(self) -> int:

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.cache import ChunkCache
+from fhash_formats.container.coding import without_crc32c
 from fhash_formats.container.layout import Member
 from fhash_formats.container.sharding import ENTRY_BYTES, Sharding, parse_entry, parse_index
 from fhash_formats.container.source import Source
@@ -69,6 +70,7 @@ class StoredArray:
         chunks: members of the file, in its order, by index of the chunk or, where there are
             shards, of the shard.
         nbytes_stored: bytes of the members' data in the file.
+        masks: the array that holds the masks of the chunks; None where chunks hold their own.
     """
 
     def __init__(
@@ -93,6 +95,7 @@ class StoredArray:
         self.dimension_names = metadata.dimension_names
         self.attributes = metadata.attributes
         self.nbytes_stored = sum(member.size for member in chunks.values())
+        self.masks: StoredArray | None = None
         self._indices: dict[ChunkIndex, npt.NDArray[np.int64]] = {}
         self._entries: dict[tuple[ChunkIndex, int], tuple[int, int]] = {}
         self._lock = threading.Lock()
@@ -164,12 +167,11 @@ class StoredArray:
     def decode_chunk(self, index: tuple[int, ...], lod: int = 0) -> npt.NDArray[Any]:
         """A full chunk, padding included, from the container's cache or else from the file.
 
+        The array is read-only.
+
         Args:
             index: of the chunk in `grid`.
             lod: level of detail. 0 is the full chunk; the coder of the array defines others.
-
-        Returns:
-            A read-only array.
 
         Raises:
             RegionError: for an index outside `grid`.
@@ -200,9 +202,7 @@ class StoredArray:
     @property
     def coding(self) -> str:
         """Name of the first codec, that of inner chunks where there are shards."""
-        sharding = self._metadata.sharding
-        codecs = self._metadata.codecs if sharding is None else sharding.codecs
-        return str(codecs[0]["name"])
+        return self._metadata.coding
 
     def _check_index(self, index: tuple[int, ...]) -> None:
         if len(index) != len(self.grid) or not all(
@@ -291,6 +291,25 @@ class StoredArray:
 
         table: the chunk before its corrections, without its mask.
         """
+        # A level of detail has no mask.
+        masks = self.masks
+        mask = None if masks is None else memoryview(b"") if lod else masks.coded(index)
+        with self._stored_chunk(index) as data:
+            coder = self._metadata.coder
+            if table:
+                return coder.decode_table(data, lod, mask), None
+            if self.masked and not lod:
+                return coder.decode_masked(data, mask)
+            return coder.decode(data, lod, mask), None
+
+    def coded(self, index: ChunkIndex) -> memoryview:
+        """The bytes of a chunk, checked. Raises DamagedFileError that names the member."""
+        with self._stored_chunk(index) as data:
+            return without_crc32c(data)
+
+    @contextmanager
+    def _stored_chunk(self, index: ChunkIndex) -> Iterator[memoryview]:
+        """The bytes of an inner chunk, for a block whose errors name where it lies."""
         sharding = self._metadata.sharding
         if sharding is None:
             member, place = self.chunks[index], ""
@@ -301,14 +320,7 @@ class StoredArray:
             offset, size = self._entry(sharding, shard, number)
             data = memoryview(self._source.read(member.data_offset + offset, size))
         try:
-            coder = self._metadata.coder
-            if table:
-                return coder.decode_table(data, lod), None
-            return (
-                coder.decode_masked(data)
-                if self.masked and not lod
-                else (coder.decode(data, lod), None)
-            )
+            yield data
         except DamagedFileError as error:
             raise type(error)(f"member {member.name}: {place}{error}") from error
 

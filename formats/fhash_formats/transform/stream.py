@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError, UnsupportedFileError
+from fhash_formats.transform.apart import apart_message, without_names
+from fhash_formats.transform.tile.apart import join_mask
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask, decode_tile_table
 from fhash_formats.transform.tile.encoding import encode_tile
 from fhash_formats.transform.tile.sections import Shape
@@ -30,6 +32,8 @@ class TransformCoder:
         settings: settings that all chunks share; None where each stream has its own.
         features: features that a container with these settings requires besides `transform`.
         masked: whether the chunks say which of their values are occupied.
+        apart: arrays that hold the head or the masks. Such a coder does not decode; a container
+            gives its coder these parts.
     """
 
     def __init__(
@@ -57,7 +61,7 @@ class TransformCoder:
             raise DamagedFileError(
                 f"fhash.transform codes arrays of at most 4 axes, not {len(shape)}"
             )
-        configuration = codecs[0].get("configuration", {})
+        configuration, self.apart = without_names(codecs[0].get("configuration", {}))
         try:
             self.settings = (
                 TileSettings.from_dict(configuration) if "transform" in configuration else None
@@ -79,23 +83,37 @@ class TransformCoder:
             )
         return encode_tile(chunk.reshape(self._tile_shape), self.settings).data
 
-    def decode(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+    def decode(self, data: memoryview | bytes, lod: int = 0) -> npt.NDArray[Any]:
         """The full chunk, or with `lod` every 2^lod-th vertex along z, y, x.
 
         Raises DamagedFileError.
         """
+        self._check_complete()
         values = decode_tile(data, self._tile_shape, self._dtype, self.settings, lod)
         return values.reshape(values.shape[4 - len(self._shape) :])
 
-    def decode_table(self, data: memoryview, lod: int = 0) -> npt.NDArray[Any]:
+    def decode_table(self, data: memoryview | bytes, lod: int = 0) -> npt.NDArray[Any]:
         """The table of the full chunk, see `decode_tile_table`; `lod` as in `decode`.
 
         Raises DamagedFileError.
         """
+        self._check_complete()
         values = decode_tile_table(data, self._tile_shape, self._dtype, self.settings, lod)
         return values.reshape(values.shape[4 - len(self._shape) :])
 
-    def decode_masked(self, data: memoryview) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
+    def join(self, data: memoryview, mask: memoryview) -> bytes:
+        """The stream of a chunk whose mask lies in an array of its own; raises DamagedFileError."""
+        return join_mask(data, mask)
+
+    def decode_masked(
+        self, data: memoryview | bytes
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[np.bool_]]:
         """The full chunk, and which of its values are occupied. Raises DamagedFileError."""
+        self._check_complete()
         values, mask = decode_tile_mask(data, self._tile_shape, self._dtype, self.settings)
         return values.reshape(self._shape), mask.reshape(self._shape)
+
+    def _check_complete(self) -> None:
+        """Raise InputError where a head or masks are missing, so that no wrong value comes out."""
+        if self.apart:
+            raise InputError(apart_message(self.apart))

@@ -26,6 +26,7 @@ import numpy as np
 from zarr.abc.codec import ArrayBytesCodec
 
 from fhash_formats.errors import InputError
+from fhash_formats.transform.apart import apart_message, without_names
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.chunk import Quality, decode_chunk, encode_chunk, supported, tile_shape
 from fhash_formats.transform.tile.decoding import decode_tile
@@ -61,6 +62,8 @@ class TransformCodec(ArrayBytesCodec):
             configuration with the key `center`.
         reading: whether the codec only decodes streams with their own settings, as in containers
             whose configuration is empty.
+        apart: a configuration that names arrays of the container for its head or masks. Such a
+            codec shows its array, but raises InputError when values are asked for.
 
     Raises InputError for other combinations.
     """
@@ -73,9 +76,12 @@ class TransformCodec(ArrayBytesCodec):
     transform: TransformSpec | Mapping[str, Any] | None = None
     settings: TileSettings | None = None
     reading: bool = False
+    apart: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
-        if self.settings is None and not self.reading:
+        if self.apart is not None:
+            TileSettings.from_dict(without_names(self.apart)[0])
+        elif self.settings is None and not self.reading:
             Quality(max_error=self.max_error, max_error_rel=self.max_error_rel, step=self.step)
             if isinstance(self.transform, Mapping):
                 object.__setattr__(self, "transform", TransformSpec.from_dict(self.transform))
@@ -94,6 +100,8 @@ class TransformCodec(ArrayBytesCodec):
             raise InputError(
                 f"codec {data.get('name')!r:.40} with {configuration!r:.60} is no {NAME}"
             )
+        if without_names(configuration)[1]:
+            return cls(apart=configuration)
         if "center" in configuration:
             return cls(settings=TileSettings.from_dict(configuration))
         if not configuration:
@@ -108,7 +116,9 @@ class TransformCodec(ArrayBytesCodec):
     def to_dict(self) -> dict[str, JSON]:
         """The inverse of `from_dict`."""
         configuration: dict[str, Any]
-        if self.settings is not None:
+        if self.apart is not None:
+            configuration = dict(self.apart)
+        elif self.settings is not None:
             configuration = self.settings.to_dict()
         elif self.reading:
             configuration = {}
@@ -144,6 +154,7 @@ class TransformCodec(ArrayBytesCodec):
         raise NotImplementedError
 
     def _encode_sync(self, chunk_array: NDBuffer, chunk_spec: ArraySpec) -> Buffer | None:
+        self._check_complete()
         if self.reading:
             raise InputError(
                 f"{NAME} without a configuration only decodes: "
@@ -166,6 +177,7 @@ class TransformCodec(ArrayBytesCodec):
         return chunk_spec.prototype.buffer.from_bytes(data)
 
     def _decode_sync(self, chunk_data: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
+        self._check_complete()
         data, shape = chunk_data.to_bytes(), chunk_spec.shape
         dtype = chunk_spec.dtype.to_native_dtype()
         if self.settings is None:
@@ -177,6 +189,11 @@ class TransformCodec(ArrayBytesCodec):
                 .astype(dtype, copy=False)
             )
         return chunk_spec.prototype.nd_buffer.from_numpy_array(values)
+
+    def _check_complete(self) -> None:
+        """Raise InputError where head or masks lie elsewhere: no wrong value may come out."""
+        if self.apart is not None:
+            raise InputError(apart_message(without_names(self.apart)[1]))
 
     async def _encode_single(self, chunk_data: NDBuffer, chunk_spec: ArraySpec) -> Buffer | None:
         return await asyncio.to_thread(self._encode_sync, chunk_data, chunk_spec)

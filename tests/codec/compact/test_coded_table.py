@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from fhash_codec import EncodeConfig
-from fhash_codec.compact.coded_table import model_header, required_features
+from fhash_codec.compact.coded_table import model_header
 from fhash_codec.compact.tiles_to_promise import code_series
 from fhash_codec.coreset.selection import select_features
 from fhash_codec.progress import silent
@@ -29,4 +29,4 @@ def test_the_header_describes_the_table(field: Field, timings: bool) -> None:
     assert header["head"] is None
     assert header["parameters"] == table.outcome.nonzero > 0
     assert all(("seconds" in gain) == timings for gain in header["gains"])
-    assert required_features(table) == ["transform", "mask"]
+    assert table.parts.features == ["transform", "apart", "mask"]

@@ -200,6 +200,7 @@ class Table:
 
     shape, chunk_shape = (2, 2, 3, 4), (1, 2, 3, 4)
     dtype = np.dtype(np.float32)
+    masked = False
 
     def __init__(self) -> None:
         self.values = np.arange(48, dtype=np.float32).reshape(self.shape)

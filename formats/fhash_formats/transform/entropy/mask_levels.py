@@ -102,13 +102,14 @@ class MaskLevels:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values, without those that have their default."""
-        named = {
-            "edges": list(self.edges),
-            "scores": list(self.scores),
-            "others": list(self.others),
-            "reach": self.reach,
-        }
-        return {name: value for name, value in named.items() if value and value != [0]}
+        named: dict[str, Any] = {"edges": list(self.edges)} if self.edges else {}
+        if self.scores != (0,):
+            named["scores"] = list(self.scores)
+        if self.others:
+            named["others"] = list(self.others)
+        if self.reach:
+            named["reach"] = self.reach
+        return named
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> MaskLevels:

@@ -48,6 +48,7 @@ __all__ = [
     "MANY",
     "MASKED",
     "MISSING",
+    "NUMBER",
     "OWN",
     "PREDICTED",
     "PREDICTED_MASKED",
@@ -101,7 +102,7 @@ LABELS_MASKED = 6 << 5
 MANY = 16
 """Flag of a stream of labels that has more than 256 of them."""
 
-_NUMBER = 0xE0
+NUMBER = 0xE0
 """Bits of the flags that hold the format number."""
 _MAX_SETTINGS = 1 << 22
 """Most bytes of a tile's own settings, inflated."""
@@ -204,14 +205,14 @@ def parse_stream(data: bytes | memoryview) -> TileStream:
     if not len(data):
         raise DamagedFileError("a coded tile is empty")
     flags = data[0]
-    number = flags & _NUMBER
+    number = flags & NUMBER
     labelled = number in (LABELS, LABELS_MASKED)
     if not labelled and number not in (FORMAT, MASKED, PREDICTED, PREDICTED_MASKED):
         raise DamagedFileError(
             f"a coded tile begins with {flags:#04x}, which is no known stream format"
         )
     masked = number in (MASKED, PREDICTED_MASKED, LABELS_MASKED)
-    if labelled and flags & ~_NUMBER & ~(OWN | MANY):
+    if labelled and flags & ~NUMBER & ~(OWN | MANY):
         raise DamagedFileError("a coded tile is of labels and something else as well")
     predicted = number in (PREDICTED, PREDICTED_MASKED)
     coded = not flags & (EXACT | EMPTY) and not labelled

@@ -56,6 +56,7 @@ def test_settings_that_are_not_allowed(change: Any) -> None:
 def test_settings_are_what_their_values_say() -> None:
     for levels in (
         MaskLevels(),
+        MaskLevels(edges=(0.0,), scores=(0, 7)),  # an edge of 0 is no default
         MaskLevels(edges=(-1.0, 2.5), scores=(0, 7, 9), others=(9, 7, 0), reach=3),
     ):
         assert MaskLevels.from_dict(levels.to_dict()) == levels

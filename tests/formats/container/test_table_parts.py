@@ -1,0 +1,74 @@
+"""Tables in parts: the numbers are those of a table that has its head and masks itself."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from table_files import HEAD, SHAPE, table_parts, write_table
+
+from fhash_formats.container import Container
+
+
+@pytest.mark.parametrize(("head", "mask"), list(product([True, False], repeat=2)))
+def test_parts_give_the_numbers_of_the_whole(tmp_path, samples, head, mask) -> None:
+    parts = table_parts(head=head, mask=mask)
+    header = samples.compact_header()
+    paths = [
+        write_table(tmp_path / f"{apart}.fhz", header, parts, apart=apart)
+        for apart in (True, False)
+    ]
+    with Container.open(paths[0]) as container, Container.open(paths[1]) as whole:
+        names = ["mlp/parameters"] * head + ["occupancy/mask"] * mask
+        assert sorted({*container.arrays} - {*whole.arrays}) == names
+        assert ("apart" in container.header["required_features"]) == (head or mask)
+        table, other = container.arrays["tables/level_1"], whole.arrays["tables/level_1"]
+        assert table.masked == other.masked == mask
+        region = tuple(slice(1, n) for n in SHAPE)
+        for there in (None, region):
+            np.testing.assert_array_equal(table.read(there), other.read(there))
+            np.testing.assert_array_equal(table.read_mask(there), other.read_mask(there))
+        for index, lod in product(np.ndindex(table.grid), (0, 1, 2)):
+            np.testing.assert_array_equal(
+                table.decode_chunk(index, lod), other.decode_chunk(index, lod)
+            )
+            np.testing.assert_array_equal(
+                table.decode_table(index, lod), other.decode_table(index, lod)
+            )
+        assert container.verify() == 1 + head + mask
+        if mask:
+            assert not table.read_mask().all()
+            assert container.arrays["occupancy/mask"].grid == table.grid
+
+
+def test_the_parameters_are_those_of_the_head(tmp_path, samples) -> None:
+    path = write_table(tmp_path / "a.fhz", samples.compact_header(), table_parts(), apart=True)
+    with Container.open(path) as container:
+        parameters = container.arrays["mlp/parameters"].read()
+    expected = np.concatenate(
+        [
+            part.ravel() * scale
+            for layer in HEAD.layers
+            for part, scale in (
+                (layer.weights, layer.weight_scale),
+                (layer.biases, layer.bias_scale),
+            )
+        ]
+    )
+    np.testing.assert_array_equal(parameters, expected.astype(np.float32))
+
+
+def test_masks_that_say_nothing_take_no_array(tmp_path, samples) -> None:
+    parts = table_parts(head=False)
+    full = [parts.streams[1]] * 2
+    whole = type(parts)(**{**vars_of(parts), "streams": full})
+    assert whole.features == ["transform", "mask"]
+    path = write_table(tmp_path / "a.fhz", samples.compact_header(), whole, apart=True)
+    with Container.open(path) as container:
+        assert list(container.arrays) == ["tables/level_1"]
+        assert container.arrays["tables/level_1"].read_mask().all()
+
+
+def vars_of(parts):
+    return {name: getattr(parts, name) for name in ("shape", "dtype", "tile", "settings")}
