@@ -86,20 +86,22 @@ GAIN_FACTOR = 1.2
 """Gain of the full training as a multiple of the gain of the trial, roughly."""
 GAIN_BESIDES = 0.02
 """Gain in dB of the full training besides that multiple."""
-WEIGHT_BYTES = 0.9
+WEIGHT_BYTES = 0.7
 """Bytes that each weight of a head adds to the file."""
-HEAD_BYTES = 240
-"""Bytes that a head adds to the file besides its weights (its training history included)."""
+ARRAY_BYTES = 540
+"""Bytes in the file that describe the array of a head: two documents and three places of a ZIP."""
 HISTORY_BYTES = 200
 """Bytes of the training history in the file."""
+HEAD_BYTES = ARRAY_BYTES + HISTORY_BYTES + 40
+"""Bytes that a head adds to the file besides its weights."""
 WEIGHT_TIME = 5e-6
 """Share of the file that each weight must save to pay for the decoding time it costs."""
 TRAINING_VERTICES = 48 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
-MIN_BYTES = 2000
+MIN_BYTES = 3200
 """Bytes of coded tiles below which a head cannot save what it takes.
 
-The smallest head takes some 800 bytes with its history, and none saves 40 % of the tiles.
+The smallest head takes some 1,300 bytes with array and history, and none saves 40 % of the tiles.
 """
 
 
@@ -214,11 +216,12 @@ def _cheapest(
     best, lowest_cost, history = (settings, outcome), 0.0, HeadHistory()
     for candidate in candidates:
         psnr = candidate.outcome.psnr(data_range)
-        # Bytes more than without a head; the file has a head as text of 4/3 of its bytes.
+        # Bytes more than without a head.
         cost = (
             candidate.outcome.size
             - outcome.size
-            + len(candidate.trained.head.to_bytes()) * 4 / 3
+            + len(candidate.trained.head.to_bytes())
+            + ARRAY_BYTES
             + HISTORY_BYTES
         )
         if not strict:
