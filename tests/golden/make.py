@@ -205,7 +205,7 @@ def encode_with_head(name: str, path: Path, config: EncodeConfig) -> None:
 
     with (
         mock.patch.object(compact, "code_series", coded),
-        mock.patch.object(encoding, "missed_promise", lambda *_: None),
+        mock.patch.object(encoding, "missed_promise", return_value=None),
     ):
         fhash_codec.encode(series(), path, config)
 
