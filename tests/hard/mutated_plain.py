@@ -143,7 +143,7 @@ def _giant_plain(chance: random.Random, parts: Parts) -> Parts:
     if not _is_plain(parts):
         raise NothingFitsError
     root, header = _root(parts)
-    vertices = 1 << chance.choice((18, 20, 22, 24))
+    vertices = 1 << chance.choice((16, 18, 20, 22, 24))
     shape = [1, 1, 1, 1]
     while prod(shape) < vertices:
         shape[chance.randrange(4)] *= 2
@@ -154,9 +154,10 @@ def _giant_plain(chance: random.Random, parts: Parts) -> Parts:
     header["model"].update(
         levels=[shape],
         tables=chance.choice(("float64" if wide else "float32", "float32")),
-        tile=chance.choice((shape, [64] * 4, [2**20] * 4, [1, 1, 1, 1])),
+        tile=chance.choice((shape, [64] * 4, [2**20] * 4, [1] * 4)),
     )
-    if chance.random() < 0.5:
+    # A head is applied tile by tile, which takes some 50 us for the smallest tile.
+    if chance.random() < 0.5 or (header["model"]["tile"] == [1] * 4 and vertices > 1 << 16):
         header["model"]["head"] = None
     header.pop("missing", None)
     bits = -(-prod(1 << (n - 1).bit_length() for n in shape[1:]) // 8)
