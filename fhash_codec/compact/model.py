@@ -68,7 +68,7 @@ class CompactModel:
         space = tuple(slice(low, high) for low, high in region)
         if "occupancy/mask" in self._arrays and not self._table.masked:
             mask = self._arrays["occupancy/mask"].read((slice(first, last + 1), *space))
-            return np.asarray((mask[0] & mask[-1]) != 0)
+            return np.asarray((mask[0] != 0) & (mask[-1] != 0))
         if self._table.masked or "occupancy/bits" not in self._arrays:
             mask = self._table.read_mask((slice(first, last + 1), *space))
             return np.asarray(mask[0] & mask[-1])

@@ -6,13 +6,19 @@ decode it to the values beside it. Tests only read goldens.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import numpy as np
 
 import fhash_codec
-from fhash_codec import EncodeConfig
+from fhash_codec import EncodeConfig, encoding
+from fhash_codec.compact import encode as compact
+from fhash_codec.compact.coded_table import CodedTable
 from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.transform.head.head import Layer, NeighbourHead
 
 HERE = Path(__file__).parent
 TOLERANCE = 1e-5
@@ -53,6 +59,17 @@ GOLDENS = {
     "compact-1.2-classes": EncodeConfig(max_error=0.0, effort=2, timings=False),
     "compact-1.2-counts": EncodeConfig(max_error=4.0, effort=2, timings=False),
     "compact-1.3-one-tile": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="whole"),
+    "compact-1.3-head": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="3x6x4x9"),
+    "compact-1.3-cross": EncodeConfig(
+        max_error=0.02, effort=2, timings=False, tile="5x6x4x9", features=("interval:0.5:2",)
+    ),
+    "compact-1.3-many-labels": EncodeConfig(
+        max_error=0.0, effort=2, timings=False, features=("interval:700:9000",), dilation=0
+    ),
+    "compact-1.4-head": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="3x6x4x9"),
+    "compact-1.4-cross": EncodeConfig(
+        max_error=0.02, effort=2, timings=False, tile="5x6x4x9", features=("interval:0.5:2",)
+    ),
     "paper-1.1-transform": EncodeConfig(
         profile="paper",
         hidden_layers=1,
@@ -62,7 +79,36 @@ GOLDENS = {
         tables="transform",
         psnr=60.0,
     ),
+    "paper-1.3-coded-occupancy": EncodeConfig(
+        profile="paper",
+        hidden_layers=1,
+        width=32,
+        embedding_size=4,
+        timings=False,
+        features=("interval:1:2",),
+        tables="transform",
+        key_frames="0,2,4",
+    ),
+    "paper-1.3-features": EncodeConfig(
+        profile="paper",
+        hidden_layers=1,
+        width=4,
+        timings=False,
+        features=("interval:1:2", "isosurface:0.5", "interval:-3:-0.5"),
+        dilation=0,
+        tables="uint8",
+        key_frames="0,2,4",
+    ),
 }
+
+PLAIN = {
+    "compact-1.3-plain-bound": "compact-1.1-bound",
+    "compact-1.3-plain-cross": "compact-1.3-cross",
+    "compact-1.3-plain-head": "compact-1.3-head",
+    "compact-1.3-plain-labels": "compact-1.2-labels",
+    "paper-1.3-plain-coded": "paper-1.3-coded-occupancy",
+}
+"""Goldens that are the plain export of another one."""
 
 TIME = Coordinate(
     name="time",
@@ -124,21 +170,76 @@ def counts() -> ArraySeries:
     return series
 
 
+def grains() -> ArraySeries:
+    """Columns of 600 numbers in a random order, some of which move: more labels than a byte has."""
+    chance = np.random.default_rng(1)
+    numbers = chance.permutation(600).reshape(20, 30).repeat(2, 0).repeat(2, 1) * 15
+    values = np.broadcast_to(numbers, (5, 3, 40, 60)).astype(np.float32)
+    values[1:, :, 10:20, 10:30] = values[1:, :, 11:21, 10:30]
+    values[2, 1, 4:9, 5:9] = np.nan
+    series = ArraySeries(values, name="density", units="kg m-3", coords={"t": TIME})
+    series.source_dtype, series.fill = np.dtype(np.int16), -1
+    return series
+
+
+def head(name: str) -> NeighbourHead:
+    """A head of random weights that hardly changes a value: one layer, or two with a cross."""
+    chance = np.random.default_rng(3)
+    shapes = [(4, 28), (1, 4)] if name.endswith("-head") else [(4, 28), (3, 36), (1, 3)]
+    layers = tuple(
+        Layer(
+            weights=chance.integers(-20, 21, shape).astype(np.int8),
+            biases=chance.integers(-99, 100, shape[0]).astype(np.int8),
+            weight_scale=0.0123291015625,
+            bias_scale=0.0078125,
+        )
+        for shape in shapes
+    )
+    return NeighbourHead(layers=layers, sigma=0.015625, low=-1.0, high=2.0, cross=len(shapes) == 3)
+
+
+def encode_with_head(name: str, path: Path, config: EncodeConfig) -> None:
+    """Encode `series` with a head that was not trained, as no head pays in so small a file."""
+    code = compact.code_series
+
+    def coded(*arguments: Any, **options: Any) -> CodedTable:
+        table = code(*arguments, **options)
+        settings = replace(table.plan.settings, head=head(name))
+        return replace(table, plan=replace(table.plan, settings=settings))
+
+    with (
+        mock.patch.object(compact, "code_series", coded),
+        mock.patch.object(encoding, "missed_promise", return_value=None),
+    ):
+        fhash_codec.encode(series(), path, config)
+
+
 SERIES = {
     "compact-1.1-predictor": fronts,
     "compact-1.2-classes": classes,
     "compact-1.2-counts": counts,
     "compact-1.2-labels": basins,
+    "compact-1.3-many-labels": grains,
 }
 """Sources of the goldens that are not made from `series`."""
 
 
+def make(name: str, path: Path) -> None:
+    """Write a golden; those of PLAIN are made last, since each is made of another one."""
+    if name in PLAIN:
+        fhash_codec.export_plain(HERE / f"{PLAIN[name]}.fhz", path)
+    elif name.endswith(("-head", "-cross")):
+        encode_with_head(name, path, GOLDENS[name])
+    else:
+        fhash_codec.encode(SERIES.get(name, series)(), path, GOLDENS[name])
+
+
 def main() -> None:
-    for name, config in GOLDENS.items():
+    for name in (*GOLDENS, *PLAIN):
         path = HERE / f"{name}.fhz"
         if path.exists():  # goldens are never replaced
             continue
-        fhash_codec.encode(SERIES.get(name, series)(), path, config)
+        make(name, path)
         with fhash_codec.open(path) as volume:
             between = np.stack([volume.read(t) for t in (0.5, 3.75)])
             np.savez_compressed(

@@ -21,13 +21,23 @@ COMPACT = [
     "compact-1.2-clip",
     "compact-1.2-counts",
     "compact-1.2-labels",
+    "compact-1.3-cross",
+    "compact-1.3-head",
+    "compact-1.3-many-labels",
     "compact-1.3-one-tile",
+    "compact-1.3-plain-bound",
+    "compact-1.3-plain-cross",
+    "compact-1.3-plain-head",
+    "compact-1.3-plain-labels",
 ]
 NAMES = [
     "paper-1.0-plain",
     "paper-1.0-feature",
     "paper-1.0-linear-uint8",
     "paper-1.1-transform",
+    "paper-1.3-coded-occupancy",
+    "paper-1.3-features",
+    "paper-1.3-plain-coded",
     *COMPACT,
 ]
 

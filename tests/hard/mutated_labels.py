@@ -28,12 +28,12 @@ from mutated_payload import (
 )
 
 from fhash_formats.container.array import DTYPES
-from fhash_formats.transform.entropy.labels import MAX_LABELS
+from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
 from fhash_formats.transform.tile.sections import (
-    EMPTY,
     EXACT,
     LABELS,
     LABELS_MASKED,
+    MANY,
     MISSING,
     OWN,
     RESIDUAL,
@@ -91,19 +91,29 @@ def _labels_changed(
     size = int.from_bytes(body[4:8], "little")
     packed: bytes = body[8 : 8 + size]
     coded = body[8 + size :]
-    bits = np.frombuffer(zlib.decompress(packed), f"<u{dtype.itemsize}")
+    plain = zlib.decompress(packed)
+    bits = _unpacked(plain, dtype) if flags & MANY else np.frombuffer(plain, f"<u{dtype.itemsize}")
     turn = chance.randrange(10)
     if turn == 0:  # other values
-        packed = zlib.compress(_palette(chance, bits, dtype).tobytes())
+        packed = _packed(_palette(chance, bits, dtype), flags)
     elif turn == 1:  # another number of values
-        counts = (0, 1, 2, len(bits) - 1, len(bits) + 1, MAX_LABELS - 1, MAX_LABELS, 257, 70_000)
-        most = 1 << min(8 * dtype.itemsize, 20)
-        packed = zlib.compress(
-            np.arange(min(chance.choice(counts), most), dtype=bits.dtype).tobytes()
+        counts = (
+            0,
+            1,
+            2,
+            len(bits) - 1,
+            len(bits) + 1,
+            MAX_NARROW,
+            MAX_LABELS - 1,
+            MAX_LABELS,
+            257,
+            70_000,
         )
+        most = 1 << min(8 * dtype.itemsize, 20)
+        packed = _packed(np.arange(min(chance.choice(counts), most), dtype=bits.dtype), flags)
     elif turn == 2:  # values that do not ascend
         order = chance.choice((bits[::-1], np.repeat(bits, 2), np.roll(bits, 1), bits[:1] * 0))
-        packed = zlib.compress(order.tobytes())
+        packed = _packed(order, flags)
     elif turn == 3:  # bytes that are no palette
         packed = chance.choice(
             (
@@ -118,7 +128,7 @@ def _labels_changed(
         masked = not masked
         flags ^= LABELS ^ LABELS_MASKED
     elif turn == 7:
-        flags ^= chance.choice((OWN, MISSING, RESIDUAL, EXACT, EMPTY, 0xE0, 0x60))
+        flags ^= chance.choice((OWN, MISSING, RESIDUAL, EXACT, MANY, MANY, 0xE0, 0x60))
     body = labelled_body(packed, coded, dtype, shape, masked=masked)
     if turn == 8:  # another digest, or another length of the palette
         at = chance.choice((0, 4))
@@ -130,6 +140,21 @@ def _labels_changed(
             ([], [b""], sections * 2, [*sections, b""], [body[:7]], [body[:8]], [b"", *sections])
         )
     return bytes([flags]) + b"".join(map(section, sections))
+
+
+def _unpacked(plain: bytes, dtype: np.dtype[Any]) -> Any:
+    """Return the palette of many labels, whose differences stand in planes of bytes."""
+    planes = np.frombuffer(plain, np.uint8).reshape(dtype.itemsize, -1)
+    steps = np.ascontiguousarray(planes.T).view(f"<u{dtype.itemsize}").reshape(-1)
+    return np.cumsum(steps, dtype=steps.dtype)
+
+
+def _packed(palette: Any, flags: int) -> bytes:
+    """Return a deflated palette, in the form that the flags of its stream say."""
+    if not flags & MANY:
+        return zlib.compress(palette.tobytes())
+    steps = np.diff(palette, prepend=palette.dtype.type(0))
+    return zlib.compress(steps.view(np.uint8).reshape(palette.size, -1).T.tobytes())
 
 
 def _palette(chance: random.Random, bits: Any, dtype: np.dtype[Any]) -> Any:

@@ -34,7 +34,7 @@ from mutated_payload import (
 )
 
 from fhash_formats.container.array import DTYPES
-from fhash_formats.container.header import KNOWN_FEATURES
+from fhash_formats.container.header import KNOWN_FEATURES, PLAIN_FEATURE
 from fhash_formats.container.sharding import Sharding
 from fhash_formats.transform.axes.basis import Basis
 from fhash_formats.transform.entropy.coder import encode_block
@@ -51,6 +51,9 @@ from fhash_formats.transform.tile.sections import (
     OWN,
     PREDICTED,
 )
+
+CODED_FEATURES = sorted(KNOWN_FEATURES - {PLAIN_FEATURE})
+"""Features of files with coded tiles: all but that of plain files, whose headers differ."""
 
 
 def _flags(chance: random.Random, parts: Parts) -> Parts:
@@ -92,7 +95,7 @@ def _settings(chance: random.Random, parts: Parts) -> Parts:
         tile_of(document),
     )
     root = json.loads(dict(parts)[DOCUMENT])
-    root["attributes"]["fhash"]["required_features"] = sorted(KNOWN_FEATURES)
+    root["attributes"]["fhash"]["required_features"] = CODED_FEATURES
     return replaced(parts, {f"{name}/{DOCUMENT}": dumped(document), DOCUMENT: dumped(root)})
 
 
@@ -140,7 +143,7 @@ def _settings_changed(
     elif turn == 7:
         settings["predictor"] = _predictor(chance)
     elif turn == 8:
-        for name in ("clip", "labels"):
+        for name in ("clip", "labels", "many_labels"):
             settings[name] = chance.choice((True, True, False, 1, None))
     else:
         holder, key = chance.choice(list(places(settings)))
@@ -219,24 +222,25 @@ def _giant(chance: random.Random, parts: Parts) -> Parts:
     document = documents_of(parts).get("tables/level_1", {})
     root = json.loads(dict(parts)[DOCUMENT])
     header = root["attributes"]["fhash"]
-    if header["model"]["profile"] != "compact":
+    if header["model"]["profile"] != "compact" or not is_coded(document):
         return values_changed(chance, parts)
     kind = chance.choice(list(DTYPES))
     shape, chunk, shard = _giant_shapes(chance, header, kind)
-    configuration = document["codecs"][0]["configuration"]
-    document.update(shape=shape, data_type=kind, fill_value=0)
-    document["chunk_grid"]["configuration"]["chunk_shape"] = shard
-    configuration["chunk_shape"] = chunk
+    settings = configuration_of(document)
     plain = dict.fromkeys("tzyx", "none")
     if chance.random() < 0.7:
-        configuration["codecs"][0]["configuration"] = {
-            "transform": plain,
-            "step": 1.0,
-            "center": 0.5,
-            "range": [0.0, 1.0],
-        }
+        settings = {"transform": plain, "step": 1.0, "center": 0.5, "range": [0.0, 1.0]}
     elif chance.random() < 0.5:
-        configuration["codecs"][0]["configuration"]["transform"] = plain
+        settings["transform"] = plain
+    document.update(shape=shape, data_type=kind, fill_value=0)
+    document["chunk_grid"]["configuration"]["chunk_shape"] = shard
+    checked = {"name": "crc32c"}
+    inner = [{"name": "fhash.transform", "configuration": settings}, checked]
+    index = [{"name": "bytes", "configuration": {"endian": "little"}}, checked]
+    sharded = {"chunk_shape": chunk, "codecs": inner, "index_codecs": index}
+    document["codecs"] = [
+        {"name": "sharding_indexed", "configuration": {**sharded, "index_location": "end"}}
+    ]
     sharding = Sharding(shard_shape=tuple(shard), chunk_shape=tuple(chunk), codecs=())
     stream = _empty_stream(chance, prod(chunk), np.dtype(kind).itemsize)
     present = sharding.present((0, 0, 0, 0), shape)
@@ -273,7 +277,7 @@ def _giant_shapes(
     header["model"]["levels"] = [shape]
     header["model"]["tables"] = kind
     header["coordinates"] = {name: {} for name in ("time", "z", "y", "x")}
-    header["required_features"] = sorted(KNOWN_FEATURES)
+    header["required_features"] = CODED_FEATURES
     return shape, chunk, [n * count for n, count in zip(chunk, counts, strict=True)]
 
 

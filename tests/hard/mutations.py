@@ -18,12 +18,20 @@ from typing import Any
 import mutated_json
 import mutated_labels
 import mutated_payload
+import mutated_plain
 import mutated_settings
 import mutated_zip
 from containers import Parts, pack, unpack
 
 GOLDENS = Path(__file__).parents[1] / "golden"
-NEWEST = tuple(f"compact-1.2-{name}" for name in ("clip", "labels", "counts", "classes"))
+NEWEST = (
+    "compact-1.2-clip",
+    "compact-1.2-labels",
+    "compact-1.2-counts",
+    "compact-1.2-classes",
+    "compact-1.3-cross",
+    "compact-1.3-many-labels",
+)
 """Goldens that take turns most evenly, with clipped values and with labels in turns: every kind
 soon meets both."""
 
@@ -62,13 +70,14 @@ def goldens() -> dict[str, tuple[bytes, Parts]]:
 def mutation(number: int) -> Mutation:
     """Return the mutation of a number from 0 on; kinds and goldens take turns.
 
-    A golden without what a kind changes is passed over for the next one.
+    A golden without what a kind changes is passed over for any other one.
     """
     names, kinds = list(goldens()), list(KINDS)
     turn, place = divmod(number, len(kinds))
-    for passed_over in range(len(names)):
+    first = names.pop((turn + place) % len(names))
+    for name in (first, *random.Random(number).sample(names, len(names))):
         try:
-            return _mutation(number, names[(turn + place + passed_over) % len(names)], kinds[place])
+            return _mutation(number, name, kinds[place])
         except mutated_payload.NothingFitsError:
             continue
     raise AssertionError(f"no golden has what {kinds[place]} changes")
@@ -153,15 +162,14 @@ def _packed(
     return lambda chance, parts: pack(change(chance, parts))
 
 
+_MODULES = (mutated_json, mutated_payload, mutated_settings, mutated_labels, mutated_plain)
 SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
     **mutated_zip.KINDS,
-    **{
-        name: _packed(change)
-        for module in (mutated_json, mutated_payload, mutated_settings, mutated_labels)
-        for name, change in module.KINDS.items()
-    },
+    **{name: _packed(change) for module in _MODULES for name, change in module.KINDS.items()},
 }
 KINDS = (*DAMAGES, *SEALED)
+PLAIN_KINDS = frozenset(mutated_plain.KINDS)
+"""Kinds that change plain files, or arrays of occupancy, only."""
 
 
 def header_of(parts: Parts) -> Any:

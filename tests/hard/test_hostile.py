@@ -18,7 +18,7 @@ import mutations
 import pytest
 from reporting import LONG, record
 
-QUICK = 280
+QUICK = 294
 """Mutations of the quick set: each kind of seven goldens."""
 MANY = 12_000
 """Mutations of the long set; kinds and goldens take turns."""
@@ -50,10 +50,19 @@ def test_every_kind_meets_labels_and_clipped_values(report: hostile.Report) -> N
     """Kinds pass over goldens without what they change, so some could meet none of the newest."""
     clipped, labelled = set(mutations.NEWEST[::2]), set(mutations.NEWEST[1::2])
     # These kinds change ordinary arrays, clipped values or labels only.
-    for kind in set(mutations.KINDS) - {"values", "clip"}:
+    kinds = set(mutations.KINDS) - mutations.PLAIN_KINDS
+    for kind in kinds - {"values", "clip"}:
         assert report.met[kind] & labelled, kind
-    for kind in set(mutations.KINDS) - {"values", "labels"}:
+    for kind in kinds - {"values", "labels"}:
         assert report.met[kind] & clipped, kind
+    assert "compact-1.3-many-labels" in report.met["labels"]
+
+
+def test_kinds_of_plain_files_take_turns_among_them(report: hostile.Report) -> None:
+    for kind in mutations.PLAIN_KINDS - {"occupancy"}:
+        assert len(report.met[kind]) >= 2, kind
+        assert all("-plain-" in golden for golden in report.met[kind])
+    assert len(report.met["occupancy"]) >= 3
 
 
 def test_damage_is_refused_and_much_of_what_is_sealed_reaches_the_decoders(
@@ -69,7 +78,7 @@ def test_damage_is_refused_and_much_of_what_is_sealed_reaches_the_decoders(
         decoded[kind] > 0
         for kind in (
             *("stream", "settings", "values", "coordinates", "header", "giant", "shuffled"),
-            *("labels", "clip", "integers"),
+            *("labels", "clip", "integers", *sorted(mutations.PLAIN_KINDS)),
         )
     )
     # A sealed mutation gets past the checksums and is refused for its contents only.

@@ -42,6 +42,7 @@ class MarchInput:
         floor: gradient at which shading has faded by half.
         smoothing: deviation of the Gaussian by which values are smoothed before shading, in
             vertices; 0 for none.
+        error: largest error of a value, scaled likewise; smoothed values stay within it.
         light_offset, light_scale: a place is at place * scale + offset (3,) in the light grid.
     """
 
@@ -61,6 +62,7 @@ class MarchInput:
     steepness: float
     floor: float
     smoothing: float
+    error: float
     light_offset: Floats
     light_scale: float
 
@@ -100,6 +102,7 @@ class MarchInput:
             steepness=span * scaling.unit / (stride * grid.vertex_spacing),
             floor=floor,
             smoothing=smoothing(span, scaling.width(task.noise)),
+            error=scaling.width(task.error),
             light_offset=np.zeros(3) if light is None else (first - light.first) / light.cell,
             light_scale=1.0 if light is None else stride / light.cell,
         )

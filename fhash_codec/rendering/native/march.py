@@ -254,8 +254,8 @@ def _smooth(given: MarchInput, task: Task, bricks: Bricks) -> Single | None:
     if not given.smoothing or not (task.shaded or task.surfaces):
         return None
     if given.values is not bricks.values:  # scaled for this task alone
-        return smoothed(given.values, given.smoothing)
-    return bricks.smoothed(given.smoothing)
+        return smoothed(given.values, given.smoothing, given.error)
+    return bricks.smoothed(given.smoothing, given.error)
 
 
 def _grading_fields(given: MarchInput, task: Task) -> dict[str, object]:

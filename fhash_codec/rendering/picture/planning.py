@@ -77,9 +77,12 @@ def plan_picture(
     shadows, occlusion = secondary_light(scene, grid)
     lamp = lamp_of(rays, scene.effects.shading, shadows)
     units = Units.of(volume)
-    noise = coding_noise(volume) * units.factor * grid.vertex_spacing / grid.series_spacing
+    error = coding_noise(volume) / 2 * units.factor
+    noise = 2 * error * grid.vertex_spacing / grid.series_spacing
     task = _task(scene, rays, function, units, lamp, lod, noise)
-    task = replace(task, grading=grading_of(scene.transfer_function, volume, units, grid))
+    task = replace(
+        task, error=error, grading=grading_of(scene.transfer_function, volume, units, grid)
+    )
     _check_ray_length(task)
     mode = _mode(scene.march)
     margin = _margin(task, lod)

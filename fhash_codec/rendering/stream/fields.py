@@ -127,9 +127,9 @@ class FrameField:
             self._values = arrays.array(bricks.values)
         self._flat = self._values.reshape(-1)
 
-    def smoothed(self, deviation: float) -> FrameField:
+    def smoothed(self, deviation: float, error: float) -> FrameField:
         """The field of values that a Gaussian has smoothed, as `smoothing.smoothed` has them."""
-        bricks = replace(self.bricks, values=self.bricks.smoothed(deviation))
+        bricks = replace(self.bricks, values=self.bricks.smoothed(deviation, error))
         return FrameField(self._frame, self._grid, bricks, self.arrays)
 
     def visible(self, palette: Palette) -> Array:

@@ -52,7 +52,7 @@ class Phong:
             lamp=None if lighting.lamp is None else arrays.array(lighting.lamp, "float64"),
             scale=arrays.array(field.stride * slope_scale(task.rays.grid, span, least, most)),
             floor=floor,
-            field=field.smoothed(deviation)
+            field=field.smoothed(deviation, task.error)
             if deviation and isinstance(field, FrameField)
             else field,
             central=lighting.central or deviation > 0,

@@ -92,10 +92,13 @@ class Bricks:
                 kept.popitem(last=False)
         return cast(Result, kept[key])
 
-    def smoothed(self, deviation: float) -> Single:
+    def smoothed(self, deviation: float, error: float) -> Single:
         """The values smoothed by a Gaussian, as `smoothing.smoothed` has them, kept."""
         return self.remembered(
-            "smoothed", deviation, lambda: smoothed(self.values, deviation), most=1
+            "smoothed",
+            (deviation, error),
+            lambda: smoothed(self.values, deviation, error),
+            most=1,
         )
 
     def matters(self, task: Task) -> Mask:

@@ -3,6 +3,10 @@
 The errors of a bounded file have no direction, and neighbouring vertices may be wrong in opposite
 directions. In the gradient of values that a Gaussian has smoothed, errors largely cancel, and what
 the values do over several vertices is left.
+
+Where the values themselves change from vertex to vertex, a Gaussian would blur what is there. The
+errors have a bound, so a smoothed value that is further from the decoded one than this bound is
+wrong for sure: it is clipped to the bound.
 """
 
 from __future__ import annotations
@@ -24,8 +28,8 @@ REACH = 3.0
 """Standard deviations after which the Gaussian ends."""
 
 
-def smoothed(values: Single, deviation: float) -> Single:
-    """Values smoothed by a Gaussian along each axis.
+def smoothed(values: Single, deviation: float, error: float = math.inf) -> Single:
+    """Values smoothed by a Gaussian along each axis, and no further from their own than an error.
 
     The pair of values on both sides of a vertex counts only where both are there; else twice the
     value of the vertex takes its place. So values that are linear stay as they are, up to the
@@ -34,7 +38,23 @@ def smoothed(values: Single, deviation: float) -> Single:
     Args:
         values: float32 (z, y, x), contiguous, NaN where there is none.
         deviation: standard deviation of the Gaussian, in vertices, above 0.
+        error: largest difference of a smoothed value from its own, in the units of the values.
     """
+    out = _blurred(values, deviation)
+    if error < math.inf:
+        list(in_threads(lambda z: _clip(out[z], values[z], np.float32(error)), range(len(out))))
+    return out
+
+
+def _clip(blurred: Single, values: Single, error: np.float32) -> None:
+    """Clip a layer of smoothed values, in place."""
+    blurred -= values
+    np.clip(blurred, -error, error, out=blurred)
+    blurred += values
+
+
+def _blurred(values: Single, deviation: float) -> Single:
+    """The values after a Gaussian along each axis; a new array."""
     weights = _weights(deviation)
     library = native.library()
     if library is None:

@@ -12,6 +12,7 @@ linear between its entries; alpha = 1 - exp(-extinction * length).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -180,6 +181,7 @@ class Task:
         jitter: whether the first sample of each ray is shifted by a share of the ray's own.
         skipping: whether rays leap over invisible bricks.
         noise: difference of two neighbouring vertices, in marched units, below which shading fades.
+        error: largest error of a value, in marched units: smoothed values stay within it.
     """
 
     rays: Rays
@@ -200,6 +202,7 @@ class Task:
     jitter: bool = False
     skipping: bool = True
     noise: float = 0.0
+    error: float = math.inf
 
     @property
     def bounds(self) -> Floats:

@@ -34,6 +34,9 @@ from fhash_formats.errors import DamagedFileError
 Expected = tuple[str, tuple[int, ...], tuple[str, ...]]
 """Name, shape and allowed number types of an array."""
 
+MASK_FEATURE = "coded-occupancy"
+"""Feature of files that have MASK_ARRAY in place of bits."""
+
 
 def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata]) -> None:
     """Check that the arrays are those that a valid header asks for.
@@ -41,7 +44,7 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
     Raises DamagedFileError that names the first array that is missing or does not fit.
     """
     for name, shape, dtypes in _required_arrays(header):
-        if name == "occupancy/bits" and "occupancy/mask" in arrays:
+        if name == "occupancy/bits" and MASK_ARRAY in arrays:
             continue
         if name not in arrays:
             raise DamagedFileError(f"array {name} is missing")
@@ -50,7 +53,12 @@ def check_arrays(header: Mapping[str, Any], arrays: Mapping[str, ArrayMetadata])
             _check_table_attributes(name, arrays[name], header["model"])
     if PLAIN_FEATURE in header["required_features"]:
         _check_layers(arrays, header["model"])
-    _check_array_features(header["required_features"], arrays)
+    plain = PLAIN_FEATURE in header["required_features"]
+    _check_array_features(
+        header["required_features"],
+        arrays,
+        coded_needed=plain or header["model"]["profile"] == PAPER,
+    )
     for name, shape, dtypes in _optional_arrays(header):
         if name in arrays:
             _check_array(name, arrays[name], shape, dtypes)
@@ -149,7 +157,7 @@ def _optional_arrays(header: Mapping[str, Any]) -> Iterator[Expected]:
         bits = (model["levels"][0][0], occupancy_bytes(header["feature_bounding_box"]))
         for number in range(1, len(header["features"]) + 1):
             yield f"occupancy/feature_{number}", bits, ("uint8",)
-    yield "occupancy/mask", tuple(model["levels"][0]), ("uint8",)
+    yield MASK_ARRAY, tuple(model["levels"][0]), ("uint8",)
     yield "missing/bits", (steps, -(-prod(header["domain"]["shape"][1:]) // 8)), ("uint8",)
 
 
@@ -192,9 +200,16 @@ def _check_layers(arrays: Mapping[str, ArrayMetadata], model: Mapping[str, Any])
 
 
 def _check_array_features(
-    required_features: Sequence[str], arrays: Mapping[str, ArrayMetadata]
+    required_features: Sequence[str],
+    arrays: Mapping[str, ArrayMetadata],
+    *,
+    coded_needed: bool,
 ) -> None:
-    """Check that the header requires every feature that a reader of the arrays must know."""
+    """Check that the header requires every feature that a reader of the arrays must know.
+
+    coded_needed: whether an occupancy in MASK_ARRAY needs a feature of its own, as in all files but
+    coded ones of the profile compact.
+    """
     if TRANSFORM_FEATURE not in required_features:
         for name, array in arrays.items():
             if array.sharding is not None or array.coding == TRANSFORM:
@@ -202,6 +217,11 @@ def _check_array_features(
                     f"array {name} has codecs of the feature {TRANSFORM_FEATURE}, "
                     "which the header does not require"
                 )
+    if coded_needed and MASK_ARRAY in arrays and MASK_FEATURE not in required_features:
+        raise DamagedFileError(
+            f"array {MASK_ARRAY} is there without the feature {MASK_FEATURE}; "
+            "a reader that does not know it would look for other arrays"
+        )
     for name, array in arrays.items():
         for feature in array.coder.features:
             if feature not in required_features:

@@ -323,6 +323,7 @@ def _check_plain(model: Record) -> None:
     model.integers("tile", 4, 1, MAX_LENGTH)
     if model.get("head") is None:
         return
+    model.need(model.get("tables") == "float32", "tables", "float32 where there is a head")
     head = model.record("head")
     hidden = head.get("hidden")
     count = len(hidden) if isinstance(hidden, list) else 0

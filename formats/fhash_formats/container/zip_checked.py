@@ -1,8 +1,10 @@
 """Safe opening of a container's ZIP: every field is checked before it is used to allocate memory.
 
 The comment holds a digest of the directory, the members lie one after the other from the first byte
-to the directory, and each field has the value that `layout` writes. So every byte of the file is
-checked: the directory by its digest, a member's header by the directory, its data by their CRC-32.
+to the directory, and each field has the value that `layout` writes. So a changed byte is refused:
+in the directory by its digest, in a member's header by the directory, in its data by their CRC-32.
+The CRC-32 of a deflated document is that of its text: bytes that inflate to the same text, such as
+others in the unused bits at the end, are the same document.
 """
 
 from __future__ import annotations

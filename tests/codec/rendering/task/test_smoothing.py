@@ -40,3 +40,28 @@ def test_both_ways_agree(shape: tuple[int, int, int], monkeypatch: pytest.Monkey
     monkeypatch.setenv("FHASH_NATIVE", "0")
     assert native.library() is None
     np.testing.assert_allclose(fast, smoothed(given, 1.3), atol=2e-6)
+
+
+@pytest.mark.parametrize("error", [0.0, 0.01, 0.2])
+def test_smoothed_values_stay_within_the_error(error: float, way: str) -> None:
+    noise = values((9, 11, 20))
+    noise[3, 4, 5] = np.nan
+    free, found = smoothed(noise, 1.5), smoothed(noise, 1.5, error)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(noise))
+    assert np.nanmax(np.abs(free - noise)) > error
+    assert np.nanmax(np.abs(found - noise)) <= error + 1e-6
+    near = np.abs(free - noise) <= error
+    np.testing.assert_allclose(found[near], free[near], atol=1e-6)
+
+
+def test_errors_cancel_and_what_is_larger_than_they_are_stays(way: str) -> None:
+    """A plateau with errors becomes flat; a step beside it keeps its height between neighbours."""
+    step = np.zeros((16, 16, 16), np.float32)
+    step[..., 8:] = 1
+    bounded = step + (0.02 * values(step.shape) - 0.01).astype(np.float32)
+    free, found = smoothed(bounded, 2.5), smoothed(bounded, 2.5, 0.01)
+    plateau = (slice(4, -4), slice(4, -4), slice(0, 3))
+    assert np.ptp(found[plateau]) < 0.5 * np.ptp(bounded[plateau])
+    heights = found[4:-4, 4:-4, 8] - found[4:-4, 4:-4, 7]
+    assert heights.min() > 0.95
+    assert (free[..., 8] - free[..., 7]).max() < 0.5
