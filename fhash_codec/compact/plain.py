@@ -150,7 +150,8 @@ class PlainArray:
         if self._corrections is None:
             return base
         corrections = self._corrections.read(region)
-        most = float(np.finfo(np.float64).max) if base.dtype.kind == "f" else 2.0**63
-        if not (np.abs(corrections) <= most).all():
+        whole = base.dtype.kind != "f"
+        sound = np.abs(corrections) <= 2.0**63 if whole else np.isfinite(corrections)
+        if not sound.all():
             raise DamagedFileError("array corrections has numbers beyond the type of the values")
         return corrected(base, corrections)

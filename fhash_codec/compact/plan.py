@@ -124,7 +124,7 @@ def _by_trial(
     """Return the plan after trials of all choices, or of labels where these need fewer bytes."""
     attempt = first_guess(task, tiled, settings)
     if trial is not None and is_hopeless(
-        trial.attempt.outcome.size, attempt.outcome.size, trial.entropy
+        trial.attempt.outcome.size, attempt.outcome.size, trial.entropy, trial.rank
     ):
         return _label_plan(task, trial.attempt)
     attempt = _improved(task, attempt)

@@ -196,6 +196,7 @@ WRONG = {
     "tile": lambda model: model.update(tile=[2, 9, 0, 14]),
     "values": lambda model: model.update(values="float64"),
     "tables": lambda model: model.update(tables="int8"),
+    "float32 where there is a head": lambda model: model.update(tables="float64"),
     "profile": lambda model: model.update(
         profile="paper", fold=2, embedding_size=1, hidden_layers=0, width=1, tables="float32"
     ),

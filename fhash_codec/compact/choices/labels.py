@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
@@ -15,12 +16,13 @@ from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.compact.tiles.tiling import tile_for
 from fhash_codec.measure.value_range import ValueRange
+from fhash_formats.transform.axes.basis import MAX_LENGTH
 from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.labelled import has_regions
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["LabelTrial", "has_labels", "is_hopeless", "plan_labels"]
+__all__ = ["LabelTrial", "has_labels", "is_hopeless", "plan_labels", "rank_share"]
 
 LOOK_VERTICES = 1 << 18
 """Vertices that are looked at, and coded for the size estimate."""
@@ -33,6 +35,8 @@ MAX_TILE_VERTICES = 12 << 20
 
 HOPELESS = 1.25
 """Size of the first guess, as a multiple of that of labels, from which on nothing else is tried."""
+ENERGY = 0.99
+"""Share of the squared deviations from the mean that the counted vectors of a basis hold."""
 STRUCTURELESS = 0.97
 """Share of the values' own entropy from which on labels are taken for noise."""
 
@@ -45,26 +49,63 @@ class LabelTrial:
         attempt: tiles and settings.
         clearly: whether nothing else can take fewer bytes.
         entropy: bytes of the values by how often each occurs in its tile, whatever stands around.
+        rank: see `rank_share`.
     """
 
     attempt: Attempt
     clearly: bool
     entropy: float
+    rank: float
 
 
-def is_hopeless(labels: float, other: float, entropy: float) -> bool:
+def is_hopeless(labels: float, other: float, entropy: float, rank: float) -> bool:
     """Whether trials that begin with a first guess of `other` bytes can end below `labels` bytes.
 
     They hardly change the size of noise, which neither way takes for anything else. Elsewhere they
-    save less, the larger the first guess is beside labels.
+    save less, the larger the first guess is beside labels, unless the data's own basis of an axis
+    needs but few vectors: a trial of it leaves about this share of the first guess.
 
     Args:
         labels: bytes as labels.
         other: bytes of the first guess.
-        entropy: see `LabelTrial`.
+        entropy, rank: see `LabelTrial`.
     """
-    noise = labels >= STRUCTURELESS * entropy
-    return other >= (1 if noise else HOPELESS) * labels
+    if labels >= STRUCTURELESS * entropy:
+        return other >= labels
+    return rank * other >= HOPELESS * labels
+
+
+def rank_share(tiles: Sequence[npt.NDArray[Any]]) -> float:
+    """Return the share of the vectors of an axis that hold ENERGY of tiles (t, z, y, x).
+
+    It is that of the axis with the smallest share, of those along which a tile may have a basis; 1
+    for tiles of one value. The basis is the data's own, one for all tiles of one length.
+    """
+    deviations = [_unit_deviations(tile) for tile in tiles]
+    smallest = 1.0
+    for axis in range(4):
+        moments: dict[int, npt.NDArray[np.float64]] = {}
+        for tile in deviations:
+            if 1 < tile.shape[axis] <= MAX_LENGTH:
+                lines = np.moveaxis(tile, axis, -1).reshape(-1, tile.shape[axis])
+                moments[lines.shape[1]] = moments.get(lines.shape[1], 0.0) + lines.T @ lines
+        vectors = length = 0
+        for moment in moments.values():
+            energies = np.cumsum(np.linalg.eigvalsh(moment)[::-1])
+            if energies[-1] > 0:
+                vectors += 1 + int(np.searchsorted(energies, ENERGY * energies[-1]))
+                length += len(moment)
+        if length:
+            smallest = min(smallest, vectors / length)
+    return smallest
+
+
+def _unit_deviations(tile: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Return the deviations of a tile from its middle, of magnitudes up to 1; 0 for NaN."""
+    values = np.nan_to_num(tile.astype(np.float64), posinf=0.0, neginf=0.0)
+    values /= max(np.abs(values).max(), np.finfo(np.float64).tiny)
+    values -= values.mean()
+    return values
 
 
 def has_labels(task: PlanTask, tiled: Blocks) -> bool:
@@ -94,6 +135,13 @@ def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelT
         weight * _entropy(values if counted is None else values[counted])
         for weight, (values, counted) in zip(sample.weights, sample.tiles, strict=True)
     )
+    rank = rank_share(
+        [
+            values if counted is None else np.where(counted, values, values[counted].mean())
+            for values, counted in sample.tiles
+            if counted is None or counted.any()
+        ]
+    )
     clearly = CLEARLY * outcome.size <= sample.run(settings, exact).size
     if task.fixed_tile is None:
         tile = tile_for(task.blocks.shape, outcome.size)
@@ -104,7 +152,7 @@ def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelT
     settings = replace(settings, many_labels=_may_be_many(task.value_range, sample))
     task.gains.note("labels", outcome)
     attempt = Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
-    return LabelTrial(attempt=attempt, clearly=clearly, entropy=entropy)
+    return LabelTrial(attempt=attempt, clearly=clearly, entropy=entropy, rank=rank)
 
 
 def _entropy(values: npt.NDArray[Any]) -> float:

@@ -248,3 +248,19 @@ def test_infinities_outside_the_coreset_of_older_files_are_no_values(way: int) -
     result = reads(model_of(arrays))[way]()
     assert np.isnan(result).any()
     assert not np.isinf(result).any()
+
+
+def test_masks_of_other_numbers_are_masks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any number other than 0 is a vertex of the coreset, also where two have no bit in common."""
+    golden = Path(__file__).parents[2] / "golden" / "compact-1.1-bound.fhz"
+    with fhash_codec.open(golden) as volume:
+        mask = volume.container.arrays["occupancy/mask"].read()
+        expected = volume[...]
+        between = volume.read(0.5)
+    numbers = mask * np.array([1, 2, 4, 128, 255], np.uint8).reshape(5, 1, 1, 1)
+    with fhash_codec.open(golden) as volume:
+        monkeypatch.setattr(
+            volume.container.arrays["occupancy/mask"], "read", lambda region: numbers[region]
+        )
+        np.testing.assert_array_equal(volume[...], expected)
+        np.testing.assert_array_equal(volume.read(0.5), between)

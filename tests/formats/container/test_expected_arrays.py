@@ -58,8 +58,12 @@ def test_other_models_fit(tmp_path, samples, fields) -> None:
 def test_a_mask_may_stand_in_place_of_the_bits(tmp_path, samples) -> None:
     header = samples.header()
     arrays = samples.arrays(header)
-    del arrays["occupancy/bits"]
+    bits = arrays.pop("occupancy/bits")
     mask = np.ones(header["model"]["levels"][0], np.uint8)
+    for other in ({}, {"occupancy/bits": bits}):
+        with pytest.raises(InputError, match="occupancy/mask is there without the feature coded"):
+            samples.write(tmp_path / "a.fhz", header, arrays | other | {"occupancy/mask": mask})
+    header["required_features"] = ["coded-occupancy"]
     samples.write(tmp_path / "a.fhz", header, arrays | {"occupancy/mask": mask})
     with Container.open(tmp_path / "a.fhz") as container:
         assert container.verify() == len(arrays) + 1

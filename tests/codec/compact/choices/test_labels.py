@@ -10,7 +10,7 @@ import pytest
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.compact import plan as planning
-from fhash_codec.compact.choices.labels import is_hopeless
+from fhash_codec.compact.choices.labels import is_hopeless, rank_share
 
 
 def moving_regions() -> np.ndarray:
@@ -76,17 +76,62 @@ def test_many_labels_need_their_feature(tmp_path, count, many) -> None:
 
 
 @pytest.mark.parametrize(
-    ("other", "entropy", "hopeless"),
+    ("other", "entropy", "rank", "hopeless"),
     [
-        (125, 200, True),  # a first guess much above labels, though these found a structure
-        (124, 200, False),
-        (100, 103, True),  # noise, which no way takes for anything else
-        (99, 103, False),
-        (100, 104, False),  # labels found a little structure
+        (125, 200, 1.0, True),  # a first guess much above labels, though these found a structure
+        (124, 200, 1.0, False),
+        (250, 200, 0.5, True),  # the same after a basis of half of the vectors
+        (249, 200, 0.5, False),
+        (100, 103, 0.9, True),  # noise, which no way takes for anything else
+        (99, 103, 1.0, False),
+        (100, 104, 1.0, False),  # labels found a little structure
     ],
 )
-def test_trials_end_where_they_cannot_gain(other: float, entropy: float, hopeless: bool) -> None:
-    assert is_hopeless(100, other, entropy) is hopeless
+def test_trials_end_where_they_cannot_gain(
+    other: float, entropy: float, rank: float, hopeless: bool
+) -> None:
+    assert is_hopeless(100, other, entropy, rank) is hopeless
+
+
+def pieces(lengths: list[int]) -> np.ndarray:
+    """Random numbers (2, 6, 24, x) that are the same along each of some pieces of x."""
+    noise = np.random.default_rng(0).integers(0, 12, (2, 6, 24, len(lengths)))
+    return np.repeat(noise, lengths, axis=3).astype("u1")
+
+
+def test_the_rank_is_that_of_the_axis_with_the_fewest_vectors() -> None:
+    noise = np.random.default_rng(0).integers(0, 12, (2, 6, 24, 28)).astype("u1")
+    assert rank_share([noise]) > 0.7
+    assert rank_share([pieces([5, 9, 14])]) == 3 / 28
+    assert rank_share([pieces([5, 9, 14]), pieces([9, 5, 14])]) == 4 / 28
+    assert rank_share([np.zeros((1, 2, 3, 4), "i4")]) == 1.0
+
+
+@pytest.mark.parametrize("kind", ["i8", "u8", "f4", "f8"])
+def test_the_rank_of_extreme_values(kind: str) -> None:
+    limits = np.finfo(kind) if kind[0] == "f" else np.iinfo(kind)
+    values = np.array([limits.min, limits.max], kind)[pieces([9, 5]) % 2]
+    assert rank_share([values]) == 2 / 14
+    if kind[0] == "f":
+        values[0, 0, 0] = [np.nan, np.inf, -np.inf, *values[0, 0, 0, 3:]]
+        assert 0 < rank_share([values]) <= 1
+
+
+def test_an_axis_that_is_too_long_for_a_basis_does_not_count() -> None:
+    lines = np.repeat(np.arange(4, dtype="u1").reshape(1, 1, 4, 1), 700, axis=3)
+    assert rank_share([lines[..., :512]]) == 1 / 512
+    assert rank_share([lines]) == 1 / 4
+
+
+def test_pieces_at_fixed_places_are_tried_further(tmp_path, monkeypatch) -> None:
+    """Their first guess is three times as long as labels; with their own basis it is shorter."""
+
+    def tried(*_: object) -> None:
+        raise LookupError
+
+    monkeypatch.setattr(planning, "_improved", tried)
+    with pytest.raises(LookupError):
+        encoded(tmp_path, np.tile(pieces([14, 14]), 2))
 
 
 def test_noise_is_planned_without_further_trials(tmp_path, monkeypatch) -> None:
