@@ -217,7 +217,7 @@ def _cheapest(
     for candidate in candidates:
         psnr = candidate.outcome.psnr(data_range)
         # Bytes more than without a head.
-        cost = (
+        cost: float = (
             candidate.outcome.size
             - outcome.size
             + len(candidate.trained.head.to_bytes())
