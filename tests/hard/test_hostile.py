@@ -18,8 +18,8 @@ import mutations
 import pytest
 from reporting import LONG, record
 
-QUICK = 294
-"""Mutations of the quick set: each kind of seven goldens."""
+QUICK = 378
+"""Mutations of the quick set: each kind of nine goldens."""
 MANY = 12_000
 """Mutations of the long set; kinds and goldens take turns."""
 

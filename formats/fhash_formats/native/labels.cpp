@@ -36,11 +36,11 @@ const uint32_t SCATTER = 40503;        // multiplier of hashes: 2^16 over the go
 template <bool DECODES, bool WIDE> struct LabelCoder {
     using Label = typename std::conditional<WIDE, uint16_t, uint8_t>::type;
     using Known = typename std::conditional<WIDE, int32_t, int16_t>::type;
-    static const int NONE = WIDE ? 65536 : 256;  // label of vertices that do not exist
-    static const int MIXED = NONE + 1;           // state of a segment of more than one label
-    static const int NOTHING = NONE + 2;         // state of a segment that does not exist
-    static const int BIT_LEVELS = WIDE ? 16 : 8;  // sets of weights of bits
-    static const int BIT_SIZE = WIDE ? 65536 : 16384;  // contexts of an estimate of bits
+    static constexpr int NONE = WIDE ? 65536 : 256;  // label of vertices that do not exist
+    static constexpr int MIXED = NONE + 1;           // state of a segment of more than one label
+    static constexpr int NOTHING = NONE + 2;         // state of a segment that does not exist
+    static constexpr int BIT_LEVELS = WIDE ? 16 : 8;  // sets of weights of bits
+    static constexpr int BIT_SIZE = WIDE ? 65536 : 16384;  // contexts of an estimate of bits
 
     typename std::conditional<DECODES, Decoder, Encoder>::type range;
     State* state;

@@ -98,6 +98,7 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
     if shutil.which(compiler.split()[0]) is None:
         raise CannotBuild(f"no compiler {compiler}")
     folder.mkdir(parents=True, exist_ok=True)
+    _require_sanitizers(compiler, folder)
     tracing, headers = ("-fsanitize-coverage=trace-pc",), f"-I{NATIVE}"
     jobs: list[tuple[Path, tuple[str, ...]]] = [(HERE / "driver.cpp", ("-fsanitize=address", "-g"))]
     if march:
@@ -134,10 +135,22 @@ def build(folder: Path, optimise: str = "-O1", march: bool = False) -> Path:
 def _compile(command: list[str]) -> None:
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
-        last = (done.stderr.strip() or "no message").splitlines()[-1]
-        raise CannotBuild(
-            f"{command[0]} does not build this with {SANITIZE[0]} and trace-pc: {last}"
+        raise RuntimeError(f"the fuzzer does not compile: {done.stderr[-2000:]}")
+
+
+def _require_sanitizers(compiler: str, folder: Path) -> None:
+    """Raise CannotBuild where a compiler does not build a program of one line."""
+    source = folder / "probe.cpp"
+    source.write_text("int main() { return 0; }\n", encoding="utf-8")
+    command = [*compiler.split(), *SANITIZE, "-fsanitize-coverage=trace-pc", str(source)]
+    # The function that trace-pc calls is the driver's; none is here, so that nothing is linked.
+    for more in (["-c"], ["-fno-sanitize-coverage=trace-pc"]):
+        done = subprocess.run(
+            [*command, *more, "-o", str(folder / "probe")], capture_output=True, text=True
         )
+        if done.returncode:
+            last = (done.stderr.strip() or "no message").splitlines()[-1]
+            raise CannotBuild(f"{compiler} does not build with {SANITIZE[0]} and trace-pc: {last}")
 
 
 def prepare(folder: Path, every: int = 1, only: str | None = None) -> dict[str, str]:

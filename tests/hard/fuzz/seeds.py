@@ -104,7 +104,8 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             data = np.ascontiguousarray(array).tobytes()
             file.write(struct.pack("<q", len(data)) + data)
 
-        for state in (prior_state(), mask_prior_state(), blank_state(), blank_label_state()):
+        labels = blank_label_state(), blank_label_state(wide=True)
+        for state in (prior_state(), mask_prior_state(), blank_state(), *labels):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
         file.write(struct.pack("<q", len(bands)))
@@ -170,7 +171,7 @@ def write_seeds(
             coded = encode_mask(rng.random(shape) < density, nothing)
             put(MASK, bytes([*(n - 1 for n in shape), 0]), coded)
     for shape, labels, data in label_streams():
-        put(LABELS, bytes([*(n - 1 for n in shape), labels - 1]), data)
+        put(LABELS, bytes([*(n - 1 for n in shape)]), struct.pack("<H", labels - 1), data)
     for target in range(len(NAMES)):
         if target in WITH_SEEDS:
             continue
@@ -185,11 +186,12 @@ def label_streams() -> Iterator[tuple[tuple[int, ...], int, bytes]]:
     rng = np.random.default_rng(1)
     for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (3, 4, 6, 40)):
         regions = np.indices(shape).sum(0) // 5
-        for most in (1, 2, 5, 17, 256):
+        # More than 256 are those whose upper byte is odd (target_labels.cpp).
+        for most in (1, 2, 5, 17, 256, 257, 300, 65536):
             for noise in (0.0, 0.05, 1.0):
                 random = rng.integers(0, most, shape)
                 labels = np.where(rng.random(shape) < noise, random, regions % most)
-                yield shape, most, encode_labels(labels.astype(np.uint8), most)
+                yield shape, most, encode_labels(labels.astype(np.uint16), most)
 
 
 def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int, int]]]:

@@ -6,47 +6,67 @@
 
 using std::int64_t;
 
+#define STATE                                                                                      \
+    const std::uint16_t*, int64_t, const std::int32_t*, int64_t, const std::uint16_t*, int64_t
 extern "C" {
-int64_t fhash_encode_labels(std::uint8_t*, int64_t, const int64_t*, const std::uint16_t*, int64_t,
-                            const std::int32_t*, int64_t, const std::uint16_t*, int64_t,
-                            std::uint8_t*, int64_t);
-int64_t fhash_decode_labels(std::uint8_t*, int64_t, const int64_t*, const std::uint16_t*, int64_t,
-                            const std::int32_t*, int64_t, const std::uint16_t*, int64_t,
-                            const std::uint8_t*, int64_t);
+int64_t fhash_encode_labels(std::uint8_t*, int64_t, const int64_t*, STATE, std::uint8_t*, int64_t);
+int64_t fhash_encode_wide_labels(std::uint16_t*, int64_t, const int64_t*, STATE, std::uint8_t*,
+                                 int64_t);
+int64_t fhash_decode_labels(std::uint8_t*, int64_t, const int64_t*, STATE, const std::uint8_t*,
+                            int64_t);
+int64_t fhash_decode_wide_labels(std::uint16_t*, int64_t, const int64_t*, STATE,
+                                 const std::uint8_t*, int64_t);
 }
 
 namespace {
 
-using Labels = std::vector<std::uint8_t>;
+using Bytes = std::vector<std::uint8_t>;
+
+// The coder of up to 256 labels.
+struct Narrow {
+    using Labels = std::vector<std::uint8_t>;
+    static const State& state() { return setups().labels; }
+    static constexpr auto encode = fhash_encode_labels;
+    static constexpr auto decode = fhash_decode_labels;
+};
+
+// The coder of more labels.
+struct Wide {
+    using Labels = std::vector<std::uint16_t>;
+    static const State& state() { return setups().wide_labels; }
+    static constexpr auto encode = fhash_encode_wide_labels;
+    static constexpr auto decode = fhash_decode_wide_labels;
+};
 
 struct Tile {
     std::vector<int64_t> shape;
     int64_t count;  // of different labels
 };
 
-Labels decoded(const Tile& tile, const Labels& data) {
-    const State& blank = setups().labels;
-    Labels labels(static_cast<std::size_t>(volume(tile.shape)), 255);
-    const int64_t code = fhash_decode_labels(
+template <class Coder> typename Coder::Labels decoded(const Tile& tile, const Bytes& data) {
+    const State& blank = Coder::state();
+    typename Coder::Labels labels(static_cast<std::size_t>(volume(tile.shape)), 255);
+    const int64_t code = Coder::decode(
         labels.data(), tile.count, tile.shape.data(), blank.slots.data(),
         static_cast<int64_t>(blank.slots.size() / 4), blank.weights.data(),
         static_cast<int64_t>(blank.weights.size()), blank.simples.data(),
         static_cast<int64_t>(blank.simples.size() / 2), data.data(),
         static_cast<int64_t>(data.size()));
     require(code == 0, "bytes that are refused");
-    for (const std::uint8_t label : labels)
-        require(label < tile.count, "a label that does not exist");
+    for (const int64_t label : labels) require(label < tile.count, "a label that does not exist");
     return labels;
 }
 
 // The bytes of labels, by a first call with little room and a second one with as much as it asked
 // for. The coder may write to its labels.
-Labels encoded(const Tile& tile, const Labels& labels, std::size_t room) {
-    const State& blank = setups().labels;
-    Labels data(room), work;
+template <class Coder>
+Bytes encoded(const Tile& tile, const typename Coder::Labels& labels, std::size_t room) {
+    const State& blank = Coder::state();
+    Bytes data(room);
+    typename Coder::Labels work;
     const auto encode = [&] {
         work = labels;
-        return fhash_encode_labels(
+        return Coder::encode(
             work.data(), tile.count, tile.shape.data(), blank.slots.data(),
             static_cast<int64_t>(blank.slots.size() / 4), blank.weights.data(),
             static_cast<int64_t>(blank.weights.size()), blank.simples.data(),
@@ -67,10 +87,11 @@ Labels encoded(const Tile& tile, const Labels& labels, std::size_t room) {
 
 // Labels below a count in regions, of which the input says how long they are along x, y, z and t,
 // and which vertices have a label of their own.
-Labels drawn(Reader& in, const Tile& tile) {
+template <class Labels> Labels drawn(Reader& in, const Tile& tile) {
     int64_t lengths[4];
     for (int64_t& length : lengths) length = in.within(1, 40);
-    const Labels palette = in.numbers<std::uint8_t>(16), others = in.numbers<std::uint8_t>(8);
+    using Label = typename Labels::value_type;
+    const Labels palette = in.numbers<Label>(16), others = in.numbers<Label>(8);
     const std::uint8_t noise = in.byte();
     Labels labels;
     std::size_t at = 0;
@@ -81,10 +102,10 @@ Labels drawn(Reader& in, const Tile& tile) {
                     const int64_t region = x / lengths[0] + 3 * (y / lengths[1]) +
                                            5 * (z / lengths[2]) + 7 * (t / lengths[3]);
                     const bool alone = (at * 167 + at / 13) % 256 < noise;
-                    const std::uint8_t label =
-                        alone ? static_cast<std::uint8_t>(others[at % 8] + at / 8)
+                    const Label label =
+                        alone ? static_cast<Label>(others[at % 8] + at / 8)
                               : palette[static_cast<std::size_t>(region) % palette.size()];
-                    labels.push_back(static_cast<std::uint8_t>(label % tile.count));
+                    labels.push_back(static_cast<Label>(label % tile.count));
                 }
     return labels;
 }
@@ -93,20 +114,28 @@ Tile tile_of(Reader& in) {
     Tile tile;
     // Rows of up to three segments.
     for (const int64_t most : {4, 4, 6, 40}) tile.shape.push_back(in.within(1, most));
-    tile.count = 1 + in.byte();
+    // A byte, and another one that counts where it is odd: as many narrow tiles as wide ones.
+    const int64_t low = in.byte(), high = in.byte();
+    tile.count = 1 + low + (high % 2 ? 256 * high : 0);
     return tile;
+}
+
+template <class Coder> void round_trip(Reader& in, const Tile& tile) {
+    const std::size_t room = in.byte();
+    const auto labels = drawn<typename Coder::Labels>(in, tile);
+    require(decoded<Coder>(tile, encoded<Coder>(tile, labels, room)) == labels, "other labels");
 }
 
 }  // namespace
 
 void decode_label_bytes(Reader& in) {
     const Tile tile = tile_of(in);
-    decoded(tile, in.rest());
+    if (tile.count > 256) decoded<Wide>(tile, in.rest());
+    else decoded<Narrow>(tile, in.rest());
 }
 
 void label_round_trip(Reader& in) {
     const Tile tile = tile_of(in);
-    const std::size_t room = in.byte();
-    const Labels labels = drawn(in, tile);
-    require(decoded(tile, encoded(tile, labels, room)) == labels, "other labels");
+    if (tile.count > 256) round_trip<Wide>(in, tile);
+    else round_trip<Narrow>(in, tile);
 }

@@ -84,3 +84,22 @@ def test_an_overrun_is_seen(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert "heap-buffer-overflow" in figures.crashes[0].with_suffix(".txt").read_text(
         encoding="utf-8"
     )
+
+
+def test_code_that_does_not_compile_is_no_reason_to_skip(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only a compiler without sanitizers is one: else a defect would stop the fuzzer for good."""
+    broken = tmp_path / "broken.cpp"
+    broken.write_text("int missing();\nint used = missing() +;\n", encoding="utf-8")
+    monkeypatch.setattr(run, "SOURCES", ())
+    monkeypatch.setattr(run, "CODEC_SOURCES", ())
+    monkeypatch.setattr(run, "TARGETS", (broken,))
+    try:
+        with pytest.raises(RuntimeError, match=r"(?s)does not compile: .*broken\.cpp"):
+            run.build(tmp_path / "built", optimise="-O0")
+    except run.CannotBuild as error:
+        pytest.skip(str(error))
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(run.CannotBuild, match="no compiler"):
+        run.build(tmp_path / "built")
