@@ -65,7 +65,7 @@ def chosen(
     fitting = [
         (name, data)
         for name, data in parts
-        if "/c/" in name and (coded is None or is_coded(documents[_array_of(name)]) == coded)
+        if "/c/" in name and _fits(documents[_array_of(name)], coded)
     ]
     if not fitting:
         raise NothingFitsError
@@ -85,8 +85,21 @@ def is_sharded(document: dict[str, Any]) -> bool:
     return bool(document["codecs"][0]["name"] == "sharding_indexed")
 
 
+def coding(document: dict[str, Any]) -> str:
+    """Return the name of the codec that makes bytes of a chunk, or of an inner chunk of a shard."""
+    codecs = document["codecs"]
+    return str(
+        (codecs[0]["configuration"]["codecs"] if is_sharded(document) else codecs)[0]["name"]
+    )
+
+
 def is_coded(document: dict[str, Any]) -> bool:
-    return is_sharded(document) or bool(document["codecs"][0]["name"] == "fhash.transform")
+    return coding(document) == "fhash.transform"
+
+
+def _fits(document: dict[str, Any], coded: bool | None) -> bool:
+    """Whether an array is coded by `fhash.transform`, or by ordinary codecs; None allows all."""
+    return coded is None or coding(document) == ("fhash.transform" if coded else "bytes")
 
 
 def replaced(parts: Parts, new: dict[str, bytes]) -> Parts:

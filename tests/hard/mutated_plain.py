@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from containers import Parts, with_crc
 from documents import DOCUMENT, FLOATS, LARGE, OTHERS, dumped, hostile, places
-from mutated_payload import SPECIAL, NothingFitsError, documents_of, is_coded, replaced
+from mutated_payload import SPECIAL, NothingFitsError, coding, documents_of, replaced
 from numcodecs.zstd import compress, decompress
 
 from fhash_formats.container.array import DTYPES
@@ -248,8 +248,8 @@ def _occupancy(chance: random.Random, parts: Parts) -> Parts:
             (header["features"][:1], header["features"] * 2, [], ["all"], ["interval:1:2"] * 40)
         )
         return replaced(parts, {DOCUMENT: dumped(root)})
-    if is_coded(document):
-        raise NothingFitsError  # kind "stream" and its like
+    if coding(document) != "bytes":
+        raise NothingFitsError  # kinds "stream" and "apart" and their like
     member = chance.choice(_members(parts, name))
     values = _values(parts, member, document)
     if turn == 4:

@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import mutated_apart
 import mutated_json
 import mutated_labels
 import mutated_payload
@@ -29,7 +30,7 @@ NEWEST = (
     "compact-1.2-labels",
     "compact-1.2-counts",
     "compact-1.2-classes",
-    "compact-1.3-cross",
+    "compact-1.4-cross",
     "compact-1.3-many-labels",
 )
 """Goldens that take turns most evenly, with clipped values and with labels in turns: every kind
@@ -162,14 +163,21 @@ def _packed(
     return lambda chance, parts: pack(change(chance, parts))
 
 
-_MODULES = (mutated_json, mutated_payload, mutated_settings, mutated_labels, mutated_plain)
+_MODULES = (
+    mutated_json,
+    mutated_payload,
+    mutated_settings,
+    mutated_labels,
+    mutated_plain,
+    mutated_apart,
+)
 SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
     **mutated_zip.KINDS,
     **{name: _packed(change) for module in _MODULES for name, change in module.KINDS.items()},
 }
 KINDS = (*DAMAGES, *SEALED)
-PLAIN_KINDS = frozenset(mutated_plain.KINDS)
-"""Kinds that change plain files, or arrays of occupancy, only."""
+PLAIN_KINDS = frozenset(mutated_plain.KINDS) | frozenset(mutated_apart.KINDS)
+"""Kinds that change plain files, arrays of occupancy, or parts of a table, only."""
 
 
 def header_of(parts: Parts) -> Any:
