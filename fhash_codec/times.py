@@ -197,8 +197,10 @@ def number_text(coordinate: Coordinate, time: float) -> str:
     gap = _gap(coordinate)
     largest = float(np.max(np.abs(coordinate.values)))
     digits = DIGITS[0]
-    if gap and math.isfinite(largest):
-        digits = min(max(digits, math.ceil(math.log10(largest / gap)) + 1), DIGITS[1])
+    if gap and largest and math.isfinite(largest):
+        # A quotient of the two may be beyond the floats; the difference of logarithms never is.
+        decades = math.log10(largest) - math.log10(gap)
+        digits = min(max(digits, math.ceil(decades) + 1), DIGITS[1])
     return f"{time:.{digits}g}"
 
 

@@ -82,6 +82,7 @@ def test_texts_tell_steps_apart() -> None:
     assert number_text(late, late.values[0]) == "347921.001"
     assert number_text(times([5], "s"), 5) == "5"
     assert number_text(times([1e-300, 1e300], "s"), 1e300) == "1e+300"
+    assert number_text(times([0, 1e-300, 1e300], "s"), 1e-300) == "1e-300"
     assert time_text(times([0, float("nan")]), float("nan")) == "nan days since 2001-02-10"
 
 

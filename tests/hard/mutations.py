@@ -176,8 +176,10 @@ SEALED: dict[str, Callable[[random.Random, Parts], bytes]] = {
     **{name: _packed(change) for module in _MODULES for name, change in module.KINDS.items()},
 }
 KINDS = (*DAMAGES, *SEALED)
-PLAIN_KINDS = frozenset(mutated_plain.KINDS) | frozenset(mutated_apart.KINDS)
-"""Kinds that change plain files, arrays of occupancy, or parts of a table, only."""
+PLAIN_KINDS = frozenset(mutated_plain.KINDS)
+"""Kinds that change plain files, or arrays of occupancy, only."""
+APART_KINDS = frozenset(mutated_apart.KINDS)
+"""Kinds that change parts of a table that lie in arrays of their own, only."""
 
 
 def header_of(parts: Parts) -> Any:

@@ -10,7 +10,8 @@ using std::int64_t;
 
 extern "C" {
 int64_t fhash_march_extinction(const float*, const int64_t*, const float*, int64_t, double, double,
-                               int64_t, const int64_t*, int64_t, int64_t, float*, float*);
+                               int64_t, const int64_t*, int64_t, int64_t, const float*, float*,
+                               float*);
 int64_t fhash_march_sum(const float*, const int64_t*, const double*, int64_t, int64_t, int64_t,
                         float*);
 }
@@ -28,10 +29,16 @@ void light(Reader& in) {
     for (float& entry : table)
         entry = std::isfinite(entry) ? std::min(std::fabs(entry), 1e30F) : 0.0F;
     const double low = in.finite<double>(), scale = std::fabs(in.finite<double>());
+    // Factors by which extinctions count: a share from 0 to 1 for each vertex, or none.
+    std::vector<float> factors;
+    if (in.within(0, 1)) factors = repeated<float>(in, shape[0] * shape[1] * shape[2]);
+    for (float& factor : factors)
+        factor = std::isfinite(factor) ? std::min(std::fabs(factor), 1.0F) : 0.0F;
     std::vector<float> extinction(static_cast<std::size_t>(points[0] * points[1] * points[2])),
         scratch(static_cast<std::size_t>(shape[2]));
     fhash_march_extinction(values.data(), shape, table.data(), entries, low, scale, cell, points, 0,
-                           points[0], extinction.data(), scratch.data());
+                           points[0], factors.empty() ? nullptr : factors.data(),
+                           extinction.data(), scratch.data());
     double step[3];
     for (double& length : step) length = std::remainder(in.finite<double>(), 16.0);
     std::vector<float> sum(extinction.size());
