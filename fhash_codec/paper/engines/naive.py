@@ -68,9 +68,9 @@ class NaiveEngine:
 
     @torch.no_grad()
     def infer(self, chosen: Chosen) -> Tensor:
-        """Return the values (bricks, vertices) of some bricks at all their vertices."""
-        points = torch.from_numpy(_vertices(self.coreset, chosen)).to(self.device, self.dtype)
-        return torch.as_tensor(self.model(points.view(-1, 4))).view(len(chosen), -1)
+        """Return the values (n,) at the samples of some bricks."""
+        points, _ = self._samples(chosen)
+        return torch.as_tensor(self.model(points))
 
     @torch.no_grad()
     def squared_error(self, chosen: Chosen) -> float:
