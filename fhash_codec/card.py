@@ -80,8 +80,8 @@ class Card:
         box.
 
         Keys: `config` (with `settings`), `tables` (with `level`, `shape`, `dtype`), `mlp` (with
-        `layer`, `shape` of the weights, `activation`) and `occupancy` (with `shape` of the bits, and
-        `apart`, the features that have bits of their own).
+        `layer`, `shape` of the weights, `activation`) and `occupancy` (with `shape` of the bits,
+        and `apart`, the features that have bits of their own).
         """
         settings = len(self.config)
         return {

@@ -24,7 +24,7 @@ from fhash_codec.demo.simulate import SCENES, simulate
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.selection import select
-from fhash_codec.paper.training.train import TrainingPlan, plan_training, probe_psnr
+from fhash_codec.paper.training.train import TrainingPlan, plan_training, probe_bricks, probe_psnr
 from fhash_codec.progress import Progress, silent
 from fhash_codec.training.devices import choose_device
 from fhash_codec.training.threads import threads_for
@@ -232,7 +232,7 @@ class _Run:
 
     def result(self, flops: int, peak: float) -> dict[str, Any]:
         train = median(self.train_speeds)
-        probe = np.sort(np.random.default_rng(0).permutation(self.plan.bricks)[:256])
+        probe = probe_bricks(self.coreset, 0, 256)
         return {
             "engine": self.name,
             "train_msamples_s": train / 1e6,

@@ -51,7 +51,10 @@ class Engine(Protocol):
         """
 
     def squared_error(self, chosen: Chosen) -> float:
-        """Return the sum of squared errors over the coreset vertices of some bricks."""
+        """Return the sum of squared errors over the coreset vertices of some bricks.
+
+        Samples of the fringe do not count.
+        """
 
     def parameters(self) -> Parameters:
         """Return the trained numbers, on the CPU."""

@@ -142,8 +142,11 @@ class SlabEngine:
     def squared_error(self, chosen: Chosen) -> float:
         """Return the sum of squared errors over the coreset vertices of some bricks."""
         ids = torch.from_numpy(chosen).to(self.device)
-        target, in_coreset = self._targets(ids)
-        error = self._infer(ids, in_coreset) - target[in_coreset.bool()]
+        target, is_sample = self._targets(ids)
+        error = self._infer(ids, is_sample) - target[is_sample.bool()]
+        if self.coreset.fringe is not None:
+            fringe = self.coreset.fringe[self.coreset.places(chosen)]
+            error.masked_fill_(torch.from_numpy(fringe).to(self.device), 0.0)
         return float(error.square().sum(dtype=torch.float64))
 
     @torch.no_grad()
