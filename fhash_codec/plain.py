@@ -266,11 +266,12 @@ class _Export:
             return
         self._total += keys * count
         region = Box.of_shape(self._volume.box.shape)
+
+        def read(numbers: tuple[int, ...], key: int) -> npt.NDArray[np.bool_]:
+            return model.occupied_by(numbers, key, key, region)
+
         for number in range(count):
-            read = partial(model.occupied_by, (number,))
-            self._write_bits(
-                feature_bits(number + 1), keys, lambda key, read=read: read(key, key, region)
-            )
+            self._write_bits(feature_bits(number + 1), keys, partial(read, (number,)))
 
     def _write_bits(
         self, name: str, keys: int, occupied: Callable[[int], npt.NDArray[np.bool_]]

@@ -79,7 +79,7 @@ def bench_decode(
 def _whole_blocks(mask: Mask) -> Mask:
     """Return the vertices (z, y, x) of all blocks that hold a vertex of a mask."""
     result = np.zeros_like(mask)
-    shape = block_shape(mask.shape)  # type: ignore[arg-type]
+    shape = block_shape(mask.shape)
     for first in np.ndindex(*(-(-n // m) for n, m in zip(mask.shape, shape, strict=True))):
         block = tuple(slice(i * m, (i + 1) * m) for i, m in zip(first, shape, strict=True))
         result[block] = mask[block].any()

@@ -32,7 +32,7 @@ def _in_coreset(coreset: Coreset) -> npt.NDArray[np.bool_]:
 
 @pytest.fixture(scope="session")
 def noise_coreset() -> Callable[..., Coreset]:
-    """A function of (shape, low, fringe): noise, in which values from `low` to 1 are the feature."""
+    """A function of (shape, low, fringe): noise; values from `low` to 1 are the feature."""
     return _noise_coreset
 
 
