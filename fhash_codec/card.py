@@ -15,6 +15,7 @@ from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import pack, packed_bytes
 from fhash_codec.header import full_config
 from fhash_codec.model_parts import Mlp, Table
+from fhash_codec.paper.model import PaperModel
 from fhash_codec.volume_model import VolumeModel
 from fhash_formats.container import Container
 from fhash_formats.container.apart import HEAD_ARRAY, MASK_ARRAY
@@ -80,7 +81,8 @@ class Card:
         box.
 
         Keys: `config` (with `settings`), `tables` (with `level`, `shape`, `dtype`), `mlp` (with
-        `layer`, `shape` of the weights, `activation`) and `occupancy` (with `shape` of the bits).
+        `layer`, `shape` of the weights, `activation`) and `occupancy` (with `shape` of the bits,
+        and `apart`, the features that have bits of their own).
         """
         settings = len(self.config)
         return {
@@ -122,12 +124,23 @@ class Card:
     def _describe_occupancy(self) -> dict[str, Any]:
         """The bits of all key frames, or what stands in their place."""
         shape = [self.tables[0].shape[0], packed_bytes(self.box.shape)]
+        arrays = self.container.arrays
+        model = self._model
+        names = [str(name) for name in self.container.header["features"]]
+        apart = isinstance(model, PaperModel) and model.features_apart and len(names) > 1
+        own = sum(
+            array.nbytes_stored
+            for name, array in arrays.items()
+            if name.startswith("occupancy/feature_")
+        )
         for name in ("occupancy/bits", MASK_ARRAY):
-            if name in self.container.arrays:
-                return {"shape": shape, **self._place(name, "")}
+            if name in arrays:
+                place = self._place(name, "")
+                place["bytes"] += own
+                return {"shape": shape, **place, "apart": names if apart else []}
         masked = self.container.arrays["tables/level_1"].masked
         coding = "in the tiles of tables/level_1" if masked else "every vertex of the box"
-        return {"shape": shape, "path": "", "coding": coding, "bytes": 0}
+        return {"shape": shape, "path": "", "coding": coding, "bytes": 0, "apart": []}
 
     def _place(self, name: str, otherwise: str) -> dict[str, Any]:
         """Path, coding and bytes of an array, or of the arrays below that name."""

@@ -65,19 +65,20 @@ def only_features(volume: Volume, features: Sequence[str]) -> Volume:
     if set(numbers) == set(range(len(_names(volume)))):
         return volume
     if not holds_features_apart(volume):
+        reason = (
+            "it is from a version that did not keep them apart; encode it again"
+            if volume.profile == "paper"
+            else "encode with --profile paper, which keeps several features apart"
+        )
         raise InputError(
-            f"{volume.path}: its features are merged, none can be taken alone; "
-            "--profile paper keeps several features apart"
+            f"{volume.path}: its features are merged, none can be taken alone; {reason}"
         )
     return FeatureVolume(volume.container, numbers, fill=volume._asked_fill)
 
 
 def holds_features_apart(volume: Volume) -> bool:
     """Whether a file keeps the occupancy of each of its features."""
-    arrays = volume.container.arrays
-    return volume.profile == "paper" and all(
-        f"occupancy/feature_{number + 1}" in arrays for number in range(len(_names(volume)))
-    )
+    return isinstance(volume._model, PaperModel) and volume._model.features_apart
 
 
 def _numbers(volume: Volume, features: Sequence[str]) -> tuple[int, ...]:

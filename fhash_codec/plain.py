@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import product
 from math import prod
 from pathlib import Path
@@ -20,6 +21,8 @@ from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import pack, packed_bytes
 from fhash_codec.encoding import check_name
 from fhash_codec.model_parts import TABLE_AXES, Table
+from fhash_codec.paper.model import PaperModel
+from fhash_codec.paper.storage import BITS, MASK, feature_bits
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
@@ -35,8 +38,6 @@ __all__ = ["export_plain"]
 
 CHUNK_BYTES = 2 << 20
 """Bytes of a decoded chunk of a table that is not cut by tiles."""
-MASK = "occupancy/mask"
-"""Array of a coded occupancy, in whose place plain files have bits."""
 
 Index = tuple[int, ...]
 
@@ -107,6 +108,7 @@ class _Export:
             self._write_table(table)
         if keys:
             self._write_occupancy(keys)
+            self._write_features_apart(keys)
         tables = "float32" if coded else self._header["model"]["tables"]
         return {
             **self._header,
@@ -252,16 +254,38 @@ class _Export:
 
     def _write_occupancy(self, keys: int) -> None:
         """Write the bits of every key frame."""
-        box = self._volume.box.shape
+        region = Box.of_shape(self._volume.box.shape)
+        self._write_bits(BITS, keys, lambda key: self._volume._model.occupied(key, key, region))
+
+    def _write_features_apart(self, keys: int) -> None:
+        """Write the bits of each feature, if the numbers of the coded occupancy tell them apart."""
+        model = self._volume._model
+        assert isinstance(model, PaperModel), "other profiles merge features"
+        count = len(self._header["features"])
+        if feature_bits(1) in self._arrays or count < 2 or not model.features_apart:
+            return
+        self._total += keys * count
+        region = Box.of_shape(self._volume.box.shape)
+
+        def read(numbers: tuple[int, ...], key: int) -> npt.NDArray[np.bool_]:
+            return model.occupied_by(numbers, key, key, region)
+
+        for number in range(count):
+            self._write_bits(feature_bits(number + 1), keys, partial(read, (number,)))
+
+    def _write_bits(
+        self, name: str, keys: int, occupied: Callable[[int], npt.NDArray[np.bool_]]
+    ) -> None:
+        """Write an array of bits. occupied: key frame -> vertices (z, y, x) of the box."""
 
         def chunks() -> Iterator[npt.NDArray[Any]]:
             for key in range(keys):
-                yield pack(self._volume._model.occupied(key, key, Box.of_shape(box)))[np.newaxis]
+                yield pack(occupied(key))[np.newaxis]
                 self._tick("occupancy")
 
-        size = packed_bytes(box)
+        size = packed_bytes(self._volume.box.shape)
         self._writer.add_array(
-            "occupancy/bits",
+            name,
             shape=(keys, size),
             dtype=np.uint8,
             chunk_shape=(1, size),

@@ -18,8 +18,14 @@ def card_rows(info: Mapping[str, Any], *, verbose: bool) -> list[tuple[str, str]
         *_config(info, card["config"], verbose=verbose),
         *_tables(info["model"], card["tables"], verbose=verbose),
         *_mlp(card["mlp"], verbose=verbose),
-        ("occupancy", f"bits {extent(card['occupancy']['shape'])}; {_place(card['occupancy'])}"),
+        ("occupancy", _occupancy(card["occupancy"])),
     ]
+
+
+def _occupancy(part: Mapping[str, Any]) -> str:
+    """The bits, and how many features have their own."""
+    apart = f"; {len(part['apart'])} features apart" if part["apart"] else ""
+    return f"bits {extent(part['shape'])}; {_place(part)}{apart}"
 
 
 def _place(part: Mapping[str, Any]) -> str:

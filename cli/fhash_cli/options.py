@@ -131,6 +131,12 @@ class SourceOptions:
                 " read"
             )
 
+    def refuse_without_data(self) -> None:
+        """Raise InputError if any option is given, where there is no DATA to read."""
+        given = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
+        if given:
+            raise InputError(f"--{given[0].replace('_', '-')} is for DATA that are read; name them")
+
     def _wishes(self) -> dict[str, Any]:
         from fhash_formats import RawLayout, parse_shape
 

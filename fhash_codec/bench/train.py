@@ -1,9 +1,13 @@
-"""`fhash bench train`: the engines on one series, in turns: a busy machine treats them alike."""
+"""`fhash bench train`: engines on a series with a feature and whole, in turns.
+
+A busy machine treats all of them alike.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from math import prod
 from statistics import median
 from typing import Any
@@ -11,18 +15,21 @@ from typing import Any
 import numpy as np
 import torch
 
+from fhash_codec.bench.decode import bench_decode
 from fhash_codec.bench.machine import machine
 from fhash_codec.config import ENGINES, EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.coreset.selection import Source, open_source
+from fhash_codec.demo.simulate import SCENES, simulate
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.selection import select
-from fhash_codec.paper.training.train import TrainingPlan, plan_training, probe_psnr
+from fhash_codec.paper.training.train import TrainingPlan, plan_training, probe_bricks, probe_psnr
 from fhash_codec.progress import Progress, silent
 from fhash_codec.training.devices import choose_device
 from fhash_codec.training.threads import threads_for
 from fhash_formats.errors import InputError
+from fhash_formats.series import Series
 
 TURNS = 3
 """Turns over which each engine's time is spread."""
@@ -30,12 +37,16 @@ WARM_UP_STEPS = 4
 """First steps of an engine, whose fastest foretells the number of all steps."""
 SHORTEST_STEP = 1e-6
 """Seconds of a step at least: a clock may stand still for a short one."""
+MADE = "front"
+"""Scene of the made series."""
+MADE_SHAPE = (8, 32, 64, 64)
+"""Shape (t, z, y, x) of the made series."""
 INFER_SECONDS = 1.0
 """Seconds of evaluation in each turn."""
 
 
 def bench_train(
-    source: Source,
+    source: Source | None = None,
     config: EncodeConfig | None = None,
     *,
     engines: Sequence[str] = ENGINES,
@@ -44,9 +55,12 @@ def bench_train(
 ) -> dict[str, Any]:
     """Measure engines on the coreset of a series.
 
-    Each engine trains for `seconds` in three turns, and evaluates bricks in each. The result has
-    the keys `engines`, `machine`, `series`, `samples`, `batch_samples` and `brick_fill`, the share
-    of samples among the vertices of bricks. An entry of `engines`:
+    A series with a feature is measured a second time without it: bricks around a feature are
+    partly empty. Each engine trains for `seconds` in three turns, and evaluates samples in each.
+    The result has the keys `series`, a list, and `machine`. An entry of `series` has `series` (its
+    name), `features`, `samples`, `batch_samples`, `brick_fill`, the share of samples among the
+    vertices of bricks, `decode_msamples_s` and `decode_ratio` (`bench_decode`), and `engines`. An
+    entry of `engines`:
 
     - `train_msamples_s`, `infer_msamples_s`: coreset vertices, in 10^6 a second, medians over the
       turns.
@@ -57,7 +71,15 @@ def bench_train(
       to zero over each engine's own seconds.
     - `epochs`, `seconds`: of training.
 
-    Raises InputError for an unknown engine or seconds that are not positive.
+    Args:
+        source: the series; None for a made one, a blast's shell.
+        config: the settings; the made series has a feature of its own where they name none.
+        engines: names of the engines.
+        seconds: training of each engine.
+        progress: called with each step of the work.
+
+    Raises:
+        InputError: an engine is unknown, or the seconds are not positive.
     """
     config = config or EncodeConfig(profile="paper")
     if seconds <= 0 or not engines:
@@ -66,10 +88,31 @@ def bench_train(
             " a positive time and at least one engine are needed"
         )
     device = choose_device(config.device)
+    if source is None:
+        source = simulate(MADE, MADE_SHAPE)
+        if config.features == ("all",):
+            config = replace(config, features=(SCENES[MADE].feature,))
+    configs = [config]
+    if config.features != ("all",):
+        configs.append(replace(config, features=("all",)))
     with open_source(source) as series:
-        selected = select(series, config, progress)
-        coreset, architecture = selected.coreset, selected.architecture
-        name = f"{series.source} {series.name}"
+        results = [
+            _measured(series, config, engines, seconds, device, progress) for config in configs
+        ]
+    return {"series": results, "machine": machine() | _torch_on(device)}
+
+
+def _measured(
+    series: Series,
+    config: EncodeConfig,
+    engines: Sequence[str],
+    seconds: float,
+    device: torch.device,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Return an entry of `series`; arguments as in `bench_train`."""
+    selected = select(series, config, progress)
+    coreset, architecture = selected.coreset, selected.architecture
     plan = plan_training(
         coreset,
         epochs=1,
@@ -88,20 +131,24 @@ def bench_train(
         peak = matrix_product_rate(device)
         flops = 3 * 2 * sum(outputs * inputs for outputs, inputs in architecture.layer_shapes)
         results = [run.result(flops, peak) for run in runs]
-        used = machine() | _torch_on(device) | {"matrix_product_gflops": peak / 1e9}
     naive = next((result for result in results if result["engine"] == "naive"), None)
     for result in results:
         for kind in ("train", "infer"):
             result[f"{kind}_ratio"] = (
                 result[f"{kind}_msamples_s"] / naive[f"{kind}_msamples_s"] if naive else None
             )
+    _, layers = runs[-1].engine.parameters().dense(architecture)
     return {
-        "engines": results,
-        "machine": used,
-        "series": name,
+        "series": f"{series.source} {series.name}",
+        "features": [str(feature) for feature in selected.features],
         "samples": len(coreset.values),
         "batch_samples": len(coreset.values) / plan.batches,
         "brick_fill": len(coreset.values) / (len(coreset.bricks) * prod(coreset.brick_shape)),
+        "engines": results,
+        "matrix_product_gflops": peak / 1e9,
+        **bench_decode(
+            architecture, coreset, [(weight.numpy(), bias.numpy()) for weight, bias in layers]
+        ),
     }
 
 
@@ -185,7 +232,7 @@ class _Run:
 
     def result(self, flops: int, peak: float) -> dict[str, Any]:
         train = median(self.train_speeds)
-        probe = np.sort(np.random.default_rng(0).permutation(self.plan.bricks)[:256])
+        probe = probe_bricks(self.coreset, 0, 256)
         return {
             "engine": self.name,
             "train_msamples_s": train / 1e6,

@@ -50,6 +50,7 @@ class Coreset:
         background: mean of the finite values outside the coreset over the key frames, in data
             units; the mean of all values if none is outside.
         apart: `occupancy` of each feature alone; empty if there is only one.
+        fringe: bool (samples,), which samples are of the fringe; None if none was asked for.
     """
 
     box: Box
@@ -64,6 +65,20 @@ class Coreset:
     fraction: float
     background: float
     apart: tuple[tuple[npt.NDArray[np.uint8], ...], ...] = ()
+    fringe: npt.NDArray[np.bool_] | None = None
+
+    @property
+    def counts(self) -> npt.NDArray[np.int64]:
+        """Samples of each brick without those of the fringe, int64 (n,)."""
+        if self.fringe is None:
+            return np.diff(self.offsets)
+        ends = np.concatenate([[0], np.cumsum(~self.fringe, dtype=np.int64)])
+        return np.asarray(np.diff(ends[self.offsets]))
+
+    def places(self, chosen: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Places (n,) in `values` of the samples of some bricks, in their order."""
+        spans = zip(self.offsets[chosen].tolist(), self.offsets[chosen + 1].tolist(), strict=True)
+        return np.concatenate([np.arange(first, end) for first, end in spans])
 
 
 def build_coreset(
@@ -95,9 +110,10 @@ def build_coreset(
     grid = (-(-size[0] // shape[0]), -(-size[1] // shape[1]), -(-size[2] // shape[2]))
     samples = extent.samples_with_fringe() if fringe else extent.samples
     values = np.empty(samples, dtype=np.float32)
+    in_fringe = np.zeros(samples, dtype=np.bool_) if fringe else None
     grids, layers, end = [], [], 0
     for key, step in enumerate(key_frames):
-        mask = extent.mask(key)
+        mask = of_key = extent.mask(key)
         grids.append(occupancy.pack(mask))
         frame = series.read(step)[box.slices()]
         if fringe:
@@ -110,6 +126,8 @@ def build_coreset(
             samples_of_layer = scan.value_range.to_unit(tile(frame[rows], shape)[in_coreset])
             start, end = end, end + samples_of_layer.size
             values[start:end] = samples_of_layer
+            if in_fringe is not None:
+                in_fringe[start:end] = ~tile(of_key[rows], shape)[in_coreset]
             layers.append(_layer_bricks(in_coreset, key, layer))
         progress("gathering", key + 1, len(key_frames), "")
     bricks, mask_bits, counts = (np.concatenate(arrays) for arrays in zip(*layers, strict=True))
@@ -129,6 +147,7 @@ def build_coreset(
             tuple(occupancy.pack(extent.mask_of(number, key)) for key in range(len(key_frames)))
             for number in range(len(extent.apart))
         ),
+        fringe=in_fringe,
     )
 
 

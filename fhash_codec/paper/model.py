@@ -5,20 +5,19 @@ This module needs numpy only.
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.coreset.boxes import Box
-from fhash_codec.coreset.occupancy import Bits, between, unpack
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.model_parts import CORNERS, Mlp, Table
 from fhash_codec.paper.network import Network
 from fhash_codec.paper.points import sample_points
 from fhash_codec.paper.regions import decode_region
-from fhash_codec.paper.storage import load_network
+from fhash_codec.paper.storage import features_apart, load_network, read_occupancy
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError
 
@@ -37,7 +36,7 @@ class PaperModel:
         self._range = ValueRange(*header["value_range"])
         self._box = Box.of(header["feature_bounding_box"])
         self.chunks: tuple[int, ...] = (1, *header["domain"]["shape"][1:])
-        self._unpacked = lru_cache(maxsize=4)(self._unpack)
+        self._occupancy = lru_cache(maxsize=4)(partial(read_occupancy, container))
 
     @cached_property
     def network(self) -> Network:
@@ -59,7 +58,12 @@ class PaperModel:
 
     def occupied(self, first: int, last: int, region: Box) -> npt.NDArray[np.bool_]:
         """Return which vertices (z, y, x) of a region are in the coreset at either key frame."""
-        return self._unpacked(first, last)[region.slices()]
+        return self._occupancy(first, last)[region.slices()]
+
+    @property
+    def features_apart(self) -> bool:
+        """Whether the file has the occupancy of each of its features."""
+        return features_apart(self._container)
 
     def occupied_by(
         self, features: tuple[int, ...], first: int, last: int, region: Box
@@ -67,12 +71,11 @@ class PaperModel:
         """Return which vertices (z, y, x) of a region are in the coreset for some features.
 
         Args:
-            features: their numbers, counted from 0; those of a file with several features.
+            features: their numbers, counted from 0; those of a file with `features_apart`.
             first, last: neighbouring key frames, or the same key frame twice.
             region: the region.
         """
-        names = tuple(f"occupancy/feature_{number + 1}" for number in features)
-        return self._unpacked(first, last, names)[region.slices()]
+        return self._occupancy(first, last, features)[region.slices()]
 
     def read(
         self, key: float, region: Box, requested: npt.NDArray[np.bool_]
@@ -102,21 +105,3 @@ class PaperModel:
         return self._range.from_unit(unit), slopes.astype(np.float64) * (
             self._range.high - self._range.low
         )
-
-    def _unpack(
-        self, first: int, last: int, names: tuple[str, ...] = ("occupancy/bits",)
-    ) -> npt.NDArray[np.bool_]:
-        """Return the occupancy (z, y, x) of the box in some arrays at either of two key frames."""
-        arrays = self._container.arrays
-        if names == ("occupancy/bits",) and "occupancy/mask" in arrays:
-            space = tuple(slice(0, length) for length in self._box.shape)
-            mask = arrays["occupancy/mask"].read((slice(first, last + 1), *space)) != 0
-            return np.asarray(mask[0] | mask[-1])
-        merged: Bits | None = None
-        for name in names:
-            stored = arrays[name]
-            bits = stored.read((slice(first, last + 1), slice(0, stored.shape[1])))
-            one = between(bits[0], bits[-1])
-            merged = one if merged is None else merged | one
-        assert merged is not None, "at least one array is read"
-        return unpack(merged, self._box.shape)

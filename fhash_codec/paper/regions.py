@@ -14,6 +14,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,9 +26,17 @@ from fhash_formats.support.threads import share_out, usable_threads
 
 BLOCK_VERTICES = 8192
 """Largest number of vertices in a block."""
+ROW_COLUMNS = 32
+"""Usual vertices of a block along x, two rows to a product."""
+MIN_SHIFT = 5
+"""Columns at least by which a plane of a block begins before or after the column of the last one.
+
+With 5 columns, the sparse blocks of a shock's feature take 0.19 of their products; with none, 0.45.
+"""
 READ_NUMBERS = 2**24
 """Numbers of a table that are read at once for one time node."""
 
+Scalar = TypeVar("Scalar", bound=np.generic)
 BlockIndex = tuple[int, int, int]
 """Place (z, y, x) of a block in the grid of blocks."""
 
@@ -102,12 +111,19 @@ def decode_region(
     ]
 
     def decode(share: Sequence[BlockIndex]) -> None:
-        layers = DenseLayers(network, math.prod(shape))
+        samples = shape[0] * _plane_samples(shape)
+        layers = DenseLayers(network, samples)
+        in_block = np.zeros(samples, np.bool_)
         for block in share:
             _encode(network, block, shape, windows, weights, layers)
-            values = layers.run()[: math.prod(shape)].reshape(shape)
             inside_block, inside_region = _overlap(block, shape, region)
-            result[inside_region] = values[inside_block]
+            if requested is None:
+                outputs = layers.run()
+            else:
+                in_block[:] = False
+                _in_planes(in_block, shape)[inside_block] = requested[inside_region]
+                outputs = layers.run_some(in_block)
+            result[inside_region] = _in_planes(outputs[:samples], shape)[inside_block]
 
     share_out(decode, blocks, threads)
     return result
@@ -128,6 +144,25 @@ def block_shape(box_size: tuple[int, int, int]) -> tuple[int, int, int]:
         shape[axis] = min(2 * shape[axis], box_size[axis])
     z, y, x = (-(-size // -(-size // limit)) for size, limit in zip(box_size, shape, strict=True))
     return z, y, x
+
+
+def _plane_samples(shape: Sequence[int]) -> int:
+    """Return the samples of `DenseLayers` that a plane (y, x) of a block takes, unused ones last.
+
+    Planes that began in the same column of a product, or nearly so, would have the vertices of a
+    feature below each other, and then they could not move to fewer products.
+    """
+    samples = shape[1] * shape[2]
+    while shape[0] > 1 and not MIN_SHIFT <= samples % ROW_COLUMNS <= ROW_COLUMNS - MIN_SHIFT:
+        samples += 1
+    return samples
+
+
+def _in_planes(samples: npt.NDArray[Scalar], shape: Sequence[int]) -> npt.NDArray[Scalar]:
+    """Return the samples (..., z * plane) of a block as a view (..., z, y, x)."""
+    leading = samples.shape[:-1]
+    planes = samples.reshape(*leading, shape[0], -1)
+    return planes[..., : shape[1] * shape[2]].reshape(*leading, *shape)
 
 
 def _check(
@@ -268,15 +303,15 @@ def _encode(
             for axis, first in zip((z, y, x), window.first, strict=True)
         )
         values = window.values[(slice(None), *slices)]
-        rows = layers.inputs[level * size : (level + 1) * size, : bz * by * bx]
+        rows = _in_planes(
+            layers.inputs[level * size : (level + 1) * size, : bz * _plane_samples(shape)], shape
+        )
         if network.levels[level][1:] == network.box_size:
             # The vertices of the level are those of the box: only the end of the box needs padding.
-            padded = rows.reshape(size, bz, by, bx)
-            if values.shape != padded.shape:
-                padded[...] = 0.0
-            padded[tuple(slice(length) for length in values.shape)] = values
+            if values.shape != rows.shape:
+                rows[...] = 0.0
+            rows[tuple(slice(length) for length in values.shape)] = values
         else:
             upsampled = y.weights @ (values @ x.weights.T)
-            np.matmul(
-                z.weights, upsampled.reshape(size, -1, by * bx), out=rows.reshape(size, bz, by * bx)
-            )
+            planes = rows.reshape(size, bz, by * bx)
+            np.matmul(z.weights, upsampled.reshape(size, -1, by * bx), out=planes)

@@ -24,13 +24,22 @@ def ramp() -> np.ndarray:
     return np.clip(x - 0.05 * t * y + 0 * z, 0, 1).astype(np.float32)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module", params=["float16", "transform", "plain"])
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with plain tables, one with coded tables, and that one in plain numbers."""
     path = tmp_path_factory.mktemp("apart") / "two.fhz"
     config = EncodeConfig(
-        profile="paper", features=(LOW, HIGH), key_frames="0,2,3", epochs=2, width=8
+        profile="paper",
+        features=(LOW, HIGH),
+        key_frames="0,2,3",
+        epochs=2,
+        width=8,
+        tables="float16" if request.param == "float16" else "transform",
     )
     fhash_codec.encode(ramp(), path, config)
+    if request.param == "plain":
+        fhash_codec.export_plain(path, path.with_name("plain.fhz"))
+        return path.with_name("plain.fhz")
     return path
 
 
@@ -68,6 +77,57 @@ def test_features_that_a_file_lacks_or_has_merged_are_refused(run, tmp_path) -> 
     fhash_codec.encode(ramp(), path, EncodeConfig(features=(LOW, HIGH), effort=1))
     with fhash_codec.open(path) as volume, pytest.raises(InputError, match="are merged"):
         only_features(volume, [LOW])
+
+
+def test_the_reason_why_a_file_has_its_features_merged_is_the_true_one(tmp_path) -> None:
+    compact, older = tmp_path / "compact.fhz", tmp_path / "older.fhz"
+    fhash_codec.encode(ramp(), compact, EncodeConfig(features=(LOW, HIGH), effort=1))
+    config = EncodeConfig(
+        profile="paper", features=(LOW, HIGH), epochs=1, width=4, tables="transform"
+    )
+    with pytest.MonkeyPatch.context() as patch:  # as versions before wrote it
+        patch.setattr("fhash_codec.paper.tables.small_parts.MASK_BITS", 1)
+        patch.setattr("fhash_codec.paper.tables.small_parts.write_features_apart", lambda *_: None)
+        fhash_codec.encode(ramp(), older, config)
+    for path, reason in ((compact, "encode with --profile paper"), (older, "encode it again")):
+        with fhash_codec.open(path) as volume, pytest.raises(InputError, match=reason):
+            only_features(volume, [LOW])
+    with fhash_codec.open(older) as volume:
+        assert volume.describe()["occupancy"]["apart"] == []
+
+
+@pytest.mark.parametrize("count", [8, 9])
+def test_many_features_are_apart_in_coded_files_too(tmp_path, count) -> None:
+    """The numbers of the mask have 8 bits; more features have arrays of their own."""
+    features = tuple(f"interval:{n / 10:g}:{n / 10 + 0.05:g}" for n in range(count))
+    config = EncodeConfig(
+        profile="paper", features=features, epochs=1, width=4, dilation=0, tables="transform"
+    )
+    path, plain = tmp_path / "many.fhz", tmp_path / "plain.fhz"
+    fhash_codec.encode(ramp(), path, config)
+    fhash_codec.export_plain(path, plain)
+    for name in (path, plain):
+        with fhash_codec.open(name) as volume:
+            own = "occupancy/feature_9" in volume.container.arrays
+            assert own == (count == 9)
+            assert ("occupancy/feature_1" in volume.container.arrays) == (own or name == plain)
+            source = ramp()[2]
+            for feature in (features[0], features[-1]):
+                low, high = (np.float32(end) for end in feature.split(":")[1:])
+                np.testing.assert_array_equal(
+                    only_features(volume, [feature]).occupancy(2),
+                    (source >= low) & (source <= high),
+                )
+
+
+def test_the_card_names_the_features_apart(run) -> None:
+    with fhash_codec.open(run) as volume:
+        occupancy = volume.describe()["occupancy"]
+        assert occupancy["apart"] == [LOW, HIGH]
+        stored = volume.container.arrays
+        assert occupancy["bytes"] == sum(
+            array.nbytes_stored for name, array in stored.items() if "occupancy/" in name
+        )
 
 
 def test_a_picture_of_one_feature_skips_the_other(run) -> None:

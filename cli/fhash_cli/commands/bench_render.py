@@ -151,6 +151,7 @@ def _tables(result: RenderBench) -> Iterator[Rows]:
     yield _switches("orbit", result.orbit)
     yield _beside(result)
     yield _streams(result)
+    yield _break_even(result)
     yield _beside_vtk(result)
     yield _exactness(result)
     yield _playback(result)
@@ -189,6 +190,25 @@ def _streams(result: RenderBench) -> Rows:
                 number(run.largest, digits=2),
             )
             for run in result.streams
+        ),
+    ]
+
+
+def _break_even(result: RenderBench) -> Rows:
+    """Time of the cache and of adaptive ray marching by the size of the picture."""
+    return [
+        ("pixels", "cache ms", "kept ms", "arm ms", "arm / cache", "arm up to", "auto"),
+        *(
+            (
+                str(pair.size),
+                _ms(pair.first_ms),
+                _ms(pair.kept_ms),
+                _ms(pair.arm_ms),
+                number(pair.ratio, "x", digits=3),
+                "any" if pair.pictures is None else f"{pair.pictures} pictures",
+                pair.auto,
+            )
+            for pair in result.break_even
         ),
     ]
 

@@ -15,6 +15,7 @@ import numpy as np
 from fhash_codec.bench.machine import machine
 from fhash_codec.bench.pictures.beside_shell import beside_shell
 from fhash_codec.bench.pictures.beside_vtk import Comparison
+from fhash_codec.bench.pictures.break_even import break_even
 from fhash_codec.bench.pictures.likeness import picture_psnr
 from fhash_codec.bench.pictures.orbit import orbit
 from fhash_codec.bench.pictures.ospray_peer import find_ospray, load_ospray
@@ -130,6 +131,7 @@ def bench_render(
         orbit=results.get("orbit", ()),
         beside=results.get("shell", ()),
         streams=results.get("streams", ()),
+        break_even=results.get("break-even", ()),
         against=results.get("vtk", ()),
         exactness=results.get("exactness", ()),
         playback=results.get("playback", ()),
@@ -155,6 +157,9 @@ def _measure(
         "orbit": partial(orbit, bench.turns, bench.scene.size[0]),
         "shell": partial(beside_shell, bench.turns, bench.scene.size[0], ospray, bench.progress),
         "streams": bench.streams,
+        "break-even": lambda: break_even(
+            bench.volume, bench.scene, bench.turns, bench.scene.size[0], bench.progress
+        ),
         "vtk": lambda: beside().against(),
         "exactness": lambda: beside().exactness(),
         "playback": lambda: beside().playback(),

@@ -5,6 +5,7 @@ Times are medians, in milliseconds, of runs in turns.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
@@ -15,6 +16,7 @@ PARTS = (
     "orbit",
     "shell",
     "streams",
+    "break-even",
     "vtk",
     "exactness",
     "playback",
@@ -63,6 +65,40 @@ class Stream:
     evaluations: int
     psnr: float | None
     largest: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class BreakEven:
+    """Pictures of one size by the cache and by adaptive ray marching through the model.
+
+    Attributes:
+        size: pixels along both sides.
+        first_ms: the cache, decoding included.
+        kept_ms: the cache with the frame kept.
+        arm_ms: adaptive ray marching, which keeps nothing.
+        evaluations: of the model.
+        auto: the mode that 'auto' takes.
+    """
+
+    size: int
+    first_ms: float
+    kept_ms: float
+    arm_ms: float
+    evaluations: int
+    auto: str
+
+    @property
+    def ratio(self) -> float:
+        """Time of adaptive ray marching over that of a first picture by the cache."""
+        return self.arm_ms / self.first_ms
+
+    @property
+    def pictures(self) -> int | None:
+        """Number of pictures of one step for which marching takes less; None for any number."""
+        if self.arm_ms <= self.kept_ms:
+            return None
+        decoding = max(self.first_ms - self.kept_ms, 0.0)
+        return math.floor(decoding / (self.arm_ms - self.kept_ms))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,6 +244,7 @@ class RenderBench:
     notes: tuple[str, ...]
     orbit: tuple[Switch, ...] = ()
     beside: tuple[Beside, ...] = ()
+    break_even: tuple[BreakEven, ...] = ()
 
     def summary(self) -> dict[str, float]:
         """Median and smallest ratio to VTK, for unlit and lit scenes apart; empty without VTK."""
@@ -226,4 +263,6 @@ class RenderBench:
         for name in ("effects", "accelerations", "orbit", "beside", "against", "playback"):
             for entry, record in zip(values[name], getattr(self, name), strict=True):
                 entry["ratio"] = record.ratio
+        for entry, pair in zip(values["break_even"], self.break_even, strict=True):
+            entry |= {"ratio": pair.ratio, "pictures": pair.pictures}
         return {**values, "summary": self.summary()}

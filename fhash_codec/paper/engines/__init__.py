@@ -45,10 +45,16 @@ class Engine(Protocol):
         """Finish work that training put off: evaluation is then faster until the next step."""
 
     def infer(self, chosen: Chosen) -> torch.Tensor:
-        """Return the normalised values (bricks, vertices) of some bricks at all their vertices."""
+        """Return the normalised values (n,) at the samples of some bricks.
+
+        They come brick by brick, in C order in a brick, as `Coreset.values` has them.
+        """
 
     def squared_error(self, chosen: Chosen) -> float:
-        """Return the sum of squared errors over the coreset vertices of some bricks."""
+        """Return the sum of squared errors over the coreset vertices of some bricks.
+
+        Samples of the fringe do not count.
+        """
 
     def parameters(self) -> Parameters:
         """Return the trained numbers, on the CPU."""

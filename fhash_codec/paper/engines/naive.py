@@ -68,15 +68,19 @@ class NaiveEngine:
 
     @torch.no_grad()
     def infer(self, chosen: Chosen) -> Tensor:
-        """Return the values (bricks, vertices) of some bricks at all their vertices."""
-        points = torch.from_numpy(_vertices(self.coreset, chosen)).to(self.device, self.dtype)
-        return torch.as_tensor(self.model(points.view(-1, 4))).view(len(chosen), -1)
+        """Return the values (n,) at the samples of some bricks."""
+        points, _ = self._samples(chosen)
+        return torch.as_tensor(self.model(points))
 
     @torch.no_grad()
     def squared_error(self, chosen: Chosen) -> float:
         """Return the sum of squared errors over the coreset vertices of some bricks."""
         points, target = self._samples(chosen)
-        return float((self.model(points) - target).square().sum(dtype=torch.float64))
+        error = self.model(points) - target
+        if self.coreset.fringe is not None:
+            fringe = self.coreset.fringe[self.coreset.places(chosen)]
+            error = error[torch.from_numpy(~fringe).to(self.device)]
+        return float(error.square().sum(dtype=torch.float64))
 
     def parameters(self) -> Parameters:
         """Return the trained numbers, float32 on the CPU; embeddings outside the coreset are 0."""
@@ -125,8 +129,7 @@ class NaiveEngine:
     def _samples(self, chosen: Chosen) -> tuple[Tensor, Tensor]:
         """Return points (n, 4) and normalised values (n,) of the coreset vertices of bricks."""
         points = _vertices(self.coreset, chosen)[self.in_coreset[chosen]]
-        offsets = self.coreset.offsets
-        values = np.concatenate([self.coreset.values[offsets[i] : offsets[i + 1]] for i in chosen])
+        values = self.coreset.values[self.coreset.places(chosen)]
         return (torch.from_numpy(array).to(self.device, self.dtype) for array in (points, values))  # type: ignore[return-value]
 
 

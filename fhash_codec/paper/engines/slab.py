@@ -134,17 +134,20 @@ class SlabEngine:
 
     @torch.no_grad()
     def infer(self, chosen: Chosen) -> Tensor:
-        """Return the values (bricks, vertices) of some bricks at all their vertices."""
+        """Return the values (n,) at the samples of some bricks."""
         ids = torch.from_numpy(chosen).to(self.device)
-        fine = self.fine[ids] if self.settled == self.step else self._caught_up(ids, self.step)[2]
-        lattices = self.upsampling.lattices(self.bricks[ids])
-        return self._value(self._inputs(lattices, fine)).view(len(ids), self.vertices)
+        return self._infer(ids, self._in_coreset(ids))
 
     @torch.no_grad()
     def squared_error(self, chosen: Chosen) -> float:
         """Return the sum of squared errors over the coreset vertices of some bricks."""
-        target, in_coreset = self._targets(torch.from_numpy(chosen).to(self.device))
-        return float(((self.infer(chosen) - target) * in_coreset).square().sum(dtype=torch.float64))
+        ids = torch.from_numpy(chosen).to(self.device)
+        target, is_sample = self._targets(ids)
+        error = self._infer(ids, is_sample) - target[is_sample.bool()]
+        if self.coreset.fringe is not None:
+            fringe = self.coreset.fringe[self.coreset.places(chosen)]
+            error.masked_fill_(torch.from_numpy(fringe).to(self.device), 0.0)
+        return float(error.square().sum(dtype=torch.float64))
 
     @torch.no_grad()
     def settle(self) -> None:
@@ -243,6 +246,25 @@ class SlabEngine:
         lattices.interpolate(self.flat, levels[1:])
         return inputs
 
+    def _infer(self, ids: Tensor, in_coreset: Tensor) -> Tensor:
+        """Return the values (n,) at the samples of bricks, given the mask of `_targets`.
+
+        Only samples go through the MLP where the bricks are sparse.
+        """
+        fine = self.fine[ids] if self.settled == self.step else self._caught_up(ids, self.step)[2]
+        lattices = self.upsampling.lattices(self.bricks[ids])
+        inputs = self._inputs(lattices, fine)
+        samples = in_coreset.reshape(-1).nonzero().squeeze(1)
+        if len(samples) > FULL * in_coreset.numel():
+            return self._value(inputs)[samples]
+        return self._value(self._picked(inputs, samples))
+
+    def _picked(self, inputs: Tensor, samples: Tensor) -> Tensor:
+        """Return the columns of some samples; the next call overwrites them."""
+        picked = self._scratch("picked inputs", len(inputs), len(samples))
+        torch.index_select(inputs, 1, samples, out=picked)
+        return picked
+
     def _value(self, inputs: Tensor) -> Tensor:
         """Return the output of the MLP (samples,)."""
         result = torch.empty(inputs.shape[1], device=self.device)
@@ -280,10 +302,8 @@ class SlabEngine:
         samples = flat_mask.nonzero().squeeze(1)
         if len(samples) > FULL * len(flat_mask):
             return self._backpropagate(inputs, target, in_coreset, scale)
-        picked = self._scratch("picked inputs", len(inputs), len(samples))
-        torch.index_select(inputs, 1, samples, out=picked)
         error, gradient = self._backpropagate(
-            picked, target.reshape(-1)[samples], flat_mask[samples], scale
+            self._picked(inputs, samples), target.reshape(-1)[samples], flat_mask[samples], scale
         )
         whole = self._scratch("whole gradient", len(gradient), inputs.shape[1]).zero_()
         return error, whole.index_copy_(1, samples, gradient)

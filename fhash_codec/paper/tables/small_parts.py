@@ -11,10 +11,12 @@ from collections.abc import Callable, Sequence
 from math import prod
 
 import numpy as np
+import numpy.typing as npt
 
 from fhash_codec.coreset import occupancy
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats, Layer
+from fhash_codec.paper.storage import MASK, MASK_BITS, MASK_FEATURE_BITS, write_features_apart
 from fhash_formats.container import ContainerWriter
 from fhash_formats.container.coding import transform_codecs
 from fhash_formats.transform.axes.spec import TransformSpec
@@ -71,26 +73,47 @@ def write_layers(
 
 
 def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
-    """Write the occupancy of a coreset as `occupancy/mask`, coded as labels."""
+    """Write the occupancy of a coreset as `occupancy/mask`, coded as labels, its features apart.
+
+    A number of several features has one bit for each of them. More than MASK_BITS features have
+    arrays of their own, as beside plain tables.
+    """
     box = coreset.box.shape
-    steps = max(1, min(len(coreset.occupancy), MASK_VERTICES // prod(box)))
-    starts = range(0, len(coreset.occupancy), steps)
+    keys = len(coreset.occupancy)
+    steps = max(1, min(keys, MASK_VERTICES // prod(box)))
+    apart = coreset.apart if len(coreset.apart) <= MASK_BITS else ()
+    grids = apart or (coreset.occupancy,)
+
+    def numbers(key: int) -> npt.NDArray[np.uint8]:
+        result = np.zeros(box, np.uint8)
+        for bit, packed in enumerate(grids):
+            result |= occupancy.unpack(packed[key], box).view(np.uint8) << np.uint8(bit)
+        return result
+
     writer.add_array(
-        "occupancy/mask",
-        shape=(len(coreset.occupancy), *box),
+        MASK,
+        shape=(keys, *box),
         dtype=np.uint8,
         chunk_shape=(steps, *box),
         chunks=(
-            np.stack(
-                [occupancy.unpack(bits, box) for bits in coreset.occupancy[i : i + steps]]
-            ).view(np.uint8)
-            for i in starts
+            np.stack([numbers(key) for key in range(first, min(first + steps, keys))])
+            for first in range(0, keys, steps)
         ),
         dimension_names=("t", "z", "y", "x"),
+        attributes={MASK_FEATURE_BITS: True} if apart else None,
         codecs=transform_codecs(
-            TileSettings(transform=_PLAIN, step=1.0, center=0.0, low=0.0, high=1.0, labels=True)
+            TileSettings(
+                transform=_PLAIN,
+                step=1.0,
+                center=0.0,
+                low=0.0,
+                high=float((1 << len(grids)) - 1),
+                labels=True,
+            )
         ),
     )
+    if not apart:
+        write_features_apart(writer, coreset)
 
 
 def _weight_settings(weight: Floats, share: float) -> TileSettings | None:

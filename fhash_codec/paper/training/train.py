@@ -243,9 +243,7 @@ class _Loop:
         self.note = ""
         self._engine, self._plan, self._coreset, self._reached = engine, plan, coreset, reached
         self._samples = np.diff(coreset.offsets)
-        self._probe = np.sort(
-            np.random.default_rng(plan.seed).permutation(plan.bricks)[:PROBE_BRICKS]
-        )
+        self._probe = probe_bricks(coreset, plan.seed, PROBE_BRICKS)
         self._epochs_a_point = -(-plan.epochs // HISTORY_POINTS)
         self._largest_error: Tensor | None = None
         self._seconds_before, self._begun = reached.seconds, time.perf_counter()
@@ -313,12 +311,18 @@ class _Saving:
         self._seconds = max(self._seconds, 20 * (self._saved - begun))
 
 
+def probe_bricks(coreset: Coreset, seed: int, count: int) -> npt.NDArray[np.int64]:
+    """Return the numbers of at most `count` random bricks with a vertex of the coreset, sorted."""
+    order = np.random.default_rng(seed).permutation(len(coreset.bricks))
+    return np.sort(order[coreset.counts[order] > 0][:count])
+
+
 def probe_psnr(engine: Engine, coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float | None:
     """Return the PSNR in dB over the coreset vertices of some bricks; None if the error is 0.
 
     The values are normalised, so their range is 1. Raises Diverged if the error is not finite.
     """
-    samples = int(np.diff(coreset.offsets)[bricks].sum())
+    samples = int(coreset.counts[bricks].sum())
     error = sum(
         engine.squared_error(batch)
         for batch in np.array_split(bricks, -(-len(bricks) // PROBED_AT_ONCE))
@@ -350,8 +354,7 @@ def _dead(reached: TrainingProgress, variance: float) -> bool:
 
 def _variance(coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float:
     """Return the variance of the normalised values at the coreset vertices of some bricks."""
-    values = [
-        coreset.values[first:end]
-        for first, end in zip(coreset.offsets[bricks], coreset.offsets[bricks + 1], strict=True)
-    ]
-    return float(np.var(np.concatenate(values), dtype=np.float64))
+    places = coreset.places(bricks)
+    if coreset.fringe is not None:
+        places = places[~coreset.fringe[places]]
+    return float(np.var(coreset.values[places], dtype=np.float64))

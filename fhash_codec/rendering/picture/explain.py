@@ -119,9 +119,8 @@ def _time_text(plan: Plan) -> str:
 
 
 def _mode_text(plan: Plan, volume: Volume) -> str:
-    chosen = plan.scene.march.mode == "auto"
     if plan.mode == "cache":
-        why = ", as is fastest on a CPU" if chosen else ""
+        why = f", {plan.why_mode}" if plan.why_mode else ""
         lattice = (
             "; linear between vertices, where the network (arm) has other values"
             if volume.profile == "paper"
@@ -133,8 +132,8 @@ def _mode_text(plan: Plan, volume: Volume) -> str:
         if volume.profile == "paper"
         else "the lattice, with the same values as cache"
     )
-    if chosen:
-        through += "; chosen for the GPU"
+    if plan.why_mode:
+        through += f"; {plan.why_mode}"
     if plan.mode == "stream":
         return f"stream: one sample of each ray in a pass, straight through {through}"
     budget = plan.scene.march.samples_per_pass

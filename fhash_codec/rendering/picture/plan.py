@@ -29,6 +29,7 @@ class Plan:
         step: of the series; fractional between two steps.
         time: physical time.
         mode: 'cache', 'arm' or 'stream'.
+        why_mode: reason why 'auto' took the mode, for people; empty where the scene names it.
         lod: level of detail, 0 for the finest.
         why_lod: reason for the level, for people.
         region: part of the domain (z, y, x) that is decoded.
@@ -46,6 +47,7 @@ class Plan:
     step: float
     time: float
     mode: str
+    why_mode: str
     lod: int
     why_lod: str
     region: Box

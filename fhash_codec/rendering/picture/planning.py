@@ -30,7 +30,6 @@ from fhash_codec.rendering.picture.lighting import (
 from fhash_codec.rendering.picture.plan import Plan
 from fhash_codec.rendering.scene.scene import (
     Effects,
-    Marching,
     Scene,
 )
 from fhash_codec.rendering.task.arrays import NUMPY
@@ -49,6 +48,12 @@ LONG_RAY = 10**5
 """Samples of a ray above which a warning is given: a picture of usual size then takes minutes."""
 MAX_RAY_SAMPLES = 10**8
 """Most samples of a ray: more would take days, and Ctrl-C cannot stop a ray being marched."""
+VERTICES_A_SAMPLE = 64
+"""Vertices that a CPU decodes in the time of a sample through the network, and more.
+
+Measured 43 on a series without a feature and 16 with one, by samples that are evaluated; the bound
+of a picture counts those that are skipped, too.
+"""
 MAX_RAYS = 2**26
 """Most rays of a picture: more would not fit in the memory of most machines."""
 
@@ -84,7 +89,7 @@ def plan_picture(
         task, error=error, grading=grading_of(scene.transfer_function, volume, units, grid)
     )
     _check_ray_length(task)
-    mode = _mode(scene.march)
+    mode, why_mode = _mode(volume, scene)
     margin = _margin(task, lod)
     # Light comes from all of the volume, whether it is in view or not.
     domain = part_of_body(volume, task.body, grid.warp, margin)
@@ -96,6 +101,7 @@ def plan_picture(
         step=step,
         time=_time_of(volume, step),
         mode=mode,
+        why_mode=why_mode,
         lod=lod,
         why_lod=why_lod,
         region=domain if lit else part_in_view(rays, volume, task.body, margin),
@@ -348,17 +354,33 @@ def _warn_of_unseen_surfaces(volume: Volume, scene: Scene) -> None:
         )
 
 
-def _mode(march: Marching) -> str:
-    """The way to march; raises InputError for one that the device cannot take."""
+def _mode(volume: Volume, scene: Scene) -> tuple[str, str]:
+    """The way to march, and why 'auto' took it; InputError for one that the device cannot take."""
+    march = scene.march
     if march.mode == "auto":
-        # On a CPU a network is evaluated at some ten thousand samples while native code marches
-        # millions through a decoded frame.
-        on_gpu = march.device == "cuda" or (
+        if march.device == "cuda" or (
             march.device == "auto" and arrays_on(march.device) is not NUMPY
-        )
-        return "arm" if on_gpu else "cache"
+        ):
+            return "arm", "chosen for the GPU"
+        if _few_samples(volume, scene):
+            return "arm", "chosen since so few samples cost less than decoding the frame"
+        return "cache", "as is fastest on a CPU"
     if march.mode == "cache" and march.device == "cuda":
         raise InputError(
             "march 'cache' computes on the CPU; take 'arm' or 'stream' for device 'cuda'"
         )
-    return march.mode
+    return march.mode, ""
+
+
+def _few_samples(volume: Volume, scene: Scene) -> bool:
+    """Whether all samples that a picture may take cost less through the network than its frame.
+
+    `fhash bench render --part break-even` measures it. Light needs the frame in any case.
+    """
+    effects, header = scene.effects, volume.container.header
+    if volume.profile != "paper" or effects.shadows or effects.ambient_occlusion:
+        return False
+    rays = scene.size[0] * scene.size[1] * effects.antialiasing**2
+    longest = float(np.linalg.norm(volume.box.shape)) / scene.march.step
+    frame = header["coreset_fraction"] * float(np.prod(volume.shape[1:]))
+    return rays * longest * VERTICES_A_SAMPLE <= frame

@@ -31,8 +31,9 @@ def test_bench_train_measures_each_engine(fhash: Fhash, data: Path) -> None:
     result = fhash("bench", "train", data, "--seconds", "0.1", "--width", "4", "--json", "-q")
     assert (result.exit_code, result.stderr) == (0, "")
     report = json.loads(result.stdout)
-    assert sorted(entry["engine"] for entry in report["engines"]) == ["naive", "slab"]
-    for entry in report["engines"]:
+    (series,) = report["series"]
+    assert sorted(entry["engine"] for entry in series["engines"]) == ["naive", "slab"]
+    for entry in series["engines"]:
         assert entry["train_msamples_s"] > 0
         assert entry["infer_msamples_s"] > 0
         assert 0 < entry["fraction_of_peak"] < 1
@@ -45,9 +46,25 @@ def test_bench_train_prints_a_table(fhash: Fhash, data: Path) -> None:
         "bench", "train", data, "--seconds", "0.1", "--engines", "slab", "--width", "4", "-q"
     )
     assert result.exit_code == 0
-    header, row, _ = result.stdout.splitlines()
-    assert header.startswith("engine")
-    assert row.startswith("slab")
+    header, row, fill, _ = result.stdout.splitlines()
+    assert header.split()[:2] == ["features", "engine"]
+    assert row.split()[:2] == ["all", "slab"]
+    assert "times as fast as by whole blocks" in fill
+
+
+@pytest.mark.usefixtures("steady")
+def test_bench_train_makes_a_series_where_none_is_given(
+    fhash: Fhash, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train, "MADE_SHAPE", (2, 8, 16, 16))
+    words = ["bench", "train", "--seconds", "0.1", "--width", "4", "--json", "-q"]
+    result = fhash(*words)
+    assert (result.exit_code, result.stderr) == (0, "")
+    features = [entry["features"] for entry in json.loads(result.stdout)["series"]]
+    assert features == [["interval:0.25:2"], ["all"]]
+    refused = fhash(*words[:2], "--var", "velocity", "-q")
+    assert refused.exit_code == 2
+    assert refused.stderr == "fhash: error: --var is for DATA that are read; name them\n"
 
 
 RATE = ["--profile", "paper", "--epochs", "1", "--width", "4", "-q"]

@@ -240,6 +240,23 @@ def test_the_fringe_is_sampled_and_no_part_of_the_coreset() -> None:
     assert (fringed.fraction, fringed.background) == (plain.fraction, plain.background)
 
 
+def test_samples_of_the_fringe_are_told_and_not_counted() -> None:
+    values = np.random.default_rng(1).random((3, 5, 20, 40)).astype(np.float32)
+    plain, _ = build(values, [Interval(0.95, 1.0)], dilation=0)
+    fringed, _ = build(values, [Interval(0.95, 1.0)], dilation=0, fringe=True)
+    assert plain.fringe is None
+    np.testing.assert_array_equal(plain.counts, np.diff(plain.offsets))
+    assert fringed.fringe.shape == fringed.values.shape
+    np.testing.assert_array_equal(fringed.values[~fringed.fringe], plain.values)
+    assert fringed.counts.sum() == len(plain.values) < len(fringed.values)
+    chosen = np.array([3, 0, 2])
+    places = fringed.places(chosen)
+    np.testing.assert_array_equal(
+        np.add.reduceat(~fringed.fringe[places], np.cumsum([0, *np.diff(fringed.offsets)[[3, 0]]])),
+        fringed.counts[chosen],
+    )
+
+
 def test_a_fringe_without_a_value_has_that_of_the_neighbour() -> None:
     values = np.zeros((3, 2, 3, 4), np.float32)
     values[0, 0], values[2, 1] = 0.75, 0.5

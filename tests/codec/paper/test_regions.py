@@ -92,6 +92,43 @@ def test_blocks_without_a_requested_vertex_are_nan_and_the_others_as_ever(
     assert np.isnan(decode_region(net, 0, region, requested=np.zeros(cut.shape, bool))).all()
 
 
+def test_vertices_in_few_products_have_the_bits_of_the_whole(networks, monkeypatch) -> None:
+    """A ball, a plate, a column and random vertices, on a key frame and between two."""
+    net = networks.random((25, 40, 64), 3, 2, 2, 2, width=64)
+    z, y, x = np.ogrid[:25, :40, :64]
+    shapes = [
+        (z - 12) ** 2 + (y - 15) ** 2 + (x - 30) ** 2 < 90,
+        np.broadcast_to(np.abs(x - 20) < 5, net.box_size),
+        np.broadcast_to((y == 7) & (x > 60), net.box_size),
+        np.random.default_rng(0).random(net.box_size) < 0.02,
+    ]
+    for key_index in (1.0, 0.4):
+        frame = decode_region(net, key_index, networks.box(net))
+        for requested in shapes:
+            found = decode_region(
+                net, key_index, networks.box(net), requested=np.ascontiguousarray(requested)
+            )
+            np.testing.assert_array_equal(found[requested], frame[requested])
+            assert np.isnan(found[~requested]).all(), "few vertices cost few products"
+
+
+@pytest.mark.parametrize(
+    ("shape", "samples"),
+    [
+        ((8, 16, 32), 16 * 32 + 5),
+        ((8, 1, 36), 37),
+        ((8, 1, 37), 37),
+        ((8, 1, 59), 59),
+        ((8, 1, 60), 69),
+        ((1, 64, 128), 64 * 128),
+    ],
+    ids=str,
+)
+def test_planes_of_a_block_begin_in_other_columns(shape, samples) -> None:
+    """A single plane has no neighbour to begin apart from."""
+    assert regions._plane_samples(shape) == samples
+
+
 def test_a_region_reads_just_its_surroundings_once_per_level(networks) -> None:
     net = networks.recording(networks.random((64, 64, 64), 8, 2, 2, 1))
     decode_region(net, 3.0, ((20, 36),) * 3)

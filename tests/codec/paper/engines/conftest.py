@@ -16,10 +16,14 @@ from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 
 
-def _noise_coreset(shape: tuple[int, int, int, int], low: float = 0.3) -> Coreset:
+def _noise_coreset(
+    shape: tuple[int, int, int, int], low: float = 0.3, fringe: bool = False
+) -> Coreset:
     series = ArraySeries(np.random.default_rng(3).random(shape, dtype=np.float32))
     scanned = scan(series, silent)
-    return build_coreset(series, scanned, range(shape[0]), [Interval(low, 1.0)], 0, silent)
+    return build_coreset(
+        series, scanned, range(shape[0]), [Interval(low, 1.0)], 0, silent, fringe=fringe
+    )
 
 
 def _in_coreset(coreset: Coreset) -> npt.NDArray[np.bool_]:
@@ -28,7 +32,7 @@ def _in_coreset(coreset: Coreset) -> npt.NDArray[np.bool_]:
 
 @pytest.fixture(scope="session")
 def noise_coreset() -> Callable[..., Coreset]:
-    """A function of (shape, low): noise in which the values from `low` to 1 are the feature."""
+    """A function of (shape, low, fringe): noise; values from `low` to 1 are the feature."""
     return _noise_coreset
 
 

@@ -48,13 +48,12 @@ def engines_of(noise_coreset):
 
 
 @pytest.mark.parametrize(("shape", "settings"), CASES)
-def test_slab_equals_the_oracle_before_training(in_coreset, engines_of, shape, settings) -> None:
+def test_slab_equals_the_oracle_before_training(engines_of, shape, settings) -> None:
     coreset, slab, oracle = engines_of(shape, settings)
     bricks = np.arange(len(coreset.bricks))
-    mask = in_coreset(coreset)
-    np.testing.assert_allclose(
-        slab.infer(bricks).numpy()[mask], oracle.infer(bricks).numpy()[mask], atol=2e-7
-    )
+    values = slab.infer(bricks).numpy()
+    assert values.shape == coreset.values.shape
+    np.testing.assert_allclose(values, oracle.infer(bricks).numpy(), atol=2e-7)
     assert slab.squared_error(bricks) == pytest.approx(oracle.squared_error(bricks), rel=1e-5)
 
 
@@ -132,3 +131,32 @@ def test_samples_alone_give_the_same_gradients_as_all_vertices_of_sparse_bricks(
     assert errors[0] == pytest.approx(errors[1], rel=1e-6)
     apart = (gradients[0] - gradients[1]).abs() / gradients[1].abs().max()
     assert float(apart.max()) < 1e-5
+
+
+@pytest.mark.parametrize("full", [1.0, 0.0])
+def test_only_samples_of_sparse_bricks_are_evaluated(engines_of, monkeypatch, full) -> None:
+    """Both ways give the values at the samples; FULL decides how many columns the MLP takes."""
+    monkeypatch.setattr("fhash_codec.paper.engines.slab.FULL", full)
+    settings = {"embedding_size": 2, "hidden_layers": 2, "low": 0.8}
+    coreset, slab, oracle = engines_of((3, 9, 20, 35), settings)
+    columns, value = [], slab._value
+    monkeypatch.setattr(
+        slab, "_value", lambda inputs: (columns.append(inputs.shape[1]), value(inputs))[1]
+    )
+    chosen = np.arange(len(coreset.bricks))[::-2].copy()
+    np.testing.assert_allclose(slab.infer(chosen).numpy(), oracle.infer(chosen).numpy(), atol=2e-7)
+    samples = int(np.diff(coreset.offsets)[chosen].sum())
+    assert columns == [samples if full else len(chosen) * slab.vertices]
+
+
+def test_errors_are_those_of_the_coreset_without_its_fringe(noise_coreset) -> None:
+    coreset = noise_coreset((3, 6, 10, 20), 0.9, fringe=True)
+    architecture = Architecture.for_box(coreset.box.shape, 3, width=8)
+    bricks = np.arange(len(coreset.bricks))[::-1].copy()
+    inside = ~coreset.fringe[coreset.places(bricks)]
+    target = coreset.values[coreset.places(bricks)]
+    assert 0 < inside.sum() < inside.size
+    for engine in (SlabEngine, NaiveEngine):
+        made = engine(architecture, coreset, np.full(10, 0.01), seed=1, device=CPU)
+        expected = np.square(made.infer(bricks).numpy() - target)[inside].sum()
+        assert made.squared_error(bricks) == pytest.approx(float(expected), rel=1e-5)

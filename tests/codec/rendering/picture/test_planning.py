@@ -339,6 +339,34 @@ def test_auto_is_arm_on_a_gpu_and_cache_on_a_cpu(
     assert ("fastest on a CPU" in line) == (chosen and mode == "cache")
 
 
+@pytest.mark.parametrize("few", [True, False])
+def test_auto_is_arm_on_a_cpu_where_all_samples_cost_less_than_the_frame(
+    tmp_path: Path, volume: Volume, monkeypatch: pytest.MonkeyPatch, few: bool
+) -> None:
+    """Both sides of the number; a compact file, and light, need the frame in any case."""
+    module = "fhash_codec.rendering.picture.planning"
+    monkeypatch.setattr(f"{module}.arrays_on", lambda device: NUMPY)
+    path = tmp_path / "a.fhz"
+    field = np.random.default_rng(0).random((2, 4, 5, 6), dtype=np.float32)
+    fhash_codec.encode(field, path, EncodeConfig(profile="paper", epochs=1, width=4))
+    samples = 16 * 16 * np.sqrt(4**2 + 5**2 + 6**2) / 0.5
+    limit = 4 * 5 * 6 / samples
+    monkeypatch.setattr(f"{module}.VERTICES_A_SAMPLE", limit * (0.999 if few else 1.001))
+    scene = {"size": [16, 16], "march": {"step": 0.5}}
+    with fhash_codec.open(path) as paper:
+        planned = plan(paper, **scene)
+        assert planned.mode == ("arm" if few else "cache")
+        line = planned.to_dict()["march"]
+        assert ("cost less than decoding the frame" in line) == few
+        assert ("fastest on a CPU" in line) == (not few)
+        smooth = {"effects": {"antialiasing": 2}}
+        lit = {"effects": {"shadows": {}}}
+        assert {plan(paper, **scene, **more).mode for more in (smooth, lit)} == {"cache"}
+        marched = plan(paper, **{**scene, "march": {"step": 0.5, "mode": "cache"}})
+        assert marched.mode == "cache"
+    assert plan(volume, **scene).mode == "cache"
+
+
 @pytest.mark.parametrize(("mode", "words"), [("cache", "has other values"), ("arm", "is linear")])
 def test_a_plan_says_where_network_and_lattice_differ(
     tmp_path: Path, volume: Volume, mode: str, words: str
