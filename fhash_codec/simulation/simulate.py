@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.simulation.effects.effect import Array, Body, Place, Surface
+from fhash_codec.simulation.effects.effect import Array, Body, Place, Surface, Vector
 from fhash_codec.simulation.scene import SimulatedScene, scene_of
 from fhash_codec.simulation.terms import Terms, terms_of
 from fhash_formats.errors import InputError
@@ -32,11 +32,15 @@ from fhash_formats.support.threads import in_threads
 __all__ = ["BLOCK_VERTICES", "MAX_FRAME_VERTICES", "Counters", "Simulation", "simulate"]
 
 Block = tuple[slice, slice, slice]
+Shifts = dict[tuple[int, Vector | None], Array]
 
-BLOCK_VERTICES = 2**16
+BLOCK_VERTICES = 2**15
 """Vertices that are computed at once, about: their arrays fit into a processor's cache."""
 MAX_FRAME_VERTICES = 2**32
 """Most vertices of a frame, of which one is held in memory."""
+KEPT_BYTES = 24 * 2**20
+"""Bytes of an array that is made and freed before a frame: the C library then keeps that much
+memory for the arrays of blocks, where it would give it back to the system after each of them."""
 MAX_SEED = 2**32 - 1
 """Largest seed."""
 VERTEX_WIDTH = 0.7
@@ -120,6 +124,7 @@ class Simulation(Series):
         self.require_step(step)
         time = float(self.coords["t"].values[step])
         frame: Array = np.empty(self.scene.shape, dtype=np.float32)
+        np.empty(KEPT_BYTES, dtype=np.uint8)
 
         def compute(block: Block) -> Counters:
             counters = Counters()
@@ -155,11 +160,15 @@ class Simulation(Series):
         core = tuple(slice(n) for n in shape)
         counters.places += math.prod(extended)
         place = self._carried(self._places(block, extended), time, counters)
-        stretch = self._stretch(place, shape, extended, counters) if terms.sheared else None
+        stretch = None
+        if terms.sheared:
+            nothing: Array = np.zeros(shape, dtype=np.float32)
+            stretch = self._stretch(place, shape, extended, counters, (nothing, nothing))
+        shifts: Shifts = {}
         for number, body in terms.bodies:
             surface = body.surface(place, time)
             counters.add(number, surface.distance.size)
-            distance = self._bent(surface, body, time, counters)
+            distance = self._bent(surface, body, time, shifts, counters)
             widths = stretch
             if terms.bends:
                 widths = self._stretch((distance,), shape, extended, counters, stretch)
@@ -190,13 +199,20 @@ class Simulation(Series):
                 counters.add(number, max(axis.size for axis in place))
         return place
 
-    def _bent(self, surface: Surface, body: Body, time: float, counters: Counters) -> Array:
-        """The distance to the surface with its fingers."""
+    def _bent(
+        self, surface: Surface, body: Body, time: float, shifts: Shifts, counters: Counters
+    ) -> Array:
+        """The distance to the surface with its fingers.
+
+        shifts: those computed so far; bodies with one middle have the same.
+        """
         distance = surface.distance
         for number, bend in self.terms.bends if time > 0 else ():
-            shift = bend(surface.waves(), body.curved, time)
-            counters.add(number, shift.size)
-            distance = distance - shift * np.float32(surface.scale)
+            key = number, body.middle
+            if key not in shifts:
+                shifts[key] = bend(surface.waves(), body.middle is not None, time)
+                counters.add(number, shifts[key].size)
+            distance = distance - shifts[key] * np.float32(surface.scale)
         return distance
 
     def _stretch(
@@ -210,14 +226,13 @@ class Simulation(Series):
         """Squares of the largest change of `parts` to a vertex behind, in m^2 and per m.
 
         parts: arrays whose changes are the legs of a right angle, such as z, y and x.
-        least: squares that the result has at least.
+        least: squares that the result has at least; those of a medium at rest if left out.
         """
         core = tuple(slice(n) for n in shape)
-        change, steepest = (
-            least
-            if least is not None
-            else (np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32))
-        )
+        if least is None:
+            still = np.float32(max(self.terms.spacing) ** 2)
+            least = np.full(shape, still), np.ones(shape, dtype=np.float32)
+        change, steepest = least
         counters.stretches += math.prod(shape)
         for axis, step in enumerate(self.terms.spacing):
             if step == 0:

@@ -48,7 +48,7 @@ class Blob(Effect):
             return smooth_step(distance, width) * self._dilution(widening)
 
         low, high = sorted((0.0, self.strength))
-        return Body(surface=surface, value=value, low=low, high=high, curved=True)
+        return Body(surface=surface, value=value, low=low, high=high, middle=(z, y, x))
 
     def _dilution(self, widening: Array | float) -> Array:
         """The value that keeps the amount, once the edge is wider.

@@ -116,14 +116,14 @@ class Body:
             what diffusion and the distance of vertices add to the width of the surface, in m^2.
         low: least value that it can add.
         high: largest value that it can add.
-        curved: whether fingers stand on directions and not on positions.
+        middle: point from which directions say where fingers stand; None where positions do.
     """
 
     surface: Callable[[Place, float], Surface]
     value: Callable[[Array, Array | float, float], Array]
     low: float
     high: float
-    curved: bool
+    middle: Vector | None = None
 
 
 def smooth_step(distance: Array, width: Array | float) -> Array:

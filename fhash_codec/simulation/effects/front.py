@@ -71,4 +71,4 @@ class Front(Effect):
             return behind
 
         low, high = sorted((0.0, self.strength))
-        return Body(surface=surface, value=value, low=low, high=high, curved=False)
+        return Body(surface=surface, value=value, low=low, high=high)

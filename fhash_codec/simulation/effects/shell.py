@@ -66,4 +66,4 @@ class Shell(Effect):
             return inside
 
         low, high = sorted((0.0, self.level(0.0)))
-        return Body(surface=surface, value=value, low=low, high=high, curved=True)
+        return Body(surface=surface, value=value, low=low, high=high, middle=self.centre)
