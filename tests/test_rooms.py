@@ -66,7 +66,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fhash_cli": (
         ("intervals", "progress_bar"),
         ("base_command", "conversion", "options", "output", "scene_types", "selection"),
-        ("animation_options", "card_rows", "gallery", "scene_options", "simulating", "source_listing"),
+        ("animation_options", "card_rows", "gallery", "scene_options", "simulating"),
+        ("source_listing",),
         ("commands",),
         ("main",),
     ),

@@ -137,11 +137,12 @@ def _demonstrate(
     """Simulate, encode, compare and draw; the result as JSON values, and as rows."""
     import fhash_codec
     from fhash_codec.config import EncodeConfig
+    from fhash_codec.coreset.features import parse_feature
     from fhash_formats import open_series
     from fhash_formats.support.atomic import replacing
 
     data, run, picture = (folder / f"{chosen.name}.{suffix}" for suffix in ("h5", "fhz", "png"))
-    # Checked before any work, as all of the encoder's settings are.
+    parse_feature(simulation.scene.feature)
     config = EncodeConfig(features=(simulation.scene.feature,))
     try:
         folder.mkdir(exist_ok=True)
