@@ -206,7 +206,7 @@ def _sources(chosen: SceneOptions) -> list[str]:
 def result_of(
     chosen: SceneOptions, simulation: Simulation, seconds: float, explain: bool
 ) -> dict[str, Any]:
-    """What was simulated, as JSON values."""
+    """A simulation as JSON values: what was computed, and with `explain` why."""
     from fhash_codec.simulation.explain import counts, reasons
 
     result: dict[str, Any] = {

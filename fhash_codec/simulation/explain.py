@@ -15,7 +15,7 @@ ROLES = {
     "bend": "moves the surfaces of all bodies",
     "spread": "widens the surfaces of all bodies",
 }
-"""What the effects of a role do."""
+"""Work of the effects of each role."""
 
 
 def reasons(simulation: Simulation) -> list[tuple[str, str]]:
@@ -42,7 +42,7 @@ def reasons(simulation: Simulation) -> list[tuple[str, str]]:
 
 
 def counts(simulation: Simulation) -> dict[str, Any]:
-    """What was computed so far, as JSON values; each kind of effect is there, with 0 if not named.
+    """Counters of a simulation as JSON values; each kind of effect is there, 0 if not named.
 
     `made` is the number of terms, and `places` for how many places they were computed.
     """
@@ -62,7 +62,7 @@ def counts(simulation: Simulation) -> dict[str, Any]:
 
 
 def _time_text(simulation: Simulation) -> str:
-    """How the time to a step is cut for the flows."""
+    """The parts into which the time to a step is cut for the flows."""
     terms = simulation.terms
     if not terms.flows:
         return "nothing is carried: a step needs none of the times before it"
@@ -75,7 +75,7 @@ def _time_text(simulation: Simulation) -> str:
 
 
 def _surface_text(simulation: Simulation) -> str:
-    """How wide surfaces become."""
+    """The width of surfaces."""
     terms = simulation.terms
     if not terms.bodies:
         return "none: the value is the background everywhere"

@@ -38,8 +38,8 @@ FRONT: Scene = {
     "shape": (32, 48, 48),
     "background": 0.1,
     "effects": [
-        {"effect": "shell", "strength": 0.5, "radius": 0.4, "age": 0.13, "thickness": 0.06},
-        {"effect": "fingers", "strength": 0.28, "count": 14, "growth": 0.7},
+        {"effect": "shell", "strength": 0.75, "radius": 0.38, "age": 0.13, "thickness": 0.07},
+        {"effect": "fingers", "strength": 0.5, "count": 14, "growth": 0.8},
     ],
 }
 """A blast wave."""

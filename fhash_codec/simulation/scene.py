@@ -27,7 +27,7 @@ MAX_SIDE = 16384
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedScene(Record):
-    """What to simulate. Axes are always (z, y, x).
+    """A box, a time and effects to simulate. Axes are always (z, y, x).
 
     The vertices are the middles of equal cells of the box, and the steps are spread evenly over the
     duration, its ends included.

@@ -51,7 +51,7 @@ MAX_WIDENING = 1e30
 
 @dataclass
 class Counters:
-    """What was computed so far.
+    """Counts of what was computed so far.
 
     Attributes:
         frames: frames computed.

@@ -184,7 +184,9 @@ def _draw(scene: str, series: Series, volume: Volume, report: dict[str, Any]) ->
     """Draw the slice of constant z with the most of the coreset, at evenly spread steps."""
     from fhash_codec.demo.comparison_picture import Pair, compare
 
-    steps = [round((index + 0.5) * series.shape[0] / COLUMNS) for index in range(COLUMNS)]
+    count = series.shape[0]
+    columns = min(COLUMNS, count)
+    steps = [int((index + 0.5) * count / columns) for index in range(columns)]
     layer = int(sum(volume.occupancy(step).sum(axis=(1, 2), dtype=int) for step in steps).argmax())
     times, heights = series.coords["t"].values, series.coords["z"].values
     window = ((layer, layer + 1), (0, series.shape[2]), (0, series.shape[3]))

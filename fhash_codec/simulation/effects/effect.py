@@ -1,9 +1,9 @@
-"""What an effect is: a record of settings that makes a pure term, and the three kinds of terms.
+"""An effect is a record of settings that makes a pure term; there are four kinds of terms.
 
 - A `Flow` carries parcels of the medium: it says where a parcel was a moment ago.
 - A `Body` is something with a surface: it says how far a place is from the surface, and which value
   stands there.
-- A bend (`fingers`) and a spread (`diffusion`) change the surfaces of all bodies.
+- A bend (`fingers`) moves the surfaces of all bodies, and a spread (`diffusion`) widens them.
 
 Terms depend on nothing but their arguments. Arrays are float32 in metres, broadcastable against
 each other: what does not depend on an axis has length 1 along it, and costs as little.

@@ -1,4 +1,4 @@
-"""What effects share: a step, directions and axes."""
+"""Tools that effects share: a step, directions and axes."""
 
 from __future__ import annotations
 
