@@ -47,6 +47,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("volume",),
         ("feature_volume", "promises", "report"),
         ("rendering",),
+        ("simulation",),
         ("comparison", "demo", "isosurface"),
         ("encoding",),
         ("plain",),
@@ -65,7 +66,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fhash_cli": (
         ("intervals", "progress_bar"),
         ("base_command", "conversion", "options", "output", "scene_types", "selection"),
-        ("animation_options", "card_rows", "gallery", "scene_options", "source_listing"),
+        ("animation_options", "card_rows", "gallery", "scene_options", "simulating"),
+        ("source_listing",),
         ("commands",),
         ("main",),
     ),

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.demo.simulate import simulate
+from fhash_codec.simulation.simulate import simulate
 from fhash_formats.series import ArraySeries, Coordinate
 
 __all__ = ["GALLERY_SERIES", "PICTURES", "GallerySeries", "Picture"]

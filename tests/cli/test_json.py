@@ -16,7 +16,6 @@ import pytest
 from click.testing import Result
 
 import fhash_codec
-from fhash_cli.commands import demo
 from fhash_cli.main import COMMANDS
 from fhash_codec.bench import train
 from fhash_codec.bench.pictures.results import RenderBench
@@ -139,17 +138,18 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
 
 
 def test_demo(fhash: Fhash, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    simulate, encode = demo.simulate, fhash_codec.encode
+    encode = fhash_codec.encode
 
     def encode_fast(*words: Any, **options: Any) -> dict[str, Any]:
         *files, config = words
         return encode(*files, replace(config, effort=2), **options)
 
-    monkeypatch.setattr(demo, "simulate", lambda name: simulate(name, (5, 8, 10, 12)))
     monkeypatch.setattr(fhash_codec, "encode", encode_fast)
     for name in ("curve[].epoch", "curve[].seconds", "curve[].psnr"):  # nothing is trained here
         monkeypatch.delitem(KEYS["demo"], name)
-    check("demo", parsed(fhash("demo", "-o", tmp_path, "--json", "-q")))
+    words = ("demo", "--shape", "8,10,12", "--steps", "5", "--explain", "--json", "-q", "-o")
+    check("demo", parsed(fhash(*words, tmp_path)))
+    check("demo -o FILE", parsed(fhash(*words, tmp_path / "run.npy")))
 
 
 def test_verify_and_decode(fhash: Fhash, run: Path) -> None:

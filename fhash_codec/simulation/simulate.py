@@ -1,0 +1,328 @@
+"""Simulation of a scene: every value from its place and time alone, frame by frame.
+
+The value at a vertex is the background and what each body adds there. The flows say from where the
+medium at the vertex came: the time from 0 to a step is cut into equal parts, and in each, from the
+last to the first, every flow carries the place back (Lie splitting of the characteristics). Bodies
+are looked at there. So no error adds up from step to step, every value lies between bounds that the
+bodies give, and a step costs the same memory however many there are.
+
+A surface is as wide as its own width, what diffusion adds, and a part of the way that the medium of
+one vertex had to that of the next: sheets thinner than the lattice fade into their mean value.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.simulation.effects.effect import Array, Body, Place, Surface, Vector
+from fhash_codec.simulation.scene import SimulatedScene, scene_of
+from fhash_codec.simulation.terms import Terms, terms_of
+from fhash_formats.errors import InputError
+from fhash_formats.series import AXIS_NAMES, Coordinate, Series
+from fhash_formats.support.threads import in_threads
+
+__all__ = ["BLOCK_VERTICES", "MAX_FRAME_VERTICES", "Counters", "Simulation", "simulate"]
+
+Block = tuple[slice, slice, slice]
+Shifts = dict[tuple[int, Vector | None], Array]
+
+BLOCK_VERTICES = 2**15
+"""Vertices that are computed at once, about: their arrays fit into a processor's cache."""
+MAX_FRAME_VERTICES = 2**32
+"""Most vertices of a frame, of which one is held in memory."""
+KEPT_BYTES = 24 * 2**20
+"""Bytes of an array that is made and freed before a frame: the C library then keeps that much
+memory for the arrays of blocks, where it would give it back to the system after each of them."""
+MAX_SEED = 2**32 - 1
+"""Largest seed."""
+VERTEX_WIDTH = 0.7
+"""Width of a sharp surface as a share of the change of distance between vertices."""
+MAX_WIDENING = 1e30
+"""Largest square of a width in m^2: float32 holds it."""
+
+
+@dataclass
+class Counters:
+    """Counts of what was computed so far.
+
+    Attributes:
+        frames: frames computed.
+        vertices: vertices of these frames.
+        places: places that were looked at for them, those beside blocks included.
+        parts: parts of the time over all frames, in each of which every flow acts.
+        evaluations: places for which each effect was computed, by its number in the scene.
+        stretches: places at which the change of a distance between vertices was computed.
+    """
+
+    frames: int = 0
+    vertices: int = 0
+    places: int = 0
+    parts: int = 0
+    evaluations: dict[int, int] = field(default_factory=dict)
+    stretches: int = 0
+
+    def add(self, number: int, count: int) -> None:
+        """Count places for which the effect of a number was computed."""
+        self.evaluations[number] = self.evaluations.get(number, 0) + count
+
+
+class Simulation(Series):
+    """A scene as a series (t, z, y, x) of float32, computed as its frames are asked for.
+
+    A frame is the same in whatever order frames are read, and whatever the number of threads.
+
+    Attributes:
+        scene: what is simulated.
+        seed: of the random numbers.
+        terms: of the scene's effects.
+        counters: of what was computed so far.
+
+    Raises InputError for a seed or shape that is not allowed.
+    """
+
+    def __init__(self, scene: SimulatedScene, seed: int = 0) -> None:
+        if not isinstance(seed, int) or not 0 <= seed <= MAX_SEED:
+            raise InputError(f"seed is {seed}; allowed: 0 to {MAX_SEED}")
+        if math.prod(scene.shape) > MAX_FRAME_VERTICES:
+            raise InputError(
+                f"shape is {scene.shape} in (z, y, x), {math.prod(scene.shape)} vertices; a frame"
+                f" may have {MAX_FRAME_VERTICES}"
+            )
+        self.scene, self.seed = scene, seed
+        self.terms: Terms = terms_of(scene, seed)
+        self.counters = Counters()
+        self.source, self.name, self.units = "simulation", scene.name, scene.units
+        self.dtype = np.dtype(np.float32)
+        self.shape = (scene.steps, *scene.shape)
+        self.attributes: Mapping[str, Any] = {}
+        self.coords = _coordinates(scene)
+        self._centres = [self.coords[axis].values.astype(np.float32) for axis in ("z", "y", "x")]
+        self._lock = threading.Lock()
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Numbers that no value is below or above, but for rounding."""
+        low = sum(body.low for _, body in self.terms.bodies)
+        high = sum(body.high for _, body in self.terms.bodies)
+        return self.scene.background + low, self.scene.background + high
+
+    def parts(self, time: float) -> int:
+        """Parts into which the time from 0 s is cut for the flows; 0 where none acts."""
+        if not self.terms.flows or time == 0:
+            return 0
+        return 1 if self.terms.exact else self.scene.splits
+
+    def read(self, step: int) -> npt.NDArray[np.float32]:
+        self.require_step(step)
+        time = float(self.coords["t"].values[step])
+        frame: Array = np.empty(self.scene.shape, dtype=np.float32)
+        np.empty(KEPT_BYTES, dtype=np.uint8)
+
+        def compute(block: Block) -> Counters:
+            counters = Counters()
+            frame[block] = self._values(block, time, counters)
+            return counters
+
+        done = list(in_threads(compute, blocks(self.scene.shape)))
+        with self._lock:
+            self._count(done, self.parts(time))
+        return frame
+
+    def _count(self, done: list[Counters], parts: int) -> None:
+        """Add what the blocks of a frame took to the counters."""
+        self.counters.frames += 1
+        self.counters.vertices += math.prod(self.scene.shape)
+        self.counters.parts += parts
+        for counters in done:
+            self.counters.places += counters.places
+            self.counters.stretches += counters.stretches
+            for number, count in counters.evaluations.items():
+                self.counters.add(number, count)
+
+    def _values(self, block: Block, time: float, counters: Counters) -> Array:
+        """The values of a block; a last layer beside it shows how distances change."""
+        terms, shape = self.terms, tuple(part.stop - part.start for part in block)
+        values: Array = np.full(shape, self.scene.background, dtype=np.float32)
+        if not terms.bodies:
+            return values
+        extended = tuple(
+            n + 1 if terms.stretched and total > 1 else n
+            for n, total in zip(shape, self.scene.shape, strict=True)
+        )
+        core = tuple(slice(n) for n in shape)
+        counters.places += math.prod(extended)
+        place = self._carried(self._places(block, extended), time, counters)
+        stretch = None
+        if terms.sheared:
+            nothing: Array = np.zeros(shape, dtype=np.float32)
+            stretch = self._stretch(place, shape, extended, counters, (nothing, nothing))
+        shifts: Shifts = {}
+        for number, body in terms.bodies:
+            surface = body.surface(place, time)
+            counters.add(number, surface.distance.size)
+            distance = self._bent(surface, body, time, shifts, counters)
+            widths = stretch
+            if terms.bends:
+                widths = self._stretch((distance,), shape, extended, counters, stretch)
+            distance = np.broadcast_to(distance, extended)[core]
+            values += body.value(distance, self._widening(widths, time, counters), time)
+        return values
+
+    def _places(self, block: Block, extended: tuple[int, ...]) -> Place:
+        """Positions of the vertices of a block, and of those right behind it."""
+        lines = []
+        for axis, (part, count) in enumerate(zip(block, extended, strict=True)):
+            line = self._centres[axis][part]
+            if count > line.size:
+                # The vertex behind the box is one like any other.
+                after = line[-1] + np.float32(self.terms.spacing[axis])
+                line = np.append(line, after).astype(np.float32)
+            lines.append(line)
+        z, y, x = np.ix_(*lines)
+        return z, y, x
+
+    def _carried(self, place: Place, time: float, counters: Counters) -> Place:
+        """The places from which the flows brought the medium since 0 s."""
+        parts = self.parts(time)
+        for part in range(parts, 0, -1):
+            start, stop = time * (part - 1) / parts, time * part / parts
+            for number, flow in reversed(self.terms.flows):
+                place = flow.carry(place, start, stop)
+                counters.add(number, max(axis.size for axis in place))
+        return place
+
+    def _bent(
+        self, surface: Surface, body: Body, time: float, shifts: Shifts, counters: Counters
+    ) -> Array:
+        """The distance to the surface with its fingers.
+
+        shifts: those computed so far; bodies with one middle have the same.
+        """
+        distance = surface.distance
+        for number, bend in self.terms.bends if time > 0 else ():
+            key = number, body.middle
+            if key not in shifts:
+                shifts[key] = bend(surface.waves(), body.middle is not None, time)
+                counters.add(number, shifts[key].size)
+            distance = distance - shifts[key] * np.float32(surface.scale)
+        return distance
+
+    def _stretch(
+        self,
+        parts: Sequence[Array],
+        shape: tuple[int, ...],
+        extended: tuple[int, ...],
+        counters: Counters,
+        least: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, Array]:
+        """Squares of the largest change of `parts` to a vertex behind, in m^2 and per m.
+
+        parts: arrays whose changes are the legs of a right angle, such as z, y and x.
+        least: squares that the result has at least; those of a medium at rest if left out.
+        """
+        core = tuple(slice(n) for n in shape)
+        if least is None:
+            still = np.float32(max(self.terms.spacing) ** 2)
+            least = np.full(shape, still), np.ones(shape, dtype=np.float32)
+        change, steepest = least
+        counters.stretches += math.prod(shape)
+        for axis, step in enumerate(self.terms.spacing):
+            if step == 0:
+                continue
+            behind = list(core)
+            behind[axis] = slice(1, shape[axis] + 1)
+            total: Array | None = None
+            for part in parts:
+                whole = np.broadcast_to(part, extended)
+                square = whole[tuple(behind)] - whole[core]
+                square *= square
+                total = square if total is None else np.add(total, square, out=total)
+            assert total is not None
+            change = np.maximum(change, total)
+            total *= np.float32(1 / step**2)
+            steepest = np.maximum(steepest, total)
+        return change, steepest
+
+    def _widening(
+        self, stretch: tuple[Array, Array] | None, time: float, counters: Counters
+    ) -> Array | float:
+        """The square of what diffusion and the distance of vertices add to a surface's width.
+
+        Where the medium is drawn out evenly in time to g times its length, diffusion acts on the
+        mean of g^2 over that time, 2/3 + g^2 / 3.
+        """
+        spread, vertex = 4 * self.terms.diffusivity * time, VERTEX_WIDTH**2
+        if spread:
+            for number in self.terms.spreads:
+                counters.add(number, 1 if stretch is None else stretch[0].size)
+        if stretch is None:
+            return min(vertex * max(self.terms.spacing) ** 2 + spread, MAX_WIDENING)
+        change, steepest = stretch
+        widening = change * np.float32(vertex)
+        if spread:
+            widening += steepest * np.float32(spread / 3)
+            widening += np.float32(spread * 2 / 3)
+        return np.minimum(widening, np.float32(MAX_WIDENING), out=widening)
+
+
+def blocks(shape: tuple[int, int, int]) -> list[Block]:
+    """Blocks of about BLOCK_VERTICES that cover a frame; x is cut last, since it lies together."""
+    x = min(shape[2], BLOCK_VERTICES)
+    rows = max(1, BLOCK_VERTICES // x)
+    y = min(shape[1], max(1, math.isqrt(rows)))
+    z = min(shape[0], max(1, rows // y))
+    y = min(shape[1], max(1, rows // z))
+    return [
+        (
+            slice(a, min(a + z, shape[0])),
+            slice(b, min(b + y, shape[1])),
+            slice(c, min(c + x, shape[2])),
+        )
+        for a in range(0, shape[0], z)
+        for b in range(0, shape[1], y)
+        for c in range(0, shape[2], x)
+    ]
+
+
+def simulate(
+    scene: str | Path | Mapping[str, Any] | SimulatedScene,
+    shape: tuple[int, int, int, int] | None = None,
+    seed: int = 0,
+) -> Simulation:
+    """Simulate a scene as a series (t, z, y, x) of float32, with time in s and positions in m.
+
+    Args:
+        scene: name of a preset, path of a TOML or JSON file, or its settings.
+        shape: (t, z, y, x), instead of the scene's own.
+        seed: of the random numbers, 0 to 2^32 - 1.
+
+    Frames are computed as they are asked for. Raises InputError for an unsuitable scene, shape or
+    seed.
+    """
+    described = scene_of(scene)
+    if shape is not None:
+        steps, z, y, x = shape
+        described = described.resized((z, y, x), steps)
+    return Simulation(described, seed)
+
+
+def _coordinates(scene: SimulatedScene) -> dict[str, Coordinate]:
+    """Times in s, and the middles of the cells in m."""
+    positions = {"t": np.linspace(0.0, scene.duration, scene.steps)} | {
+        axis: (np.arange(count) + 0.5) / count * length
+        for axis, count, length in zip("zyx", scene.shape, scene.size, strict=True)
+    }
+    return {
+        axis: Coordinate(
+            name=AXIS_NAMES[axis], values=values, attributes={"units": "s" if axis == "t" else "m"}
+        )
+        for axis, values in positions.items()
+    }
