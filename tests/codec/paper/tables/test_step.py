@@ -64,6 +64,7 @@ def test_a_promise_out_of_reach_costs_no_bytes(waves, coded_config, tmp_path) ->
         fhash_codec.encode(
             waves(), tmp_path / "b.fhz", replace(config, psnr=150.0, train_on_seconds=0)
         )
+    assert "Training ended at its limit of --train-on-seconds 0: more may help" in str(missed.value)
     assert missed.value.figures["tables_loss_db"] <= MAX_LOSS + 1e-4
     assert missed.value.figures["bytes"] <= free["bytes"] + 40  # the texts of the settings
 
