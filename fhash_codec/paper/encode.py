@@ -142,7 +142,7 @@ def _header(
         "coreset_fraction": coreset.fraction,
         "model": {
             "profile": config.profile,
-            "fold": config.fold,
+            "fold": config.model_fold,
             "embedding_size": architecture.embedding_size,
             "hidden_layers": architecture.hidden_layers,
             "width": architecture.width,
