@@ -93,10 +93,20 @@ class EncodeConfig:
         profile="paper",
     )
     fold: int = option(
-        2, "paper: ratio of resolution from one level to the next", low=2, high=64, profile="paper"
+        0,
+        "paper: ratio of resolution from one level to the next, 2 to 64; 0 for 2, the published "
+        "one, or 8 with --tables transform, where more levels cost bytes",
+        low=0,
+        high=64,
+        profile="paper",
     )
     embedding_size: int = option(
-        2, "paper: numbers trained at each grid corner", low=1, high=16, profile="paper"
+        0,
+        "paper: numbers trained at each grid corner; 0 for 2, the published size, or 1 with "
+        "--tables transform",
+        low=0,
+        high=16,
+        profile="paper",
     )
     hidden_layers: int = option(
         2, "paper: hidden layers of the network", low=0, high=8, profile="paper"
@@ -212,8 +222,27 @@ class EncodeConfig:
         self._accept_python_values()
         for field in dataclasses.fields(self):
             _check(field, getattr(self, field.name))
+        if self.fold == 1:
+            raise InputError("fold is 1; allowed: 2 to 64, or 0 for a ratio that suits the tables")
         self._check_profile()
         self._check_promises()
+
+    @property
+    def model_fold(self) -> int:
+        """The ratio of resolution of the profile paper's levels: `fold`, or what its 0 stands for.
+
+        Coded tables of more levels take more bytes at the same PSNR: the finest table describes the
+        values alone, and the coarser ones repeat what it could say.
+        """
+        return self.fold or (8 if self.tables == "transform" else 2)
+
+    @property
+    def model_embedding_size(self) -> int:
+        """Numbers at a grid corner of the profile paper: `embedding_size`, or what 0 stands for.
+
+        Of several numbers, coded tables use one: the coding turns the others into a constant.
+        """
+        return self.embedding_size or (1 if self.tables == "transform" else 2)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name; `from_dict` gives the same record back."""

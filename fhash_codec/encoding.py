@@ -78,11 +78,13 @@ def encode(
         check_output(path, force, sources=[*series.files, *_mask_files(config)])
         with ContainerWriter(path, force=force) as writer:
             measured = _Measured(writer, series, progress)
-            checkpoint = None
+            checkpoint, advice = None, ""
             if config.profile == "compact":
                 header = encode_compact(writer, series, config, mask, progress, measured.complete)
             else:
-                header, checkpoint = encode_paper(writer, series, config, mask, path, progress)
+                header, checkpoint, advice = encode_paper(
+                    writer, series, config, mask, path, progress
+                )
                 header = measured.complete(header)
             missed = missed_promise(config, measured.figures(header))
             if missed is not None and os.path.lexists(path):
@@ -97,7 +99,7 @@ def encode(
         seconds = time.perf_counter() - begun
         figures = report(volume, measured.quality, seconds=seconds, files=series.files)
     if missed is not None:
-        raise QualityError(_told(path, written, missed, config), figures)
+        raise QualityError(_told(path, written, missed, advice), figures)
     for remark in remarks(config, figures):
         warnings.warn(remark, FhashWarning, stacklevel=2)
     return figures
@@ -149,11 +151,10 @@ def missed_path(path: Path) -> Path:
         number += 1
 
 
-def _told(path: Path, written: Path, missed: str, config: EncodeConfig) -> str:
-    """The message of a missed promise: what was missed, and where the file is."""
+def _told(path: Path, written: Path, missed: str, advice: str) -> str:
+    """The message of a missed promise: what was missed, where the file is, and what may help."""
     where = "the file is written" if written == path else f"it is kept, the new file is {written}"
-    advice = "" if config.profile == "compact" else ". More --epochs may help"
-    return f"{path}: {missed}; {where}{advice}"
+    return f"{path}: {missed}; {where}" + (f". {advice}" if advice else "")
 
 
 def check_name(path: Path) -> None:

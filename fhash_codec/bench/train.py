@@ -24,7 +24,8 @@ from fhash_codec.demo.simulate import SCENES, simulate
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.selection import select
-from fhash_codec.paper.training.train import TrainingPlan, plan_training, probe_bricks, probe_psnr
+from fhash_codec.paper.training.probe import Probe
+from fhash_codec.paper.training.train import TrainingPlan, plan_training
 from fhash_codec.progress import Progress, silent
 from fhash_codec.training.devices import choose_device
 from fhash_codec.training.threads import threads_for
@@ -232,13 +233,12 @@ class _Run:
 
     def result(self, flops: int, peak: float) -> dict[str, Any]:
         train = median(self.train_speeds)
-        probe = probe_bricks(self.coreset, 0, 256)
         return {
             "engine": self.name,
             "train_msamples_s": train / 1e6,
             "infer_msamples_s": median(self.infer_speeds) / 1e6,
             "fraction_of_peak": train * flops / peak,
-            "psnr": probe_psnr(self.engine, self.coreset, probe),
+            "psnr": Probe(self.coreset, 256).psnr(self.engine),
             "epochs": self.engine.step / self.plan.batches,
             "seconds": self.seconds,
         }

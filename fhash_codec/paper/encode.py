@@ -31,7 +31,7 @@ def encode_paper(
     mask: npt.ArrayLike | None,
     path: Path,
     progress: Progress,
-) -> tuple[dict[str, Any], Path | None]:
+) -> tuple[dict[str, Any], Path | None, str]:
     """Train the published model on a series and write it.
 
     Args:
@@ -43,7 +43,8 @@ def encode_paper(
         progress: called with each step of the work.
 
     Returns:
-        The header without its quality, and the checkpoint to remove once the file is complete.
+        The header without its quality, the checkpoint to remove once the file is complete, and what
+        may help where the file misses its promise.
     """
     selection = select(series, config, progress, mask)
     coreset, architecture = selection.coreset, selection.architecture
@@ -62,7 +63,21 @@ def encode_paper(
 
         header["required_features"] = ["transform", *MASK_FEATURES]
         header["model"]["tables_loss_db"] = round(loss, 4)
-    return header, trained.checkpoint
+    return header, trained.checkpoint, _advice(selection, series, trained, config)
+
+
+def _advice(
+    selection: Selection, series: Series, trained: TrainedModel, config: EncodeConfig
+) -> str:
+    """Return what may help where the file misses its promise, as a sentence without a full stop."""
+    if len(selection.coreset.key_frames) < series.shape[0]:
+        return "The promise is about all steps, but only key frames are trained: try all of them"
+    if trained.limited:
+        return (
+            f"Training ended at its limit of --train-on-seconds {config.train_on_seconds}: "
+            "more may help"
+        )
+    return "More --epochs may help"
 
 
 def _goal(selection: Selection, series: Series, config: EncodeConfig) -> Goal | None:
@@ -127,7 +142,7 @@ def _header(
         "coreset_fraction": coreset.fraction,
         "model": {
             "profile": config.profile,
-            "fold": config.fold,
+            "fold": config.model_fold,
             "embedding_size": architecture.embedding_size,
             "hidden_layers": architecture.hidden_layers,
             "width": architecture.width,

@@ -61,8 +61,8 @@ def select(
     architecture = Architecture.for_box(
         coreset.box.shape,
         len(key_frames),
-        fold=config.fold,
-        embedding_size=config.embedding_size,
+        fold=config.model_fold,
+        embedding_size=config.model_embedding_size,
         hidden_layers=config.hidden_layers,
         width=config.width,
     )

@@ -8,19 +8,21 @@ are decided one after the other.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome
-from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.transform.axes.basis import MAX_LENGTH, fit_basis
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
+Result = TypeVar("Result")
 Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
 """Transforms along (t, z, y, x)."""
 NONE = AxisTransform(kind="none")
@@ -36,6 +38,29 @@ LINE_WAVELETS = (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3), (
 """Kinds and depths tried along t and along z."""
 ERROR_PRICE = 0.8
 """Squared error in squared steps that is worth a byte."""
+
+
+class TileSample(Protocol):
+    """Tiles on which transforms are tried, such as a `Sample`.
+
+    Attributes:
+        tiles: the tiles, all of one shape.
+    """
+
+    tiles: list[Tile]
+
+    @property
+    def allows_bases(self) -> bool:
+        """Whether bases of the data's own may be computed."""
+        ...
+
+    def map_all(self, work: Callable[[Tile], Result]) -> Iterator[Result]:
+        """Yield the results of `work` for all tiles that the sample stands for."""
+        ...
+
+    def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
+        """Return the size and the error that the tiles have with each settings and coding."""
+        ...
 
 
 def wavelet(kind: str, depth: int, length: int) -> AxisTransform:
@@ -57,7 +82,7 @@ def usual_transform(shape: Shape) -> TransformSpec:
 
 
 def choose_transform(
-    sample: Sample, settings: TileSettings, coding: Coding, *, quick: bool = False
+    sample: TileSample, settings: TileSettings, coding: Coding, *, quick: bool = False
 ) -> tuple[TileSettings, float]:
     """Return settings with the transform of the lowest J on the sample, and that J.
 
@@ -92,7 +117,7 @@ def choose_transform(
     return replace(settings, transform=TransformSpec(axes=axes)), lowest
 
 
-def refit(sample: Sample, settings: TileSettings) -> TileSettings:
+def refit(sample: TileSample, settings: TileSettings) -> TileSettings:
     """Return settings with the data's own bases made anew for their step.
 
     Settings without such bases are returned themselves, the same object.
@@ -131,7 +156,7 @@ def _fitted(axis: AxisTransform, length: int) -> AxisTransform:
 
 
 def _costs(
-    sample: Sample, settings: TileSettings, trials: Sequence[Axes], coding: Coding
+    sample: TileSample, settings: TileSettings, trials: Sequence[Axes], coding: Coding
 ) -> list[float]:
     """Return J of each trial."""
 
@@ -185,14 +210,14 @@ def _line_trials(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, A
 class _Bases:
     """The data's own bases along the axes of a tile, computed when they are asked for."""
 
-    def __init__(self, sample: Sample, settings: TileSettings) -> None:
+    def __init__(self, sample: TileSample, settings: TileSettings) -> None:
         self._sample, self._settings = sample, settings
         self._cache: dict[int, AxisTransform] = {}
 
     def possible(self, *lengths: int) -> bool:
         """Whether axes of these lengths can have a basis; only a series in memory can."""
-        in_memory = self._sample.blocks.in_memory
-        return in_memory and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
+        allowed = self._sample.allows_bases
+        return allowed and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
 
     def along(self, axis: int) -> AxisTransform:
         """Return the basis along an axis, as precise as the step of the settings needs."""

@@ -101,6 +101,11 @@ class Sample:
         self._filling: tuple[TileSettings, int] | None = None
         self.tick = tick
 
+    @property
+    def allows_bases(self) -> bool:
+        """Whether the series is in memory: bases of its own read all of it once more."""
+        return self.blocks.in_memory
+
     def wider(self, max_vertices: int) -> Sample:
         """Return a sample of more tiles, up to `max_vertices` together, filled in the same way.
 

@@ -50,12 +50,6 @@ class Engine(Protocol):
         They come brick by brick, in C order in a brick, as `Coreset.values` has them.
         """
 
-    def squared_error(self, chosen: Chosen) -> float:
-        """Return the sum of squared errors over the coreset vertices of some bricks.
-
-        Samples of the fringe do not count.
-        """
-
     def parameters(self) -> Parameters:
         """Return the trained numbers, on the CPU."""
 

@@ -72,16 +72,6 @@ class NaiveEngine:
         points, _ = self._samples(chosen)
         return torch.as_tensor(self.model(points))
 
-    @torch.no_grad()
-    def squared_error(self, chosen: Chosen) -> float:
-        """Return the sum of squared errors over the coreset vertices of some bricks."""
-        points, target = self._samples(chosen)
-        error = self.model(points) - target
-        if self.coreset.fringe is not None:
-            fringe = self.coreset.fringe[self.coreset.places(chosen)]
-            error = error[torch.from_numpy(~fringe).to(self.device)]
-        return float(error.square().sum(dtype=torch.float64))
-
     def parameters(self) -> Parameters:
         """Return the trained numbers, float32 on the CPU; embeddings outside the coreset are 0."""
         fine = self.model.tables[0].detach().cpu()[self.buckets].transpose(1, 2)

@@ -139,17 +139,6 @@ class SlabEngine:
         return self._infer(ids, self._in_coreset(ids))
 
     @torch.no_grad()
-    def squared_error(self, chosen: Chosen) -> float:
-        """Return the sum of squared errors over the coreset vertices of some bricks."""
-        ids = torch.from_numpy(chosen).to(self.device)
-        target, is_sample = self._targets(ids)
-        error = self._infer(ids, is_sample) - target[is_sample.bool()]
-        if self.coreset.fringe is not None:
-            fringe = self.coreset.fringe[self.coreset.places(chosen)]
-            error.masked_fill_(torch.from_numpy(fringe).to(self.device), 0.0)
-        return float(error.square().sum(dtype=torch.float64))
-
-    @torch.no_grad()
     def settle(self) -> None:
         """Let every brick catch up with the present step, so that evaluation is faster."""
         for first in range(0, len(self.bricks), FLUSH):

@@ -11,7 +11,7 @@ matters to the network takes hardly any bits.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import product
@@ -20,20 +20,19 @@ from math import prod
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.choices.transform import wavelet
-from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, OFFSETS
+from fhash_codec.compact.choices.transform import Result, choose_transform, usual_transform
+from fhash_codec.compact.tiles.blocks import Tile
+from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, OFFSETS, WEIGHT, Coding, Outcome, code
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.network import Floats
 from fhash_codec.paper.tables.tiles import (
+    ROUNDS,
     LevelCoding,
-    code_tile,
     components_of,
     tile_region,
     tile_shape,
 )
 from fhash_codec.paper.tables.trained_tables import Region, TrainedTable
-from fhash_formats.transform.axes.spec import TransformSpec
-from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
 MIN_IMPORTANCE = 1e-4
@@ -45,18 +44,6 @@ MIN_LEVEL_IMPORTANCE = 1e-12
 """Smallest eigenvalue of M that is used, as a share of the largest trace of M of all levels."""
 MIN_STEP = 1e-30
 """Smallest quantiser step, whatever the tables."""
-TRANSFORMS = (
-    (("none", 0), ("none", 0), ("none", 0)),
-    (("none", 0), ("9/7", 1), ("9/7", 3)),
-    (("haar", 1), ("9/7", 1), ("9/7", 3)),
-    (("9/7", 1), ("9/7", 1), ("9/7", 3)),
-    (("none", 0), ("5/3", 1), ("5/3", 2)),
-    (("none", 0), ("none", 0), ("9/7", 2)),
-)
-"""Transforms to try: (kind, depth) along t, along z, and along both y and x."""
-SQUARED_STEPS_A_BYTE = 0.8
-"""Squared error, in squared quantiser steps, that is worth a byte when transforms are compared."""
-
 Matrix = npt.NDArray[np.float64]
 
 
@@ -67,6 +54,8 @@ def choose_codings(
     slopes: Floats,
     quantiser_step: float,
     workers: ThreadPoolExecutor,
+    *,
+    quick: bool = False,
 ) -> list[LevelCoding]:
     """Choose the coding of each level.
 
@@ -77,6 +66,7 @@ def choose_codings(
         slopes: derivatives (inputs, n) of the value by the network's inputs at some samples.
         quantiser_step: about the step of the coding.
         workers: threads for trials.
+        quick: tries few transforms.
     """
     size = architecture.embedding_size
     importances: list[Matrix] = []
@@ -95,7 +85,9 @@ def choose_codings(
         )
     floor = MIN_LEVEL_IMPORTANCE * max(float(np.trace(matrix)) for matrix in importances) or 1.0
     return [
-        _choose_coding(table, importance, floor, quantiser_step, workers)
+        _with_best_transforms(
+            table, _coding(table, importance, floor, quantiser_step), workers, quick=quick
+        )
         for table, importance in zip(tables, importances, strict=True)
     ]
 
@@ -120,30 +112,25 @@ def _needed_embeddings(table: TrainedTable) -> Iterator[Floats]:
         yield table.read((*region, slice(0, table.shape[4])))[table.needed(region)]
 
 
-def _choose_coding(
-    table: TrainedTable,
-    importance: Matrix,
-    floor: float,
-    quantiser_step: float,
-    workers: ThreadPoolExecutor,
+def _coding(
+    table: TrainedTable, importance: Matrix, floor: float, quantiser_step: float
 ) -> LevelCoding:
-    """Choose components, range and transforms of a level.
+    """Choose components and range of a level, with usual transforms.
 
     Args:
         table: the trained table.
         importance: the matrix M of the level.
         floor: smallest eigenvalue of M that is used.
         quantiser_step: about the step of the coding.
-        workers: threads for trials.
     """
     mixing, unmixing, center = _mixing(table, importance, floor)
     low, high = _component_range(table, unmixing, center)
     t, z, y, x = table.shape[:4]
     tile = tile_shape((t, z, y, x))
-    plain = _spec(TRANSFORMS[0], tile)
+    usual = usual_transform(tile)
     settings = tuple(
         TileSettings(
-            transform=plain,
+            transform=usual,
             step=max(quantiser_step, MIN_STEP_SHARE * float(last - first), MIN_STEP),
             center=_single(middle),
             low=_single(first),
@@ -152,8 +139,7 @@ def _choose_coding(
         )
         for middle, first, last in zip(center, low, high, strict=True)
     )
-    coding = LevelCoding(tile=tile, mixing=mixing, unmixing=unmixing, settings=settings)
-    return _with_best_transforms(table, coding, workers)
+    return LevelCoding(tile=tile, mixing=mixing, unmixing=unmixing, settings=settings)
 
 
 def _mixing(
@@ -193,35 +179,55 @@ def _component_range(
 
 
 def _with_best_transforms(
-    table: TrainedTable, coding: LevelCoding, workers: ThreadPoolExecutor
+    table: TrainedTable, coding: LevelCoding, workers: ThreadPoolExecutor, *, quick: bool
 ) -> LevelCoding:
-    """Return the coding with the transform of each component that codes the fullest tile best."""
-    grid = [range(-(-length // n)) for length, n in zip(table.shape[:4], coding.tile, strict=True)]
-    regions = [tile_region(index, coding.tile, table.shape) for index in product(*grid)]  # type: ignore[arg-type]
-    fullest = max(regions, key=lambda region: int(np.count_nonzero(table.needed(region))))
-    components, needed = components_of(table, coding, fullest)
-    specs = list(dict.fromkeys(_spec(kinds, coding.tile) for kinds in TRANSFORMS))
+    """Return the coding with the transform of each component that codes the fullest tile best.
 
-    def cost(trial: tuple[Floats, TileSettings]) -> float:
-        component, settings = trial
-        data, decoded = code_tile(component, needed, settings)
-        error = (decoded[needed].astype(np.float64) - component[needed]) / settings.step
-        return len(data) + float(np.square(error).sum()) / SQUARED_STEPS_A_BYTE
-
+    A component within a quantiser step around its center decodes to that, whatever the transform.
+    """
     chosen = []
-    for component, settings in zip(components, coding.settings, strict=True):
-        trials = [replace(settings, transform=spec) for spec in specs]
-        costs = list(workers.map(cost, [(component, trial) for trial in trials]))
-        chosen.append(trials[costs.index(min(costs))])
+    for component, settings in enumerate(coding.settings):
+        if settings.high - settings.low < settings.step:
+            chosen.append(settings)
+            continue
+        trials = _Trials(table, coding, component, workers)
+        how = Coding(weight=WEIGHT, rounds=0 if trials.allows_bases else ROUNDS)
+        chosen.append(choose_transform(trials, settings, how, quick=quick)[0])
     return replace(coding, settings=tuple(chosen))
 
 
-def _spec(kinds: Sequence[tuple[str, int]], tile: Shape) -> TransformSpec:
-    """Return the transform of some TRANSFORMS, less deep along short axes of a tile."""
-    t, z, y, x = (
-        wavelet(*kind, length) for kind, length in zip((*kinds, kinds[-1]), tile, strict=True)
-    )
-    return TransformSpec(axes=(t, z, y, x))
+class _Trials:
+    """A `TileSample` of one component of a table: its fullest tile."""
+
+    def __init__(
+        self, table: TrainedTable, coding: LevelCoding, component: int, workers: ThreadPoolExecutor
+    ) -> None:
+        self._table, self._coding, self._component = table, coding, component
+        self._workers = workers
+        grid = [
+            range(-(-length // n)) for length, n in zip(table.shape[:4], coding.tile, strict=True)
+        ]
+        self._regions = [tile_region(index, coding.tile, table.shape) for index in product(*grid)]  # type: ignore[arg-type]
+        counts = [int(np.count_nonzero(table.needed(region))) for region in self._regions]
+        self._complete = sum(counts) == prod(table.shape[:4])
+        self.tiles = [self._tile(self._regions[counts.index(max(counts))])]
+
+    @property
+    def allows_bases(self) -> bool:
+        """Whether all vertices of the table are needed: a basis would describe the others too."""
+        return self._complete
+
+    def map_all(self, work: Callable[[Tile], Result]) -> Iterator[Result]:
+        """Yield the results of `work` for all tiles of the component."""
+        return (work(self._tile(region)) for region in self._regions)
+
+    def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
+        """Return the size and the error that the tile has with each settings and coding."""
+        return list(self._workers.map(lambda trial: code(self.tiles[0], *trial)[1], trials))
+
+    def _tile(self, region: Region) -> Tile:
+        components, needed = components_of(self._table, self._coding, region)
+        return Tile(components[self._component], None if needed.all() else needed)
 
 
 def _single(value: float) -> float:

@@ -145,15 +145,18 @@ class _Coding:
     def run(self) -> CodedTables:
         """Search for the step on some of the samples, then on all."""
         step = self._guess()
-        self._choose_codings(step)
+        self._choose_codings(step, quick=True)
         step = self._search(step, self._some, ROUGH_WIDTH).step
         self._choose_codings(step)
         if len(self._some) < len(self._all):
             step = self._search(step, self._some, SAMPLE_WIDTH).step
         coded = self._search(step, self._all, self._width)
         for _ in range(ROUNDS_OF_LEVELS):
+            before = coded
             for level in self._levels:
                 coded = self._with_larger_step(coded, level)
+            if coded is before:
+                break
         return coded
 
     def _quantise_layers(self) -> None:
@@ -177,11 +180,17 @@ class _Coding:
         added = max(self._allowed - self._error_of_all, 0.0)
         return math.sqrt(12 * added * self._samples.total / numbers)
 
-    def _choose_codings(self, step: float) -> None:
-        """Choose the coding of each level for about a step."""
+    def _choose_codings(self, step: float, *, quick: bool = False) -> None:
+        """Choose the coding of each level for about a step, by few trials if `quick`."""
         slopes = self._samples.slopes(self._network_before, self._some)
         self._codings = choose_codings(
-            self._architecture, self._samples.total, self._trained, slopes, step, self._workers
+            self._architecture,
+            self._samples.total,
+            self._trained,
+            slopes,
+            step,
+            self._workers,
+            quick=quick,
         )
         self._min_step = max(
             MIN_STEP,
@@ -194,9 +203,10 @@ class _Coding:
         )
 
     def _search(self, step: float, tiles: Sequence[Index], width: float) -> CodedTables:
-        """Return the tables coded with the largest step found that keeps the allowed error.
+        """Return the coded tables whose error is nearest to the allowed one, and not above it.
 
-        If no step keeps it, return those of the last trial.
+        If no step keeps it, return those of the last trial. The step is the largest that keeps it,
+        but for small tables, whose error jumps up and down.
 
         Args:
             step: the step to try first.
@@ -213,7 +223,7 @@ class _Coding:
             self._progress(stage, min(trial, trials), trials, f"step {step:.3g}")
             coded = self._coded([self._tiled(level, step) for level in self._levels], tiles)
             done = search.add(coded.error)
-            if search.best == step:
+            if coded.error <= self._allowed and (best is None or coded.error > best.error):
                 best = coded
             if done or (best is not None and trial + 1 >= trials):
                 break

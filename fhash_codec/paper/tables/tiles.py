@@ -30,10 +30,10 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 Index = tuple[int, int, int, int]
 """Place (t, z, y, x) of a tile in the grid of tiles."""
-TILE_STEPS = 8
+TILE_STEPS = 32
 """Largest number of time nodes in a tile."""
-TILE_VERTICES = 1 << 16
-"""Vertices (z, y, x) that a tile may grow to at each time node."""
+TILE_VERTICES = 1 << 19
+"""Vertices that a tile may grow to."""
 CACHE_BYTES = 64 << 20
 """Bytes of decoded tiles of one table that stay in memory."""
 BATCH = 16
@@ -159,18 +159,19 @@ class TiledTable:
 def tile_shape(resolution: Shape) -> Shape:
     """Return the tile (t, z, y, x) of a level of a resolution (t, z, y, x).
 
-    It consists of whole blocks of the decoder (`regions.block_shape`), with about TILE_VERTICES
-    vertices at each of at most TILE_STEPS time nodes.
+    It consists of whole blocks of the decoder (`regions.block_shape`), at most TILE_STEPS time
+    nodes of them.
     """
     box = resolution[1:]
+    steps = -(-resolution[0] // -(-resolution[0] // TILE_STEPS))
     shape = list(block_shape(box))
-    while (growing := [axis for axis in range(3) if shape[axis] < box[axis]]) and 2 * prod(
+    while (growing := [axis for axis in range(3) if shape[axis] < box[axis]]) and 2 * steps * prod(
         shape
     ) <= TILE_VERTICES:
         axis = min(growing, key=lambda axis: shape[axis])
         shape[axis] = 2 * shape[axis]
     z, y, x = (min(n, length) for n, length in zip(shape, box, strict=True))
-    return -(-resolution[0] // -(-resolution[0] // TILE_STEPS)), z, y, x
+    return steps, z, y, x
 
 
 def tile_region(index: Index, tile: Shape, shape: Sequence[int]) -> Region:

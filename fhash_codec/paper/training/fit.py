@@ -55,6 +55,7 @@ class TrainedModel:
         checkpoint: path of the checkpoint, of no more use once the numbers are written.
         restarts: restarts at a lower learning rate.
         learning_rate: learning rate of the last start.
+        limited: whether the limit in time ended the training before its goal.
     """
 
     fine: npt.NDArray[np.float32]
@@ -67,6 +68,7 @@ class TrainedModel:
     checkpoint: Path
     restarts: int
     learning_rate: float
+    limited: bool
 
 
 def train_model(
@@ -96,7 +98,7 @@ def train_model(
         InterruptedEncodingError: a signal asked for the end; a checkpoint was saved.
         InputError: the checkpoint cannot be read, or the device or the engine is not available.
     """
-    from fhash_codec.paper.training.train import Diverged
+    from fhash_codec.paper.training.probe import Diverged
 
     fitting = _Fitting(coreset, architecture, config, path, progress, goal)
     while True:
@@ -126,6 +128,7 @@ class _Fitting:
 
         self._coreset, self._architecture, self._config = coreset, architecture, config
         self._progress, self._goal = progress, goal
+        self._limited = False
         self._device: torch.device = choose_device(config.device)
         self._checkpoint = checkpoint_path(path, coreset, config)
         saved = load_checkpoint(self._checkpoint)
@@ -177,13 +180,13 @@ class _Fitting:
     def _next_round(self, engine: Engine, plan: TrainingPlan) -> TrainingPlan | None:
         """Return the plan with a further round; None where the training ends.
 
-        All samples are measured, once for each round. What follows is told in a warning.
+        The whole coreset is measured, once for each round. What follows is told in a warning.
         """
-        from fhash_codec.paper.training.train import probe_psnr
+        from fhash_codec.paper.training.probe import Probe
 
         if self._goal is None:
             return None
-        psnr = probe_psnr(engine, self._coreset, np.arange(plan.bricks))
+        psnr = Probe(self._coreset).psnr(engine)
         reached = self._reached
         decision = decide(
             self._goal,
@@ -196,6 +199,7 @@ class _Fitting:
         if decision.message:
             warnings.warn(decision.message, FhashWarning, stacklevel=4)
         if decision.round is None:
+            self._limited = decision.limited
             return None
         reached.rounds.append(asdict(decision.round))
         return extended(plan, decision.round.epochs, self._config.schedule)
@@ -287,4 +291,5 @@ class _Fitting:
             checkpoint=self._checkpoint,
             restarts=self._reached.restarts,
             learning_rate=self._reached.rate(self._config.learning_rate),
+            limited=self._limited,
         )

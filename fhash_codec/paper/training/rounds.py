@@ -32,7 +32,7 @@ class Goal:
     """Quality that a model must have before its tables are coded.
 
     Attributes:
-        psnr: PSNR in dB over all samples.
+        psnr: PSNR in dB over the coreset.
         promised: promised PSNR in dB of the coded tables, at most `psnr`.
         seconds: time that further rounds may take.
     """
@@ -48,7 +48,7 @@ class Round:
 
     Attributes:
         epochs: epochs of the round.
-        psnr: PSNR in dB over all samples before it.
+        psnr: PSNR in dB over the coreset before it.
         seconds: seconds of training before it.
     """
 
@@ -64,10 +64,12 @@ class Decision:
     Attributes:
         round: the next round; None to end the training.
         message: text for the user; "" where the goal is reached.
+        limited: whether the limit in time ends the training.
     """
 
     round: Round | None
     message: str
+    limited: bool = False
 
 
 def decide(
@@ -77,7 +79,7 @@ def decide(
 
     Args:
         goal: the quality that is needed, and the limit in time.
-        psnr: PSNR in dB of the model over all samples; infinite for an exact one.
+        psnr: PSNR in dB of the model over the coreset; infinite for an exact one.
         epochs: finished epochs.
         steps: training steps so far.
         seconds: seconds of training so far.
@@ -85,7 +87,7 @@ def decide(
     """
     if psnr >= goal.psnr:
         return Decision(round=None, message="")
-    has = f"the model has {psnr:.2f} dB over all samples after {epochs} epochs"
+    has = f"the model has {psnr:.2f} dB over the coreset after {epochs} epochs"
     needed = f"{goal.promised:g} dB are promised"
     short = (
         "" if psnr < goal.promised else f", which costs bytes: {goal.psnr:g} dB would leave room"
@@ -107,6 +109,7 @@ def decide(
             round=None,
             message=f"training ends at its limit of {goal.seconds:g} more seconds: {has}, "
             f"{needed}{short}; --train-on-seconds sets the limit",
+            limited=True,
         )
     return Decision(
         round=Round(epochs=count, psnr=psnr, seconds=seconds),

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.engines import Engine
+from fhash_codec.paper.training.probe import Diverged, Probe
 from fhash_codec.progress import Progress, silent
-from fhash_formats.errors import TrainingError
 from fhash_formats.support.interrupts import StopRequest
 
 BATCH_SAMPLES = 1 << 16
@@ -29,8 +29,6 @@ HISTORY_POINTS = 100
 """Largest number of points in the history."""
 PROBE_BRICKS = 512
 """Bricks on which the quality of an epoch is measured."""
-PROBED_AT_ONCE = 64
-"""Bricks of them that are evaluated at a time."""
 DIVERGED = 4.0
 """Mean squared error of a batch above which a training diverged, in squares of the value range.
 
@@ -52,10 +50,6 @@ LOWER = 0.25
 """Factor on the learning rate after a training diverged."""
 MAX_RESTARTS = 8
 """Largest number of restarts at a lower learning rate."""
-
-
-class Diverged(TrainingError):
-    """A training came to nothing at its learning rate; a lower rate may do better."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +187,8 @@ def train(
     """Train from where `reached` stands to the end of the plan. Return whether that was reached.
 
     Every epoch adds {seconds, epoch, psnr} to the history; of more than 100 epochs every 2nd, 3rd,
-    ... does. The PSNR in dB is of normalised values on a fixed random choice of bricks.
+    ... does. The PSNR in dB is of normalised values of the coreset, without its fringe, on a fixed
+    random choice of bricks.
 
     Args:
         engine: the model in training.
@@ -241,9 +236,9 @@ class _Loop:
         self, engine: Engine, plan: TrainingPlan, coreset: Coreset, reached: TrainingProgress
     ) -> None:
         self.note = ""
-        self._engine, self._plan, self._coreset, self._reached = engine, plan, coreset, reached
+        self._engine, self._plan, self._reached = engine, plan, reached
         self._samples = np.diff(coreset.offsets)
-        self._probe = probe_bricks(coreset, plan.seed, PROBE_BRICKS)
+        self._probe = Probe(coreset, PROBE_BRICKS, plan.seed)
         self._epochs_a_point = -(-plan.epochs // HISTORY_POINTS)
         self._largest_error: Tensor | None = None
         self._seconds_before, self._begun = reached.seconds, time.perf_counter()
@@ -272,7 +267,7 @@ class _Loop:
         reached = self._reached
         reached.epoch, reached.batch = reached.epoch + 1, 0
         if reached.epoch % self._epochs_a_point == 0 or reached.epoch == self._plan.epochs:
-            psnr = probe_psnr(self._engine, self._coreset, self._probe)
+            psnr = self._probe.psnr(self._engine)
             self._count_seconds()
             reached.history.append(
                 {"seconds": reached.seconds, "epoch": reached.epoch, "psnr": psnr}
@@ -282,7 +277,7 @@ class _Loop:
     def check_dead(self) -> None:
         """Raise Diverged if a learning rate above the usual one left nothing but a constant."""
         if self._plan.rates[0] > USUAL_RATE and _dead(
-            self._reached, _variance(self._coreset, self._probe)
+            self._reached, self._probe.error_of_constant()
         ):
             raise Diverged("training ended in a constant")
 
@@ -311,50 +306,23 @@ class _Saving:
         self._seconds = max(self._seconds, 20 * (self._saved - begun))
 
 
-def probe_bricks(coreset: Coreset, seed: int, count: int) -> npt.NDArray[np.int64]:
-    """Return the numbers of at most `count` random bricks with a vertex of the coreset, sorted."""
-    order = np.random.default_rng(seed).permutation(len(coreset.bricks))
-    return np.sort(order[coreset.counts[order] > 0][:count])
-
-
-def probe_psnr(engine: Engine, coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float | None:
-    """Return the PSNR in dB over the coreset vertices of some bricks; None if the error is 0.
-
-    The values are normalised, so their range is 1. Raises Diverged if the error is not finite.
-    """
-    samples = int(coreset.counts[bricks].sum())
-    error = sum(
-        engine.squared_error(batch)
-        for batch in np.array_split(bricks, -(-len(bricks) // PROBED_AT_ONCE))
-    )
-    if not np.isfinite(error):
-        raise Diverged(
-            "training diverged: the error is no longer finite; set a lower --learning-rate"
-        )
-    return None if error == 0 else -10 * log10(error / samples)
-
-
-def _dead(reached: TrainingProgress, variance: float) -> bool:
+def _dead(reached: TrainingProgress, error: float) -> bool:
     """Return whether the model gave nothing but a constant in the second half of a training.
 
-    The error of the best constant, the mean, is the variance of the (normalised) values. The model
-    is dead if its PSNR stayed within STILL dB of that and its last error within the share DEAD.
+    The model is dead if its PSNR stayed within STILL dB of the best constant's and its last error
+    within the share DEAD.
+
+    Args:
+        reached: the training.
+        error: mean squared error of the best constant.
     """
     late = [point["psnr"] for point in reached.history[len(reached.history) // 2 :]]
-    if not variance > 0 or len(late) < 2:
+    if not error > 0 or len(late) < 2:
         return False
-    constant = -10 * log10(variance)
+    constant = -10 * log10(error)
     distances = [abs(psnr - constant) for psnr in late if psnr is not None]
     return (
         len(distances) == len(late)
         and max(distances) <= STILL
         and distances[-1] <= -10 * log10(1 - DEAD)
     )
-
-
-def _variance(coreset: Coreset, bricks: npt.NDArray[np.int64]) -> float:
-    """Return the variance of the normalised values at the coreset vertices of some bricks."""
-    places = coreset.places(bricks)
-    if coreset.fringe is not None:
-        places = places[~coreset.fringe[places]]
-    return float(np.var(coreset.values[places], dtype=np.float64))

@@ -57,7 +57,9 @@ def test_coded_tables_are_reported_with_their_loss(
     fhash: Fhash, data: Path, tmp_path: Path
 ) -> None:
     for name, tables in {"plain": "float32", "coded": "transform"}.items():
-        result = fhash("encode", data, "-o", tmp_path / name, *PAPER, "--tables", tables)
+        result = fhash(
+            "encode", data, "-o", tmp_path / name, *PAPER, "--fold", 2, "--tables", tables
+        )
         assert (result.exit_code, result.stderr) == (0, "")
         assert ("coded, for" in result.stdout) == (name == "coded")
     info = fhash("info", tmp_path / "coded")

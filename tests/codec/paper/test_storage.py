@@ -119,7 +119,7 @@ def small(tmp_path_factory):
     path = tmp_path_factory.mktemp("small") / "a.fhz"
     t, z, y, x = np.meshgrid(*(np.linspace(0, 1, n) for n in (3, 4, 5, 6)), indexing="ij")
     field = (100 * (np.sin(5 * x + 3 * t) * np.cos(4 * y) + z)).astype(np.float32)
-    config = EncodeConfig(profile="paper", epochs=2, width=16, tables="transform")
+    config = EncodeConfig(profile="paper", epochs=2, width=16, embedding_size=2, tables="transform")
     fhash_codec.encode(field, path, config)
     return path
 

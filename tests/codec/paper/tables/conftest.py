@@ -21,7 +21,9 @@ from fhash_codec.paper.tables.trained_tables import TrainedTable, trained_tables
 from fhash_codec.progress import silent
 from fhash_formats.series import ArraySeries
 
-CODED = EncodeConfig(profile="paper", epochs=6, width=16, tables="transform")
+CODED = EncodeConfig(
+    profile="paper", epochs=6, width=16, fold=2, embedding_size=2, tables="transform"
+)
 
 
 def _waves(shape: tuple[int, ...] = (5, 9, 12, 20)) -> npt.NDArray[np.float32]:

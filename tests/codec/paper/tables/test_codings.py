@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from fhash_codec.paper.storage import mix_components
 from fhash_codec.paper.tables.codings import choose_codings, squared_weights
 from fhash_codec.paper.tables.tiles import components_of, tile_region
+from fhash_codec.paper.tables.trained_tables import CoarseTable
 
 
 @pytest.mark.parametrize(("length", "resolution"), [(1, 1), (5, 3), (5, 5), (9, 2), (20, 7)])
@@ -45,3 +47,26 @@ def test_components_keep_the_embeddings_and_lie_in_their_range(random_model) -> 
             values = component[needed]
             assert (values >= settings.low - slack).all()
             assert (values <= settings.high + slack).all()
+
+
+def test_the_transform_of_a_component_suits_its_numbers(random_model) -> None:
+    """A basis of their own suits a pattern whose strength changes at random."""
+    architecture = random_model.selection.architecture
+    slopes = np.ones((2, 200), np.float32)
+    random = np.random.default_rng(0)
+    pattern = random.standard_normal((16, 1, 1, 1)) * random.standard_normal((1, 8, 12, 12))
+    chosen = {}
+    for name, needed in (
+        ("complete", np.ones(pattern.shape, bool)),
+        ("part", np.broadcast_to(np.arange(12) < 9, pattern.shape)),
+    ):
+        both = np.stack([pattern, 0.5 * pattern], axis=-1).astype(np.float32)
+        one = replace(architecture, levels=(pattern.shape,), box_size=(8, 12, 12), key_frames=16)
+        with ThreadPoolExecutor(2) as workers:
+            [coding] = choose_codings(
+                one, pattern.size, [CoarseTable(both, needed)], slopes, 0.05, workers
+            )
+        chosen[name] = coding.settings[1].transform.axes
+    assert chosen["complete"][0].kind == "klt"
+    # Where vertices are not needed, a basis would describe them too.
+    assert all(axis.basis is None for axis in chosen["part"])

@@ -32,7 +32,7 @@ def test_a_model_that_is_good_enough_is_not_trained_on(psnr) -> None:
 def test_a_round_doubles_the_epochs_and_says_so() -> None:
     decision = decide(GOAL, 44.0, 20, MIN_STEPS, 10.0, [])
     assert decision.round == Round(epochs=20, psnr=44.0, seconds=10.0)
-    assert "goes on for 20 epochs: the model has 44.00 dB over all samples" in decision.message
+    assert "goes on for 20 epochs: the model has 44.00 dB over the coreset" in decision.message
     assert "45 dB are promised" in decision.message
     again = decide(GOAL, 44.8, 40, MIN_STEPS, 20.0, [decision.round])
     assert again.round == Round(epochs=40, psnr=44.8, seconds=20.0)

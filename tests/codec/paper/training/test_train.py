@@ -10,8 +10,8 @@ import torch
 
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
+from fhash_codec.paper.training.probe import Diverged
 from fhash_codec.paper.training.train import (
-    Diverged,
     TrainingProgress,
     batch_ends,
     plan_training,
