@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.simulation.simulate import simulate
-from fhash_formats.series import ArraySeries, Coordinate
+from fhash_formats.series import ArraySeries, Coordinate, Series
 
 __all__ = ["GALLERY_SERIES", "PICTURES", "GallerySeries", "Picture"]
 
@@ -34,7 +34,7 @@ class GallerySeries:
         options: of `fhash encode`.
     """
 
-    make: Callable[[], ArraySeries]
+    make: Callable[[], Series]
     options: tuple[str, ...]
 
 

@@ -266,11 +266,12 @@ class Simulation(Series):
         if stretch is None:
             return min(vertex * max(self.terms.spacing) ** 2 + spread, MAX_WIDENING)
         change, steepest = stretch
-        widening = change * np.float32(vertex)
+        widening: Array = change * np.float32(vertex)
         if spread:
             widening += steepest * np.float32(spread / 3)
             widening += np.float32(spread * 2 / 3)
-        return np.minimum(widening, np.float32(MAX_WIDENING), out=widening)
+        np.minimum(widening, np.float32(MAX_WIDENING), out=widening)
+        return widening
 
 
 def blocks(shape: tuple[int, int, int]) -> list[Block]:

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fhash_codec.simulation.effects.effect import Body, Effect, Flow, Vector
-from fhash_codec.simulation.effects.fingers import Bend
+from fhash_codec.simulation.effects.effect import Bend, Body, Effect, Flow, Vector
 from fhash_codec.simulation.scene import SimulatedScene
 
 __all__ = ["Terms", "spacing_of", "terms_of"]

@@ -99,7 +99,7 @@ def _make_gallery(folder: str, force: bool, as_json: bool, quiet: bool) -> None:
     from fhash_cli.commands import encode, render
     from fhash_cli.gallery import make_gallery
 
-    commands = {"encode": encode.command, "render": render.command}
+    commands: dict[str, click.Command] = {"encode": encode.command, "render": render.command}
     made = make_gallery(Path(folder), commands, force=force, quiet=quiet)
     emit(made, table([("page", made["page"]), ("pictures", str(len(made["pictures"])))]), as_json)
 

@@ -45,7 +45,9 @@ class Blob(Effect):
 
         def value(distance: Array, widening: Array | float, time: float) -> Array:
             width = np.sqrt(np.float32(self.edge**2 + 1e-12) + widening)
-            return smooth_step(distance, width) * self._dilution(widening)
+            values = smooth_step(distance, width)
+            values *= self._dilution(widening)
+            return values
 
         low, high = sorted((0.0, self.strength))
         return Body(surface=surface, value=value, low=low, high=high, middle=(z, y, x))
@@ -57,9 +59,9 @@ class Blob(Effect):
         """
         share = 1.5 / self.radius**2
         before = 1 + share * self.edge**2
-        return np.float32(self.strength * before) / (
-            np.float32(before) + np.float32(share) * widening
-        )
+        wider = np.asarray(widening, dtype=np.float32) * np.float32(share / before)
+        wider += np.float32(1)
+        return np.asarray(np.float32(self.strength) / wider, dtype=np.float32)
 
 
 def round_surface(place: Place, centre: Vector, radius: float) -> Surface:

@@ -12,6 +12,7 @@ each other: what does not depend on an axis has length 1 along it, and costs as 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
@@ -25,6 +26,7 @@ __all__ = [
     "AXES",
     "MAX_SPEED",
     "Array",
+    "Bend",
     "Body",
     "Effect",
     "Flow",
@@ -41,6 +43,9 @@ Array = npt.NDArray[np.float32]
 Vector = tuple[float, float, float]
 Place = tuple[Array, Array, Array]
 """Positions z, y and x in metres."""
+Bend = Callable[[Place, bool, float], Array]
+"""(coordinates along a surface, whether they are directions, time) -> outward shift as a share of
+the surface's scale."""
 
 AXES = ("z", "y", "x")
 """Names of the axes of a box, as in an array."""
@@ -53,7 +58,7 @@ FLAT = 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Effect(Record):
+class Effect(Record, ABC):
     """An effect as a scene describes it.
 
     Attributes:
@@ -70,6 +75,15 @@ class Effect(Record):
     def idle(self) -> str:
         """Why the effect is not computed; empty where it is."""
         return "its strength is 0" if getattr(self, "strength", 1.0) == 0 else ""
+
+    @abstractmethod
+    def term(self, generator: np.random.Generator, spacing: Vector) -> Flow | Body | Bend | float:
+        """The term: a Flow, a Body, a Bend, or a diffusivity in m^2/s.
+
+        Args:
+            generator: of the random numbers, the effect's own.
+            spacing: metres between vertices along z, y and x, 0 along an axis of one vertex.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,17 +11,15 @@ import numpy as np
 from fhash_codec.rendering.scene.record import limits
 from fhash_codec.simulation.effects.effect import (
     Array,
+    Bend,
     Effect,
     Place,
     Vector,
     times,
 )
 
-__all__ = ["Bend", "Fingers"]
+__all__ = ["Fingers"]
 
-Bend = Callable[[Place, bool, float], Array]
-"""(coordinates along a surface, whether they are directions, time) -> outward shift as a share of
-the surface's scale."""
 SHARPNESS = 3.0
 """Steepness of a finger's flank."""
 ONSET = 0.8

@@ -49,5 +49,6 @@ def test_products_leave_out_parts_that_are_zero() -> None:
     assert times((z, y, x), (0, 0, 0)).item() == 0
 
 
-def test_an_effect_without_a_strength_is_never_idle() -> None:
-    assert not Effect().idle
+def test_an_effect_without_a_term_cannot_be_made() -> None:
+    with pytest.raises(TypeError, match="abstract"):
+        Effect()  # type: ignore[abstract]
