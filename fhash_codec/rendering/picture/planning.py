@@ -383,4 +383,4 @@ def _few_samples(volume: Volume, scene: Scene) -> bool:
     rays = scene.size[0] * scene.size[1] * effects.antialiasing**2
     longest = float(np.linalg.norm(volume.box.shape)) / scene.march.step
     frame = header["coreset_fraction"] * float(np.prod(volume.shape[1:]))
-    return rays * longest * VERTICES_A_SAMPLE <= frame
+    return bool(rays * longest * VERTICES_A_SAMPLE <= frame)
