@@ -20,13 +20,13 @@ from fhash_codec.bench.machine import machine
 from fhash_codec.config import ENGINES, EncodeConfig
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.coreset.selection import Source, open_source
-from fhash_codec.demo.simulate import SCENES, simulate
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.engines import make_engine
 from fhash_codec.paper.selection import select
 from fhash_codec.paper.training.probe import Probe
 from fhash_codec.paper.training.train import TrainingPlan, plan_training
 from fhash_codec.progress import Progress, silent
+from fhash_codec.simulation.simulate import simulate
 from fhash_codec.training.devices import choose_device
 from fhash_codec.training.threads import threads_for
 from fhash_formats.errors import InputError
@@ -90,9 +90,10 @@ def bench_train(
         )
     device = choose_device(config.device)
     if source is None:
-        source = simulate(MADE, MADE_SHAPE)
+        scene = simulate(MADE, MADE_SHAPE)
+        source = scene
         if config.features == ("all",):
-            config = replace(config, features=(SCENES[MADE].feature,))
+            config = replace(config, features=(scene.scene.feature,))
     configs = [config]
     if config.features != ("all",):
         configs.append(replace(config, features=("all",)))

@@ -26,6 +26,7 @@ from fhash_formats.transform.entropy.predict import blank_state, encode_predicte
 from fhash_formats.transform.entropy.predictor import Predictor, pass_arrays, passes_of
 from fhash_formats.transform.entropy.prior import prior_state
 from fhash_formats.transform.entropy.table import single_band
+from fhash_formats.transform.tile.apart import join_mask
 from fhash_formats.transform.tile.sections import parse_stream
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -199,30 +200,14 @@ def golden_streams() -> Iterator[tuple[bytes, TileSettings, tuple[int, int, int,
     for path in sorted(GOLDENS.glob("*.fhz")):
         with Container.open(path) as container:
             for array in container.arrays.values():
-                inner = (
-                    array._metadata.codecs
-                    if array._metadata.sharding is None
-                    else array._metadata.sharding.codecs
-                )
-                if inner[0]["name"] != TRANSFORM:
+                if array.coding != TRANSFORM:
                     continue
-                settings = TileSettings.from_dict(inner[0]["configuration"])
-                t, z, y, x = array.chunk_shape
-                for shard, member in array.chunks.items():
-                    sharding = array._metadata.sharding
-                    if sharding is None:
-                        stored = container._source.read(member.data_offset, member.size)
-                        yield stored[:-4], settings, (t, z, y, x)
-                        continue
-                    for offset, size in array._shard_index(sharding, shard):
-                        if size:
-                            yield (
-                                container._source.read(member.data_offset + int(offset), int(size))[
-                                    :-4
-                                ],
-                                settings,
-                                (t, z, y, x),
-                            )
+                t, z, y, x = (1,) * (4 - len(array.chunk_shape)) + array.chunk_shape
+                for index in np.ndindex(*array.grid):
+                    stream = bytes(array.coded(index))
+                    if array.masks is not None:
+                        stream = join_mask(stream, array.masks.coded(index))
+                    yield stream, array.settings, (t, z, y, x)
 
 
 def coefficients_of(stream: bytes) -> bytes:
