@@ -86,10 +86,11 @@ def _mlp(layers: list[dict[str, Any]], *, verbose: bool) -> list[tuple[str, str]
     if not layers:
         return [("MLP", "none: the values are those of level 1")]
     widths = " to ".join(str(width) for width in _widths(layers))
-    stored = [layer for layer in layers if layer["path"]]
+    # Layers may share an array.
+    stored = list({layer["path"]: layer for layer in layers if layer["path"]}.values())
     place = _place(layers[0])
-    if stored:
-        total = size(sum(layer["bytes"] for layer in layers))
+    if len(stored) > 1:
+        total = size(sum(layer["bytes"] for layer in stored))
         place = f"{stored[0]['path']} to {stored[-1]['path']}, {stored[0]['coding']}, {total}"
     rows = [("MLP", f"{widths}, {layers[0]['activation']}; {place}")]
     if verbose:

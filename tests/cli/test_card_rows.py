@@ -28,6 +28,10 @@ def added(line: str) -> bool:
         ("paper-1.1-transform", ["fhash.transform", "occupancy/bits, bytes,"]),
         ("compact-1.1-psnr", ["tables/level_1, fhash.transform,", "none: the values"]),
         ("compact-1.1-mask", ["in the tiles of tables/level_1"]),
+        (
+            "compact-1.4-cross",
+            ["; mlp/parameters, fhash.head, 402 B", "; occupancy/mask, fhash.mask, "],
+        ),
     ],
 )  # fmt: skip
 def test_the_card_names_every_part_with_its_place(
