@@ -17,7 +17,10 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "key-frames", "fold", "embedding-size", "hidden-layers", "width", "epochs",
         "learning-rate", "schedule", "batch", "tables", "engine", "engines",
     ),
-    "Scene": ("scene", "set", "effect", "size", "background", "antialiasing", "scale"),
+    "Scene": (
+        "scene", "steps", "paper-shape", "gallery", "set", "effect", "size", "background",
+        "antialiasing", "scale",
+    ),
     "Camera": (
         "view", "azimuth", "elevation", "zoom", "projection", "position", "focal-point", "view-up",
     ),
@@ -47,6 +50,7 @@ ELSEWHERE = {
     ("encode", "device"): "Run",
     ("train", "device"): "Run",
     ("rate", "device"): "Run",
+    ("demo", "shape"): "Scene",
     ("diff", "max-error"): "Quality, gates",
     ("diff", "min-psnr"): "Quality, gates",
     ("diff", "min-psnr-bulk"): "Quality, gates",

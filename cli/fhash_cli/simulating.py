@@ -63,7 +63,9 @@ def _shape(text: str) -> dict[str, int]:
     """Lengths by axis; raises ValueError for a text of another form."""
     if "=" not in text:
         words = text.split(",")
-        if len(words) != 3 or not all(word.strip().isdecimal() for word in words):
+        if len(words) != 3 or not all(
+            word.strip().isascii() and word.strip().isdecimal() for word in words
+        ):
             raise ValueError
         return dict(zip("zyx", map(int, words), strict=True))
     from fhash_formats import parse_shape

@@ -36,7 +36,7 @@ Shifts = dict[tuple[int, Vector | None], Array]
 
 BLOCK_VERTICES = 2**15
 """Vertices that are computed at once, about: their arrays fit into a processor's cache."""
-MAX_FRAME_VERTICES = 2**32
+MAX_FRAME_VERTICES = 2**31
 """Most vertices of a frame, of which one is held in memory."""
 KEPT_BYTES = 24 * 2**20
 """Bytes of an array that is made and freed before a frame: the C library then keeps that much

@@ -57,7 +57,9 @@ def test_shapes_are_z_y_x_or_named(text: str, shape: dict[str, int]) -> None:
     assert ShapeType().convert(text, None, None) == shape
 
 
-@pytest.mark.parametrize("text", ["", "5", "5,6", "5,6,7,8", "5,6,-7", "5x6x7", "x=5,y=6", "a=1"])
+@pytest.mark.parametrize(
+    "text", ["", "5", "5,6", "5,6,7,8", "5,6,-7", "5x6x7", "x=5,y=6", "a=1", "\uff15,6,7"]
+)
 def test_other_shapes_are_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match="is not Z,Y,X such as"):
         ShapeType().convert(text, None, None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -12,6 +13,7 @@ from fhash_codec.simulation.effects.vortex import Vortex
 from fhash_codec.simulation.scene import MAX_EFFECTS, SimulatedScene, scene_of
 from fhash_formats.errors import InputError, MissingInputError
 
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "scenes.md"
 TOML = """
 name = "smoke"
 shape = [4, 5, 6]
@@ -101,3 +103,21 @@ def test_resizing_changes_shape_and_steps_alone_and_checks_them() -> None:
     }
     with pytest.raises(InputError, match="shape is 0"):
         scene.resized((0, 2, 3))
+
+
+def test_the_document_has_every_setting_of_a_scene() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8").partition("## Settings of a scene")[2]
+    rows = re.findall(
+        r"^\| `(\w+)` \| [^|]* \| ([^|]*)\| ([^|]*) \|$", text.partition("## E")[0], re.M
+    )
+    limits = {
+        setting.name: setting.metadata
+        for setting in dataclasses.fields(SimulatedScene)
+        if setting.name != "effects"
+    }
+    assert {name: help for name, _, help in rows} == {
+        name: each["help"] for name, each in limits.items()
+    }
+    for name, allowed, _ in rows:
+        low, high = limits[name]["low"], limits[name]["high"]
+        assert allowed.strip() == ("" if low is None else f"{low:g} to {high:g}")

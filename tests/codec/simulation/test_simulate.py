@@ -168,6 +168,36 @@ def test_flows_in_turn_come_near_the_exact_motion_with_more_splits() -> None:
     assert errors[2] < 0.02
 
 
+@pytest.mark.parametrize(
+    ("effect", "kept"),
+    [
+        ({"effect": "diffusion", "strength": 1e-3}, 0.005),
+        ({"effect": "turbulence", "strength": 0.05}, 0.01),
+        ({"effect": "rotation", "strength": 1}, 0.005),
+    ],
+)
+def test_the_amount_of_a_blob_stays(effect: dict[str, Any], kept: float) -> None:
+    blob = {"effect": "blob", "centre": (0.4, 0.5, 0.45), "radius": 0.15, "edge": 0.05}
+    series = simulate({"effects": [blob, effect]}, (3, 32, 32, 32))
+    amounts = [float(frame.mean(dtype=np.float64)) for frame in series.frames()]
+    np.testing.assert_allclose(amounts, amounts[0], rtol=kept)
+
+
+def test_the_amount_of_a_wound_up_blob_comes_nearer_on_a_finer_lattice() -> None:
+    """Widths of sheets as thin as the lattice are estimates: 28 % off at worst on 16^3 vertices."""
+    effects = [
+        {"effect": "blob", "centre": (0.5, 0.5, 0.4), "radius": 0.15},
+        {"effect": "vortex", "strength": 1},
+    ]
+
+    def gain(count: int) -> float:
+        series = simulate({"effects": effects}, (2, count, count, count))
+        first, last = (float(frame.mean(dtype=np.float64)) for frame in series.frames())
+        return abs(last / first - 1)
+
+    assert gain(56) < 0.5 * gain(14) < 0.15
+
+
 def test_counters_say_what_was_computed() -> None:
     effects = [BLOB, {"effect": "rotation"}, {"effect": "vortex"}, {"effect": "diffusion"}]
     series = simulate({"effects": effects, "splits": 3}, (2, 4, 4, 4))
@@ -196,9 +226,9 @@ def test_a_seed_outside_its_range_is_refused(seed: Any) -> None:
 
 
 def test_a_frame_that_no_memory_holds_is_refused() -> None:
-    with pytest.raises(InputError, match="a frame may have 4294967296"):
-        simulate("front", (1, 16384, 16384, 17))
-    assert simulate("front", (1, 16384, 16384, 16)).shape[1] == 16384
+    with pytest.raises(InputError, match="a frame may have 2147483648"):
+        simulate("front", (1, 16384, 16384, 9))
+    assert simulate("front", (1, 16384, 16384, 8)).shape[1] == 16384
 
 
 def test_memory_does_not_grow_with_the_steps() -> None:
