@@ -112,7 +112,12 @@ class EncodeConfig:
         2, "paper: hidden layers of the network", low=0, high=8, profile="paper"
     )
     width: int = option(
-        64, "paper: neurons of each hidden layer", low=1, high=1024, profile="paper"
+        0,
+        "paper: neurons of each hidden layer; 0 for 64, the published width, or 16 with "
+        "--tables transform",
+        low=0,
+        high=1024,
+        profile="paper",
     )
     epochs: int = option(
         0,
@@ -243,6 +248,15 @@ class EncodeConfig:
         Of several numbers, coded tables use one: the coding turns the others into a constant.
         """
         return self.embedding_size or (1 if self.tables == "transform" else 2)
+
+    @property
+    def model_width(self) -> int:
+        """Neurons of the profile paper's hidden layers: `width`, or what its 0 stands for.
+
+        A function of a few numbers needs few. Beside coded tables, 64 would take up to a quarter of
+        the file.
+        """
+        return self.width or (16 if self.tables == "transform" else 64)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON values by field name; `from_dict` gives the same record back."""

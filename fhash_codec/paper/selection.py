@@ -64,6 +64,6 @@ def select(
         fold=config.model_fold,
         embedding_size=config.model_embedding_size,
         hidden_layers=config.hidden_layers,
-        width=config.width,
+        width=config.model_width,
     )
     return Selection(scanned=scanned, features=features, coreset=coreset, architecture=architecture)

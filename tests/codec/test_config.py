@@ -98,10 +98,12 @@ def test_settings_may_be_given_as_python_values() -> None:
         EncodeConfig(features=(np.ones(3, bool),))
 
 
-@pytest.mark.parametrize("fold", [0, 5])
-@pytest.mark.parametrize("size", [0, 3])
-def test_the_sizes_of_a_model_suit_its_tables_unless_they_are_given(fold, size) -> None:
-    for tables, usual in (("float16", (2, 2)), ("uint8", (2, 2)), ("transform", (8, 1))):
-        config = EncodeConfig(profile="paper", tables=tables, fold=fold, embedding_size=size)
-        expected = (fold or usual[0], size or usual[1])
-        assert (config.model_fold, config.model_embedding_size) == expected
+@pytest.mark.parametrize(("fold", "size", "width"), [(0, 0, 0), (5, 3, 32)])
+def test_the_sizes_of_a_model_suit_its_tables_unless_they_are_given(fold, size, width) -> None:
+    usual = {"float16": (2, 2, 64), "uint8": (2, 2, 64), "transform": (8, 1, 16)}
+    for tables, sizes in usual.items():
+        config = EncodeConfig(
+            profile="paper", tables=tables, fold=fold, embedding_size=size, width=width
+        )
+        found = (config.model_fold, config.model_embedding_size, config.model_width)
+        assert found == ((fold, size, width) if fold else sizes)

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.tiles.coding import WEIGHT
+from fhash_codec.compact.tiles.tiling import even_tile
 from fhash_codec.paper.network import Floats
-from fhash_codec.paper.regions import block_shape
 from fhash_codec.paper.storage import mix_components
 from fhash_codec.paper.tables.trained_tables import Mask, Region, TrainedTable
 from fhash_formats.container import shard_shape
@@ -30,13 +30,15 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 Index = tuple[int, int, int, int]
 """Place (t, z, y, x) of a tile in the grid of tiles."""
-TILE_STEPS = 32
-"""Largest number of time nodes in a tile."""
-TILE_VERTICES = 1 << 19
-"""Vertices that a tile may grow to."""
+TILE_VERTICES = 1 << 21
+"""About the largest number of vertices in a tile: with more tiles, their borders cost bytes."""
+FEW_TILES = 16
+"""Number of tiles from which on a tile has fewer time nodes, so that a frame is read in time."""
+TILE_STEPS = (32, 8)
+"""Largest numbers of time nodes in a tile, of few tiles and of many."""
 CACHE_BYTES = 64 << 20
 """Bytes of decoded tiles of one table that stay in memory."""
-BATCH = 16
+BATCH = 8
 """Tiles that are worked on at a time."""
 ROUNDS = 2
 """Projections by which the coder fills vertices that are not needed."""
@@ -159,19 +161,11 @@ class TiledTable:
 def tile_shape(resolution: Shape) -> Shape:
     """Return the tile (t, z, y, x) of a level of a resolution (t, z, y, x).
 
-    It consists of whole blocks of the decoder (`regions.block_shape`), at most TILE_STEPS time
-    nodes of them.
+    The level is cut evenly into tiles of about TILE_VERTICES vertices.
     """
-    box = resolution[1:]
-    steps = -(-resolution[0] // -(-resolution[0] // TILE_STEPS))
-    shape = list(block_shape(box))
-    while (growing := [axis for axis in range(3) if shape[axis] < box[axis]]) and 2 * steps * prod(
-        shape
-    ) <= TILE_VERTICES:
-        axis = min(growing, key=lambda axis: shape[axis])
-        shape[axis] = 2 * shape[axis]
-    z, y, x = (min(n, length) for n, length in zip(shape, box, strict=True))
-    return steps, z, y, x
+    tiles = -(-prod(resolution) // TILE_VERTICES)
+    steps = TILE_STEPS[tiles >= FEW_TILES]
+    return even_tile(resolution, tiles, min(steps, resolution[0]))
 
 
 def tile_region(index: Index, tile: Shape, shape: Sequence[int]) -> Region:

@@ -38,6 +38,11 @@ def checkpoint_path(output: Path, coreset: Coreset, config: EncodeConfig) -> Pat
     It is `OUTPUT.<digest of coreset and settings>.checkpoint`, beside the output.
     """
     settings = {name: value for name, value in config.to_dict().items() if name not in UNRELATED}
+    settings |= {
+        "fold": config.model_fold,
+        "embedding_size": config.model_embedding_size,
+        "width": config.model_width,
+    }
     digest = hashlib.sha256(
         json.dumps(
             [version("fhash"), settings, coreset.box, coreset.key_frames], sort_keys=True

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import fhash_codec
-from fhash_codec.paper.regions import block_shape
-from fhash_codec.paper.tables.tiles import TILE_STEPS, TILE_VERTICES, tile_shape
+from fhash_codec.paper.tables.tiles import FEW_TILES, TILE_VERTICES, tile_shape
 
 
 def decoded(path) -> np.ndarray:
@@ -44,11 +43,20 @@ def test_points_and_times_between_are_as_smooth_as_before(waves, pair) -> None:
 
 
 @pytest.mark.parametrize(
-    "resolution", [(1, 1, 1, 1), (9, 20, 30, 40), (17, 200, 200, 200), (3, 1, 1, 5000)], ids=str
+    "resolution",
+    [(1, 1, 1, 1), (9, 20, 30, 40), (81, 40, 40, 63), (17, 200, 200, 200), (3, 1, 1, 5000)],
+    ids=str,
 )
-def test_tiles_are_whole_blocks_of_a_bounded_size(resolution) -> None:
-    nodes, *tile = tile_shape(resolution)
-    assert 1 <= nodes <= TILE_STEPS
-    assert nodes * np.prod(tile) <= TILE_VERTICES
-    for length, block, size in zip(tile, block_shape(resolution[1:]), resolution[1:], strict=True):
-        assert length % block == 0 or length == size
+def test_tiles_cut_a_level_evenly(resolution) -> None:
+    tile = tile_shape(resolution)
+    covered = [-(-n // length) * length for n, length in zip(resolution, tile, strict=True)]
+    assert np.prod(covered) < 1.2 * np.prod(resolution)
+    assert np.prod(tile) < 1.5 * TILE_VERTICES
+    assert all(1 <= length <= n for length, n in zip(tile, resolution, strict=True))
+
+
+@pytest.mark.parametrize(("steps", "most"), [(14, 32 * 1.5), (16, 8 * 1.5)])
+def test_tiles_of_a_long_series_have_few_time_nodes(steps, most) -> None:
+    tile = tile_shape((steps * 16, 64, 64, 32))  # as many times TILE_VERTICES as `steps`
+    assert tile[0] <= most
+    assert (tile[0] > 8 * 1.5) == (steps < FEW_TILES)

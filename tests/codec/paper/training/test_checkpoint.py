@@ -59,3 +59,16 @@ def test_a_damaged_checkpoint_is_named_not_ignored(tmp_path) -> None:
         path.write_bytes(damaged)
         with pytest.raises(InputError, match=r"run\.checkpoint cannot be read"):
             load_checkpoint(path)
+
+
+def test_tables_that_change_the_sizes_of_the_model_have_a_checkpoint_of_their_own(
+    coreset, tmp_path
+) -> None:
+    def path(**settings):
+        return checkpoint_path(tmp_path, coreset, EncodeConfig(profile="paper", **settings))
+
+    published = {"fold": 2, "embedding_size": 2, "width": 64}
+    assert path() == path(tables="uint8") == path(**published)
+    assert path() == path(tables="transform", **published)
+    for setting in published:
+        assert path() != path(tables="transform", **(published | {setting: 0}))
