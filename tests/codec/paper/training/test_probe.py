@@ -20,11 +20,13 @@ SHAPE = (3, 9, 10, 21)
 
 
 class Engine:
-    """An engine whose values at the vertices of bricks are given."""
+    """An engine whose values at the samples of bricks are given."""
 
     def __init__(self, coreset: Coreset, frames: np.ndarray) -> None:
         low, size = [span[0] for span in coreset.box], coreset.box.shape
         self.shape, self.bricks = coreset.brick_shape, coreset.bricks
+        vertices = int(np.prod(self.shape))
+        self.samples = np.unpackbits(coreset.mask_bits, axis=1, count=vertices).view(np.bool_)
         padded = [n * m for n, m in zip(coreset.brick_grid, self.shape, strict=True)]
         self.frames = np.zeros((len(frames), *padded))
         box = tuple(slice(a, a + n) for a, n in zip(low, size, strict=True))
@@ -37,7 +39,7 @@ class Engine:
             ].ravel()
             for key, *place in self.bricks[chosen].tolist()
         ]
-        return torch.from_numpy(np.array(values))
+        return torch.from_numpy(np.array(values)[self.samples[chosen]])
 
 
 def built(field: np.ndarray, feature: object, fringe: bool) -> Coreset:
