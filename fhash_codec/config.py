@@ -228,7 +228,9 @@ class EncodeConfig:
         for field in dataclasses.fields(self):
             _check(field, getattr(self, field.name))
         if self.fold == 1:
-            raise InputError("--fold is 1; allowed: 2 to 64, or 0 for a ratio that suits the tables")
+            raise InputError(
+                "--fold is 1; allowed: 2 to 64, or 0 for a ratio that suits the tables"
+            )
         self._check_profile()
         self._check_promises()
 

@@ -162,7 +162,7 @@ SETTINGS = [
     (["--tile", "4x4"], "as in 4x32x32x32"),
     (["--tile", "0x4x4x4"], "4x32x32x32"),
     (["--fold", "1"], "--fold"),
-    (["--width", "0"], "--width"),
+    (["--width", "-1"], "--width"),
     (["--width", "many"], "--width"),
     (["--epochs", "-1"], "--epochs"),
     (["--dilation", "1000"], "--dilation"),
