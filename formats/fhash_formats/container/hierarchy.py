@@ -16,6 +16,7 @@ from fhash_formats.container import strict_json
 from fhash_formats.container.apart import inline
 from fhash_formats.container.array import ArrayMetadata, attributes_of, check_keys
 from fhash_formats.container.coding import without_crc32c
+from fhash_formats.container.header import validate_header
 from fhash_formats.container.layout import Member
 from fhash_formats.container.source import Source
 from fhash_formats.container.zip_checked import DOCUMENT, read_member
@@ -35,7 +36,7 @@ class Hierarchy:
     """The content of a container's ZIP.
 
     Attributes:
-        header: attribute "fhash" of the root.
+        header: attribute "fhash" of the root, checked by `validate_header`.
         arrays: metadata by name of the array.
         chunks: members by name of the array and index of the chunk.
     """
@@ -72,6 +73,8 @@ def read_hierarchy(source: Source, members: Mapping[str, Member]) -> Hierarchy:
     for node in [*documents, *groups]:
         if node and node.rpartition("/")[0] not in groups:
             raise DamagedFileError(f"member {node}/{DOCUMENT} lies in no group")
+    # A newer format says so in its header, and may have arrays of which nothing is known here.
+    validate_header(groups[""]["fhash"])
     arrays = _read_arrays(source, members, documents)
     return Hierarchy(
         header=groups[""]["fhash"], arrays=arrays, chunks=_place_chunks(arrays, chunk_members)

@@ -13,7 +13,7 @@ from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.coding import MASK
 from fhash_formats.container.coordinates import described_coordinate
 from fhash_formats.container.expected_arrays import check_arrays, check_key_frames
-from fhash_formats.container.header import POSITIONS, validate_header
+from fhash_formats.container.header import POSITIONS
 from fhash_formats.container.hierarchy import Hierarchy, read_hierarchy
 from fhash_formats.container.mask_array import MaskArray
 from fhash_formats.container.source import CountedSource, FileSource, Source
@@ -81,7 +81,6 @@ class Container:
                     member.name.endswith("zarr.json") for member in members.values()
                 )
                 tree = read_hierarchy(source, members)
-                validate_header(tree.header)
                 check_arrays(tree.header, tree.arrays)
             self.header, self.header_bytes = tree.header, members[DOCUMENT].size
             self.arrays = MappingProxyType(self._stored_arrays(tree))

@@ -7,6 +7,8 @@ import json
 import pytest
 from hostile_files import DOCUMENT, ROOT, edited, refused, replaced
 
+from fhash_formats.errors import UnsupportedFileError
+
 
 def extra_array(shape):
     metadata = {
@@ -105,4 +107,18 @@ def test_root_is_an_ordinary_zarr_group(sample, samples) -> None:
         sample,
         edited(sample, samples, ROOT, lambda v: v.update(attributes={})),
         "not the group of an fhash container",
+    )
+
+
+def test_a_newer_format_is_named_before_its_unknown_codecs(tmp_path, sample, samples) -> None:
+    def newer(root) -> None:
+        root["attributes"]["fhash"]["required_features"] = ["teleport"]
+
+    def unknown(document) -> None:
+        document["codecs"][0] = {"name": "fhash.teleport"}
+
+    path = tmp_path / "a.fhz"
+    path.write_bytes(edited(sample, samples, ROOT, newer))
+    refused(
+        path, edited(path, samples, DOCUMENT, unknown), "feature 'teleport'", UnsupportedFileError
     )
