@@ -4,16 +4,22 @@ BIN := .venv/bin
 # Tests run in a process for each processor; those of a file stay together, since they share what is dear to make.
 SPREAD := -n auto --dist loadfile
 
-.PHONY: demo test hard wheels clean
+.PHONY: demo test types units hard wheels clean
 
 # Simulate a small series, encode it, decode it, compare and draw: demo/vortex.h5, .fhz and .png.
 demo: .venv/.stamp
 	$(BIN)/fhash demo -o demo --force
 
+# Types are checked beside the tests: mypy takes a minute of one processor.
 test: .venv/.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(MAKE) --no-print-directory -j 2 types units
+
+types: .venv/.stamp
 	$(BIN)/mypy
+
+units: .venv/.stamp
 	$(BIN)/python -m pytest $(SPREAD)
 
 # The long set of hard cases, hostile files, faults and fuzzing: some 35 minutes on 4 processors; needs g++. docs/stability.md gets the figures.
