@@ -22,11 +22,12 @@ from fhash_codec.coreset.occupancy import pack, packed_bytes
 from fhash_codec.encoding import check_name
 from fhash_codec.model_parts import TABLE_AXES, Table
 from fhash_codec.paper.model import PaperModel
-from fhash_codec.paper.storage import BITS, MASK, feature_bits
+from fhash_codec.paper.storage import BITS, feature_bits
 from fhash_codec.progress import Progress, silent
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.container import ContainerWriter, StoredArray
+from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.header import PLAIN_FEATURE
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXIS_NAMES
@@ -97,9 +98,9 @@ class _Export:
     def paper(self) -> dict[str, Any]:
         """Write a file of the profile paper: arrays decoded, tables and occupancy whole."""
         coded = [t for t in self._volume.tables if f"tables/level_{t.level}" not in self._arrays]
-        rewritten = (*(f"tables/level_{table.level}/" for table in coded), MASK)
+        rewritten = (*(f"tables/level_{table.level}/" for table in coded), MASK_ARRAY)
         copied = [a for name, a in self._arrays.items() if not name.startswith(rewritten)]
-        keys = len(self._volume.key_times.key_frames) if MASK in self._arrays else 0
+        keys = len(self._volume.key_times.key_frames) if MASK_ARRAY in self._arrays else 0
         self._total = sum(prod(array.grid) for array in copied) + keys
         self._total += sum(map(_chunk_count, coded))
         for array in copied:

@@ -16,6 +16,7 @@ from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.occupancy import unpack
 from fhash_codec.model_parts import Mlp, Table
 from fhash_formats.container import Container
+from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.header import PLAIN_FEATURE
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.values.elementwise import cast
@@ -66,8 +67,8 @@ class CompactModel:
         """Return which vertices (z, y, x) of a region are in the coreset at both of two steps."""
         # Between steps both count: a value is no better than the two it lies between.
         space = tuple(slice(low, high) for low, high in region)
-        if "occupancy/mask" in self._arrays and not self._table.masked:
-            mask = self._arrays["occupancy/mask"].read((slice(first, last + 1), *space))
+        if MASK_ARRAY in self._arrays and not self._table.masked:
+            mask = self._arrays[MASK_ARRAY].read((slice(first, last + 1), *space))
             return np.asarray((mask[0] != 0) & (mask[-1] != 0))
         if self._table.masked or "occupancy/bits" not in self._arrays:
             mask = self._table.read_mask((slice(first, last + 1), *space))

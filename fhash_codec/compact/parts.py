@@ -104,15 +104,10 @@ def head_mlp(head: NeighbourHead | None) -> Mlp:
     """Return the MLP of a head; one without layers where there is none."""
     if head is None:
         return Mlp(weights=(), biases=(), activation="", stencil=NEIGHBOURS)
-    # Whole numbers of 6 and 8 bits times scales of 11 bits: float32 holds the products exactly.
+    weights, biases = zip(*(layer.parameters for layer in head.layers), strict=True)
     return Mlp(
-        weights=tuple(
-            layer.weights.astype(np.float32) * np.float32(layer.weight_scale)
-            for layer in head.layers
-        ),
-        biases=tuple(
-            layer.biases.astype(np.float32) * np.float32(layer.bias_scale) for layer in head.layers
-        ),
+        weights=weights,
+        biases=biases,
         activation="leaky",
         stencil=NEIGHBOURS,
         constants={

@@ -18,24 +18,22 @@ import numpy.typing as npt
 from fhash_codec.coreset import occupancy
 from fhash_codec.coreset.boxes import Box
 from fhash_codec.coreset.bricks import Coreset
+from fhash_codec.model_parts import TABLE_AXES
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.fringe import fringe_step, round_fringe
 from fhash_codec.paper.network import Floats, Network, TableSource
 from fhash_formats.container import Container, ContainerWriter, StoredArray
+from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.errors import DamagedFileError, InputError
 
 CHUNK_BYTES = 2 << 20
 """Bytes of the largest chunk of a table. Each chunk has a fixed cost; reads decode whole chunks."""
 BITS = "occupancy/bits"
 """Array of the occupancy as bits."""
-MASK = "occupancy/mask"
-"""Array of the coded occupancy, in place of the bits."""
 MASK_BITS = 8
 """Largest number of features that the numbers of the coded occupancy tell apart."""
 MASK_FEATURE_BITS = "feature_bits"
 """Attribute of the coded occupancy that is true where its numbers have a bit for each feature."""
-TABLE_AXES = ("t", "z", "y", "x", "embedding")
-"""Names of the axes of a table."""
 
 
 def write_model(
@@ -85,9 +83,9 @@ def read_occupancy(
     """
     arrays = container.arrays
     box = Box.of(container.header["feature_bounding_box"]).shape
-    if MASK in arrays and (features is None or _has_feature_bits(container)):
+    if MASK_ARRAY in arrays and (features is None or _has_feature_bits(container)):
         space = tuple(slice(0, length) for length in box)
-        mask = arrays[MASK].read((slice(first, last + 1), *space))
+        mask = arrays[MASK_ARRAY].read((slice(first, last + 1), *space))
         bits = 0xFF if features is None else sum(1 << number for number in features)
         return np.asarray(((mask[0] | mask[-1]) & np.uint8(bits)) != 0)
     names = [BITS] if features is None else [feature_bits(number + 1) for number in features]
@@ -100,7 +98,7 @@ def read_occupancy(
 
 def _has_feature_bits(container: Container) -> bool:
     """Return whether the numbers of the coded occupancy have a bit for each feature."""
-    mask = container.arrays.get(MASK)
+    mask = container.arrays.get(MASK_ARRAY)
     return (
         mask is not None
         and mask.attributes.get(MASK_FEATURE_BITS) is True

@@ -10,7 +10,7 @@ from fhash_formats.errors import InputError
 from fhash_formats.transform.stream import MAX_TILE_VERTICES
 from fhash_formats.transform.tile.sections import Shape
 
-__all__ = ["even_tile", "first_tile", "parse_tile", "shard_shape", "tile_for"]
+__all__ = ["even_tile", "first_tile", "parse_tile", "tile_for"]
 
 TILE_BYTES = 1500
 """Bytes that a tile should take at least."""
@@ -37,8 +37,6 @@ PRICE_OF_FEWER = 0.05
 """Price of fewer tiles than asked for, per factor of e."""
 PRICE_OF_SHORT = 0.1
 """Price of each space axis that is cut into parts shorter than MIN_LENGTH."""
-MAX_TILES_OF_SHARD = 4096
-"""Tiles in one shard at most; a larger table has a shard for each layer of tiles in time."""
 
 
 def parse_tile(text: str, shape: Shape) -> Shape | None:
@@ -146,10 +144,3 @@ def tile_for(shape: Shape, size: float) -> Shape:
         parts = -(-steps // TILE_STEPS) if tiles >= 16 else 1
         steps = -(-steps // min(parts, max(1, tiles // 8)))
     return even_tile(shape, max(1, tiles), steps)
-
-
-def shard_shape(tile: Shape, grid: tuple[int, int, int, int]) -> Shape:
-    """Return the vertices of a shard: all tiles, or one layer in time of a large grid."""
-    layers = grid[0] if prod(grid) <= MAX_TILES_OF_SHARD else 1
-    t, z, y, x = (n * count for n, count in zip(tile, (layers, *grid[1:]), strict=True))
-    return t, z, y, x

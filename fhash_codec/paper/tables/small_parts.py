@@ -16,8 +16,9 @@ import numpy.typing as npt
 from fhash_codec.coreset import occupancy
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.network import Floats, Layer
-from fhash_codec.paper.storage import MASK, MASK_BITS, MASK_FEATURE_BITS, write_features_apart
+from fhash_codec.paper.storage import MASK_BITS, MASK_FEATURE_BITS, write_features_apart
 from fhash_formats.container import ContainerWriter
+from fhash_formats.container.apart import MASK_ARRAY
 from fhash_formats.container.coding import transform_codecs
 from fhash_formats.transform.axes.spec import TransformSpec
 from fhash_formats.transform.tile.encoding import Coding, encode_tile
@@ -91,7 +92,7 @@ def write_mask(writer: ContainerWriter, coreset: Coreset) -> None:
         return result
 
     writer.add_array(
-        MASK,
+        MASK_ARRAY,
         shape=(keys, *box),
         dtype=np.uint8,
         chunk_shape=(steps, *box),

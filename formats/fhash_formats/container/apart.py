@@ -48,11 +48,11 @@ def inline(documents: Mapping[str, Document], chunk: Callable[[str], bytes]) -> 
         if name != TABLE and without_names(_settings(document.get("codecs")))[1]:
             raise DamagedFileError(f"array {name} has no head or masks in other arrays")
     settings = _settings(documents.get(TABLE, {}).get("codecs"))
+    whole = without_names(settings)[0]
     replaced: dict[str, Any] = {}
     for key, (array, codec) in _PARTS.items():
         part = settings.get(key)
-        part = part if isinstance(part, Mapping) else {}
-        named = part.get("array")
+        named = part.get("array") if isinstance(part, Mapping) else None
         there = _first(documents.get(array, {}).get("codecs")).get("name") == codec
         if named is None and not there:
             continue
@@ -62,9 +62,7 @@ def inline(documents: Mapping[str, Document], chunk: Callable[[str], bytes]) -> 
                 f"{array} is {'there' if there else f'no array coded by {codec}'}"
             )
         replaced[key] = (
-            base64.b64encode(chunk(array)).decode("ascii")
-            if key == "head"
-            else {name: value for name, value in part.items() if name != "array"}
+            base64.b64encode(chunk(array)).decode("ascii") if key == "head" else whole["mask"]
         )
     result = dict(documents)
     if replaced:

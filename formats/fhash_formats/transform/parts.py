@@ -22,17 +22,8 @@ def head_parameters(data: bytes | memoryview) -> npt.NDArray[np.float32]:
 
     Raises DamagedFileError for bytes that are no packed head.
     """
-    # Whole numbers of 6 and 8 bits times scales of 11 bits: float32 holds the products exactly.
-    return np.concatenate(
-        [
-            numbers.ravel().astype(np.float32) * np.float32(scale)
-            for layer in NeighbourHead.from_bytes(bytes(data)).layers
-            for numbers, scale in (
-                (layer.weights, layer.weight_scale),
-                (layer.biases, layer.bias_scale),
-            )
-        ]
-    )
+    layers = NeighbourHead.from_bytes(bytes(data)).layers
+    return np.concatenate([numbers.ravel() for layer in layers for numbers in layer.parameters])
 
 
 class HeadCoder:

@@ -240,3 +240,9 @@ def test_a_large_array_has_a_shard_for_each_layer(grid, shards) -> None:
     assert all(n % chunk == 0 for n, chunk in zip(shape, chunk_shape, strict=True))
     lengths = [n * chunk for n, chunk in zip(grid, chunk_shape, strict=True)]
     assert tuple(-(-n // shard) for n, shard in zip(lengths, shape, strict=True)) == shards
+
+
+def test_a_large_grid_has_a_shard_for_each_layer_in_time() -> None:
+    tile = (2, 3, 4, 5)
+    assert shard_shape(tile, (4, 16, 8, 8)) == (8, 48, 32, 40)
+    assert shard_shape(tile, (5, 16, 8, 8)) == (2, 48, 32, 40)

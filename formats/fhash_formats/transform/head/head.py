@@ -108,6 +108,17 @@ class Layer:
     weight_scale: float
     bias_scale: float
 
+    @property
+    def parameters(self) -> tuple[Floats, Floats]:
+        """Weights (out, in) and biases (out,), float32.
+
+        They are exact: whole numbers of 6 and 8 bits times scales of 11 bits.
+        """
+        return (
+            self.weights.astype(np.float32) * np.float32(self.weight_scale),
+            self.biases.astype(np.float32) * np.float32(self.bias_scale),
+        )
+
     @classmethod
     def of(cls, weights: Scaled, biases: Scaled) -> Self:
         """The layer of its numbers, each with their scale."""

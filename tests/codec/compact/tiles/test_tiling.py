@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fhash_codec.compact.tiles.tiling import parse_tile, shard_shape, tile_for
+from fhash_codec.compact.tiles.tiling import parse_tile, tile_for
 from fhash_formats.errors import InputError
 
 Shape = tuple[int, int, int, int]
@@ -29,9 +29,3 @@ def test_a_tile_that_no_reader_would_take_is_refused(text: str) -> None:
     with pytest.raises(InputError, match=r"at most 134,217,728 are decoded together"):
         parse_tile(text, (200, 1000, 1000, 2))
     assert parse_tile("1x1000x1000x9", (200, 1000, 1000, 2)) == (1, 1000, 1000, 2)
-
-
-def test_a_large_grid_has_a_shard_for_each_layer_in_time() -> None:
-    tile = (2, 3, 4, 5)
-    assert shard_shape(tile, (4, 16, 8, 8)) == (8, 48, 32, 40)
-    assert shard_shape(tile, (5, 16, 8, 8)) == (2, 48, 32, 40)
