@@ -53,6 +53,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("plain",),
         ("selftest",),
         ("bench",),
+        ("cost",),
     ),
     "fhash_codec.rendering": (
         ("scene",),
