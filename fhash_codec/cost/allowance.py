@@ -51,20 +51,22 @@ class Allowance:
     def has(self, what: str, seconds: float, *, share: float = 1.0) -> bool:
         """Whether work of some seconds fits in a share of what is left of the part.
 
-        Where it does not, it is noted as left out.
+        Where it does not, it is noted as left out; where it does, an older note of it is dropped.
         """
         if self.interrupted:
             self.leave_out(what, "interrupted")
             return False
         allowed = share * self.left
         if seconds <= allowed:
+            self.left_out = [entry for entry in self.left_out if entry.what != what]
             return True
         why = f"needs about {seconds:.3g} s; {allowed:.3g} s were left for it"
         self.leave_out(what, why, late=True)
         return False
 
     def leave_out(self, what: str, why: str, *, late: bool = False) -> None:
-        """Note what is not measured; late: time alone is wanting."""
+        """Note what is not measured, in place of an older note; late: time alone is wanting."""
+        self.left_out = [entry for entry in self.left_out if entry.what != what]
         self.left_out.append(LeftOut(what=what, why=why, late=late))
 
     @contextmanager

@@ -15,10 +15,10 @@ from fhash_codec.cost.advice import advise
 from fhash_codec.cost.allowance import Allowance
 from fhash_codec.cost.crop import cropped, described
 from fhash_codec.cost.facts import Facts, facts_of
-from fhash_codec.cost.own import KeptFile, OwnEncodings
+from fhash_codec.cost.own import ONE_SHARE, KeptFile, OwnEncodings
 from fhash_codec.cost.peers import PeerEncodings
 from fhash_codec.cost.pictures import PictureCosts
-from fhash_codec.cost.plan import wishes
+from fhash_codec.cost.plan import PEERS, wishes
 from fhash_codec.cost.prediction import predict
 from fhash_codec.cost.reads import measure_reads
 from fhash_codec.cost.results import CostReport, Picture, Read
@@ -91,10 +91,15 @@ def measure_cost(
         pictures: list[Picture] = []
         try:
             allowance.part(ENCODE_END)
-            for wish in wishes():
-                if allowance.interrupted:
-                    break
-                (peers if wish.config is None and wish.target else own).measure(wish)
+            # What was too long for its share may fit into what the others left.
+            for share in (ONE_SHARE, 1.0):
+                for wish in wishes():
+                    if allowance.interrupted:
+                        break
+                    if wish.codec in PEERS:
+                        peers.measure(wish)
+                    else:
+                        own.measure(wish, share=share)
             if not allowance.interrupted:
                 measure_uses(series, facts, own.files, allowance, progress, reads, pictures)
         except KeyboardInterrupt:

@@ -35,7 +35,7 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
     units = f", {report.units}" if report.units else ", in the units of the data"
     second, byte = (
         Axis(label="seconds of encoding", log=True),
-        Axis(label="size of the file", unit="B", log=True),
+        Axis(label="size of the file, bytes", unit="B", log=True),
     )
     decibel = Axis(label="PSNR of all values, dB")
     for key, title, x, y, x_of, y_of in (

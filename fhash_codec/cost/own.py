@@ -21,7 +21,7 @@ from fhash_codec.training.devices import need_torch
 from fhash_formats.errors import FhashError, FhashWarning, MissingDependencyError, QualityError
 from fhash_formats.series import Series
 
-__all__ = ["KeptFile", "OwnEncodings", "encoded_of"]
+__all__ = ["ONE_SHARE", "KeptFile", "OwnEncodings", "encoded_of"]
 
 ONE_SHARE = 0.6
 """Share of the time left for encoding that one encoding may take, so that others follow."""
@@ -76,9 +76,16 @@ class OwnEncodings:
         self._fastest = prod(series.shape) / USUAL_RATE
         self._usual: dict[str, float] = {}
         self._predicting = 0.0
+        self._share = ONE_SHARE
 
-    def measure(self, wish: Wish) -> None:
-        """Measure a wish, or keep its prediction where there is no time for it."""
+    def measure(self, wish: Wish, *, share: float = ONE_SHARE) -> None:
+        """Measure a wish, or keep its prediction where there is no time for it.
+
+        A wish that was measured before is not measured again.
+
+        share: share of the time left that it may take.
+        """
+        self._share = share
         if wish.codec == "paper":
             self._measure_paper(wish)
         else:
@@ -86,12 +93,17 @@ class OwnEncodings:
 
     def _measure(self, wish: Wish) -> Encoded:
         assert wish.config is not None
+        before = next((point for point in self.points if point.name == wish.name), None)
+        if before is not None and before.measured:
+            return before
         with self._allowance.work(f"prediction of {wish.name}"):
             self._predict(wish.config)
         point = _predicted(wish, self._predictions.get(wish.config))
-        if self._allowance.has(wish.name, self._expected(wish.config), share=ONE_SHARE):
+        if self._allowance.has(wish.name, self._expected(wish.config), share=self._share):
             with self._allowance.work(wish.name):
                 point = self._encode(wish, point)
+        if before is not None:
+            self.points.remove(before)
         if point.measured or point.predicted_seconds is not None:
             self.points.append(point)
         return point
@@ -103,12 +115,14 @@ class OwnEncodings:
         except MissingDependencyError as error:
             self._allowance.leave_out(wish.name, str(error))
             return
+        if any(point.codec == "paper" and point.measured for point in self.points):
+            return
         first = self._measure(replace(wish, config=paper_config(1)))
         if not first.seconds or self._allowance.interrupted:
             return
         epoch = self.curves[-1].points[-1]["seconds"] or first.seconds
         rest = max(first.seconds - epoch, 0.0)
-        limit = ONE_SHARE * self._allowance.left
+        limit = self._share * self._allowance.left
         fitting = [epochs for epochs in EPOCHS if rest + epochs * epoch <= limit]
         if fitting:
             self._expect(paper_config(fitting[-1]), rest + fitting[-1] * epoch)
@@ -155,7 +169,7 @@ class OwnEncodings:
         """Encode, and keep the file; the point as predicted where that failed."""
         assert wish.config is not None
         path = self._folder / f"{len(self.files)}.fhz"
-        guarded = self._allowance.guard(self._progress, share=ONE_SHARE)
+        guarded = self._allowance.guard(self._progress, share=self._share)
         missed = False
         try:
             with warnings.catch_warnings():

@@ -13,6 +13,7 @@ from typing import Any
 
 from fhash_codec.cost.advice import told
 from fhash_codec.cost.panels import panels
+from fhash_codec.cost.pictures import NOTHING
 from fhash_codec.cost.results import CostReport
 from fhash_codec.cost.tables import Table, tables
 from fhash_formats.errors import MissingDependencyError
@@ -20,6 +21,8 @@ from fhash_formats.support.plain_json import plain_json
 
 __all__ = ["json_text", "page", "require_plotly"]
 
+EFFECT_COUNTERS = ("gradients", "secondary_rays", "evaluations")
+"""Counters of work that effects alone ask for, where a decoded frame is marched."""
 SECTIONS = {"encode": "Encode", "read": "Read", "picture": "Picture", "about": "About"}
 """Headings of the page by the sections of panels and tables."""
 
@@ -88,15 +91,34 @@ def _section(name: str, report: CostReport) -> str:
         notes = "<ul>" + "".join(f"<li>{escape(note)}</li>" for note in report.notes) + "</ul>"
     if not (plots or lists or notes):
         return ""
-    return f'<h2>{SECTIONS[name]}</h2><div class="plots">{plots}</div>{lists}{notes}'
+    zeros = _zeros(report) if name == "picture" else ""
+    return f'<h2>{SECTIONS[name]}</h2>{zeros}<div class="plots">{plots}</div>{lists}{notes}'
+
+
+def _cell(text: str) -> str:
+    """A cell of a table; numbers stand to the right."""
+    try:
+        float(text)
+    except ValueError:
+        return f"<td>{escape(text)}</td>"
+    return f'<td class="number">{escape(text)}</td>'
+
+
+def _zeros(report: CostReport) -> str:
+    """A line on the picture without effects: all that they would take is 0."""
+    plain = [each for each in report.pictures if each.setting == NOTHING]
+    if not plain:
+        return ""
+    counts = ", ".join(
+        f"{name.replace('_', ' ')} {plain[0].counters[name]}" for name in EFFECT_COUNTERS
+    )
+    return f"<p>An effect that is not named costs nothing. With {NOTHING}: {counts}.</p>"
 
 
 def _table(table: Table) -> str:
     """A table with a button that copies it as tab-separated text."""
     header = "".join(f"<th>{escape(name)}</th>" for name in table.header)
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in table.rows
-    )
+    rows = "".join("<tr>" + "".join(_cell(text) for text in row) + "</tr>" for row in table.rows)
     return (
         f"<details open><summary>{escape(table.title)} ({len(table.rows)})</summary>"
         '<button type="button" class="copy">copy as TSV</button>'

@@ -65,10 +65,13 @@ class PeerEncodings:
         self._trials: dict[tuple[str, float], Encoded] = {}
         self._seconds: dict[str, float] = {}
         self._missing_told = False
+        self._done: set[str] = set()
         self.points: list[Encoded] = []
 
     def measure(self, wish: Wish) -> None:
-        """Measure a peer at a quality, where there is time for it."""
+        """Measure a peer at a quality, once, where there is time for it."""
+        if wish.name in self._done:
+            return
         if not self._prepared(wish):
             return
         expected = self._seconds.get(wish.codec, self._facts.raw_bytes / USUAL_RATE)
@@ -85,6 +88,7 @@ class PeerEncodings:
                     best = trial.bytes, variant, search, point
         self._progress("comparing", 1, 1, wish.name)
         if best is not None:
+            self._done.add(wish.name)
             self._searches[wish.codec] = [best[1:3]]
             self.points.append(best[3])
 

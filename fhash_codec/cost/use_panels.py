@@ -94,13 +94,13 @@ def _knobs(pictures: Iterable[Picture], pick: int) -> Iterator[Trace]:
     """A curve of time and likeness for each knob."""
     groups = dict.fromkeys(each.group for each in pictures if each.group in KNOBS)
     for place, group in enumerate(groups):
-        points = sorted(
+        points = [  # in the order of the settings: times alone may go up and down
             (each.milliseconds, value, f"{group} {each.setting}<br>{each.milliseconds:.3g} ms")
             for each in pictures
             if each.group == group
             and not each.best
             and (value := (each.psnr, each.ssim)[pick]) is not None
-        )
+        ]
         if points:
             yield Trace(
                 name=group,
@@ -147,7 +147,7 @@ def _pictures_by_size(report: CostReport) -> Panel:
         key="picture-bytes",
         section="picture",
         title="Likeness to the source's picture against size",
-        x=Axis(label="size of the file", unit="B", log=True),
+        x=Axis(label="size of the file, bytes", unit="B", log=True),
         y=Axis(label="PSNR of the picture, dB"),
         traces=tuple(traces),
     )
