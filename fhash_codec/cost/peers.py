@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.bench.rate.measuring import UNIFORM
 from fhash_codec.bench.rate.own import trial_of
 from fhash_codec.bench.rate.peers import (
     Variant,
@@ -37,6 +38,8 @@ TRIALS = 3
 """New trials for a quality, at most."""
 SLACK = 0.5
 """dB above a quality at which its search ends."""
+PEER_SHARE = 0.15
+"""Share of the time left for encoding that a peer may take at a quality."""
 USUAL_RATE = 20e6
 """Bytes a second of a peer that was not measured yet."""
 
@@ -66,6 +69,7 @@ class PeerEncodings:
         self._seconds: dict[str, float] = {}
         self._missing_told = False
         self._done: set[str] = set()
+        self._end = 0.0
         self.points: list[Encoded] = []
 
     def measure(self, wish: Wish) -> None:
@@ -78,19 +82,24 @@ class PeerEncodings:
         searches = self._searches[wish.codec]
         if not self._allowance.has(wish.name, expected * len(searches)):
             return
+        self._end = self._allowance.spent + PEER_SHARE * self._allowance.left
         self._progress("comparing", 0, 1, wish.name)
-        best: tuple[int, Variant, Search, Encoded] | None = None
+        found: list[tuple[Variant, Search, Trial]] = []
         with self._allowance.work(wish.name):
-            for variant, search in list(searches):
+            for variant, search in searches:
                 trial = self._find(variant, search, wish.target)
-                if trial is not None and (best is None or trial.bytes < best[0]):
-                    point = self._trials[variant.name, trial.level]
-                    best = trial.bytes, variant, search, point
+                if trial is not None:
+                    found.append((variant, search, trial))
         self._progress("comparing", 1, 1, wish.name)
-        if best is not None:
+        if found:
+            variant, search, best = min(
+                found, key=lambda entry: (entry[2].psnr < wish.target, entry[2].bytes)
+            )
             self._done.add(wish.name)
-            self._searches[wish.codec] = [best[1:3]]
-            self.points.append(best[3])
+            self._searches[wish.codec] = [(variant, search)]
+            point = self._trials[variant.name, best.level]
+            if point not in self.points:
+                self.points.append(point)
 
     def _prepared(self, wish: Wish) -> bool:
         """Whether a peer can be measured; the values are read for the first one."""
@@ -124,16 +133,24 @@ class PeerEncodings:
         return Search(lambda level: self._trial(variant, level), step=variant.step)
 
     def _find(self, variant: Variant, search: Search, target: float) -> Trial | None:
-        """The smallest trial that reaches a PSNR in dB; None where none does."""
+        """The smallest trial that reaches a PSNR in dB; the closest where time does not allow it.
+
+        None where no trial was made.
+        """
+        first = target - UNIFORM if variant.mode == "tolerance" else target
         try:
-            return search.find("psnr", target, first=target, slack=SLACK, most=TRIALS)
+            found = search.find("psnr", target, first=first, slack=SLACK, most=TRIALS)
         except InputError as error:
             self._allowance.leave_out(f"{variant.name}, {target:g} dB", str(error))
             return None
+        except BudgetSpentError:
+            found = None
+        trials = search.trials.values()
+        return found or min(trials, key=lambda trial: abs(trial.psnr - target), default=None)
 
     def _trial(self, variant: Variant, level: float) -> Trial:
         """Encode, decode and measure at a level; raises BudgetSpentError where time is over."""
-        if self._allowance.left == 0:
+        if self._allowance.spent > self._end and self._trials:
             raise BudgetSpentError
         assert self._values is not None
         facts = self._facts
@@ -146,7 +163,7 @@ class PeerEncodings:
         errors = facts.errors()
         for step, frame in enumerate(decoded):
             errors.add(step, self._series.read(step), frame)
-        self._seconds[variant.peer] = 2 * (time.perf_counter() - begun)
+        self._seconds[variant.peer] = time.perf_counter() - begun
         trial = trial_of(errors, level, count)
         bulk = errors.bulk_quality()
         exact = trial.psnr == EXACT
