@@ -85,6 +85,10 @@ def measure_cost(
     ):
         series = _measurable(whole, budget, progress)
         facts = facts_of(series, progress)
+        if not facts.width:
+            raise InputError(
+                f"{whole.source}: '{whole.name}' is constant; accuracy costs nothing there"
+            )
         own = OwnEncodings(series, Path(folder), allowance, progress)
         peers = PeerEncodings(series, facts, Path(folder), allowance, progress)
         reads: list[Read] = []

@@ -94,7 +94,8 @@ def command(
         check_report_folder(Path(report_folder), force, data)
     before = _stamp(output)
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
-        missed = None
+        missed: QualityError | None = None
+        stopped: InterruptedEncodingError | None = None
         try:
             report = fhash_codec.encode(series, output, config, force=force, progress=progress)
         except QualityError as error:
@@ -103,18 +104,22 @@ def command(
         except KeyboardInterrupt:
             raise InterruptedEncodingError(_after_interruption(output, before)) from None
         if report_folder is not None:
-            _write_report(series, report, config, Path(report_folder), force, missed, progress)
+            stopped = _write_report(
+                series, report, config, Path(report_folder), force, missed, progress
+            )
     _say_unmet(source, series, quiet)
     integers = (series.source_dtype or series.dtype).kind in "iu"
     if integers and not quiet and looks_categorical(report):
         say("few different integers: if they are labels, --max-error 0 keeps each exactly")
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
+    if report_folder is not None:
+        rows.append(("report", str(Path(report_folder) / "cost.html")))
     text = table(rows)
     stages = report.pop("stages")
     if explain:
         report["stages"] = stages
         text += f"\n\n{stage_table(stages)}"
-    emit(report, text, as_json, missed)
+    emit(report, text, as_json, missed or stopped)
 
 
 def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:
@@ -141,13 +146,21 @@ def _write_report(
     force: bool,
     missed: QualityError | None,
     progress: Progress,
-) -> None:
-    """Measure reads and pictures of the file just written, and write its report."""
+) -> InterruptedEncodingError | None:
+    """Measure reads and pictures of the file just written, and write its report.
+
+    The error that is returned says that Ctrl-C ended the measurements; None where it did not.
+    """
     from fhash_codec.cost.files import write_report
     from fhash_codec.cost.one import report_on_encode
 
     costs = report_on_encode(series, figures, config, missed=missed is not None, progress=progress)
-    write_report(costs, folder, force=force)
+    page, *_ = write_report(costs, folder, force=force)
+    if not costs.interrupted:
+        return None
+    return InterruptedEncodingError(
+        f"interrupted; {figures['path']} is complete, {page} has what was measured until then"
+    )
 
 
 def _say_unmet(source: SourceOptions, series: Series, quiet: bool) -> None:

@@ -61,7 +61,7 @@ def test_an_encoding_that_overruns_is_no_point(series: ArraySeries, tmp_path: Pa
     encodings = OwnEncodings(series, tmp_path, allowance, advance)
     encodings.measure(FAST)
     assert not any(point.measured for point in encodings.points)
-    assert "stopped after its time" in allowance.left_out[0].why
+    assert "took longer" in allowance.left_out[0].why
     assert list(tmp_path.iterdir()) == []
 
 
