@@ -27,6 +27,8 @@ ONE_SHARE = 0.6
 """Share of the time left for encoding that one encoding may take, so that others follow."""
 MAX_SCALE = 4.0
 """Largest factor between measured and predicted seconds that later predictions are scaled by."""
+DEFAULT_SHARE = 0.85
+"""Share that the default settings may take: most people will use them."""
 PREDICT_SHARE = 0.12
 """Share of the budget that predicting may take; without a prediction USUAL_SECONDS serve."""
 USUAL_RATE = 2e6
@@ -106,9 +108,12 @@ class OwnEncodings:
         with self._allowance.work(f"prediction of {wish.name}"):
             self._predict(wish.config)
         point = _predicted(wish, self._predictions.get(wish.config))
-        if self._allowance.has(wish.name, self._expected(wish.config), share=self._share):
+        share = self._share
+        if wish.config == EncodeConfig():
+            share = max(share, DEFAULT_SHARE)
+        if self._allowance.has(wish.name, self._expected(wish.config), share=share):
             with self._allowance.work(wish.name):
-                point = self._encode(wish, point)
+                point = self._encode(wish, point, share)
         if before is not None:
             self.points.remove(before)
         if point.measured or point.predicted_seconds is not None:
@@ -170,11 +175,14 @@ class OwnEncodings:
             return 1.0
         return min(max(median(self._ratios), 1 / MAX_SCALE), MAX_SCALE)
 
-    def _encode(self, wish: Wish, point: Encoded) -> Encoded:
-        """Encode, and keep the file; the point as predicted where that failed."""
+    def _encode(self, wish: Wish, point: Encoded, share: float) -> Encoded:
+        """Encode, and keep the file; the point as predicted where that failed.
+
+        share: share of the time left after which the encoding is stopped.
+        """
         assert wish.config is not None
         path = self._folder / f"{len(self.files)}.fhz"
-        guarded = self._allowance.guard(self._progress, share=self._share)
+        guarded = self._allowance.guard(self._progress, share=share)
         missed = False
         try:
             with warnings.catch_warnings():
