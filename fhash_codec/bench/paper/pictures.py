@@ -141,7 +141,8 @@ def view_of_feature(
     function = TransferFunction.of(
         TransferFunctionSpec(), value_range=value_range, spacing=1.0, features=(feature,)
     )
-    table, surfaces = None, ()
+    table: Table | None = None
+    surfaces: tuple[Surface, ...] = ()
     if isinstance(kind, Isosurface):
         surfaces = (
             Surface(
