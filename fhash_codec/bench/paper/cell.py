@@ -119,7 +119,7 @@ class Cell:
         return cls(**{**values, **tuples})
 
     def reached(self, decibels: float, figure: str = "coreset_psnr") -> Point | None:
-        """The first point whose figure is at least `decibels`; None where it is not reached (NR)."""
+        """The first point whose figure is at least `decibels`; None where none is (NR)."""
         for point in self.curve:
             value = getattr(point, figure)
             if value is not None and value >= decibels:
@@ -128,6 +128,6 @@ class Cell:
 
 
 def settings_id(settings: Mapping[str, Any]) -> str:
-    """Eight hexadecimal digits that identify settings: equal settings, and only they, share them."""
+    """Eight hexadecimal digits of a hash of settings, by which their cell is found again."""
     text = json.dumps({**settings, "version": CELL_VERSION}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:8]
