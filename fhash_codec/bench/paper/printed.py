@@ -17,7 +17,7 @@ __all__ = [
 ]  # fmt: skip
 
 ENCODINGS: Mapping[str, str] = {
-    "mhe": "MHE",
+    "hash": "MHE",
     "tcnn": "MHE (tiny-cuda-nn)",
     "dense": "Dense Grid single-resolution",
     "dense-multi": "Dense Grid multi-resolution",
@@ -120,85 +120,85 @@ NR: Three = (None, None, None)
 
 TABLE_3: Mapping[str, Mapping[int, Mapping[str, Three]]] = {
     "flame": {
-        20: {"mhe": (33.2, 51.9, 31.7), "tcnn": (24.3, 54.7, 45.6), "dense": (37.4, 46.3, 35.9),
+        20: {"hash": (33.2, 51.9, 31.7), "tcnn": (24.3, 54.7, 45.6), "dense": (37.4, 46.3, 35.9),
              "dense-multi": (29.0, 39.7, 25.9), "fhash": (1.0, 2.2, 1.2)},
-        30: {"mhe": NR, "tcnn": (83.6, None, 86.6), "dense": (None, None, 67.2),
+        30: {"hash": NR, "tcnn": (83.6, None, 86.6), "dense": (None, None, 67.2),
              "dense-multi": (83.9, None, 58.0), "fhash": (4.2, 5.0, 2.0)},
-        40: {"mhe": NR, "tcnn": NR, "dense": NR, "dense-multi": NR, "fhash": (None, 7.4, 2.9)},
+        40: {"hash": NR, "tcnn": NR, "dense": NR, "dense-multi": NR, "fhash": (None, 7.4, 2.9)},
     },
     "bubble": {
-        20: {"mhe": (22.6, 30.2, 30.2), "tcnn": (21.2, 23.2, 23.1), "dense": (37.5, 44.4, 46.1),
+        20: {"hash": (22.6, 30.2, 30.2), "tcnn": (21.2, 23.2, 23.1), "dense": (37.5, 44.4, 46.1),
              "dense-multi": (16.6, 14.5, 14.5), "fhash": (2.2, 1.1, 1.1)},
-        30: {"mhe": NR, "tcnn": (28.9, 32.8, 26.9), "dense": (61.4, 59.7, 59.7),
+        30: {"hash": NR, "tcnn": (28.9, 32.8, 26.9), "dense": (61.4, 59.7, 59.7),
              "dense-multi": (29.0, 29.0, 27.0), "fhash": (3.4, 3.1, 2.2)},
-        40: {"mhe": NR, "tcnn": (48.2, 73.2, 36.6), "dense": (80.2, 63.1, 68.3),
+        40: {"hash": NR, "tcnn": (48.2, 73.2, 36.6), "dense": (80.2, 63.1, 68.3),
              "dense-multi": (43.6, 49.8, 35.3), "fhash": (4.8, 5.9, 3.4)},
     },
     "shell": {
-        20: {"mhe": (163.7, 147.3, 135.1), "tcnn": (52.6, 68.7, 40.4),
+        20: {"hash": (163.7, 147.3, 135.1), "tcnn": (52.6, 68.7, 40.4),
              "dense": (190.4, 190.3, 186.4), "dense-multi": (134.3, 134.3, 126.2),
              "fhash": (2.1, 2.1, 1.6)},
-        30: {"mhe": (None, None, 237.4), "tcnn": (None, None, 137.5), "dense": NR,
+        30: {"hash": (None, None, 237.4), "tcnn": (None, None, 137.5), "dense": NR,
              "dense-multi": (None, None, 179.1), "fhash": (7.4, 10.0, 2.6)},
-        40: {"mhe": NR, "tcnn": NR, "dense": NR, "dense-multi": NR, "fhash": (None, None, 5.8)},
+        40: {"hash": NR, "tcnn": NR, "dense": NR, "dense-multi": NR, "fhash": (None, None, 5.8)},
     },
 }  # fmt: skip
 """Minutes to a mean PSNR of the pictures: data set, dB, encoding, features."""
 
 TABLE_3_SETTINGS: Mapping[str, Mapping[str, str]] = {
-    "flame": {"mhe": "T=2^20, 6 levels", "tcnn": "T=2^20, 6 levels", "dense": "", "dense-multi": "",
-              "fhash": "fold 2, 6 / 6 / 6 levels"},
-    "bubble": {"mhe": "T=2^21, 7 levels", "tcnn": "T=2^21, 7 levels", "dense": "",
+    "flame": {"hash": "T=2^20, 6 levels", "tcnn": "T=2^20, 6 levels", "dense": "",
+              "dense-multi": "", "fhash": "fold 2, 6 / 6 / 6 levels"},
+    "bubble": {"hash": "T=2^21, 7 levels", "tcnn": "T=2^21, 7 levels", "dense": "",
                "dense-multi": "", "fhash": "fold 2, 6 / 7 / 7 levels"},
-    "shell": {"mhe": "T=2^23, 7 levels", "tcnn": "T=2^23, 7 levels", "dense": "", "dense-multi": "",
-              "fhash": "fold 2, 8 / 8 / 8 levels"},
+    "shell": {"hash": "T=2^23, 7 levels", "tcnn": "T=2^23, 7 levels", "dense": "",
+              "dense-multi": "", "fhash": "fold 2, 8 / 8 / 8 levels"},
 }  # fmt: skip
 """Settings of each encoding; the dense grids' are not printed."""
 
 PARAMETERS: Mapping[str, Mapping[str, tuple[float, float, float]]] = {
-    "flame": {"mhe": (120.0,) * 3, "tcnn": (45.8,) * 3, "dense": (45.0,) * 3,
+    "flame": {"hash": (120.0,) * 3, "tcnn": (45.8,) * 3, "dense": (45.0,) * 3,
               "dense-multi": (51.5,) * 3, "fhash": (16.1, 17.4, 24.2)},
-    "bubble": {"mhe": (252.0,) * 3, "tcnn": (77.2,) * 3, "dense": (72.0,) * 3,
+    "bubble": {"hash": (252.0,) * 3, "tcnn": (77.2,) * 3, "dense": (72.0,) * 3,
                "dense-multi": (82.3,) * 3, "fhash": (16.7, 19.5, 19.7)},
-    "shell": {"mhe": (1120.0,) * 3, "tcnn": (205.8,) * 3, "dense": (135.0,) * 3,
+    "shell": {"hash": (1120.0,) * 3, "tcnn": (205.8,) * 3, "dense": (135.0,) * 3,
               "dense-multi": (154.3,) * 3, "fhash": (108.2, 86.9, 107.7)},
 }  # fmt: skip
 """Parameters of the encodings in M (2^20), of the three features; one number where all share it."""
 
 TABLE_4: Mapping[str, Mapping[str, Accuracy]] = {
-    "flame": {"mhe": Accuracy(18.9, 0.818, 43.4), "tcnn": Accuracy(23.7, 0.906, 45.7),
+    "flame": {"hash": Accuracy(18.9, 0.818, 43.4), "tcnn": Accuracy(23.7, 0.906, 45.7),
               "dense": Accuracy(20.2, 0.829, 44.8), "dense-multi": Accuracy(20.5, 0.850, 45.9),
               "fhash": Accuracy(47.1, 0.994, 7.4)},
-    "bubble": {"mhe": Accuracy(22.3, 0.862, 56.5), "tcnn": Accuracy(28.3, 0.987, 57.9),
+    "bubble": {"hash": Accuracy(22.3, 0.862, 56.5), "tcnn": Accuracy(28.3, 0.987, 57.9),
                "dense": Accuracy(23.9, 0.908, 51.1), "dense-multi": Accuracy(35.6, 0.987, 62.3),
                "fhash": Accuracy(64.6, 0.999, 8.5)},
-    "shell": {"mhe": Accuracy(26.7, 0.870, 122.7), "tcnn": Accuracy(26.6, 0.861, 121.4),
+    "shell": {"hash": Accuracy(26.7, 0.870, 122.7), "tcnn": Accuracy(26.6, 0.861, 121.4),
               "dense": Accuracy(24.5, 0.899, 122.2), "dense-multi": Accuracy(31.7, 0.941, 118.8),
               "fhash": Accuracy(38.7, 0.986, 15.7)},
 }  # fmt: skip
 """Accuracy of pictures of the segmentation after 30 epochs."""
 
 TABLE_5: Mapping[str, Mapping[str, tuple[float, ...]]] = {
-    "flame": {"mhe": (1.9,), "tcnn": (3.5,), "dense": (5.1,), "dense-multi": (4.5,),
+    "flame": {"hash": (1.9,), "tcnn": (3.5,), "dense": (5.1,), "dense-multi": (4.5,),
               "fhash": (14.3, 13.2, 9.5), "NeurComp": (1407.3,), "SZ3": (51.4,),
               "TTHRESH": (1023.3,)},
-    "bubble": {"mhe": (3.7,), "tcnn": (6.2,), "dense": (12.8,), "dense-multi": (11.2,),
+    "bubble": {"hash": (3.7,), "tcnn": (6.2,), "dense": (12.8,), "dense-multi": (11.2,),
                "fhash": (55.2, 47.1, 46.8), "NeurComp": (1223.8,), "SZ3": (54.6,),
                "TTHRESH": (1107.4,)},
-    "shell": {"mhe": (1.1,), "tcnn": (2.4,), "dense": (9.2,), "dense-multi": (8.1,),
+    "shell": {"hash": (1.1,), "tcnn": (2.4,), "dense": (9.2,), "dense-multi": (8.1,),
               "fhash": (11.5, 14.3, 11.6), "NeurComp": (1371.2,), "SZ3": (61.7,),
               "TTHRESH": (1240.3,)},
 }  # fmt: skip
 """Compression ratios: one, or those of the three features. Codecs are at 45 dB or more."""
 
 TABLE_6: Mapping[str, Mapping[str, Latency]] = {
-    "flame": {"mhe": Latency(385.4, 253.5), "tcnn": Latency(211.1, 136.6),
+    "flame": {"hash": Latency(385.4, 253.5), "tcnn": Latency(211.1, 136.6),
               "dense": Latency(144.5, 97.1), "dense-multi": Latency(165.2, 110.9),
               "fhash": Latency(77.6, 53.8)},
-    "bubble": {"mhe": Latency(898.5, 592.4), "tcnn": Latency(531.5, 351.9),
+    "bubble": {"hash": Latency(898.5, 592.4), "tcnn": Latency(531.5, 351.9),
                "dense": Latency(256.9, 168.8), "dense-multi": Latency(293.6, 192.4),
                "fhash": Latency(63.01, 43.4)},
-    "shell": {"mhe": Latency(3592.5, 2367.5), "tcnn": Latency(1686.1, 1112.6),
+    "shell": {"hash": Latency(3592.5, 2367.5), "tcnn": Latency(1686.1, 1112.6),
               "dense": Latency(432.8, 284.6), "dense-multi": Latency(494.8, 326.6),
               "fhash": Latency(345.3, 228.1)},
 }  # fmt: skip

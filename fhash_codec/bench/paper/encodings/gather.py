@@ -185,8 +185,7 @@ class GatherModel:
         """Buckets of all levels (n, levels, corners) around points, and float64 weights."""
         corners = [level.corners(points) for level in self.levels]
         buckets = [
-            index + int(first)
-            for (index, _), first in zip(corners, self._first[:-1], strict=True)
+            index + int(first) for (index, _), first in zip(corners, self._first[:-1], strict=True)
         ]
         return torch.stack(buckets, 1), torch.stack([weight for _, weight in corners], 1)
 
