@@ -68,8 +68,8 @@ class Cell:
         curve: points, the first before training.
         settings: all other settings of the training by name; together with the fields above they
             identify the cell.
-        latency: {"stream_ms", "arm_ms", "passes", "samples", "evaluations", "occupancy"}, or None.
-        between: {"psnr"} of all steps by interpolation in time, or None.
+        latency: of pictures through the encoding, as `latency.measure_latency` has it, or None.
+        between: of steps between key frames, as `evaluation.between_key_frames` has it, or None.
         machine: processor, threads, versions, date.
     """
 
