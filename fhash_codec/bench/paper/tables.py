@@ -294,19 +294,15 @@ def _between(protocol: str, grouped: Sequence[Group]) -> PaperTable:
     figures = {
         "psnr_key_frames": "key frames, dB",
         "psnr_between": "between, dB",
-        "linear_psnr": "true key frames, interpolated, dB",
-        "fringe_psnr": "fringe, dB",
+        "psnr_linear": "true key frames, interpolated, dB",
+        "psnr_fringe": "fringe, dB",
         "psnr": "all steps, dB",
-        "worst_psnr": "worst step, dB",
     }
     rows: list[tuple[Value, ...]] = []
     for group in grouped:
-        cells = [cell.between for cell in group.cells if cell.between]
-        if cells:
-            found = [
-                Spread.of([one[key] for one in cells if one[key] is not None]) for key in figures
-            ]
-            missed = Spread.of([100 * one["missed_share"] for one in cells])
+        if any(cell.between for cell in group.cells):
+            found = [group.spread(lambda cell: (cell.between or {}).get(key)) for key in figures]  # noqa: B023
+            missed = group.spread(lambda cell: _percent((cell.between or {}).get("missed_share")))
             rows.append((group.data_set, group.feature, group.encoding, *found, missed))
     return PaperTable(
         name=f"between-{protocol}",
@@ -318,3 +314,8 @@ def _between(protocol: str, grouped: Sequence[Group]) -> PaperTable:
             " is in the coreset of one of them",
         ),
     )
+
+
+def _percent(share: float | None) -> float | None:
+    """A share in percent."""
+    return None if share is None else 100 * share
