@@ -11,6 +11,7 @@ import click
 
 from fhash_cli.base_command import BaseGroup
 from fhash_cli.commands.bench_labels import labels
+from fhash_cli.commands.bench_paper import paper
 from fhash_cli.commands.bench_render import render
 from fhash_cli.options import (
     RealRange,
@@ -81,6 +82,7 @@ def command() -> None:
 
 
 command.add_command(labels)
+command.add_command(paper)
 command.add_command(render)
 
 

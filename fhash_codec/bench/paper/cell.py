@@ -59,7 +59,8 @@ class Cell:
         seed: seed of the initial numbers and of the batches.
         parameters: {"tables", "mlp"}, trained numbers of all models.
         buckets_used: share of the embeddings that a gradient moved.
-        bytes: the trained numbers as float32, losslessly compressed as the product stores them.
+        bytes: the trained numbers as float32, compressed by zstd, as the product stores them;
+            embeddings that no gradient moved are 0.
         raw_bytes: the source's values of all steps.
         samples_an_epoch: samples that all models together see in an epoch.
         steps_an_epoch: Adam steps of each model in an epoch.
@@ -69,7 +70,15 @@ class Cell:
         settings: all other settings of the training by name; together with the fields above they
             identify the cell.
         latency: of pictures through the encoding, as `latency.measure_latency` has it, or None.
-        between: of steps between key frames, as `evaluation.between_key_frames` has it, or None.
+        between: figures of all steps over the coreset of the key frames around each, or None.
+            "psnr" in dB of all steps by interpolation in time; "psnr_key_frames" and
+            "psnr_between" of those that are key frames and of the others; "psnr_linear" of the
+            others where the source's key frames are interpolated. "psnr_fringe" and
+            "psnr_fringe_linear" at vertices in the coreset of one of the two key frames, whose
+            share is "fringe_share"; "missed_share" of the steps' own features is in neither.
+        collisions: share of the corners of hashed levels that share their bucket; 0 for others.
+        trial: {steps, seconds, psnr, reached} of each number of steps that the protocol best
+            tried; `reached` has the seconds to 20, 30 and 40 dB, or None.
         machine: processor, threads, versions, date.
     """
 
@@ -95,6 +104,9 @@ class Cell:
     latency: dict[str, Any] | None = None
     between: dict[str, Any] | None = None
     machine: dict[str, Any] = field(default_factory=dict)
+    collisions: float = 0.0
+    trial: tuple[dict[str, Any], ...] = ()
+    engine: str = "gather"
     version: int = CELL_VERSION
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,6 +127,7 @@ class Cell:
             "key_frames": tuple(values["key_frames"]),
             "box": tuple(tuple(span) for span in values["box"]),
             "curve": tuple(Point(**point) for point in values["curve"]),
+            "trial": tuple(values["trial"]),
         }
         return cls(**{**values, **tuples})
 

@@ -30,8 +30,8 @@ class Arrangement:
         joint: whether one model with one network holds all key frames; else each has its own.
         whole: whether every vertex of the domain is a sample; else those of the coreset are, and
             the model covers the feature bounding box.
-        steps: Adam steps of each model in an epoch; several are candidates, of which a trial
-            chooses one.
+        steps: Adam steps of each model in an epoch; several are candidates, which are all trained,
+            and of which the best counts.
         engine: gather, lattice or tcnn.
     """
 

@@ -21,11 +21,11 @@ EVERY_EPOCH = 20
 """Epochs from the first that are all measured."""
 POINTS = 30
 """Points of a curve after these, about."""
-TRIAL_SECONDS = 2.0
-"""Seconds of training that each candidate of the protocol best gets in its trial."""
+DECIBELS = (20.0, 30.0, 40.0)
+"""PSNR in dB to which the paper's Table 3 gives times."""
 
 Frames = Sequence[npt.NDArray[np.float32]]
-PictureProbe = Callable[[Frames], tuple[float, float]]
+PictureMeasure = Callable[[Frames], tuple[float, float]]
 """Mean PSNR in dB and SSIM of pictures of the key frames' normalised frames (z, y, x)."""
 
 
@@ -61,7 +61,7 @@ def train(
     epochs: int,
     *,
     device: torch.device,
-    picture: PictureProbe | None = None,
+    picture: PictureMeasure | None = None,
     progress: Progress = silent,
 ) -> Trained:
     """Train an encoding and measure it on the way.
@@ -89,38 +89,24 @@ def train(
     return Trained(curve=tuple(points), seconds=seconds)
 
 
-def try_steps(
-    candidates: Sequence[int],
-    make: Callable[[int], Encoding],
-    data: Data,
-    device: torch.device,
-    seconds: float = TRIAL_SECONDS,
-) -> list[dict[str, float]]:
-    """Train each candidate for the same time and return {steps, epochs, psnr} of each.
+def rank(curve: Sequence[Point]) -> tuple[int, float, float]:
+    """Return what is larger for the better of two courses of an encoding.
 
-    Args:
-        candidates: Adam steps in an epoch.
-        make: makes the encoding that is trained by so many steps.
-        data: what it is trained on; the PSNR is over the coreset at the key frames.
-        device: where it computes.
-        seconds: training of each.
+    More of DECIBELS reached on the coreset come first, then fewer seconds to the last of these,
+    then the highest PSNR.
     """
-    tried, seen = [], set()
-    for steps in candidates:
-        encoding = make(steps)
-        if encoding.steps_an_epoch in seen:
-            continue
-        seen.add(encoding.steps_an_epoch)
-        begun, epoch = time.perf_counter(), 0
-        while epoch == 0 or time.perf_counter() - begun < seconds:
-            encoding.train_epoch(epoch)
-            wait(device)
-            epoch += 1
-        encoding.settle()
-        point = _point(encoding, data, epoch, 0.0, None)
-        psnr = -math.inf if point.coreset_psnr is None else point.coreset_psnr
-        tried.append({"steps": encoding.steps_an_epoch, "epochs": epoch, "psnr": psnr})
-    return tried
+    seconds = [first_seconds(curve, decibels) for decibels in DECIBELS]
+    reached = [value for value in seconds if value is not None]
+    highest = max((point.coreset_psnr or -math.inf for point in curve), default=-math.inf)
+    return len(reached), -reached[-1] if reached else -math.inf, highest
+
+
+def first_seconds(curve: Sequence[Point], decibels: float) -> float | None:
+    """Return the seconds of training to a PSNR of the coreset; None where it is not reached."""
+    return next(
+        (p.seconds for p in curve if p.coreset_psnr is not None and p.coreset_psnr >= decibels),
+        None,
+    )
 
 
 def wait(device: torch.device) -> None:
@@ -130,7 +116,7 @@ def wait(device: torch.device) -> None:
 
 
 def _point(
-    encoding: Encoding, data: Data, epoch: int, seconds: float, picture: PictureProbe | None
+    encoding: Encoding, data: Data, epoch: int, seconds: float, picture: PictureMeasure | None
 ) -> Point:
     """Return the figures of an encoding after some epochs."""
     encoding.settle()

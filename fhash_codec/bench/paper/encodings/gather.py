@@ -8,6 +8,7 @@ its tables alone.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -77,7 +78,7 @@ class GatherModel:
         self.table = table.to(device, dtype).requires_grad_()
         widths = [EMBEDDING_SIZE * len(levels), *[WIDTH] * HIDDEN_LAYERS, 1]
         self.layers: list[tuple[Tensor, Tensor]] = []
-        for inputs, outputs in zip(widths, widths[1:], strict=False):
+        for inputs, outputs in itertools.pairwise(widths):
             bound = inputs**-0.5
             weight, bias = (
                 torch.empty(shape).uniform_(-bound, bound, generator=random)
@@ -204,7 +205,7 @@ class GatherModel:
 
     def _keep(self) -> tuple[Tensor, Tensor] | None:
         """Buckets (samples, levels, corners) int32 and weights of all samples, if they fit."""
-        buckets, weights = self._around(self.places[:1].double())
+        buckets, _ = self._around(self.places[:1].double())
         width = 4 if self.dtype == torch.float32 else 8
         if len(self.places) * buckets.numel() * (4 + width) > KEPT_BYTES:
             return None
