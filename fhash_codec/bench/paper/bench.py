@@ -50,7 +50,7 @@ ZSTD_LEVEL = 3
 
 @dataclass(frozen=True, kw_only=True)
 class BenchPlan:
-    """What is to be measured.
+    """Cells that are to be measured.
 
     Attributes:
         scale: full, half or quarter of the paper's lengths; of the scenes alone.
@@ -117,7 +117,7 @@ def bench_paper(
 
     Args:
         plan: what is to be measured.
-        folder: of the cells; it is made if it is missing.
+        folder: of the cells; it is made for the first.
         source: the user's own series; None for the scenes of the plan.
         name: name of the user's series.
         progress: called with each step of the work.
@@ -131,7 +131,6 @@ def bench_paper(
     if reason is not None:
         encodings.remove("tcnn")
         notes.append(f"not measured: {reason}")
-    folder.mkdir(parents=True, exist_ok=True)
     requests = list(_requests(plan, encodings, source, name))
     finished = [load(folder, request) for request in requests]
     device, cells = choose_device(plan.device), []

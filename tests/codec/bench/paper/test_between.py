@@ -12,7 +12,7 @@ from fhash_codec.bench.paper.data import Data
 
 
 class Exact:
-    """As an encoding without any error at key frames, whose values are interpolated in time."""
+    """An encoding without any error at key frames, whose values are interpolated in time."""
 
     def __init__(self, data: Data) -> None:
         self.data = data

@@ -18,7 +18,7 @@ from fhash_formats.errors import MissingDependencyError
 
 
 class StandIn(torch.nn.Module):
-    """As tiny-cuda-nn's module: the same arguments, the same number of parameters."""
+    """Stand-in for tiny-cuda-nn's module: the same arguments, the same number of parameters."""
 
     made: list[dict[str, Any]] = []  # noqa: RUF012
 
