@@ -210,6 +210,11 @@ def test_bench_rate() -> None:
     check("bench rate", json.loads(json.dumps(result.to_dict())))
 
 
+def test_bench_ablate(fhash: Fhash, data: Path) -> None:
+    words = ["bench", "ablate", data, "--axis", "fringe", "--epochs", "1"]
+    check("bench ablate", parsed(fhash(*words, "--json", "-q")))
+
+
 def test_bench_labels(fhash: Fhash) -> None:
     words = ["bench", "labels", "--kind", "tiny grid", "--effort", "1"]
     check("bench labels", parsed(fhash(*words, "--json", "-q")))
