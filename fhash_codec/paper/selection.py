@@ -13,6 +13,7 @@ from fhash_codec.coreset.scan import Scan
 from fhash_codec.coreset.selection import resolve_selection
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.progress import Progress
+from fhash_codec.stage_clock import stage
 from fhash_formats.series import Series
 
 
@@ -50,16 +51,17 @@ def select(
     """
     brick = parse_brick(config.brick)
     scanned, key_frames, features = resolve_selection(series, config, progress, mask)
-    coreset = build_coreset(
-        series,
-        scanned,
-        key_frames,
-        features,
-        config.dilation,
-        progress,
-        fringe=config.fringe == "trained",
-        brick=brick,
-    )
+    with stage("coreset", "samples at the key frames, for the training"):
+        coreset = build_coreset(
+            series,
+            scanned,
+            key_frames,
+            features,
+            config.dilation,
+            progress,
+            fringe=config.fringe == "trained",
+                brick=brick,
+        )
     architecture = Architecture.for_box(
         coreset.box.shape,
         len(key_frames),

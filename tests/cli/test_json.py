@@ -120,6 +120,7 @@ def test_types_are_told_apart(value: Any, kind: str, fit: bool) -> None:
 def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.fhz"
     outputs: dict[str, list[Any]] = {"encode": [], "diff": [], "info": [], "info DATA": []}
+    explained: list[Any] = []
     with h5py.File(data) as file:
         smallest = file["density"][...].min()
     for settings in (
@@ -129,9 +130,11 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
     ):
         words = ["encode", data, "-o", path, "--force", *settings]
         outputs["encode"].append(parsed(fhash(*words, "--json", "-q")))
+        explained.append(parsed(fhash(*words, "--json", "-q", "--explain")))
         outputs["diff"].append(parsed(fhash("diff", data, path, "--json", "-q")))
         outputs["info"].append(parsed(fhash("info", path, "--json")))
     detailed = ["--var", "density", "--t", "1:", "--missing", "-9"]
+    outputs["encode --explain"] = explained
     outputs["info DATA"].append(parsed(fhash("info", data, *detailed, "--json")))
     for command, results in outputs.items():
         check(command, *results)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +53,9 @@ MAX_LABELS = 64
 @force_option
 @json_option
 @quiet_option
+@click.option(
+    "--explain", is_flag=True, help="Say how long each stage took, and why it ran or did not."
+)
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
 def command(
     data: str,
@@ -62,6 +65,7 @@ def command(
     force: bool,
     as_json: bool,
     quiet: bool,
+    explain: bool,
     verbose: bool,
 ) -> None:
     """Find the features of DATA, encode them and write them as RUN.fhz.
@@ -92,7 +96,28 @@ def command(
     if integers and not quiet and looks_categorical(report):
         say("few different integers: if they are labels, --max-error 0 keeps each exactly")
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
-    emit(report, table(rows), as_json, missed)
+    text = table(rows)
+    stages = report.pop("stages")
+    if explain:
+        report["stages"] = stages
+        text += f"\n\n{stage_table(stages)}"
+    emit(report, text, as_json, missed)
+
+
+def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:
+    """The stages of an encoding: seconds, share of the whole, and why each ran or did not.
+
+    stages: as in the report of `fhash_codec.encode`.
+    """
+    total = max(sum(entry["seconds"] for entry in stages), 1e-9)
+    rows = [("stage", " seconds  share  why")]
+    for entry in stages:
+        taken = f"{entry['seconds']:8.2f} {entry['seconds'] / total:6.1%}"
+        if not entry["times"]:
+            taken = f"{'-':>8} {'-':>6}"
+        again = f", {entry['times']} times" if entry["times"] > 1 else ""
+        rows.append((entry["stage"], f"{taken}  {entry['why']}{again}"))
+    return table(rows)
 
 
 def _say_unmet(source: SourceOptions, series: Series, quiet: bool) -> None:
