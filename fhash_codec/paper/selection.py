@@ -60,7 +60,7 @@ def select(
             config.dilation,
             progress,
             fringe=config.fringe == "trained",
-                brick=brick,
+            brick=brick,
         )
     architecture = Architecture.for_box(
         coreset.box.shape,

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     metavar="NAME",
     multiple=True,
     help="Only this axis; repeat. Axes: encoding, network, key-frames, dilation, fringe, brick,"
-    " batch, schedule, tables (profile paper), effort, tile, stages (profile compact).",
+    " batch, schedule, tables (profile paper), effort, tile, stages, stages-of-bound (compact).",
 )
 @click.option(
     "--epochs",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -148,7 +149,7 @@ class _Work:
         """The name of a kept run, which all that its figures depend on is part of."""
         identity = json.dumps([self._digest, config.to_dict()], sort_keys=True)
         digest = hashlib.sha256(identity.encode()).hexdigest()[:10]
-        words = "-".join(str(value).replace(":", "") for value in varied.values())
+        words = re.sub(r"[^a-z0-9]+", "-", told(varied).lower()).strip("-")
         return f"{axis.name}-{words}-{digest}.json"
 
 
@@ -161,8 +162,12 @@ def _digest(series: Series) -> str:
 
 
 def told(settings: dict[str, Any]) -> str:
-    """Settings as options of the command line."""
-    return " ".join(f"--{name.replace('_', '-')} {value}" for name, value in settings.items())
+    """Settings as options of the command line; an empty one as nothing left out."""
+    texts = {
+        name: (",".join(value) or "nothing") if isinstance(value, list | tuple) else value
+        for name, value in settings.items()
+    }
+    return " ".join(f"--{name.replace('_', '-')} {text}" for name, text in texts.items())
 
 
 def _encoded(series: Series, path: Path, config: EncodeConfig) -> dict[str, Any]:

@@ -122,6 +122,19 @@ AXES = (
         varied=_one("tile", "auto", "whole", "4x16x16x16", "4x32x32x32", "16x16x16x16"),
         why="vertices that are decoded together",
     ),
+    Axis(
+        name="stages",
+        profile="compact",
+        varied=_one("without", (), ("tiles",), ("transform",), ("head",)),
+        why="stages of the encoding, each left out",
+    ),
+    Axis(
+        name="stages-of-bound",
+        profile="compact",
+        varied=_one("without", (), ("tiles",), ("transform",), ("head",), ("predictor",)),
+        why="the same for a strict bound of 1 % of the range, whatever is promised otherwise",
+        common=(("psnr", None), ("max_error", None), ("max_error_rel", 0.01)),
+    ),
 )
 """All axes, in the order in which they are measured."""
 

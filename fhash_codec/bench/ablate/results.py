@@ -47,8 +47,12 @@ class Run:
     def from_dict(cls, values: dict[str, Any]) -> Run:
         """The record that `asdict` gave. Raises InputError for other values."""
         try:
-            return cls(**{**values, "curve": tuple(values["curve"])})
-        except (KeyError, TypeError) as error:
+            settings = {
+                name: tuple(value) if isinstance(value, list) else value
+                for name, value in values["settings"].items()
+            }
+            return cls(**{**values, "settings": settings, "curve": tuple(values["curve"])})
+        except (AttributeError, KeyError, TypeError) as error:
             raise InputError(f"not a run of bench ablate: {error}") from error
 
 
