@@ -82,8 +82,7 @@ AXES = (
     Axis(
         name="brick",
         profile="paper",
-        varied=_one("brick", "4x4x4", "4x4x8", "4x8x8", "8x8x8", "8x8x16", "16x16x16"),
-        reference=4,
+        varied=_one("brick", "auto", "4x4x4", "4x4x8", "4x8x8", "8x8x8", "8x8x16", "16x16x16"),
         why="vertices that are trained together",
     ),
     Axis(

@@ -17,7 +17,7 @@ def test_the_reference_is_the_default(axis: Axis) -> None:
     assert reference.model_fold == usual.model_fold
     assert reference.model_embedding_size == usual.model_embedding_size
     assert reference.model_width == usual.model_width
-    for name in set(axis.varied[axis.reference]) - {"fold", "embedding_size", "width", "brick"}:
+    for name in set(axis.varied[axis.reference]) - {"fold", "embedding_size", "width"}:
         assert getattr(reference, name) == getattr(usual, name), name
 
 
