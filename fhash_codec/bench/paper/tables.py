@@ -144,6 +144,10 @@ def _convergence(protocol: str, grouped: Sequence[Group], quality: str) -> Paper
     rows: list[tuple[Value, ...]] = []
     for (name, feature), mine in by_data(grouped):
         for decibels, (clock, label) in product(DECIBELS, CLOCKS.items()):
+            if not any(
+                cell.reached(decibels, quality) for group in mine.values() for cell in group.cells
+            ):
+                continue
             found = {
                 encoding: group.reached(decibels, quality, clock)
                 for encoding, group in mine.items()
@@ -164,7 +168,7 @@ def _convergence(protocol: str, grouped: Sequence[Group], quality: str) -> Paper
         columns=("data set", "feature", "dB", "of", *ENCODINGS, "best other / fhash"),
         rows=tuple(rows),
         notes=(
-            "NR: not reached; a dash: not measured",
+            "NR: not reached, a dash: not measured; what no encoding reached has no row",
             *(("pictures are means over key frames of decoded values, marched",) if pictures else
               ("all vertices of the coreset at the key frames, also for encodings that were trained"
                " on more",)),
@@ -182,7 +186,7 @@ def _convergence_row(
     ratio: Value = None
     if own is not None and others and own.median < float("inf"):
         ratio = min(others) / own.median if own.median else None
-        ratio = "-> NR" if ratio == float("inf") else ratio
+        ratio = "others NR" if ratio == float("inf") else ratio
     return name, feature, decibels, label, *(found.get(key) for key in ENCODINGS), ratio
 
 
