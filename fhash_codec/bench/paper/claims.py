@@ -157,7 +157,9 @@ def _parameters(protocol: str, data: Sequence[Encodings]) -> Answer:
 
 def _collisions(protocol: str, data: Sequence[Encodings]) -> Answer:
     """Whether a hash table with collisions ends less accurate than grids without any."""
-    early, late, shares = [], [], []
+    early: list[float] = []
+    late: list[float] = []
+    shares: list[float] = []
     for encodings in data:
         if not {"hash", "dense-multi"} <= encodings.keys():
             continue

@@ -6,7 +6,7 @@ Seconds are those of training alone, on the machine of the cells, and never the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 
 from fhash_codec.bench.paper.cell import Cell
@@ -178,7 +178,7 @@ def _convergence(protocol: str, grouped: Sequence[Group], quality: str) -> Paper
 
 
 def _convergence_row(
-    name: str, feature: str, decibels: int, label: str, found: dict[str, Spread | None]
+    name: str, feature: str, decibels: int, label: str, found: Mapping[str, Spread | None]
 ) -> tuple[Value, ...]:
     """A row of times by encoding, and how many times longer the best other encoding took."""
     others = [one.median for key, one in found.items() if one is not None and key != "fhash"]
