@@ -60,7 +60,7 @@ def paper_tables(cells: Sequence[Cell]) -> tuple[PaperTable, ...]:
 
 
 def _trainings(grouped: Sequence[Group]) -> PaperTable:
-    """What each training was: parameters, samples and steps."""
+    """Parameters, samples and steps of each training."""
     rows: list[tuple[Value, ...]] = []
     for group in grouped:
         cell = group.first
@@ -199,6 +199,13 @@ def _accuracy(protocol: str, grouped: Sequence[Group]) -> PaperTable:
     for (name, feature), mine in by_data(grouped):
         if feature != chosen:
             continue
+        untrained = {
+            key: group.spread(lambda cell: cell.curve[0].picture_psnr)
+            for key, group in mine.items()
+        }
+        rows.append(
+            (name, "picture PSNR before training, dB", *(untrained.get(key) for key in ENCODINGS))
+        )
         for figure, label, digits in (
             ("picture_psnr", "picture PSNR, dB", 3),
             ("picture_ssim", "picture SSIM", 4),

@@ -25,7 +25,7 @@ def point(codec: str, count: int, *, reached: bool = True) -> Point:
 
 
 class Encodings:
-    """In place of encoding: files of F-Hash that gain 15 dB by twice the epochs."""
+    """Stand-in for encoding: files of F-Hash that gain 15 dB by twice the epochs."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.configs: list[Any] = []
