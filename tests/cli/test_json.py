@@ -96,7 +96,13 @@ def parsed(result: Result, code: int = 0) -> Any:
 def test_the_document_names_every_command() -> None:
     commands = {title.split()[0] for title in KEYS} - {"Errors"}
     assert commands == set(COMMANDS) - WITHOUT_JSON
-    assert {"bench train", "bench rate", "bench labels", "bench render"} <= KEYS.keys()
+    assert {
+        "bench train",
+        "bench rate",
+        "bench labels",
+        "bench paper",
+        "bench render",
+    } <= KEYS.keys()
 
 
 @pytest.mark.parametrize(
@@ -221,6 +227,14 @@ def test_bench_ablate(fhash: Fhash, data: Path) -> None:
 def test_bench_labels(fhash: Fhash) -> None:
     words = ["bench", "labels", "--kind", "tiny grid", "--effort", "1"]
     check("bench labels", parsed(fhash(*words, "--json", "-q")))
+
+
+def test_bench_paper(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    words = ["bench", "paper", data, "--quick", "--epochs", "1", "--protocol", "equal", "--feature"]
+    words += ["interval:6:99", "--encoding", "fhash", "-o", tmp_path, "--no-latency"]
+    results = [parsed(fhash(*words, "--json", "-q"))]
+    results.append(parsed(fhash("bench", "paper", "--parameters", "--json")))
+    check("bench paper", *results)
 
 
 def test_bench_render() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,13 +12,11 @@ import click
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import SourceOptions, json_option, quiet_option, series_options
-from fhash_cli.output import Progress, emit, extent, number, size, table
+from fhash_cli.output import Progress, emit, extent, table
 
 if TYPE_CHECKING:
     from fhash_codec.bench.paper.bench import BenchPlan, PaperBench
-
-DECIBELS = (20, 30, 40)
-"""PSNR in dB whose first epochs are shown."""
+    from fhash_codec.bench.paper.table import PaperTable
 
 
 class NameType(click.ParamType[str]):
@@ -136,7 +136,8 @@ def paper(
     Without DATA: the scenes flame, bubble and shell, which resemble the paper's data sets. Each
     encoding is trained by each protocol: published as the paper does, equal with the same samples,
     steps and network, best with the fastest engine and number of steps of each. An interrupted
-    bench goes on where it was.
+    bench goes on where it was. The tables are those of the paper, its own figures beside ours,
+    marked as quoted.
     """
     if parameters:
         emit(*_parameters(), as_json)
@@ -153,7 +154,13 @@ def paper(
         series = None if data is None else stack.enter_context(source.open(data, progress))
         name = "data" if data is None else Path(data).name
         result = bench_paper(plan, Path(folder), series, name=name, progress=progress)
-    emit(result.to_dict() | {"folder": folder}, _text(result, folder), as_json)
+        from fhash_codec.bench.paper.report import tables_of, write_report
+
+        tables = tables_of(result.cells)
+        files, missing = write_report(result.cells, tables, Path(folder))
+    result = replace(result, notes=(*result.notes, *missing))
+    found = {"tables": [entry.to_dict() for entry in tables], "files": [str(f) for f in files]}
+    emit(result.to_dict() | found, _text(result, tables, files), as_json)
 
 
 def _plan(scenes: bool, *, quick: bool, **choices: Any) -> BenchPlan:
@@ -181,45 +188,13 @@ def _parameters() -> tuple[dict[str, Any], str]:
     return {"parameters": counts}, f"{table(rows)}\n{note}"
 
 
-def _text(result: PaperBench, folder: str) -> str:
-    """A row for each cell, and what was left out."""
-    header = (
-        "data set",
-        "feature",
-        "protocol",
-        "encoding",
-        "seed",
-        "parameters",
-        "used",
-        "samples",
-        "steps",
-        *(f"{decibels} dB" for decibels in DECIBELS),
-        "PSNR",
-        "picture",
-        "seconds",
-    )
-    rows = [header]
-    for cell in result.cells:
-        reached = [cell.reached(decibels) for decibels in DECIBELS]
-        rows.append(
-            (
-                cell.data_set,
-                cell.feature,
-                cell.protocol,
-                cell.encoding,
-                str(cell.seed),
-                f"{sum(cell.parameters.values()):,}",
-                f"{cell.buckets_used:.0%}",
-                f"{cell.samples_an_epoch:,}",
-                f"{cell.steps_an_epoch}",
-                *("NR" if point is None else str(point.epoch) for point in reached),
-                number(cell.curve[-1].coreset_psnr, "dB", digits=3),
-                number(cell.curve[-1].picture_psnr, "dB", digits=3),
-                number(cell.training_seconds, digits=3),
-            )
-        )
-    lines = [table(rows), "", "samples and steps in an epoch; epochs to a PSNR of the coreset"]
-    first = result.cells[0] if result.cells else None
-    if first is not None:
-        lines.append(f"{extent(first.shape)}, {size(first.raw_bytes)}; cells in {folder}")
-    return "\n".join([*lines, *result.notes])
+def _text(result: PaperBench, tables: Sequence[PaperTable], files: Sequence[Path]) -> str:
+    """The tables, how the cells were measured, and what was left out or written."""
+    lines = []
+    for entry in tables:
+        lines += [entry.title, table(entry.lines()), *entry.notes, ""]
+    if result.cells:
+        cell = result.cells[-1]
+        facts = ", ".join(f"{name} {fact}" for name, fact in cell.machine.items())
+        lines.append(f"{len(result.cells)} cells, such as {extent(cell.shape)}; {facts}")
+    return "\n".join([*lines, *result.notes, *(f"wrote {path}" for path in files)])

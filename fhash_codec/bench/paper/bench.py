@@ -20,7 +20,7 @@ from fhash_codec.bench.paper.encodings.build import RATE, build
 from fhash_codec.bench.paper.encodings.tcnn import missing
 from fhash_codec.bench.paper.encodings.trained import TrainedEncoding
 from fhash_codec.bench.paper.latency import measure_latency
-from fhash_codec.bench.paper.pictures import PictureProbe
+from fhash_codec.bench.paper.pictures import SIZE, PictureProbe
 from fhash_codec.bench.paper.protocols import ENCODINGS, PROTOCOLS, Arrangement, arrangement
 from fhash_codec.bench.paper.sets import SETS
 from fhash_codec.bench.paper.store import Request, load, save
@@ -50,7 +50,7 @@ ZSTD_LEVEL = 3
 
 @dataclass(frozen=True, kw_only=True)
 class BenchPlan:
-    """What is to be measured.
+    """Cells that are to be measured.
 
     Attributes:
         scale: full, half or quarter of the paper's lengths; of the scenes alone.
@@ -63,6 +63,7 @@ class BenchPlan:
         device: auto, cpu or cuda.
         latency: whether pictures through the encodings are timed, for the first seed of the
             protocol published.
+        picture_size: pixels along both sides of the pictures of curves.
     """
 
     scale: str = "full"
@@ -75,6 +76,7 @@ class BenchPlan:
     key_frames: str | None = None
     device: str = "auto"
     latency: bool = True
+    picture_size: int = SIZE
 
     @classmethod
     def quick(cls, **changes: Any) -> BenchPlan:
@@ -115,7 +117,7 @@ def bench_paper(
 
     Args:
         plan: what is to be measured.
-        folder: of the cells; it is made if it is missing.
+        folder: of the cells; it is made for the first.
         source: the user's own series; None for the scenes of the plan.
         name: name of the user's series.
         progress: called with each step of the work.
@@ -129,7 +131,6 @@ def bench_paper(
     if reason is not None:
         encodings.remove("tcnn")
         notes.append(f"not measured: {reason}")
-    folder.mkdir(parents=True, exist_ok=True)
     requests = list(_requests(plan, encodings, source, name))
     finished = [load(folder, request) for request in requests]
     device, cells = choose_device(plan.device), []
@@ -167,6 +168,7 @@ def _requests(
                 "key_frames": _key_frames(plan, data_set, series),
                 "epochs": plan.epochs,
                 "learning_rate": RATE,
+                "picture_size": plan.picture_size,
                 "device": choose_device(plan.device).type,
             }
             for seed in range(1, plan.seeds + 1):

@@ -69,10 +69,13 @@ class Cell:
         curve: points, the first before training.
         settings: all other settings of the training by name; together with the fields above they
             identify the cell.
-        latency: {"stream_ms", "arm_ms", "passes", "samples", "evaluations", "occupancy"}, or None.
-        between: {"psnr", "psnr_between", "psnr_linear"} in dB over the coreset: of all steps by
-            interpolation in time, of those that are no key frames, and of these where the source's
-            key frames are interpolated; or None.
+        latency: of pictures through the encoding, as `latency.measure_latency` has it, or None.
+        between: figures of all steps over the coreset of the key frames around each, or None.
+            "psnr" in dB of all steps by interpolation in time; "psnr_key_frames" and
+            "psnr_between" of those that are key frames and of the others; "psnr_linear" of the
+            others where the source's key frames are interpolated. "psnr_fringe" and
+            "psnr_fringe_linear" at vertices in the coreset of one of the two key frames, whose
+            share is "fringe_share"; "missed_share" of the steps' own features is in neither.
         collisions: share of the corners of hashed levels that share their bucket; 0 for others.
         trial: {steps, seconds, psnr, reached} of each number of steps that the protocol best
             tried; `reached` has the seconds to 20, 30 and 40 dB, or None.

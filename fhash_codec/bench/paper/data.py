@@ -37,7 +37,7 @@ DILATION = 1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Data:
-    """What every encoding of a cell is trained on and compared with.
+    """Samples that every encoding of a cell is trained on, and frames to compare it with.
 
     Attributes:
         name: flame, bubble, shell, or the name of the user's data.

@@ -24,7 +24,7 @@ CANDIDATES = (5, 20, 80)
 
 @dataclass(frozen=True, kw_only=True)
 class Arrangement:
-    """How an encoding is trained.
+    """Samples, models, steps and engine of a training.
 
     Attributes:
         joint: whether one model with one network holds all key frames; else each has its own.

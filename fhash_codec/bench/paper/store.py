@@ -51,8 +51,9 @@ def load(folder: Path, request: Request) -> Cell | None:
 
 
 def save(folder: Path, request: Request, cell: Cell) -> None:
-    """Write a cell; its file is complete or absent. Raises OutputError where it cannot be."""
+    """Write a cell; its file is complete or absent, the folder made if missing. Raises OutputError where it cannot be."""
     text = json.dumps(cell.to_dict(), indent=1, allow_nan=False)
+    folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / request.filename, force=True) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
