@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -77,8 +78,7 @@ def encode(
     """
     config, path = config or EncodeConfig(), Path(os.path.normpath(path))
     begun = time.perf_counter()
-    _check_before(path, force, config)
-    with recording() as clock, open_source(source) as series:
+    with recording() as clock, _opened(source, path, force, config) as series:
         check_output(path, force, sources=[*series.files, *_mask_files(config)])
         with ContainerWriter(path, force=force) as writer:
             measured = _Measured(writer, series, config, progress)
@@ -111,13 +111,18 @@ def encode(
     return figures
 
 
-def _check_before(path: Path, force: bool, config: EncodeConfig) -> None:
-    """Raise what can be told before the source is opened, and not after the planning."""
-    check_name(path)
-    check_output(path, force)
-    if config.profile == "paper":
-        need_torch("profile paper")
-        choose_device(config.device)
+@contextmanager
+def _opened(source: Source, path: Path, force: bool, config: EncodeConfig) -> Iterator[Series]:
+    """The series of a source; raises what can be told at once, and not after the planning."""
+    with ExitStack() as stack:
+        with stage("opening", "paths, libraries and the source"):
+            check_name(path)
+            check_output(path, force)
+            if config.profile == "paper":
+                need_torch("profile paper")
+                choose_device(config.device)
+            series = stack.enter_context(open_source(source))
+        yield series
 
 
 def _with_prediction(

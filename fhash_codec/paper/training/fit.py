@@ -99,9 +99,9 @@ def train_model(
         InterruptedEncodingError: a signal asked for the end; a checkpoint was saved.
         InputError: the checkpoint cannot be read, or the device or the engine is not available.
     """
-    from fhash_codec.paper.training.probe import Diverged
-
     with stage("engine", "tables and network at their random start"):
+        from fhash_codec.paper.training.probe import Diverged
+
         fitting = _Fitting(coreset, architecture, config, path, progress, goal)
     while True:
         try:
