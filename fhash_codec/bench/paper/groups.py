@@ -33,7 +33,7 @@ class Group:
         return Spread.of([one for one in found if one is not None], digits)
 
     def reached(self, decibels: float, quality: str, clock: str) -> Spread:
-        """How long it took to a quality, by a field of a point; NR counts as infinitely long."""
+        """Time to a quality, by a field of a point; NR counts as infinitely long."""
         points = (cell.reached(decibels, quality) for cell in self.cells)
         found = Spread.of([None if point is None else getattr(point, clock) for point in points])
         assert found is not None

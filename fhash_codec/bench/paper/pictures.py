@@ -10,6 +10,7 @@ and half a vertex spacing a step.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +37,8 @@ STEP = 0.5
 """Length of a ray's step in vertex spacings."""
 THRESHOLD = 1 / 1024
 """Share of the light behind a sample below which a ray ends."""
+FILLED = 0.97
+"""Share of the picture, from its middle to its border, that the feature reaches to."""
 IDENTICAL = 100.0
 """PSNR in dB that stands for pictures without any difference, so that a mean exists; above it none
 is told apart."""
@@ -89,7 +92,7 @@ class PictureProbe:
             feature,
             value_range=value_range,
             size=size,
-            camera=_aimed(truth, feature, value_range, azimuth),
+            camera=_aimed(truth, feature, value_range, azimuth, size),
         )
         self.pictures = [self.draw(frame) for frame in truth]
         self._black = [black(picture) for picture in self.pictures]
@@ -133,8 +136,6 @@ def view_of_feature(
     Vertices are 1 apart along every axis. The camera is the default one if None. Raises InputError
     for a feature that is malformed or shows nothing of the range.
     """
-    z, y, x = shape
-    grid = Grid(counts=(x, y, z), origin=np.zeros(3), spacing=np.ones(3))
     low, high = value_range
     unit = 1 / (high - low)
     kind = parse_feature(feature)
@@ -158,7 +159,7 @@ def view_of_feature(
             extinctions=extinctions,
         )
     return Task(
-        rays=Rays.of(camera or Camera(), grid, (size, size)),
+        rays=Rays.of(camera or Camera(), _grid(shape), (size, size)),
         step=STEP,
         threshold=THRESHOLD,
         table=table,
@@ -167,23 +168,32 @@ def view_of_feature(
     )
 
 
-def _aimed(truth: Sequence[Single], feature: str, value_range: Range, azimuth: float) -> Camera:
+def _aimed(
+    truth: Sequence[Single], feature: str, value_range: Range, azimuth: float, size: int
+) -> Camera:
     """The default camera aimed at a feature in any of the frames, which fills the picture.
 
     A feature that other values than those of a vertex tell is not looked for: the whole domain
     fills the picture.
     """
-    kind, shape = parse_feature(feature), np.array(truth[0].shape)
+    kind, camera = parse_feature(feature), Camera(azimuth=azimuth)
     if not isinstance(kind, Interval | Isosurface | Segmentation):
-        return Camera(azimuth=azimuth)
+        return camera
     low, high = value_range
     seen = np.zeros(truth[0].shape, dtype=bool)
     for frame in truth:
         seen |= kind.select(low + frame * (high - low), 0)
     if not seen.any():
-        return Camera(azimuth=azimuth)
-    places = np.argwhere(seen)
-    first, last = places.min(axis=0), places.max(axis=0)
-    z, y, x = (float(middle) for middle in (first + last) / 2)
-    domain, part = (float(np.linalg.norm(lengths)) for lengths in (shape - 1, last - first + 1))
-    return Camera(azimuth=azimuth, focal_point=(x, y, z), zoom=max(domain / part, 1.0))
+        return camera
+    places = np.argwhere(seen)[:, ::-1].astype(np.float64)
+    x, y, z = ((places.min(axis=0) + places.max(axis=0)) / 2).tolist()
+    camera = replace(camera, focal_point=(x, y, z))
+    pixels, _ = Rays.of(camera, _grid(truth[0].shape), (size, size)).project(places)
+    reach = float(np.abs(2 * pixels / size - 1).max())
+    return replace(camera, zoom=FILLED / max(reach, 1e-3))
+
+
+def _grid(shape: tuple[int, ...]) -> Grid:
+    """A grid of vertices (z, y, x) that are 1 apart."""
+    z, y, x = shape
+    return Grid(counts=(x, y, z), origin=np.zeros(3), spacing=np.ones(3))

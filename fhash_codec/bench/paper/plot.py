@@ -110,8 +110,9 @@ def _panel(axes: Any, encodings: dict[str, Group], clock: str, quality: str) -> 
         if len(group.cells) > 1:
             axes.fill_between(at, low, high, color=COLOURS.get(name, "#3b3f46"), alpha=0.18)
     if clock in LOGARITHMIC:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        axes.set_xscale("log", subs=(2, 5))
+        for formatted in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+            formatted(lambda value, _: f"{value:g}")
     axes.grid(True, which="major", color="#e9eaee", linewidth=0.8)
     axes.set_axisbelow(True)
 

@@ -113,21 +113,24 @@ class PaperTable:
 
 
 def shown(value: Value) -> str:
-    """A value as text: a dash where nothing was measured, at most four digits of a fraction."""
+    """A value as text: a dash where nothing was measured, numbers with at most four digits."""
     if value is None:
         return "-"
     if isinstance(value, str | Spread):
         return str(value)
-    return f"{value:,}" if isinstance(value, int) else _number(value, 4)
+    return f"{value:,}" if isinstance(value, int) else _number(value, 4, least=1)
 
 
-def _number(value: float, digits: int) -> str:
-    """A number with some significant digits, no exponent and no idle zeros; NR if infinite."""
+def _number(value: float, digits: int, least: int = 0) -> str:
+    """A number with some significant digits, no exponent and no idle zeros; NR if infinite.
+
+    least: decimals that are kept of large numbers too.
+    """
     if not math.isfinite(value):
         return NR
     if value == 0:
         return "0"
-    decimals = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
+    decimals = max(digits - 1 - math.floor(math.log10(abs(value))), least)
     text = f"{value:,.{decimals}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text
 

@@ -6,7 +6,7 @@ Seconds are those of training alone, on the machine of the cells, and never the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 
 from fhash_codec.bench.paper.cell import Cell
@@ -60,7 +60,7 @@ def paper_tables(cells: Sequence[Cell]) -> tuple[PaperTable, ...]:
 
 
 def _trainings(grouped: Sequence[Group]) -> PaperTable:
-    """What each training was: parameters, samples and steps."""
+    """Parameters, samples and steps of each training."""
     rows: list[tuple[Value, ...]] = []
     for group in grouped:
         cell = group.first
@@ -144,6 +144,10 @@ def _convergence(protocol: str, grouped: Sequence[Group], quality: str) -> Paper
     rows: list[tuple[Value, ...]] = []
     for (name, feature), mine in by_data(grouped):
         for decibels, (clock, label) in product(DECIBELS, CLOCKS.items()):
+            if not any(
+                cell.reached(decibels, quality) for group in mine.values() for cell in group.cells
+            ):
+                continue
             found = {
                 encoding: group.reached(decibels, quality, clock)
                 for encoding, group in mine.items()
@@ -164,7 +168,7 @@ def _convergence(protocol: str, grouped: Sequence[Group], quality: str) -> Paper
         columns=("data set", "feature", "dB", "of", *ENCODINGS, "best other / fhash"),
         rows=tuple(rows),
         notes=(
-            "NR: not reached; a dash: not measured",
+            "NR: not reached, a dash: not measured; what no encoding reached has no row",
             *(("pictures are means over key frames of decoded values, marched",) if pictures else
               ("all vertices of the coreset at the key frames, also for encodings that were trained"
                " on more",)),
@@ -174,7 +178,7 @@ def _convergence(protocol: str, grouped: Sequence[Group], quality: str) -> Paper
 
 
 def _convergence_row(
-    name: str, feature: str, decibels: int, label: str, found: dict[str, Spread | None]
+    name: str, feature: str, decibels: int, label: str, found: Mapping[str, Spread | None]
 ) -> tuple[Value, ...]:
     """A row of times by encoding, and how many times longer the best other encoding took."""
     others = [one.median for key, one in found.items() if one is not None and key != "fhash"]
@@ -182,7 +186,7 @@ def _convergence_row(
     ratio: Value = None
     if own is not None and others and own.median < float("inf"):
         ratio = min(others) / own.median if own.median else None
-        ratio = "-> NR" if ratio == float("inf") else ratio
+        ratio = "others NR" if ratio == float("inf") else ratio
     return name, feature, decibels, label, *(found.get(key) for key in ENCODINGS), ratio
 
 
@@ -195,6 +199,13 @@ def _accuracy(protocol: str, grouped: Sequence[Group]) -> PaperTable:
     for (name, feature), mine in by_data(grouped):
         if feature != chosen:
             continue
+        untrained = {
+            key: group.spread(lambda cell: cell.curve[0].picture_psnr)
+            for key, group in mine.items()
+        }
+        rows.append(
+            (name, "picture PSNR before training, dB", *(untrained.get(key) for key in ENCODINGS))
+        )
         for figure, label, digits in (
             ("picture_psnr", "picture PSNR, dB", 3),
             ("picture_ssim", "picture SSIM", 4),

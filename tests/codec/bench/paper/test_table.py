@@ -34,7 +34,14 @@ def test_no_seed_has_no_spread() -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(None, "-"), ("a", "a"), (1234567, "1,234,567"), (205.83, "205.8"), (0.05, "0.05")],
+    [
+        (None, "-"),
+        ("a", "a"),
+        (1234567, "1,234,567"),
+        (205.83, "205.8"),
+        (1223.84, "1,223.8"),
+        (0.05, "0.05"),
+    ],
 )
 def test_values_as_text(value: float | str | None, text: str) -> None:
     assert shown(value) == text
