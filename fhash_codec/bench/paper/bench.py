@@ -186,7 +186,7 @@ def _requests(
 
 
 def _identity(source: Series) -> list[Any]:
-    """Return what tells data of one's own apart: name, and size and time of each file."""
+    """Return the identity of the user's data: names, and size and time of each file."""
     files = [
         [path.name, path.stat().st_size, path.stat().st_mtime_ns]
         for path in source.files
@@ -231,7 +231,12 @@ class _Held:
             request.data_set, series, request.feature, request.settings["key_frames"], progress
         )
         span = data.scanned.value_range
-        probe = PictureProbe(data.frames, str(data.features[0]), value_range=(span.low, span.high))
+        probe = PictureProbe(
+            data.frames,
+            str(data.features[0]),
+            value_range=(span.low, span.high),
+            size=plan.picture_size,
+        )
         return cls(
             data_set=request.data_set,
             feature=request.feature,
@@ -313,7 +318,7 @@ def _run(
 
 
 def _tried(encoding: TrainedEncoding, course: Trained) -> dict[str, Any]:
-    """Return what a number of steps led to, as `Cell.trial` lists it."""
+    """Return the result of a number of steps, as `Cell.trial` lists it."""
     return {
         "steps": encoding.steps_an_epoch,
         "seconds": course.seconds,
@@ -323,7 +328,7 @@ def _tried(encoding: TrainedEncoding, course: Trained) -> dict[str, Any]:
 
 
 def _pictures(held: _Held, arranged: Arrangement) -> PictureMeasure:
-    """Return what compares pictures; what no model was trained on shows nothing."""
+    """Return a function that compares pictures; vertices without training show nothing."""
     masks = None if arranged.whole else held.data.masks
 
     def measure(frames: Frames) -> tuple[float, float]:
