@@ -16,7 +16,9 @@ from fhash_cli.output import Progress, emit, extent, table
 
 if TYPE_CHECKING:
     from fhash_codec.bench.paper.bench import BenchPlan, PaperBench
+    from fhash_codec.bench.paper.ratios import FileResult
     from fhash_codec.bench.paper.table import PaperTable
+    from fhash_formats.series import Series
 
 
 class NameType(click.ParamType[str]):
@@ -100,6 +102,12 @@ class NameType(click.ParamType[str]):
     help="Time pictures straight through the encodings of the protocol published.",
 )
 @click.option(
+    "--files/--no-files",
+    default=True,
+    show_default=True,
+    help="Encode each data set at 45 dB over all steps, by fhash and by the codecs of bench rate.",
+)
+@click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda"]),
     default="auto",
@@ -126,6 +134,7 @@ def paper(
     data: str | None,
     source: SourceOptions,
     parameters: bool,
+    files: bool,
     folder: str,
     as_json: bool,
     quiet: bool,
@@ -156,11 +165,27 @@ def paper(
         result = bench_paper(plan, Path(folder), series, name=name, progress=progress)
         from fhash_codec.bench.paper.report import tables_of, write_report
 
-        tables = tables_of(result.cells)
-        files, missing = write_report(result.cells, tables, Path(folder))
+        encoded, refused = (
+            _files(result, plan, series, Path(folder), progress) if files else ([], [])
+        )
+        tables = tables_of(result.cells, encoded, refused)
+        written, missing = write_report(result.cells, tables, Path(folder))
     result = replace(result, notes=(*result.notes, *missing))
-    found = {"tables": [entry.to_dict() for entry in tables], "files": [str(f) for f in files]}
-    emit(result.to_dict() | found, _text(result, tables, files), as_json)
+    found = {"tables": [entry.to_dict() for entry in tables], "files": [str(f) for f in written]}
+    emit(result.to_dict() | found, _text(result, tables, written), as_json)
+
+
+def _files(
+    result: PaperBench, plan: BenchPlan, series: Series | None, folder: Path, progress: Progress
+) -> tuple[list[FileResult], list[str]]:
+    """Files at a quality of the bench's data sets, and lines for those that could not be made."""
+    from fhash_codec.bench.paper.data import simulated
+    from fhash_codec.bench.paper.files import files_of
+
+    def series_of(name: str) -> Series:
+        return simulated(name, plan.scale) if series is None else series
+
+    return files_of(result.cells, series_of, folder, progress)
 
 
 def _plan(scenes: bool, *, quick: bool, **choices: Any) -> BenchPlan:

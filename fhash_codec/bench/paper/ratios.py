@@ -120,7 +120,13 @@ def measure_files(
     }
     results = []
     for number, (name, work) in enumerate(works.items()):
-        progress("files", number, len(works), name)
+
+        def told(stage: str, done: int, total: int, note: str) -> None:
+            text = f"{data_set}, {name}: {stage} {done}/{total} {note}"  # noqa: B023
+            progress("files", number, len(works), text.rstrip())  # noqa: B023
+
+        progress("files", number, len(works), f"{data_set}, {name}")
+        made.progress = told
         try:
             results += work()
         except MissingDependencyError as error:
@@ -138,6 +144,7 @@ class _Files:
         self.data_set, self.series, self.feature, self.kind = data_set, series, feature, kind
         self.target = target
         self.refused: list[str] = []
+        self.progress: Progress = silent
 
     def trained(self, tables: str) -> FileResult:
         """F-Hash with tables of a number type, trained until it has the quality."""
@@ -168,6 +175,7 @@ class _Files:
             names=PEERS,
             profiles=("compact",),
             speed=False,
+            progress=self.progress,
         )
         self.refused += [f"{name} not measured: {why}" for name, why in bench.refused.items()]
         return [
@@ -192,7 +200,7 @@ class _Files:
         with tempfile.TemporaryDirectory(prefix="fhash-bench-") as folder:
             path, begun = Path(folder, "file.fhz"), time.perf_counter()
             with suppress(QualityError):  # the file is written, and its quality is in the result
-                fhash_codec.encode(self.series, path, config)
+                fhash_codec.encode(self.series, path, config, progress=self.progress)
             seconds = time.perf_counter() - begun
             with fhash_codec.open(path) as volume:
                 info = volume.info
