@@ -21,7 +21,13 @@ from fhash_codec.bench.paper.encodings.tcnn import missing
 from fhash_codec.bench.paper.encodings.trained import TrainedEncoding
 from fhash_codec.bench.paper.latency import measure_latency
 from fhash_codec.bench.paper.pictures import SIZE, PictureProbe
-from fhash_codec.bench.paper.protocols import ENCODINGS, PROTOCOLS, Arrangement, arrangement
+from fhash_codec.bench.paper.protocols import (
+    CANDIDATES,
+    ENCODINGS,
+    PROTOCOLS,
+    Arrangement,
+    arrangement,
+)
 from fhash_codec.bench.paper.sets import SETS
 from fhash_codec.bench.paper.store import Request, load, save
 from fhash_codec.bench.paper.training import (
@@ -174,6 +180,7 @@ def _requests(
             for seed in range(1, plan.seeds + 1):
                 for protocol in plan.protocols:
                     timed = plan.latency and protocol == "published" and seed == 1
+                    tried = {"candidates": list(CANDIDATES)} if protocol == "best" else {}
                     for encoding in encodings:
                         yield Request(
                             encoding=encoding,
@@ -181,7 +188,7 @@ def _requests(
                             data_set=data_set,
                             feature=feature,
                             seed=seed,
-                            settings=settings | {"latency": timed},
+                            settings=settings | {"latency": timed} | tried,
                         )
 
 
