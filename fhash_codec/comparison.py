@@ -75,8 +75,12 @@ def _is_index(positions: npt.NDArray[np.float64]) -> bool:
     return bool((positions == np.arange(positions.size)).all())
 
 
-def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any]:
+def measure(
+    series: Series, volume: Volume, progress: Progress, *, with_ssim: bool = True
+) -> dict[str, Any]:
     """Measure every decoded step of a volume against its series: `metrics.Quality` as JSON values.
+
+    with_ssim: measure the SSIM, too; else it is None.
 
     The bulk is that of the volume's header; it is found in the series if the header knows none.
     Raises InputError if the series changed since it was opened.
@@ -93,6 +97,7 @@ def measure(series: Series, volume: Volume, progress: Progress) -> dict[str, Any
         progress,
         bulk=_bulk(series, volume),
         neighbours=_neighbours(series, volume),
+        with_ssim=with_ssim,
     )
     series.check()
     return quality.to_dict()

@@ -27,6 +27,12 @@ FRINGES = ("trained", "untrained")
 PROMISES = ("psnr", "psnr_bulk", "max_error", "max_error_rel", "ratio")
 """Settings that promise a quality or a size; at most one of them is given, or PAIR."""
 
+OPTIONAL_STAGES = ("tiles", "transform", "filling", "head", "predictor", "ssim")
+"""Stages of an encoding that `without` may name."""
+
+STAGES_OF_PAPER = ("ssim",)
+"""Those of them that the profile paper has."""
+
 PAIR = ("psnr", "psnr_bulk")
 """Promises that may be given together."""
 
@@ -150,6 +156,11 @@ class EncodeConfig:
         high=2**31,
         profile="paper",
     )
+    brick: str = option(
+        "auto",
+        "paper: vertices that are trained together, as ZxYxX such as 8x8x16; 'auto' for about 1024",
+        profile="paper",
+    )
     psnr: float | None = option(
         None,
         "promise of quality in dB over the coreset of all steps "
@@ -200,6 +211,11 @@ class EncodeConfig:
         "'auto', or 'whole' for one tile",
         profile="compact",
     )
+    without: tuple[str, ...] = option(
+        (),
+        "stages to leave out, which then take no time: tiles, transform, filling, head, predictor "
+        "(trials of compact, for fewer bytes) and ssim; repeat, or join by commas",
+    )
     tables: str = option(
         "float16",
         "paper: number type of the stored tables; "
@@ -232,6 +248,7 @@ class EncodeConfig:
                 "--fold is 1; allowed: 2 to 64, or 0 for a ratio that suits the tables"
             )
         self._check_profile()
+        self._check_without()
         self._check_promises()
 
     @property
@@ -286,6 +303,17 @@ class EncodeConfig:
     def _accept_python_values(self) -> None:
         """Turn a single feature into a tuple, and key frames given as numbers into text."""
         features, key_frames = cast(Any, self.features), cast(Any, self.key_frames)
+        without = cast(Any, self.without)
+        texts = (without,) if isinstance(without, str) else tuple(map(str, without))
+        names = {name.strip() for text in texts for name in text.split(",") if name.strip()}
+        unknown = sorted(names - set(OPTIONAL_STAGES))
+        if unknown:
+            raise InputError(
+                f"without names '{unknown[0]}'; {suggestion(unknown[0], OPTIONAL_STAGES)}"
+            )
+        # One order, so that the same stages give the same bytes however they are named.
+        in_order = tuple(name for name in OPTIONAL_STAGES if name in names)
+        object.__setattr__(self, "without", in_order)
         if isinstance(features, str):
             object.__setattr__(self, "features", (features,))
         elif not all(isinstance(feature, str) for feature in features):
@@ -304,6 +332,15 @@ class EncodeConfig:
                     f"{_option_name(field)} belongs to --profile {profile}; "
                     f"the profile is {self.profile}"
                 )
+
+    def _check_without(self) -> None:
+        """Raise InputError for a stage to leave out that the profile does not have."""
+        others = [name for name in self.without if name not in STAGES_OF_PAPER]
+        if self.profile == "paper" and others:
+            raise InputError(
+                f"without names '{others[0]}', a stage of --profile compact; "
+                f"the profile paper has {', '.join(STAGES_OF_PAPER)}"
+            )
 
     def _check_promises(self) -> None:
         """Raise InputError if more than one promise is given, except the two of PAIR."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import time
 import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from fhash_codec.paper.encode import encode_paper
 from fhash_codec.progress import Progress, silent
 from fhash_codec.promises import missed_promise, remarks
 from fhash_codec.report import report
+from fhash_codec.stage_clock import recording, skip, stage
 from fhash_codec.training.devices import choose_device, need_torch
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
@@ -27,6 +30,9 @@ from fhash_formats.container import ContainerWriter
 from fhash_formats.errors import FhashWarning, InputError, QualityError
 from fhash_formats.series import Series
 from fhash_formats.support.atomic import check_output
+
+PREDICTED = ("seconds", "bytes", "psnr")
+"""Figures of a prediction that a header keeps."""
 
 DATA_SUFFIX_NAMES = """.npy .npz .h5 .hdf5 .hdf .he5 .nc .nc4 .netcdf .cdf .zarr .raw .vti .vtr .pvd
 .pvti .pvtr .series .vtkhdf .nrrd .nhdr .mha .mhd .tif .tiff .vtp .ply"""
@@ -45,6 +51,7 @@ def encode(
     mask: npt.ArrayLike | None = None,
     force: bool = False,
     progress: Progress = silent,
+    predicted: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Encode a series into the container `path`, complete or not at all.
 
@@ -54,8 +61,10 @@ def encode(
     mask: booleans (t, z, y, x) or (z, y, x), one more feature. It is the only feature if the
         settings name none.
     force: replace a file that exists.
+    predicted: seconds, bytes and psnr that were predicted, for the header; see `fhash info`.
 
-    Returns the figures of the written file (see `report`). In the profile paper Ctrl-C during the
+    Returns the figures of the written file (see `report`), and as "stages" what took the time (see
+    `stage_clock.Stage`). In the profile paper Ctrl-C during the
     training saves a checkpoint beside `path` and raises InterruptedEncodingError; the same call
     then continues from the checkpoint to the same result. In the profile compact nothing is kept:
     KeyboardInterrupt passes through, and the same call starts again.
@@ -69,15 +78,10 @@ def encode(
     """
     config, path = config or EncodeConfig(), Path(os.path.normpath(path))
     begun = time.perf_counter()
-    check_name(path)
-    check_output(path, force)
-    if config.profile == "paper":
-        need_torch("profile paper")
-        choose_device(config.device)  # told now, and not after the planning
-    with open_source(source) as series:
+    with recording() as clock, _opened(source, path, force, config) as series:
         check_output(path, force, sources=[*series.files, *_mask_files(config)])
         with ContainerWriter(path, force=force) as writer:
-            measured = _Measured(writer, series, progress)
+            measured = _Measured(writer, series, config, progress)
             checkpoint, advice = None, ""
             if config.profile == "compact":
                 header = encode_compact(writer, series, config, mask, progress, measured.complete)
@@ -91,18 +95,49 @@ def encode(
                 writer.divert(missed_path(path))
             written = writer.path
             progress("writing", 0, 1, "")
-            writer.commit(header)
+            with stage("writing", "header, and the file takes its name"):
+                writer.commit(_with_prediction(header, predicted, config, begun))
             progress("writing", 1, 1, "")
         if checkpoint is not None:
             checkpoint.unlink(missing_ok=True)
     with open_volume(written) as volume:
         seconds = time.perf_counter() - begun
         figures = report(volume, measured.quality, seconds=seconds, files=series.files)
+    figures["stages"] = clock.to_list()
     if missed is not None:
         raise QualityError(_told(path, written, missed, advice), figures)
     for remark in remarks(config, figures):
         warnings.warn(remark, FhashWarning, stacklevel=2)
     return figures
+
+
+@contextmanager
+def _opened(source: Source, path: Path, force: bool, config: EncodeConfig) -> Iterator[Series]:
+    """The series of a source; raises what can be told at once, and not after the planning."""
+    with ExitStack() as stack:
+        with stage("opening", "paths, libraries and the source"):
+            check_name(path)
+            check_output(path, force)
+            if config.profile == "paper":
+                need_torch("profile paper")
+                choose_device(config.device)
+            series = stack.enter_context(open_source(source))
+        yield series
+
+
+def _with_prediction(
+    header: dict[str, Any], predicted: Mapping[str, Any] | None, config: EncodeConfig, begun: float
+) -> dict[str, Any]:
+    """Return the header with what was predicted, and the seconds that the whole job took.
+
+    Without timings the header stays as it is: a prediction may follow from the clock, and the same
+    input and settings give the same bytes.
+    """
+    if predicted is None or not config.timings:
+        return header
+    took = round(time.perf_counter() - begun, 3)
+    told = {name: predicted[name] for name in PREDICTED if name in predicted}
+    return {**header, "encoder": {**header["encoder"], "predicted": told, "took_seconds": took}}
 
 
 class _Measured:
@@ -112,14 +147,23 @@ class _Measured:
         quality: the figures of the last header that was completed, as JSON values.
     """
 
-    def __init__(self, writer: ContainerWriter, series: Series, progress: Progress) -> None:
+    def __init__(
+        self, writer: ContainerWriter, series: Series, config: EncodeConfig, progress: Progress
+    ) -> None:
         self.quality: dict[str, Any] = {}
         self._writer, self._series, self._progress = writer, series, progress
+        self._config = config
 
     def complete(self, header: dict[str, Any]) -> dict[str, Any]:
         """The header with the quality of the arrays written so far, as they decode."""
-        with Volume(self._writer.preview(header)) as volume:
-            self.quality = measure(self._series, volume, self._progress)
+        with_ssim = "ssim" not in self._config.without
+        if not with_ssim:
+            skip("ssim", "--without ssim")
+        with (
+            stage("measuring", "errors of the written bytes, as a reader decodes them"),
+            Volume(self._writer.preview(header)) as volume,
+        ):
+            self.quality = measure(self._series, volume, self._progress, with_ssim=with_ssim)
         low, high = header["value_range"]
         steps = header["domain"]["shape"][0]
         return {**header, "quality": brief_quality(self.quality, high - low, steps)}

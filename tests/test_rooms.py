@@ -35,7 +35,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("numcodecs_codec", "zarr_codec", "zarr_parts"),
     ),
     "fhash_codec": (
-        ("config", "native", "progress"),
+        ("config", "native", "progress", "stage_clock"),
         ("measure", "training"),
         ("coreset",),
         ("header", "indexing"),
@@ -53,6 +53,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("plain",),
         ("selftest",),
         ("bench",),
+        ("cost",),
     ),
     "fhash_codec.rendering": (
         ("scene",),

@@ -26,6 +26,7 @@ from fhash_codec.coreset.selection import FeatureSelection, select_features
 from fhash_codec.header import brief_history, describe_source, history_columns, write_series
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
+from fhash_codec.stage_clock import stage
 from fhash_formats import native
 from fhash_formats.container import ContainerWriter
 from fhash_formats.errors import FhashWarning
@@ -66,20 +67,22 @@ def encode_compact(
         )
     begun = time.perf_counter()
     selection = select_features(series, config, progress, mask, ranked=not fits_memory(series))
-    described = write_series(
-        writer,
-        series,
-        selection.scanned,
-        selection.extent.key_frames,
-        brief=True,
-        everything=any(isinstance(feature, Everything) for feature in selection.features),
-    )
+    with stage("writing", "coordinates and masks of missing values, tiles, header"):
+        described = write_series(
+            writer,
+            series,
+            selection.scanned,
+            selection.extent.key_frames,
+            brief=True,
+            everything=any(isinstance(feature, Everything) for feature in selection.features),
+        )
     mark = writer.mark()
     source = describe_source(series, selection.scanned.value_range, config)
     overhead = writer.size(source) + HEADER_BYTES + STEP_BYTES * series.shape[0]
     table = code_series(series, selection, config, progress, overhead=overhead)
     for _ in range(WRITINGS):
-        table.parts.write(writer)
+        with stage("writing", "tiles"):
+            table.parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
         header = complete(source | described | _header(selection, table, config, seconds))
         overhead = writer.size(header) - table.outcome.size

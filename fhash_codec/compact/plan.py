@@ -31,6 +31,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Feature
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Parts, Progress
+from fhash_codec.stage_clock import stage
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
@@ -102,15 +103,15 @@ def plan(
     parts = task.parts
     parts.begin("first guess")
     tiled = blocks.retile(tile)
-    settings = first_settings(task, tiled)
-    trial: LabelTrial | None = None
-    if goal.lossless and has_labels(task, tiled):
-        trial = plan_labels(task, tiled, settings)
-        if trial.clearly:
-            parts.end()
-            return _label_plan(task, trial.attempt)
+    with stage("first guess", "mean and approximate bytes, by which tiles are chosen"):
+        settings = first_settings(task, tiled)
+    trial = _label_trial(task, tiled, settings)
+    if trial is not None and trial.clearly:
+        parts.end()
+        return _label_plan(task, trial.attempt)
     if _can_estimate(task, tiled, settings):
-        estimated_plan = _estimated_plan(task, tiled, settings)
+        with stage("estimate", "effort 1: step and tiles from coefficients, without trials"):
+            estimated_plan = _estimated_plan(task, tiled, settings)
         parts.end()
         return estimated_plan
     found = _by_trial(task, tiled, settings, trial)
@@ -118,11 +119,20 @@ def plan(
     return found
 
 
+def _label_trial(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelTrial | None:
+    """Return the trial of coding as labels; None where values are no labels, or may change."""
+    if not task.goal.lossless:
+        return None
+    with stage("labels", "exact values, of which few may differ"):
+        return plan_labels(task, tiled, settings) if has_labels(task, tiled) else None
+
+
 def _by_trial(
     task: PlanTask, tiled: Blocks, settings: TileSettings, trial: LabelTrial | None
 ) -> CodingPlan:
     """Return the plan after trials of all choices, or of labels where these need fewer bytes."""
-    attempt = first_guess(task, tiled, settings)
+    with stage("first guess", "approximate bytes, by which tiles are chosen"):
+        attempt = first_guess(task, tiled, settings)
     if trial is not None and is_hopeless(
         trial.attempt.outcome.size, attempt.outcome.size, trial.entropy, trial.rank
     ):

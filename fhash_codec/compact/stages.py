@@ -6,6 +6,7 @@ Another order of the trials would give other bytes in the file.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from math import prod
 
@@ -23,6 +24,7 @@ from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.compact.tiles.tiling import even_tile, tile_for
+from fhash_codec.stage_clock import skip, stage
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -54,6 +56,10 @@ MAX_TILE_STEPS = 32
 """Longest tile in time steps that may span the whole series for its bytes alone."""
 PRICE_OF_STEPS = 0.97
 """Size ratio below which slower access to a single step is accepted."""
+MIN_HEAD_EFFORT = 5
+"""Least effort that trains a head."""
+SAMPLE_WHY = "tiles on which the choices are tried"
+"""Reason for the stage that reads and fills a sample."""
 REFITS = 3
 """Times that the data's own bases are made anew for another step."""
 SAME_STEP = 0.1
@@ -107,16 +113,27 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     if task.fixed_tile is None:
         tiled = task.blocks.retile(tile_for(task.blocks.shape, attempt.outcome.size))
     settings = replace(attempt.settings, transform=usual_transform(tiled.tile))
-    sample = _sample(task, tiled, settings, TRIAL_VERTICES)
+    with stage("sample", SAMPLE_WHY):
+        sample = _sample(task, tiled, settings, TRIAL_VERTICES)
     attempt = replace(attempt, sample=sample, settings=settings)
     if task.config.effort == 1:
+        for name in ("transform", "tiles"):
+            skip(name, "effort 1 tries none; from 2 on")
         return attempt
-    attempt = _choose_transform(task, attempt)
-    if task.fixed_tile is None:
+    if _asked(task, "transform"):
+        with stage("transform", f"trials along each axis, at effort {task.config.effort}"):
+            attempt = _choose_transform(task, attempt)
+    else:
+        with stage("step", "size of the tiles where the promise is kept"):
+            attempt = _choose_transform(task, attempt)
+    if task.fixed_tile is not None:
+        skip("tiles", f"--tile {task.config.tile}")
+    elif _asked(task, "tiles"):
         attempt = _try_other_tiles(task, attempt)
     vertices = prod(task.blocks.shape)
     searched = MAX_SEARCHED_VERTICES if vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
-    return replace(attempt, sample=attempt.sample.wider(searched))
+    with stage("sample", SAMPLE_WHY):
+        return replace(attempt, sample=attempt.sample.wider(searched))
 
 
 def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -128,17 +145,27 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
         rounds=0 if effort == 1 else 2 if effort < 7 else 4,
     )
     sample, settings = attempt.sample, attempt.settings
-    if not task.blocks.complete:
-        coding = replace(coding, rounds=2, filled=True)
-        if effort > 1:
+    if task.blocks.complete:
+        skip("filling", "every vertex of the box counts")
+        return replace(attempt, coding=coding)
+    coding = replace(coding, rounds=2, filled=True)
+    if effort > 1 and _asked(task, "filling"):
+        with stage("filling", "trials of values where none count"):
             sample = choose_filling(sample, settings, coding, task.goal, task.density)
-        else:
+    else:
+        with stage("sample", SAMPLE_WHY):
             sample = sample.filled(settings, task.density)
     return replace(attempt, sample=sample, coding=coding)
 
 
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     """Choose the step that keeps the promise, and fit the data's own bases to it."""
+    with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
+        return _searched_step(task, attempt)
+
+
+def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return the attempt with the step that the sample asks for, and with bases fitted to it."""
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
     tries = 3 if task.config.effort == 1 else 5
     tried: list[Outcome] = []
@@ -163,13 +190,10 @@ def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
 def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
     """Train a head, and keep it if the file gets smaller by it."""
     config, goal = task.config, task.goal
-    trainable = (
-        goal.size is None
-        and goal.error != 0
-        and goal.data_range > 0
-        and not attempt.settings.double
-    )
-    if config.effort < 5 or not trainable:
+    if not _asked(task, "head"):
+        return attempt
+    if reason := _without_head(task, attempt):
+        skip("head", reason)
         return attempt
 
     def find(settings: TileSettings, tried: list[Outcome]) -> tuple[TileSettings, Outcome]:
@@ -192,18 +216,44 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
     return replace(attempt, settings=settings, outcome=outcome, history=history)
 
 
+def _without_head(task: PlanTask, attempt: Attempt) -> str:
+    """Return why no head is to be trained; "" where one is."""
+    goal, effort = task.goal, task.config.effort
+    if effort < MIN_HEAD_EFFORT:
+        return f"effort {effort} trains none; from {MIN_HEAD_EFFORT} on"
+    if goal.size is not None:
+        return "a promised ratio: the step changes once the whole file is known"
+    if goal.error == 0 or goal.data_range <= 0:
+        return "exact values leave nothing to correct"
+    if attempt.settings.double:
+        return "the step is too fine for float32, in which heads compute"
+    return ""
+
+
 def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
     """Train a predictor for a strict bound, and keep it if the file gets smaller by it."""
     goal, effort = task.goal, task.config.effort
-    if effort == 1 or not goal.error or goal.data_range <= 0:
+    if not goal.error or goal.data_range <= 0:
+        skip("predictor", "only a bound on each error has use for it")
         return attempt
-    settings, size = choose_predictor(
-        attempt.sample, attempt.settings, attempt.outcome.size, error=goal.error, effort=effort
-    )
+    if effort == 1 or not _asked(task, "predictor"):
+        return attempt
+    with stage("predictor", "trials beside the transform, for the bound on each error"):
+        settings, size = choose_predictor(
+            attempt.sample, attempt.settings, attempt.outcome.size, error=goal.error, effort=effort
+        )
     outcome = replace(attempt.outcome, size=size)
     kept = settings.predictor is not None
     task.gains.note("prediction" if kept else "prediction (left out)", outcome)
     return replace(attempt, settings=settings, outcome=outcome)
+
+
+def _asked(task: PlanTask, name: str) -> bool:
+    """Whether the settings leave a stage in; one that they leave out is recorded."""
+    if name not in task.config.without:
+        return True
+    skip(name, f"--without {name}")
+    return False
 
 
 def _sample(task: PlanTask, tiled: Blocks, settings: TileSettings, max_vertices: int) -> Sample:
@@ -235,16 +285,30 @@ def _choose_transform(task: PlanTask, attempt: Attempt, *, quick: bool = False) 
     Attempts with other tiles are compared at this step: at equal quality.
     """
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
-    settings, _ = choose_transform(sample, attempt.settings, goal.bounded(coding), quick=quick)
+    if "transform" in task.config.without:
+        usual = usual_transform(sample.blocks.tile)
+        settings = replace(attempt.settings, transform=usual)
+    else:
+        settings, _ = choose_transform(sample, attempt.settings, goal.bounded(coding), quick=quick)
     settings, outcome = find_step(sample, settings, coding, goal, tries=3 if quick else 4)
     return replace(attempt, settings=settings, outcome=outcome)
 
 
 def _try_other_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     """Try larger and longer tiles, and keep them if the file gets much smaller by them."""
+    others = _other_tiles(attempt.sample.blocks, attempt.outcome.size)
+    if not others:
+        skip("tiles", "no other tile is worth the slower access to a region")
+        return attempt
+    with stage("tiles", "trials of larger and longer tiles, for a small file or a sparse coreset"):
+        return _best_tiles(task, attempt, others)
+
+
+def _best_tiles(task: PlanTask, attempt: Attempt, others: Sequence[Shape]) -> Attempt:
+    """Return the best of the attempt and those with other tiles, larger ones at a price."""
     tiled = attempt.sample.blocks
     max_vertices = MAX_TILE_VERTICES if tiled.complete else TRIAL_VERTICES
-    for tile in _other_tiles(tiled, attempt.outcome.size):
+    for tile in others:
         settings = attempt.settings
         sample = _sample(task, task.blocks.retile(tile), settings, max_vertices)
         other = _choose_transform(task, replace(attempt, sample=sample), quick=True)

@@ -26,6 +26,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection
 from fhash_codec.measure.bulk import bulk_of_ranks, find_bulk
 from fhash_codec.progress import Progress
+from fhash_codec.stage_clock import stage
 from fhash_formats.series import Series
 from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
 
@@ -74,10 +75,11 @@ def code_series(
     begun = time.perf_counter()
     blocks = Blocks(series, selection.extent, series.shape)
     integers = blocks.dtype.kind in "iu"
-    if blocks.in_memory or selection.ranks is None:
-        bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
-    else:  # the series was too long to be read for this alone
-        bulk = bulk_of_ranks(selection.ranks, value_range, whole=integers)
+    with stage("bulk", "range of the middle 98 % of the values, which has a promise of its own"):
+        if blocks.in_memory or selection.ranks is None:
+            bulk = find_bulk(blocks.counted_values, value_range, whole=integers)
+        else:  # the series was too long to be read for this alone
+            bulk = bulk_of_ranks(selection.ranks, value_range, whole=integers)
     goal = goal_of(config, value_range, raw_bytes, overhead, bulk, integers=integers)
     with thread_pool() as workers:
         coding_plan = plan(
@@ -267,8 +269,11 @@ def _code_all(
     streams: list[bytes] = []
     outcomes: list[Outcome] = []
     sources = (source(index) for index in blocks.indices())
-    for data, outcome in map_ahead(workers, work, sources, 2 * usable_threads()):
-        streams.append(data)
-        outcomes.append(outcome)
-        progress("coding", len(streams), prod(blocks.grid), note)
+    with stage(
+        "coding", "all tiles, once for each step of the quantiser until the promise is kept"
+    ):
+        for data, outcome in map_ahead(workers, work, sources, 2 * usable_threads()):
+            streams.append(data)
+            outcomes.append(outcome)
+            progress("coding", len(streams), prod(blocks.grid), note)
     return CodedTable(plan=coding_plan, streams=streams, outcome=total(outcomes))

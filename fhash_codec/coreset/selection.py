@@ -19,6 +19,7 @@ from fhash_codec.coreset.key_frames import select_key_frames, time_axis
 from fhash_codec.coreset.scan import Scan, scan
 from fhash_codec.measure.ranks import Ranks
 from fhash_codec.progress import Progress
+from fhash_codec.stage_clock import stage
 from fhash_formats import open_series
 from fhash_formats.errors import FhashWarning, InputError
 from fhash_formats.readers.common.layout import Dimension, must_select
@@ -148,7 +149,10 @@ def select_features(
         series, config, progress, mask, ranks if everything else None
     )
     selected = None if everything else ranks
-    extent = find_extent(series, scanned, key_frames, features, config.dilation, progress, selected)
+    with stage("features", f"vertices of {', '.join(map(str, features))}"):
+        extent = find_extent(
+            series, scanned, key_frames, features, config.dilation, progress, selected
+        )
     return FeatureSelection(scanned=scanned, features=features, extent=extent, ranks=ranks)
 
 
@@ -171,9 +175,14 @@ def resolve_selection(
             FhashWarning,
             stacklevel=3,
         )
-    scanned = scan(series, progress, ranks)
-    key_frames = select_key_frames(config.key_frames, series, times, progress)
-    features = resolve_features(config.features, series, key_frames, scanned.value_range, progress)
+    with stage("scan", "range and missing values, by one pass over all steps"):
+        scanned = scan(series, progress, ranks)
+    with stage("key frames", f"steps to encode: {config.key_frames}"):
+        key_frames = select_key_frames(config.key_frames, series, times, progress)
+    with stage("features", f"thresholds of {', '.join(config.features)}"):
+        features = resolve_features(
+            config.features, series, key_frames, scanned.value_range, progress
+        )
     if mask is not None:
         named = () if config.features == ("all",) else features
         features = (_array_mask(mask, series), *named)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,6 +24,7 @@ from fhash_codec.measure.ssim import SIGMA, WINDOW, ssim, ssim_steps
 from fhash_codec.measure.sums import ErrorSums, Values
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
+from fhash_codec.stage_clock import attribute
 from fhash_formats.support.threads import usable_threads
 
 __all__ = [
@@ -85,6 +87,7 @@ class _Comparison:
     Attributes:
         coreset, domain: scaled differences over the coreset, and over all vertices.
         similarity: what `ssim` returns; (0.0, 0) for a step whose SSIM is not measured.
+        seconds, ssim_seconds: of the comparison, and of the SSIM alone, in its thread.
         between: differences of the interpolated source; None for a key frame.
     """
 
@@ -93,6 +96,8 @@ class _Comparison:
     domain: ErrorSums
     similarity: tuple[float, int]
     between: BetweenSums | None
+    seconds: float
+    ssim_seconds: float
 
 
 class _Comparer:
@@ -105,6 +110,8 @@ class _Comparer:
         self.coreset, self.domain = Errors(data_range, bulk), Errors(data_range)
         self.between = BetweenErrors(data_range)
         self.similarity, self.similar_vertices = 0.0, 0
+        # Of all threads together: reading, decoding and comparing, and the SSIM alone.
+        self.seconds, self.ssim_seconds = 0.0, 0.0
         self._background = background
 
     def compare(
@@ -121,21 +128,29 @@ class _Comparer:
 
         neighbours: the key frames around the step; None for a key frame. threads: of the SSIM.
         """
+        begun = time.perf_counter()
         in_coreset = np.isfinite(decoded)
         mask = None if in_coreset.all() else in_coreset
         coreset = domain = self.coreset.compare(step, original, decoded, mask)
         if mask is not None:
             filled = np.where(mask, decoded, decoded.dtype.type(self._background))
             domain = self.domain.compare(step, original, filled)
-        similarity = 0.0, 0
+        similarity, ssim_seconds = (0.0, 0), 0.0
         if with_ssim:
-            data_range = self.coreset.data_range
+            data_range, ssim_begun = self.coreset.data_range, time.perf_counter()
             similarity = ssim(original, decoded, data_range, mask, threads=threads)
+            ssim_seconds = time.perf_counter() - ssim_begun
         between = None
         if neighbours is not None:
             between = self.between.compare(step, original, decoded, in_coreset, neighbours)
         return _Comparison(
-            step=step, coreset=coreset, domain=domain, similarity=similarity, between=between
+            step=step,
+            coreset=coreset,
+            domain=domain,
+            similarity=similarity,
+            between=between,
+            seconds=time.perf_counter() - begun,
+            ssim_seconds=ssim_seconds,
         )
 
     def add(self, comparison: _Comparison) -> StepQuality:
@@ -146,7 +161,19 @@ class _Comparer:
         total, vertices = comparison.similarity
         self.similarity += total
         self.similar_vertices += vertices
+        self.seconds += comparison.seconds
+        self.ssim_seconds += comparison.ssim_seconds
         return figures
+
+    def tell_ssim(self, steps: int, elapsed: float) -> None:
+        """Record the stage of the SSIM: its share of all work, in seconds of the clock.
+
+        steps: number of measured steps. elapsed: seconds of the whole measurement.
+        """
+        if not steps:
+            return
+        share = self.ssim_seconds / max(self.seconds, 1e-9)
+        attribute("ssim", f"likeness of {steps} steps, for the reports", share * elapsed)
 
     def quality(self, measured: list[int]) -> Quality:
         """The figures of all steps added; `measured` are the steps whose SSIM is."""
@@ -182,6 +209,7 @@ def measure_quality(
     *,
     bulk: ValueRange | None = None,
     neighbours: NeighboursOf | None = None,
+    with_ssim: bool = True,
 ) -> Quality:
     """Compare all steps of a decoded series with the original.
 
@@ -191,13 +219,14 @@ def measure_quality(
     background: decoded value outside the coreset for the figures over the domain, in data units.
     bulk: of the original series, in data units (`find_bulk`); no figures of it if None.
     neighbours: of the key frames, see `neighbours_of`; None if every step is a key frame.
+    with_ssim: measure the SSIM; else it is None, of no step.
 
     At most FRAMES_HELD frames of each series are in memory. The SSIM is measured over the coreset
     of evenly spaced steps (`ssim_steps`). Raises InputError for frames of different shapes.
     Progress stage: "measuring".
     """
     comparer = _Comparer(data_range, background, bulk)
-    measured = [-1]
+    measured, begun = [-1], time.perf_counter()
     threads, waiting = usable_threads(), deque[Future[_Comparison]]()
 
     def collect() -> None:
@@ -210,9 +239,11 @@ def measure_quality(
 
     with ThreadPoolExecutor(threads, thread_name_prefix="fhash-measure") as workers:
         for step in range(steps):
+            reading = time.perf_counter()
             original, decoded = original_frames(step), decode(step)
+            comparer.seconds += time.perf_counter() - reading
             if step == 0:
-                measured = ssim_steps(steps, original.size)
+                measured = ssim_steps(steps, original.size) if with_ssim else []
             at_once = max(1, min(FRAMES_HELD, steps, VERTICES_HELD // max(original.size, 1)))
             while len(waiting) >= at_once:
                 collect()
@@ -229,4 +260,5 @@ def measure_quality(
             )
         while waiting:
             collect()
+    comparer.tell_ssim(len(measured), time.perf_counter() - begun)
     return comparer.quality(measured)

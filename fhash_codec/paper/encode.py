@@ -14,6 +14,7 @@ from fhash_codec.paper.storage import write_model, write_tables
 from fhash_codec.paper.training.fit import TrainedModel, train_model
 from fhash_codec.paper.training.rounds import Goal
 from fhash_codec.progress import Progress
+from fhash_codec.stage_clock import stage
 from fhash_formats.container import ContainerWriter
 from fhash_formats.series import Series
 
@@ -50,13 +51,16 @@ def encode_paper(
     coreset, architecture = selection.coreset, selection.architecture
     goal = _goal(selection, series, config)
     trained = train_model(coreset, architecture, config, path, progress, goal)
-    write_series(writer, series, selection.scanned, coreset.key_frames)
+    with stage("writing", "coordinates, masks, tables, network and header"):
+        write_series(writer, series, selection.scanned, coreset.key_frames)
     loss = None
     if config.tables == "transform":
-        loss = _write_coded_tables(writer, series, selection, trained, config, progress)
+        with stage("tables", "--tables transform: coded at a loss that the promise allows"):
+            loss = _write_coded_tables(writer, series, selection, trained, config, progress)
     else:
-        write_tables(writer, architecture, coreset, trained.fine, trained.tables, config.tables)
-        write_model(writer, coreset, trained.layers)
+        with stage("writing", "tables"):
+            write_tables(writer, architecture, coreset, trained.fine, trained.tables, config.tables)
+            write_model(writer, coreset, trained.layers)
     header = _header(series, selection, trained, config)
     if loss is not None:
         from fhash_codec.paper.tables.small_parts import MASK_FEATURES

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.bricks import Coreset, build_coreset
+from fhash_codec.coreset.bricks import Coreset, build_coreset, parse_brick
 from fhash_codec.coreset.features import Feature
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.coreset.selection import resolve_selection
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.progress import Progress
+from fhash_codec.stage_clock import stage
 from fhash_formats.series import Series
 
 
@@ -48,16 +49,19 @@ def select(
     Raises:
         InputError: the settings do not fit the series, or they select nothing.
     """
+    brick = parse_brick(config.brick)
     scanned, key_frames, features = resolve_selection(series, config, progress, mask)
-    coreset = build_coreset(
-        series,
-        scanned,
-        key_frames,
-        features,
-        config.dilation,
-        progress,
-        fringe=config.fringe == "trained",
-    )
+    with stage("coreset", "samples at the key frames, for the training"):
+        coreset = build_coreset(
+            series,
+            scanned,
+            key_frames,
+            features,
+            config.dilation,
+            progress,
+            fringe=config.fringe == "trained",
+            brick=brick,
+        )
     architecture = Architecture.for_box(
         coreset.box.shape,
         len(key_frames),

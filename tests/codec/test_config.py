@@ -83,6 +83,11 @@ def test_an_unknown_name_is_refused_and_the_nearest_is_offered() -> None:
         ({"psnr": -1.0}, "psnr is -1"),
         ({"features": ()}, "feature is empty"),
         ({"dilation": -1}, "dilation is -1"),
+        ({"without": ("heads",)}, "without names 'heads'; did you mean 'head'"),
+        (
+            {"profile": "paper", "without": "head"},
+            "without names 'head', a stage of --profile compact",
+        ),
     ],
 )
 def test_a_value_that_is_not_allowed_is_named_with_what_is(values, message) -> None:
@@ -107,3 +112,9 @@ def test_the_sizes_of_a_model_suit_its_tables_unless_they_are_given(fold, size, 
         )
         found = (config.model_fold, config.model_embedding_size, config.model_width)
         assert found == ((fold, size, width) if fold else sizes)
+
+
+def test_stages_to_leave_out_have_one_order_however_they_are_named() -> None:
+    for without in ("ssim,head", ("ssim", "head"), ["head, ssim", "head"]):
+        assert EncodeConfig(without=without).without == ("head", "ssim")  # type: ignore[arg-type]
+    assert EncodeConfig(profile="paper", without=("ssim",)).without == ("ssim",)

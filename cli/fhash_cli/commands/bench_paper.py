@@ -204,7 +204,7 @@ def _parameters() -> tuple[dict[str, Any], str]:
     from fhash_codec.bench.paper.sets import SETS, paper_parameters
 
     counts = {name: paper_parameters(name) for name in SETS}
-    rows = [("parameters", *ENCODINGS)]
+    rows: list[tuple[str, ...]] = [("parameters", *ENCODINGS)]
     rows += [
         (SETS[name].title, *(f"{counts[name][encoding]:,}" for encoding in ENCODINGS))
         for name in SETS

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from fhash_cli.base_command import BaseCommand
+from fhash_cli.commands.cost import check_report_folder
 from fhash_cli.options import (
     SourceOptions,
     check_writable,
@@ -53,7 +54,17 @@ MAX_LABELS = 64
 @force_option
 @json_option
 @quiet_option
+@click.option(
+    "--explain", is_flag=True, help="Say how long each stage took, and why it ran or did not."
+)
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
+@click.option(
+    "--report",
+    "report_folder",
+    metavar="DIR",
+    type=click.Path(),
+    help="Also measure reads and pictures of the file, and write the page of `fhash cost` on it.",
+)
 def command(
     data: str,
     output: str,
@@ -62,7 +73,9 @@ def command(
     force: bool,
     as_json: bool,
     quiet: bool,
+    explain: bool,
     verbose: bool,
+    report_folder: str | None,
 ) -> None:
     """Find the features of DATA, encode them and write them as RUN.fhz.
 
@@ -77,6 +90,8 @@ def command(
 
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
+    if report_folder is not None:
+        check_report_folder(Path(report_folder), force, data)
     before = _stamp(output)
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         missed = None
@@ -87,12 +102,52 @@ def command(
             missed, report = error, error.figures
         except KeyboardInterrupt:
             raise InterruptedEncodingError(_after_interruption(output, before)) from None
+        if report_folder is not None:
+            _write_report(series, report, config, Path(report_folder), force, missed, progress)
     _say_unmet(source, series, quiet)
     integers = (series.source_dtype or series.dtype).kind in "iu"
     if integers and not quiet and looks_categorical(report):
         say("few different integers: if they are labels, --max-error 0 keeps each exactly")
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
-    emit(report, table(rows), as_json, missed)
+    text = table(rows)
+    stages = report.pop("stages")
+    if explain:
+        report["stages"] = stages
+        text += f"\n\n{stage_table(stages)}"
+    emit(report, text, as_json, missed)
+
+
+def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:
+    """The stages of an encoding: seconds, share of the whole, and why each ran or did not.
+
+    stages: as in the report of `fhash_codec.encode`.
+    """
+    total = max(sum(entry["seconds"] for entry in stages), 1e-9)
+    rows = [("stage", " seconds  share  why")]
+    for entry in stages:
+        taken = f"{entry['seconds']:8.2f} {entry['seconds'] / total:6.1%}"
+        if not entry["times"]:
+            taken = f"{'-':>8} {'-':>6}"
+        again = f", {entry['times']} times" if entry["times"] > 1 else ""
+        rows.append((entry["stage"], f"{taken}  {entry['why']}{again}"))
+    return table(rows)
+
+
+def _write_report(
+    series: Series,
+    figures: dict[str, Any],
+    config: EncodeConfig,
+    folder: Path,
+    force: bool,
+    missed: QualityError | None,
+    progress: Progress,
+) -> None:
+    """Measure reads and pictures of the file just written, and write its report."""
+    from fhash_codec.cost.files import write_report
+    from fhash_codec.cost.one import report_on_encode
+
+    costs = report_on_encode(series, figures, config, missed=missed is not None, progress=progress)
+    write_report(costs, folder, force=force)
 
 
 def _say_unmet(source: SourceOptions, series: Series, quiet: bool) -> None:

@@ -275,7 +275,7 @@ def _run(
         warm.train_epoch(0)
         del warm
         courses: list[tuple[TrainedEncoding, Trained]] = []
-        trial = []
+        trial: list[dict[str, Any]] = []
         for steps in arranged.steps:
             encoding = make(steps, plan.epochs)
             if any(entry["steps"] == encoding.steps_an_epoch for entry in trial):

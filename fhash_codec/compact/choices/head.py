@@ -16,6 +16,7 @@ from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.progress import Parts
+from fhash_codec.stage_clock import skip, stage
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -143,19 +144,24 @@ def choose_head(
     parts: progress of the planning, which is told about the training.
     """
     if outcome.size < MIN_BYTES:
+        skip("head", f"tiles of {outcome.size} bytes: no head saves what it takes itself")
         return settings, outcome, []
     training = _Training(seed=seed)
-    pairs = _training_pairs(sample, settings, coding)
     parts = parts or Parts()
     tell = partial(parts.report, "training")
-    trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET, tell)
+    with stage("head trial", "gain of a quick training, by which heads are chosen"):
+        pairs = _training_pairs(sample, settings, coding)
+        trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET, tell)
     if trial is None or trial.gain_db < MIN_GAIN:
+        skip("head", "its trial gains nothing")
         return settings, outcome, []
     gain = GAIN_FACTOR * trial.gain_db + GAIN_BESIDES
     widths = _best_widths(outcome.size, gain, _octave(tried, data_range), effort)
     # A head is trained on what it will meet: coarser data, which it lifts to the quality asked for.
     coarser = replace(settings, step=settings.step * math.exp(trial.gain_db / SLOPE))
-    pairs = _training_pairs(sample.wider(TRAINING_VERTICES), coarser, coding)
+    why = f"at effort {effort}; its trial gained {trial.gain_db:.2f} dB"
+    with stage("head", why):
+        pairs = _training_pairs(sample.wider(TRAINING_VERTICES), coarser, coding)
     budget = EFFORTS[effort].budget
 
     def train(shape: Shape, tell: Callable[[float], None]) -> _Candidate | None:
@@ -170,7 +176,8 @@ def choose_head(
         return _Candidate(trained, settings_with_head, outcome_with_head, tried_with_head)
 
     shapes = [Shape(widths, cross=True), PERCEPTRON] if widths else [PERCEPTRON]
-    trained_heads = _side_by_side(shapes, train, parts)
+    with stage("head", why):
+        trained_heads = _side_by_side(shapes, train, parts)
     candidates = [candidate for candidate in trained_heads if candidate is not None]
     return _cheapest(settings, outcome, candidates, strict=strict, data_range=data_range)
 

@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome
-from fhash_formats.transform.axes.basis import MAX_LENGTH, fit_basis
+from fhash_codec.stage_clock import stage
+from fhash_formats.transform.axes.basis import MAX_LENGTH, Basis, fit_basis
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
@@ -115,6 +116,27 @@ def choose_transform(
             lowest = min(costs)
             axes = trials[costs.index(lowest)]
     return replace(settings, transform=TransformSpec(axes=axes)), lowest
+
+
+def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
+    """Return the codings of a sample by `choose_transform`, and the bases that it fits.
+
+    shape: of a tile.
+    in_memory: whether the series is, so that bases are possible.
+    """
+
+    def possible(*lengths: int) -> bool:
+        return in_memory and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
+
+    t, z, y, x = shape
+    plane = sum(2 ** (depth - 1) < max(y, x) for _, depth in PLANE_WAVELETS)
+    lines = sum(
+        sum(2 ** (depth - 1) < length for _, depth in LINE_WAVELETS) + possible(length)
+        for length in (t, z)
+        if length > 1
+    )
+    bases = 2 * possible(y, x) + possible(t) + possible(z)
+    return 1 + plane + possible(y, x) + lines, bases
 
 
 def refit(sample: TileSample, settings: TileSettings) -> TileSettings:
@@ -222,15 +244,21 @@ class _Bases:
     def along(self, axis: int) -> AxisTransform:
         """Return the basis along an axis, as precise as the step of the settings needs."""
         if axis not in self._cache:
-            # Fitted on all tiles: a direction that the basis drops cannot be restored by any
-            # coefficient.
-            length = self._sample.tiles[0].values.shape[axis]
-            gram = np.zeros((length, length))
-            for tile_gram in self._sample.map_all(lambda tile: self._gram(tile.values, axis)):
-                gram += tile_gram
-            basis = fit_basis(gram, self._settings.step)
+            with stage("bases", "the data's own bases, which compete as transforms of short axes"):
+                basis = self._fitted(axis)
             self._cache[axis] = AxisTransform(kind="klt", basis=basis)
         return self._cache[axis]
+
+    def _fitted(self, axis: int) -> Basis:
+        """Return the basis of all tiles.
+
+        A direction that the basis drops cannot be restored by any coefficient.
+        """
+        length = self._sample.tiles[0].values.shape[axis]
+        gram = np.zeros((length, length))
+        for tile_gram in self._sample.map_all(lambda tile: self._gram(tile.values, axis)):
+            gram += tile_gram
+        return fit_basis(gram, self._settings.step)
 
     def _gram(self, values: npt.NDArray[np.generic], axis: int) -> npt.NDArray[np.float64]:
         """Return the products of the lines of a tile along an axis, (length, length)."""

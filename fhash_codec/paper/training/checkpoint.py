@@ -28,7 +28,7 @@ MAX_NAME_BYTES = 250
 """Bytes of a checkpoint's file name, with those that a temporary name adds; systems allow 255."""
 PARTIAL_BYTES = 24
 """Bytes that a temporary name adds while the checkpoint is written."""
-UNRELATED = ("psnr", "tables", "timings", "train_on_seconds")
+UNRELATED = ("psnr", "tables", "timings", "train_on_seconds", "without")
 """Settings that do not change the course of a training, but at most where it ends."""
 
 

@@ -16,6 +16,7 @@ from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.architecture import Architecture
 from fhash_codec.paper.training.rounds import Goal, Round, decide, extended
 from fhash_codec.progress import Progress, silent
+from fhash_codec.stage_clock import stage
 from fhash_codec.training.devices import choose_device
 from fhash_formats.errors import (
     FhashWarning,
@@ -98,9 +99,10 @@ def train_model(
         InterruptedEncodingError: a signal asked for the end; a checkpoint was saved.
         InputError: the checkpoint cannot be read, or the device or the engine is not available.
     """
-    from fhash_codec.paper.training.probe import Diverged
+    with stage("engine", "tables and network at their random start"):
+        from fhash_codec.paper.training.probe import Diverged
 
-    fitting = _Fitting(coreset, architecture, config, path, progress, goal)
+        fitting = _Fitting(coreset, architecture, config, path, progress, goal)
     while True:
         try:
             return fitting.run()
@@ -139,9 +141,14 @@ class _Fitting:
         """Train to the end of the plan. Raises Diverged where the learning rate is too high."""
         from fhash_codec.training.threads import threads_for
 
-        plan = self._plan()
-        engine = self._engine(plan)
-        with deferred_interrupts() as stop, threads_for(plan.batch_samples):
+        with stage("engine", "tables and network at their random start"):
+            plan = self._plan()
+            engine = self._engine(plan)
+        with (
+            stage("training", f"{plan.epochs} epochs of {plan.batches} steps"),
+            deferred_interrupts() as stop,
+            threads_for(plan.batch_samples),
+        ):
             while self._trained_to_end(engine, plan, stop):
                 further = self._next_round(engine, plan)
                 if further is None:

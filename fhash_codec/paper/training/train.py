@@ -15,6 +15,7 @@ from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.engines import Engine
 from fhash_codec.paper.training.probe import Diverged, Probe
 from fhash_codec.progress import Progress, silent
+from fhash_codec.stage_clock import stage
 from fhash_formats.support.interrupts import StopRequest
 
 BATCH_SAMPLES = 1 << 16
@@ -267,7 +268,8 @@ class _Loop:
         reached = self._reached
         reached.epoch, reached.batch = reached.epoch + 1, 0
         if reached.epoch % self._epochs_a_point == 0 or reached.epoch == self._plan.epochs:
-            psnr = self._probe.psnr(self._engine)
+            with stage("curve", "quality of the model after its epochs, on some bricks"):
+                psnr = self._probe.psnr(self._engine)
             self._count_seconds()
             reached.history.append(
                 {"seconds": reached.seconds, "epoch": reached.epoch, "psnr": psnr}

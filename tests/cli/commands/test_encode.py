@@ -274,3 +274,26 @@ def test_the_help_says_what_ctrl_c_leaves(fhash: Fhash) -> None:
     text = " ".join(fhash("encode", "--help").stdout.split())
     assert "Ctrl-C leaves no file" in text
     assert "with the profile compact the same command starts again" in text
+
+
+def test_explain_says_what_took_the_time_and_what_was_left_out(
+    fhash: Fhash, data: Path, tmp_path: Path
+) -> None:
+    words = ("encode", data, "-o", tmp_path / "run.fhz", *SMALL, "--without", "ssim,head")
+    result = fhash(*words, "--explain")
+    assert (result.exit_code, result.stderr) == (0, "")
+    lines = result.stdout.splitlines()
+    assert any(line.split() == ["stage", "seconds", "share", "why"] for line in lines)
+    assert any(line.startswith("ssim") and line.endswith("--without ssim") for line in lines)
+    assert any(line.startswith("coding") and "%" in line for line in lines)
+    assert lines[-1].startswith("other")
+    report = json.loads(fhash(*words, "--force", "--json").stdout)
+    assert "stages" not in report
+    assert report["ssim"] is None
+    assert report["quality"]["ssim_window"]["steps"] == []
+
+
+def test_a_stage_of_no_name_is_refused(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    result = fhash("encode", data, "-o", tmp_path / "run.fhz", "--without", "hed")
+    assert result.exit_code == 2
+    assert "without names 'hed'; did you mean 'head'?" in result.stderr

@@ -102,3 +102,40 @@ def test_a_coreset_of_integers_is_filled_anew_for_all_tiles(tmp_path: Path, fiel
     with fhash_codec.open(tmp_path / "a.fhz") as volume:
         assert volume[...].dtype.kind == "f"  # NaN outside the coreset
         assert volume.verify() == len(volume.info["arrays"])
+
+
+def _stages(report: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {entry["stage"]: entry for entry in report["stages"]}
+
+
+def test_a_stage_that_is_switched_off_is_never_entered(field: Field, tmp_path: Path) -> None:
+    values = field((4, 8, 12, 16))
+    path = tmp_path / "a.fhz"
+    mask = np.zeros(values.shape, bool)
+    mask[:, 1:3, 2:4, 3:6] = mask[:, 4:7, 7:10, 8:14] = True
+
+    def encode(without: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+        config = EncodeConfig(effort=5, max_error=0.5, without=without)
+        return _stages(fhash_codec.encode(values, path, config, mask=mask, force=True))
+
+    every = ("tiles", "transform", "filling", "head", "predictor", "ssim")
+    without = encode(every)
+    for name in every:
+        assert without[name]["times"] == 0
+        assert without[name]["seconds"] == 0
+        assert without[name]["why"] == f"--without {name}"
+    with_all = encode(())
+    assert {with_all[name]["times"] for name in ("transform", "filling", "predictor", "ssim")} == {
+        1
+    }
+
+
+def test_the_seconds_of_the_stages_are_those_of_the_whole(field: Field, tmp_path: Path) -> None:
+    report = fhash_codec.encode(field((4, 8, 12, 16)), tmp_path / "a.fhz", EncodeConfig(effort=2))
+    assert sum(entry["seconds"] for entry in report["stages"]) == pytest.approx(
+        report["seconds"], rel=0.05, abs=0.02
+    )
+    stages = _stages(report)
+    assert {"scan", "features", "bulk", "first guess", "transform", "step", "coding"} <= set(stages)
+    assert stages["head"]["why"] == "effort 2 trains none; from 5 on"
+    assert stages["measuring"]["times"] == stages["ssim"]["times"] == 1
