@@ -91,7 +91,7 @@ class _Course:
     def __str__(self) -> str:
         """The ratios of all clocks."""
         figures = [f"{label} {spread(self.ratios[clock], 'x')}" for clock, label in CLOCKS.items()]
-        return f"{', '.join(figures)}, reached by F-Hash alone {self.alone} times"
+        return f"{', '.join(figures)} ({self.alone} that F-Hash alone reached)"
 
 
 def accuracy(protocol: str, data: Sequence[Encodings]) -> Answer:
