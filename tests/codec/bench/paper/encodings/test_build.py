@@ -10,6 +10,7 @@ import torch
 from fhash_codec.bench.paper.data import Data
 from fhash_codec.bench.paper.encodings.build import build, levels_of, paper_grid
 from fhash_codec.bench.paper.encodings.corners import GridLevel, HashLevel
+from fhash_codec.bench.paper.encodings.gather import GatherModel
 from fhash_codec.bench.paper.protocols import Arrangement, arrangement
 from fhash_formats.series import ArraySeries
 
@@ -46,6 +47,11 @@ def test_key_frames_start_apart(data: Data) -> None:
     arranged = Arrangement(joint=False, whole=True, steps=(1,), engine="gather")
     encoding = build("dense", data, arranged, steps=1, epochs=1, seed=1, device=torch.device("cpu"))
     assert [part.plan.seed for part in encoding.parts] == [3, 4, 5]
+    first, second, _ = (part.model for part in encoding.parts)
+    assert isinstance(first, GatherModel)
+    assert isinstance(second, GatherModel)
+    assert first.places is second.places  # every vertex is a sample at every key frame
+    assert not torch.equal(first.table, second.table)
 
 
 @pytest.mark.parametrize(
