@@ -19,9 +19,15 @@ from fhash_codec.bench.paper.data import KINDS, Data, feature_text, gather_data,
 from fhash_codec.bench.paper.encodings.build import RATE, build
 from fhash_codec.bench.paper.encodings.tcnn import missing
 from fhash_codec.bench.paper.encodings.trained import TrainedEncoding
-from fhash_codec.bench.paper.latency import measure_latency
+from fhash_codec.bench.paper.latency import VIEWS, measure_latency
 from fhash_codec.bench.paper.pictures import SIZE, PictureProbe
-from fhash_codec.bench.paper.protocols import ENCODINGS, PROTOCOLS, Arrangement, arrangement
+from fhash_codec.bench.paper.protocols import (
+    CANDIDATES,
+    ENCODINGS,
+    PROTOCOLS,
+    Arrangement,
+    arrangement,
+)
 from fhash_codec.bench.paper.sets import SETS
 from fhash_codec.bench.paper.store import Request, load, save
 from fhash_codec.bench.paper.training import (
@@ -63,6 +69,7 @@ class BenchPlan:
         device: auto, cpu or cuda.
         latency: whether pictures through the encodings are timed, for the first seed of the
             protocol published.
+        views: views of these pictures.
         picture_size: pixels along both sides of the pictures of curves.
     """
 
@@ -76,6 +83,7 @@ class BenchPlan:
     key_frames: str | None = None
     device: str = "auto"
     latency: bool = True
+    views: int = VIEWS
     picture_size: int = SIZE
 
     @classmethod
@@ -87,6 +95,7 @@ class BenchPlan:
             "epochs": 20,
             "seeds": 1,
             "key_frames": f"auto:{QUICK_KEY_FRAMES}",
+            "views": 1,
         }
         return cls(**(settings | changes))
 
@@ -174,6 +183,7 @@ def _requests(
             for seed in range(1, plan.seeds + 1):
                 for protocol in plan.protocols:
                     timed = plan.latency and protocol == "published" and seed == 1
+                    tried = {"candidates": list(CANDIDATES)} if protocol == "best" else {}
                     for encoding in encodings:
                         yield Request(
                             encoding=encoding,
@@ -181,7 +191,7 @@ def _requests(
                             data_set=data_set,
                             feature=feature,
                             seed=seed,
-                            settings=settings | {"latency": timed},
+                            settings=settings | {"latency": timed and plan.views} | tried,
                         )
 
 
@@ -354,6 +364,7 @@ def _latency(
         data.masks,
         str(data.features[0]),
         value_range=(span.low, span.high),
+        views=request.settings["latency"],
         device=device.type,
         progress=progress,
     )

@@ -28,7 +28,7 @@ from fhash_codec.paper.levels import level_resolutions
 from fhash_codec.paper.training.train import TrainingPlan
 
 RATE = 0.01
-"""Learning rate of Adam (paper, section 4.2), constant: no schedule is printed."""
+"""Learning rate of Adam at the start (paper, section 4.2); no schedule is printed."""
 
 
 def build(
@@ -68,7 +68,7 @@ def build(
             continue
         # Models of single key frames must not start alike.
         part_seed = seed * len(keys) + part_keys[0]
-        plan = _plan(coreset, steps, epochs, part_seed)
+        plan = _plan(coreset, steps, epochs, part_seed, arranged.schedule)
         before = parts[-1].model if parts else None
         model = _model(name, data, arranged, coreset, plan, part_seed, device, before)
         parts.append(Part(part_keys, coreset, plan, model))
@@ -140,13 +140,15 @@ def _model(
     return GatherModel(levels, coreset, plan.rates, seed=seed, device=device, like=like)
 
 
-def _plan(coreset: Coreset, steps: int, epochs: int, seed: int) -> TrainingPlan:
+def _plan(coreset: Coreset, steps: int, epochs: int, seed: int, schedule: str) -> TrainingPlan:
     """Return the batches of a model: whole bricks, in an order of their own each epoch."""
     batches = min(steps, len(coreset.bricks))
+    share = np.arange(epochs * batches + 1) / (epochs * batches)
+    falling = 0.5 + 0.5 * np.cos(np.pi * share)
     return TrainingPlan(
         epochs=epochs,
         counts=np.diff(coreset.offsets),
         batches=batches,
         seed=seed,
-        rates=np.full(epochs * batches + 1, RATE),
+        rates=RATE * (falling if schedule == "cosine" else np.ones_like(share)),
     )

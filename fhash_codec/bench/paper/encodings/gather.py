@@ -71,11 +71,11 @@ class GatherModel:
         self.device, self.dtype, self.step = device, dtype, 0
         places = torch.from_numpy(sample_places(coreset))
         shared = like if like is not None and torch.equal(like.places, places) else None
-        self.places = places if shared is None else shared.places
+        self.places: Tensor = places if shared is None else shared.places
         self.values = torch.from_numpy(coreset.values).to(device, dtype)
         self._first = np.concatenate([[0], np.cumsum([level.size for level in levels])])
-        self.rank = self._ranked() if shared is None else shared.rank
-        self._kept = self._keep() if shared is None else shared._kept
+        self.rank: Tensor | None = self._ranked() if shared is None else shared.rank
+        self._kept: tuple[Tensor, Tensor] | None = self._keep() if shared is None else shared._kept
 
         random = torch.Generator().manual_seed(seed)
         held = int(self._first[-1]) if self.rank is None else int(self.rank.max()) + 1
