@@ -31,6 +31,7 @@ COMMANDS = {
     "verify": "read and check every part of RUN.fhz",
     "diff": "measure RUN.fhz against the data it was made from",
     "demo": "simulate, encode, decode, compare, draw",
+    "cost": "measure what accuracy costs in time and bytes on your data",
     "bench": "measure speed on this machine",
     "selftest": "check hard cases on this machine",
     "completion": "print the shell code that completes fhash's words on Tab",

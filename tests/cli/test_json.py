@@ -20,6 +20,17 @@ from fhash_cli.main import COMMANDS
 from fhash_codec.bench import train
 from fhash_codec.bench.pictures.results import RenderBench
 from fhash_codec.bench.rate.results import Access, Point, RateBench, Speed
+from fhash_codec.cost.results import (
+    Advice,
+    CostReport,
+    Curve,
+    Encoded,
+    Gain,
+    LeftOut,
+    Picture,
+    Read,
+)
+from fhash_codec.cost.results import Stage as StageOfCost
 from fhash_codec.selftest.case import Finding
 from fhash_codec.selftest.results import CaseResult, Summary
 
@@ -96,7 +107,13 @@ def parsed(result: Result, code: int = 0) -> Any:
 def test_the_document_names_every_command() -> None:
     commands = {title.split()[0] for title in KEYS} - {"Errors"}
     assert commands == set(COMMANDS) - WITHOUT_JSON
-    assert {"bench train", "bench rate", "bench labels", "bench render"} <= KEYS.keys()
+    assert {
+        "bench train",
+        "bench rate",
+        "bench labels",
+        "bench paper",
+        "bench render",
+    } <= KEYS.keys()
 
 
 @pytest.mark.parametrize(
@@ -185,6 +202,28 @@ def test_selftest(fhash: Fhash, monkeypatch: pytest.MonkeyPatch) -> None:
     check("selftest", parsed(fhash("selftest", "--json", "-q"), code=1))
 
 
+def test_cost() -> None:
+    point = Encoded(name="a", codec="compact", group="a", seconds=1.0, bytes=9, ratio=2.0)
+    result = CostReport(
+        series="a", units="", dtype="float32", shape=(1, 2, 3, 4), measured="the whole series",
+        measured_shape=(1, 2, 3, 4), raw_bytes=96, value_range=(0.0, 1.0), budget_seconds=1.0,
+        seconds=2.0, interrupted=False,
+        encodings=(point, replace(point, seconds=None, predicted_seconds=2.0)),
+        curves=(Curve(name="a", points=({"seconds": None, "epoch": 1.0, "psnr": 40.0},)),),
+        stages=(StageOfCost(stage="head", seconds=1.0, times=1, why="a"),),
+        gains=(Gain(what="head", bytes=9, seconds=None),),
+        per_step=({"step": 0, "psnr": None, "rmse": 0.0, "max_abs_error": 0.0},),
+        reads=(Read(file="a", file_psnr=None, what="frame", values=9, milliseconds=1.0,
+                    bytes_read=9, psnr=40.0, max_abs_error=0.1),),
+        pictures=(Picture(group="effect", setting="a", milliseconds=1.0, counters={"rays": 0},
+                          psnr=None, ssim=None),),
+        advice=(Advice(psnr=40.0, aim="smallest", name="a", options="", seconds=1.0, bytes=9,
+                       reached=None),),
+        left_out=(LeftOut(what="a", why="b"),), machine={}, notes=("a",),
+    )  # fmt: skip
+    check("cost", json.loads(json.dumps({"paths": ["a"], **result.to_dict()})))
+
+
 def test_bench_train(fhash: Fhash, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = count()
     monkeypatch.setattr(train, "time", SimpleNamespace(perf_counter=lambda: next(ticks) / 100))
@@ -213,9 +252,22 @@ def test_bench_rate() -> None:
     check("bench rate", json.loads(json.dumps(result.to_dict())))
 
 
+def test_bench_ablate(fhash: Fhash, data: Path) -> None:
+    words = ["bench", "ablate", data, "--axis", "fringe", "--epochs", "1"]
+    check("bench ablate", parsed(fhash(*words, "--json", "-q")))
+
+
 def test_bench_labels(fhash: Fhash) -> None:
     words = ["bench", "labels", "--kind", "tiny grid", "--effort", "1"]
     check("bench labels", parsed(fhash(*words, "--json", "-q")))
+
+
+def test_bench_paper(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    words = ["bench", "paper", data, "--quick", "--epochs", "1", "--protocol", "equal", "--feature"]
+    words += ["interval:6:99", "--encoding", "fhash", "-o", tmp_path, "--no-latency"]
+    results = [parsed(fhash(*words, "--json", "-q"))]
+    results.append(parsed(fhash("bench", "paper", "--parameters", "--json")))
+    check("bench paper", *results)
 
 
 def test_bench_render() -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.base_command import BaseCommand
+from fhash_cli.commands.cost import check_report_folder
 from fhash_cli.options import (
     SourceOptions,
     check_writable,
@@ -57,6 +58,13 @@ MAX_LABELS = 64
     "--explain", is_flag=True, help="Say how long each stage took, and why it ran or did not."
 )
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
+@click.option(
+    "--report",
+    "report_folder",
+    metavar="DIR",
+    type=click.Path(),
+    help="Also measure reads and pictures of the file, and write the page of `fhash cost` on it.",
+)
 def command(
     data: str,
     output: str,
@@ -67,6 +75,7 @@ def command(
     quiet: bool,
     explain: bool,
     verbose: bool,
+    report_folder: str | None,
 ) -> None:
     """Find the features of DATA, encode them and write them as RUN.fhz.
 
@@ -81,6 +90,8 @@ def command(
 
     # The reader says whether a folder is data at all; `encode` then keeps it from being replaced.
     check_writable(output, force, sources=[] if Path(data).is_dir() else [data])
+    if report_folder is not None:
+        check_report_folder(Path(report_folder), force, data)
     before = _stamp(output)
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         missed = None
@@ -91,6 +102,8 @@ def command(
             missed, report = error, error.figures
         except KeyboardInterrupt:
             raise InterruptedEncodingError(_after_interruption(output, before)) from None
+        if report_folder is not None:
+            _write_report(series, report, config, Path(report_folder), force, missed, progress)
     _say_unmet(source, series, quiet)
     integers = (series.source_dtype or series.dtype).kind in "iu"
     if integers and not quiet and looks_categorical(report):
@@ -118,6 +131,23 @@ def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:
         again = f", {entry['times']} times" if entry["times"] > 1 else ""
         rows.append((entry["stage"], f"{taken}  {entry['why']}{again}"))
     return table(rows)
+
+
+def _write_report(
+    series: Series,
+    figures: dict[str, Any],
+    config: EncodeConfig,
+    folder: Path,
+    force: bool,
+    missed: QualityError | None,
+    progress: Progress,
+) -> None:
+    """Measure reads and pictures of the file just written, and write its report."""
+    from fhash_codec.cost.files import write_report
+    from fhash_codec.cost.one import report_on_encode
+
+    costs = report_on_encode(series, figures, config, missed=missed is not None, progress=progress)
+    write_report(costs, folder, force=force)
 
 
 def _say_unmet(source: SourceOptions, series: Series, quiet: bool) -> None:

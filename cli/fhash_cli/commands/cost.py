@@ -1,0 +1,126 @@
+"""`fhash cost`: what accuracy costs on the user's own series, as a page, a PNG and JSON."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fhash_cli.base_command import BaseCommand
+from fhash_cli.options import (
+    SourceOptions,
+    force_option,
+    json_option,
+    quiet_option,
+    series_options,
+)
+from fhash_cli.output import Progress, duration, emit, extent, table
+from fhash_formats.errors import InputError, InterruptedEncodingError, OutputError
+
+if TYPE_CHECKING:
+    from fhash_codec.cost.results import CostReport
+
+MAX_BUDGET = 86_400.0
+"""Longest budget, in seconds."""
+
+
+class DurationType(click.ParamType[float]):
+    """A time such as 90s, 2m or 1h; a plain number is in seconds."""
+
+    name = "TIME"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Seconds; refuses what is no time, and one outside of 1 s to 24 h."""
+        if isinstance(value, float):
+            return value
+        match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([smh]?)", str(value).strip())
+        if match is None:
+            self.fail(f"'{value}' is no time; write one such as 90s, 2m or 1h", param, ctx)
+        seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
+        if not 1 <= seconds <= MAX_BUDGET:
+            self.fail(f"'{value}' is {seconds:g} s; allowed: 1s to 24h", param, ctx)
+        return seconds
+
+
+@click.command("cost", cls=BaseCommand)
+@click.argument("data", type=click.Path())
+@click.option(
+    "-o",
+    "output",
+    metavar="DIR",
+    type=click.Path(),
+    help="Folder of the report: cost.html, cost.png and cost.json.  [default: DATA.cost here]",
+)
+@series_options
+@click.option(
+    "--budget",
+    type=DurationType(),
+    default="2m",
+    show_default=True,
+    help="Time to measure for, such as 90s, 2m or 1h.",
+)
+@force_option
+@json_option
+@quiet_option
+def command(
+    data: str,
+    output: str | None,
+    source: SourceOptions,
+    budget: float,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Measure what accuracy costs on DATA: seconds and bytes of encoding, reading and drawing.
+
+    The most telling measurements come first, until the budget is spent; the report says what was
+    left out. Ctrl-C ends the measurements, and the report of what there is by then is written.
+    SZ3, SPERR and ZFP come with pip install 'fhash[bench]', as does what the page needs; the
+    profile paper with 'fhash[train]'.
+    """
+    folder = Path(output) if output is not None else Path(Path(data).stem + ".cost")
+    check_report_folder(folder, force, data)
+    with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
+        from fhash_codec.cost.cost import measure_cost
+        from fhash_codec.cost.files import write_report
+
+        report = measure_cost(series, budget=budget, progress=progress)
+        paths = write_report(report, folder, force=force)
+    stopped = None
+    if report.interrupted:
+        stopped = InterruptedEncodingError(
+            f"interrupted; {paths[0]} has what was measured until then"
+        )
+    result = {"paths": [str(path) for path in paths], **report.to_dict()}
+    emit(result, report_text(report, paths), as_json, stopped)
+
+
+def check_report_folder(folder: Path, force: bool, data: str) -> None:
+    """Refuse the folder of a report before any work; raises InputError and what imports raise."""
+    from fhash_codec.cost.files import check_folder
+
+    try:
+        check_folder(folder, force, sources=(Path(data),))
+    except OutputError as error:
+        raise InputError(str(error)) from error
+
+
+def report_text(report: CostReport, paths: list[Path]) -> str:
+    """The recommendation, what was left out, and where the report is."""
+    from fhash_codec.cost.advice import told
+
+    lines = [told(entry) for entry in report.advice]
+    late = [entry.what for entry in report.left_out if entry.late]
+    if late:
+        lines += ["", f"no time was left for: {'; '.join(late)}"]
+    lines += [f"left out: {entry.what}: {entry.why}" for entry in report.left_out if not entry.late]
+    facts = [
+        ("measured", f"{report.measured}, {extent(report.measured_shape)}"),
+        ("time", f"{duration(report.seconds)} of {duration(report.budget_seconds)}"),
+        *(("written", str(path)) for path in paths),
+    ]
+    return "\n".join([*lines, "", table(facts)]).strip()

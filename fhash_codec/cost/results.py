@@ -1,0 +1,223 @@
+"""Results of `fhash cost`, as records and JSON values.
+
+PSNR is in dB over all finite values with the range of the measured series, unless a field says
+otherwise; it is None where nothing differs or where it is not known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+OWN = ("compact", "paper")
+"""Codecs of this package; the others are peers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Encoded:
+    """One encoding: what was predicted, and what was measured.
+
+    Attributes:
+        name: the encoding in words, such as "compact, effort 5, 50 dB".
+        codec: "compact", "paper" or the name of a peer.
+        group: the curve that the point belongs to, such as "compact, effort 5".
+        options: options of `fhash encode` that give it again; empty for a peer.
+        seconds: of the whole encoding; None where it was predicted only.
+        bytes: of the file; for a peer of its stored chunks.
+        ratio: raw bytes over `bytes`.
+        psnr: dB over all finite values.
+        psnr_bulk: dB over the middle 98 % of the values.
+        max_abs_error: largest error, in data units.
+        exact: whether nothing differs.
+        missed: whether the file misses its promise.
+        predicted_seconds, predicted_bytes, predicted_psnr: what was foretold; None where it was
+            not.
+        basis: what the prediction rests on, in words; empty without one.
+    """
+
+    name: str
+    codec: str
+    group: str
+    options: str = ""
+    seconds: float | None = None
+    bytes: int | None = None
+    ratio: float | None = None
+    psnr: float | None = None
+    psnr_bulk: float | None = None
+    max_abs_error: float | None = None
+    exact: bool = False
+    missed: bool = False
+    predicted_seconds: float | None = None
+    predicted_bytes: int | None = None
+    predicted_psnr: float | None = None
+    basis: str = ""
+
+    @property
+    def measured(self) -> bool:
+        """Whether the encoding was made, and not predicted only."""
+        return self.seconds is not None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values by field name, and `measured`."""
+        return {**asdict(self), "measured": self.measured}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curve:
+    """The course of one training: points of {seconds, epoch, psnr}, psnr in dB on samples."""
+
+    name: str
+    points: tuple[dict[str, float | None], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """A stage of one encoding.
+
+    Attributes:
+        stage: its name. why: why it ran, or was left out.
+        seconds: in it, without those of stages inside.
+        times: how often it was entered; 0 for one that was left out.
+    """
+
+    stage: str
+    seconds: float
+    times: int
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gain:
+    """The size of a compact file after a part of the search, estimated but for the last.
+
+    Attributes:
+        seconds: since the search began; None where the file does not tell.
+    """
+
+    what: str
+    bytes: int
+    seconds: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Read:
+    """One kind of read from one file: medians over random places.
+
+    Attributes:
+        file: name of the encoding.
+        file_psnr: dB of the whole file.
+        what: kind of the read, such as "frame".
+        values: number of values that one read gives.
+        milliseconds: of a read, opening the file included.
+        bytes_read: of the file, its directory included.
+        psnr: dB of what was read against the source, with the range of the series.
+        max_abs_error: largest difference, in data units.
+    """
+
+    file: str
+    file_psnr: float | None
+    what: str
+    values: int
+    milliseconds: float
+    bytes_read: int
+    psnr: float | None
+    max_abs_error: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """One picture.
+
+    Attributes:
+        group: what is varied, such as "step length" or "effect".
+        setting: its value in words.
+        milliseconds: median of some runs, of marching and lighting a frame that is decoded already,
+            except for the group "first picture".
+        counters: see `fhash_codec.rendering.task.counters.COUNTERS`.
+        psnr, ssim: of the picture against the best one of its group; None where the group has none,
+            psnr also where nothing differs.
+        best: whether the others are compared with this one.
+    """
+
+    group: str
+    setting: str
+    milliseconds: float
+    counters: dict[str, int]
+    psnr: float | None
+    ssim: float | None
+    best: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Advice:
+    """The best of what was measured for an accuracy.
+
+    Attributes:
+        psnr: accuracy asked for, in dB.
+        aim: "smallest" or "fastest" of this package, or "smallest peer".
+        name: the encoding.
+        options: options of `fhash encode` that give it; empty for a peer.
+        seconds, bytes, reached: its figures, reached in dB; None where exact.
+    """
+
+    psnr: float
+    aim: str
+    name: str
+    options: str
+    seconds: float
+    bytes: int
+    reached: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeftOut:
+    """A thing that was not measured, and why; late: whether time alone was wanting."""
+
+    what: str
+    why: str
+    late: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostReport:
+    """Everything that `fhash cost` measured.
+
+    Attributes:
+        series: source and variable. shape: (t, z, y, x) of the whole series.
+        measured: the part that was measured, in words. measured_shape: its shape.
+        raw_bytes: of the measured part.
+        value_range: smallest and largest value of it.
+        budget_seconds, seconds: what was allowed, and what it took.
+        interrupted: whether Ctrl-C ended it.
+        curves: of the encodings that were trained.
+        stages, gains: of the one encoding of a report.
+        per_step: figures of each step of the one encoding of a report.
+        machine: where it was measured. notes: how.
+    """
+
+    series: str
+    units: str
+    dtype: str
+    shape: tuple[int, ...]
+    measured: str
+    measured_shape: tuple[int, ...]
+    raw_bytes: int
+    value_range: tuple[float, float]
+    budget_seconds: float
+    seconds: float
+    interrupted: bool
+    encodings: tuple[Encoded, ...]
+    curves: tuple[Curve, ...]
+    stages: tuple[Stage, ...]
+    gains: tuple[Gain, ...]
+    per_step: tuple[dict[str, Any], ...]
+    reads: tuple[Read, ...]
+    pictures: tuple[Picture, ...]
+    advice: tuple[Advice, ...]
+    left_out: tuple[LeftOut, ...]
+    machine: dict[str, Any]
+    notes: tuple[str, ...] = field(default=())
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values by field name."""
+        return {**asdict(self), "encodings": [entry.to_dict() for entry in self.encodings]}
