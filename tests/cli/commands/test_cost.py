@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
-from fhash_cli.commands.cost import DurationType
+from fhash_cli.durations import DurationType
 from fhash_codec.cost import cost, files, own, pictures
 from fhash_codec.cost.plan import Wish
 from fhash_codec.cost.prediction import Prediction
