@@ -2,7 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 # Tests run in a process for each processor; those of a file stay together, since they share what is dear to make.
-SPREAD := -n auto --dist loadfile
+# tests/conftest.py puts the slow files first; xdist's own order, most tests first, would leave them to the end.
+SPREAD := -n auto --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test types units hard wheels clean
 

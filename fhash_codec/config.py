@@ -156,6 +156,11 @@ class EncodeConfig:
         high=2**31,
         profile="paper",
     )
+    brick: str = option(
+        "auto",
+        "paper: vertices that are trained together, as ZxYxX such as 8x8x16; 'auto' for about 1024",
+        profile="paper",
+    )
     psnr: float | None = option(
         None,
         "promise of quality in dB over the coreset of all steps "

@@ -1,7 +1,12 @@
 """Settings of the process that all tests share."""
 
+from __future__ import annotations
+
 import os
 import signal
+from pathlib import Path
+
+import pytest
 
 # The tests' models are tiny: a second thread costs more than it brings, above all where several
 # test runs share a machine.
@@ -13,3 +18,21 @@ for _name, _usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.
     _number = getattr(signal, _name, None)
     if _number is not None and signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _usual)
+
+SLOW_ROOMS = ("fresh", "hard", "golden")
+"""Rooms of `tests` whose files take minutes: they run first, so that no process ends alone."""
+SLOW_FILES = ("test_pictures.py", "test_coder.py", "test_train.py")
+"""Names of files that take a good part of a minute."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts slow files first, and keeps the order of all others."""
+    root = Path(__file__).parent
+
+    def rank(item: pytest.Item) -> int:
+        room = item.path.relative_to(root).parts[0]
+        if room in SLOW_ROOMS:
+            return SLOW_ROOMS.index(room)
+        return len(SLOW_ROOMS) + (item.path.name not in SLOW_FILES)
+
+    items.sort(key=rank)

@@ -29,7 +29,8 @@ ALLOWED = {
 }
 TORCH_FILES = re.compile(
     r"paper/(fhash|tesseract)\.py|paper/(training|engines)/.+\.py|training/.+\.py|bench/train\.py"
-    r"|rendering/task/torch_arrays\.py"
+    r"|rendering/task/torch_arrays\.py|bench/paper/(bench|between|training)\.py"
+    r"|bench/paper/encodings/.+\.py"
 )
 """Modules of fhash_codec that train or evaluate tensors, march through them, or start training."""
 SLOW = ("torch", "xarray", "zarr", "h5py", "matplotlib", "pandas", "scipy")

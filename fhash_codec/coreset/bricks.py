@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import prod
 from typing import TypeVar
 
 import numpy as np
@@ -21,12 +22,15 @@ from fhash_codec.coreset.extent import Extent, find_extent
 from fhash_codec.coreset.features import Feature
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.progress import Progress
+from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 BRICK_BITS = (3, 3, 4)
 """Exponents of two of the usual brick: 8 x 8 x 16 vertices (z, y, x)."""
+MAX_BRICK_VERTICES = 1 << 15
+"""Vertices of a brick that is asked for: the engines hold all inputs of a batch at once."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -166,6 +170,26 @@ def brick_shape(size: Sizes) -> Sizes:
         bits[min(growing, key=lambda axis: bits[axis])] += 1
     counts = [-(-length // 2**bit) for length, bit in zip(size, bits, strict=True)]
     z, y, x = (-(-length // count) for length, count in zip(size, counts, strict=True))
+    return z, y, x
+
+
+def parse_brick(text: str) -> Sizes | None:
+    """The shape (z, y, x) of a brick that a setting names; None for 'auto'.
+
+    Raises InputError for another text and for a brick that is too large.
+    """
+    if text == "auto":
+        return None
+    try:
+        numbers = [int(number) for number in text.split("x")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 3 or min(numbers) < 1 or prod(numbers) > MAX_BRICK_VERTICES:
+        raise InputError(
+            f"brick is '{text}'; allowed: auto, or three whole numbers (z, y, x) as in 8x8x16,"
+            f" {MAX_BRICK_VERTICES:,} vertices at most"
+        )
+    z, y, x = numbers
     return z, y, x
 
 

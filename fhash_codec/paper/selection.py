@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy.typing as npt
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.bricks import Coreset, build_coreset
+from fhash_codec.coreset.bricks import Coreset, build_coreset, parse_brick
 from fhash_codec.coreset.features import Feature
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.coreset.selection import resolve_selection
@@ -49,6 +49,7 @@ def select(
     Raises:
         InputError: the settings do not fit the series, or they select nothing.
     """
+    brick = parse_brick(config.brick)
     scanned, key_frames, features = resolve_selection(series, config, progress, mask)
     with stage("coreset", "samples at the key frames, for the training"):
         coreset = build_coreset(
@@ -59,6 +60,7 @@ def select(
             config.dilation,
             progress,
             fringe=config.fringe == "trained",
+            brick=brick,
         )
     architecture = Architecture.for_box(
         coreset.box.shape,

@@ -107,7 +107,13 @@ def parsed(result: Result, code: int = 0) -> Any:
 def test_the_document_names_every_command() -> None:
     commands = {title.split()[0] for title in KEYS} - {"Errors"}
     assert commands == set(COMMANDS) - WITHOUT_JSON
-    assert {"bench train", "bench rate", "bench labels", "bench render"} <= KEYS.keys()
+    assert {
+        "bench train",
+        "bench rate",
+        "bench labels",
+        "bench paper",
+        "bench render",
+    } <= KEYS.keys()
 
 
 @pytest.mark.parametrize(
@@ -146,6 +152,8 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
         outputs["info"].append(parsed(fhash("info", path, "--json")))
     detailed = ["--var", "density", "--t", "1:", "--missing", "-9"]
     outputs["encode --explain"] = explained
+    words = ["encode", data, "-o", path, "--force", "--effort", "2", "--time-budget", "10m"]
+    outputs["encode --time-budget"] = [*outputs["encode"], parsed(fhash(*words, "--json", "-q"))]
     outputs["info DATA"].append(parsed(fhash("info", data, *detailed, "--json")))
     for command, results in outputs.items():
         check(command, *results)
@@ -246,9 +254,22 @@ def test_bench_rate() -> None:
     check("bench rate", json.loads(json.dumps(result.to_dict())))
 
 
+def test_bench_ablate(fhash: Fhash, data: Path) -> None:
+    words = ["bench", "ablate", data, "--axis", "fringe", "--epochs", "1"]
+    check("bench ablate", parsed(fhash(*words, "--json", "-q")))
+
+
 def test_bench_labels(fhash: Fhash) -> None:
     words = ["bench", "labels", "--kind", "tiny grid", "--effort", "1"]
     check("bench labels", parsed(fhash(*words, "--json", "-q")))
+
+
+def test_bench_paper(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    words = ["bench", "paper", data, "--quick", "--epochs", "1", "--protocol", "equal", "--feature"]
+    words += ["interval:6:99", "--encoding", "fhash", "-o", tmp_path, "--no-latency"]
+    results = [parsed(fhash(*words, "--json", "-q"))]
+    results.append(parsed(fhash("bench", "paper", "--parameters", "--json")))
+    check("bench paper", *results)
 
 
 def test_bench_render() -> None:

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.base_command import BaseGroup
+from fhash_cli.commands.bench_ablate import ablate
 from fhash_cli.commands.bench_labels import labels
+from fhash_cli.commands.bench_paper import paper
 from fhash_cli.commands.bench_render import render
 from fhash_cli.options import (
     RealRange,
@@ -80,7 +82,9 @@ def command() -> None:
     """Measure speed and size on this machine."""
 
 
+command.add_command(ablate)
 command.add_command(labels)
+command.add_command(paper)
 command.add_command(render)
 
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import glob
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.commands.cost import check_report_folder
+from fhash_cli.durations import DurationType
 from fhash_cli.options import (
     SourceOptions,
     check_writable,
@@ -34,10 +38,11 @@ from fhash_cli.output import (
     spans,
     table,
 )
-from fhash_formats.errors import InterruptedEncodingError, QualityError
+from fhash_formats.errors import FhashWarning, InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
+    from fhash_codec.cost.time_budget import Choice
     from fhash_formats.series import Series
 
 MAX_LABELS = 64
@@ -57,6 +62,13 @@ MAX_LABELS = 64
 @click.option(
     "--explain", is_flag=True, help="Say how long each stage took, and why it ran or did not."
 )
+@click.option(
+    "--time-budget",
+    type=DurationType(),
+    help="Choose the highest effort, or with --profile paper the most epochs, that should take no "
+    "longer than a time such as 60s or 5m, by a short probe; --effort or --epochs is then the most "
+    "that may be chosen.",
+)
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
 @click.option(
     "--report",
@@ -74,6 +86,7 @@ def command(
     as_json: bool,
     quiet: bool,
     explain: bool,
+    time_budget: float | None,
     verbose: bool,
     report_folder: str | None,
 ) -> None:
@@ -96,8 +109,15 @@ def command(
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
         missed: QualityError | None = None
         stopped: InterruptedEncodingError | None = None
+        choice = None
+        if time_budget is not None:
+            choice = _choose(series, config, time_budget, progress, quiet=quiet)
+            config = choice.config
+        predicted = None if choice is None else dataclasses.asdict(choice.prediction)
         try:
-            report = fhash_codec.encode(series, output, config, force=force, progress=progress)
+            report = fhash_codec.encode(
+                series, output, config, force=force, progress=progress, predicted=predicted
+            )
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
@@ -119,7 +139,36 @@ def command(
     if explain:
         report["stages"] = stages
         text += f"\n\n{stage_table(stages)}"
+    if choice is not None:
+        report["time_budget"] = choice.to_dict()
     emit(report, text, as_json, missed or stopped)
+
+
+def _choose(
+    series: Series,
+    config: EncodeConfig,
+    seconds: float,
+    progress: Progress,
+    *,
+    quiet: bool,
+) -> Choice:
+    """Choose effort or epochs by a budget in seconds, and say so in one line."""
+    from fhash_codec.cost.time_budget import choose
+
+    name = "epochs" if config.profile == "paper" else "effort"
+    given = click.get_current_context().get_parameter_source(name)
+    choice = choose(
+        series,
+        config,
+        seconds,
+        capped=given is not None and given is not ParameterSource.DEFAULT,
+        progress=progress,
+    )
+    if not choice.fits:
+        warnings.warn(choice.why, FhashWarning, stacklevel=2)
+    elif not quiet:
+        say(choice.why)
+    return choice
 
 
 def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:

@@ -5,7 +5,7 @@ from math import prod
 import numpy as np
 import pytest
 
-from fhash_codec.coreset.bricks import brick_shape, build_coreset
+from fhash_codec.coreset.bricks import brick_shape, build_coreset, parse_brick
 from fhash_codec.coreset.features import Everything, Interval, Isosurface, Segmentation, dilate
 from fhash_codec.coreset.occupancy import unpack
 from fhash_codec.coreset.scan import scan
@@ -267,3 +267,11 @@ def test_a_fringe_without_a_value_has_that_of_the_neighbour() -> None:
     expected = np.stack([np.full((3, 4), 0.75), np.full((3, 4), 0.5)]).astype(np.float32)
     expected[0, 0, 0] = 1.0
     np.testing.assert_array_equal(middle, seen.value_range.to_unit(expected))
+
+
+def test_bricks_are_named_by_their_shape():
+    assert parse_brick("auto") is None
+    assert parse_brick("4x2x16") == (4, 2, 16)
+    for text in ("4x2", "4x0x2", "axbxc", "64x64x64"):
+        with pytest.raises(InputError, match=f"brick is '{text}'; allowed"):
+            parse_brick(text)

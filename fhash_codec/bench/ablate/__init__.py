@@ -1,0 +1,1 @@
+"""`fhash bench ablate`: what each setting changes, one axis at a time."""

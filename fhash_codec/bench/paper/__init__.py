@@ -1,0 +1,1 @@
+"""The input encodings of the F-Hash paper's evaluation, trained side by side."""

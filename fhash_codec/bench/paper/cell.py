@@ -1,0 +1,146 @@
+"""A cell of the bench: one encoding, trained once on one feature of one data set."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+from fhash_formats.errors import InputError
+
+CELL_VERSION = 1
+"""Version of the cells and of what they measure; a cell of another version is run again."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """A point of a curve, after whole epochs. Figures are None where they were not measured.
+
+    Attributes:
+        step: Adam steps of each model.
+        epoch: passes over all samples.
+        seconds: training alone, of all models together.
+        coreset_psnr: dB of normalised values over the coreset at the key frames (peak 1).
+        coreset_ssim: mean SSIM over the coreset at the key frames.
+        domain_psnr: as `coreset_psnr`, over every vertex of the domain; what was not trained holds
+            the background.
+        domain_ssim: mean SSIM over the domain at the key frames.
+        picture_psnr: dB of pictures, mean over the key frames.
+        picture_ssim: SSIM of pictures, mean over the key frames.
+    """
+
+    step: int
+    epoch: int
+    seconds: float
+    coreset_psnr: float | None = None
+    coreset_ssim: float | None = None
+    domain_psnr: float | None = None
+    domain_ssim: float | None = None
+    picture_psnr: float | None = None
+    picture_ssim: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """The result of one training, as a file keeps it.
+
+    Attributes:
+        encoding: name of the encoding.
+        protocol: published, equal or best.
+        data_set: flame, bubble, shell, or the name of the user's data.
+        shape: (t, z, y, x) of the series.
+        feature: kind of the feature: interval, isosurface, segmentation, or as the user wrote it.
+        key_frames: steps of the series.
+        coreset_share: vertices of the coreset / vertices of the key frames.
+        box: spans (first, end) along z, y and x of the feature bounding box.
+        seed: seed of the initial numbers and of the batches.
+        parameters: {"tables", "mlp"}, trained numbers of all models.
+        buckets_used: share of the embeddings that a gradient moved.
+        bytes: the trained numbers as float32, compressed by zstd, as the product stores them;
+            embeddings that no gradient moved are 0.
+        raw_bytes: the source's values of all steps.
+        samples_an_epoch: samples that all models together see in an epoch.
+        steps_an_epoch: Adam steps of each model in an epoch.
+        samples_per_second: of training.
+        training_seconds: of all epochs.
+        curve: points, the first before training.
+        settings: all other settings of the training by name; together with the fields above they
+            identify the cell.
+        latency: of pictures through the encoding, as `latency.measure_latency` has it, or None.
+        between: figures of all steps over the coreset of the key frames around each, or None.
+            "psnr" in dB of all steps by interpolation in time; "psnr_key_frames" and
+            "psnr_between" of those that are key frames and of the others; "psnr_linear" of the
+            others where the source's key frames are interpolated. "psnr_fringe" and
+            "psnr_fringe_linear" at vertices in the coreset of one of the two key frames, whose
+            share is "fringe_share"; "missed_share" of the steps' own features is in neither.
+        collisions: share of the corners of hashed levels that share their bucket; 0 for others.
+        trial: {steps, seconds, psnr, reached} of each number of steps that the protocol best
+            tried; `reached` has the seconds to 20, 30 and 40 dB, or None.
+        machine: processor, threads, versions, date.
+    """
+
+    encoding: str
+    protocol: str
+    data_set: str
+    shape: tuple[int, int, int, int]
+    feature: str
+    key_frames: tuple[int, ...]
+    coreset_share: float
+    box: tuple[tuple[int, int], tuple[int, int], tuple[int, int]]
+    seed: int
+    parameters: dict[str, int]
+    buckets_used: float
+    bytes: int
+    raw_bytes: int
+    samples_an_epoch: int
+    steps_an_epoch: int
+    samples_per_second: float
+    training_seconds: float
+    curve: tuple[Point, ...]
+    settings: dict[str, Any] = field(default_factory=dict)
+    latency: dict[str, Any] | None = None
+    between: dict[str, Any] | None = None
+    machine: dict[str, Any] = field(default_factory=dict)
+    collisions: float = 0.0
+    trial: tuple[dict[str, Any], ...] = ()
+    engine: str = "gather"
+    version: int = CELL_VERSION
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON values by field name."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The cell of what `to_dict` gave; raises InputError for missing or unknown fields."""
+        needed = {entry.name for entry in dataclasses.fields(cls)}
+        if values.keys() != needed:
+            raise InputError(
+                f"a cell has the fields {', '.join(sorted(values))};"
+                f" needed: {', '.join(sorted(needed))}"
+            )
+        tuples = {
+            "shape": tuple(values["shape"]),
+            "key_frames": tuple(values["key_frames"]),
+            "box": tuple(tuple(span) for span in values["box"]),
+            "curve": tuple(Point(**point) for point in values["curve"]),
+            "trial": tuple(values["trial"]),
+        }
+        return cls(**{**values, **tuples})
+
+    def reached(self, decibels: float, figure: str = "coreset_psnr") -> Point | None:
+        """The first point whose figure is at least `decibels`; None where none is (NR)."""
+        for point in self.curve:
+            value = getattr(point, figure)
+            if value is not None and value >= decibels:
+                return point
+        return None
+
+
+def settings_id(settings: Mapping[str, Any]) -> str:
+    """Eight hexadecimal digits of a hash of settings, by which their cell is found again."""
+    text = json.dumps({**settings, "version": CELL_VERSION}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:8]

@@ -1,0 +1,1 @@
+"""Input encodings: what turns a place into the inputs of a small network."""

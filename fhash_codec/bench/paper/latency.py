@@ -1,0 +1,207 @@
+"""Latency of pictures straight through an encoding (paper, Table 6): sample streaming and ARM.
+
+The paper gives milliseconds alone, and F-Hash alone has an occupancy there. Milliseconds mix three
+things: samples that are asked for, passes in which they come, and the cost of one evaluation. So
+each encoding is marched with and without the occupancy of the coreset, and passes, samples and
+evaluations are counted.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from statistics import median
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fhash_codec.bench.paper.encodings.encoding import Encoding
+from fhash_codec.bench.paper.pictures import view_of_feature
+from fhash_codec.progress import Progress, silent
+from fhash_codec.rendering.camera.camera import Grid
+from fhash_codec.rendering.scene.scene import Camera
+from fhash_codec.rendering.stream.fields import FrameField
+from fhash_codec.rendering.stream.stream import stream
+from fhash_codec.rendering.task.arrays import Array, Arrays
+from fhash_codec.rendering.task.bricks import Bricks
+from fhash_codec.rendering.task.palette import Palette
+from fhash_codec.rendering.task.task import Frame
+from fhash_codec.rendering.task.torch_arrays import TorchArrays
+from fhash_codec.training.devices import choose_device
+
+__all__ = ["EncodingField", "measure_latency"]
+
+Mask = npt.NDArray[np.bool_]
+Range = tuple[float, float]
+
+SIZE = 64
+"""Pixels along both sides of a picture, by default."""
+VIEWS = 3
+"""Random views, by default: the figures are medians over them."""
+MODES = {"stream": False, "arm": True}
+"""Ways to march, and whether each is adaptive."""
+NEAR = 0.125
+"""Distance in vertices over which a slope is the difference of two values."""
+MARGIN = np.float32(1)
+"""Distance beyond 0 and 1 of the least and the largest value that an encoding is taken to hold:
+what it holds is not known before it is evaluated."""
+
+
+class EncodingField:
+    """Values of an encoding at a key frame, evaluated at every place; a `Field` of `stream`.
+
+    A place has no value where a vertex of weight around it is outside the coreset.
+
+    Attributes:
+        evaluations: places at which the encoding was evaluated so far.
+    """
+
+    stride = 1.0
+
+    def __init__(
+        self, encoding: Encoding, key: int, mask: Mask, arrays: Arrays, *, occupancy: bool
+    ) -> None:
+        """Prepare a field.
+
+        Args:
+            encoding: settled.
+            key: number of a key frame.
+            mask: vertices (z, y, x) of the domain in the coreset at the key frame.
+            arrays: tensors on the device of the encoding.
+            occupancy: whether places outside the coreset are known before evaluation; else the
+                encoding is evaluated there in vain.
+        """
+        self.arrays, self.evaluations = arrays, 0
+        self._encoding, self._key, self._occupancy = encoding, key, occupancy
+        z, y, x = mask.shape
+        frame = Frame(values=np.where(mask, np.float32(1), np.float32(np.nan)), first=(0, 0, 0))
+        grid = Grid(counts=(x, y, z), origin=np.zeros(3), spacing=np.ones(3))
+        bricks = Bricks.of(frame)
+        self._coreset = FrameField(frame, grid, bricks, arrays)
+        self.bounds, self.vertices = self._coreset.bounds, self._coreset.vertices
+        self.first = self._coreset.first
+        seen = bricks.low <= bricks.high
+        self.bricks = replace(
+            bricks,
+            low=np.where(seen, -MARGIN, np.float32(np.inf)),
+            high=np.where(seen, 1 + MARGIN, np.float32(-np.inf)),
+        )
+        self._cells = _cells(mask)
+
+    def visible(self, palette: Palette) -> Array:
+        """Cells with a vertex of the coreset, as the product's occupancy has them."""
+        return self.arrays.array(self._cells)
+
+    def values(self, places: Array) -> Array:
+        inside = ~self.arrays.xp.isnan(self._coreset.values(places))
+        result = self.arrays.full(len(places), np.nan)
+        if self._occupancy:
+            result[inside] = self._evaluated(places[inside])
+        else:
+            result[inside] = self._evaluated(places)[inside]
+        return result
+
+    def slopes(self, places: Array) -> Array:
+        """Differences over NEAR to both sides, also where these leave the coreset."""
+        arrays, (low, high) = self.arrays, self.vertices.T
+        slopes = arrays.empty((len(places), 3))
+        for axis in range(3):
+            before, after = arrays.copy(places), arrays.copy(places)
+            before[:, axis] = arrays.xp.clip(places[:, axis] - NEAR, low[axis], high[axis])
+            after[:, axis] = arrays.xp.clip(places[:, axis] + NEAR, low[axis], high[axis])
+            rise = self._evaluated(after) - self._evaluated(before)
+            slopes[:, axis] = rise / arrays.xp.clip(after[:, axis] - before[:, axis], NEAR, None)
+        return slopes
+
+    def _evaluated(self, places: Array) -> Array:
+        """The encoding's values (n,), float64, at places (n, 3), x, y, z."""
+        self.evaluations += len(places)
+        if not len(places):
+            return self.arrays.empty((0,))
+        at = self.arrays.to_float32(self.arrays.xp.flip(places, (1,)))
+        return self.arrays.to_float64(self._encoding.sample(self._key, at).detach())
+
+
+def measure_latency(
+    encoding: Encoding,
+    masks: Sequence[Mask],
+    feature: str,
+    *,
+    value_range: Range = (0.0, 1.0),
+    size: int = SIZE,
+    views: int = VIEWS,
+    seed: int = 0,
+    device: str = "cpu",
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Measure pictures of key frames from random views through an encoding.
+
+    Args:
+        encoding: settled.
+        masks: vertices (z, y, x) of the domain in the coreset, for each key frame.
+        feature, value_range: as for `PictureProbe`.
+        size: pixels along both sides.
+        views: random views; they go through the key frames in turn.
+        seed: of the views.
+        device: of the encoding, cpu or cuda.
+        progress: is told about each picture.
+
+    Returns:
+        {"size", "views", "off": {...}, "on": {...}} for the occupancy off and on, each with
+        "stream_ms" and "arm_ms" (medians over views) and the means over views "stream_passes",
+        "arm_passes", "samples" (streaming), "arm_samples" and "evaluations" (streaming).
+    """
+    arrays = TorchArrays(choose_device(device))
+    rng = np.random.default_rng(seed)
+    cameras = [
+        Camera(azimuth=float(rng.uniform(0, 360)), elevation=float(rng.uniform(-60, 60)))
+        for _ in range(views)
+    ]
+    found: dict[str, Any] = {"size": size, "views": views}
+    runs, done = [(on, mode) for on in (False, True) for mode in MODES], 0
+    for number, camera in enumerate(cameras):
+        key = number % len(masks)
+        task = view_of_feature(
+            masks[key].shape, feature, value_range=value_range, size=size, camera=camera
+        )
+        for on, mode in runs:
+            field = EncodingField(encoding, key, masks[key], arrays, occupancy=on)
+            if not number:  # the first call of a model allocates and compiles
+                field.values(arrays.array(np.zeros((size * size, 3))))
+                field.evaluations = 0
+            begun = time.perf_counter()
+            marched = stream(field, replace(task, skipping=on), adaptive=MODES[mode])
+            spent = 1e3 * (time.perf_counter() - begun)
+            entry = found.setdefault("on" if on else "off", {}).setdefault(mode, [])
+            entry.append((spent, marched.counters, field.evaluations))
+            done += 1
+            progress("rendering", done, views * len(runs), mode)
+    return {**found, **{switch: _summary(found[switch]) for switch in ("off", "on")}}
+
+
+def _summary(runs: dict[str, list[tuple[float, Any, int]]]) -> dict[str, float]:
+    """Medians of milliseconds and means of counts over the views, of one kind of occupancy."""
+
+    def mean(mode: str, name: str) -> float:
+        return float(np.mean([counters[name] for _, counters, _ in runs[mode]]))
+
+    return {
+        "stream_ms": median(spent for spent, _, _ in runs["stream"]),
+        "arm_ms": median(spent for spent, _, _ in runs["arm"]),
+        "stream_passes": mean("stream", "passes"),
+        "arm_passes": mean("arm", "passes"),
+        "samples": mean("stream", "samples"),
+        "arm_samples": mean("arm", "samples"),
+        "evaluations": float(np.mean([count for _, _, count in runs["stream"]])),
+    }
+
+
+def _cells(mask: Mask) -> Mask:
+    """Cells (z, y, x) with at least one vertex of a mask; an axis of one vertex has one cell."""
+    for axis in range(3):
+        if mask.shape[axis] > 1:
+            lines = np.moveaxis(mask, axis, 0)
+            mask = np.moveaxis(lines[:-1] | lines[1:], 0, axis)
+    return mask

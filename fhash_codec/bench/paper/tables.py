@@ -1,0 +1,332 @@
+"""The paper's tables from cells, each beside the figures that the paper prints, quoted.
+
+A table joins cells that differ in their seed alone: medians, with the smallest and the largest.
+Seconds are those of training alone, on the machine of the cells, and never the paper's minutes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+
+from fhash_codec.bench.paper.cell import Cell
+from fhash_codec.bench.paper.groups import Group, by_data, groups, within
+from fhash_codec.bench.paper.printed import (
+    DECIBELS,
+    ENCODINGS,
+    FEATURES,
+    NOTES,
+    PARAMETERS,
+    SETS,
+    TABLE_1,
+    TABLE_2,
+    TABLE_3,
+    TABLE_4,
+    TABLE_5,
+    TABLE_6,
+    notes_of,
+)
+from fhash_codec.bench.paper.sets import paper_parameters
+from fhash_codec.bench.paper.table import QUOTED, PaperTable, Spread, Value
+from fhash_codec.paper.levels import level_resolutions, parameter_count
+
+__all__ = ["paper_tables"]
+
+EPOCHS = 30
+"""Epochs after which Table 4 compares."""
+CLOCKS = {"seconds": "seconds", "epoch": "epochs", "step": "Adam steps"}
+"""Fields of a point that measure the course of a training, and their names."""
+M = 2**20
+"""The paper's million."""
+QUALITIES = {"picture_psnr": "of pictures", "coreset_psnr": "of the coreset's vertices"}
+"""Figures whose course is compared, and their names."""
+MARK = f"paper, {QUOTED}"
+"""Heading of quoted figures."""
+
+
+def paper_tables(cells: Sequence[Cell]) -> tuple[PaperTable, ...]:
+    """Tables 1, and 3 to 6 of all protocols that the cells are of, and what each training was."""
+    grouped = groups(cells)
+    tables = [_trainings(grouped), _folds(), _configurations()]
+    for protocol in dict.fromkeys(group.protocol for group in grouped):
+        mine = [group for group in grouped if group.protocol == protocol]
+        tables += [_convergence(protocol, mine, quality) for quality in QUALITIES]
+        tables += [_accuracy(protocol, mine), _ratios(protocol, mine)]
+        if any(cell.latency for group in mine for cell in group.cells):
+            tables.append(_latency(protocol, mine))
+        if any(cell.between for group in mine for cell in group.cells):
+            tables.append(_between(protocol, mine))
+    return tuple(tables)
+
+
+def _trainings(grouped: Sequence[Group]) -> PaperTable:
+    """Parameters, samples and steps of each training."""
+    rows: list[tuple[Value, ...]] = []
+    for group in grouped:
+        cell = group.first
+        rows.append(
+            (
+                group.protocol,
+                group.data_set,
+                group.feature,
+                group.encoding,
+                cell.parameters["tables"],
+                cell.parameters["mlp"],
+                group.spread(lambda cell: 100 * cell.buckets_used),
+                group.spread(lambda cell: cell.bytes / 1e6),
+                100 * cell.coreset_share,
+                cell.samples_an_epoch,
+                cell.steps_an_epoch,
+                group.spread(lambda cell: cell.samples_per_second / 1e6),
+                group.spread(lambda cell: cell.training_seconds),
+                len(group.cells),
+            )
+        )
+    machines = {
+        ", ".join(f"{name} {value}" for name, value in cell.machine.items())
+        for group in grouped
+        for cell in group.cells
+    }
+    return PaperTable(
+        name="trainings",
+        title="Trainings: what each encoding was given, and what it took",
+        columns=(
+            "protocol", "data set", "feature", "encoding", "table numbers", "MLP numbers",
+            "buckets used %", "stored MB", "coreset %", "samples/epoch", "steps/epoch",
+            "Msamples/s", "seconds", "seeds",
+        ),
+        rows=tuple(rows),
+        notes=(
+            "steps are of each model; per-frame models are trained at once, and each of them makes"
+            " as many",
+            *sorted(machines),
+        ),
+    )  # fmt: skip
+
+
+def _configurations() -> PaperTable:
+    """Table 3, right: parameters at the paper's own configuration, computed, and printed."""
+    rows: list[tuple[Value, ...]] = []
+    for name, title in SETS.items():
+        computed = paper_parameters(name)
+        for encoding, label in ENCODINGS.items():
+            printed = PARAMETERS[name][encoding][-1]
+            rows.append((title, label, computed[encoding], computed[encoding] / M, printed))
+    return PaperTable(
+        name="table-3-parameters",
+        title="Table 3, right: parameters at the paper's configuration (F-Hash: segmentation)",
+        columns=("data set", "encoding", "computed", "computed, M", f"{MARK}, M"),
+        rows=tuple(rows),
+        notes=("M is 2^20", *(note.text for note in NOTES if note.tables == (3,))),
+    )
+
+
+def _folds() -> PaperTable:
+    """Table 1: levels and parameters by fold and embedding, computed, and the printed minutes."""
+    data, rows = TABLE_2["bubble"], []
+    x, y, z = data.box
+    for (fold, size), minutes in TABLE_1.items():
+        levels = level_resolutions((z, y, x), data.key_frames, fold)
+        numbers = parameter_count(levels, size)
+        rows.append((fold, size, len(levels), numbers, minutes, minutes / TABLE_1[fold, 1]))
+    return PaperTable(
+        name="table-1",
+        title="Table 1: F-Hash on Argon Bubble (segmentation) by fold and embedding size",
+        columns=("fold", "embedding", "levels, computed", "table numbers, computed",
+                 f"minutes ({MARK})", "of embedding 1"),
+        rows=tuple(rows),
+        notes=("`fhash bench ablate` measures folds, embeddings and networks", *notes_of(1)),
+    )  # fmt: skip
+
+
+def _convergence(protocol: str, grouped: Sequence[Group], quality: str) -> PaperTable:
+    """Table 3, left: seconds, epochs and Adam steps to a PSNR."""
+    rows: list[tuple[Value, ...]] = []
+    for (name, feature), mine in by_data(grouped):
+        for decibels, (clock, label) in product(DECIBELS, CLOCKS.items()):
+            if not any(
+                cell.reached(decibels, quality) for group in mine.values() for cell in group.cells
+            ):
+                continue
+            found = {
+                encoding: group.reached(decibels, quality, clock)
+                for encoding, group in mine.items()
+            }
+            rows.append(_convergence_row(name, feature, decibels, label, found))
+        if quality != "picture_psnr" or name not in TABLE_3 or feature not in FEATURES:
+            continue
+        for decibels in DECIBELS:
+            minutes = {
+                encoding: Spread.of([three[FEATURES.index(feature)]])
+                for encoding, three in TABLE_3[name][decibels].items()
+            }
+            rows.append(_convergence_row(name, feature, decibels, f"minutes ({MARK})", minutes))
+    pictures = quality == "picture_psnr"
+    return PaperTable(
+        name=f"table-3-{'pictures' if pictures else 'volume'}-{protocol}",
+        title=f"Table 3, left, protocol {protocol}: course to a PSNR {QUALITIES[quality]}",
+        columns=("data set", "feature", "dB", "of", *ENCODINGS, "best other / fhash"),
+        rows=tuple(rows),
+        notes=(
+            "NR: not reached, a dash: not measured; what no encoding reached has no row",
+            *(("pictures are means over key frames of decoded values, marched",) if pictures else
+              ("all vertices of the coreset at the key frames, also for encodings that were trained"
+               " on more",)),
+            *(notes_of(4) if pictures else ()),
+        ),
+    )  # fmt: skip
+
+
+def _convergence_row(
+    name: str, feature: str, decibels: int, label: str, found: Mapping[str, Spread | None]
+) -> tuple[Value, ...]:
+    """A row of times by encoding, and how many times longer the best other encoding took."""
+    others = [one.median for key, one in found.items() if one is not None and key != "fhash"]
+    own = found.get("fhash")
+    ratio: Value = None
+    if own is not None and others and own.median < float("inf"):
+        ratio = min(others) / own.median if own.median else None
+        ratio = "others NR" if ratio == float("inf") else ratio
+    return name, feature, decibels, label, *(found.get(key) for key in ENCODINGS), ratio
+
+
+def _accuracy(protocol: str, grouped: Sequence[Group]) -> PaperTable:
+    """Table 4: PSNR and SSIM of pictures, and seconds, after 30 epochs."""
+    kinds = {group.feature for group in grouped}
+    chosen = "segmentation" if "segmentation" in kinds else sorted(kinds)[0]
+    rows: list[tuple[Value, ...]] = []
+    epochs = {within(cell, EPOCHS).epoch for group in grouped for cell in group.cells}
+    for (name, feature), mine in by_data(grouped):
+        if feature != chosen:
+            continue
+        untrained = {
+            key: group.spread(lambda cell: cell.curve[0].picture_psnr)
+            for key, group in mine.items()
+        }
+        rows.append(
+            (name, "picture PSNR before training, dB", *(untrained.get(key) for key in ENCODINGS))
+        )
+        for figure, label, digits in (
+            ("picture_psnr", "picture PSNR, dB", 3),
+            ("picture_ssim", "picture SSIM", 4),
+            ("coreset_psnr", "volume PSNR, dB", 3),
+            ("seconds", "seconds", 3),
+        ):
+            found = {key: group.after(EPOCHS, figure, digits) for key, group in mine.items()}
+            rows.append((name, label, *(found.get(key) for key in ENCODINGS)))
+        if name in TABLE_4:
+            printed = [TABLE_4[name][key] for key in ENCODINGS]
+            rows.append((name, f"picture PSNR ({MARK})", *(cell.psnr for cell in printed)))
+            rows.append((name, f"picture SSIM ({MARK})", *(cell.ssim for cell in printed)))
+            rows.append((name, f"minutes ({MARK})", *(cell.minutes for cell in printed)))
+    after = " or ".join(map(str, sorted(epochs)))
+    return PaperTable(
+        name=f"table-4-{protocol}",
+        title=f"Table 4, protocol {protocol}: {chosen} after {after} epochs",
+        columns=("data set", "figure", *ENCODINGS),
+        rows=tuple(rows),
+        notes=notes_of(4),
+    )
+
+
+def _ratios(protocol: str, grouped: Sequence[Group]) -> PaperTable:
+    """Table 5: the paper's ratio, raw bytes of all steps over 4 bytes a parameter."""
+    rows: list[tuple[Value, ...]] = []
+    for (name, feature), mine in by_data(grouped):
+        figures: dict[str, Callable[[Cell], float | None]] = {
+            "raw / (4 B x parameters)": lambda c: c.raw_bytes / (4 * sum(c.parameters.values())),
+            "raw / stored bytes": lambda c: c.raw_bytes / c.bytes,
+            "PSNR at key frames, dB": lambda c: c.curve[-1].coreset_psnr,
+            "PSNR at all steps, dB": lambda c: (c.between or {}).get("psnr"),
+        }
+        for label, figure in figures.items():
+            found = {key: group.spread(figure) for key, group in mine.items()}
+            rows.append((name, feature, label, *(found.get(key) for key in ENCODINGS)))
+        if name in TABLE_5 and feature in FEATURES:
+            place = FEATURES.index(feature)
+            printed = [TABLE_5[name][key] for key in ENCODINGS]
+            rows.append(
+                (name, feature, f"ratio ({MARK})", *(p[min(place, len(p) - 1)] for p in printed))
+            )
+    return PaperTable(
+        name=f"table-5-{protocol}",
+        title=f"Table 5, protocol {protocol}: the paper's ratio, by parameters",
+        columns=("data set", "feature", "figure", *ENCODINGS),
+        rows=tuple(rows),
+        notes=(
+            "that ratio sets key frames of a feature against all steps of the whole domain, and"
+            " asks for no quality: files at a quality are in the table of files",
+            *notes_of(5),
+        ),
+    )
+
+
+def _latency(protocol: str, grouped: Sequence[Group]) -> PaperTable:
+    """Table 6: milliseconds, passes and evaluations of pictures, with and without occupancy."""
+    rows: list[tuple[Value, ...]] = []
+    for group in grouped:
+        cells = [cell.latency for cell in group.cells if cell.latency]
+        for switch in ("off", "on") if cells else ():
+            entry = {
+                key: Spread.of([one[switch][key] for one in cells]) for key in cells[0][switch]
+            }
+            gain = Spread.of([one[switch]["stream_ms"] / one[switch]["arm_ms"] for one in cells])
+            printed = TABLE_6.get(group.data_set, {}).get(group.encoding)
+            quoted = (
+                f"{printed.stream:g} / {printed.arm:g} ({printed.gain:.2f}x)"
+                if printed and switch == ("on" if group.encoding == "fhash" else "off")
+                else None
+            )
+            rows.append(
+                (
+                    group.data_set, group.feature, group.encoding, switch, entry["stream_ms"],
+                    entry["arm_ms"], gain, entry["stream_passes"], entry["arm_passes"],
+                    entry["samples"], entry["evaluations"], quoted,
+                )
+            )  # fmt: skip
+    return PaperTable(
+        name=f"table-6-{protocol}",
+        title=f"Table 6, protocol {protocol}: pictures of key frames straight through the encoding",
+        columns=(
+            "data set", "feature", "encoding", "occupancy", "stream ms", "ARM ms", "gain",
+            "passes", "passes, ARM", "samples", "evaluations", f"ms, stream / ARM ({MARK})",
+        ),
+        rows=tuple(rows),
+        notes=(
+            "counts are means and milliseconds medians over random views; samples and evaluations"
+            " are those of streaming",
+            *notes_of(6),
+        ),
+    )  # fmt: skip
+
+
+def _between(protocol: str, grouped: Sequence[Group]) -> PaperTable:
+    """PSNR at all steps, beside the true key frames interpolated linearly."""
+    figures = {
+        "psnr_key_frames": "key frames, dB",
+        "psnr_between": "between, dB",
+        "psnr_linear": "true key frames, interpolated, dB",
+        "psnr_fringe": "fringe, dB",
+        "psnr": "all steps, dB",
+    }
+    rows: list[tuple[Value, ...]] = []
+    for group in grouped:
+        if any(cell.between for cell in group.cells):
+            found = [group.spread(lambda cell: (cell.between or {}).get(key)) for key in figures]  # noqa: B023
+            missed = group.spread(lambda cell: _percent((cell.between or {}).get("missed_share")))
+            rows.append((group.data_set, group.feature, group.encoding, *found, missed))
+    return PaperTable(
+        name=f"between-{protocol}",
+        title=f"Between key frames, protocol {protocol}",
+        columns=("data set", "feature", "encoding", *figures.values(), "feature missed %"),
+        rows=tuple(rows),
+        notes=(
+            "over the vertices in the coreset of the key frame before or after a step; the fringe"
+            " is in the coreset of one of them",
+        ),
+    )
+
+
+def _percent(share: float | None) -> float | None:
+    """A share in percent."""
+    return None if share is None else 100 * share

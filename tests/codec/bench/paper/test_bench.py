@@ -1,0 +1,108 @@
+"""The bench: all cells once, finished ones never again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from fhash_codec.bench.paper import bench
+from fhash_codec.bench.paper.bench import BenchPlan, bench_paper
+from fhash_codec.bench.paper.store import load_all
+from fhash_formats.errors import InputError
+from fhash_formats.series import ArraySeries
+
+PLAN = BenchPlan.quick(
+    features=("interval:0.2:2",),
+    key_frames="0,2,4",
+    epochs=2,
+    device="cpu",
+    latency=False,
+    picture_size=32,
+)
+
+
+def test_every_encoding_in_every_protocol(
+    series: ArraySeries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fhash_codec.bench.paper.protocols.CANDIDATES", (1, 2))
+    result = bench_paper(replace(PLAN, epochs=1), tmp_path, series, name="blob")
+    assert [(cell.protocol, cell.encoding) for cell in result.cells] == [
+        (protocol, encoding)
+        for protocol in ("published", "equal", "best")
+        for encoding in ("dense", "dense-multi", "hash", "fhash")
+    ]
+    assert len(result.notes) == 1
+    assert "tcnn" in result.notes[0]
+    assert sorted(load_all(tmp_path), key=str) == sorted(result.cells, key=str)
+    cells = {(cell.protocol, cell.encoding): cell for cell in result.cells}
+    equal = [cells["equal", name] for name in ("dense", "dense-multi", "hash", "fhash")]
+    for figure in ("samples_an_epoch", "steps_an_epoch", "box", "engine"):
+        assert len({getattr(cell, figure) for cell in equal}) == 1
+    assert cells["published", "hash"].samples_an_epoch == 3 * 7 * 9 * 12
+    assert cells["published", "hash"].collisions > 0
+    assert [entry["steps"] for entry in cells["best", "hash"].trial] == [1, 2]
+    for cell in result.cells:
+        assert [point.epoch for point in cell.curve] == [0, 1]
+        assert all(point.picture_psnr is not None for point in cell.curve)
+        assert cell.curve[-1].step == cell.steps_an_epoch
+        assert 0 < cell.bytes <= 4 * sum(cell.parameters.values()) + 1000
+        assert cell.between is not None
+        assert 0 < cell.buckets_used <= 1
+
+
+def test_finished_cells_are_not_run_again(
+    series: ArraySeries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = replace(PLAN, protocols=("equal",), encodings=("dense", "fhash"))
+    first = bench_paper(plan, tmp_path, series, name="blob")
+    ran = []
+    run = bench._run
+
+    def counted(*words: object) -> object:
+        ran.append(words[1])
+        return run(*words)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(bench, "_run", counted)
+    assert bench_paper(plan, tmp_path, series, name="blob") == first
+    assert not ran
+    bench_paper(replace(plan, encodings=("dense", "hash")), tmp_path, series, name="blob")
+    assert [request.encoding for request in ran] == ["hash"]  # type: ignore[attr-defined]
+    bench_paper(replace(plan, epochs=1), tmp_path, series, name="blob")
+    assert len(ran) == 3
+
+
+def test_an_interrupt_leaves_finished_cells(
+    series: ArraySeries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = replace(PLAN, protocols=("equal",), encodings=("dense", "fhash"))
+    train, calls = bench.train, []
+
+    def stopped(*words: object, **settings: object) -> object:
+        calls.append(words)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return train(*words, **settings)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(bench, "train", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        bench_paper(plan, tmp_path, series, name="blob")
+    assert [cell.encoding for cell in load_all(tmp_path)] == ["dense"]
+    assert len(list(tmp_path.iterdir())) == 1
+    assert len(bench_paper(plan, tmp_path, series, name="blob").cells) == 2
+    assert len(calls) == 3
+
+
+def test_the_same_seed_gives_the_same_curve(series: ArraySeries, tmp_path: Path) -> None:
+    plan = replace(PLAN, protocols=("equal",), encodings=("hash",))
+    curves = []
+    for folder in ("a", "b"):
+        (cell,) = bench_paper(plan, tmp_path / folder, series, name="blob").cells
+        curves.append([point.coreset_psnr for point in cell.curve])
+    assert curves[0] == curves[1]
+
+
+def test_an_unknown_protocol_is_refused(series: ArraySeries, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="fair"):
+        bench_paper(replace(PLAN, protocols=("fair",)), tmp_path, series)

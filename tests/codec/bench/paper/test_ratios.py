@@ -1,0 +1,138 @@
+"""Files at a quality: settings that are tried, and their table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from fhash_codec.bench.paper import ratios
+from fhash_codec.bench.paper.ratios import FileResult, files_table, measure_files
+from fhash_codec.bench.rate.results import Point
+from fhash_formats.errors import InputError, MissingDependencyError
+from fhash_formats.series import Series
+
+SERIES: Any = object()
+
+
+def point(codec: str, count: int, *, reached: bool = True) -> Point:
+    return Point(
+        codec=codec, goal="psnr", asked=45.0, reached=reached, bytes=count, psnr=45.1,
+        max_error=0.1, setting=f"{codec} tolerance", as_asked=None,
+    )  # fmt: skip
+
+
+class Encodings:
+    """Stand-in for encoding: files of F-Hash that gain 15 dB by twice the epochs."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.configs: list[Any] = []
+        monkeypatch.setattr(ratios.fhash_codec, "encode", self.encode)
+        monkeypatch.setattr(ratios.fhash_codec, "open", self.open)
+
+    def encode(self, series: Series, path: Path, config: Any, *, progress: Any) -> None:
+        progress("training", 1, 2, "")
+        self.configs.append(config)
+
+    def open(self, path: Path) -> Any:
+        config = self.configs[-1]
+        psnr = config.psnr or {10: 33.0, 20: 48.0}[config.epochs]
+        info = {
+            "bytes": 500,
+            "raw_bytes": 10_000,
+            "quality": {"psnr": psnr},
+        }
+        volume = SimpleNamespace(info=info)
+
+        class Opened:
+            def __enter__(self) -> Any:
+                return volume
+
+            def __exit__(self, *_: object) -> None:
+                return None
+
+        return Opened()
+
+
+@pytest.fixture
+def encodings(monkeypatch: pytest.MonkeyPatch) -> Encodings:
+    bench = SimpleNamespace(
+        points=[point("SZ3", 900), point("ZFP", 700, reached=False), point("fhash compact", 300)],
+        refused={"SPERR rate": "too small"},
+        raw_bytes=10_000,
+    )
+    monkeypatch.setattr(ratios, "bench_rate", lambda *args, **options: bench)
+    return Encodings(monkeypatch)
+
+
+def test_files_are_encoded_until_they_have_the_quality(encodings: Encodings) -> None:
+    told: list[Any] = []
+    results, refused = measure_files(
+        "bubble",
+        SERIES,
+        "segmentation:0.3",
+        kind="segmentation",
+        progress=lambda *w: told.append(w),
+    )
+    paper = [config for config in encodings.configs if config.profile == "paper"]
+    assert [(config.tables, config.epochs) for config in paper[:4]] == [
+        ("float32", 10),
+        ("float32", 20),
+        ("float16", 10),
+        ("float16", 20),
+    ]
+    assert (paper[4].tables, paper[4].psnr) == ("transform", 45.0)
+    assert {config.features for config in encodings.configs} == {("segmentation:0.3",)}
+    assert [(each.kind, each.whole, each.reached) for each in results] == [
+        ("paper", False, True),
+        ("paper", False, True),
+        ("paper", False, True),
+        ("compact", False, True),
+        ("peer", True, True),
+        ("peer", True, False),
+        ("compact", True, True),
+    ]
+    assert results[0].ratio == 20
+    assert results[0].codec == "F-Hash, float32, 20 epochs"
+    assert refused == ["SPERR rate not measured: too small"]
+    assert told[-1][1] == told[-1][2]
+    assert ("files", 2, 5, "bubble, F-Hash, coded tables: training 1/2") in told
+
+
+def test_without_peers_a_line_says_so(
+    encodings: Encodings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*args: Any, **options: Any) -> None:
+        raise MissingDependencyError("pip install 'fhash[bench]'")
+
+    monkeypatch.setattr(ratios, "bench_rate", refuse)
+    results, refused = measure_files("mine", SERIES, "all")
+    assert {each.kind for each in results} == {"paper", "compact"}
+    assert refused == ["SZ3, SPERR, ZFP not measured: pip install 'fhash[bench]'"]
+
+
+def test_the_smallest_file_comes_first_and_printed_ratios_are_marked(
+    encodings: Encodings,
+) -> None:
+    results, refused = measure_files("bubble", SERIES, "segmentation")
+    heading, *rows = files_table(results, refused).lines()
+    table = [dict(zip(heading, row, strict=True)) for row in rows]
+    measured = [row for row in table if row["reached"] != "-"]
+    assert [row["bytes"] for row in measured] == ["300", "500", "500", "500", "500", "900", "700"]
+    assert [row["reached"] for row in measured] == ["yes"] * 6 + ["no"]
+    quoted = {row["codec"]: row["ratio"] for row in table if row["reached"] == "-"}
+    assert quoted["TTHRESH on Argon Bubble (paper, quoted)"] == "1,107.4"
+    assert quoted["F-Hash on Argon Bubble (paper, quoted)"] == "46.8"
+    assert "SPERR rate not measured: too small" in files_table(results, refused).notes
+
+
+def test_results_go_through_json() -> None:
+    made = FileResult(
+        data_set="a", feature="b", codec="c", kind="peer", whole=True, bytes=1, raw_bytes=2,
+        psnr=None, reached=True, seconds=None,
+    )  # fmt: skip
+    assert FileResult.from_dict(made.to_dict()) == made
+    with pytest.raises(InputError, match="needed: bytes"):
+        FileResult.from_dict({"bytes": 1})
