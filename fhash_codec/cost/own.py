@@ -18,7 +18,13 @@ from fhash_codec.cost.results import Curve, Encoded
 from fhash_codec.encoding import encode
 from fhash_codec.progress import Progress
 from fhash_codec.training.devices import need_torch
-from fhash_formats.errors import FhashError, FhashWarning, MissingDependencyError, QualityError
+from fhash_formats.errors import (
+    FhashError,
+    FhashWarning,
+    InterruptedEncodingError,
+    MissingDependencyError,
+    QualityError,
+)
 from fhash_formats.series import Series
 
 __all__ = ["ONE_SHARE", "KeptFile", "OwnEncodings", "encoded_of"]
@@ -134,7 +140,8 @@ class OwnEncodings:
             return
         epoch = self.curves[-1].points[-1]["seconds"] or first.seconds
         rest = max(first.seconds - epoch, 0.0)
-        limit = self._share * self._allowance.left
+        # A training that is stopped leaves nothing: half of its share is for what goes wrong.
+        limit = 0.5 * self._share * self._allowance.left
         fitting = [epochs for epochs in EPOCHS if rest + epochs * epoch <= limit]
         if fitting:
             self._expect(paper_config(fitting[-1]), rest + fitting[-1] * epoch)
@@ -190,6 +197,8 @@ class OwnEncodings:
                 report = encode(self._series, path, wish.config, force=True, progress=guarded)
         except QualityError as error:
             report, missed = error.figures, True
+        except InterruptedEncodingError:  # a training turns Ctrl-C into this
+            raise KeyboardInterrupt from None
         except FhashError as error:
             self._allowance.leave_out(wish.name, str(error))
             return point
@@ -201,7 +210,7 @@ class OwnEncodings:
         if report["curve"]:
             self.curves.append(Curve(name=measured.name, points=tuple(report["curve"])))
         self._usual[_kind(wish.config)] = report["seconds"]
-        if point.predicted_seconds:
+        if point.predicted_seconds and wish.codec == "compact":
             self._ratios.append(report["seconds"] / point.predicted_seconds)
         return measured
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ SHOWN = (
     "picture-bytes",
 )
 """Plots of the PNG; the page has all."""
+FEW_DECADES = 300
+"""Ratio of the ends of a logarithmic axis up to which 2 and 5 have marks, too."""
 MARKERS = {
     "circle": "o",
     "square": "s",
@@ -94,8 +97,16 @@ def _scale(axes: Any, axis: Axis, name: str) -> None:
         side = getattr(axes, f"{name}axis")
         side.set_major_formatter(_size if axis.unit else _plain)
         side.set_minor_formatter(_nothing)
+        low, high = sorted(getattr(axes, f"get_{name}lim")())
+        marks = (1, 2, 5) if high < FEW_DECADES * low else (1,)
+        side.set_major_locator(_ticker().LogLocator(subs=marks, numticks=20))
     if axis.reversed:
         getattr(axes, f"invert_{name}axis")()
+
+
+def _ticker() -> Any:
+    """The module of matplotlib that places the marks of an axis."""
+    return importlib.import_module("matplotlib.ticker")
 
 
 def _size(value: float, _: int) -> str:

@@ -13,7 +13,7 @@ from fhash_codec.cost.own import OwnEncodings
 from fhash_codec.cost.plan import Wish
 from fhash_codec.cost.prediction import Prediction
 from fhash_codec.progress import silent
-from fhash_formats.errors import MissingDependencyError
+from fhash_formats.errors import InterruptedEncodingError, MissingDependencyError
 from fhash_formats.series import ArraySeries
 
 FAST = Wish(codec="compact", group="compact, effort 1", config=EncodeConfig(effort=1, psnr=40.0))
@@ -86,3 +86,15 @@ def test_paper_trains_one_epoch_and_then_as_many_as_fit(
     assert [point.name for point in encodings.points] == ["paper, 1 epoch", "paper, 2 epochs"]
     assert [len(curve.points) for curve in encodings.curves] == [1, 2]
     assert list(tmp_path.glob("*.checkpoint")) == []
+
+
+def test_ctrl_c_in_a_training_ends_the_measurements(
+    series: ArraySeries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise InterruptedEncodingError("interrupted, a checkpoint is saved")
+
+    monkeypatch.setattr(own, "encode", interrupted)
+    allowance = Allowance(1000.0)
+    OwnEncodings(series, tmp_path, allowance, foretold, silent).measure(FAST)
+    assert allowance.interrupted
