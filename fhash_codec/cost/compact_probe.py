@@ -43,6 +43,10 @@ OVERHEAD_BYTES = 3000
 """Approximate bytes of a container without its tiles."""
 PROBE_VERTICES = 1 << 17
 """Vertices of a probed tile; larger ones are cut to about this size."""
+PROBE_VERTICES_OF_FEW_BYTES = 1 << 19
+"""The same where a vertex takes less than FEW_BYTES: there borders count, and coding is fast."""
+FEW_BYTES = 0.02
+"""Bytes for each vertex below which a series takes few bytes."""
 MIN_TILES = 4
 """Tiles that are probed at least, where a series has so many."""
 COMPARED_VERTICES = 1 << 20
@@ -251,8 +255,10 @@ def _probed_sample(look: Look) -> tuple[Sample, TileSettings]:
     blocks = look.task.blocks
     t, z, y, x = look.tile
     tile: Shape = (min(t, blocks.shape[0]), z, y, x)
-    if prod(tile) > PROBE_VERTICES:
-        tile = even_tile(tile, prod(tile) // PROBE_VERTICES + 1, min(tile[0], 8))
+    few = look.attempt.outcome.size < FEW_BYTES * prod(blocks.shape)
+    limit = PROBE_VERTICES_OF_FEW_BYTES if few else PROBE_VERTICES
+    if prod(tile) > limit:
+        tile = even_tile(tile, prod(tile) // limit + 1, min(tile[0], 8))
     tiled = blocks.retile(tile)
     settings = replace(look.attempt.settings, transform=usual_transform(tiled.tile))
     count = max(MIN_TILES, usable_threads())

@@ -59,7 +59,9 @@ BOUND_TRIALS = 8
 SIZE_TRIES = 3
 """Trials of a search for the step of a size."""
 PASSES = 1.2
-"""Times that all tiles are coded for a PSNR."""
+"""Times that all tiles are coded for a PSNR, where the step was searched on all of them."""
+SAMPLED_PASSES = 2.0
+"""Times that all tiles are coded for a PSNR, where the step was searched on a sample."""
 SIZE_PASSES = 2.0
 """Times that all tiles are coded for a promised ratio."""
 GAIN_AFTER = 1.6
@@ -142,7 +144,9 @@ def stage_seconds(
     if look.task.goal.error and config.effort > 1 and "predictor" not in config.without:
         seconds["predictor"] = _predictor(work)
     goal = look.task.goal
-    passes = 1.0 if goal.error is not None else SIZE_PASSES if goal.size is not None else PASSES
+    passes = PASSES if work.vertices <= MAX_SEARCHED_VERTICES else SAMPLED_PASSES
+    if goal.psnr is None:
+        passes = 1.0 if goal.error is not None else SIZE_PASSES
     return seconds | {"coding": passes * _all_tiles(work, final)}
 
 

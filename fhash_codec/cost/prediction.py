@@ -164,15 +164,16 @@ class Predictor:
         if key not in self._trainings:
             self._trainings[key] = probe_paper(part, share, key)
         probe = self._trainings[key]
+        stages = probe.stage_seconds(config)
         more = config.psnr is not None and config.tables == "transform"
         return Prediction(
-            seconds=probe.seconds(config),
+            seconds=sum(stages.values()),
             bytes=None if config.tables == "transform" else probe.bytes,
             psnr=None,
             basis=f"two epochs on {_steps(part, self._series)}, in {now() - begun:.1f} s"
             + ("; further rounds for --psnr are not counted" if more else "")
             + "; the PSNR is not told before the training",
-            stages=dict(probe.stages),
+            stages=stages,
         )
 
     def _part(self, vertices: int) -> Series:
