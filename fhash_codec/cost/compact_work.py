@@ -22,6 +22,7 @@ from fhash_codec.compact.choices.head import (
     TRIAL_BUDGET,
     Budget,
     best_widths,
+    most_saved,
 )
 from fhash_codec.compact.choices.labels import is_hopeless
 from fhash_codec.compact.choices.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
@@ -223,7 +224,10 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     gain = GAIN_AFTER * head.gain_db
     if gain < MIN_GAIN:
         return seconds
-    widths = best_widths(size, GAIN_FACTOR * gain + GAIN_BESIDES, EXCHANGE, config.effort)
+    expected = GAIN_FACTOR * gain + GAIN_BESIDES
+    widths = best_widths(size, expected, EXCHANGE, config.effort)
+    if widths is None and most_saved(size, expected, EXCHANGE) <= 0:
+        return seconds
     budget = EFFORTS[config.effort].budget
     search = work.tries(TRIES) * work.wall(rates.search + head.final, tile, searched)
     single = work.tries(TRIES) * searched * prod(tile) * (rates.search + head.final)

@@ -20,7 +20,7 @@ from fhash_codec.stage_clock import skip, stage
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["HeadHistory", "best_widths", "choose_head", "training_pairs"]
+__all__ = ["HeadHistory", "best_widths", "choose_head", "most_saved", "training_pairs"]
 
 HeadHistory = list[dict[str, float | None]]
 """Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
@@ -159,7 +159,7 @@ def choose_head(
         return settings, outcome, []
     gain = GAIN_FACTOR * trial.gain_db + GAIN_BESIDES
     widths = best_widths(outcome.size, gain, _octave(tried, data_range), effort)
-    most = _most_saved(outcome.size, gain, _octave(tried, data_range))
+    most = most_saved(outcome.size, gain, _octave(tried, data_range))
     if widths is None and most <= 0:
         gained = f"its trial gained {trial.gain_db:.2f} dB"
         skip("head", f"{gained}: no head would save what it takes itself")
@@ -292,7 +292,7 @@ def best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[i
     return best if saved(best) > 0 else None
 
 
-def _most_saved(size: float, gain: float, octave: float) -> float:
+def most_saved(size: float, gain: float, octave: float) -> float:
     """Return the bytes that a perceptron saves at most, less those that it takes.
 
     The parameters are those of `best_widths`.
