@@ -16,7 +16,9 @@ from fhash_cli.output import Progress, emit, extent, table
 
 if TYPE_CHECKING:
     from fhash_codec.bench.paper.bench import BenchPlan, PaperBench
+    from fhash_codec.bench.paper.ratios import FileResult
     from fhash_codec.bench.paper.table import PaperTable
+    from fhash_formats.series import Series
 
 
 class NameType(click.ParamType[str]):
@@ -100,6 +102,12 @@ class NameType(click.ParamType[str]):
     help="Time pictures straight through the encodings of the protocol published.",
 )
 @click.option(
+    "--files/--no-files",
+    default=True,
+    show_default=True,
+    help="Encode each data set at 45 dB over all steps, by fhash and by the codecs of bench rate.",
+)
+@click.option(
     "--device",
     type=click.Choice(["auto", "cpu", "cuda"]),
     default="auto",
@@ -126,6 +134,7 @@ def paper(
     data: str | None,
     source: SourceOptions,
     parameters: bool,
+    files: bool,
     folder: str,
     as_json: bool,
     quiet: bool,
@@ -156,11 +165,41 @@ def paper(
         result = bench_paper(plan, Path(folder), series, name=name, progress=progress)
         from fhash_codec.bench.paper.report import tables_of, write_report
 
-        tables = tables_of(result.cells)
-        files, missing = write_report(result.cells, tables, Path(folder))
+        encoded, refused = (
+            _files(result, plan, series, Path(folder), quick=choices["quick"], progress=progress)
+            if files
+            else ([], [])
+        )
+        tables = tables_of(result.cells, encoded, refused)
+        written, missing = write_report(result.cells, tables, Path(folder))
     result = replace(result, notes=(*result.notes, *missing))
-    found = {"tables": [entry.to_dict() for entry in tables], "files": [str(f) for f in files]}
-    emit(result.to_dict() | found, _text(result, tables, files), as_json)
+    found = {"tables": [entry.to_dict() for entry in tables], "files": [str(f) for f in written]}
+    emit(result.to_dict() | found, _text(result, tables, written), as_json)
+
+
+def _files(
+    result: PaperBench,
+    plan: BenchPlan,
+    series: Series | None,
+    folder: Path,
+    *,
+    quick: bool,
+    progress: Progress,
+) -> tuple[list[FileResult], list[str]]:
+    """Files at a quality of the bench's data sets, and lines for those that were not made."""
+    from fhash_codec.bench.paper.data import simulated
+    from fhash_codec.bench.paper.files import files_of
+    from fhash_codec.bench.paper.ratios import NUMBER_TYPES
+
+    def series_of(name: str) -> Series:
+        return simulated(name, plan.scale) if series is None else series
+
+    number_types = ("float16",) if quick else NUMBER_TYPES
+    found, refused = files_of(
+        result.cells, series_of, folder, number_types=number_types, progress=progress
+    )
+    left_out = ["--quick leaves F-Hash with float32 tables out, which trains once more"]
+    return found, [*refused, *(left_out if quick and found else [])]
 
 
 def _plan(scenes: bool, *, quick: bool, **choices: Any) -> BenchPlan:
@@ -179,7 +218,7 @@ def _parameters() -> tuple[dict[str, Any], str]:
     from fhash_codec.bench.paper.sets import SETS, paper_parameters
 
     counts = {name: paper_parameters(name) for name in SETS}
-    rows = [("parameters", *ENCODINGS)]
+    rows: list[tuple[str, ...]] = [("parameters", *ENCODINGS)]
     rows += [
         (SETS[name].title, *(f"{counts[name][encoding]:,}" for encoding in ENCODINGS))
         for name in SETS
@@ -190,11 +229,24 @@ def _parameters() -> tuple[dict[str, Any], str]:
 
 def _text(result: PaperBench, tables: Sequence[PaperTable], files: Sequence[Path]) -> str:
     """The tables, how the cells were measured, and what was left out or written."""
-    lines = []
+    lines: list[str] = []
+    told: set[str] = set()
     for entry in tables:
-        lines += [entry.title, table(entry.lines()), *entry.notes, ""]
+        body = _claims(entry) if entry.name == "claims" else table(entry.lines())
+        notes = [f"- {note}" for note in entry.notes if note not in told]
+        told.update(entry.notes)
+        lines += [entry.title, body, *notes, ""]
     if result.cells:
         cell = result.cells[-1]
         facts = ", ".join(f"{name} {fact}" for name, fact in cell.machine.items())
         lines.append(f"{len(result.cells)} cells, such as {extent(cell.shape)}; {facts}")
     return "\n".join([*lines, *result.notes, *(f"wrote {path}" for path in files)])
+
+
+def _claims(entry: PaperTable) -> str:
+    """Claims with their verdicts, each in two lines: the figures are too long for a table."""
+    lines = []
+    for claim, protocol, verdict, figures in entry.lines()[1:]:
+        where = f" [{protocol}]" if protocol not in ("all", "files", "-") else ""
+        lines += [f"{verdict.upper()}: {claim}{where}", f"    {figures}"]
+    return "\n".join(lines)

@@ -107,7 +107,9 @@ def command(
         check_report_folder(Path(report_folder), force, data)
     before = _stamp(output)
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
-        missed, choice = None, None
+        missed: QualityError | None = None
+        stopped: InterruptedEncodingError | None = None
+        choice = None
         if time_budget is not None:
             choice = _choose(series, config, time_budget, progress, quiet=quiet)
             config = choice.config
@@ -122,12 +124,16 @@ def command(
         except KeyboardInterrupt:
             raise InterruptedEncodingError(_after_interruption(output, before)) from None
         if report_folder is not None:
-            _write_report(series, report, config, Path(report_folder), force, missed, progress)
+            stopped = _write_report(
+                series, report, config, Path(report_folder), force, missed, progress
+            )
     _say_unmet(source, series, quiet)
     integers = (series.source_dtype or series.dtype).kind in "iu"
     if integers and not quiet and looks_categorical(report):
         say("few different integers: if they are labels, --max-error 0 keeps each exactly")
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
+    if report_folder is not None:
+        rows.append(("report", str(Path(report_folder) / "cost.html")))
     text = table(rows)
     stages = report.pop("stages")
     if explain:
@@ -135,7 +141,7 @@ def command(
         text += f"\n\n{stage_table(stages)}"
     if choice is not None:
         report["time_budget"] = choice.to_dict()
-    emit(report, text, as_json, missed)
+    emit(report, text, as_json, missed or stopped)
 
 
 def _choose(
@@ -189,13 +195,21 @@ def _write_report(
     force: bool,
     missed: QualityError | None,
     progress: Progress,
-) -> None:
-    """Measure reads and pictures of the file just written, and write its report."""
+) -> InterruptedEncodingError | None:
+    """Measure reads and pictures of the file just written, and write its report.
+
+    The error that is returned says that Ctrl-C ended the measurements; None where it did not.
+    """
     from fhash_codec.cost.files import write_report
     from fhash_codec.cost.one import report_on_encode
 
     costs = report_on_encode(series, figures, config, missed=missed is not None, progress=progress)
-    write_report(costs, folder, force=force)
+    page, *_ = write_report(costs, folder, force=force)
+    if not costs.interrupted:
+        return None
+    return InterruptedEncodingError(
+        f"interrupted; {figures['path']} is complete, {page} has what was measured until then"
+    )
 
 
 def _say_unmet(source: SourceOptions, series: Series, quiet: bool) -> None:

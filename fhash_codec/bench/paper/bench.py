@@ -19,9 +19,15 @@ from fhash_codec.bench.paper.data import KINDS, Data, feature_text, gather_data,
 from fhash_codec.bench.paper.encodings.build import RATE, build
 from fhash_codec.bench.paper.encodings.tcnn import missing
 from fhash_codec.bench.paper.encodings.trained import TrainedEncoding
-from fhash_codec.bench.paper.latency import measure_latency
+from fhash_codec.bench.paper.latency import VIEWS, measure_latency
 from fhash_codec.bench.paper.pictures import SIZE, PictureProbe
-from fhash_codec.bench.paper.protocols import ENCODINGS, PROTOCOLS, Arrangement, arrangement
+from fhash_codec.bench.paper.protocols import (
+    CANDIDATES,
+    ENCODINGS,
+    PROTOCOLS,
+    Arrangement,
+    arrangement,
+)
 from fhash_codec.bench.paper.sets import SETS
 from fhash_codec.bench.paper.store import Request, load, save
 from fhash_codec.bench.paper.training import (
@@ -63,6 +69,7 @@ class BenchPlan:
         device: auto, cpu or cuda.
         latency: whether pictures through the encodings are timed, for the first seed of the
             protocol published.
+        views: views of these pictures.
         picture_size: pixels along both sides of the pictures of curves.
     """
 
@@ -76,6 +83,7 @@ class BenchPlan:
     key_frames: str | None = None
     device: str = "auto"
     latency: bool = True
+    views: int = VIEWS
     picture_size: int = SIZE
 
     @classmethod
@@ -87,6 +95,7 @@ class BenchPlan:
             "epochs": 20,
             "seeds": 1,
             "key_frames": f"auto:{QUICK_KEY_FRAMES}",
+            "views": 1,
         }
         return cls(**(settings | changes))
 
@@ -174,6 +183,7 @@ def _requests(
             for seed in range(1, plan.seeds + 1):
                 for protocol in plan.protocols:
                     timed = plan.latency and protocol == "published" and seed == 1
+                    tried = {"candidates": list(CANDIDATES)} if protocol == "best" else {}
                     for encoding in encodings:
                         yield Request(
                             encoding=encoding,
@@ -181,12 +191,12 @@ def _requests(
                             data_set=data_set,
                             feature=feature,
                             seed=seed,
-                            settings=settings | {"latency": timed},
+                            settings=settings | {"latency": timed and plan.views} | tried,
                         )
 
 
 def _identity(source: Series) -> list[Any]:
-    """Return what tells data of one's own apart: name, and size and time of each file."""
+    """Return the identity of the user's data: names, and size and time of each file."""
     files = [
         [path.name, path.stat().st_size, path.stat().st_mtime_ns]
         for path in source.files
@@ -231,7 +241,12 @@ class _Held:
             request.data_set, series, request.feature, request.settings["key_frames"], progress
         )
         span = data.scanned.value_range
-        probe = PictureProbe(data.frames, str(data.features[0]), value_range=(span.low, span.high))
+        probe = PictureProbe(
+            data.frames,
+            str(data.features[0]),
+            value_range=(span.low, span.high),
+            size=plan.picture_size,
+        )
         return cls(
             data_set=request.data_set,
             feature=request.feature,
@@ -270,7 +285,7 @@ def _run(
         warm.train_epoch(0)
         del warm
         courses: list[tuple[TrainedEncoding, Trained]] = []
-        trial = []
+        trial: list[dict[str, Any]] = []
         for steps in arranged.steps:
             encoding = make(steps, plan.epochs)
             if any(entry["steps"] == encoding.steps_an_epoch for entry in trial):
@@ -313,7 +328,7 @@ def _run(
 
 
 def _tried(encoding: TrainedEncoding, course: Trained) -> dict[str, Any]:
-    """Return what a number of steps led to, as `Cell.trial` lists it."""
+    """Return the result of a number of steps, as `Cell.trial` lists it."""
     return {
         "steps": encoding.steps_an_epoch,
         "seconds": course.seconds,
@@ -323,7 +338,7 @@ def _tried(encoding: TrainedEncoding, course: Trained) -> dict[str, Any]:
 
 
 def _pictures(held: _Held, arranged: Arrangement) -> PictureMeasure:
-    """Return what compares pictures; what no model was trained on shows nothing."""
+    """Return a function that compares pictures; vertices without training show nothing."""
     masks = None if arranged.whole else held.data.masks
 
     def measure(frames: Frames) -> tuple[float, float]:
@@ -349,6 +364,7 @@ def _latency(
         data.masks,
         str(data.features[0]),
         value_range=(span.low, span.high),
+        views=request.settings["latency"],
         device=device.type,
         progress=progress,
     )

@@ -33,12 +33,14 @@ class Arrangement:
         steps: Adam steps of each model in an epoch; several are candidates, which are all trained,
             and of which the best counts.
         engine: gather, lattice or tcnn.
+        schedule: of the learning rate: constant, or cosine, which falls to zero over all epochs.
     """
 
     joint: bool
     whole: bool
     steps: tuple[int, ...]
     engine: str
+    schedule: str = "constant"
 
 
 def arrangement(protocol: str, encoding: str, data: Data) -> Arrangement:
@@ -49,7 +51,9 @@ def arrangement(protocol: str, encoding: str, data: Data) -> Arrangement:
       scaled by the vertices of a frame over those of the paper's frame.
     - `equal`: every encoding is one model with one network, on the coreset and in its box. All get
       the same batches, by the gather engine.
-    - `best`: as `equal`, with the fastest engine of each encoding, and its best steps.
+    - `best`: as `equal`, with the fastest engine of each encoding, its best steps, and a rate that
+      falls to zero, as the product trains. A constant one lets every encoding jump by many dB
+      between epochs, the more the smaller the batches are.
 
     tiny-cuda-nn joins no key frames: it has a model for each of them in every protocol.
 
@@ -75,7 +79,9 @@ def arrangement(protocol: str, encoding: str, data: Data) -> Arrangement:
         steps = (min(max(-(-samples // EQUAL_BATCH), low), high),)
         return Arrangement(joint=joint, whole=False, steps=steps, engine=engine)
     fastest = "lattice" if encoding in ("dense", "dense-multi", "fhash") else engine
-    return Arrangement(joint=joint, whole=False, steps=CANDIDATES, engine=fastest)
+    return Arrangement(
+        joint=joint, whole=False, steps=CANDIDATES, engine=fastest, schedule="cosine"
+    )
 
 
 def published_batch(name: str, frame: Sizes) -> int:

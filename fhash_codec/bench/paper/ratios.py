@@ -33,6 +33,8 @@ PEERS = ("SZ3", "SPERR", "ZFP")
 """Codecs that the files are compared with, as HDF5 filters."""
 EPOCHS = (10, 20, 40, 80)
 """Epochs of F-Hash that are tried until a file has the quality; its bytes hardly depend on them."""
+NUMBER_TYPES = ("float32", "float16")
+"""Number types of F-Hash's stored tables."""
 EFFORT = 3
 """Effort of `compact`: a larger one makes smaller files in several times the time."""
 PAPER = {"profile": "paper", "key_frames": "all"}
@@ -94,6 +96,7 @@ def measure_files(
     *,
     kind: str = "",
     target: float = TARGET,
+    number_types: Sequence[str] = NUMBER_TYPES,
     progress: Progress = silent,
 ) -> tuple[list[FileResult], list[str]]:
     """Encode a series by F-Hash, by `compact` and by the peers that are installed.
@@ -104,6 +107,7 @@ def measure_files(
         feature: as `fhash encode --feature` takes it.
         kind: name of the feature, as of a cell; the feature itself if empty.
         target: PSNR in dB over all steps.
+        number_types: of F-Hash's tables, beside coded ones; each is a training of its own.
         progress: is told about each file.
 
     Returns:
@@ -112,15 +116,23 @@ def measure_files(
     made = _Files(data_set, series, feature, kind or feature, target)
     refused: list[str] = []
     works: dict[str, Callable[[], list[FileResult]]] = {
-        "F-Hash, float32 tables": lambda: [made.trained("float32")],
-        "F-Hash, float16 tables": lambda: [made.trained("float16")],
+        **{
+            f"F-Hash, {name} tables": lambda name=name: [made.trained(name)]  # type: ignore[misc]
+            for name in number_types
+        },
         "F-Hash, coded tables": lambda: [made.coded()],
         "compact": lambda: [made.compact()],
         ", ".join(PEERS): made.peers,
     }
     results = []
     for number, (name, work) in enumerate(works.items()):
-        progress("files", number, len(works), name)
+
+        def told(stage: str, done: int, total: int, note: str) -> None:
+            text = f"{data_set}, {name}: {stage} {done}/{total} {note}"  # noqa: B023
+            progress("files", number, len(works), text.rstrip())  # noqa: B023
+
+        progress("files", number, len(works), f"{data_set}, {name}")
+        made.progress = told
         try:
             results += work()
         except MissingDependencyError as error:
@@ -138,6 +150,7 @@ class _Files:
         self.data_set, self.series, self.feature, self.kind = data_set, series, feature, kind
         self.target = target
         self.refused: list[str] = []
+        self.progress: Progress = silent
 
     def trained(self, tables: str) -> FileResult:
         """F-Hash with tables of a number type, trained until it has the quality."""
@@ -168,6 +181,7 @@ class _Files:
             names=PEERS,
             profiles=("compact",),
             speed=False,
+            progress=self.progress,
         )
         self.refused += [f"{name} not measured: {why}" for name, why in bench.refused.items()]
         return [
@@ -192,7 +206,7 @@ class _Files:
         with tempfile.TemporaryDirectory(prefix="fhash-bench-") as folder:
             path, begun = Path(folder, "file.fhz"), time.perf_counter()
             with suppress(QualityError):  # the file is written, and its quality is in the result
-                fhash_codec.encode(self.series, path, config)
+                fhash_codec.encode(self.series, path, config, progress=self.progress)
             seconds = time.perf_counter() - begun
             with fhash_codec.open(path) as volume:
                 info = volume.info

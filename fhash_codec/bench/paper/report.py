@@ -8,6 +8,7 @@ from pathlib import Path
 from fhash_codec.bench.paper.cell import Cell
 from fhash_codec.bench.paper.claims import claims_table
 from fhash_codec.bench.paper.plot import plot_convergence
+from fhash_codec.bench.paper.ratios import FileResult, files_table
 from fhash_codec.bench.paper.table import PaperTable
 from fhash_codec.bench.paper.tables import paper_tables
 from fhash_formats.errors import MissingDependencyError
@@ -17,9 +18,20 @@ FILENAME = "tables.md"
 """File of the tables in the folder of the cells."""
 
 
-def tables_of(cells: Sequence[Cell]) -> tuple[PaperTable, ...]:
-    """Return the paper's tables of cells, and the answers to its claims; none without cells."""
-    return (*paper_tables(cells), claims_table(cells)) if cells else ()
+def tables_of(
+    cells: Sequence[Cell], files: Sequence[FileResult] = (), refused: Sequence[str] = ()
+) -> tuple[PaperTable, ...]:
+    """Return the paper's tables of cells, and the answers to its claims; none without cells.
+
+    Args:
+        cells: of the bench.
+        files: files at a quality, of `files.files_of`.
+        refused: lines for files that could not be measured.
+    """
+    if not cells:
+        return ()
+    at_quality = (files_table(files, refused),) if files or refused else ()
+    return (*paper_tables(cells), *at_quality, claims_table(cells, files))
 
 
 def write_report(

@@ -51,7 +51,10 @@ def load(folder: Path, request: Request) -> Cell | None:
 
 
 def save(folder: Path, request: Request, cell: Cell) -> None:
-    """Write a cell; its file is complete or absent, the folder made if missing. Raises OutputError where it cannot be."""
+    """Write a cell into a folder, which is made if it is missing.
+
+    The file is complete or absent. Raises OutputError where it cannot be written.
+    """
     text = json.dumps(cell.to_dict(), indent=1, allow_nan=False)
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / request.filename, force=True) as temporary:

@@ -90,7 +90,7 @@ def train(
 
 
 def rank(curve: Sequence[Point]) -> tuple[int, float, float]:
-    """Return what is larger for the better of two courses of an encoding.
+    """Return a key that is larger for the better of two courses of an encoding.
 
     More of DECIBELS reached on the coreset come first, then fewer seconds to the last of these,
     then the highest PSNR.

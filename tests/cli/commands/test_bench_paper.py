@@ -9,8 +9,12 @@ from pathlib import Path
 import pytest
 from click.testing import Result
 
+from fhash_formats.series import Series
+
 Fhash = Callable[..., Result]
-FEW = ["--quick", "--epochs", "1", "--no-latency", "-q", "--feature", "interval:6:99"]
+FEW = [
+    "--quick", "--epochs", "1", "--no-latency", "--no-files", "-q", "--feature", "interval:6:99",
+]  # fmt: skip
 """Options that make a training a matter of milliseconds."""
 
 
@@ -40,6 +44,26 @@ def test_cells_of_own_data_are_resumed(fhash: Fhash, data: Path, tmp_path: Path)
     assert (cell["data_set"], cell["encoding"]) == ("tiny.h5", "hash")
     assert fhash(*words).stdout == first.stdout
     assert path.stat().st_mtime_ns == before
+
+
+def test_files_are_asked_for_by_data_set(
+    fhash: Fhash, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def measure(
+        name: str, series: Series, feature: str, **_: object
+    ) -> tuple[list[object], list[str]]:
+        asked.append((name, len(series.shape), feature))
+        return [], ["SZ3 not measured"]
+
+    monkeypatch.setattr("fhash_codec.bench.paper.files.measure_files", measure)
+    words = [word for word in FEW if word != "--no-files"]
+    words += ["--encoding", "fhash", "--protocol", "equal", "-o", str(tmp_path / "cells")]
+    result = fhash("bench", "paper", data, *words)
+    assert result.exit_code == 0, result.stderr
+    assert asked == [("tiny.h5", 4, "interval:6:99")]
+    assert "SZ3 not measured" in result.stdout
 
 
 @pytest.mark.parametrize(

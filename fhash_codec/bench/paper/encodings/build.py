@@ -28,7 +28,7 @@ from fhash_codec.paper.levels import level_resolutions
 from fhash_codec.paper.training.train import TrainingPlan
 
 RATE = 0.01
-"""Learning rate of Adam (paper, section 4.2), constant: no schedule is printed."""
+"""Learning rate of Adam at the start (paper, section 4.2); no schedule is printed."""
 
 
 def build(
@@ -62,14 +62,15 @@ def build(
         if arranged.joint
         else [((key,), of_key_frame(samples, key)) for key in keys]
     )
-    parts = []
+    parts: list[Part] = []
     for part_keys, coreset in pieces:
         if not len(coreset.bricks):
             continue
         # Models of single key frames must not start alike.
         part_seed = seed * len(keys) + part_keys[0]
-        plan = _plan(coreset, steps, epochs, part_seed)
-        model = _model(name, data, arranged, coreset, plan, part_seed, device)
+        plan = _plan(coreset, steps, epochs, part_seed, arranged.schedule)
+        before = parts[-1].model if parts else None
+        model = _model(name, data, arranged, coreset, plan, part_seed, device, before)
         parts.append(Part(part_keys, coreset, plan, model))
     levels = levels_of(name, data, samples, arranged) if name == "hash" else []
     hashed = [level for level in levels if isinstance(level, HashLevel)]
@@ -120,8 +121,12 @@ def _model(
     plan: TrainingPlan,
     seed: int,
     device: torch.device,
+    before: Model | None,
 ) -> Model:
-    """Return a model of the arranged engine; arguments as of `build`."""
+    """Return a model of the arranged engine; arguments as of `build`.
+
+    before: the model of the key frame before, whose corners it may share.
+    """
     if arranged.engine == "tcnn":
         from fhash_codec.bench.paper.encodings.tcnn import TcnnModel
 
@@ -131,16 +136,19 @@ def _model(
     if arranged.engine == "lattice":
         grids = [level for level in levels if isinstance(level, GridLevel)]
         return LatticeModel(grids, coreset, plan.rates, seed=seed, device=device)
-    return GatherModel(levels, coreset, plan.rates, seed=seed, device=device)
+    like = before if isinstance(before, GatherModel) else None
+    return GatherModel(levels, coreset, plan.rates, seed=seed, device=device, like=like)
 
 
-def _plan(coreset: Coreset, steps: int, epochs: int, seed: int) -> TrainingPlan:
+def _plan(coreset: Coreset, steps: int, epochs: int, seed: int, schedule: str) -> TrainingPlan:
     """Return the batches of a model: whole bricks, in an order of their own each epoch."""
     batches = min(steps, len(coreset.bricks))
+    share = np.arange(epochs * batches + 1) / (epochs * batches)
+    falling = 0.5 + 0.5 * np.cos(np.pi * share)
     return TrainingPlan(
         epochs=epochs,
         counts=np.diff(coreset.offsets),
         batches=batches,
         seed=seed,
-        rates=np.full(epochs * batches + 1, RATE),
+        rates=RATE * (falling if schedule == "cosine" else np.ones_like(share)),
     )

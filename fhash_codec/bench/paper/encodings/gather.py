@@ -53,6 +53,7 @@ class GatherModel:
         seed: int,
         device: torch.device,
         dtype: torch.dtype = torch.float32,
+        like: GatherModel | None = None,
     ) -> None:
         """Start from random numbers.
 
@@ -63,14 +64,18 @@ class GatherModel:
             seed: seed of the initial numbers.
             device: where the model is trained.
             dtype: type of all its numbers.
+            like: a model with the same levels; where its samples are at the same places, their
+                corners are shared.
         """
         self.levels, self.coreset, self.rates = tuple(levels), coreset, rates
         self.device, self.dtype, self.step = device, dtype, 0
-        self.places = torch.from_numpy(sample_places(coreset))
+        places = torch.from_numpy(sample_places(coreset))
+        shared = like if like is not None and torch.equal(like.places, places) else None
+        self.places: Tensor = places if shared is None else shared.places
         self.values = torch.from_numpy(coreset.values).to(device, dtype)
         self._first = np.concatenate([[0], np.cumsum([level.size for level in levels])])
-        self.rank = self._ranked()
-        self._kept = self._keep()
+        self.rank: Tensor | None = self._ranked() if shared is None else shared.rank
+        self._kept: tuple[Tensor, Tensor] | None = self._keep() if shared is None else shared._kept
 
         random = torch.Generator().manual_seed(seed)
         held = int(self._first[-1]) if self.rank is None else int(self.rank.max()) + 1
@@ -239,7 +244,7 @@ class GatherModel:
     def _encoded(self, buckets: Tensor, weights: Tensor) -> Tensor:
         """Inputs of the network (n, levels E): the embeddings of all levels, concatenated."""
         corners = buckets.shape[-1]
-        encoded: Tensor = WeightedSum.apply(
+        encoded: Tensor = WeightedSum.apply(  # type: ignore[no-untyped-call]
             self.table, buckets.reshape(-1, corners), weights.reshape(-1, corners)
         )
         return encoded.view(len(buckets), -1)

@@ -109,7 +109,8 @@ class TcnnModel:
         (gradient,) = torch.autograd.grad(error, self.parameters)
         with torch.no_grad():
             rate = float(self.rates[self.step])
-            adam_step(self.parameters, gradient, *self._moments, self.step, rate)
+            mean, square = self._moments
+            adam_step(self.parameters, gradient, mean, square, self.step, rate)
 
     def settle(self) -> None:
         """Do nothing: every number takes part in every step."""

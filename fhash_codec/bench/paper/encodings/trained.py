@@ -87,18 +87,18 @@ class TrainedEncoding:
         self.name, self.parts, self.data = name, tuple(parts), data
         self.in_time, self.collisions = in_time, collisions
         self._part = {key: part for part in parts for key in part.keys}
-        # Flat places in a frame of the samples of each key frame, and their numbers.
-        self._places: dict[int, npt.NDArray[np.int64]] = {}
-        self._numbers: dict[int, npt.NDArray[np.int64]] = {}
+        # Flat places in a frame of the samples of each key frame, and their first and last number.
+        self._places: dict[int, npt.NDArray[np.int32]] = {}
+        self._numbers: dict[int, tuple[int, int]] = {}
         for part in parts:
-            places = sample_places(part.coreset).astype(np.int64)
-            box = part.coreset.box
-            flat = np.ravel_multi_index(
-                tuple((places[:, 1:] + np.array(box.first)).T), data.frame_shape
-            )
+            places, box = sample_places(part.coreset), part.coreset.box
             for local, key in enumerate(part.keys):
-                numbers = np.flatnonzero(places[:, 0] == local)
-                self._places[key], self._numbers[key] = flat[numbers], numbers
+                # The samples come key frame by key frame.
+                first, end = np.searchsorted(places[:, 0], [local, local + 1])
+                at = places[first:end, 1:] + np.array(box.first, np.int32)
+                flat = np.ravel_multi_index(tuple(at.T), data.frame_shape)
+                self._places[key] = flat.astype(np.int32)
+                self._numbers[key] = int(first), int(end)
 
     @property
     def tables(self) -> int:
@@ -139,7 +139,9 @@ class TrainedEncoding:
     def frame(self, key: int) -> Values:
         """Values (z, y, x) of a key frame, the background where no model was trained."""
         frame = np.full(self.data.frame_shape, self.data.background, np.float32)
-        frame.reshape(-1)[self._places[key]] = self._part[key].model.infer(self._numbers[key])
+        if key in self._part:
+            numbers = np.arange(*self._numbers[key])
+            frame.reshape(-1)[self._places[key]] = self._part[key].model.infer(numbers)
         return frame
 
     def sample(self, key: float, places: Tensor) -> Tensor:
@@ -152,7 +154,9 @@ class TrainedEncoding:
         share = key - before
         if share > 0 and not self.in_time:
             return torch.lerp(self.sample(before, places), self.sample(before + 1, places), share)
-        part = self._part[before]
+        part = self._part.get(before)
+        if part is None:
+            return torch.full((len(places),), self.data.background, device=places.device)
         box = part.coreset.box
         first = torch.tensor(box.first, dtype=torch.float64, device=places.device)
         last = first + torch.tensor(box.shape, dtype=torch.float64, device=places.device) - 1

@@ -32,7 +32,8 @@ class Encodings:
         monkeypatch.setattr(ratios.fhash_codec, "encode", self.encode)
         monkeypatch.setattr(ratios.fhash_codec, "open", self.open)
 
-    def encode(self, series: Series, path: Path, config: Any) -> None:
+    def encode(self, series: Series, path: Path, config: Any, *, progress: Any) -> None:
+        progress("training", 1, 2, "")
         self.configs.append(config)
 
     def open(self, path: Path) -> Any:
@@ -97,6 +98,7 @@ def test_files_are_encoded_until_they_have_the_quality(encodings: Encodings) -> 
     assert results[0].codec == "F-Hash, float32, 20 epochs"
     assert refused == ["SPERR rate not measured: too small"]
     assert told[-1][1] == told[-1][2]
+    assert ("files", 2, 5, "bubble, F-Hash, coded tables: training 1/2") in told
 
 
 def test_without_peers_a_line_says_so(

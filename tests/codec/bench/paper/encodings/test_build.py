@@ -10,6 +10,7 @@ import torch
 from fhash_codec.bench.paper.data import Data
 from fhash_codec.bench.paper.encodings.build import build, levels_of, paper_grid
 from fhash_codec.bench.paper.encodings.corners import GridLevel, HashLevel
+from fhash_codec.bench.paper.encodings.gather import GatherModel
 from fhash_codec.bench.paper.protocols import Arrangement, arrangement
 from fhash_formats.series import ArraySeries
 
@@ -42,10 +43,29 @@ def test_the_same_batches_in_the_protocol_equal(data: Data) -> None:
     assert orders[0] == orders[1] == orders[2]
 
 
+def test_the_rate_of_the_protocol_best_falls_to_zero(data: Data) -> None:
+    rates = {}
+    for protocol in ("equal", "best"):
+        arranged = arrangement(protocol, "dense", data)
+        encoding = build(
+            "dense", data, arranged, steps=2, epochs=3, seed=1, device=torch.device("cpu")
+        )
+        rates[protocol] = encoding.parts[0].plan.rates[1:]
+    assert (rates["equal"] == 0.01).all()
+    assert (rates["best"][1:] < rates["best"][:-1]).all()
+    assert rates["best"][0] < 0.01
+    assert abs(rates["best"][-1]) < 1e-12
+
+
 def test_key_frames_start_apart(data: Data) -> None:
     arranged = Arrangement(joint=False, whole=True, steps=(1,), engine="gather")
     encoding = build("dense", data, arranged, steps=1, epochs=1, seed=1, device=torch.device("cpu"))
     assert [part.plan.seed for part in encoding.parts] == [3, 4, 5]
+    first, second, _ = (part.model for part in encoding.parts)
+    assert isinstance(first, GatherModel)
+    assert isinstance(second, GatherModel)
+    assert first.places is second.places  # every vertex is a sample at every key frame
+    assert not torch.equal(first.table, second.table)
 
 
 @pytest.mark.parametrize(
