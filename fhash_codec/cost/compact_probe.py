@@ -18,7 +18,7 @@ from fhash_codec.compact.choices.estimate import tile_costs
 from fhash_codec.compact.choices.labels import LabelTrial, has_labels, plan_labels
 from fhash_codec.compact.choices.predictor import TRIAL_ROWS, IntegerTile, fit_weights
 from fhash_codec.compact.choices.step import find_step
-from fhash_codec.compact.choices.transform import choose_transform, usual_transform
+from fhash_codec.compact.choices.transform import likely_transform, usual_transform
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.stages import first_guess, first_settings
 from fhash_codec.compact.tiles.blocks import Blocks, Tile
@@ -43,6 +43,12 @@ OVERHEAD_BYTES = 3000
 """Approximate bytes of a container without its tiles."""
 PROBE_VERTICES = 1 << 17
 """Vertices of a probed tile; larger ones are cut to about this size."""
+PROBE_VERTICES_OF_FEW_BYTES = 1 << 19
+"""The same where a vertex takes less than FEW_BYTES: there borders count, and coding is fast."""
+FEW_BYTES = 0.02
+"""Bytes for each vertex below which a series takes few bytes."""
+MAX_STEPS = 32
+"""Steps of a probed tile at most."""
 MIN_TILES = 4
 """Tiles that are probed at least, where a series has so many."""
 COMPARED_VERTICES = 1 << 20
@@ -203,8 +209,9 @@ def probe_rates(look: Look, config: EncodeConfig) -> Rates:
     bases = 0.0
     if effort > 1 and "transform" not in config.without:
         with recording() as clock:
-            settings, _ = choose_transform(sample, settings, trial_coding, quick=True)
-        bases = sum(entry.seconds for entry in clock.stages() if entry.stage == "bases") / 3
+            settings = likely_transform(sample, settings, trial_coding)
+        fitted = [entry for entry in clock.stages() if entry.stage == "bases"]
+        bases = sum(entry.seconds / entry.times for entry in fitted)
     search, fill, coding = trial, 0.0, search_coding(look, effort)
     if effort > 1 or not task.blocks.complete:
         search, outcome, coded = coded_tiles(sample, settings, coding)
@@ -251,8 +258,10 @@ def _probed_sample(look: Look) -> tuple[Sample, TileSettings]:
     blocks = look.task.blocks
     t, z, y, x = look.tile
     tile: Shape = (min(t, blocks.shape[0]), z, y, x)
-    if prod(tile) > PROBE_VERTICES:
-        tile = even_tile(tile, prod(tile) // PROBE_VERTICES + 1, min(tile[0], 8))
+    few = look.attempt.outcome.size < FEW_BYTES * prod(blocks.shape)
+    limit = PROBE_VERTICES_OF_FEW_BYTES if few else PROBE_VERTICES
+    if prod(tile) > limit:
+        tile = even_tile(tile, prod(tile) // limit + 1, min(tile[0], MAX_STEPS))
     tiled = blocks.retile(tile)
     settings = replace(look.attempt.settings, transform=usual_transform(tiled.tile))
     count = max(MIN_TILES, usable_threads())

@@ -22,6 +22,7 @@ from fhash_codec.compact.choices.head import (
     TRIAL_BUDGET,
     Budget,
     best_widths,
+    most_saved,
 )
 from fhash_codec.compact.choices.labels import is_hopeless
 from fhash_codec.compact.choices.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
@@ -59,7 +60,9 @@ BOUND_TRIALS = 8
 SIZE_TRIES = 3
 """Trials of a search for the step of a size."""
 PASSES = 1.2
-"""Times that all tiles are coded for a PSNR."""
+"""Times that all tiles are coded for a PSNR, where the step was searched on all of them."""
+SAMPLED_PASSES = 2.0
+"""Times that all tiles are coded for a PSNR, where the step was searched on a sample."""
 SIZE_PASSES = 2.0
 """Times that all tiles are coded for a promised ratio."""
 GAIN_AFTER = 1.6
@@ -142,7 +145,9 @@ def stage_seconds(
     if look.task.goal.error and config.effort > 1 and "predictor" not in config.without:
         seconds["predictor"] = _predictor(work)
     goal = look.task.goal
-    passes = 1.0 if goal.error is not None else SIZE_PASSES if goal.size is not None else PASSES
+    passes = PASSES if work.vertices <= MAX_SEARCHED_VERTICES else SAMPLED_PASSES
+    if goal.psnr is None:
+        passes = 1.0 if goal.error is not None else SIZE_PASSES
     return seconds | {"coding": passes * _all_tiles(work, final)}
 
 
@@ -219,7 +224,10 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     gain = GAIN_AFTER * head.gain_db
     if gain < MIN_GAIN:
         return seconds
-    widths = best_widths(size, GAIN_FACTOR * gain + GAIN_BESIDES, EXCHANGE, config.effort)
+    expected = GAIN_FACTOR * gain + GAIN_BESIDES
+    widths = best_widths(size, expected, EXCHANGE, config.effort)
+    if widths is None and most_saved(size, expected, EXCHANGE) <= 0:
+        return seconds
     budget = EFFORTS[config.effort].budget
     search = work.tries(TRIES) * work.wall(rates.search + head.final, tile, searched)
     single = work.tries(TRIES) * searched * prod(tile) * (rates.search + head.final)

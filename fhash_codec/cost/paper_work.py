@@ -48,15 +48,19 @@ class PaperProbe:
     bricks: int
     bytes: int
 
-    def seconds(self, config: EncodeConfig) -> float:
-        """Return the predicted seconds of an encoding whose settings differ in epochs alone."""
+    def stage_seconds(self, config: EncodeConfig) -> dict[str, float]:
+        """Return the predicted seconds of each stage, for settings that differ in epochs alone."""
         # torch takes seconds to import, and only a training needs it.
         from fhash_codec.paper.training.train import HISTORY_POINTS, usual_batches, usual_epochs
 
         batches = usual_batches(self.samples, self.bricks, config.batch)
         epochs = config.epochs or usual_epochs(batches)
         points = len(range(0, epochs, -(-epochs // HISTORY_POINTS)))
-        return sum(self.stages.values()) + epochs * batches * self.step + points * self.curve
+        return {
+            **self.stages,
+            "training": epochs * batches * self.step,
+            "curve": points * self.curve,
+        }
 
 
 def probe_paper(part: Series, share: float, config: EncodeConfig) -> PaperProbe:

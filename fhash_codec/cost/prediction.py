@@ -16,6 +16,7 @@ from math import prod
 
 import numpy as np
 
+from fhash_codec.compact.choices.search import EXCHANGE
 from fhash_codec.compact.stages import MIN_HEAD_EFFORT
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.compact_probe import (
@@ -44,6 +45,8 @@ WINDOW_STEPS = 8
 """Successive steps of each part of a longer series that is looked at: those of a tile."""
 WHOLE_PASSES = 0.15
 """Seconds besides all stages, as a share of those of scanning and measuring."""
+MAX_MISSING = 10.0
+"""Distance in dB of the probed tiles from the promise up to which bytes are corrected for it."""
 SLIMMER = 0.97
 """Bytes after all trials of a transform, as a share of those after a quick choice."""
 
@@ -164,15 +167,16 @@ class Predictor:
         if key not in self._trainings:
             self._trainings[key] = probe_paper(part, share, key)
         probe = self._trainings[key]
+        stages = probe.stage_seconds(config)
         more = config.psnr is not None and config.tables == "transform"
         return Prediction(
-            seconds=probe.seconds(config),
+            seconds=sum(stages.values()),
             bytes=None if config.tables == "transform" else probe.bytes,
             psnr=None,
             basis=f"two epochs on {_steps(part, self._series)}, in {now() - begun:.1f} s"
             + ("; further rounds for --psnr are not counted" if more else "")
             + "; the PSNR is not told before the training",
-            stages=dict(probe.stages),
+            stages=stages,
         )
 
     def _part(self, vertices: int) -> Series:
@@ -204,7 +208,17 @@ def _bytes(look: Look, rates: Rates) -> int:
     tiles = look.attempt.outcome.size if rates.outcome.size == 0 else rates.outcome.size
     if look.labels is not None:
         tiles = min(tiles, look.labels.attempt.outcome.size)
-    return round(SLIMMER * tiles / look.share) + OVERHEAD_BYTES
+    missing = _missing(look, rates)
+    return round(SLIMMER * tiles * 2 ** (missing / EXCHANGE) / look.share) + OVERHEAD_BYTES
+
+
+def _missing(look: Look, rates: Rates) -> float:
+    """The PSNR in dB by which the probed tiles miss the promise; negative where they exceed it."""
+    goal = look.task.goal
+    if goal.psnr is None or goal.data_range == 0:
+        return 0.0
+    missing = goal.psnr - rates.outcome.psnr(goal.data_range)
+    return missing if abs(missing) < MAX_MISSING else 0.0
 
 
 def _psnr(look: Look, rates: Rates) -> float | None:
@@ -218,7 +232,7 @@ def _psnr(look: Look, rates: Rates) -> float | None:
     mean = outcome.squares / outcome.count if outcome.count else 0.0
     if mean <= 0:
         return None
-    psnr = float(10 * np.log10(goal.data_range**2 / mean))
+    psnr = float(10 * np.log10(goal.data_range**2 / mean)) + _missing(look, rates)
     # Beside a promise about the bulk, that about all values holds as well.
     return (
         psnr if goal.psnr is None or goal.bulk is None or goal.bulk.alone else max(psnr, goal.psnr)
@@ -230,6 +244,8 @@ def _basis(look: Look, rates: Rates, seconds: float) -> str:
     vertices = sum(tile.values.size for tile in rates.sample.tiles)
     part = "all steps" if look.share == 1 else f"{look.share:.0%} of the steps"
     uncertain = "seconds within 25 % as a rule, bytes within 20 %"
+    if rates.has_bases:
+        uncertain = "seconds within 35 %; bytes up to twice those of the file, as bases pay here"
     if look.task.goal.error is not None or look.task.goal.size is not None:
         uncertain = "seconds within 50 % for a bound or a ratio, bytes within 30 %"
     return f"a look at {part} and {vertices:,} vertices coded, in {seconds:.1f} s; {uncertain}"

@@ -20,7 +20,7 @@ from fhash_codec.stage_clock import skip, stage
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["HeadHistory", "best_widths", "choose_head", "training_pairs"]
+__all__ = ["HeadHistory", "best_widths", "choose_head", "most_saved", "training_pairs"]
 
 HeadHistory = list[dict[str, float | None]]
 """Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
@@ -87,6 +87,8 @@ GAIN_FACTOR = 1.2
 """Gain of the full training as a multiple of the gain of the trial, roughly."""
 GAIN_BESIDES = 0.02
 """Gain in dB of the full training besides that multiple."""
+MAX_OF_TRIAL = 1.5
+"""Largest gain of a perceptron as a multiple of that expected of the trial head."""
 WEIGHT_BYTES = 0.7
 """Bytes that each weight of a head adds to the file."""
 ARRAY_BYTES = 540
@@ -157,6 +159,11 @@ def choose_head(
         return settings, outcome, []
     gain = GAIN_FACTOR * trial.gain_db + GAIN_BESIDES
     widths = best_widths(outcome.size, gain, _octave(tried, data_range), effort)
+    most = most_saved(outcome.size, gain, _octave(tried, data_range))
+    if widths is None and most <= 0:
+        gained = f"its trial gained {trial.gain_db:.2f} dB"
+        skip("head", f"{gained}: no head would save what it takes itself")
+        return settings, outcome, []
     # A head is trained on what it will meet: coarser data, which it lifts to the quality asked for.
     coarser = replace(settings, step=settings.step * math.exp(trial.gain_db / SLOPE))
     why = f"at effort {effort}; its trial gained {trial.gain_db:.2f} dB"
@@ -283,6 +290,17 @@ def best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[i
 
     best = max(list(GAIN_BY_WIDTHS)[: EFFORTS[effort].candidates], key=saved)
     return best if saved(best) > 0 else None
+
+
+def most_saved(size: float, gain: float, octave: float) -> float:
+    """Return the bytes that a perceptron saves at most, less those that it takes.
+
+    The parameters are those of `best_widths`.
+    """
+    first, second = PERCEPTRON.widths
+    weights = INPUTS * first + first * second + second
+    share = 1 - 2 ** (-MAX_OF_TRIAL * gain / octave)
+    return size * share - WEIGHT_BYTES * weights - HEAD_BYTES
 
 
 def training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:

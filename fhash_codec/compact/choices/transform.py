@@ -118,6 +118,23 @@ def choose_transform(
     return replace(settings, transform=TransformSpec(axes=axes)), lowest
 
 
+def likely_transform(sample: TileSample, settings: TileSettings, coding: Coding) -> TileSettings:
+    """Return settings with what `choose_transform` is likely to find, by few trials.
+
+    The usual transform competes with the data's own bases along time, in space, and along both.
+    """
+    shape: Shape = sample.tiles[0].values.shape
+    bases, usual = _Bases(sample, settings), usual_transform(shape).axes
+    trials = [usual]
+    in_space, in_time = bases.possible(*shape[1:]), bases.possible(shape[0])
+    if in_space:
+        trials.append((usual[0], bases.along(1), bases.along(2), bases.along(3)))
+    if in_time:
+        trials += [(bases.along(0), *axes[1:]) for axes in trials[:]]
+    costs = _costs(sample, settings, trials, coding)
+    return replace(settings, transform=TransformSpec(axes=trials[costs.index(min(costs))]))
+
+
 def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     """Return the codings of a sample by `choose_transform`, and the bases that it fits.
 

@@ -24,6 +24,7 @@ from fhash_codec.compact.choices.head import (
     _side_by_side,
     best_widths,
     choose_head,
+    most_saved,
 )
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.coding import Coding, Outcome
@@ -96,6 +97,12 @@ def test_a_small_file_gets_no_head_and_a_large_one_a_large_head() -> None:
     assert widths(1e9, gain=3.0) == (14, 24)
     assert widths(1e9, gain=3.0, effort=5) == (12, 12)
     assert widths(1e6, gain=0.01) is None
+
+
+def test_a_perceptron_that_cannot_pay_is_told_from_its_size_and_the_gain_of_the_trial() -> None:
+    assert most_saved(20_000, 0.03, 4.5) < 0
+    assert most_saved(20_000, 0.5, 4.5) > 0
+    assert most_saved(500_000, 0.03, 4.5) > 0
 
 
 def test_an_interruption_ends_the_trainings_of_other_threads() -> None:

@@ -7,7 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from fhash_codec.compact.choices.transform import choose_transform, refit, usual_transform
+from fhash_codec.compact.choices.transform import (
+    choose_transform,
+    likely_transform,
+    refit,
+    usual_transform,
+)
 from fhash_codec.compact.tiles.blocks import Index, Tile
 from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
@@ -69,3 +74,14 @@ def test_few_patterns_get_a_basis_of_their_own() -> None:
         usual = sample.run(settings, Coding())
         assert cost < usual.size
         assert refit(sample, chosen) is not chosen
+
+
+def test_a_likely_transform_is_found_by_four_trials() -> None:
+    hats = Hats()
+    with ThreadPoolExecutor(1) as pool:
+        sample = Sample(hats, 1 << 20, pool)  # type: ignore[arg-type]
+        settings = TileSettings(
+            transform=usual_transform(hats.shape), step=0.1, center=0.0, low=-4.0, high=4.0
+        )
+        # A series that is not in memory has no bases, and keeps the usual transform.
+        assert likely_transform(sample, settings, Coding()) == settings
