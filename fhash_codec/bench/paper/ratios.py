@@ -48,7 +48,8 @@ class FileResult:
     Attributes:
         data_set, feature: as of a cell.
         codec: its name, with its setting.
-        kind: paper (tables of a number type), coded (tables coded by the transform), compact or peer.
+        kind: paper, with tables of a number type; coded, with tables that the transform codes;
+            compact or peer.
         whole: whether the file holds the whole domain; else the coreset of the feature alone.
         bytes: on disk.
         raw_bytes: the values of all steps in the source's number type.
@@ -252,8 +253,8 @@ def files_table(results: Sequence[FileResult], refused: Sequence[str] = ()) -> P
         notes=(
             "the ratio is that of the raw values of all steps of the whole domain; peers are"
             " stored chunks alone, without the structure of a file",
-            "dB are over what a file holds: over a feature, all of whose vertices are hard, 45 dB are"
-            " more than over a domain that is mostly background",
+            "dB are over what a file holds: 45 dB over a feature, all of whose vertices are hard,"
+            " are more than over a domain that is mostly background",
             *refused,
             *notes_of(5),
         ),
