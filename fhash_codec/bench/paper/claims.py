@@ -14,15 +14,18 @@ from typing import Any
 
 from fhash_codec.bench.paper.answer import NOT_TESTABLE, Answer, spread, verdict
 from fhash_codec.bench.paper.cell import Cell
+from fhash_codec.bench.paper.claims_of_training import (
+    accuracy,
+    collisions,
+    convergence,
+    parameters,
+)
 from fhash_codec.bench.paper.groups import Group, by_data, groups
-from fhash_codec.bench.paper.printed import DECIBELS
 from fhash_codec.bench.paper.ratios import TARGET, FileResult
 from fhash_codec.bench.paper.table import PaperTable
 
 __all__ = ["answers", "claims_table"]
 
-FASTER = 10.0
-"""Times by which F-Hash converges faster than the best other encoding, as the paper claims."""
 ALL_USED = 0.99
 """Share of embeddings from which on all of them count as used."""
 MISSED = 0.01
@@ -33,13 +36,6 @@ ARM_GAIN = 1.44
 """Smallest gain of ARM in the paper's Table 6."""
 SMALL_SHARE = 0.2
 """Largest share of the volume that the paper gives for its features."""
-EARLY = 8
-"""Epochs after which accuracy counts as early."""
-CLOCKS = {"seconds": "seconds", "epoch": "epochs", "step": "steps"}
-"""Fields of a point that measure the course of a training, and their names."""
-
-Encodings = dict[str, Group]
-"""Groups of one protocol, data set and feature, by encoding."""
 
 
 def claims_table(cells: Sequence[Cell], files: Sequence[FileResult] = ()) -> PaperTable:
@@ -67,7 +63,7 @@ def answers(cells: Sequence[Cell], files: Sequence[FileResult] = ()) -> list[Ans
     grouped = groups(cells)
     protocols = list(dict.fromkeys(group.protocol for group in grouped))
     found: list[Answer] = []
-    for about in (_convergence, _accuracy, _parameters, _collisions):
+    for about in (convergence, accuracy, parameters, collisions):
         for protocol in protocols:
             mine = [group for group in grouped if group.protocol == protocol]
             found.append(about(protocol, [encodings for _, encodings in by_data(mine)]))
@@ -81,104 +77,6 @@ def answers(cells: Sequence[Cell], files: Sequence[FileResult] = ()) -> list[Ans
         _shares(grouped),
     ]
     return [*found, *_elsewhere()]
-
-
-def _convergence(protocol: str, data: Sequence[Encodings]) -> Answer:
-    """Whether F-Hash reaches a quality in a tenth of the best other encoding's time."""
-    ratios: dict[str, list[float]] = {clock: [] for clock in CLOCKS}
-    alone = 0
-    for encodings, decibels, clock in product(data, DECIBELS, CLOCKS):
-        own = encodings.get("fhash")
-        others = [group for name, group in encodings.items() if name != "fhash"]
-        if own is None or not others:
-            continue
-        quality = _quality(encodings)
-        took = own.reached(decibels, quality, clock).median
-        best = min(group.reached(decibels, quality, clock).median for group in others)
-        if not math.isfinite(took) or not took > 0:
-            continue
-        if math.isfinite(best):
-            ratios[clock].append(best / took)
-            continue
-        # Encodings that do not get there took at least as long as they were trained: this counts
-        # where it decides.
-        alone += clock == "seconds"
-        limit = min(getattr(cell.curve[-1], clock) for group in others for cell in group.cells)
-        if limit / took >= FASTER:
-            ratios[clock].append(limit / took)
-    figures = [f"{label} {spread(ratios[clock], 'x')}" for clock, label in CLOCKS.items()]
-    return Answer(
-        f"F-Hash converges {FASTER:g} to 100 times faster than the best other encoding",
-        protocol,
-        verdict(ratios["seconds"], lambda values: median(values) >= FASTER),
-        f"best other / F-Hash to {', '.join(map(str, DECIBELS))} dB: {'; '.join(figures)};"
-        f" reached by F-Hash alone {alone} times"
-        if ratios["seconds"] or alone
-        else "F-Hash, another encoding, or a quality that F-Hash reaches is missing",
-    )
-
-
-def _accuracy(protocol: str, data: Sequence[Encodings]) -> Answer:
-    """Whether F-Hash is the most accurate after the last epoch."""
-    ahead = []
-    for encodings in data:
-        quality = _quality(encodings)
-        last = {name: _last(group, quality) for name, group in encodings.items()}
-        others = [value for name, value in last.items() if name != "fhash" and value is not None]
-        own = last.get("fhash")
-        if own is not None and others:
-            ahead.append(own - max(others))
-    return Answer(
-        "F-Hash is the most accurate after the same epochs",
-        protocol,
-        verdict(ahead, lambda values: median(values) > 0),
-        f"ahead of the best other by {spread(ahead, ' dB')}" if ahead else "no other encoding",
-    )
-
-
-def _parameters(protocol: str, data: Sequence[Encodings]) -> Answer:
-    """Whether F-Hash has fewer numbers than dense grids."""
-    ratios: dict[str, list[float]] = {"dense": [], "dense-multi": []}
-    for encodings, name in product(data, ratios):
-        if {"fhash", name} <= encodings.keys():
-            own, other = (encodings[key].first.parameters for key in ("fhash", name))
-            ratios[name].append(sum(other.values()) / sum(own.values()))
-    known = [ratio for values in ratios.values() for ratio in values]
-    return Answer(
-        "F-Hash needs fewer parameters than dense grids",
-        protocol,
-        verdict(known, lambda values: min(values) > 1),
-        f"single-resolution / F-Hash {spread(ratios['dense'], 'x')},"
-        f" multi-resolution / F-Hash {spread(ratios['dense-multi'], 'x')}"
-        if known
-        else "no dense grid",
-    )
-
-
-def _collisions(protocol: str, data: Sequence[Encodings]) -> Answer:
-    """Whether a hash table with collisions ends less accurate than grids without any."""
-    early: list[float] = []
-    late: list[float] = []
-    shares: list[float] = []
-    for encodings in data:
-        if not {"hash", "dense-multi"} <= encodings.keys():
-            continue
-        hashed, grids = encodings["hash"], encodings["dense-multi"]
-        shares += [cell.collisions for cell in hashed.cells]
-        for values, epochs in ((early, EARLY), (late, 10**9)):
-            figures = [group.after(epochs, "coreset_psnr") for group in (grids, hashed)]
-            if None not in figures:
-                values.append(figures[0].median - figures[1].median)  # type: ignore[union-attr]
-    return Answer(
-        "Collisions limit the accuracy of MHE",
-        protocol,
-        verdict(late, lambda values: median(values) > CLOSE),
-        f"collision-free multi-resolution grids are ahead by {spread(early, ' dB')} after {EARLY}"
-        f" epochs, {spread(late, ' dB')} at the end; corners that share a bucket"
-        f" {spread([100 * share for share in shares], ' %')}"
-        if late
-        else "MHE or multi-resolution grids are missing",
-    )
 
 
 def _used(grouped: Iterable[Group]) -> Answer:
@@ -353,23 +251,6 @@ def _elsewhere() -> list[Answer]:
             "no encoding here has an irregular grid",
         ),
     ]
-
-
-def _quality(encodings: Encodings) -> str:
-    """The figure that the paper compares by, of pictures; that of vertices where none is drawn."""
-    drawn = all(
-        point.picture_psnr is not None
-        for group in encodings.values()
-        for cell in group.cells
-        for point in cell.curve[-1:]
-    )
-    return "picture_psnr" if drawn else "coreset_psnr"
-
-
-def _last(group: Group, quality: str) -> float | None:
-    """The median over seeds of a figure after the last epoch."""
-    found = group.spread(lambda cell: getattr(cell.curve[-1], quality))
-    return None if found is None else found.median
 
 
 def _between(grouped: Iterable[Group]) -> list[dict[str, Any]]:

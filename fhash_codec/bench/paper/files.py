@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from fhash_codec.bench.paper.cell import Cell, settings_id
-from fhash_codec.bench.paper.ratios import EFFORT, EPOCHS, PEERS, TARGET, FileResult, measure_files
+from fhash_codec.bench.paper.ratios import (
+    EFFORT,
+    EPOCHS,
+    NUMBER_TYPES,
+    PEERS,
+    TARGET,
+    FileResult,
+    measure_files,
+)
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import InputError
 from fhash_formats.series import Series
@@ -26,6 +34,8 @@ def files_of(
     cells: Sequence[Cell],
     series_of: Callable[[str], Series],
     folder: Path,
+    *,
+    number_types: Sequence[str] = NUMBER_TYPES,
     progress: Progress = silent,
 ) -> tuple[list[FileResult], list[str]]:
     """Measure the files of every data set and feature of some cells.
@@ -36,6 +46,7 @@ def files_of(
         cells: of the bench.
         series_of: name of a data set -> all of its steps.
         folder: of the cells, one file is added for each data set and feature.
+        number_types: of F-Hash's tables, as for `measure_files`.
         progress: is told about each file.
 
     Returns:
@@ -52,11 +63,16 @@ def files_of(
             )
             continue
         feature = cell.settings.get("feature_resolved", kind)
-        path = folder / _filename(cell, feature)
+        path = folder / _filename(cell, feature, number_types)
         kept = _load(path)
         if kept is None:
             found, missing = measure_files(
-                data_set, series_of(data_set), feature, kind=kind, progress=progress
+                data_set,
+                series_of(data_set),
+                feature,
+                kind=kind,
+                number_types=number_types,
+                progress=progress,
             )
             _save(path, found, missing)
             kept = found, missing
@@ -65,7 +81,7 @@ def files_of(
     return results, list(dict.fromkeys(refused))
 
 
-def _filename(cell: Cell, feature: str) -> str:
+def _filename(cell: Cell, feature: str, number_types: Sequence[str]) -> str:
     """The name of the file of results; other data or settings have another name."""
     settings: dict[str, Any] = {
         "shape": list(cell.shape),
@@ -75,6 +91,7 @@ def _filename(cell: Cell, feature: str) -> str:
         "epochs": list(EPOCHS),
         "effort": EFFORT,
         "peers": list(PEERS),
+        "number_types": list(number_types),
     }
     words = re.sub(r"[^A-Za-z0-9.-]+", "-", f"{cell.data_set}_{cell.feature}")
     return f"files_{words[:100]}_{settings_id(settings)}.json"

@@ -33,6 +33,8 @@ PEERS = ("SZ3", "SPERR", "ZFP")
 """Codecs that the files are compared with, as HDF5 filters."""
 EPOCHS = (10, 20, 40, 80)
 """Epochs of F-Hash that are tried until a file has the quality; its bytes hardly depend on them."""
+NUMBER_TYPES = ("float32", "float16")
+"""Number types of F-Hash's stored tables."""
 EFFORT = 3
 """Effort of `compact`: a larger one makes smaller files in several times the time."""
 PAPER = {"profile": "paper", "key_frames": "all"}
@@ -94,6 +96,7 @@ def measure_files(
     *,
     kind: str = "",
     target: float = TARGET,
+    number_types: Sequence[str] = NUMBER_TYPES,
     progress: Progress = silent,
 ) -> tuple[list[FileResult], list[str]]:
     """Encode a series by F-Hash, by `compact` and by the peers that are installed.
@@ -104,6 +107,7 @@ def measure_files(
         feature: as `fhash encode --feature` takes it.
         kind: name of the feature, as of a cell; the feature itself if empty.
         target: PSNR in dB over all steps.
+        number_types: of F-Hash's tables, beside coded ones; each is a training of its own.
         progress: is told about each file.
 
     Returns:
@@ -112,8 +116,10 @@ def measure_files(
     made = _Files(data_set, series, feature, kind or feature, target)
     refused: list[str] = []
     works: dict[str, Callable[[], list[FileResult]]] = {
-        "F-Hash, float32 tables": lambda: [made.trained("float32")],
-        "F-Hash, float16 tables": lambda: [made.trained("float16")],
+        **{
+            f"F-Hash, {name} tables": lambda name=name: [made.trained(name)]  # type: ignore[misc]
+            for name in number_types
+        },
         "F-Hash, coded tables": lambda: [made.coded()],
         "compact": lambda: [made.compact()],
         ", ".join(PEERS): made.peers,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from fhash_codec.bench.paper.answer import Answer
 from fhash_codec.bench.paper.cell import Cell, Point
+from fhash_codec.bench.paper.claims import answers
 
 RISES = {"dense": 1.0, "dense-multi": 2.0, "hash": 2.5, "fhash": 4.0}
 """dB an epoch of each encoding, from 10 dB on."""
@@ -77,3 +79,13 @@ def cells() -> list[Cell]:
         for protocol, samples in (("published", 200_000), ("equal", 40_000))
         for encoding in RISES
     ]
+
+
+def answer(words: str, *made: Any, protocol: str | None = None, files: Any = ()) -> Answer:
+    """The only answer whose claim has some words, of a protocol."""
+    (found,) = [
+        each
+        for each in answers(made, files)
+        if words in each.claim and protocol in (None, each.protocol)
+    ]
+    return found

@@ -5,20 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from made_cells import BETWEEN, LATENCY, cell, cells
+from made_cells import BETWEEN, LATENCY, answer, cell, cells
 
-from fhash_codec.bench.paper.answer import CONFIRMED, NOT_TESTABLE, REFUTED, Answer
+from fhash_codec.bench.paper.answer import CONFIRMED, NOT_TESTABLE, REFUTED
 from fhash_codec.bench.paper.claims import answers, claims_table
 from fhash_codec.bench.paper.ratios import FileResult
-
-
-def answer(words: str, *made: Any, protocol: str | None = None, files: Any = ()) -> Answer:
-    (found,) = [
-        each
-        for each in answers(made, files)
-        if words in each.claim and protocol in (None, each.protocol)
-    ]
-    return found
 
 
 def test_every_claim_has_an_answer_even_without_cells() -> None:
@@ -27,41 +18,6 @@ def test_every_claim_has_an_answer_even_without_cells() -> None:
     assert len({each.claim for each in found}) == 13
     assert len(found) == 13 + 4  # four of them in each of two protocols
     assert all(each.figures for each in found)
-
-
-def test_speed_is_answered_by_protocol() -> None:
-    slow = [cell(name, "published", rise=0.2) for name in ("dense", "hash")]
-    made = [*slow, cell("fhash", "published"), cell("dense", rise=3.0), cell(rise=4.0)]
-    published = answer("converges", *made, protocol="published")
-    equal = answer("converges", *made, protocol="equal")
-    assert (published.verdict, equal.verdict) == (CONFIRMED, REFUTED)
-    assert "seconds" in equal.figures
-    assert "steps 1." in equal.figures
-
-
-def test_accuracy_turns_with_the_curves() -> None:
-    assert answer("most accurate", cell(), cell("dense")).verdict == CONFIRMED
-    assert answer("most accurate", cell(rise=0.5), cell("dense")).verdict == REFUTED
-
-
-def test_parameters_are_compared_with_the_smallest_grid() -> None:
-    few, many = {"tables": 100, "mlp": 10}, {"tables": 300, "mlp": 10}
-    dense = cell("dense", parameters=few)
-    multi = cell("dense-multi", parameters=many)
-    own = cell(parameters={"tables": 150, "mlp": 10})
-    assert answer("fewer parameters", dense, multi, own).verdict == REFUTED
-    assert answer("fewer parameters", multi, own).verdict == CONFIRMED
-    assert "0.688x" in answer("fewer parameters", dense, multi, own).figures
-
-
-def test_collisions_are_judged_at_the_end() -> None:
-    made = [cell("hash", rise=2.5, collisions=0.9), cell("dense-multi", rise=2.0)]
-    assert answer("Collisions", *made).verdict == REFUTED
-    made = [cell("hash", rise=1.5, collisions=0.9), cell("dense-multi", rise=2.0)]
-    found = answer("Collisions", *made)
-    assert found.verdict == CONFIRMED
-    assert "4 dB after 8 epochs, 20 dB at the end" in found.figures
-    assert "90 %" in found.figures
 
 
 @pytest.mark.parametrize(("used", "verdict"), [(0.3, REFUTED), (1.0, CONFIRMED)])

@@ -21,7 +21,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     calls: list[Any] = []
 
     def measure(
-        name: str, series: Any, feature: str, *, kind: str, progress: Any
+        name: str, series: Any, feature: str, *, kind: str, **_: Any
     ) -> tuple[list[FileResult], list[str]]:
         calls.append((name, series, feature, kind))
         made = FileResult(
