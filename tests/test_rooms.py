@@ -65,7 +65,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("animation",),
     ),
     "fhash_cli": (
-        ("intervals", "progress_bar"),
+        ("durations", "intervals", "progress_bar"),
         ("base_command", "conversion", "options", "output", "scene_types", "selection"),
         ("animation_options", "card_rows", "gallery", "scene_options", "simulating"),
         ("source_listing",),

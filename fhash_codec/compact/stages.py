@@ -34,6 +34,7 @@ __all__ = [
     "fill_tiles",
     "first_guess",
     "first_settings",
+    "other_tiles",
     "try_head",
     "try_predictor",
 ]
@@ -129,7 +130,7 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     if task.fixed_tile is not None:
         skip("tiles", f"--tile {task.config.tile}")
     elif _asked(task, "tiles"):
-        attempt = _try_other_tiles(task, attempt)
+        attempt = _tryother_tiles(task, attempt)
     vertices = prod(task.blocks.shape)
     searched = MAX_SEARCHED_VERTICES if vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
     with stage("sample", SAMPLE_WHY):
@@ -294,9 +295,10 @@ def _choose_transform(task: PlanTask, attempt: Attempt, *, quick: bool = False) 
     return replace(attempt, settings=settings, outcome=outcome)
 
 
-def _try_other_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
+def _tryother_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     """Try larger and longer tiles, and keep them if the file gets much smaller by them."""
-    others = _other_tiles(attempt.sample.blocks, attempt.outcome.size)
+    tiled = attempt.sample.blocks
+    others = other_tiles(tiled.shape, tiled.tile, attempt.outcome.size, complete=tiled.complete)
     if not others:
         skip("tiles", "no other tile is worth the slower access to a region")
         return attempt
@@ -321,8 +323,13 @@ def _best_tiles(task: PlanTask, attempt: Attempt, others: Sequence[Shape]) -> At
     return attempt
 
 
-def _other_tiles(tiled: Blocks, size: int) -> list[Shape]:
-    """Return tiles to try beside the usual ones, which take `size` bytes.
+def other_tiles(shape: Shape, tile: Shape, size: float, *, complete: bool) -> list[Shape]:
+    """Return tiles to try beside the usual one.
+
+    shape: of the box over all steps.
+    tile: the usual one.
+    size: bytes of the tiles.
+    complete: whether all vertices of the box count.
 
     For a small file: all space in one tile, and the whole series in one tile. They make random
     access slower, so they must save much, and they must not be too large to decode.
@@ -330,15 +337,15 @@ def _other_tiles(tiled: Blocks, size: int) -> list[Shape]:
     For a series that is partly outside the coreset: as many tiles, each of all steps. Where few
     vertices count, those of other steps help to fill the rest.
     """
-    shape = tiled.shape
     tiles: list[Shape] = []
     if size <= SMALL_FILE_BYTES:
-        steps = -(-shape[0] // -(-shape[0] // max(tiled.tile[0], 8)))
+        steps = -(-shape[0] // -(-shape[0] // max(tile[0], 8)))
         tiles += [(steps, *shape[1:]), shape]
-    if not tiled.complete and shape[0] <= MAX_TILE_STEPS and tiled.grid[0] > 1:
-        tiles.append(even_tile(shape, prod(tiled.grid), shape[0]))
+    if not complete and shape[0] <= MAX_TILE_STEPS and tile[0] < shape[0]:
+        count = prod(-(-n // length) for n, length in zip(shape, tile, strict=True))
+        tiles.append(even_tile(shape, count, shape[0]))
     return [
-        tile
-        for tile in dict.fromkeys(tiles)
-        if prod(tile) <= MAX_TILE_VERTICES and tile != tiled.tile
+        other
+        for other in dict.fromkeys(tiles)
+        if prod(other) <= MAX_TILE_VERTICES and other != tile
     ]

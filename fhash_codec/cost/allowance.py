@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 from fhash_codec.cost.results import LeftOut
 from fhash_codec.progress import Progress
+from fhash_formats.errors import FhashError
 
 OVERRUN = 0.25
 """Share of its time by which work that has begun may exceed it."""
@@ -57,7 +58,7 @@ class Allowance:
             self.leave_out(what, "interrupted")
             return False
         allowed = share * self.left
-        if seconds <= allowed:
+        if seconds <= allowed and allowed > 0:
             self.left_out = [entry for entry in self.left_out if entry.what != what]
             return True
         why = f"needs about {seconds:.3g} s; {allowed:.3g} s were left for it"
@@ -71,11 +72,13 @@ class Allowance:
 
     @contextmanager
     def work(self, what: str) -> Iterator[None]:
-        """A block of work; where its time is over or Ctrl-C comes, it is noted as left out."""
+        """A block of work; noted as left out where it fails, its time is over or Ctrl-C comes."""
         try:
             yield
         except BudgetSpentError:
-            self.leave_out(what, f"stopped after its time; {self.spent:.3g} s were spent in all")
+            self.leave_out(what, "took longer than its share of the time; stopped", late=True)
+        except FhashError as error:
+            self.leave_out(what, str(error))
         except KeyboardInterrupt:
             self.interrupted = True
             self.leave_out(what, "interrupted")

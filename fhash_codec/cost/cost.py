@@ -19,7 +19,7 @@ from fhash_codec.cost.own import ONE_SHARE, KeptFile, OwnEncodings
 from fhash_codec.cost.peers import PeerEncodings
 from fhash_codec.cost.pictures import PictureCosts
 from fhash_codec.cost.plan import PEERS, wishes
-from fhash_codec.cost.prediction import predict
+from fhash_codec.cost.prediction import predictor
 from fhash_codec.cost.reads import measure_reads
 from fhash_codec.cost.results import CostReport, Picture, Read
 from fhash_codec.progress import Progress, silent
@@ -85,25 +85,21 @@ def measure_cost(
     ):
         series = _measurable(whole, budget, progress)
         facts = facts_of(series, progress)
-        own = OwnEncodings(series, Path(folder), allowance, progress)
+        if not facts.width:
+            raise InputError(
+                f"{whole.source}: '{whole.name}' is constant; accuracy costs nothing there"
+            )
         peers = PeerEncodings(series, facts, Path(folder), allowance, progress)
         reads: list[Read] = []
         pictures: list[Picture] = []
-        try:
-            allowance.part(ENCODE_END)
-            # What was too long for its share may fit into what the others left.
-            for share in (ONE_SHARE, 1.0):
-                for wish in wishes():
-                    if allowance.interrupted:
-                        break
-                    if wish.codec in PEERS:
-                        peers.measure(wish)
-                    else:
-                        own.measure(wish, share=share)
-            if not allowance.interrupted:
+        allowance.part(ENCODE_END)
+        with predictor(series) as foretold:
+            own = OwnEncodings(series, Path(folder), allowance, foretold.predict, progress)
+            with allowance.work("further encodings"):
+                _encode(own, peers, allowance)
+        if not allowance.interrupted:
+            with allowance.work("further reads and pictures"):
                 measure_uses(series, facts, own.files, allowance, progress, reads, pictures)
-        except KeyboardInterrupt:
-            allowance.interrupted = True
         points = [*own.points, *peers.points]
         if allowance.interrupted and not any(point.measured for point in points):
             raise KeyboardInterrupt
@@ -120,10 +116,26 @@ def measure_cost(
         )
 
 
+def _encode(own: OwnEncodings, peers: PeerEncodings, allowance: Allowance) -> None:
+    """Measure every wish once, as far as time goes."""
+    # What was too long for its share may fit into what the others left.
+    for share in (ONE_SHARE, 1.0):
+        for wish in wishes():
+            if allowance.interrupted:
+                return
+            if wish.codec in PEERS:
+                peers.measure(wish)
+            else:
+                own.measure(wish, share=share)
+
+
 def _measurable(whole: Series, budget: float, progress: Progress) -> Series:
     """The series, or a crop of it where its fastest encoding takes too much of the budget."""
     fastest = EncodeConfig(effort=1, psnr=50.0)
-    (prediction,) = predict(whole, [fastest], progress=progress)
+    progress("predicting", 0, 1, "")
+    with predictor(whole) as foretold:
+        prediction = foretold.predict(fastest)
+    progress("predicting", 1, 1, "")
     allowed = FAST_SHARE * budget
     if prediction.seconds <= allowed:
         return whole

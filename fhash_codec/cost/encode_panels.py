@@ -32,7 +32,7 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
     def largest(point: Encoded, measured: bool) -> float | None:
         return point.max_abs_error if measured else None
 
-    units = f", {report.units}" if report.units else ", in the units of the data"
+    units = f", {report.units}" if report.units not in ("", "1") else ", in the units of the data"
     second, byte = (
         Axis(label="seconds of encoding", log=True),
         Axis(label="size of the file, bytes", unit="B", log=True),
@@ -61,7 +61,8 @@ def encode_panels(report: CostReport) -> Iterator[Panel]:
         traces = tuple(_frontier(report.encodings, x_of, y_of))
         if key == "encode-seconds":
             traces += tuple(trace for trace in _trainings(report) if trace.name.startswith("paper"))
-        yield Panel(key=key, section="encode", title=title, x=x, y=y, traces=traces)
+        if len(report.encodings) > 1:
+            yield Panel(key=key, section="encode", title=title, x=x, y=y, traces=traces)
     yield from _courses(report)
     yield _foretold(report.encodings)
 

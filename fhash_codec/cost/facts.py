@@ -8,9 +8,8 @@ from math import prod
 from fhash_codec.coreset.scan import scan
 from fhash_codec.measure.bulk import find_bulk
 from fhash_codec.measure.errors import Errors
-from fhash_codec.measure.value_range import ValueRange
+from fhash_codec.measure.value_range import ValueRange, power_of_two
 from fhash_codec.progress import Progress
-from fhash_formats.errors import InputError
 from fhash_formats.series import Series
 
 
@@ -33,19 +32,25 @@ class Facts:
         """Width of the range, in data units."""
         return self.value_range.high - self.value_range.low
 
+    @property
+    def scale(self) -> float:
+        """Power of two that brings differences of values near 1."""
+        return power_of_two(self.width)
+
+    @property
+    def scaled_width(self) -> float:
+        """Width of the range after scaling."""
+        return self.width * self.scale
+
     def errors(self) -> Errors:
         """Errors without a frame yet."""
         return Errors(self.width, self.bulk)
 
 
 def facts_of(series: Series, progress: Progress) -> Facts:
-    """Scan a series; raises InputError for one that is constant or without a finite value."""
+    """Scan a series; raises InputError for one without a finite value."""
     scanned = scan(series, progress)
     value_range = scanned.value_range
-    if value_range.low == value_range.high:
-        raise InputError(
-            f"{series.source}: '{series.name}' is constant; accuracy costs nothing there"
-        )
     bulk = find_bulk(lambda: series.frames(), value_range, whole=series.dtype.kind in "iu")
     count = prod(series.shape)
     return Facts(

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from fhash_codec.config import EncodeConfig
-from fhash_codec.cost.advice import advise
 from fhash_codec.cost.allowance import Allowance
 from fhash_codec.cost.cost import measure_uses, report_on
 from fhash_codec.cost.facts import facts_of
@@ -82,6 +81,6 @@ def report_on_encode(
         per_step=tuple(figures["quality"]["per_step"]),
         reads=tuple(reads),
         pictures=tuple(pictures),
-        advice=advise([point]),
     )
-    return replace(report, seconds=report.seconds + figures["seconds"])
+    seconds = figures["seconds"]
+    return replace(report, seconds=report.seconds + seconds, budget_seconds=budget + seconds)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.allowance import Allowance
 from fhash_codec.cost.plan import EPOCHS, Wish, paper_config
-from fhash_codec.cost.prediction import Prediction, predict
+from fhash_codec.cost.prediction import Prediction
 from fhash_codec.cost.results import Curve, Encoded
 from fhash_codec.encoding import encode
 from fhash_codec.progress import Progress
@@ -27,8 +27,8 @@ ONE_SHARE = 0.6
 """Share of the time left for encoding that one encoding may take, so that others follow."""
 MAX_SCALE = 4.0
 """Largest factor between measured and predicted seconds that later predictions are scaled by."""
-PREDICT_SHARE = 0.1
-"""Share of the time spent that predicting may take; without a prediction USUAL_SECONDS serve."""
+PREDICT_SHARE = 0.12
+"""Share of the budget that predicting may take; without a prediction USUAL_SECONDS serve."""
 USUAL_RATE = 2e6
 """Vertices a second of the fastest encoding, before one was measured."""
 USUAL_TRAINING = 3e5
@@ -56,7 +56,12 @@ class OwnEncodings:
     """
 
     def __init__(
-        self, series: Series, folder: Path, allowance: Allowance, progress: Progress
+        self,
+        series: Series,
+        folder: Path,
+        allowance: Allowance,
+        predict: Callable[[EncodeConfig], Prediction],
+        progress: Progress,
     ) -> None:
         """Prepare; nothing is encoded yet.
 
@@ -64,8 +69,10 @@ class OwnEncodings:
             series: what is encoded.
             folder: place of the containers, which the caller removes.
             allowance: the time there is.
+            predict: predicts an encoding of the series.
             progress: called with each step of the work.
         """
+        self._predict_one = predict
         self._series, self._folder = series, folder
         self._allowance, self._progress = allowance, progress
         self.points: list[Encoded] = []
@@ -133,14 +140,12 @@ class OwnEncodings:
     def _predict(self, config: EncodeConfig) -> None:
         """Predict an encoding, unless predictions have taken their share of the time."""
         spent = self._allowance.spent
-        if config in self._predictions or self._predicting > PREDICT_SHARE * spent:
+        limit = PREDICT_SHARE * self._allowance.seconds
+        if config in self._predictions or self._predicting > limit:
             return
-        try:
-            (prediction,) = predict(self._series, [config], progress=self._progress)
-        except FhashError as error:
-            self._allowance.leave_out("a prediction", str(error))
-        else:
-            self._predictions[config] = prediction
+        self._progress("predicting", 0, 1, "")
+        self._predictions[config] = self._predict_one(config)
+        self._progress("predicting", 1, 1, "")
         self._predicting += self._allowance.spent - spent
 
     def _expect(self, config: EncodeConfig, seconds: float) -> None:

@@ -11,7 +11,7 @@ __all__ = ["CYCLE", "SYMBOLS", "Axis", "Panel", "Trace", "single", "style_of"]
 STYLES: dict[str, tuple[str, str]] = {
     "compact, effort 1": ("#56B4E9", "circle"),
     "compact, effort 2": ("#56B4E9", "diamond"),
-    "compact, effort 3": ("#0072B2", "circle"),
+    "compact, effort 3": ("#2583C4", "circle"),
     "compact, effort 5": ("#D55E00", "circle"),
     "compact, effort 7": ("#D55E00", "diamond"),
     "compact, effort 9": ("#D55E00", "star"),
@@ -20,8 +20,8 @@ STYLES: dict[str, tuple[str, str]] = {
     "SPERR": ("#E69F00", "triangle-up"),
     "ZFP": ("#8A8F98", "x"),
 }
-"""Colour (Okabe and Ito's, which colour-blind people tell apart) and symbol of each curve."""
-CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8A8F98")
+"""Colour, after Okabe and Ito (told apart by colour-blind people), and symbol of each curve."""
+CYCLE = ("#2583C4", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8A8F98")
 """Colours of curves that have none of their own."""
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "x", "star", "cross")
 """Symbols of curves that have none of their own."""

@@ -11,6 +11,6 @@ __all__ = ["panels"]
 
 
 def panels(report: CostReport) -> list[Panel]:
-    """Every plot for which there are points."""
+    """Every plot for which there are points; those that compare encodings need two."""
     made = [*encode_panels(report), *read_panels(report), *picture_panels(report)]
     return [panel for panel in made if any(trace.x for trace in panel.traces)]

@@ -80,6 +80,11 @@ class PictureCosts:
 
     def measure(self, series: Series, files: Sequence[KeptFile]) -> None:
         """Measure everything, the most telling first, until the time of the part is over."""
+        with self._allowance.work("pictures"):
+            self._renderer.render(self._scene)
+            begun = time.perf_counter()
+            self._renderer.render(self._scene)
+            self._seconds = time.perf_counter() - begun
         self._group("effect", self._effects(), best=None)
         self._knob("step length", "step", STEPS)
         if self._volume.profile == "compact":
@@ -105,8 +110,10 @@ class PictureCosts:
     ) -> None:
         """Measure scenes in turns; with `best` each is compared with that one."""
         renderer = renderer or self._renderer
-        expected = self._seconds * len(scenes) * (turns + 1)
-        if not self._allowance.has(f"pictures by {group}", expected):
+        expected = self._seconds * len(scenes)
+        if turns > 1 and expected * (turns + 1) > self._allowance.left:
+            turns = 1
+        if not self._allowance.has(f"pictures by {group}", expected * (turns + 1)):
             return
         begun = time.perf_counter()
         with self._allowance.work(f"pictures by {group}"):

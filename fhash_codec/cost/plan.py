@@ -79,8 +79,9 @@ def wishes() -> Iterator[Wish]:
     for target in (40, 60):
         yield _psnr(1, target)
         yield from _peers(target)
-        yield _psnr(3, target)
     yield Wish(codec="paper", group="paper")
+    for target in (40, 60):
+        yield _psnr(3, target)
     for target in (45, 70):
         yield _psnr(1, target)
         yield from _peers(target)

@@ -180,7 +180,9 @@ def _measured(series: Series, file: KeptFile, kind: _Kind, facts: Facts) -> Read
                 continue
             original, decoded = kind.compare(volume, step, region, values)
         both = np.isfinite(original) & np.isfinite(decoded)
-        error = np.abs(original[both].astype(np.float64) - decoded[both].astype(np.float64))
+        # Scaled by a power of two near the range, squares of large values do not overflow.
+        scaled = (part[both].astype(np.float64) * facts.scale for part in (original, decoded))
+        error = np.abs(np.subtract(*scaled))
         squares, count = squares + float(np.sum(error**2)), count + error.size
         largest = max(largest, float(error.max(initial=0.0)))
     rmse = (squares / count) ** 0.5 if count else None
@@ -191,6 +193,6 @@ def _measured(series: Series, file: KeptFile, kind: _Kind, facts: Facts) -> Read
         values=values.size,
         milliseconds=1e3 * median(taken),
         bytes_read=round(median(touched)),
-        psnr=psnr(facts.width, rmse) if rmse else None,
-        max_abs_error=largest if count else None,
+        psnr=psnr(facts.scaled_width, rmse),
+        max_abs_error=largest / facts.scale if count else None,
     )

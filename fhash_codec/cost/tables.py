@@ -59,7 +59,7 @@ def _advice(report: CostReport) -> Table:
 
 
 def _encodings(report: CostReport) -> Table:
-    units = f" {report.units}" if report.units else ""
+    units = f" {report.units}" if report.units not in ("", "1") else ""
     return Table(
         section="encode",
         title="Encodings",

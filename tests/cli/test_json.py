@@ -152,6 +152,8 @@ def test_encode_diff_and_info(fhash: Fhash, data: Path, tmp_path: Path) -> None:
         outputs["info"].append(parsed(fhash("info", path, "--json")))
     detailed = ["--var", "density", "--t", "1:", "--missing", "-9"]
     outputs["encode --explain"] = explained
+    words = ["encode", data, "-o", path, "--force", "--effort", "2", "--time-budget", "10m"]
+    outputs["encode --time-budget"] = [*outputs["encode"], parsed(fhash(*words, "--json", "-q"))]
     outputs["info DATA"].append(parsed(fhash("info", data, *detailed, "--json")))
     for command, results in outputs.items():
         check(command, *results)

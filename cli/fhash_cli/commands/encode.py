@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import glob
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.commands.cost import check_report_folder
+from fhash_cli.durations import DurationType
 from fhash_cli.options import (
     SourceOptions,
     check_writable,
@@ -34,10 +38,11 @@ from fhash_cli.output import (
     spans,
     table,
 )
-from fhash_formats.errors import InterruptedEncodingError, QualityError
+from fhash_formats.errors import FhashWarning, InterruptedEncodingError, QualityError
 
 if TYPE_CHECKING:
     from fhash_codec.config import EncodeConfig
+    from fhash_codec.cost.time_budget import Choice
     from fhash_formats.series import Series
 
 MAX_LABELS = 64
@@ -57,6 +62,13 @@ MAX_LABELS = 64
 @click.option(
     "--explain", is_flag=True, help="Say how long each stage took, and why it ran or did not."
 )
+@click.option(
+    "--time-budget",
+    type=DurationType(),
+    help="Choose the highest effort, or with --profile paper the most epochs, that should take no "
+    "longer than a time such as 60s or 5m, by a short probe; --effort or --epochs is then the most "
+    "that may be chosen.",
+)
 @click.option("-v", "--verbose", is_flag=True, help="Also print what the search went through.")
 @click.option(
     "--report",
@@ -74,6 +86,7 @@ def command(
     as_json: bool,
     quiet: bool,
     explain: bool,
+    time_budget: float | None,
     verbose: bool,
     report_folder: str | None,
 ) -> None:
@@ -94,27 +107,68 @@ def command(
         check_report_folder(Path(report_folder), force, data)
     before = _stamp(output)
     with Progress(quiet=quiet) as progress, source.open(data, progress) as series:
-        missed = None
+        missed: QualityError | None = None
+        stopped: InterruptedEncodingError | None = None
+        choice = None
+        if time_budget is not None:
+            choice = _choose(series, config, time_budget, progress, quiet=quiet)
+            config = choice.config
+        predicted = None if choice is None else dataclasses.asdict(choice.prediction)
         try:
-            report = fhash_codec.encode(series, output, config, force=force, progress=progress)
+            report = fhash_codec.encode(
+                series, output, config, force=force, progress=progress, predicted=predicted
+            )
         except QualityError as error:
             # The file is written, and its figures are a result all the same.
             missed, report = error, error.figures
         except KeyboardInterrupt:
             raise InterruptedEncodingError(_after_interruption(output, before)) from None
         if report_folder is not None:
-            _write_report(series, report, config, Path(report_folder), force, missed, progress)
+            stopped = _write_report(
+                series, report, config, Path(report_folder), force, missed, progress
+            )
     _say_unmet(source, series, quiet)
     integers = (series.source_dtype or series.dtype).kind in "iu"
     if integers and not quiet and looks_categorical(report):
         say("few different integers: if they are labels, --max-error 0 keeps each exactly")
     rows = report_rows(report, series.units, part=source.part, verbose=verbose)
+    if report_folder is not None:
+        rows.append(("report", str(Path(report_folder) / "cost.html")))
     text = table(rows)
     stages = report.pop("stages")
     if explain:
         report["stages"] = stages
         text += f"\n\n{stage_table(stages)}"
-    emit(report, text, as_json, missed)
+    if choice is not None:
+        report["time_budget"] = choice.to_dict()
+    emit(report, text, as_json, missed or stopped)
+
+
+def _choose(
+    series: Series,
+    config: EncodeConfig,
+    seconds: float,
+    progress: Progress,
+    *,
+    quiet: bool,
+) -> Choice:
+    """Choose effort or epochs by a budget in seconds, and say so in one line."""
+    from fhash_codec.cost.time_budget import choose
+
+    name = "epochs" if config.profile == "paper" else "effort"
+    given = click.get_current_context().get_parameter_source(name)
+    choice = choose(
+        series,
+        config,
+        seconds,
+        capped=given is not None and given is not ParameterSource.DEFAULT,
+        progress=progress,
+    )
+    if not choice.fits:
+        warnings.warn(choice.why, FhashWarning, stacklevel=2)
+    elif not quiet:
+        say(choice.why)
+    return choice
 
 
 def stage_table(stages: Sequence[Mapping[str, Any]]) -> str:
@@ -141,13 +195,21 @@ def _write_report(
     force: bool,
     missed: QualityError | None,
     progress: Progress,
-) -> None:
-    """Measure reads and pictures of the file just written, and write its report."""
+) -> InterruptedEncodingError | None:
+    """Measure reads and pictures of the file just written, and write its report.
+
+    The error that is returned says that Ctrl-C ended the measurements; None where it did not.
+    """
     from fhash_codec.cost.files import write_report
     from fhash_codec.cost.one import report_on_encode
 
     costs = report_on_encode(series, figures, config, missed=missed is not None, progress=progress)
-    write_report(costs, folder, force=force)
+    page, *_ = write_report(costs, folder, force=force)
+    if not costs.interrupted:
+        return None
+    return InterruptedEncodingError(
+        f"interrupted; {figures['path']} is complete, {page} has what was measured until then"
+    )
 
 
 def _say_unmet(source: SourceOptions, series: Series, quiet: bool) -> None:

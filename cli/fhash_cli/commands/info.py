@@ -19,6 +19,7 @@ from fhash_cli.output import (
     loss_rows,
     number,
     quality_rows,
+    size,
     spans,
     table,
 )
@@ -107,6 +108,7 @@ def _rows(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         *(_compact(volume, info) if volume.profile == "compact" else loss_rows(info["model"])),
         ("training", _training(info)),
+        *_predicted(info),
         *quality_rows(info["quality"], volume.units),
     ]
 
@@ -137,6 +139,26 @@ def _training(info: dict[str, Any]) -> str:
         f"{steps}{training['epochs']} epochs{took} on {training['device']},"
         f" seed {info['encoder']['seed']}{lowered}{'; the head was left out' if unused else ''}"
     )
+
+
+def _predicted(info: dict[str, Any]) -> list[tuple[str, str]]:
+    """The row of what was predicted before the encoding, and what it took; none without either."""
+    encoder = info["encoder"]
+    told = encoder.get("predicted")
+    if told is None:
+        return []
+    parts = [
+        text
+        for name, text in (
+            ("seconds", number(told.get("seconds"), "s", digits=3)),
+            ("bytes", size(told.get("bytes") or 0)),
+            ("psnr", number(told.get("psnr"), "dB")),
+        )
+        if told.get(name) is not None
+    ]
+    took = encoder.get("took_seconds")
+    was = "" if took is None else f"; it took {number(took, 's', digits=3)}"
+    return [("predicted", f"{', '.join(parts)}{was}, {size(info['bytes'])}")]
 
 
 def _compact(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:

@@ -49,7 +49,7 @@ def convergence(protocol: str, data: Sequence[Encodings]) -> Answer:
 
 @dataclass(frozen=True)
 class _Course:
-    """Ratios of the best other encoding's time to that of F-Hash, by clock.
+    """Ratio of the best other encoding's time to that of F-Hash, by clock.
 
     Attributes:
         ratios: of all data and decibels that F-Hash reached, for each of CLOCKS.

@@ -20,7 +20,7 @@ from fhash_codec.stage_clock import skip, stage
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["HeadHistory", "choose_head"]
+__all__ = ["HeadHistory", "best_widths", "choose_head", "training_pairs"]
 
 HeadHistory = list[dict[str, float | None]]
 """Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
@@ -150,18 +150,18 @@ def choose_head(
     parts = parts or Parts()
     tell = partial(parts.report, "training")
     with stage("head trial", "gain of a quick training, by which heads are chosen"):
-        pairs = _training_pairs(sample, settings, coding)
+        pairs = training_pairs(sample, settings, coding)
         trial = training.run(pairs, settings, TRIAL_HEAD, TRIAL_BUDGET, tell)
     if trial is None or trial.gain_db < MIN_GAIN:
         skip("head", "its trial gains nothing")
         return settings, outcome, []
     gain = GAIN_FACTOR * trial.gain_db + GAIN_BESIDES
-    widths = _best_widths(outcome.size, gain, _octave(tried, data_range), effort)
+    widths = best_widths(outcome.size, gain, _octave(tried, data_range), effort)
     # A head is trained on what it will meet: coarser data, which it lifts to the quality asked for.
     coarser = replace(settings, step=settings.step * math.exp(trial.gain_db / SLOPE))
     why = f"at effort {effort}; its trial gained {trial.gain_db:.2f} dB"
     with stage("head", why):
-        pairs = _training_pairs(sample.wider(TRAINING_VERTICES), coarser, coding)
+        pairs = training_pairs(sample.wider(TRAINING_VERTICES), coarser, coding)
     budget = EFFORTS[effort].budget
 
     def train(shape: Shape, tell: Callable[[float], None]) -> _Candidate | None:
@@ -264,7 +264,7 @@ def _octave(tried: list[Outcome], data_range: float) -> float:
     return exchange(points, EXCHANGE)
 
 
-def _best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, int] | None:
+def best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, int] | None:
     """Return the widths of the head with a cross that should save most; None if none should.
 
     size: bytes of the coded tiles.
@@ -285,7 +285,7 @@ def _best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[
     return best if saved(best) > 0 else None
 
 
-def _training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:
+def training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:
     """Return the tiles as they decode without a head, with their originals and masks."""
     decoded = sample.decoded(replace(settings, head=None, mask=None), coding)
     return [

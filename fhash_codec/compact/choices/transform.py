@@ -125,18 +125,15 @@ def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     in_memory: whether the series is, so that bases are possible.
     """
 
-    def possible(*lengths: int) -> bool:
-        return in_memory and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
-
-    t, z, y, x = shape
-    plane = sum(2 ** (depth - 1) < max(y, x) for _, depth in PLANE_WAVELETS)
-    lines = sum(
-        sum(2 ** (depth - 1) < length for _, depth in LINE_WAVELETS) + possible(length)
-        for length in (t, z)
-        if length > 1
+    bases = _CountedBases(in_memory)
+    axes = usual_transform(shape).axes
+    groups = (
+        _plane_trials(shape, bases),
+        _line_trials(0, shape, bases),
+        _line_trials(1, shape, bases),
     )
-    bases = 2 * possible(y, x) + possible(t) + possible(z)
-    return 1 + plane + possible(y, x) + lines, bases
+    trials = 1 + sum(_changed(axes, change) != axes for group in groups for change in group)
+    return trials, len(bases.fitted)
 
 
 def refit(sample: TileSample, settings: TileSettings) -> TileSettings:
@@ -267,6 +264,27 @@ class _Bases:
         centred[~np.isfinite(centred)] = 0.0
         columns = np.moveaxis(centred, axis, 0).reshape(values.shape[axis], -1)
         return columns @ columns.T
+
+
+class _CountedBases(_Bases):
+    """Bases that are counted and not fitted.
+
+    Attributes:
+        fitted: axes along which the encoder would fit one.
+    """
+
+    def __init__(self, in_memory: bool) -> None:
+        self.fitted: set[int] = set()
+        self._in_memory = in_memory
+
+    def possible(self, *lengths: int) -> bool:
+        """Whether axes of these lengths can have a basis."""
+        return self._in_memory and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
+
+    def along(self, axis: int) -> AxisTransform:
+        """Return what stands for a basis along an axis, other than the usual one, and count it."""
+        self.fitted.add(axis)
+        return AxisTransform(kind="haar", depth=1)
 
 
 assert MAX_BASIS_LENGTH <= MAX_LENGTH

@@ -108,6 +108,27 @@ def batch_ends(counts: npt.NDArray[np.int64], batches: int) -> npt.NDArray[np.in
     return np.minimum(cuts, len(counts) - batches + numbers).astype(np.int64)
 
 
+def usual_batches(samples: int, bricks: int, batch: int = 0) -> int:
+    """Return the training steps of an epoch.
+
+    Args:
+        samples: samples of the coreset.
+        bricks: bricks that hold them.
+        batch: as in `plan_training`.
+    """
+    if batch:
+        batches = max(1, round(samples / batch))
+    else:
+        low, high = STEPS_AN_EPOCH
+        batches = min(max(-(-samples // BATCH_SAMPLES), low), high)
+    return min(batches, bricks)
+
+
+def usual_epochs(batches: int) -> int:
+    """Return the epochs where none are given, each of a number of training steps."""
+    return max(USUAL_EPOCHS, -(-USUAL_STEPS // batches))
+
+
 def plan_training(
     coreset: Coreset, *, epochs: int, learning_rate: float, schedule: str, batch: int, seed: int
 ) -> TrainingPlan:
@@ -123,14 +144,8 @@ def plan_training(
         seed: seed of the order of the bricks.
     """
     counts = np.diff(coreset.offsets)
-    samples = int(counts.sum())
-    if batch:
-        batches = max(1, round(samples / batch))
-    else:
-        low, high = STEPS_AN_EPOCH
-        batches = min(max(-(-samples // BATCH_SAMPLES), low), high)
-    batches = min(batches, len(counts))
-    epochs = epochs or max(USUAL_EPOCHS, -(-USUAL_STEPS // batches))
+    batches = usual_batches(int(counts.sum()), len(counts), batch)
+    epochs = epochs or usual_epochs(batches)
     share = np.arange(epochs * batches + 1) / max(epochs * batches, 1)
     rates = learning_rate * (
         0.5 + 0.5 * np.cos(np.pi * share) if schedule == "cosine" else np.ones_like(share)

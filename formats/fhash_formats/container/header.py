@@ -146,6 +146,11 @@ def _check_source(top: Record) -> np.dtype[Any]:
     encoder.text("version")
     encoder.integer("seed", -(2**63), 2**64 - 1)
     encoder.number_or_null("seconds")
+    encoder.number_or_null("took_seconds")
+    if encoder.has("predicted"):
+        predicted = encoder.record("predicted")
+        for figure in ("seconds", "bytes", "psnr"):
+            predicted.number_or_null(figure)
     variable.text("name")
     variable.text("units")
     dtype = DTYPES[variable.choice("dtype", tuple(DTYPES))]

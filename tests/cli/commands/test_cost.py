@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import Result
 
-from fhash_cli.commands.cost import DurationType
-from fhash_codec.cost import cost, files, own, pictures
+from fhash_cli.durations import DurationType
+from fhash_codec.cost import cost, files, pictures
 from fhash_codec.cost.plan import Wish
 from fhash_codec.cost.prediction import Prediction
 
@@ -27,8 +29,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     wish = Wish(codec="compact", group="g", config=EncodeConfig(effort=1, psnr=40.0))
     prediction = Prediction(seconds=0.01, bytes=9, psnr=40.0, basis="")
     monkeypatch.setattr(cost, "wishes", lambda: iter([wish]))
-    for module in (cost, own):
-        monkeypatch.setattr(module, "predict", lambda *_, **__: [prediction])
+    foretold = SimpleNamespace(predict=lambda config: prediction)
+    monkeypatch.setattr(cost, "predictor", lambda series: nullcontext(foretold))
     monkeypatch.setattr(pictures.PictureCosts, "measure", lambda *_: None)
     monkeypatch.setattr(files, "plot", lambda report, path: path.write_bytes(b"PNG"))
 

@@ -297,3 +297,28 @@ def test_a_stage_of_no_name_is_refused(fhash: Fhash, data: Path, tmp_path: Path)
     result = fhash("encode", data, "-o", tmp_path / "run.fhz", "--without", "hed")
     assert result.exit_code == 2
     assert "without names 'hed'; did you mean 'head'?" in result.stderr
+
+
+def test_a_time_budget_chooses_an_effort_and_info_says_what_was_predicted(
+    fhash: Fhash, data: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run.fhz"
+    words = ("encode", data, "-o", run, "--psnr", "40", "--force")
+    result = fhash(*words, "--time-budget", "10m", "--effort", "2")
+    assert result.exit_code == 0
+    assert "time budget 600 s: --effort 2, predicted to take" in result.stderr
+    assert "the most that is allowed" in result.stderr
+    shown = fhash("info", run).stdout
+    assert any(line.startswith("predicted") and "it took" in line for line in shown.splitlines())
+    encoder = json.loads(fhash("info", run, "--json").stdout)["encoder"]
+    assert set(encoder["predicted"]) == {"seconds", "bytes", "psnr"}
+    assert encoder["took_seconds"] > 0
+
+
+def test_without_timings_a_budget_changes_no_byte(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    runs = [tmp_path / "a.fhz", tmp_path / "b.fhz"]
+    for run, words in zip(runs, (["--time-budget", "10m"], []), strict=True):
+        more = ["--effort", "2", "--no-timings", "-q"]
+        assert fhash("encode", data, "-o", run, *words, *more).exit_code == 0
+    assert runs[0].read_bytes() == runs[1].read_bytes()
+    assert "predicted" not in fhash("info", runs[0]).stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -28,12 +29,16 @@ def few() -> Iterator[Wish]:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few encodings, no predictions to wait for, and small pictures."""
 
-    def foretold(series: ArraySeries, configs: list[EncodeConfig], **_: object) -> list[Prediction]:
-        seconds = 1e-9 * float(np.prod(series.shape))
-        return [Prediction(seconds=seconds, bytes=9, psnr=40.0, basis="") for _ in configs]
+    class Foretold:
+        """A predictor of times as long as the series."""
 
-    monkeypatch.setattr(own, "predict", foretold)
-    monkeypatch.setattr(cost, "predict", foretold)
+        def __init__(self, series: ArraySeries) -> None:
+            self.seconds = 1e-9 * float(np.prod(series.shape))
+
+        def predict(self, config: EncodeConfig) -> Prediction:
+            return Prediction(seconds=self.seconds, bytes=9, psnr=40.0, basis="")
+
+    monkeypatch.setattr(cost, "predictor", lambda series: nullcontext(Foretold(series)))
     monkeypatch.setattr(cost, "wishes", few)
     monkeypatch.setattr(pictures.PictureCosts, "measure", lambda self, series, files: None)
 

@@ -19,17 +19,15 @@ from fhash_formats.series import ArraySeries
 FAST = Wish(codec="compact", group="compact, effort 1", config=EncodeConfig(effort=1, psnr=40.0))
 
 
-@pytest.fixture(autouse=True)
-def foretold(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Predictions of 2 s."""
-    prediction = Prediction(seconds=2.0, bytes=99, psnr=40.0, basis="none")
-    monkeypatch.setattr(own, "predict", lambda series, configs, **_: [prediction] * len(configs))
+def foretold(config: EncodeConfig) -> Prediction:
+    """A prediction of 2 s."""
+    return Prediction(seconds=2.0, bytes=99, psnr=40.0, basis="none")
 
 
 def test_an_encoding_has_its_figures_and_its_prediction(
     series: ArraySeries, tmp_path: Path
 ) -> None:
-    encodings = OwnEncodings(series, tmp_path, Allowance(1000.0), silent)
+    encodings = OwnEncodings(series, tmp_path, Allowance(1000.0), foretold, silent)
     encodings.measure(FAST)
     (point,), (file,) = encodings.points, encodings.files
     assert point.measured
@@ -41,7 +39,7 @@ def test_an_encoding_has_its_figures_and_its_prediction(
 
 def test_where_time_is_wanting_the_prediction_stays(series: ArraySeries, tmp_path: Path) -> None:
     allowance = Allowance(1.0)
-    encodings = OwnEncodings(series, tmp_path, allowance, silent)
+    encodings = OwnEncodings(series, tmp_path, allowance, foretold, silent)
     encodings.measure(FAST)
     (point,) = encodings.points
     assert not point.measured
@@ -56,12 +54,12 @@ def test_an_encoding_that_overruns_is_no_point(series: ArraySeries, tmp_path: Pa
 
     def advance(stage: str, done: int, total: int, note: str) -> None:
         nonlocal now
-        now += 500.0
+        now += 0.0 if stage == "predicting" else 500.0
 
-    encodings = OwnEncodings(series, tmp_path, allowance, advance)
+    encodings = OwnEncodings(series, tmp_path, allowance, foretold, advance)
     encodings.measure(FAST)
     assert not any(point.measured for point in encodings.points)
-    assert "stopped after its time" in allowance.left_out[0].why
+    assert "took longer" in allowance.left_out[0].why
     assert list(tmp_path.iterdir()) == []
 
 
@@ -73,7 +71,7 @@ def test_paper_needs_torch(
 
     monkeypatch.setattr(own, "need_torch", missing)
     allowance = Allowance(1000.0)
-    encodings = OwnEncodings(series, tmp_path, allowance, silent)
+    encodings = OwnEncodings(series, tmp_path, allowance, foretold, silent)
     encodings.measure(Wish(codec="paper", group="paper"))
     assert encodings.points == []
     assert allowance.left_out[0].why == "profile paper needs torch"
@@ -83,7 +81,7 @@ def test_paper_trains_one_epoch_and_then_as_many_as_fit(
     series: ArraySeries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(own, "EPOCHS", (2, 10**6))
-    encodings = OwnEncodings(series, tmp_path, Allowance(1000.0), silent)
+    encodings = OwnEncodings(series, tmp_path, Allowance(1000.0), foretold, silent)
     encodings.measure(Wish(codec="paper", group="paper"))
     assert [point.name for point in encodings.points] == ["paper, 1 epoch", "paper, 2 epochs"]
     assert [len(curve.points) for curve in encodings.curves] == [1, 2]

@@ -21,8 +21,8 @@ from fhash_codec.compact.choices.head import (
     Budget,
     Effort,
     Shape,
-    _best_widths,
     _side_by_side,
+    best_widths,
     choose_head,
 )
 from fhash_codec.compact.choices.transform import usual_transform
@@ -85,7 +85,7 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
 
 def test_a_small_file_gets_no_head_and_a_large_one_a_large_head() -> None:
     def widths(size: float, gain: float = 0.5, effort: int = 9) -> tuple[int, int] | None:
-        return _best_widths(size, gain, 4.5, effort)
+        return best_widths(size, gain, 4.5, effort)
 
     assert widths(1_000) is None
     chosen = [widths(size) for size in (1e4, 2e4, 3e4, 1e5, 3e5, 1e6)]

@@ -1,0 +1,284 @@
+"""Work of an encoding by the profile compact: what its stages code, and how long that takes.
+
+The counts follow the encoder (fhash_codec/compact/stages.py). What depends on the data, such as the
+number of trials until a step is found, is a constant here: its mean over many series.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from math import prod
+
+from fhash_codec.compact.choices.head import (
+    EFFORTS,
+    GAIN_BESIDES,
+    GAIN_FACTOR,
+    MIN_BYTES,
+    MIN_GAIN,
+    PERCEPTRON,
+    PERCEPTRON_LONGER,
+    TRAINING_VERTICES,
+    TRIAL_BUDGET,
+    Budget,
+    best_widths,
+)
+from fhash_codec.compact.choices.labels import is_hopeless
+from fhash_codec.compact.choices.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
+from fhash_codec.compact.choices.search import EXCHANGE
+from fhash_codec.compact.choices.transform import count_trials
+from fhash_codec.compact.stages import (
+    MAX_SEARCHED_VERTICES,
+    MAX_TILE_VERTICES,
+    MIN_HEAD_EFFORT,
+    SAMPLE_VERTICES,
+    TRIAL_VERTICES,
+    other_tiles,
+)
+from fhash_codec.compact.tiles.tiling import tile_for
+from fhash_codec.config import EncodeConfig
+from fhash_codec.cost.compact_probe import Look, Rates
+from fhash_codec.cost.head_probe import HeadProbe, updates_of
+from fhash_codec.measure.ssim import ssim_steps
+from fhash_formats.support.threads import usable_threads
+from fhash_formats.transform.head.inputs import CROSS, INPUTS
+from fhash_formats.transform.tile.sections import Shape
+
+__all__ = ["stage_seconds"]
+
+TRIES = 2.5
+"""Trials of a search for the step of a PSNR."""
+NEAR_TRIES = 1.5
+"""Trials of that search where it begins near its end: for another tile, or the same sample."""
+TRIAL_SHARE = 0.8
+"""Time of coding with a candidate for the transform, as a share of that with the usual one."""
+REFIT_TRIES = 4
+"""Further trials where the data's own bases are fitted again."""
+BOUND_TRIALS = 8
+"""Trials of a search for the step under a bound."""
+SIZE_TRIES = 3
+"""Trials of a search for the step of a size."""
+PASSES = 1.2
+"""Times that all tiles are coded for a PSNR."""
+SIZE_PASSES = 2.0
+"""Times that all tiles are coded for a promised ratio."""
+GAIN_AFTER = 1.6
+"""Gain of the trial head as a multiple of that after the few updates of a probe."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Work:
+    """Counts of the work for one setting."""
+
+    look: Look
+    rates: Rates
+    config: EncodeConfig
+
+    @property
+    def vertices(self) -> int:
+        """Vertices of the box over all steps."""
+        return prod(self.look.shape)
+
+    @property
+    def bytes_of_tiles(self) -> float:
+        """Approximate bytes of all tiles."""
+        return self.rates.outcome.size / self.look.share
+
+    def tiles(self, tile: Shape, limit: int | None = None) -> int:
+        """The number of tiles of the series, or of a sample of at most `limit` vertices."""
+        count = prod(-(-n // m) for n, m in zip(self.look.shape, tile, strict=True))
+        return count if limit is None else min(count, max(1, limit // prod(tile)))
+
+    def wall(self, rate: float, tile: Shape, jobs: float) -> float:
+        """Seconds of coding some tiles at once."""
+        threads = usable_threads()
+        rounds = math.ceil(jobs / threads) if jobs < 4 * threads else jobs / threads
+        return rounds * prod(tile) * rate
+
+    def tries(self, usual: float) -> float:
+        """Trials of a search for the step, one after the other; `usual` for a PSNR."""
+        goal = self.look.task.goal
+        if goal.data_range == 0 or goal.error == 0:
+            return 1
+        if goal.error is not None:
+            return BOUND_TRIALS
+        return SIZE_TRIES if goal.size is not None else usual
+
+
+def stage_seconds(
+    look: Look, rates: Rates, head: HeadProbe | None, config: EncodeConfig
+) -> dict[str, float]:
+    """Return the predicted seconds of each stage of an encoding, by the names of its record.
+
+    head: None for no head.
+    """
+    work = _Work(look=look, rates=rates, config=config)
+    seconds = {"scan": look.selecting, "measuring": _measuring(work, head)}
+    labels = look.labels
+    if labels is not None:
+        seconds["labels"] = look.labelling
+    if labels is not None and (
+        labels.clearly
+        or is_hopeless(
+            labels.attempt.outcome.size, look.attempt.outcome.size, labels.entropy, labels.rank
+        )
+    ):
+        if not labels.clearly:
+            seconds["first guess"] = look.guessing
+        return seconds | {"coding": _all_tiles(work, rates.final)}
+    if _estimated(look, config):
+        trials = work.wall(rates.trial, rates.sample.blocks.tile, 8)
+        return seconds | {
+            "estimate": 4 * look.costing + trials,
+            "coding": _all_tiles(work, rates.trial),
+        }
+    seconds["first guess"] = look.guessing
+    seconds |= _choices(work)
+    final = rates.final
+    if head is not None:
+        told = _head(work, head)
+        seconds |= told
+        final += head.final if "head" in told else 0.0
+    if look.task.goal.error and config.effort > 1 and "predictor" not in config.without:
+        seconds["predictor"] = _predictor(work)
+    goal = look.task.goal
+    passes = 1.0 if goal.error is not None else SIZE_PASSES if goal.size is not None else PASSES
+    return seconds | {"coding": passes * _all_tiles(work, final)}
+
+
+def _estimated(look: Look, config: EncodeConfig) -> bool:
+    """Whether effort 1 estimates the step, as `plan` decides."""
+    return (
+        config.effort == 1
+        and look.task.goal.psnr is not None
+        and look.task.goal.data_range > 0
+        and look.task.blocks.in_memory
+        and look.task.blocks.complete
+        and not look.attempt.settings.double
+    )
+
+
+def _choices(work: _Work) -> dict[str, float]:
+    """Seconds of the choices by trial: sample, transform, tiles, filling, step."""
+    look, rates, config = work.look, work.rates, work.config
+    tile, seconds = look.tile, {"sample": look.costing}
+    tried = work.tiles(tile, TRIAL_VERTICES)
+    in_memory = look.task.blocks.in_memory
+    if config.effort > 1:
+        trials, bases = count_trials(tile, in_memory=in_memory)
+        search = work.tries(TRIES) * work.wall(rates.trial, tile, tried)
+        if "transform" in config.without:
+            trials = bases = 0
+        coding = TRIAL_SHARE * work.wall(rates.trial, tile, trials * tried)
+        seconds["transform"] = coding + search
+        seconds["bases"] = bases * rates.basis * work.vertices
+        if look.task.fixed_tile is None and "tiles" not in config.without:
+            seconds["tiles"] = _tiles(work)
+    vertices = work.vertices
+    limit = MAX_SEARCHED_VERTICES if vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
+    searched = work.tiles(tile, limit)
+    once = work.wall(rates.search, tile, searched)
+    if not look.task.blocks.complete:
+        fill = work.wall(rates.fill, tile, searched)
+        if config.effort > 1 and "filling" not in config.without:
+            seconds["filling"] = 4 * fill + 4 * work.tries(2.5) * once
+        seconds["sample"] += 2 * fill
+    usual = NEAR_TRIES if searched == tried and config.effort > 1 else TRIES
+    tries = work.tries(usual + (REFIT_TRIES if rates.has_bases else 0))
+    seconds["step"] = tries * once
+    if rates.has_bases:
+        seconds["bases"] = seconds.get("bases", 0.0) + 2 * 3 * rates.basis * work.vertices
+    return seconds
+
+
+def _tiles(work: _Work) -> float:
+    """Seconds of the trials of other tiles."""
+    look, rates = work.look, work.rates
+    blocks = look.task.blocks
+    most = MAX_TILE_VERTICES if blocks.complete else TRIAL_VERTICES
+    seconds = 0.0
+    for tile in other_tiles(look.shape, look.tile, work.bytes_of_tiles, complete=blocks.complete):
+        count = work.tiles(tile, most)
+        seconds += look.costing + TRIAL_SHARE * work.wall(rates.trial, tile, 3 * count)
+        seconds += work.tries(NEAR_TRIES) * TRIAL_SHARE * work.wall(rates.trial, tile, count)
+        seconds += 3 * rates.basis * work.vertices
+    return seconds
+
+
+def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
+    """Seconds of the trial of a head and of the training; only the trial where it gains nothing."""
+    look, rates, config = work.look, work.rates, work.config
+    tile, threads = look.tile, usable_threads()
+    limit = MAX_SEARCHED_VERTICES if work.vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
+    searched = work.tiles(tile, limit)
+    size = work.bytes_of_tiles
+    if size < MIN_BYTES:
+        return {}
+    pairs = work.wall(rates.search, tile, searched)
+    seconds = {"head trial": pairs + _training(head, TRIAL_BUDGET, 1.0, 1.0)}
+    gain = GAIN_AFTER * head.gain_db
+    if gain < MIN_GAIN:
+        return seconds
+    widths = best_widths(size, GAIN_FACTOR * gain + GAIN_BESIDES, EXCHANGE, config.effort)
+    budget = EFFORTS[config.effort].budget
+    search = work.tries(TRIES) * work.wall(rates.search + head.final, tile, searched)
+    single = work.tries(TRIES) * searched * prod(tile) * (rates.search + head.final)
+    perceptron = _training(
+        head, budget.times(PERCEPTRON_LONGER), _products(PERCEPTRON.widths, 1) / _USUAL, 1 / 3
+    )
+    parts = [perceptron]
+    if widths:
+        parts.append(_training(head, budget, _products(widths, len(CROSS)) / _USUAL, 1.0))
+    # Each training takes one thread; the searches take turns on all of them.
+    alone = max(max(parts), sum(parts) / threads)
+    wider = work.wall(rates.search, tile, work.tiles(tile, TRAINING_VERTICES))
+    searches = min(len(parts) * search, len(parts) * single / threads + search)
+    return seconds | {"head": wider + alone + searches}
+
+
+def _products(widths: tuple[int, int], looked_at: int) -> float:
+    """Multiplications of a network for a voxel."""
+    first, second = widths
+    return looked_at * (INPUTS * first + first * second) + second
+
+
+_USUAL = _products((8, 8), len(CROSS))
+
+
+def _training(head: HeadProbe, budget: Budget, work: float, sampling: float) -> float:
+    """Seconds of a training, whose updates and samples cost a multiple of those of the trial."""
+    updates = updates_of(budget.updates, budget.samples)
+    return updates * head.update * work + 1.2 * budget.samples * head.sampling * sampling
+
+
+def _predictor(work: _Work) -> float:
+    """Seconds of the choice of a predictor."""
+    look, rates, effort = work.look, work.rates, work.config.effort
+    trials = 1 + 3 * (effort > 2) + 2 * (effort > 3)
+    coded = min(work.vertices, PREDICTED_VERTICES) * rates.predict / usable_threads()
+    last = work.wall(rates.predict, look.tile, work.tiles(look.tile, MAX_SEARCHED_VERTICES))
+    return trials * (rates.fit + coded) + 3 * rates.fit + last
+
+
+def _all_tiles(work: _Work, rate: float) -> float:
+    """Seconds of coding all tiles once."""
+    tile = work.look.tile
+    if _estimated(work.look, work.config) and work.look.task.fixed_tile is None:
+        tile = tile_for(work.look.shape, work.bytes_of_tiles)
+    return work.wall(rate, tile, work.tiles(tile))
+
+
+def _measuring(work: _Work, head: HeadProbe | None) -> float:
+    """Seconds of decoding the file and comparing it with the source."""
+    rates, look = work.rates, work.look
+    steps, plane = look.shape[0], prod(look.task.blocks.shape[1:])
+    decode = rates.decode + (0.0 if head is None else head.final)
+    measured = 0 if "ssim" in work.config.without else len(ssim_steps(steps, plane))
+    return (
+        work.wall(decode, look.tile, work.tiles(look.tile))
+        + rates.compare * work.vertices
+        + rates.ssim * measured * plane
+    )
+
+
+assert MIN_HEAD_EFFORT in EFFORTS
