@@ -15,7 +15,8 @@ from fhash_cli.options import SourceOptions, json_option, quiet_option, series_o
 from fhash_cli.output import Progress, emit, extent, table
 
 if TYPE_CHECKING:
-    from fhash_codec.bench.paper.bench import BenchPlan, PaperBench
+    from fhash_codec.bench.paper.bench import PaperBench
+    from fhash_codec.bench.paper.plan import BenchPlan
     from fhash_codec.bench.paper.ratios import FileResult
     from fhash_codec.bench.paper.table import PaperTable
     from fhash_formats.series import Series
@@ -204,7 +205,7 @@ def _files(
 
 def _plan(scenes: bool, *, quick: bool, **choices: Any) -> BenchPlan:
     """The plan of the options; those that were not given keep the plan's own values."""
-    from fhash_codec.bench.paper.bench import BenchPlan
+    from fhash_codec.bench.paper.plan import BenchPlan
 
     given = {name: value for name, value in choices.items() if value not in (None, ())}
     if not scenes:

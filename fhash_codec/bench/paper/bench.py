@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,20 +15,14 @@ import torch
 from fhash_codec.bench.machine import machine
 from fhash_codec.bench.paper.between import Places, measure_between, places_of
 from fhash_codec.bench.paper.cell import Cell
-from fhash_codec.bench.paper.data import KINDS, Data, feature_text, gather_data, simulated
-from fhash_codec.bench.paper.encodings.build import RATE, build
+from fhash_codec.bench.paper.data import Data, gather_data, simulated
+from fhash_codec.bench.paper.encodings.build import build
 from fhash_codec.bench.paper.encodings.tcnn import missing
 from fhash_codec.bench.paper.encodings.trained import TrainedEncoding
-from fhash_codec.bench.paper.latency import VIEWS, measure_latency
-from fhash_codec.bench.paper.pictures import SIZE, PictureProbe
-from fhash_codec.bench.paper.protocols import (
-    CANDIDATES,
-    ENCODINGS,
-    PROTOCOLS,
-    Arrangement,
-    arrangement,
-)
-from fhash_codec.bench.paper.sets import SETS
+from fhash_codec.bench.paper.latency import measure_latency
+from fhash_codec.bench.paper.pictures import PictureProbe
+from fhash_codec.bench.paper.plan import BenchPlan, requests_of
+from fhash_codec.bench.paper.protocols import Arrangement, arrangement
 from fhash_codec.bench.paper.store import Request, load, save
 from fhash_codec.bench.paper.training import (
     DECIBELS,
@@ -44,60 +38,8 @@ from fhash_codec.training.devices import choose_device
 from fhash_codec.training.threads import threads_for
 from fhash_formats.series import Series
 
-QUICK_KEY_FRAMES = 4
-"""Key frames of the quick bench."""
-USUAL_KEY_FRAMES = 10
-"""Key frames of data that are not the paper's."""
-WARM_UP_EPOCHS = 1
-"""Epochs of a first model of each kind, which no clock sees."""
 ZSTD_LEVEL = 3
 """Level at which stored numbers are compressed."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class BenchPlan:
-    """Cells that are to be measured.
-
-    Attributes:
-        scale: full, half or quarter of the paper's lengths; of the scenes alone.
-        data_sets: names of scenes; not used with data of one's own.
-        protocols, encodings: names.
-        features: kinds, or features as the codec takes them.
-        epochs: of every training.
-        seeds: seeds 1, 2, ... of every cell.
-        key_frames: as `fhash encode --key-frames` takes it; None for as many as the paper has.
-        device: auto, cpu or cuda.
-        latency: whether pictures through the encodings are timed, for the first seed of the
-            protocol published.
-        views: views of these pictures.
-        picture_size: pixels along both sides of the pictures of curves.
-    """
-
-    scale: str = "full"
-    data_sets: tuple[str, ...] = tuple(SETS)
-    protocols: tuple[str, ...] = PROTOCOLS
-    encodings: tuple[str, ...] = ENCODINGS
-    features: tuple[str, ...] = KINDS
-    epochs: int = 60
-    seeds: int = 3
-    key_frames: str | None = None
-    device: str = "auto"
-    latency: bool = True
-    views: int = VIEWS
-    picture_size: int = SIZE
-
-    @classmethod
-    def quick(cls, **changes: Any) -> BenchPlan:
-        """The plan that takes minutes: a quarter of the lengths, one feature, one seed."""
-        settings: dict[str, Any] = {
-            "scale": "quarter",
-            "features": ("segmentation",),
-            "epochs": 20,
-            "seeds": 1,
-            "key_frames": f"auto:{QUICK_KEY_FRAMES}",
-            "views": 1,
-        }
-        return cls(**(settings | changes))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +82,7 @@ def bench_paper(
     if reason is not None:
         encodings.remove("tcnn")
         notes.append(f"not measured: {reason}")
-    requests = list(_requests(plan, encodings, source, name))
+    requests = list(requests_of(plan, encodings, source, name))
     finished = [load(folder, request) for request in requests]
     device, cells = choose_device(plan.device), []
     held: _Held | None = None
@@ -160,58 +102,6 @@ def bench_paper(
         cells.append(cell)
         progress("cells", number + 1, len(requests), str(request))
     return PaperBench(cells=tuple(cells), notes=tuple(notes))
-
-
-def _requests(
-    plan: BenchPlan, encodings: Sequence[str], source: Series | None, name: str
-) -> Iterator[Request]:
-    """Yield the cells of a plan: encodings in turns, so that a busy machine treats them alike."""
-    names = plan.data_sets if source is None else (name,)
-    for data_set in names:
-        series = simulated(data_set, plan.scale) if source is None else source
-        for feature in plan.features:
-            settings = {
-                "shape": list(series.shape),
-                "source": None if source is None else _identity(source),
-                "feature": feature_text(data_set, feature),
-                "key_frames": _key_frames(plan, data_set, series),
-                "epochs": plan.epochs,
-                "learning_rate": RATE,
-                "picture_size": plan.picture_size,
-                "device": choose_device(plan.device).type,
-            }
-            for seed in range(1, plan.seeds + 1):
-                for protocol in plan.protocols:
-                    timed = plan.latency and protocol == "published" and seed == 1
-                    tried = {"candidates": list(CANDIDATES)} if protocol == "best" else {}
-                    for encoding in encodings:
-                        yield Request(
-                            encoding=encoding,
-                            protocol=protocol,
-                            data_set=data_set,
-                            feature=feature,
-                            seed=seed,
-                            settings=settings | {"latency": timed and plan.views} | tried,
-                        )
-
-
-def _identity(source: Series) -> list[Any]:
-    """Return the identity of the user's data: names, and size and time of each file."""
-    files = [
-        [path.name, path.stat().st_size, path.stat().st_mtime_ns]
-        for path in source.files
-        if path.is_file()
-    ]
-    return [source.source, source.name, str(source.dtype), files]
-
-
-def _key_frames(plan: BenchPlan, data_set: str, series: Series) -> str:
-    """Return which steps are key frames: the plan's, or as many as the paper has."""
-    if plan.key_frames is not None:
-        return plan.key_frames
-    known = SETS.get(data_set)
-    count = USUAL_KEY_FRAMES if known is None else known.key_frames
-    return "all" if count >= series.shape[0] else f"auto:{count}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -266,36 +156,29 @@ def _run(
     """Train one cell and measure it."""
     data, arranged = held.data, arrangement(request.protocol, request.encoding, held.data)
 
-    def make(steps: int, epochs: int) -> TrainedEncoding:
+    def make(steps: int) -> TrainedEncoding:
         return build(
             request.encoding,
             data,
             arranged,
             steps=steps,
-            epochs=epochs,
+            epochs=plan.epochs,
             seed=request.seed,
             device=device,
         )
 
     pictures = _pictures(held, arranged)
     progress("warming up", 0, 1, "")
-    warm = make(max(arranged.steps), WARM_UP_EPOCHS)
+    warm = make(max(arranged.steps))
     threads_of = max(1, warm.samples_an_epoch // len(warm.parts) // max(arranged.steps))
     with threads_for(threads_of) as threads:
         warm.train_epoch(0)
         del warm
-        courses: list[tuple[TrainedEncoding, Trained]] = []
-        trial: list[dict[str, Any]] = []
-        for steps in arranged.steps:
-            encoding = make(steps, plan.epochs)
-            if any(entry["steps"] == encoding.steps_an_epoch for entry in trial):
-                continue
-            course = train(
-                encoding, data, plan.epochs, device=device, picture=pictures, progress=progress
-            )
-            trial.append(_tried(encoding, course))
-            courses = [max([*courses, (encoding, course)], key=lambda pair: rank(pair[1].curve))]
-        ((encoding, result),) = courses
+        steps, trial = _best_steps(arranged, make, data, plan.epochs, device, progress)
+        encoding = make(steps)
+        result = train(
+            encoding, data, plan.epochs, device=device, picture=pictures, progress=progress
+        )
         latency = _latency(request, held, encoding, device, progress)
     samples = encoding.samples_an_epoch * plan.epochs
     return Cell(
@@ -322,9 +205,37 @@ def _run(
         between=measure_between(encoding, held.places),
         machine=_machine(device, threads),
         collisions=encoding.collisions,
-        trial=tuple(trial) if len(arranged.steps) > 1 else (),
+        trial=tuple(trial),
         engine=arranged.engine,
     )
+
+
+def _best_steps(
+    arranged: Arrangement,
+    make: Callable[[int], TrainedEncoding],
+    data: Data,
+    epochs: int,
+    device: torch.device,
+    progress: Progress,
+) -> tuple[int, list[dict[str, Any]]]:
+    """Return the best of the candidates for the steps in an epoch, and what each led to.
+
+    Each is trained to the end. A single candidate is taken without a training.
+    """
+    if len(arranged.steps) == 1:
+        return arranged.steps[0], []
+    trial: list[dict[str, Any]] = []
+    best: tuple[tuple[int, float, float], int] | None = None
+    for candidate in arranged.steps:
+        encoding = make(candidate)
+        if any(entry["steps"] == encoding.steps_an_epoch for entry in trial):
+            continue
+        course = train(encoding, data, epochs, device=device, brief=True, progress=progress)
+        trial.append(_tried(encoding, course))
+        ranked = rank(course.curve), candidate
+        best = ranked if best is None else max(best, ranked)
+    assert best is not None
+    return best[1], trial
 
 
 def _tried(encoding: TrainedEncoding, course: Trained) -> dict[str, Any]:
@@ -394,4 +305,4 @@ def _machine(device: torch.device, threads: int) -> dict[str, Any]:
     }
 
 
-__all__ = ["BenchPlan", "PaperBench", "bench_paper"]
+__all__ = ["PaperBench", "bench_paper"]

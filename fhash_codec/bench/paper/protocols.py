@@ -18,6 +18,8 @@ EQUAL_BATCH = 1 << 16
 """Largest number of samples of a batch of the protocol equal, as in the product."""
 EQUAL_STEPS = (20, 256)
 """Smallest and largest number of steps in an epoch of the protocol equal, as in the product."""
+RATE = 0.01
+"""Learning rate of Adam at the start (paper, section 4.2); no schedule is printed."""
 CANDIDATES = (5, 20, 80)
 """Steps in an epoch among which the protocol best chooses, for each encoding."""
 

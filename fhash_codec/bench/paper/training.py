@@ -62,6 +62,7 @@ def train(
     *,
     device: torch.device,
     picture: PictureMeasure | None = None,
+    brief: bool = False,
     progress: Progress = silent,
 ) -> Trained:
     """Train an encoding and measure it on the way.
@@ -72,9 +73,10 @@ def train(
         epochs: passes over its samples.
         device: where it computes.
         picture: measures pictures of the key frames.
+        brief: whether only the PSNR of the coreset is measured, for the choice among trainings.
         progress: called after each epoch.
     """
-    points, seconds = [_point(encoding, data, 0, 0.0, picture)], 0.0
+    points, seconds = [_point(encoding, data, 0, 0.0, picture, brief)], 0.0
     measured = set(measured_epochs(epochs))
     for epoch in range(epochs):
         begun = time.perf_counter()
@@ -82,7 +84,7 @@ def train(
         wait(device)
         seconds += time.perf_counter() - begun
         if epoch + 1 in measured:
-            points.append(_point(encoding, data, epoch + 1, seconds, picture))
+            points.append(_point(encoding, data, epoch + 1, seconds, picture, brief))
         latest = points[-1].coreset_psnr
         note = "" if latest is None else f"{latest:.1f} dB"
         progress("training", epoch + 1, epochs, note)
@@ -116,7 +118,12 @@ def wait(device: torch.device) -> None:
 
 
 def _point(
-    encoding: Encoding, data: Data, epoch: int, seconds: float, picture: PictureMeasure | None
+    encoding: Encoding,
+    data: Data,
+    epoch: int,
+    seconds: float,
+    picture: PictureMeasure | None,
+    brief: bool,
 ) -> Point:
     """Return the figures of an encoding after some epochs."""
     encoding.settle()
@@ -124,6 +131,9 @@ def _point(
     step = epoch * encoding.steps_an_epoch
     if not all(np.isfinite(frame).all() for frame in frames):
         return Point(step=step, epoch=epoch, seconds=seconds)
+    if brief:
+        psnr, _ = similarity(data.frames, frames, data.masks, structural=False)
+        return Point(step=step, epoch=epoch, seconds=seconds, coreset_psnr=psnr)
     coreset_psnr, coreset_ssim = similarity(data.frames, frames, data.masks)
     finite = [np.isfinite(frame) for frame in data.frames]
     domain_psnr, domain_ssim = similarity(data.frames, frames, finite)
@@ -142,18 +152,23 @@ def _point(
 
 
 def similarity(
-    truth: Frames, frames: Frames, masks: Sequence[npt.NDArray[np.bool_]]
+    truth: Frames,
+    frames: Frames,
+    masks: Sequence[npt.NDArray[np.bool_]],
+    *,
+    structural: bool = True,
 ) -> tuple[float | None, float | None]:
     """Return PSNR in dB and mean SSIM of normalised frames (z, y, x) over masked vertices.
 
-    The peak is 1. A figure without an error, or without a vertex, is None.
+    The peak is 1. A figure without an error, or without a vertex, is None. The SSIM is None, too,
+    where `structural` is not set.
     """
     squares = count = 0.0
     likeness, compared = 0.0, 0
     for original, decoded, mask in zip(truth, frames, masks, strict=True):
         difference = original[mask].astype(np.float64) - decoded[mask]
         squares, count = squares + float(difference @ difference), count + len(difference)
-        if mask.any():
+        if structural and mask.any():
             total, vertices = ssim(original, decoded, 1.0, mask)
             likeness, compared = likeness + total, compared + vertices
     psnr = 10 * math.log10(count / squares) if squares > 0 else None

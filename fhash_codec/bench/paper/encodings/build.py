@@ -13,7 +13,7 @@ from fhash_codec.bench.paper.encodings.gather import GatherModel
 from fhash_codec.bench.paper.encodings.lattice import LatticeModel
 from fhash_codec.bench.paper.encodings.places import of_key_frame
 from fhash_codec.bench.paper.encodings.trained import Model, Part, TrainedEncoding
-from fhash_codec.bench.paper.protocols import Arrangement
+from fhash_codec.bench.paper.protocols import RATE, Arrangement
 from fhash_codec.bench.paper.sets import (
     SETS,
     USUAL_COARSEST,
@@ -26,9 +26,6 @@ from fhash_codec.coreset.boxes import Sizes
 from fhash_codec.coreset.bricks import Coreset
 from fhash_codec.paper.levels import level_resolutions
 from fhash_codec.paper.training.train import TrainingPlan
-
-RATE = 0.01
-"""Learning rate of Adam at the start (paper, section 4.2); no schedule is printed."""
 
 
 def build(

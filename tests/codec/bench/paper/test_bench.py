@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from fhash_codec.bench.paper import bench
-from fhash_codec.bench.paper.bench import BenchPlan, bench_paper
+from fhash_codec.bench.paper.bench import bench_paper
+from fhash_codec.bench.paper.plan import BenchPlan
 from fhash_codec.bench.paper.store import load_all
 from fhash_formats.errors import InputError
 from fhash_formats.series import ArraySeries

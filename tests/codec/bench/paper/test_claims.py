@@ -68,9 +68,12 @@ def result(kind: str, bytes: int, **others: Any) -> FileResult:
 
 def test_files_beside_other_codecs() -> None:
     files = [result("paper", 9000), result("peer", 3000), result("compact", 1500)]
+    files.append(result("coded", 3600))
     found = answer("compression", files=files)
     assert found.verdict == CONFIRMED
-    assert "3x; best peer / profile compact 2x" in found.figures
+    assert "3x, with tables coded by the transform 1.2x; best peer / profile compact 2x" in (
+        found.figures
+    )
     small = [result("paper", 900), *files[1:]]
     assert answer("compression", files=small).verdict == REFUTED
     missed = [result("paper", 900, reached=False), *files[1:]]
