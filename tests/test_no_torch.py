@@ -21,7 +21,7 @@ from fhash_cli.main import program
 from fhash_codec.compact.choices import head
 
 head.TRIAL_BUDGET = head.Budget(updates=60, samples=8192)
-head.MIN_BYTES = 0
+head.MIN_BYTES, head.MAX_OF_TRIAL = 0, 1e6  # a head is trained, whether it pays or not
 head.EFFORTS[5] = head.Effort(candidates=4, budget=head.Budget(updates=80, samples=8192))
 for line in sys.stdin:
     result = CliRunner().invoke(program, json.loads(line))

@@ -47,6 +47,8 @@ WHOLE_PASSES = 0.15
 """Seconds besides all stages, as a share of those of scanning and measuring."""
 MAX_MISSING = 10.0
 """Distance in dB of the probed tiles from the promise up to which bytes are corrected for it."""
+SHORT_LOOK = 1.5
+"""Seconds of a first look up to which it is taken twice."""
 SLIMMER = 0.97
 """Bytes after all trials of a transform, as a share of those after a quick choice."""
 
@@ -120,9 +122,7 @@ class Predictor:
         plain = replace(config, timings=True, seed=0, without=())
         key = replace(plain, effort=1)
         if key not in self._looks:
-            self._looks[key] = look_at(
-                self._part(LOOKED_AT), self._series.shape[0], key, self._workers
-            )
+            self._looks[key] = self._look(key)
         look = self._looks[key]
         # Efforts of one class code alike.
         effort = (
@@ -146,6 +146,19 @@ class Predictor:
             basis=_basis(look, rates, now() - begun),
             stages=stages,
         )
+
+    def _look(self, config: EncodeConfig) -> Look:
+        """Look at the series; a first look that was short is taken again.
+
+        The first one also pays for what is loaded and read for the first time. The encoding that
+        follows does not pay it again.
+        """
+        part, steps = self._part(LOOKED_AT), self._series.shape[0]
+        begun = now()
+        look = look_at(part, steps, config, self._workers)
+        if self._looks or now() - begun > SHORT_LOOK:
+            return look
+        return look_at(part, steps, config, self._workers)
 
     def _may_have_head(self, look: Look, config: EncodeConfig) -> bool:
         """Whether the encoder would train a head."""
