@@ -48,6 +48,20 @@ def check_writable(
         raise InputError(str(error)) from error
 
 
+def make_folder(folder: str | Path) -> Path:
+    """Make the folder of a command's outputs if it is not there; the one above it must be.
+
+    Raises InputError where it cannot be made.
+    """
+    try:
+        Path(folder).mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: {error.strerror}; give a folder that exists or whose parent does"
+        ) from error
+    return Path(folder)
+
+
 class RealRange(click.FloatRange):
     """A number within limits, and no NaN, which click's own range lets through."""
 

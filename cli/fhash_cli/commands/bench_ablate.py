@@ -13,12 +13,12 @@ from fhash_cli.options import (
     check_writable,
     force_option,
     json_option,
+    make_folder,
     quiet_option,
     series_options,
     setting_options,
 )
 from fhash_cli.output import Progress, emit, extent, number, size, table
-from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     from fhash_codec.bench.ablate.results import AblateBench, Row
@@ -91,7 +91,7 @@ def ablate(
         check_writable(plot, force, sources=[] if data is None else [data])
     if data is None:
         source.refuse_without_data()
-    folder = None if output is None else _folder(output)
+    folder = None if output is None else make_folder(output)
     with Progress(quiet=quiet) as progress:
         from fhash_codec.bench.ablate.ablate import bench_ablate
 
@@ -112,17 +112,6 @@ def ablate(
         with replacing(Path(plot), force=force) as temporary:
             draw(result, temporary)
     emit(result.to_dict(), _text(result), as_json)
-
-
-def _folder(output: str) -> Path:
-    """The folder of the finished encodings, made if it is not there."""
-    try:
-        Path(output).mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{output}: {error.strerror}; give a folder that exists or whose parent does"
-        ) from error
-    return Path(output)
 
 
 def _text(result: AblateBench) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fhash_cli.base_command import BaseCommand
-from fhash_cli.options import check_writable, force_option, json_option, quiet_option
+from fhash_cli.options import check_writable, force_option, json_option, make_folder, quiet_option
 from fhash_cli.output import (
     Progress,
     compared,
@@ -32,7 +32,6 @@ from fhash_cli.simulating import (
     simulation_rows,
     write_series,
 )
-from fhash_formats.errors import InputError
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -144,12 +143,7 @@ def _demonstrate(
     data, run, picture = (folder / f"{chosen.name}.{suffix}" for suffix in ("h5", "fhz", "png"))
     parse_feature(simulation.scene.feature)
     config = EncodeConfig(features=(simulation.scene.feature,))
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: {error.strerror}; give a folder that exists or whose parent does"
-        ) from error
+    make_folder(folder)
     for output in (data, run, picture):
         check_writable(
             output, force, sources=[other for other in (data, run, picture) if other != output]

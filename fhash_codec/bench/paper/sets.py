@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from math import prod
 from typing import TypeVar
 
+from fhash_codec.bench.paper.printed import SETS as TITLES
+from fhash_codec.bench.paper.printed import TABLE_2
 from fhash_codec.coreset.boxes import Sizes
 from fhash_codec.paper.levels import level_resolutions, parameter_count
 from fhash_formats.errors import InputError
@@ -49,34 +51,25 @@ class PaperSet:
     segmentation_box: Sizes
 
 
+def _resembled(scene: str, grid: Sizes, coarsest: int) -> PaperSet:
+    """Return the data set that a scene resembles, with what the paper does not print of it."""
+    printed = TABLE_2[scene]
+    (x, y, z), box = printed.shape, printed.box
+    return PaperSet(
+        title=TITLES[scene],
+        frame=(z, y, x),
+        steps=printed.steps,
+        key_frames=printed.key_frames,
+        grid=grid,
+        coarsest=coarsest,
+        segmentation_box=(box[2], box[1], box[0]),
+    )
+
+
 SETS: dict[str, PaperSet] = {
-    "flame": PaperSet(
-        title="Combustion",
-        frame=(54, 172, 200),
-        steps=136,
-        key_frames=10,
-        grid=(64, 192, 192),
-        coarsest=8,
-        segmentation_box=(54, 110, 200),
-    ),
-    "bubble": PaperSet(
-        title="Argon Bubble",
-        frame=(256, 128, 128),
-        steps=241,
-        key_frames=9,
-        grid=(256, 128, 128),
-        coarsest=4,
-        segmentation_box=(204, 83, 80),
-    ),
-    "shell": PaperSet(
-        title="Supernova",
-        frame=(216, 216, 216),
-        steps=136,
-        key_frames=10,
-        grid=(192, 192, 192),
-        coarsest=4,
-        segmentation_box=(185, 183, 156),
-    ),
+    "flame": _resembled("flame", (64, 192, 192), 8),
+    "bubble": _resembled("bubble", (256, 128, 128), 4),
+    "shell": _resembled("shell", (192, 192, 192), 4),
 }
 """The paper's data sets, by the scene of the simulator that resembles them."""
 

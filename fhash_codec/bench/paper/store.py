@@ -43,11 +43,7 @@ class Request:
 
 def load(folder: Path, request: Request) -> Cell | None:
     """Return a finished cell; None where there is none, or one that cannot be read."""
-    try:
-        values = json.loads((folder / request.filename).read_text(encoding="utf-8"))
-        return Cell.from_dict(values)
-    except (OSError, ValueError, TypeError, KeyError, InputError):
-        return None
+    return _read(folder / request.filename)
 
 
 def save(folder: Path, request: Request, cell: Cell) -> None:
@@ -63,10 +59,13 @@ def save(folder: Path, request: Request, cell: Cell) -> None:
 
 def load_all(folder: Path) -> list[Cell]:
     """Return every cell in a folder, by file name; files that hold none are left out."""
-    cells = []
-    for path in sorted(folder.glob("*.json")):
-        try:
-            cells.append(Cell.from_dict(json.loads(path.read_text(encoding="utf-8"))))
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
-            continue
-    return cells
+    cells = [_read(path) for path in sorted(folder.glob("*.json"))]
+    return [cell for cell in cells if cell is not None]
+
+
+def _read(path: Path) -> Cell | None:
+    """Return the cell in a file; None where the file holds none."""
+    try:
+        return Cell.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, InputError):
+        return None
