@@ -17,7 +17,7 @@ from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
 
 FORMAT = "fhash"
-FORMAT_VERSION = (1, 4)
+FORMAT_VERSION = (1, 5)
 """(major, minor) of the format that is written; FORMAT.md says what a change of each means."""
 TRANSFORM_FEATURE = "transform"
 PLAIN_FEATURE = "plain"
@@ -29,11 +29,14 @@ KNOWN_FEATURES = frozenset(
         "apart",
         "clip",
         "coded-occupancy",
+        "coder-linear",
+        "coder-signs",
         "cross",
         "labels",
         "many-labels",
         "mask",
         "predictor",
+        "trellis",
     }
 )
 """Names in `required_features` that this version understands."""

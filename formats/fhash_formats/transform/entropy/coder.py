@@ -16,11 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
-from fhash_formats.errors import DamagedFileError
+from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.entropy.prior import State, prior_state
 from fhash_formats.transform.entropy.table import Table, single_band
 
 __all__ = [
+    "CODERS",
     "MAX_INTEGER",
     "Encoded",
     "array_arguments",
@@ -31,6 +32,11 @@ __all__ = [
     "encode_integers",
     "state_arguments",
 ]
+
+CODERS = ("contexts", "signs", "linear")
+"""Models of the coefficients. All files before version 1.5 have "contexts": adaptive estimates by
+contexts. "signs" adds linear predictors of signs; "linear" has these, and linear predictors of
+magnitudes as well."""
 
 MAX_INTEGER = 2**30 - 1
 """Largest magnitude of an integer."""
@@ -62,6 +68,8 @@ def encode_integers(
     scaled: npt.NDArray[np.float32] | None = None,
     weight: float = 0.0,
     state: State | None = None,
+    coder: str = CODERS[0],
+    trellis: bool = False,
 ) -> Encoded:
     """Code integers in the bands of a table; integers outside the bands count as 0.
 
@@ -73,7 +81,13 @@ def encode_integers(
             steps, plus `weight` per bit.
         weight: squared steps that a bit is worth.
         state: state to begin from, which is adapted in place; None begins from the prior.
+        coder: one of CODERS.
+        trellis: whether the integers are those of two quantisers (trellis.py). Raises InputError
+            for integers that are not, and does not go with `scaled`.
     """
+    _check_coder(coder)
+    if trellis and scaled is not None:
+        raise InputError("integers of a trellis are chosen before they are coded")
     keep = state is not None
     state = prior_state() if state is None else state
     given = np.ascontiguousarray(integers, dtype=np.int32)
@@ -108,11 +122,19 @@ def encode_integers(
         capacity = size
 
 
-def decode_integers(data: bytes | memoryview, shape: tuple[int, ...], table: Table) -> Integers:
-    """The integers (t, z, y, x) of a shape, int32.
+def decode_integers(
+    data: bytes | memoryview,
+    shape: tuple[int, ...],
+    table: Table,
+    *,
+    coder: str = CODERS[0],
+    trellis: bool = False,
+) -> Integers:
+    """The integers (t, z, y, x) of a shape, int32; the last two arguments as for the encoder.
 
     Raises DamagedFileError for bytes that no encoder writes, as far as the decoder can tell.
     """
+    _check_coder(coder)
     integers = np.zeros(shape, dtype=np.int32)
     library = native.library()
     if library is None:
@@ -150,6 +172,11 @@ def decode_block(data: bytes | memoryview, shape: tuple[int, ...]) -> Integers:
     if largest > MAX_INTEGER or encode_block(integers) != bytes(data):
         raise DamagedFileError("the coded integers are damaged")
     return integers
+
+
+def _check_coder(coder: str) -> None:
+    if coder not in CODERS:
+        raise InputError(f"coder is {coder!r:.40}; known: {', '.join(CODERS)}")
 
 
 def checked(code: int) -> int:

@@ -246,7 +246,8 @@ def _transformed_integers(
         raise DamagedFileError(
             f"the settings of a coded tile do not fit its shape: {error}"
         ) from error
-    integers = decode_integers(body, shape, band_table(settings.transform, shape))
+    table = band_table(settings.transform, shape)
+    integers = decode_integers(body, shape, table, coder=settings.coder, trellis=settings.trellis)
     residual = None
     if stream.residual is not None:
         residual = decode_integers(stream.residual, shape, single_band(shape))

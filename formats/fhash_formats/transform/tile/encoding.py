@@ -347,7 +347,9 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
         integers, scaled = quantise(coefficients, settings.step)
         if weight > 0:
             table = band_table(settings.transform, task.shape)
-            integers = encode_integers(integers, table, scaled=scaled, weight=weight).integers
+            integers = encode_integers(
+                integers, table, scaled=scaled, weight=weight, coder=settings.coder
+            ).integers
         rebuilt = transform.inverse(
             dequantise(integers, settings.step, settings.offsets, settings.dtype)
         )
@@ -364,12 +366,15 @@ def _code(coefficients: Values, task: _Task) -> tuple[bytes, Integers] | None:
     largest = max(-int(integers.min()), int(integers.max()))
     if largest >= LARGEST:
         return None
-    coded = encode_integers(integers, table, scaled=scaled if weight > 0 else None, weight=weight)
+    coder = task.settings.coder
+    coded = encode_integers(
+        integers, table, scaled=scaled if weight > 0 else None, weight=weight, coder=coder
+    )
     chosen = coded.integers
     if largest >= MAX_CHOSEN and weight > 0 and task.settings.double:
         large = np.abs(integers) >= MAX_CHOSEN
         nearest = np.rint(coefficients / task.settings.step).astype(np.int32)
         chosen = np.where(large, nearest, chosen)
     if (task.coding.passes > 1 and weight > 0) or chosen is not coded.integers:
-        coded = encode_integers(chosen, table)
+        coded = encode_integers(chosen, table, coder=coder)
     return coded.data, coded.integers
