@@ -92,9 +92,14 @@ def _counted(
     plain: whether `found` are indices; otherwise they are integers of the trellis.
     """
     vertices = int(np.prod(table[:, HIGH : HIGH + 4] - table[:, LOW : LOW + 4], axis=1).sum())
-    library = native.library()
     buckets = np.empty(vertices, np.uint8)
     counts = np.zeros((2, BUCKETS, RATES), np.int64)
+    library = native.library()
+    if library is None:
+        from fhash_formats.transform.entropy import trellis_portable
+
+        trellis_portable.count(found, table, buckets, counts, plain=plain)
+        return buckets, counts
     checked(
         library.fhash_trellis_count(
             _pointer(found),
@@ -112,8 +117,13 @@ def _chosen(
     scaled: npt.NDArray[Any], table: Table, buckets: npt.NDArray[np.uint8], rates: Integers
 ) -> Integers:
     """The integers of the cheapest path."""
-    library = native.library()
     levels = np.zeros(scaled.shape, np.int32)
+    library = native.library()
+    if library is None:
+        from fhash_formats.transform.entropy import trellis_portable
+
+        trellis_portable.choose(scaled, table, buckets, rates, levels)
+        return levels
     checked(
         getattr(library, f"fhash_trellis_choose_f{scaled.dtype.itemsize * 8}")(
             _pointer(scaled),

@@ -27,8 +27,8 @@ LARGEST = 1_000_000_000.0
 """Largest magnitude of an integer; larger ones are clipped."""
 
 Values = npt.NDArray[Any]
-Offsets = tuple[int, int, int] | tuple[int, int, int, int, int, int]
-"""Reconstruction offsets by magnitude, in 1/OFFSET_UNIT step; see `dequantise`."""
+Offsets = tuple[int, ...]
+"""Reconstruction offsets by magnitude, three or six, in 1/OFFSET_UNIT step; see `dequantise`."""
 
 
 def quantise(
