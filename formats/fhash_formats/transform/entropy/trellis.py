@@ -43,7 +43,7 @@ Integers = npt.NDArray[np.int32]
 
 
 def choose_levels(
-    scaled: npt.NDArray[Any], table: Table, weight: float, iterations: int = 2
+    scaled: npt.NDArray[Any], table: Table, weight: float, iterations: int = 1
 ) -> Integers:
     """The integers v, in units of delta, of the cheapest path through the trellis, int32.
 
