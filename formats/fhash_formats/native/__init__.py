@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 8
+ABI_VERSION = 9
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -66,8 +66,8 @@ _PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
 
 PROTOTYPES: Prototypes = {
     # coder.cpp
-    "fhash_encode": (ARRAY, ARRAY, REAL, ARRAY, *_SIZED, *_STATE, INTEGER, *_SIZED),
-    "fhash_decode": (ARRAY, ARRAY, *_SIZED, *_STATE, *_SIZED),
+    "fhash_encode": (ARRAY, ARRAY, REAL, INTEGER, ARRAY, *_SIZED, *_STATE, INTEGER, *_SIZED),
+    "fhash_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, *_STATE, *_SIZED),
     # mask.cpp
     "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
     "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),

@@ -19,6 +19,7 @@ from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.entropy.prior import State, prior_state
 from fhash_formats.transform.entropy.table import Table, single_band
+from fhash_formats.transform.entropy.two_quantisers import MISPLACED, NO_TRELLIS
 
 __all__ = [
     "CODERS",
@@ -89,7 +90,7 @@ def encode_integers(
     if trellis and scaled is not None:
         raise InputError("integers of a trellis are chosen before they are coded")
     keep = state is not None
-    state = prior_state() if state is None else state
+    state = prior_state(trellis) if state is None else state
     given = np.ascontiguousarray(integers, dtype=np.int32)
     library = native.library()
     if library is None:
@@ -97,7 +98,7 @@ def encode_integers(
 
         integers = given.copy()
         adapted = state if keep else state.copy()
-        data = coder_portable.encode(integers, table, scaled, weight, adapted)
+        data = coder_portable.encode(integers, table, scaled, weight, adapted, trellis)
         return Encoded(data=data, integers=integers)
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
     capacity = max(4096, given.size // 2)
@@ -109,12 +110,15 @@ def encode_integers(
             _pointer(integers),
             _pointer(chosen),
             weight,
+            trellis,
             (ctypes.c_int64 * 4)(*integers.shape),
             *array_arguments(table),
             *state_arguments(state),
             keep,
             *array_arguments(buffer),
         )
+        if size == NO_TRELLIS:
+            raise InputError(MISPLACED)
         if checked(size) <= capacity:
             return Encoded(data=buffer[:size].tobytes(), integers=integers)
         # Retry with the original integers. Coding the chosen ones would give other bytes, because
@@ -140,14 +144,15 @@ def decode_integers(
     if library is None:
         from fhash_formats.transform.entropy import coder_portable
 
-        coder_portable.decode(integers, table, bytes(data), prior_state().copy())
+        coder_portable.decode(integers, table, bytes(data), prior_state(trellis).copy(), trellis)
         return integers
     source = np.frombuffer(data, dtype=np.uint8)
     code = library.fhash_decode(
         _pointer(integers),
+        trellis,
         (ctypes.c_int64 * 4)(*shape),
         *array_arguments(table),
-        *state_arguments(prior_state()),
+        *state_arguments(prior_state(trellis)),
         *array_arguments(source),
     )
     if checked(code) < 0:
