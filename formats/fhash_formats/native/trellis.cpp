@@ -1,4 +1,4 @@
-// Choice of the integers of dependent quantisation: the path through the trellis (trellis.hpp) of
+// Choice of the integers of dependent quantisation: the path through the trellis (coder_contexts.hpp) of
 // least squared error and bits, by the algorithm of Viterbi. Encoders alone need it.
 // transform/entropy/trellis.py describes it, and trellis_portable.py has the twins, which choose the
 // same integers: all costs are whole numbers.
@@ -8,7 +8,6 @@
 #include <vector>
 
 #include "coder_contexts.hpp"
-#include "trellis.hpp"
 
 namespace {
 
@@ -19,6 +18,8 @@ const float COST = 32768;           // costs of a squared step
 const int32_t UNREACHED = 1 << 29;  // cost of a state that no path has reached yet
 const int RENEWED = 256;            // vertices after which the least cost is subtracted
 const float NEAR_ZERO = 0.5f;       // magnitudes below it have no other candidate than zero
+
+const int STATES = 8;               // of the trellis; the quantiser is the lowest bit of a state
 
 using Rates = int32_t[BUCKETS][RATES];  // of one quantiser
 
@@ -72,8 +73,8 @@ FHASH_INLINE void fill_bands(const int32_t* levels, const int64_t* shape, std::v
             if (!any && !quantisers) break;
             int32_t index = std::abs(in[x]);
             if (quantisers) {
-                index = index_of(index, state & 1);
-                state = TRELLIS[state][index & 1];
+                index = (index + (state & 1)) / 2;
+                state = TRELLIS_NEXT[state][index & 1];
             }
             out[x] = (uint16_t)min(index, MAX_MAGNITUDE);
         }
@@ -196,28 +197,28 @@ struct Paths {
 };
 #else
 struct Paths {
-    int32_t cost[TRELLIS_STATES];
+    int32_t cost[STATES];
 
     explicit Paths(int32_t unreached) {
-        for (int i = 0; i < TRELLIS_STATES; i++) cost[i] = i ? unreached : 0;
+        for (int i = 0; i < STATES; i++) cost[i] = i ? unreached : 0;
     }
     FHASH_INLINE uint8_t step(const int32_t even[2], const int32_t odd[2]) {
-        int32_t by_even[TRELLIS_STATES], by_odd[TRELLIS_STATES];
+        int32_t by_even[STATES], by_odd[STATES];
         int bits = 0;
-        for (int i = 0; i < TRELLIS_STATES; i++) {
-            by_even[TRELLIS[i][0]] = cost[i] + even[i & 1];
-            by_odd[TRELLIS[i][1]] = cost[i] + odd[i & 1];
+        for (int i = 0; i < STATES; i++) {
+            by_even[TRELLIS_NEXT[i][0]] = cost[i] + even[i & 1];
+            by_odd[TRELLIS_NEXT[i][1]] = cost[i] + odd[i & 1];
         }
-        for (int i = 0; i < TRELLIS_STATES; i++) {
+        for (int i = 0; i < STATES; i++) {
             bits |= (by_even[i] > by_odd[i]) << i;
             cost[i] = min(by_even[i], by_odd[i]);
         }
         return (uint8_t)bits;
     }
     FHASH_INLINE void zero(int32_t even, int32_t other) {
-        int32_t next[TRELLIS_STATES];
-        for (int i = 0; i < TRELLIS_STATES; i++)
-            next[TRELLIS[i][0]] = cost[i] + (i & 1 ? other : even);
+        int32_t next[STATES];
+        for (int i = 0; i < STATES; i++)
+            next[TRELLIS_NEXT[i][0]] = cost[i] + (i & 1 ? other : even);
         set(next);
     }
     FHASH_INLINE void get(int32_t* to) const { std::memcpy(to, cost, sizeof cost); }
@@ -227,7 +228,7 @@ struct Paths {
 
 // Subtract the least cost, so that costs stay in 32 bits.
 FHASH_INLINE void renew(Paths& paths) {
-    int32_t cost[TRELLIS_STATES], least = UNREACHED;
+    int32_t cost[STATES], least = UNREACHED;
     paths.get(cost);
     for (int32_t c : cost) least = min(least, c);
     for (int32_t& c : cost) c = c - least > UNREACHED / 2 ? UNREACHED : c - least;
@@ -258,10 +259,10 @@ FHASH_INLINE void extend(Paths& paths, const T* scaled, int n, const uint8_t* bu
 
 // The state before a state, where an index of this parity lies between them.
 struct Backwards {
-    uint8_t state[TRELLIS_STATES][2];
+    uint8_t state[STATES][2];
     Backwards() {
-        for (int i = 0; i < TRELLIS_STATES; i++)
-            for (int odd = 0; odd < 2; odd++) state[TRELLIS[i][odd]][odd] = (uint8_t)i;
+        for (int i = 0; i < STATES; i++)
+            for (int odd = 0; odd < 2; odd++) state[TRELLIS_NEXT[i][odd]][odd] = (uint8_t)i;
     }
 };
 const Backwards backwards;
@@ -271,10 +272,10 @@ template <class T>
 FHASH_INLINE void trace(const Paths& paths, const T* scaled, const int64_t* shape,
                         const std::vector<Band>& bands, const uint8_t* buckets,
                         const Rates* rates, const uint8_t* choices, int32_t* levels) {
-    int32_t cost[TRELLIS_STATES];
+    int32_t cost[STATES];
     paths.get(cost);
     int state = 0;
-    for (int i = 1; i < TRELLIS_STATES; i++)
+    for (int i = 1; i < STATES; i++)
         if (cost[i] < cost[state]) state = i;
     struct Start {
         int64_t origin, first;
@@ -294,7 +295,7 @@ FHASH_INLINE void trace(const Paths& paths, const T* scaled, const int64_t* shap
             const int quantiser = state & 1;
             const int32_t* const of = rates[quantiser][buckets[number]];
             const int32_t index = candidates(magnitude, quantiser, of).index[odd];
-            const int32_t level = level_of(index, quantiser);
+            const int32_t level = index ? 2 * index - quantiser : 0;
             levels[place] = value < 0 ? -level : level;
         }
 }

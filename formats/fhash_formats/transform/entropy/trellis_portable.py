@@ -35,14 +35,13 @@ from fhash_formats.transform.entropy.table import (
     SHIFT,
     Table,
 )
+from fhash_formats.transform.entropy.two_quantisers import AFTER
 
-__all__ = ["NEXT", "choose", "count"]
+__all__ = ["choose", "count"]
 
-NEXT = ((0, 2), (5, 7), (1, 3), (6, 4), (2, 0), (4, 6), (3, 1), (7, 5))
-"""State after an index of even and of odd magnitude, by the state before."""
-BEFORE_EVEN = tuple(next(s for s in range(8) if NEXT[s][0] == to) for to in range(8))
+BEFORE_EVEN = tuple(next(s for s in range(8) if AFTER[2 * s] == to) for to in range(8))
 """State before each state, where an even index lies between them."""
-BEFORE_ODD = tuple(next(s for s in range(8) if NEXT[s][1] == to) for to in range(8))
+BEFORE_ODD = tuple(next(s for s in range(8) if AFTER[2 * s + 1] == to) for to in range(8))
 """State before each state, where an odd index lies between them."""
 FIRST_BUCKET = 2 * (127 - 10)
 """Half octave that is bucket 1: 2^-10, by the bits of a float32."""
@@ -144,7 +143,7 @@ def _follow(odd: list[int], quantisers: npt.NDArray[np.int64], state: int) -> in
     states = []
     for parity in odd:
         states.append(state & 1)
-        state = NEXT[state][parity]
+        state = AFTER[2 * state + parity]
     quantisers[:] = states
     return state
 
