@@ -56,6 +56,7 @@ _HEAD = (ARRAY, *(INTEGER,) * 5, *(ARRAY,) * 4, *(FLOAT,) * 4, ARRAY)
 _QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
 _DEQUANTISE = (ARRAY, INTEGER, REAL, ARRAY, ARRAY)
 _TRELLIS = (*(ARRAY,) * 3, INTEGER, *(ARRAY,) * 3)
+_TRELLIS_COUNT = (*(ARRAY,) * 3, INTEGER, *(ARRAY,) * 2)
 _WITHIN = (ARRAY, ARRAY, ARRAY, INTEGER, REAL)
 _CLIP = (ARRAY, INTEGER, REAL, REAL, REAL)
 _FREE = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL)
@@ -89,7 +90,8 @@ PROTOTYPES: Prototypes = {
     **{f"fhash_quantise_{kind}": _QUANTISE for kind in _TYPES},
     **{f"fhash_dequantise_{kind}": _DEQUANTISE for kind in _TYPES},
     # trellis.cpp
-    "fhash_trellis_count": (ARRAY, INTEGER, *(ARRAY,) * 2, INTEGER, *(ARRAY,) * 2),
+    "fhash_trellis_count": _TRELLIS_COUNT,
+    **{f"fhash_trellis_guess_{kind}": _TRELLIS_COUNT for kind in _TYPES},
     **{f"fhash_trellis_choose_{kind}": _TRELLIS for kind in _TYPES},
     # values.cpp
     **{f"fhash_within_{kind}": _WITHIN for kind in _TYPES},

@@ -19,9 +19,18 @@ const int32_t UNREACHED = 1 << 29;  // cost of a state that no path has reached 
 const int RENEWED = 256;            // vertices after which the least cost is subtracted
 const float NEAR_ZERO = 0.5f;       // magnitudes below it have no other candidate than zero
 
+const float GUESSED_ZEROS[2] = {1.3f, 0.8f};  // magnitudes that are guessed to become zero
+const float GUESS[2] = {0.45f, 0.95f};  // added to half of a magnitude before it is rounded down
 const int STATES = 8;               // of the trellis; the quantiser is the lowest bit of a state
 
 using Rates = int32_t[BUCKETS][RATES];  // of one quantiser
+
+inline int64_t vertices_of(const std::vector<Band>& bands) {
+    int64_t sum = 0;
+    for (const Band& band : bands)
+        sum += (int64_t)band.size[0] * band.size[1] * band.size[2] * band.size[3];
+    return sum;
+}
 
 // Rows of all bands in the order of the coder.
 struct Rows {
@@ -44,11 +53,37 @@ struct Rows {
     }
 };
 
-// Write the magnitudes of the indices of levels into the bands, with flags of their rows.
-// quantisers: receives the quantiser of each vertex; null for indices that are given themselves.
-FHASH_INLINE void fill_bands(const int32_t* levels, const int64_t* shape, std::vector<Band>& bands,
+// Integers of the path that was found before, by which the states go on.
+struct Found {
+    const int32_t* levels;
+    int state;
+
+    FHASH_INLINE int quantiser(int64_t) const { return state & 1; }
+    FHASH_INLINE int32_t index(int64_t place, int quantiser) {
+        const int32_t magnitude = (std::abs(levels[place]) + quantiser) / 2;
+        state = TRELLIS_NEXT[state][magnitude & 1];
+        return magnitude;
+    }
+};
+
+// A guess where no path was found yet: quantisers in turn, and the index next to the coefficient or
+// a smaller one.
+template <class T> struct Guessed {
+    const T* scaled;
+
+    FHASH_INLINE int quantiser(int64_t number) const { return (int)(number & 1); }
+    FHASH_INLINE int32_t index(int64_t place, int quantiser) const {
+        const T magnitude = std::fabs(scaled[place]);
+        if (magnitude < (quantiser ? (T)GUESSED_ZEROS[1] : (T)GUESSED_ZEROS[0])) return 0;
+        return max((int32_t)(magnitude * (T)0.5 + (T)GUESS[quantiser]), 1);
+    }
+};
+
+// Write the magnitudes of all indices into the bands, with flags of their rows.
+// quantisers: receives the quantiser of each vertex.
+template <class Source>
+FHASH_INLINE void fill_bands(Source source, const int64_t* shape, std::vector<Band>& bands,
                              uint8_t* quantisers) {
-    int state = 0;
     for (Band& band : bands) {
         const int64_t rows = (int64_t)band.size[0] * band.size[1] * band.size[2];
         band.stride[2] = band.size[3] + 2 * PADDING;
@@ -60,24 +95,18 @@ FHASH_INLINE void fill_bands(const int32_t* levels, const int64_t* shape, std::v
     Rows{shape, bands}.all([&](const Band& of, int t, int z, int y, int64_t origin,
                                int64_t first) FHASH_LAMBDA {
         Band& band = const_cast<Band&>(of);
-        const int n = band.size[3];
-        const int32_t* const in = levels + origin;
-        int any = 0;
-        for (int x = 0; x < n; x++) any |= in[x];
         const int64_t r = ((int64_t)t * band.size[1] + z) * band.size[2] + y;
         uint16_t* const out = band.magnitudes.data() + r * band.stride[2] + PADDING;
-        band.filled[r] = any != 0;
-        band.any |= any != 0;
-        for (int x = 0; x < n; x++) {
-            if (quantisers) quantisers[first + x] = (uint8_t)(state & 1);
-            if (!any && !quantisers) break;
-            int32_t index = std::abs(in[x]);
-            if (quantisers) {
-                index = (index + (state & 1)) / 2;
-                state = TRELLIS_NEXT[state][index & 1];
-            }
+        int32_t any = 0;
+        for (int x = 0; x < band.size[3]; x++) {
+            const int quantiser = source.quantiser(first + x);
+            const int32_t index = source.index(origin + x, quantiser);
+            quantisers[first + x] = (uint8_t)quantiser;
+            any |= index;
             out[x] = (uint16_t)min(index, MAX_MAGNITUDE);
         }
+        band.filled[r] = any != 0;
+        band.any |= any != 0;
     });
 }
 
@@ -307,10 +336,7 @@ FHASH_INLINE int64_t choose(const T* scaled, const int64_t* shape, const int32_t
     std::vector<Band> bands((size_t)count);
     if (!read_bands(table, shape, bands)) return -1;
     const Rates* const rates = reinterpret_cast<const Rates*>(numbers);
-    int64_t vertices = 0;
-    for (const Band& band : bands)
-        vertices += (int64_t)band.size[0] * band.size[1] * band.size[2] * band.size[3];
-    std::vector<uint8_t> choices((size_t)vertices);
+    std::vector<uint8_t> choices((size_t)vertices_of(bands));
     Paths paths(UNREACHED);
     Rows{shape, bands}.all([&](const Band& band, int, int, int, int64_t origin,
                                int64_t first) FHASH_LAMBDA {
@@ -321,30 +347,44 @@ FHASH_INLINE int64_t choose(const T* scaled, const int64_t* shape, const int32_t
     return 0;
 }
 
-FHASH_CLONES int64_t count_indices(const int32_t* levels, int64_t plain, const int64_t* shape,
-                                   const int32_t* table, int64_t count, uint8_t* buckets,
-                                   int64_t* counts) {
-    return guarded([&]() FHASH_LAMBDA -> int64_t {
-        std::vector<Band> bands((size_t)count);
-        if (!read_bands(table, shape, bands)) return -1;
-        int64_t vertices = 0;
-        for (const Band& band : bands)
-            vertices += (int64_t)band.size[0] * band.size[1] * band.size[2] * band.size[3];
-        std::vector<uint8_t> quantisers(plain ? 0 : (size_t)vertices);
-        fill_bands(levels, shape, bands, plain ? nullptr : quantisers.data());
-        find_buckets(shape, bands, buckets);
-        Rows{shape, bands}.all([&](const Band& band, int t, int z, int y, int64_t,
-                                   int64_t first) FHASH_LAMBDA {
-            const int64_t r = ((int64_t)t * band.size[1] + z) * band.size[2] + y;
-            const uint16_t* const M = band.magnitudes.data() + r * band.stride[2] + PADDING;
-            for (int x = 0; x < band.size[3]; x++) {
-                const int64_t number = first + x;
-                const int quantiser = plain ? 0 : quantisers[number];
-                const int index = min<int>(M[x], RATES - 1);
-                counts[(quantiser * BUCKETS + buckets[number]) * RATES + index]++;
-            }
-        });
-        return 0;
+// Find the buckets and count the indices of a source.
+template <class Source>
+FHASH_INLINE int64_t tally(Source source, const int64_t* shape, const int32_t* table, int64_t count,
+                           uint8_t* buckets, int64_t* counts) {
+    std::vector<Band> bands((size_t)count);
+    if (!read_bands(table, shape, bands)) return -1;
+    std::vector<uint8_t> quantisers((size_t)vertices_of(bands));
+    fill_bands(source, shape, bands, quantisers.data());
+    find_buckets(shape, bands, buckets);
+    Rows{shape, bands}.all([&](const Band& band, int t, int z, int y, int64_t,
+                               int64_t first) FHASH_LAMBDA {
+        const int64_t r = ((int64_t)t * band.size[1] + z) * band.size[2] + y;
+        const uint16_t* const M = band.magnitudes.data() + r * band.stride[2] + PADDING;
+        for (int x = 0; x < band.size[3]; x++) {
+            const int64_t number = first + x;
+            const int index = min<int>(M[x], RATES - 1);
+            counts[(quantisers[number] * BUCKETS + buckets[number]) * RATES + index]++;
+        }
+    });
+    return 0;
+}
+
+FHASH_CLONES int64_t tally_found(Found source, const int64_t* shape, const int32_t* table,
+                                 int64_t count, uint8_t* buckets, int64_t* counts) {
+    return guarded([&]() FHASH_LAMBDA {
+        return tally(source, shape, table, count, buckets, counts);
+    });
+}
+FHASH_CLONES int64_t tally_f32(Guessed<float> source, const int64_t* shape, const int32_t* table,
+                               int64_t count, uint8_t* buckets, int64_t* counts) {
+    return guarded([&]() FHASH_LAMBDA {
+        return tally(source, shape, table, count, buckets, counts);
+    });
+}
+FHASH_CLONES int64_t tally_f64(Guessed<double> source, const int64_t* shape, const int32_t* table,
+                               int64_t count, uint8_t* buckets, int64_t* counts) {
+    return guarded([&]() FHASH_LAMBDA {
+        return tally(source, shape, table, count, buckets, counts);
     });
 }
 
@@ -367,16 +407,27 @@ FHASH_CLONES int64_t choose_f64(const double* scaled, const int64_t* shape, cons
 
 // Find the bucket of each vertex in the bands of a table, in coded order, and count the indices.
 //
-// levels: integers of the trellis (t, z, y, x), or where `plain` indices themselves, which then
-// count for the first quantiser.
+// levels: integers of the path that was found before (t, z, y, x).
 // buckets: receives one byte for each vertex of the bands.
 // counts: zeros (2, BUCKETS, RATES); receives the numbers by quantiser, bucket and index.
 //
 // Returns 0, or -1 for a band beyond the shape, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_trellis_count(const int32_t* levels, int64_t plain, const int64_t* shape,
+FHASH_EXPORT int64_t fhash_trellis_count(const int32_t* levels, const int64_t* shape,
                                          const int32_t* table, int64_t count, uint8_t* buckets,
                                          int64_t* counts) {
-    return count_indices(levels, plain, shape, table, count, buckets, counts);
+    return tally_found({levels, 0}, shape, table, count, buckets, counts);
+}
+
+// The same for a guess of the indices. scaled: coefficients / step, magnitudes below 2^30.
+FHASH_EXPORT int64_t fhash_trellis_guess_f32(const float* scaled, const int64_t* shape,
+                                             const int32_t* table, int64_t count, uint8_t* buckets,
+                                             int64_t* counts) {
+    return tally_f32({scaled}, shape, table, count, buckets, counts);
+}
+FHASH_EXPORT int64_t fhash_trellis_guess_f64(const double* scaled, const int64_t* shape,
+                                             const int32_t* table, int64_t count, uint8_t* buckets,
+                                             int64_t* counts) {
+    return tally_f64({scaled}, shape, table, count, buckets, counts);
 }
 
 // Choose the levels of the cheapest path.

@@ -18,7 +18,6 @@ import numpy.typing as npt
 from fhash_formats import native
 from fhash_formats.transform.entropy.coder import array_arguments, checked
 from fhash_formats.transform.entropy.table import HIGH, LOW, Table
-from fhash_formats.transform.values.quantise import quantise
 
 __all__ = ["BUCKETS", "COST", "RATES", "choose_levels", "rates_of"]
 
@@ -32,8 +31,6 @@ MAX_RATE_COST = 1 << 19
 """Largest cost of the bits of an index, so that sums of costs stay in 32 bits."""
 SIGN_BITS = 0.85
 """Bits of a sign, which contexts predict a little."""
-FIRST_ROUNDING = 0.35
-"""Number added to |c| / (2 delta) before rounding down, for the first guess of the indices."""
 NEIGHBOUR_SHARE = 0.3
 """Weight of the counts of the next buckets in those of a bucket."""
 PRIOR_COUNT = 8.0
@@ -55,24 +52,22 @@ def choose_levels(
             found before.
     """
     scaled = np.ascontiguousarray(scaled)
-    found = quantise(scaled, 2.0, FIRST_ROUNDING)[0]
-    for iteration in range(iterations):
-        buckets, counts = _counted(found, table, plain=iteration == 0)
-        found = _chosen(scaled, table, buckets, rates_of(counts, weight))
-    return found
+    buckets, counts = _counted(scaled, table)
+    levels = _chosen(scaled, table, buckets, rates_of(counts, weight))
+    for _ in range(1, iterations):
+        buckets, counts = _counted(levels, table)
+        levels = _chosen(scaled, table, buckets, rates_of(counts, weight))
+    return levels
 
 
 def rates_of(counts: npt.NDArray[np.int64], weight: float) -> Integers:
     """The costs of the bits of indices, int32 (2, BUCKETS, RATES).
 
     Args:
-        counts: numbers of indices by quantiser, bucket and index. Where the second quantiser has
-            none, those of the first count for both.
+        counts: numbers of indices by quantiser, bucket and index.
         weight: squared deltas that a bit is worth.
     """
     smooth = counts.astype(np.float64)
-    if not counts[1].any():
-        smooth[1] = smooth[0]
     smooth[:, 1:] += NEIGHBOUR_SHARE * counts[:, :-1]
     smooth[:, :-1] += NEIGHBOUR_SHARE * counts[:, 1:]
     total = smooth.sum(axis=2, keepdims=True)
@@ -85,11 +80,12 @@ def rates_of(counts: npt.NDArray[np.int64], weight: float) -> Integers:
 
 
 def _counted(
-    found: Integers, table: Table, *, plain: bool
+    source: npt.NDArray[Any], table: Table
 ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int64]]:
     """The bucket of each vertex, in coded order, and the counts of `rates_of`.
 
-    plain: whether `found` are indices; otherwise they are integers of the trellis.
+    source: integers of the path that was found before, int32; or coefficients / delta, for which a
+        path is guessed.
     """
     vertices = int(np.prod(table[:, HIGH : HIGH + 4] - table[:, LOW : LOW + 4], axis=1).sum())
     buckets = np.empty(vertices, np.uint8)
@@ -98,13 +94,14 @@ def _counted(
     if library is None:
         from fhash_formats.transform.entropy import trellis_portable
 
-        trellis_portable.count(found, table, buckets, counts, plain=plain)
+        trellis_portable.count(source, table, buckets, counts)
         return buckets, counts
+    guess = f"fhash_trellis_guess_f{source.dtype.itemsize * 8}"
+    count = library.fhash_trellis_count if source.dtype == np.int32 else getattr(library, guess)
     checked(
-        library.fhash_trellis_count(
-            _pointer(found),
-            plain,
-            (ctypes.c_int64 * 4)(*found.shape),
+        count(
+            _pointer(source),
+            (ctypes.c_int64 * 4)(*source.shape),
             *array_arguments(table),
             _pointer(buckets),
             _pointer(counts),

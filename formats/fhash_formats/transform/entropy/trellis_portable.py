@@ -49,6 +49,10 @@ COST = 32768
 """Costs of a squared step."""
 NEAR_ZERO = 0.5
 """Magnitudes below it have no other candidate than zero."""
+GUESSED_ZEROS = (1.3, 0.8)
+"""Magnitudes that are guessed to become zero, by quantiser."""
+GUESS = (0.45, 0.95)
+"""Number added to half of a magnitude before it is rounded down to a guess, by quantiser."""
 UNREACHED = 1 << 60
 """Cost of a state that no path has reached yet, and of a candidate that there is not."""
 CHUNK = 1 << 16
@@ -58,22 +62,22 @@ Integers = npt.NDArray[np.int32]
 
 
 def count(
-    levels: Integers,
+    source: npt.NDArray[Any],
     table: Table,
     buckets: npt.NDArray[np.uint8],
     counts: npt.NDArray[np.int64],
-    *,
-    plain: bool,
 ) -> None:
     """Find the buckets of all vertices and count the indices by quantiser, bucket and index."""
     found: list[Integers] = []
     begin, state = 0, 0
     for row in table:
-        indices = np.abs(levels[_place(row)])
-        quantisers = np.zeros(indices.size, np.int64)
-        if not plain:
-            indices = (indices + 1) // 2
-            state = _follow((indices & 1).ravel().tolist(), quantisers, state)
+        values = source[_place(row)]
+        if source.dtype == np.int32:
+            indices = (np.abs(values) + 1) // 2
+            quantisers, state = _follow((indices & 1).ravel().tolist(), state)
+        else:
+            quantisers = np.arange(begin, begin + values.size) & 1
+            indices = _guessed(values, quantisers.reshape(values.shape))
         found.append(np.minimum(indices, MAX_MAGNITUDE))
         band = buckets[begin : begin + indices.size]
         band[:] = _buckets(found, row, table).ravel()
@@ -138,14 +142,23 @@ def _chunks(table: Table) -> Iterator[tuple[npt.NDArray[np.int32], int, int]]:
         first += size
 
 
-def _follow(odd: list[int], quantisers: npt.NDArray[np.int64], state: int) -> int:
-    """Write the quantiser of each vertex of a band; the state after it."""
-    states = []
+def _follow(odd: list[int], state: int) -> tuple[npt.NDArray[np.int64], int]:
+    """The quantiser of each vertex of a band, and the state after it."""
+    quantisers = []
     for parity in odd:
-        states.append(state & 1)
+        quantisers.append(state & 1)
         state = AFTER[2 * state + parity]
-    quantisers[:] = states
-    return state
+    return np.array(quantisers, np.int64), state
+
+
+def _guessed(values: npt.NDArray[Any], quantisers: npt.NDArray[np.int64]) -> Integers:
+    """The guess of indices where no path was found yet."""
+    kind = values.dtype.type
+    magnitude = np.abs(values)
+    added = np.array(GUESS, np.float32).astype(kind)[quantisers]
+    indices = np.maximum((magnitude * kind(0.5) + added).astype(np.int32), 1)
+    is_zero = magnitude < np.array(GUESSED_ZEROS, np.float32).astype(kind)[quantisers]
+    return np.where(is_zero, 0, indices).astype(np.int32)
 
 
 def _shifted(padded: Integers, t: int, z: int, y: int, x: int) -> Integers:
