@@ -35,7 +35,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("numcodecs_codec", "zarr_codec", "zarr_parts"),
     ),
     "fhash_codec": (
-        ("config", "native", "progress", "stage_clock"),
+        ("config", "lean_header", "native", "progress", "stage_clock"),
         ("measure", "training"),
         ("coreset",),
         ("header", "indexing"),
