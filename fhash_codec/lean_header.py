@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from decimal import ROUND_CEILING, Context
-from typing import Any
+from typing import Any, TypeGuard
 
 __all__ = ["CONFIG_DEFAULTS", "full", "lean", "may_be_lean"]
 
@@ -175,7 +175,7 @@ def _full_steps(
     return result
 
 
-def _is_list_of_levels(levels: Any) -> bool:
+def _is_list_of_levels(levels: Any) -> TypeGuard[list[Any]]:
     """Whether a value is a list of whole numbers or null, the first one no null."""
     return (
         isinstance(levels, list)

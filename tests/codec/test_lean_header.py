@@ -1,4 +1,4 @@
-"""Lean headers: what is left out comes back, and figures of steps are never better than they are."""
+"""Lean headers: what is left out comes back; figures of steps are never better than they are."""
 
 from __future__ import annotations
 
