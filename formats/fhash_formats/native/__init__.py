@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 8
+ABI_VERSION = 9
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -52,7 +52,7 @@ _SIZED = (ARRAY, INTEGER)
 _STATE = _SIZED * 3
 """Slots, weights and simple estimates of an adaptive coder (`State`), each with its length."""
 _TRANSFORM = (ARRAY,) * 9
-_HEAD = (ARRAY, *(INTEGER,) * 5, *(ARRAY,) * 4, *(FLOAT,) * 4, ARRAY)
+_HEAD = (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, INTEGER, ARRAY)
 _QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
 _DEQUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, REAL, ARRAY)
 _WITHIN = (ARRAY, ARRAY, ARRAY, INTEGER, REAL)
@@ -83,7 +83,6 @@ PROTOTYPES: Prototypes = {
     **{f"fhash_transform_inverse_{kind}": _TRANSFORM for kind in _TYPES},
     # head.cpp
     "fhash_head_apply": _HEAD,
-    "fhash_head_apply_cross": _HEAD,
     # quantise.cpp
     **{f"fhash_quantise_{kind}": _QUANTISE for kind in _TYPES},
     **{f"fhash_dequantise_{kind}": _DEQUANTISE for kind in _TYPES},
