@@ -608,7 +608,7 @@ def _run(
                     best = _choose(abs(scaled[at]), p, price, first, second, memory, tables, work)
                     value = -best if scaled[at] < 0 else best
                     q[at] = value
-                if one and value and not value & 1 or two_quantisers and not one and value & 1:
+                if (one and value and not value & 1) or (two_quantisers and not one and value & 1):
                     return NO_TRELLIS, out
                 magnitude = (abs(value) + one) // 2 if two_quantisers else abs(value)
                 zero = code_bit(1 if magnitude == 0 else 0, p, stream)
