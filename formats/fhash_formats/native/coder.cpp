@@ -40,21 +40,46 @@ FHASH_CLONES int64_t choose_signs(const Task& task) { return run<CHOOSE, BY_SIGN
 FHASH_CLONES int64_t decode_signs(const Task& task) { return run<DECODE, BY_SIGNS, false>(task); }
 FHASH_CLONES int64_t decode_signs_two(const Task& task) { return run<DECODE, BY_SIGNS, true>(task); }
 
+FHASH_CLONES int64_t encode_linear(const Task& task) { return run<ENCODE, BY_LINEAR, false>(task); }
+FHASH_CLONES int64_t encode_linear_two(const Task& task) {
+    return run<ENCODE, BY_LINEAR, true>(task);
+}
+FHASH_CLONES int64_t choose_linear(const Task& task) { return run<CHOOSE, BY_LINEAR, false>(task); }
+FHASH_CLONES int64_t decode_linear(const Task& task) { return run<DECODE, BY_LINEAR, false>(task); }
+FHASH_CLONES int64_t decode_linear_two(const Task& task) {
+    return run<DECODE, BY_LINEAR, true>(task);
+}
+
 int64_t encode_task(const Task& task, int64_t model, int64_t trellis) {
     if (model == BY_CONTEXTS)
         return task.scaled ? choose(task) : trellis ? encode_two(task) : encode(task);
+    if (model == BY_LINEAR)
+        return task.scaled ? choose_linear(task)
+               : trellis   ? encode_linear_two(task)
+                           : encode_linear(task);
     return task.scaled ? choose_signs(task) : trellis ? encode_signs_two(task) : encode_signs(task);
 }
 
 int64_t decode_task(const Task& task, int64_t model, int64_t trellis) {
     if (model == BY_CONTEXTS) return trellis ? decode_two(task) : decode(task);
+    if (model == BY_LINEAR) return trellis ? decode_linear_two(task) : decode_linear(task);
     return trellis ? decode_signs_two(task) : decode_signs(task);
 }
 
-// The predictors of signs of a model that has them.
-std::unique_ptr<Signs> signs_of(int64_t model, State& state, int32_t* weights) {
-    return std::unique_ptr<Signs>(model == BY_CONTEXTS ? nullptr : new Signs(state, weights));
-}
+// The predictors that a model has, and a task with them.
+struct Predictors {
+    std::unique_ptr<Signs> signs;
+    std::unique_ptr<Magnitudes> magnitudes;
+
+    Predictors(int64_t model, State& state, int32_t* weights) {
+        if (model != BY_CONTEXTS) signs.reset(new Signs(state, weights));
+        if (model == BY_LINEAR) magnitudes.reset(new Magnitudes(weights));
+    }
+    void keep(int32_t* weights) const {
+        if (signs) signs->keep(weights);
+        if (magnitudes) magnitudes->keep(weights);
+    }
+};
 
 }  // namespace
 
@@ -81,16 +106,16 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
     return guarded([&]() -> int64_t {
         State state = make_state(slots, slot_count, weights, min(weight_count, BASE_WEIGHTS),
                                  simples, simple_count, LANES);
-        const std::unique_ptr<Signs> signs = signs_of(model, state, weights);
+        const Predictors with(model, state, weights);
         std::vector<uint8_t> out;
-        const Task task = {&state, signs.get(), q,    scaled,  lambda / 2048,
-                           shape,  table,       count, &out, nullptr, 0};
+        const Task task = {&state, with.signs.get(), with.magnitudes.get(), q, scaled, lambda / 2048,
+                           shape, table, count, &out, nullptr, 0};
         const int64_t code = encode_task(task, model, trellis);
         if (code < 0) return code;
         const int64_t size = put(out, data, capacity);
         if (keep && size <= capacity) {
             keep_state(state, slots, weights, simples, LANES);
-            if (signs) signs->keep(weights);
+            with.keep(weights);
         }
         return size;
     });
@@ -107,9 +132,9 @@ FHASH_EXPORT int64_t fhash_decode(int32_t* q, int64_t model, int64_t trellis, co
     return guarded([&] {
         State state = make_state(slots, slot_count, weights, min(weight_count, BASE_WEIGHTS),
                                  simples, simple_count, LANES);
-        const std::unique_ptr<Signs> signs = signs_of(model, state, const_cast<int32_t*>(weights));
-        const Task task = {&state, signs.get(), q,       nullptr, 0,
-                           shape,  table,       count, nullptr, data,    size};
+        const Predictors with(model, state, const_cast<int32_t*>(weights));
+        const Task task = {&state, with.signs.get(), with.magnitudes.get(), q, nullptr, 0,
+                           shape, table, count, nullptr, data, size};
         return decode_task(task, model, trellis);
     });
 }

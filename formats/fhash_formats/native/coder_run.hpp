@@ -6,7 +6,7 @@
 #include <type_traits>
 #include <vector>
 
-#include "coder_signs.hpp"
+#include "coder_linear.hpp"
 
 namespace {
 
@@ -14,7 +14,8 @@ namespace {
 // to read.
 struct Task {
     State* state;
-    Signs* signs;  // null BY_CONTEXTS
+    Signs* signs;            // null BY_CONTEXTS
+    Magnitudes* magnitudes;  // null but BY_LINEAR
     int32_t* q;
     const float* scaled;  // null, or what integers are chosen of
     double lambda;        // squared steps that 1/2048 bit is worth
@@ -25,6 +26,10 @@ struct Task {
     const uint8_t* data;
     int64_t size;
 };
+
+// A prediction of a zero flag or of "more than k".
+template <Model MODEL>
+using Decision = typename std::conditional<MODEL == BY_LINEAR, Guess, Prediction>::type;
 
 template <Mode MODE> using Range = typename std::conditional<MODE == DECODE, Decoder, Encoder>::type;
 
@@ -52,7 +57,7 @@ template <Mode MODE, Model MODEL, bool TRELLIS> struct Coder {
         s = s < 1e9 ? s : 1e9;  // also for NaN
         const int nearest = (int)(s + 0.5);
         if (nearest == 0 || nearest >= UNARY) return nearest;
-        Prediction other;
+        Decision<MODEL> other;
         const double zero = s * s + lambda * tables.cost[p];
         const double other_than_zero = lambda * (tables.cost[65536 - p] + 2048);
         if (nearest == 1) {
@@ -135,8 +140,8 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
     std::vector<uint16_t> zeros((size_t)widest + 2 * PADDING + VECTOR, 0);
     const uint16_t* const nothing = zeros.data() + PADDING;
     Sums sums((size_t)widest + VECTOR);
-    const std::vector<int16_t> no_logs(MODEL ? (size_t)widest + 2 * LOG_PADDING : 0, 0);
-    const int16_t* const no_log = no_logs.data() + (MODEL ? LOG_PADDING : 0);
+    const std::vector<int16_t> no_logs(MODEL != BY_CONTEXTS ? (size_t)widest + 2 * LOG_PADDING : 0, 0);
+    const int16_t* const no_log = no_logs.data() + (MODEL != BY_CONTEXTS ? LOG_PADDING : 0);
     Logs logs;
     int trellis = 0;
 
@@ -167,7 +172,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
         band.magnitudes.assign((size_t)M0 * n0 + VECTOR, 0);
         band.filled.assign((size_t)R0 * n0, 0);
         const int64_t L2 = n3 + 2 * LOG_PADDING;
-        if (MODEL) band.logs.assign((size_t)(R0 * n0 * L2), 0);
+        if (MODEL != BY_CONTEXTS) band.logs.assign((size_t)(R0 * n0 * L2), 0);
 
         for (int t = 0; t < n0; t++) for (int z = 0; z < n1; z++) for (int y = 0; y < n2; y++) {
             const int64_t r = t * R0 + z * R1 + y;
@@ -201,6 +206,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
             const int32_t* FHASH_RESTRICT const others = sums.others;
             const int32_t* FHASH_RESTRICT const parent = sums.parent;
             int filled = 0, left = 0, left2 = 0;
+            if (MODEL == BY_LINEAR) find_logs(bands, band, t, z, y, no_log, logs);
 
             for (int x = 0; x < n3; x++) {
                 const uint32_t mu = (uint32_t)(expected[x] + LEFT * left + LEFT2 * left2);
@@ -219,16 +225,32 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 for (int i = 0; i < CONTEXTS; i++)
                     places[i] = slots[i] + (int64_t)context[i] * DECISIONS;
                 const int one = TRELLIS ? trellis & 1 : 0;  // class of the quantiser
-                auto predict = [&](Prediction& to, int asked) FHASH_LAMBDA {
+                const Vertex vertex = {kind,
+                                       coarse,
+                                       near,
+                                       min(small(both[x]), 6),
+                                       min(parent[x] / KINDS, 6),
+                                       mu ? max(log16(mu) + offset + 4, 0) : 0,
+                                       one};
+                if constexpr (MODEL == BY_LINEAR) task.magnitudes->gather(logs, x, vertex);
+                auto predict = [&](Decision<MODEL>& to, int asked) FHASH_LAMBDA {
                     const int k = TRELLIS && one && asked < SHARED ? UNARY + asked : asked;
-                    for (int i = 0; i < CONTEXTS; i++) to.slots[i] = places[i] + k;
-                    to.first = weights + ((int64_t)k * KINDS + kind) * SET;
-                    to.second = weights + SECOND + ((int64_t)k * 64 + coarse) * SET;
-                    return mix<CONTEXTS, true>(to);
+                    if constexpr (MODEL == BY_LINEAR) {
+                        return task.magnitudes->predict(to, places, vertex, k);
+                    } else {
+                        for (int i = 0; i < CONTEXTS; i++) to.slots[i] = places[i] + k;
+                        to.first = weights + ((int64_t)k * KINDS + kind) * SET;
+                        to.second = weights + SECOND + ((int64_t)k * 64 + coarse) * SET;
+                        return mix<CONTEXTS, true>(to);
+                    }
+                };
+                auto learn_from = [&](Decision<MODEL>& from, int bit) FHASH_LAMBDA {
+                    if constexpr (MODEL == BY_LINEAR) task.magnitudes->learn(from, bit);
+                    else learn<CONTEXTS, true>(from, bit, SLOW_LIMIT);
                 };
 
                 // The zero flag.
-                Prediction now;
+                Decision<MODEL> now;
                 int p = predict(now, 0), value = MODE == DECODE ? 0 : out[x];
                 if (TRELLIS && MODE != DECODE && value && (value & 1) != one) return NO_TRELLIS;
                 if (MODE == CHOOSE) {
@@ -238,7 +260,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 }
                 int magnitude = TRELLIS ? (std::abs(value) + one) / 2 : std::abs(value);
                 const int zero = range.code(magnitude == 0, p);
-                learn<CONTEXTS, true>(now, zero, SLOW_LIMIT);
+                learn_from(now, zero);
                 left2 = left;
                 left = 0;
                 if (zero) {
@@ -248,8 +270,9 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
 
                 // The sign.
                 int negative;
-                if (MODEL) {
-                    if (!filled) find_logs(bands, band, t, z, y, no_log, logs);
+                if (MODEL != BY_CONTEXTS) {
+                    if (MODEL == BY_SIGNS && !filled)
+                        find_logs(bands, band, t, z, y, no_log, logs);
                     negative = task.signs->code(range, logs, kind, t, y, x, value < 0);
                 } else {
                     negative = code_sign(out + x, x, row, S0, S1, S2, signs, kind, value < 0);
@@ -261,7 +284,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 for (; k < UNARY; k++) {
                     p = predict(now, k);
                     const int more = range.code(magnitude > k, p);
-                    learn<CONTEXTS, true>(now, more, SLOW_LIMIT);
+                    learn_from(now, more);
                     if (!more) break;
                 }
                 if (k == UNARY) {
@@ -274,7 +297,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                     out[x] = negative ? -k : k;
                 }
                 if (TRELLIS) trellis = TRELLIS_NEXT[trellis][magnitude & 1];
-                if (MODEL)
+                if (MODEL != BY_CONTEXTS)
                     band.logs[r * L2 + LOG_PADDING + x] = signed_log(magnitude, negative != 0);
                 left = min(magnitude, MAX_MAGNITUDE);
                 M[x] = (uint16_t)left;

@@ -233,20 +233,13 @@ FHASH_INLINE void follow(int16_t* weights, __m128i step) {
     _mm_storeu_si128(at, _mm_max_epi16(sum, _mm_set1_epi16(-32767)));
 }
 
-// `learn` for a bit that is known where it is called.
-template <int N, bool PAIR, int RATE, int N_MAX>
-FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
-    const __m128i error = _mm_set1_epi16((int16_t)((((bit ? 65535 : 0) - now.p) * RATE) >> 4));
+// Adapt the estimates to a bit that is known where this is called.
+template <int N, int N_MAX>
+FHASH_INLINE void learn_slots_bit(Mixed<N_MAX>& now, const int bit, int limit) {
     const __m128i ones = _mm_set1_epi16((int16_t)-bit);
     for (int v = 0; 4 * v < N; v++) {
         const int n = min(N - 4 * v, 4);
         Slot* const* const s = now.slots + 4 * v;
-        // (error * input + 32768) >> 16
-        const __m128i in = now.inputs[v];
-        const __m128i rounding = _mm_srli_epi16(_mm_mullo_epi16(error, in), 15);
-        const __m128i step = _mm_add_epi16(_mm_mulhi_epi16(error, in), rounding);
-        follow(now.first + 8 * v, step);
-        if (PAIR) follow(now.second + 8 * v, step);
         // The distance of each probability from 1 (after a 1) or from 0 (after a 0) shrinks by its
         // rate. The product is rounded down for a 1 and up for a 0.
         __m128i far = _mm_xor_si128(now.chances[v], ones);
@@ -264,6 +257,33 @@ FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
         if (n > 2) _mm_storel_epi64(reinterpret_cast<__m128i*>(s[2]), two);
         if (n > 3) _mm_storeh_pd(reinterpret_cast<double*>(s[3]), _mm_castsi128_pd(two));
     }
+}
+
+// Adapt the estimates alone to the bit that came after `mix`.
+template <int N, int N_MAX> FHASH_INLINE void learn_slots(Mixed<N_MAX>& now, int bit, int limit) {
+    if (bit) learn_slots_bit<N>(now, 1, limit);
+    else learn_slots_bit<N>(now, 0, limit);
+}
+
+// The inputs of the mixer as numbers, two per estimate; those up to a multiple of eight are 0.
+template <int N_MAX> FHASH_INLINE void inputs_of(const Mixed<N_MAX>& now, int16_t* to) {
+    for (int v = 0; 4 * v < N_MAX; v++)
+        _mm_storeu_si128(reinterpret_cast<__m128i*>(to + 8 * v), now.inputs[v]);
+}
+
+// `learn` for a bit that is known where it is called.
+template <int N, bool PAIR, int RATE, int N_MAX>
+FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
+    const __m128i error = _mm_set1_epi16((int16_t)((((bit ? 65535 : 0) - now.p) * RATE) >> 4));
+    for (int v = 0; 4 * v < N; v++) {
+        // (error * input + 32768) >> 16
+        const __m128i in = now.inputs[v];
+        const __m128i rounding = _mm_srli_epi16(_mm_mullo_epi16(error, in), 15);
+        const __m128i step = _mm_add_epi16(_mm_mulhi_epi16(error, in), rounding);
+        follow(now.first + 8 * v, step);
+        if (PAIR) follow(now.second + 8 * v, step);
+    }
+    learn_slots_bit<N>(now, bit, limit);
 }
 
 // Adapt weights and estimates to the bit that came after `mix`. limit: observations after which the
@@ -290,6 +310,21 @@ template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now, i
     return now.p = squashed(dot);
 }
 
+template <int N, int N_MAX> FHASH_INLINE void learn_slots(Mixed<N_MAX>& now, int bit, int limit) {
+    const int target = bit ? 65535 : 0;
+    for (int i = 0; i < N; i++) {
+        Slot* s = now.slots[i];
+        const Pace& pace = tables.pace[s->count];
+        s->slow = (uint16_t)(s->slow + (((target - s->slow) * (int64_t)pace.slow) >> 16));
+        s->fast = (uint16_t)(s->fast + (((target - s->fast) * (int64_t)pace.fast) >> 16));
+        if (s->count < limit) s->count++;
+    }
+}
+
+template <int N_MAX> FHASH_INLINE void inputs_of(const Mixed<N_MAX>& now, int16_t* to) {
+    for (int i = 0; i < 2 * N_MAX; i++) to[i] = (int16_t)now.inputs[i];
+}
+
 template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
 FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
     const int target = bit ? 65535 : 0, error = ((target - now.p) * RATE) >> 4;
@@ -298,13 +333,7 @@ FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
         now.first[i] = (int16_t)min(max(now.first[i] + step, -32767), 32767);
         if (PAIR) now.second[i] = (int16_t)min(max(now.second[i] + step, -32767), 32767);
     }
-    for (int i = 0; i < N; i++) {
-        Slot* s = now.slots[i];
-        const Pace& pace = tables.pace[s->count];
-        s->slow = (uint16_t)(s->slow + (((target - s->slow) * (int64_t)pace.slow) >> 16));
-        s->fast = (uint16_t)(s->fast + (((target - s->fast) * (int64_t)pace.fast) >> 16));
-        if (s->count < limit) s->count++;
-    }
+    learn_slots<N>(now, bit, limit);
 }
 
 #endif

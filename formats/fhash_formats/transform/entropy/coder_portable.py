@@ -14,6 +14,13 @@ import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.entropy.linear_portable import linear_learn, linear_logit
+from fhash_formats.transform.entropy.magnitudes_portable import (
+    MagnitudeWork,
+    gather_magnitudes,
+    learn_magnitude,
+    magnitude_work,
+    predict_magnitude,
+)
 from fhash_formats.transform.entropy.mixing_portable import (
     ARRAYS,
     LEARNING_RATE,
@@ -132,6 +139,8 @@ DECODE = 1
 """Mode of a run that decodes."""
 CHOOSE = 2
 """Mode of a run that encodes magnitudes which it chooses by rate and distortion."""
+LINEAR = 2
+"""Number in CODERS of the coder with linear predictors of magnitudes."""
 TRELLIS = 4
 """Added to ENCODE or DECODE: the integers are those of two quantisers."""
 
@@ -244,7 +253,8 @@ def _engine() -> Callable[..., Any] | None:
         *(_small, _context_mix, _choose, _add_centre, _add_neighbour, _prepare),
         *(_any_nonzero, _find_references, _code_escape, _code_sign, after_zeros),
         *(code_linear_sign, consistent, find_places, gather_signs, log_at, octaves, sign),
-        *(linear_learn, linear_logit),
+        *(linear_learn, linear_logit, _predict, _learn),
+        *(gather_magnitudes, predict_magnitude, learn_magnitude),
     )
     return compiled(_run, helpers)
 
@@ -281,18 +291,45 @@ def _start(
     }
     price = weight / 2048  # squared steps that 1/2048 bit is worth
     signs = sign_work(coder, memory.weights, shape, mode >= TRELLIS, compiled=engine is not None)
+    magnitudes = magnitude_work(coder, memory.weights, signs.strides, compiled=engine is not None)
     model = CODERS.index(coder)
     if engine is None:
         work = Work(**{name: [0] * length for name, length in lengths.items()})
         span: Sequence = [0] * 4
         rows = bands.tolist()
         return _run(
-            mode, model, q, scaled, price, shape, rows, memory, LISTS, work, signs, span, data
+            mode,
+            model,
+            q,
+            scaled,
+            price,
+            shape,
+            rows,
+            memory,
+            LISTS,
+            work,
+            signs,
+            magnitudes,
+            span,
+            data,
         )
     work = Work(**{name: np.zeros(length, dtype=np.int64) for name, length in lengths.items()})
     span, source = np.zeros(4, np.int64), np.frombuffer(data, dtype=np.uint8).astype(np.int64)
     code, out = engine(
-        mode, model, q, scaled, price, shape, bands, memory, ARRAYS, work, signs, span, source
+        mode,
+        model,
+        q,
+        scaled,
+        price,
+        shape,
+        bands,
+        memory,
+        ARRAYS,
+        work,
+        signs,
+        magnitudes,
+        span,
+        source,
     )
     return code, out
 
@@ -327,40 +364,92 @@ def _context_mix(
     return mix(CONTEXTS, where, inputs, first, second, memory, tables)
 
 
+def _predict(
+    model: int,
+    k: int,
+    kind: int,
+    coarse: int,
+    near: int,
+    where: Sequence,
+    inputs: Sequence,
+    work: Work,
+    magnitudes: MagnitudeWork,
+    memory: Memory,
+    tables: Tables,
+) -> int:
+    """Probability of a 1 in decision k of the present vertex, by the model of the coder."""
+    if model == LINEAR:
+        for i in range(CONTEXTS):
+            where[i] = STARTS[i] + work.context[i] * DECISIONS + k
+        return predict_magnitude(k, where, near, magnitudes, memory, tables)
+    first, second = (k * KINDS + kind) * LANES, SECOND + (k * 64 + coarse) * LANES
+    return _context_mix(k, where, inputs, work.context, first, second, memory, tables)
+
+
+def _learn(
+    model: int,
+    k: int,
+    kind: int,
+    coarse: int,
+    p: int,
+    bit: int,
+    work: Work,
+    magnitudes: MagnitudeWork,
+    memory: Memory,
+    tables: Tables,
+) -> None:
+    """Learn from the bit that came after `_predict`, which returned p."""
+    if model == LINEAR:
+        learn_magnitude(k, bit, work.where, magnitudes, memory, tables)
+        return
+    first, second = (k * KINDS + kind) * LANES, SECOND + (k * 64 + coarse) * LANES
+    learn(
+        CONTEXTS,
+        work.where,
+        work.inputs,
+        first,
+        second,
+        p,
+        bit,
+        SLOW_LIMIT,
+        LEARNING_RATE,
+        memory,
+        tables.rate,
+    )
+
+
 def _choose(
     s: float,
     p: int,
     price: float,
-    first: int,
-    second: int,
+    model: int,
+    kind: int,
+    coarse: int,
+    near: int,
+    work: Work,
+    magnitudes: MagnitudeWork,
     memory: Memory,
     tables: Tables,
-    work: Work,
 ) -> int:
     """The magnitude next to `s` that costs least: the nearest one, one less, or zero."""
     s = s if s < 1e9 else 1e9
     nearest = int(s + 0.5)
     if nearest == 0 or nearest >= UNARY:
         return nearest
-    cost, where, inputs, context = tables.cost, work.other_where, work.other_inputs, work.context
+    cost, where, inputs = tables.cost, work.other_where, work.other_inputs
     zero = s * s + price * cost[p]
     other_than_zero = price * (cost[65536 - p] + 2048)
-    stop = _context_mix(
-        nearest,
-        where,
-        inputs,
-        context,
-        first + nearest * BY_KIND,
-        second + nearest * BY_LEVEL,
-        memory,
-        tables,
+    before = 0
+    if nearest > 1:
+        k = nearest - 1
+        before = _predict(
+            model, k, kind, coarse, near, where, inputs, work, magnitudes, memory, tables
+        )
+    stop = _predict(
+        model, nearest, kind, coarse, near, where, inputs, work, magnitudes, memory, tables
     )
     if nearest == 1:
         return 0 if zero <= (s - 1) * (s - 1) + price * cost[65536 - stop] + other_than_zero else 1
-    k = nearest - 1
-    before = _context_mix(
-        k, where, inputs, context, first + k * BY_KIND, second + k * BY_LEVEL, memory, tables
-    )
     same = (s - nearest) * (s - nearest) + price * (cost[before] + cost[65536 - stop])
     less = (s - nearest + 1) * (s - nearest + 1) + price * cost[65536 - before]
     if nearest == 2 and zero < min(same, less) + other_than_zero:
@@ -580,6 +669,7 @@ def _run(
     tables: Tables,
     work: Work,
     signs: SignWork,
+    magnitudes: MagnitudeWork,
     span: Sequence,
     data: Sequence,
 ) -> tuple[int, list[int]]:
@@ -664,36 +754,59 @@ def _run(
                 context[3] = _small(near, small) * 144 + sides
                 context[4] = others + min(_small(work.around[3 * width + x], small), 6)
                 context[5] = (both * 12 + parent) * KINDS + kind
+                plain_near = near
 
                 # The zero flag.
                 one = state & 1 if two_quantisers else 0  # class of the quantiser
+                near = min(_small(near, small), 6)
+                if model == LINEAR:
+                    vertex = magnitudes.vertex
+                    vertex[0], vertex[1], vertex[2], vertex[6] = kind, coarse, plain_near, one
+                    vertex[3] = min(_small(before + below, small), 6)
+                    vertex[4] = min(parent, 6)
+                    vertex[5] = max(log16(expected, log) + offset + 4, 0) if expected else 0
+                    gather_magnitudes(q, band, table, t, z, y, x, magnitudes)
                 k = UNARY if one else 0
-                first = (k * KINDS + kind) * LANES
-                second = SECOND + (k * 64 + coarse) * LANES
-                p = _context_mix(k, where, inputs, context, first, second, memory, tables)
+                p = _predict(
+                    model, k, kind, coarse, near, where, inputs, work, magnitudes, memory, tables
+                )
                 at = begin + x
                 value = 0 if decoding else q[at]
                 if mode == CHOOSE:
-                    best = _choose(abs(scaled[at]), p, price, first, second, memory, tables, work)
+                    best = _choose(
+                        abs(scaled[at]),
+                        p,
+                        price,
+                        model,
+                        kind,
+                        coarse,
+                        near,
+                        work,
+                        magnitudes,
+                        memory,
+                        tables,
+                    )
                     value = -best if scaled[at] < 0 else best
                     q[at] = value
+                    if model == LINEAR:  # trials have overwritten the prediction
+                        _predict(
+                            model,
+                            k,
+                            kind,
+                            coarse,
+                            near,
+                            where,
+                            inputs,
+                            work,
+                            magnitudes,
+                            memory,
+                            tables,
+                        )
                 if (one and value and not value & 1) or (two_quantisers and not one and value & 1):
                     return NO_TRELLIS, out
                 magnitude = (abs(value) + one) // 2 if two_quantisers else abs(value)
                 zero = code_bit(1 if magnitude == 0 else 0, p, stream)
-                learn(
-                    CONTEXTS,
-                    where,
-                    inputs,
-                    first,
-                    second,
-                    p,
-                    zero,
-                    SLOW_LIMIT,
-                    LEARNING_RATE,
-                    memory,
-                    rate,
-                )
+                _learn(model, k, kind, coarse, p, zero, work, magnitudes, memory, tables)
                 if zero:
                     state = AFTER[2 * state]
                     continue
@@ -738,23 +851,21 @@ def _run(
                 k = 1
                 while k < UNARY:
                     d = UNARY + k if one and k < SHARED else k
-                    first = (d * KINDS + kind) * LANES
-                    second = SECOND + (d * 64 + coarse) * LANES
-                    p = _context_mix(d, where, inputs, context, first, second, memory, tables)
-                    more = code_bit(1 if magnitude > k else 0, p, stream)
-                    learn(
-                        CONTEXTS,
+                    p = _predict(
+                        model,
+                        d,
+                        kind,
+                        coarse,
+                        near,
                         where,
                         inputs,
-                        first,
-                        second,
-                        p,
-                        more,
-                        SLOW_LIMIT,
-                        LEARNING_RATE,
+                        work,
+                        magnitudes,
                         memory,
-                        rate,
+                        tables,
                     )
+                    more = code_bit(1 if magnitude > k else 0, p, stream)
+                    _learn(model, d, kind, coarse, p, more, work, magnitudes, memory, tables)
                     if not more:
                         break
                     k += 1

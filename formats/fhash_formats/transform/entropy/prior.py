@@ -50,6 +50,14 @@ SIGN_SET = 24
 """Weights of a sign of these coders: two per estimate, then that of the linear logit."""
 SIGN_INPUTS = 96
 """Weights of a linear predictor of signs, each with a mean square of its gradient."""
+INPUTS = 64
+"""Weights of a linear predictor of magnitudes, each with a mean square of its gradient."""
+SET_CLASSES = (KINDS, 64, 343, 64 * 8)
+"""Classes of each of the four sets of mixing weights of the linear coder."""
+SETS = len(SET_CLASSES)
+"""Sets of mixing weights of the linear coder."""
+SET_NUMBERS = 17
+"""Numbers of such a set: two weights per estimate, of the logit, of a constant, two 0; its uses."""
 FIRST_SQUARE = 16
 """Mean square of a gradient before anything is known, 1 is 16384."""
 BASE_WEIGHTS = (KINDS * DECISIONS + 64 * DECISIONS + KINDS) * LANES
@@ -124,6 +132,10 @@ def blank_state(coder: str = CODERS[0]) -> State:
         slots += sum(MORE_SIGN_SIZES)
         weights += [(16, 2048), (1, 8192), (7, 0)] * KINDS
         weights += [(SIGN_INPUTS, 0), (SIGN_INPUTS, FIRST_SQUARE)] * KINDS
+    if coder == "linear":
+        weights += [(INPUTS, 0), (INPUTS, FIRST_SQUARE)] * (DECISIONS * KINDS)
+        weights += [(12, 2731), (1, 8192), (4, 0)] * (DECISIONS * sum(SET_CLASSES))
+        weights += [(SETS * DECISIONS * KINDS, 16384)]
     return State.even(slots=slots, weights=weights, simples=SIMPLES)
 
 
