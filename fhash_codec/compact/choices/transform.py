@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.choices.quantiser import plain_step
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.stage_clock import stage
@@ -272,7 +273,7 @@ class _Bases:
         gram = np.zeros((length, length))
         for tile_gram in self._sample.map_all(lambda tile: self._gram(tile.values, axis)):
             gram += tile_gram
-        return fit_basis(gram, self._settings.step)
+        return fit_basis(gram, plain_step(self._settings))
 
     def _gram(self, values: npt.NDArray[np.generic], axis: int) -> npt.NDArray[np.float64]:
         """Return the products of the lines of a tile along an axis, (length, length)."""
