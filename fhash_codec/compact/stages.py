@@ -62,6 +62,8 @@ MIN_HEAD_EFFORT = 5
 """Least effort that trains a head."""
 SAMPLE_WHY = "tiles on which the choices are tried"
 """Reason for the stage that reads and fills a sample."""
+HEAD_TRIES = 3
+"""Trials of the step with a head: the search begins within some hundredths of a dB of its end."""
 REFITS = 3
 """Times that the data's own bases are made anew for another step."""
 SAME_STEP = 0.1
@@ -204,8 +206,11 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
         skip("head", reason)
         return attempt
 
-    def find(settings: TileSettings, tried: list[Outcome]) -> tuple[TileSettings, Outcome]:
-        return find_step(attempt.sample, settings, attempt.coding, goal, tries=4, tried=tried)
+    def find(settings: TileSettings) -> tuple[TileSettings, Outcome]:
+        return find_step(attempt.sample, settings, attempt.coding, goal, tries=HEAD_TRIES)
+
+    def look(settings: TileSettings) -> Outcome:
+        return attempt.sample.run(settings, goal.bounded(attempt.coding))
 
     settings, outcome, history = choose_head(
         attempt.sample,
@@ -213,6 +218,7 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
         attempt.outcome,
         attempt.coding,
         find,
+        look,
         attempt.tried,
         strict=goal.error is not None,
         data_range=goal.data_range,
