@@ -164,9 +164,9 @@ FHASH_INLINE __m128i half(const void* from) {
     return _mm_loadl_epi64(static_cast<const __m128i*>(from));
 }
 
-// Probability of a 1, mixed from N estimates with one or two (PAIR) sets of weights.
-
-template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now) {
+// Probability of a 1, mixed from N estimates with one or two (PAIR) sets of weights. more: a term of
+// the sum that comes from elsewhere.
+template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now, int32_t more = 0) {
     const __m128i zero = _mm_setzero_si128();
     __m128i dot = zero;
     for (int v = 0; 4 * v < N; v++) {
@@ -179,10 +179,10 @@ template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now) {
         now.counts[v] = _mm_unpackhi_epi64(one, two);
         auto pace_of = [&](int i) FHASH_LAMBDA { return half(&tables.pace[s[i]->count]); };
         const __m128i pace = _mm_unpacklo_epi32(pace_of(0), n > 1 ? pace_of(1) : zero);
-        const __m128i more =
+        const __m128i others =
             n < 3 ? zero : _mm_unpacklo_epi32(pace_of(2), n > 3 ? pace_of(3) : zero);
-        now.rates[v] = _mm_unpacklo_epi64(pace, more);
-        const __m128i trust = _mm_unpackhi_epi64(pace, more);
+        now.rates[v] = _mm_unpacklo_epi64(pace, others);
+        const __m128i trust = _mm_unpackhi_epi64(pace, others);
         __m128i in = _mm_cvtsi32_si128((uint16_t)tables.stretch[s[0]->slow]);
         in = _mm_insert_epi16(in, tables.stretch[s[0]->fast], 1);
         if (n > 1) {
@@ -223,7 +223,7 @@ template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now) {
     }
     dot = _mm_add_epi32(dot, _mm_shuffle_epi32(dot, 0x4e));
     dot = _mm_add_epi32(dot, _mm_shuffle_epi32(dot, 0xb1));
-    return now.p = squashed(_mm_cvtsi128_si32(dot));
+    return now.p = squashed(_mm_cvtsi128_si32(dot) + more);
 }
 
 // Add a step to eight weights, within +-32767.
@@ -276,8 +276,8 @@ FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
 
 #else
 
-template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now) {
-    int32_t dot = 0;
+template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now, int32_t more = 0) {
+    int32_t dot = more;
     for (int i = 0; i < N; i++) {
         const Slot* s = now.slots[i];
         const int trust = tables.pace[s->count].trust;

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.entropy.linear_portable import linear_learn, linear_logit
 from fhash_formats.transform.entropy.mixing_portable import (
     ARRAYS,
     LEARNING_RATE,
@@ -34,6 +35,7 @@ from fhash_formats.transform.entropy.mixing_portable import (
     start_range,
 )
 from fhash_formats.transform.entropy.prior import (
+    CODERS,
     DECISIONS,
     KINDS,
     LANES,
@@ -41,6 +43,18 @@ from fhash_formats.transform.entropy.prior import (
     SIGN_SIZES,
     SIZES,
     State,
+)
+from fhash_formats.transform.entropy.signs_portable import (
+    SIGN_LIMIT,
+    SignWork,
+    code_linear_sign,
+    consistent,
+    find_places,
+    gather_signs,
+    log_at,
+    octaves,
+    sign,
+    sign_work,
 )
 from fhash_formats.transform.entropy.table import (
     BAND,
@@ -71,8 +85,6 @@ UNARY = 14
 SHARED = 2
 """Decisions from this one on are one for both quantisers; those of class 1 before it have the slots
 and weights from UNARY on."""
-SIGN_LIMIT = 255
-"""Observations after which the slow rate of an estimate of a sign stays."""
 MAX_MAGNITUDE = 4095
 """Largest magnitude that contexts see."""
 PADDING = 2
@@ -173,6 +185,7 @@ def encode(
     scaled: npt.NDArray[np.float32] | None,
     weight: float,
     state: State,
+    coder: str,
     trellis: bool,
 ) -> bytes:
     """Code integers (t, z, y, x), in C order, and adapt the state.
@@ -188,12 +201,13 @@ def encode(
     q: Sequence
     if engine is None:
         q = integers.ravel().tolist()
-        code, out = _start(engine, mode, q, real.tolist(), weight, shape, table, memory, b"")
+        values = real.tolist()
+        code, out = _start(engine, mode, coder, q, values, weight, shape, table, memory, b"")
         if mode == CHOOSE:
             integers[:] = np.array(q, dtype=np.int32).reshape(integers.shape)
     else:
         q = integers.reshape(-1)
-        code, out = _start(engine, mode, q, real, weight, shape, table, memory, b"")
+        code, out = _start(engine, mode, coder, q, real, weight, shape, table, memory, b"")
     if code < 0:
         raise InputError(MISPLACED)
     keep_memory(memory, state)
@@ -205,6 +219,7 @@ def decode(
     table: npt.NDArray[np.int32],
     data: bytes,
     state: State,
+    coder: str,
     trellis: bool,
 ) -> None:
     """Decode into integers (t, z, y, x), which are zeros in C order.
@@ -216,7 +231,7 @@ def decode(
     real: Sequence = [] if engine is None else np.zeros(0)
     memory = memory_of(state, engine is not None)
     mode = DECODE | TRELLIS if trellis else DECODE
-    code = _start(engine, mode, q, real, 0.0, integers.shape, table, memory, data)[0]
+    code = _start(engine, mode, coder, q, real, 0.0, integers.shape, table, memory, data)[0]
     if code < 0:
         raise DamagedFileError("the coded integers are damaged")
     if engine is None:
@@ -226,8 +241,10 @@ def decode(
 def _engine() -> Callable[..., Any] | None:
     """`_run` compiled, or None where numba cannot be imported."""
     helpers = (
-        *(_small, _sign, _context_mix, _choose, _add_centre, _add_neighbour, _prepare),
-        *(_any_nonzero, _find_references, _code_escape, after_zeros),
+        *(_small, _context_mix, _choose, _add_centre, _add_neighbour, _prepare),
+        *(_any_nonzero, _find_references, _code_escape, _code_sign, after_zeros),
+        *(code_linear_sign, consistent, find_places, gather_signs, log_at, octaves, sign),
+        *(linear_learn, linear_logit),
     )
     return compiled(_run, helpers)
 
@@ -235,6 +252,7 @@ def _engine() -> Callable[..., Any] | None:
 def _start(
     engine: Callable[..., Any] | None,
     mode: int,
+    coder: str,
     q: Sequence,
     scaled: Sequence,
     weight: float,
@@ -262,13 +280,20 @@ def _start(
         **dict.fromkeys(("inputs", "other_inputs"), LANES),
     }
     price = weight / 2048  # squared steps that 1/2048 bit is worth
+    signs = sign_work(coder, memory.weights, shape, mode >= TRELLIS, compiled=engine is not None)
+    model = CODERS.index(coder)
     if engine is None:
         work = Work(**{name: [0] * length for name, length in lengths.items()})
         span: Sequence = [0] * 4
-        return _run(mode, q, scaled, price, shape, bands.tolist(), memory, LISTS, work, span, data)
+        rows = bands.tolist()
+        return _run(
+            mode, model, q, scaled, price, shape, rows, memory, LISTS, work, signs, span, data
+        )
     work = Work(**{name: np.zeros(length, dtype=np.int64) for name, length in lengths.items()})
     span, source = np.zeros(4, np.int64), np.frombuffer(data, dtype=np.uint8).astype(np.int64)
-    code, out = engine(mode, q, scaled, price, shape, bands, memory, ARRAYS, work, span, source)
+    code, out = engine(
+        mode, model, q, scaled, price, shape, bands, memory, ARRAYS, work, signs, span, source
+    )
     return code, out
 
 
@@ -277,10 +302,6 @@ def _small(v: int, small: Sequence) -> int:
     if v < 37:
         return int(small[v])
     return 9 if v <= 64 else 10 if v <= 140 else 11
-
-
-def _sign(v: int) -> int:
-    return 2 if v > 0 else 0 if v < 0 else 1
 
 
 def _any_nonzero(q: Sequence, begin: int, n: int) -> int:
@@ -501,8 +522,55 @@ def _code_escape(magnitude: int, level: int, stream: Stream, memory: Memory, rat
     return min(v + UNARY - 1, 0x7FFFFFFF)
 
 
+def _code_sign(
+    bit: int,
+    q: Sequence,
+    at: int,
+    t: int,
+    z: int,
+    y: int,
+    x: int,
+    kind: int,
+    strides: tuple[int, int, int],
+    work: Work,
+    stream: Stream,
+    memory: Memory,
+    tables: Tables,
+) -> int:
+    """Code the sign of integer `at` by contexts alone; neighbours that do not exist count as 0."""
+    s0, s1, s2 = strides
+    left = sign(q[at - 1]) if x > 0 else 1
+    left2 = sign(q[at - 2]) if x > 1 else 1
+    up = sign(q[at - s2]) if y > 0 else 1
+    up2 = sign(q[at - 2 * s2]) if y > 1 else 1
+    below = sign(q[at - s1]) if z > 0 else 1
+    before = sign(q[at - s0]) if t > 0 else 1
+    where, inputs = work.where, work.inputs
+    where[0] = SIGN_STARTS[0] + kind * 27 + (left * 3 + up) * 3 + before
+    where[1] = SIGN_STARTS[1] + kind * 81 + (left * 3 + left2) * 9 + up * 3 + up2
+    where[2] = SIGN_STARTS[2] + kind * 27 + (before * 3 + below) * 3 + left
+    signs = SIGNS + kind * LANES
+    p = mix(SIGN_CONTEXTS, where, inputs, signs, -1, memory, tables)
+    bit = code_bit(bit, p, stream)
+    learn(
+        SIGN_CONTEXTS,
+        where,
+        inputs,
+        signs,
+        -1,
+        p,
+        bit,
+        SIGN_LIMIT,
+        LEARNING_RATE,
+        memory,
+        tables.rate,
+    )
+    return bit
+
+
 def _run(
     mode: int,
+    model: int,
     q: Sequence,
     scaled: Sequence,
     price: float,
@@ -511,6 +579,7 @@ def _run(
     memory: Memory,
     tables: Tables,
     work: Work,
+    signs: SignWork,
     span: Sequence,
     data: Sequence,
 ) -> tuple[int, list[int]]:
@@ -608,7 +677,7 @@ def _run(
                     best = _choose(abs(scaled[at]), p, price, first, second, memory, tables, work)
                     value = -best if scaled[at] < 0 else best
                     q[at] = value
-                if one and value and not value & 1 or two_quantisers and not one and value & 1:
+                if (one and value and not value & 1) or (two_quantisers and not one and value & 1):
                     return NO_TRELLIS, out
                 magnitude = (abs(value) + one) // 2 if two_quantisers else abs(value)
                 zero = code_bit(1 if magnitude == 0 else 0, p, stream)
@@ -630,33 +699,40 @@ def _run(
                     continue
                 work.filled[f] = 1
 
-                # The sign: 0 for negative neighbours, 1 for zeros and none, 2 for positive ones.
-                left_sign = _sign(q[at - 1]) if x > 0 else 1
-                left2_sign = _sign(q[at - 2]) if x > 1 else 1
-                y_sign = _sign(q[at - s2]) if y > 0 else 1
-                y2_sign = _sign(q[at - 2 * s2]) if y > 1 else 1
-                z_sign = _sign(q[at - s1]) if z > 0 else 1
-                t_sign = _sign(q[at - s0]) if t > 0 else 1
-                sides = (left_sign * 3 + left2_sign) * 9 + y_sign * 3 + y2_sign
-                where[0] = SIGN_STARTS[0] + kind * 27 + (left_sign * 3 + y_sign) * 3 + t_sign
-                where[1] = SIGN_STARTS[1] + kind * 81 + sides
-                where[2] = SIGN_STARTS[2] + kind * 27 + (t_sign * 3 + z_sign) * 3 + left_sign
-                signs = SIGNS + kind * LANES
-                p = mix(SIGN_CONTEXTS, where, inputs, signs, -1, memory, tables)
-                negative = code_bit(1 if value < 0 else 0, p, stream)
-                learn(
-                    SIGN_CONTEXTS,
-                    where,
-                    inputs,
-                    signs,
-                    -1,
-                    p,
-                    negative,
-                    SIGN_LIMIT,
-                    LEARNING_RATE,
-                    memory,
-                    rate,
-                )
+                # The sign.
+                negative = 1 if value < 0 else 0
+                if model:
+                    negative = code_linear_sign(
+                        negative,
+                        q,
+                        band,
+                        table,
+                        kind,
+                        t,
+                        z,
+                        y,
+                        x,
+                        signs,
+                        stream,
+                        memory,
+                        tables,
+                    )
+                else:
+                    negative = _code_sign(
+                        negative,
+                        q,
+                        at,
+                        t,
+                        z,
+                        y,
+                        x,
+                        kind,
+                        (s0, s1, s2),
+                        work,
+                        stream,
+                        memory,
+                        tables,
+                    )
 
                 # The magnitude.
                 k = 1

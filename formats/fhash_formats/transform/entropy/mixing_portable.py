@@ -271,6 +271,7 @@ def mix(
     second: int,
     memory: Memory,
     tables: Tables,
+    more: int = 0,
 ) -> int:
     """Probability of a 1, in 1/65536, mixed from n estimates.
 
@@ -282,8 +283,9 @@ def mix(
         second: where the second set of weights begins, or a negative number for none.
         memory: the estimates and weights.
         tables: ARRAYS or LISTS.
+        more: a term of the sum that comes from elsewhere.
     """
-    weights, dot = memory.weights, 0
+    weights, dot = memory.weights, more
     for i in range(n):
         at = where[i]
         slow, fast = tables.stretch[memory.slow[at]], tables.stretch[memory.fast[at]]
