@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.choices.quantiser import plain_step
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.stage_clock import stage
@@ -282,7 +283,7 @@ class _Bases:
             for tile_gram in self._sample.map_all(lambda tile: self._gram(tile.values, axis)):
                 gram += tile_gram
             grams[key] = gram
-        return fit_basis(grams[key], self._settings.step)
+        return fit_basis(grams[key], plain_step(self._settings))
 
     def _gram(self, values: npt.NDArray[np.generic], axis: int) -> Gram:
         """Return the products of the lines of a tile along an axis, (length, length)."""
