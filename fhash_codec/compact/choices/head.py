@@ -17,10 +17,11 @@ from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.progress import Parts
 from fhash_codec.stage_clock import skip, stage
+from fhash_formats.container.table_parts import APART_BYTES
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["HeadHistory", "best_widths", "choose_head", "most_saved", "training_pairs"]
+__all__ = ["HeadHistory", "best_widths", "choose_head", "most_saved", "octave", "training_pairs"]
 
 HeadHistory = list[dict[str, float | None]]
 """Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
@@ -92,19 +93,18 @@ MAX_OF_TRIAL = 1.5
 WEIGHT_BYTES = 0.7
 """Bytes that each weight of a head adds to the file."""
 ARRAY_BYTES = 540
-"""Bytes in the file that describe the array of a head: two documents and three places of a ZIP."""
-HISTORY_BYTES = 200
-"""Bytes of the training history in the file."""
-HEAD_BYTES = ARRAY_BYTES + HISTORY_BYTES + 40
-"""Bytes that a head adds to the file besides its weights."""
+"""Bytes that describe the array of a head: two documents and three places of a ZIP. In a small file
+there is none."""
+HISTORY_BYTES = 60
+"""Bytes of the training history and of the description of a head in the file."""
 WEIGHT_TIME = 5e-6
 """Share of the file that each weight must save to pay for the decoding time it costs."""
 TRAINING_VERTICES = 48 << 20
 """Vertices of the tiles that are learned from: what few tiles teach holds for them alone."""
-MIN_BYTES = 3200
+MIN_BYTES = 900
 """Bytes of coded tiles below which a head cannot save what it takes.
 
-The smallest head takes some 1,300 bytes with array and history, and none saves 40 % of the tiles.
+The smallest head takes some 250 bytes with its history, and few save 30 % of the tiles.
 """
 
 
@@ -158,8 +158,8 @@ def choose_head(
         skip("head", "its trial gains nothing")
         return settings, outcome, []
     gain = GAIN_FACTOR * trial.gain_db + GAIN_BESIDES
-    widths = best_widths(outcome.size, gain, _octave(tried, data_range), effort)
-    most = most_saved(outcome.size, gain, _octave(tried, data_range))
+    widths = best_widths(outcome.size, gain, octave(tried, data_range), effort)
+    most = most_saved(outcome.size, gain, octave(tried, data_range))
     if widths is None and most <= 0:
         gained = f"its trial gained {trial.gain_db:.2f} dB"
         skip("head", f"{gained}: no head would save what it takes itself")
@@ -235,13 +235,12 @@ def _cheapest(
             candidate.outcome.size
             - outcome.size
             + len(candidate.trained.head.to_bytes())
-            + ARRAY_BYTES
-            + HISTORY_BYTES
+            + head_bytes(candidate.outcome.size)
         )
         if not strict:
             # The rest of the difference in quality between the two searches, in bytes.
             missing = outcome.psnr(data_range) - psnr
-            cost += outcome.size * (2 ** (missing / _octave(candidate.tried, data_range)) - 1)
+            cost += outcome.size * (2 ** (missing / octave(candidate.tried, data_range)) - 1)
         if cost < lowest_cost or not history:
             psnr_without = psnr - candidate.trained.gain_db
             history = [
@@ -263,12 +262,20 @@ def _finite(psnr: float) -> float | None:
     return psnr if math.isfinite(psnr) else None
 
 
-def _octave(tried: list[Outcome], data_range: float) -> float:
+def octave(tried: list[Outcome], data_range: float) -> float:
     """Return the dB that an octave of bytes buys."""
     points = [
         (math.log2(outcome.size), outcome.psnr(data_range)) for outcome in tried if outcome.size
     ]
     return exchange(points, EXCHANGE)
+
+
+def head_bytes(size: float) -> float:
+    """Return the bytes that a head adds to the file besides its weights.
+
+    size: bytes of the coded tiles.
+    """
+    return HISTORY_BYTES + (ARRAY_BYTES if size >= APART_BYTES else 0)
 
 
 def best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[int, int] | None:
@@ -285,7 +292,7 @@ def best_widths(size: float, gain: float, octave: float, effort: int) -> tuple[i
         return (
             size * (1 - 2 ** (-GAIN_BY_WIDTHS[widths] * gain / octave) - WEIGHT_TIME * weights)
             - WEIGHT_BYTES * weights
-            - HEAD_BYTES
+            - head_bytes(size)
         )
 
     best = max(list(GAIN_BY_WIDTHS)[: EFFORTS[effort].candidates], key=saved)
@@ -300,7 +307,7 @@ def most_saved(size: float, gain: float, octave: float) -> float:
     first, second = PERCEPTRON.widths
     weights = INPUTS * first + first * second + second
     share = 1 - 2 ** (-MAX_OF_TRIAL * gain / octave)
-    return size * share - WEIGHT_BYTES * weights - HEAD_BYTES
+    return size * share - WEIGHT_BYTES * weights - head_bytes(size)
 
 
 def training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:
