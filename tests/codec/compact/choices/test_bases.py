@@ -63,16 +63,9 @@ def begun(sample: Sample, fineness: float) -> TileSettings:
         low=-4.0,
         high=4.0,
     )
-    placeholder = next(iter(_with_basis(sample, replace(settings, step=settings.step / fineness))))
-    found, _ = find_step(sample, replace(settings, transform=placeholder), Coding(), GOAL, tries=6)
-    return found
-
-
-def _with_basis(sample: Sample, settings: TileSettings) -> Iterator[TransformSpec]:
-    from fhash_codec.compact.choices.transform import _Bases
-
-    axes = settings.transform.axes
-    yield TransformSpec(axes=(*axes[:3], _Bases(sample, settings).along(3)))
+    basis = _Bases(sample, replace(settings, step=settings.step / fineness)).along(3)
+    spec = TransformSpec(axes=(*usual[:3], basis))
+    return find_step(sample, replace(settings, transform=spec), Coding(), GOAL, tries=6)[0]
 
 
 def test_bases_that_are_too_fine_become_coarser(workers: ThreadPoolExecutor) -> None:
