@@ -20,6 +20,7 @@ from fhash_codec.compact.stages import (
     fill_tiles,
     first_guess,
     first_settings,
+    refit_bases,
     try_head,
     try_predictor,
 )
@@ -42,7 +43,7 @@ MAX_VALUE = 1e145
 """Largest magnitude of a value whose squared errors fit float64."""
 MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
-STAGES = 6
+STAGES = 7
 """Number of parts of the planning that its progress counts."""
 
 
@@ -162,6 +163,7 @@ def _improved(task: PlanTask, attempt: Attempt) -> Attempt:
         ("fill values", fill_tiles),
         ("quantiser step", choose_step),
         ("head", try_head),
+        ("coarser bases", refit_bases),
         ("prediction", try_predictor),
     ):
         task.parts.begin(part)

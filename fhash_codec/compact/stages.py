@@ -13,6 +13,7 @@ from math import prod
 import numpy as np
 
 from fhash_codec.compact.attempt import Attempt, PlanTask
+from fhash_codec.compact.choices.bases import coarser_bases
 from fhash_codec.compact.choices.estimate import tile_costs
 from fhash_codec.compact.choices.fillings import choose_filling
 from fhash_codec.compact.choices.head import choose_head
@@ -36,6 +37,7 @@ __all__ = [
     "first_guess",
     "first_settings",
     "other_tiles",
+    "refit_bases",
     "try_head",
     "try_predictor",
 ]
@@ -242,6 +244,21 @@ def _without_head(task: PlanTask, attempt: Attempt) -> str:
     if attempt.settings.double:
         return "the step is too fine for float32, in which heads compute"
     return ""
+
+
+def refit_bases(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Make the data's own bases anew for the final step, and keep them if the file is smaller."""
+    if task.config.effort == 1 or task.goal.size is not None:
+        return attempt
+    found = coarser_bases(
+        attempt.sample, attempt.settings, attempt.outcome, attempt.coding, task.goal
+    )
+    if found is None:
+        return attempt
+    settings, outcome = found
+    kept = settings is not attempt.settings
+    task.gains.note("coarser bases" if kept else "coarser bases (left out)", outcome)
+    return replace(attempt, settings=settings, outcome=outcome)
 
 
 def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:

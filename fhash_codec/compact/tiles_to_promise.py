@@ -32,7 +32,7 @@ from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
 
 __all__ = ["code_series", "resized"]
 
-OVERHEAD_BYTES = 3000
+OVERHEAD_BYTES = 2000
 """Approximate bytes of a container without its tiles, for the sizes after each stage."""
 PASSES = 4
 """Times that all tiles are coded at most for a promise that the sample did not foretell."""

@@ -39,7 +39,7 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["Look", "Rates", "coded_tiles", "look_at", "now", "probe_rates", "search_coding"]
 
-OVERHEAD_BYTES = 3000
+OVERHEAD_BYTES = 2000
 """Approximate bytes of a container without its tiles."""
 PROBE_VERTICES = 1 << 17
 """Vertices of a probed tile; larger ones are cut to about this size."""

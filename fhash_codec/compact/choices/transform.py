@@ -44,6 +44,8 @@ MATRICES_AT_ONCE = 64
 """Matrices of lines whose products are held at once."""
 ERROR_PRICE = 0.8
 """Squared error in squared steps that is worth a byte."""
+BASIS_TEXT = 1.03
+"""Bytes in the file for each byte of a packed basis: it stands there as deflated base64."""
 
 
 class TileSample(Protocol):
@@ -161,15 +163,23 @@ def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     return trials, len(bases.fitted)
 
 
-def refit(sample: TileSample, settings: TileSettings) -> TileSettings:
+def basis_bytes(transform: TransformSpec) -> float:
+    """Return the bytes that the data's own bases take in the file."""
+    packed = (axis.basis.to_bytes() for axis in transform.axes if axis.basis is not None)
+    return BASIS_TEXT * sum(map(len, packed))
+
+
+def refit(sample: TileSample, settings: TileSettings, coarser: float = 1.0) -> TileSettings:
     """Return settings with the data's own bases made anew for their step.
 
     Settings without such bases are returned themselves, the same object.
+
+    coarser: factor of the step that the bases are as precise as.
     """
     axes = settings.transform.axes
     if not any(axis.basis is not None for axis in axes):
         return settings
-    bases = _Bases(sample, settings)
+    bases = _Bases(sample, replace(settings, step=coarser * settings.step))
     fresh = {
         number: bases.along(number) for number, axis in enumerate(axes) if axis.basis is not None
     }
@@ -205,8 +215,7 @@ def _costs(
     """Return J of each trial."""
 
     def cost(axes: Axes, outcome: Outcome) -> float:
-        # The file has a basis as text of 4/3 of its bytes.
-        bases = sum(len(axis.basis.to_bytes()) * 4 / 3 for axis in axes if axis.basis is not None)
+        bases = basis_bytes(TransformSpec(axes=axes))
         # Under a bound, bytes of the residual correct the errors already.
         error = 0.0
         if coding.error is None:
