@@ -37,6 +37,8 @@ PLANE_WAVELETS = (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3), (
 """
 LINE_WAVELETS = (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3), ("5/3", 1))
 """Kinds and depths tried along t and along z."""
+ROUGH_WAVELETS = (("haar", 2), ("9/7", 1))
+"""Kinds and depths tried beside the usual ones where tilings are compared."""
 ERROR_PRICE = 0.8
 """Squared error in squared steps that is worth a byte."""
 
@@ -135,6 +137,41 @@ def likely_transform(sample: TileSample, settings: TileSettings, coding: Coding)
     return replace(settings, transform=TransformSpec(axes=trials[costs.index(min(costs))]))
 
 
+def rough_transform(
+    sample: TileSample,
+    settings: TileSettings,
+    coding: Coding,
+    known: dict[int, AxisTransform],
+    lines: int,
+) -> tuple[TileSettings, Outcome | None]:
+    """Return settings with a good transform by very few trials, to compare tilings with.
+
+    Beside them is their outcome on the sample; None where nothing was tried.
+
+    known: transforms of axes that need no trial, such as those of the same axis elsewhere.
+    lines: of each tile, that the data's own bases are fitted on.
+    """
+    shape: Shape = sample.tiles[0].values.shape
+    bases = _Bases(sample, settings, lines)
+    axes = _changed(usual_transform(shape).axes, known)
+    best: tuple[float, Axes, Outcome | None] = (math.inf, axes, None)
+    for axis in (0, 1):
+        if axis in known or shape[axis] == 1:
+            continue
+        tried = [wavelet(kind, depth, shape[axis]) for kind, depth in ROUGH_WAVELETS]
+        kinds = list(dict.fromkeys([best[1][axis], *tried]))
+        if axis == 0 and bases.possible(shape[0]):
+            kinds.append(bases.along(0))
+        trials = [_changed(best[1], {axis: kind}) for kind in kinds]
+        fresh = [trial for trial in trials if best[2] is None or trial != best[1]]
+        best = min([best, *_tried(sample, settings, fresh, coding)], key=lambda trial: trial[0])
+    if bases.possible(*shape[1:]):
+        own = (best[1][0], bases.along(1), bases.along(2), bases.along(3))
+        trials = [own] if best[2] is not None else [axes, own]
+        best = min([best, *_tried(sample, settings, trials, coding)], key=lambda trial: trial[0])
+    return replace(settings, transform=TransformSpec(axes=best[1])), best[2]
+
+
 def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     """Return the codings of a sample by `choose_transform`, and the bases that it fits.
 
@@ -195,6 +232,13 @@ def _costs(
     sample: TileSample, settings: TileSettings, trials: Sequence[Axes], coding: Coding
 ) -> list[float]:
     """Return J of each trial."""
+    return [cost for cost, _, _ in _tried(sample, settings, trials, coding)]
+
+
+def _tried(
+    sample: TileSample, settings: TileSettings, trials: Sequence[Axes], coding: Coding
+) -> list[tuple[float, Axes, Outcome]]:
+    """Return J of each trial, beside the trial and its outcome."""
 
     def cost(axes: Axes, outcome: Outcome) -> float:
         # The file has a basis as text of 4/3 of its bytes.
@@ -208,7 +252,9 @@ def _costs(
     outcomes = sample.run_all(
         [(replace(settings, transform=TransformSpec(axes=axes)), coding) for axes in trials]
     )
-    return [cost(axes, outcome) for axes, outcome in zip(trials, outcomes, strict=True)]
+    return [
+        (cost(axes, outcome), axes, outcome) for axes, outcome in zip(trials, outcomes, strict=True)
+    ]
 
 
 def _plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTransform]:
@@ -246,8 +292,11 @@ def _line_trials(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, A
 class _Bases:
     """The data's own bases along the axes of a tile, computed when they are asked for."""
 
-    def __init__(self, sample: TileSample, settings: TileSettings) -> None:
-        self._sample, self._settings = sample, settings
+    def __init__(
+        self, sample: TileSample, settings: TileSettings, lines: int | None = None
+    ) -> None:
+        """Begin without any. lines: of each tile, that a basis is fitted on; None for all."""
+        self._sample, self._settings, self._lines = sample, settings, lines
         self._cache: dict[int, AxisTransform] = {}
 
     def possible(self, *lengths: int) -> bool:
@@ -277,10 +326,28 @@ class _Bases:
     def _gram(self, values: npt.NDArray[np.generic], axis: int) -> npt.NDArray[np.float64]:
         """Return the products of the lines of a tile along an axis, (length, length)."""
         # Values that do not count are kept: zeroing them would create an edge that dominates.
-        centred = values.astype(np.float64) - self._settings.center
+        centred = _some_lines(values, axis, self._lines).astype(np.float64)
+        number = centred.size
+        centred -= self._settings.center
         centred[~np.isfinite(centred)] = 0.0
-        columns = np.moveaxis(centred, axis, 0).reshape(values.shape[axis], -1)
-        return columns @ columns.T
+        return (centred @ centred.T) * (values.size / number)
+
+
+def _some_lines(
+    values: npt.NDArray[np.generic], axis: int, limit: int | None
+) -> npt.NDArray[np.generic]:
+    """Return the lines of a tile along an axis as columns, or about every n-th of them.
+
+    limit: number of lines from which on some are left out; None for none.
+    """
+    before, length = math.prod(values.shape[:axis]), values.shape[axis]
+    planes = values.reshape(before, length, -1)
+    after = planes.shape[2]
+    if limit is not None and before * after > limit:
+        leap = -(-before * after // limit)
+        along = min(leap, after)
+        planes = planes[:: -(-leap // along), :, ::along]
+    return planes.swapaxes(0, 1).reshape(length, -1)
 
 
 class _CountedBases(_Bases):
