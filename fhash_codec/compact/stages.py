@@ -19,8 +19,13 @@ from fhash_codec.compact.choices.mask import mask_levels
 from fhash_codec.compact.choices.predictor import choose_predictor
 from fhash_codec.compact.choices.step import find_step, require_reach, with_step
 from fhash_codec.compact.choices.tilings import choose_tiling
-from fhash_codec.compact.choices.transform import choose_transform, refit, usual_transform
-from fhash_codec.compact.tiles.access import Tiling, cheap_tiling
+from fhash_codec.compact.choices.transform import (
+    choose_transform,
+    own_or_found,
+    refit,
+    usual_transform,
+)
+from fhash_codec.compact.tiles.access import Tiling, cheap_tiling, part_of
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
@@ -45,6 +50,8 @@ SAMPLE_VERTICES = 6 << 20
 """Vertices coded for each trial of a step."""
 MAX_SEARCHED_VERTICES = 12 << 20
 """Vertices up to which a series is searched whole instead of on a sample."""
+LARGE = 1.5
+"""Vertices of a tile, in TRIAL_VERTICES, from which on a part of it stands for it in trials."""
 MIN_HEAD_EFFORT = 5
 """Least effort that trains a head."""
 SAMPLE_WHY = "tiles on which the choices are tried"
@@ -121,6 +128,20 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     searched = MAX_SEARCHED_VERTICES if vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
     with stage("sample", SAMPLE_WHY):
         return replace(attempt, sample=attempt.sample.wider(searched))
+
+
+def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
+    """Return settings with a transform that is chosen on a part of a large tile.
+
+    The part has all steps and all of z where it can; what it cannot tell, bases as long as the
+    tile, competes with its choice on the sample itself.
+    """
+    sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
+    part = task.blocks.window(part_of(sample.blocks.tile, TRIAL_VERTICES))
+    usual = replace(attempt.settings, transform=usual_transform(part.tile))
+    small = Sample(part, TRIAL_VERTICES, task.workers, tick=task.parts.tick).filled(usual, 1)
+    found = choose_transform(small, usual, coding)[0].transform.axes
+    return own_or_found(sample, attempt.settings, found, coding)
 
 
 def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:
@@ -285,6 +306,8 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
     if "transform" in task.config.without:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
+    elif prod(sample.blocks.tile) > LARGE * TRIAL_VERTICES:
+        settings = _transform_of_large_tile(task, attempt)
     else:
         settings, _ = choose_transform(sample, attempt.settings, goal.bounded(coding))
     settings, outcome = find_step(sample, settings, coding, goal, tries=4)

@@ -162,7 +162,7 @@ def _predicted(info: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def tiling_text(info: dict[str, Any]) -> str:
-    """What the tiles cost and how soon a region is read, as far as the header says it."""
+    """The price of the tiles and the time for a region, as far as the header says them."""
     told = info["model"].get("tiling", {})
     text = ""
     if "price" in told:

@@ -13,9 +13,9 @@ from dataclasses import replace
 from math import prod
 
 from fhash_codec.compact.attempt import PlanTask
+from fhash_codec.compact.choices.bases import MAX_BASIS_LENGTH
 from fhash_codec.compact.choices.transform import (
     ERROR_PRICE,
-    MAX_BASIS_LENGTH,
     rough_transform,
     usual_transform,
     wavelet,
@@ -44,8 +44,8 @@ FITTED_LINES = 1 << 15
 """Lines of a series that the data's own bases are fitted on, for trials."""
 MIN_LINES = 256
 """The least of them in each tile."""
-CERTAIN = 0.8
-"""Share of the allowed extra bytes that a trial may take: the files may differ by more."""
+MARGIN = 0.035
+"""Part of an allowed price that a trial may not take: the files may differ by more."""
 TRIALS = 6
 """Tilings that are coded at most."""
 STEEPNESS = 0.75
@@ -139,7 +139,7 @@ def choose_tiling(task: PlanTask, settings: TileSettings, coding: Coding, access
         blocks = task.blocks.window(largest_tile(task.blocks.shape))
         part = blocks.shape
     trials = _Trials(task, blocks, settings, coding)
-    tile = _search(trials, blocks.shape, 1 + CERTAIN * (PRICES[access] - 1))
+    tile = _search(trials, blocks.shape, max(PRICES[access] - MARGIN, 1.0))
     tried = [TilingTrial(tile=tile, size=size) for tile, size in trials.sizes.items()]
     price = trials.price(tile) if tried else 1.0
     return Tiling(tile=tile, price=price, trials=tried, part=part)
@@ -180,7 +180,7 @@ def _search(trials: _Trials, shape: Shape, allowed: float) -> Shape:
 
 
 class _Cuts:
-    """What cuts along some axes cost, by one trial with such cuts alone."""
+    """Price of cuts along some axes, by one trial with such cuts alone."""
 
     def __init__(self, trials: _Trials, shape: Shape, tried: Shape | None, axes: range) -> None:
         self._shape, self._axes, self.tried = shape, axes, tried

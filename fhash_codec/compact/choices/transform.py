@@ -8,28 +8,19 @@ are decided one after the other.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Protocol, TypeVar
 
-import numpy as np
-import numpy.typing as npt
-
-from fhash_codec.compact.tiles.blocks import Tile
+from fhash_codec.compact.choices.bases import Bases, CountedBases, TileSample
 from fhash_codec.compact.tiles.coding import Coding, Outcome
-from fhash_codec.stage_clock import stage
-from fhash_formats.transform.axes.basis import MAX_LENGTH, Basis, fit_basis
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
-Result = TypeVar("Result")
 Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
 """Transforms along (t, z, y, x)."""
 NONE = AxisTransform(kind="none")
 """Marks an axis without a transform."""
-MAX_BASIS_LENGTH = 128
-"""Longest axis in vertices that gets a basis of the data's own: longer factors cost too much."""
 PLANE_WAVELETS = (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3), ("5/3", 2))
 """Kinds and depths tried along y and x.
 
@@ -41,29 +32,6 @@ ROUGH_WAVELETS = (("haar", 2), ("9/7", 1))
 """Kinds and depths tried beside the usual ones where tilings are compared."""
 ERROR_PRICE = 0.8
 """Squared error in squared steps that is worth a byte."""
-
-
-class TileSample(Protocol):
-    """Tiles on which transforms are tried, such as a `Sample`.
-
-    Attributes:
-        tiles: the tiles, all of one shape.
-    """
-
-    tiles: list[Tile]
-
-    @property
-    def allows_bases(self) -> bool:
-        """Whether bases of the data's own may be computed."""
-        ...
-
-    def map_all(self, work: Callable[[Tile], Result]) -> Iterator[Result]:
-        """Yield the results of `work` for all tiles that the sample stands for."""
-        ...
-
-    def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
-        """Return the size and the error that the tiles have with each settings and coding."""
-        ...
 
 
 def wavelet(kind: str, depth: int, length: int) -> AxisTransform:
@@ -93,7 +61,7 @@ def choose_transform(
         plane and along z.
     """
     shape: Shape = sample.tiles[0].values.shape
-    bases = _Bases(sample, settings)
+    bases = Bases(sample, settings)
     if quick:
         trials = _quick_trials(shape, settings.transform.axes, bases)
         costs = _costs(sample, settings, trials, coding)
@@ -126,7 +94,7 @@ def likely_transform(sample: TileSample, settings: TileSettings, coding: Coding)
     The usual transform competes with the data's own bases along time, in space, and along both.
     """
     shape: Shape = sample.tiles[0].values.shape
-    bases, usual = _Bases(sample, settings), usual_transform(shape).axes
+    bases, usual = Bases(sample, settings), usual_transform(shape).axes
     trials = [usual]
     in_space, in_time = bases.possible(*shape[1:]), bases.possible(shape[0])
     if in_space:
@@ -152,7 +120,7 @@ def rough_transform(
     lines: of each tile, that the data's own bases are fitted on.
     """
     shape: Shape = sample.tiles[0].values.shape
-    bases = _Bases(sample, settings, lines)
+    bases = Bases(sample, settings, lines)
     axes = _changed(usual_transform(shape).axes, known)
     best: tuple[float, Axes, Outcome | None] = (math.inf, axes, None)
     for axis in (0, 1):
@@ -172,6 +140,36 @@ def rough_transform(
     return replace(settings, transform=TransformSpec(axes=best[1])), best[2]
 
 
+def own_or_found(
+    sample: TileSample, settings: TileSettings, found: Axes, coding: Coding
+) -> TileSettings:
+    """Return settings with transforms that were found on a part, or with own bases in space.
+
+    found: the transforms along (t, z, y, x); bases among them are made anew for the sample.
+    """
+    shape: Shape = sample.tiles[0].values.shape
+    bases = Bases(sample, settings)
+    axes = _changed(
+        found,
+        {
+            axis: (
+                bases.along(axis)
+                if transform.basis is not None and bases.possible(shape[axis])
+                else _fitted(transform, shape[axis])
+            )
+            for axis, transform in enumerate(found)
+        },
+    )
+    usual = usual_transform(shape).axes
+    trials = [axes]
+    if axes[3].basis is not None:
+        trials.append((*axes[:2], *usual[2:]))
+    elif bases.possible(*shape[1:]):
+        trials.append((axes[0], bases.along(1), bases.along(2), bases.along(3)))
+    costs = _costs(sample, settings, trials, coding) if len(trials) > 1 else [0.0]
+    return replace(settings, transform=TransformSpec(axes=trials[costs.index(min(costs))]))
+
+
 def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     """Return the codings of a sample by `choose_transform`, and the bases that it fits.
 
@@ -179,7 +177,7 @@ def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     in_memory: whether the series is, so that bases are possible.
     """
 
-    bases = _CountedBases(in_memory)
+    bases = CountedBases(in_memory)
     axes = usual_transform(shape).axes
     groups = (
         _plane_trials(shape, bases),
@@ -198,7 +196,7 @@ def refit(sample: TileSample, settings: TileSettings) -> TileSettings:
     axes = settings.transform.axes
     if not any(axis.basis is not None for axis in axes):
         return settings
-    bases = _Bases(sample, settings)
+    bases = Bases(sample, settings)
     fresh = {
         number: bases.along(number) for number, axis in enumerate(axes) if axis.basis is not None
     }
@@ -211,7 +209,7 @@ def _changed(axes: Axes, change: dict[int, AxisTransform]) -> Axes:
     return t, z, y, x
 
 
-def _quick_trials(shape: Shape, axes: Axes, bases: _Bases) -> list[Axes]:
+def _quick_trials(shape: Shape, axes: Axes, bases: Bases) -> list[Axes]:
     """Return the usual transform, the kinds of `axes`, and bases where they are possible."""
     usual = usual_transform(shape).axes
     t, z, y, x = (_fitted(axis, length) for axis, length in zip(axes, shape, strict=True))
@@ -265,7 +263,7 @@ def _plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTr
     return wavelet(kind, depth, y), wavelet(kind, depth, x)
 
 
-def _plane_trials(shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+def _plane_trials(shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransform]]:
     """Yield the transforms tried along y and x."""
     y, x = shape[2:]
     for kind, depth in PLANE_WAVELETS:
@@ -276,7 +274,7 @@ def _plane_trials(shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransfo
         yield {2: bases.along(2), 3: bases.along(3)}
 
 
-def _line_trials(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+def _line_trials(axis: int, shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransform]]:
     """Yield the transforms tried along one axis."""
     length = shape[axis]
     if length == 1:
@@ -287,88 +285,3 @@ def _line_trials(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, A
             yield {axis: AxisTransform(kind=kind, depth=depth)}
     if bases.possible(length):
         yield {axis: bases.along(axis)}
-
-
-class _Bases:
-    """The data's own bases along the axes of a tile, computed when they are asked for."""
-
-    def __init__(
-        self, sample: TileSample, settings: TileSettings, lines: int | None = None
-    ) -> None:
-        """Begin without any. lines: of each tile, that a basis is fitted on; None for all."""
-        self._sample, self._settings, self._lines = sample, settings, lines
-        self._cache: dict[int, AxisTransform] = {}
-
-    def possible(self, *lengths: int) -> bool:
-        """Whether axes of these lengths can have a basis; only a series in memory can."""
-        allowed = self._sample.allows_bases
-        return allowed and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
-
-    def along(self, axis: int) -> AxisTransform:
-        """Return the basis along an axis, as precise as the step of the settings needs."""
-        if axis not in self._cache:
-            with stage("bases", "the data's own bases, which compete as transforms of short axes"):
-                basis = self._fitted(axis)
-            self._cache[axis] = AxisTransform(kind="klt", basis=basis)
-        return self._cache[axis]
-
-    def _fitted(self, axis: int) -> Basis:
-        """Return the basis of all tiles.
-
-        A direction that the basis drops cannot be restored by any coefficient.
-        """
-        length = self._sample.tiles[0].values.shape[axis]
-        gram = np.zeros((length, length))
-        for tile_gram in self._sample.map_all(lambda tile: self._gram(tile.values, axis)):
-            gram += tile_gram
-        return fit_basis(gram, self._settings.step)
-
-    def _gram(self, values: npt.NDArray[np.generic], axis: int) -> npt.NDArray[np.float64]:
-        """Return the products of the lines of a tile along an axis, (length, length)."""
-        # Values that do not count are kept: zeroing them would create an edge that dominates.
-        centred = _some_lines(values, axis, self._lines).astype(np.float64)
-        number = centred.size
-        centred -= self._settings.center
-        centred[~np.isfinite(centred)] = 0.0
-        return (centred @ centred.T) * (values.size / number)
-
-
-def _some_lines(
-    values: npt.NDArray[np.generic], axis: int, limit: int | None
-) -> npt.NDArray[np.generic]:
-    """Return the lines of a tile along an axis as columns, or about every n-th of them.
-
-    limit: number of lines from which on some are left out; None for none.
-    """
-    before, length = math.prod(values.shape[:axis]), values.shape[axis]
-    planes = values.reshape(before, length, -1)
-    after = planes.shape[2]
-    if limit is not None and before * after > limit:
-        leap = -(-before * after // limit)
-        along = min(leap, after)
-        planes = planes[:: -(-leap // along), :, ::along]
-    return planes.swapaxes(0, 1).reshape(length, -1)
-
-
-class _CountedBases(_Bases):
-    """Bases that are counted and not fitted.
-
-    Attributes:
-        fitted: axes along which the encoder would fit one.
-    """
-
-    def __init__(self, in_memory: bool) -> None:
-        self.fitted: set[int] = set()
-        self._in_memory = in_memory
-
-    def possible(self, *lengths: int) -> bool:
-        """Whether axes of these lengths can have a basis."""
-        return self._in_memory and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
-
-    def along(self, axis: int) -> AxisTransform:
-        """Return what stands for a basis along an axis, other than the usual one, and count it."""
-        self.fitted.add(axis)
-        return AxisTransform(kind="haar", depth=1)
-
-
-assert MAX_BASIS_LENGTH <= MAX_LENGTH

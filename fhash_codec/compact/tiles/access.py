@@ -1,4 +1,4 @@
-"""What tiles cost a reader and a file: work for a region, prices that are allowed, tiles to try.
+"""Access to regions and its price: work for a region, prices that are allowed, tiles to try.
 
 A reader decodes whole tiles. Small ones let it read a region soon, and make the file larger: a cut
 breaks the correlation across it, and each tile begins to learn anew.
@@ -20,6 +20,7 @@ __all__ = [
     "TilingTrial",
     "cheap_tiling",
     "foretold_price",
+    "part_of",
     "region_vertices",
     "tiles_to_try",
 ]
@@ -119,6 +120,19 @@ def tiles_to_try(shape: Shape, max_vertices: int) -> list[Shape]:
     tiles = sorted(tiles, key=lambda tile: (region_vertices(shape, tile), tile))
     fast = sum(region_vertices(shape, tile) <= FAST_ENOUGH for tile in tiles)
     return tiles[max(fast - 1, 0) :]
+
+
+def part_of(tile: Shape, vertices: int) -> Shape:
+    """Return the lengths of a part of a tile: x and y are shortened first, to 8 at least."""
+    lengths = list(tile)
+    for axis in (3, 2, 1, 0):
+        while prod(lengths) > vertices and lengths[axis] > 8:
+            lengths[axis] = max(8, lengths[axis] // 2)
+            other = {3: 2, 2: 3}.get(axis)
+            if other is not None and prod(lengths) > vertices and lengths[other] > lengths[axis]:
+                lengths[other] = max(8, lengths[other] // 2)
+    t, z, y, x = lengths
+    return t, z, y, x
 
 
 def _part(length: int, edge: int, *, even: bool = True) -> int:
