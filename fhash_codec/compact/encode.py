@@ -20,6 +20,7 @@ from fhash_codec.compact.goal import promise
 from fhash_codec.compact.tiles.blocks import fits_memory
 from fhash_codec.compact.tiles_to_promise import code_series, resized
 from fhash_codec.compact.tiles_to_size import ByteWindow
+from fhash_codec.compact.tiling_record import tiling_header
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.selection import FeatureSelection, select_features
@@ -113,6 +114,7 @@ def _header(
     """
     extent = selection.extent
     trained = table.plan.history
+    tiling = tiling_header(table, timings=config.timings, quick=config.effort == 1)
     return {
         "encoder": {
             "version": version("fhash"),
@@ -124,7 +126,7 @@ def _header(
         "feature_bounding_box": [list(span) for span in extent.box],
         "features": [str(feature) for feature in selection.features],
         "coreset_fraction": extent.fraction,
-        "model": model_header(table, config),
+        "model": model_header(table, config) | ({} if tiling is None else {"tiling": tiling}),
         "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": _described(table.bulk)},

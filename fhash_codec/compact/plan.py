@@ -24,10 +24,11 @@ from fhash_codec.compact.stages import (
     try_head,
     try_predictor,
 )
+from fhash_codec.compact.tiles.access import Tiling, cheap_tiling
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import OFFSETS, Coding
 from fhash_codec.compact.tiles.sample import Sample
-from fhash_codec.compact.tiles.tiling import first_tile, parse_tile, tile_for
+from fhash_codec.compact.tiles.tiling import first_tile, parse_tile
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Feature
 from fhash_codec.measure.value_range import ValueRange
@@ -65,6 +66,8 @@ class CodingPlan:
     """Size of the file after each stage, see `GainLog`."""
     history: HeadHistory = field(default_factory=list)
     """Training of the head; empty without one."""
+    tiling: Tiling | None = None
+    """Choice of the tiles; None where they were asked for."""
 
 
 def plan(
@@ -153,6 +156,7 @@ def _by_trial(
         goal=task.goal,
         gains=task.gains.entries,
         history=attempt.history,
+        tiling=attempt.tiling,
     )
 
 
@@ -179,6 +183,7 @@ def _label_plan(task: PlanTask, labelled: Attempt) -> CodingPlan:
         coding=task.goal.bounded(labelled.coding),
         goal=task.goal,
         gains=task.gains.entries,
+        tiling=labelled.tiling,
     )
 
 
@@ -233,11 +238,13 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
     goal = task.goal
     assert goal.psnr is not None
     assert goal.even_psnr is not None
+    tiling = None
     if task.fixed_tile is None:
         size = estimated_size(
             tiled, settings, psnr=goal.even_psnr, data_range=goal.data_range, workers=task.workers
         )
-        tiled = task.blocks.retile(tile_for(task.blocks.shape, size))
+        tiling = cheap_tiling(task.blocks.shape, size, task.config.access)
+        tiled = task.blocks.retile(tiling.tile)
     settings = replace(settings, transform=usual_transform(tiled.tile))
     coding = Coding(filled=True, density=0, bulk=goal.bulk)
     step = estimated_step(
@@ -249,6 +256,5 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
         data_range=goal.data_range,
         workers=task.workers,
     )
-    return CodingPlan(
-        blocks=tiled, settings=with_step(settings, step, goal), coding=coding, goal=goal
-    )
+    settings = with_step(settings, step, goal)
+    return CodingPlan(blocks=tiled, settings=settings, coding=coding, goal=goal, tiling=tiling)

@@ -21,10 +21,11 @@ from fhash_codec.compact.choices.step import find_step
 from fhash_codec.compact.choices.transform import likely_transform, usual_transform
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.stages import first_guess, first_settings
+from fhash_codec.compact.tiles.access import cheap_tiling
 from fhash_codec.compact.tiles.blocks import Blocks, Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome, code, total
 from fhash_codec.compact.tiles.sample import Sample
-from fhash_codec.compact.tiles.tiling import even_tile, first_tile, parse_tile, tile_for
+from fhash_codec.compact.tiles.tiling import even_tile, first_tile, parse_tile
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection, select_features
 from fhash_codec.measure.bulk import find_bulk
@@ -141,7 +142,7 @@ def look_at(part: Series, steps: int, config: EncodeConfig, workers: ThreadPoolE
         selection=selection,
         attempt=attempt,
         labels=labels,
-        tile=fixed or tile_for(shape, size),
+        tile=fixed or cheap_tiling(shape, size, config.access).tile,
         shape=shape,
         share=share,
         selecting=selecting,
