@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from math import prod
 from typing import Any
 
 from fhash_codec.compact.attempt import Attempt, GainLog, PlanTask
@@ -42,6 +43,8 @@ MAX_VALUE = 1e145
 """Largest magnitude of a value whose squared errors fit float64."""
 MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
+MAX_BYTES_KEPT = 128 << 20
+"""Largest size of the box over all steps, in bytes, whose decoded values effort 1 keeps."""
 STAGES = 6
 """Number of parts of the planning that its progress counts."""
 
@@ -64,6 +67,8 @@ class CodingPlan:
     """Size of the file after each stage, see `GainLog`."""
     history: HeadHistory = field(default_factory=list)
     """Training of the head; empty without one."""
+    keeps_decoded: bool = False
+    """Whether all tiles are kept as they decode, to be measured without being decoded again."""
 
 
 def plan(
@@ -248,5 +253,9 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
         workers=task.workers,
     )
     return CodingPlan(
-        blocks=tiled, settings=with_step(settings, step, goal), coding=coding, goal=goal
+        blocks=tiled,
+        settings=with_step(settings, step, goal),
+        coding=coding,
+        goal=goal,
+        keeps_decoded=prod(tiled.shape) * tiled.dtype.itemsize <= MAX_BYTES_KEPT,
     )
