@@ -35,7 +35,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("numcodecs_codec", "zarr_codec", "zarr_parts"),
     ),
     "fhash_codec": (
-        ("config", "native", "progress", "stage_clock"),
+        ("config", "lean_header", "native", "progress", "stage_clock"),
         ("measure", "training"),
         ("coreset",),
         ("header", "indexing"),
@@ -67,7 +67,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fhash_cli": (
         ("durations", "intervals", "progress_bar"),
         ("base_command", "conversion", "options", "output", "scene_types", "selection"),
-        ("animation_options", "card_rows", "gallery", "scene_options", "simulating"),
+        ("animation_options", "card_rows", "gallery", "peer_options"),
+        ("scene_options", "simulating"),
         ("source_listing",),
         ("commands",),
         ("main",),

@@ -11,6 +11,9 @@
 // in the logistic domain by weights that learn as well, as in the PAQ family of compressors.
 // Contexts come from magnitudes that are already known: to the left, above, one step and one layer
 // before, and in the bands that come before.
+//
+// With TRELLIS the integers are those of two quantisers: the index of each is coded, and says how
+// the state goes on that chooses the next quantiser (FORMAT.md, Two quantisers).
 #include <cmath>
 #include <cstdint>
 #include <type_traits>
@@ -21,7 +24,7 @@
 namespace {
 
 // One run over the bands of a tile.
-template <Mode MODE> struct Coder {
+template <Mode MODE, bool TRELLIS> struct Coder {
     typename std::conditional<MODE == DECODE, Decoder, Encoder>::type range;
     State* state;
     double lambda;  // squared steps that 1/2048 bit is worth
@@ -74,10 +77,11 @@ template <Mode MODE> struct Coder {
 };
 
 // Code all bands. q, scaled, shape, table, count: as for fhash_encode and fhash_decode below.
-// 0, or -1 for bytes that no encoder writes and for a band beyond the shape.
-template <Mode MODE>
-FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int64_t* shape,
-                                      const int32_t* table, int64_t count) {
+// 0, or -1 for bytes that no encoder writes and for a band beyond the shape, or NO_TRELLIS.
+template <Mode MODE, bool TRELLIS>
+FHASH_INLINE int64_t Coder<MODE, TRELLIS>::run(int32_t* q, const float* scaled,
+                                               const int64_t* shape,
+                                               const int32_t* table, int64_t count) {
     const int64_t S2 = shape[3], S1 = S2 * shape[2], S0 = S1 * shape[1];
     std::vector<Band> bands(count);
     if (!read_bands(table, shape, bands)) return -1;
@@ -99,6 +103,7 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
     std::vector<uint16_t> zeros((size_t)widest + 2 * PADDING + VECTOR, 0);
     const uint16_t* const nothing = zeros.data() + PADDING;
     Sums sums((size_t)widest + VECTOR);
+    int trellis = 0;
 
     for (int64_t number = 0; number < count; number++) {
         Band& band = bands[number];
@@ -115,7 +120,10 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
             }
         any = simple(any, EMPTIES + kind);
         band.any = any != 0;
-        if (!any) continue;
+        if (!any) {
+            if (TRELLIS) trellis = after_zeros(trellis, (int64_t)n0 * n1 * n2 * n3);
+            continue;
+        }
         const int64_t M2 = n3 + 2 * PADDING, M1 = M2 * n2, M0 = M1 * n1;
         const int64_t R1 = n2, R0 = (int64_t)n1 * n2;
         band.stride[0] = M0;
@@ -138,7 +146,10 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                 int filled = 0;
                 if (MODE != DECODE) for (int x = 0; x < n3; x++) filled |= out[x] != 0;
                 const int flag = (n3 > 24 ? 2 : 0) + (y > 1 && F[-2] ? 1 : 0) + (r == 0 ? 4 : 0);
-                if (!simple(filled, ROWS + flag)) continue;
+                if (!simple(filled, ROWS + flag)) {
+                    if (TRELLIS) trellis = after_zeros(trellis, n3);
+                    continue;
+                }
             }
 
             const int weight = sum_neighbours(band, row, lanes, sums) +
@@ -170,7 +181,9 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                 Slot* places[CONTEXTS];
                 for (int i = 0; i < CONTEXTS; i++)
                     places[i] = slots[i] + (int64_t)context[i] * DECISIONS;
-                auto predict = [&](Prediction& to, int k) FHASH_LAMBDA {
+                const int one = TRELLIS ? trellis & 1 : 0;  // class of the quantiser
+                auto predict = [&](Prediction& to, int asked) FHASH_LAMBDA {
+                    const int k = TRELLIS && one && asked < SHARED ? UNARY + asked : asked;
                     for (int i = 0; i < CONTEXTS; i++) to.slots[i] = places[i] + k;
                     to.first = weights + ((int64_t)k * KINDS + kind) * SET;
                     to.second = weights + SECOND + ((int64_t)k * 64 + coarse) * SET;
@@ -180,17 +193,21 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                 // The zero flag.
                 Prediction now;
                 int p = predict(now, 0), value = MODE == DECODE ? 0 : out[x];
+                if (TRELLIS && MODE != DECODE && value && (value & 1) != one) return NO_TRELLIS;
                 if (MODE == CHOOSE) {
                     const float s = scaled[out - q + x];
                     const int best = choose(std::fabs((double)s), p, predict);
                     out[x] = value = s < 0 ? -best : best;
                 }
-                int magnitude = std::abs(value);
+                int magnitude = TRELLIS ? (std::abs(value) + one) / 2 : std::abs(value);
                 const int zero = range.code(magnitude == 0, p);
                 learn<CONTEXTS, true>(now, zero, SLOW_LIMIT);
                 left2 = left;
                 left = 0;
-                if (zero) continue;
+                if (zero) {
+                    if (TRELLIS) trellis = TRELLIS_NEXT[trellis][0];
+                    continue;
+                }
                 filled = 1;
 
                 // The sign.
@@ -223,8 +240,10 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
                 }
                 if (MODE == DECODE) {
                     magnitude = k;
+                    if (TRELLIS) k = (int)(min<int64_t>(2 * (int64_t)k - one, 0x7fffffff));
                     out[x] = negative ? -k : k;
                 }
+                if (TRELLIS) trellis = TRELLIS_NEXT[trellis][magnitude & 1];
                 left = min(magnitude, MAX_MAGNITUDE);
                 M[x] = (uint16_t)left;
             }
@@ -234,24 +253,35 @@ FHASH_INLINE int64_t Coder<MODE>::run(int32_t* q, const float* scaled, const int
     return 0;
 }
 
-FHASH_CLONES int64_t encode(Coder<ENCODE> coder, int32_t* q, const int64_t* shape,
-                            const int32_t* table, int64_t count) {
+// The bytes of all bands behind those of `range`. 0, or a negative code.
+template <Mode MODE, bool TRELLIS>
+FHASH_INLINE int64_t encode_all(Coder<MODE, TRELLIS>& coder, int32_t* q, const float* scaled,
+                                const int64_t* shape, const int32_t* table, int64_t count) {
     return guarded([&]() FHASH_LAMBDA -> int64_t {
-        coder.run(q, nullptr, shape, table, count);
+        const int64_t code = coder.run(q, scaled, shape, table, count);
         coder.range.finish();
-        return 0;
+        return code;
     });
 }
-FHASH_CLONES int64_t encode_chosen(Coder<CHOOSE> coder, int32_t* q, const float* scaled,
+
+FHASH_CLONES int64_t encode(Coder<ENCODE, false> coder, int32_t* q, const int64_t* shape,
+                            const int32_t* table, int64_t count) {
+    return encode_all(coder, q, nullptr, shape, table, count);
+}
+FHASH_CLONES int64_t encode_trellis(Coder<ENCODE, true> coder, int32_t* q, const int64_t* shape,
+                                    const int32_t* table, int64_t count) {
+    return encode_all(coder, q, nullptr, shape, table, count);
+}
+FHASH_CLONES int64_t encode_chosen(Coder<CHOOSE, false> coder, int32_t* q, const float* scaled,
                                    const int64_t* shape, const int32_t* table, int64_t count) {
-    return guarded([&]() FHASH_LAMBDA -> int64_t {
-        coder.run(q, scaled, shape, table, count);
-        coder.range.finish();
-        return 0;
-    });
+    return encode_all(coder, q, scaled, shape, table, count);
 }
-FHASH_CLONES int64_t decode(Coder<DECODE> coder, int32_t* q, const int64_t* shape,
+FHASH_CLONES int64_t decode(Coder<DECODE, false> coder, int32_t* q, const int64_t* shape,
                             const int32_t* table, int64_t count) {
+    return guarded([&]() FHASH_LAMBDA { return coder.run(q, nullptr, shape, table, count); });
+}
+FHASH_CLONES int64_t decode_trellis(Coder<DECODE, true> coder, int32_t* q, const int64_t* shape,
+                                    const int32_t* table, int64_t count) {
     return guarded([&]() FHASH_LAMBDA { return coder.run(q, nullptr, shape, table, count); });
 }
 
@@ -262,14 +292,16 @@ FHASH_CLONES int64_t decode(Coder<DECODE> coder, int32_t* q, const int64_t* shap
 //
 // scaled: null, or coefficients / step: then the magnitudes are chosen anew and written to q.
 // lambda: squared steps that a bit is worth.
+// trellis: whether the integers are those of two quantisers; not together with `scaled`.
 // table: (count, COLUMNS).
 // slots, weights, simples: the state (transform/entropy/prior.py). It is left adapted if `keep` and
 // if the bytes fit.
 // data: receives the bytes if they fit the capacity. If they do not, call again with the same q and
 // more room.
 //
-// Returns the number of bytes, or NO_MEMORY.
+// Returns the number of bytes, NO_MEMORY, or NO_TRELLIS for an integer that its quantiser lacks.
 FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda,
+                                  int64_t trellis,
                                   const int64_t* shape, const int32_t* table, int64_t count,
                                   uint16_t* slots, int64_t slot_count, int32_t* weights,
                                   int64_t weight_count, uint16_t* simples, int64_t simple_count,
@@ -281,7 +313,8 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
         const Encoder range = {&out};
         const int64_t code =
             scaled ? encode_chosen({range, &state, lambda / 2048}, q, scaled, shape, table, count)
-                   : encode({range, &state, 0}, q, shape, table, count);
+            : trellis ? encode_trellis({range, &state, 0}, q, shape, table, count)
+                      : encode({range, &state, 0}, q, shape, table, count);
         if (code < 0) return code;
         const int64_t size = put(out, data, capacity);
         if (keep && size <= capacity) keep_state(state, slots, weights, simples, LANES);
@@ -292,7 +325,7 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
 // Decode integers into q, which must be zeros; the other arguments are those of fhash_encode.
 //
 // Returns 0, or -1 for bytes that no encoder writes and for a band beyond q, or NO_MEMORY.
-FHASH_EXPORT int64_t fhash_decode(int32_t* q, const int64_t* shape, const int32_t* table,
+FHASH_EXPORT int64_t fhash_decode(int32_t* q, int64_t trellis, const int64_t* shape, const int32_t* table,
                                   int64_t count, const uint16_t* slots, int64_t slot_count,
                                   const int32_t* weights, int64_t weight_count,
                                   const uint16_t* simples, int64_t simple_count,
@@ -300,6 +333,7 @@ FHASH_EXPORT int64_t fhash_decode(int32_t* q, const int64_t* shape, const int32_
     return guarded([&] {
         State state = make_state(slots, slot_count, weights, weight_count, simples, simple_count,
                                  LANES);
-        return decode({{data, size}, &state, 0}, q, shape, table, count);
+        return trellis ? decode_trellis({{data, size}, &state, 0}, q, shape, table, count)
+                       : decode({{data, size}, &state, 0}, q, shape, table, count);
     });
 }

@@ -17,6 +17,8 @@ const int CONTEXTS = 6, SIGN_CONTEXTS = 3;  // estimates of a magnitude, and of 
 const int LANES = 12, SET = padded(LANES);  // weights of a set: of the caller, and as kept here
 const int DECISIONS = 16;                   // slots of a context
 const int UNARY = 14;                       // magnitudes from this one on have an escape code
+const int SHARED = 2;  // decisions from this one on are one for both quantisers; those of class 1
+                       // before it have the slots and weights from UNARY on
 const int KINDS = 64;                       // kinds of bands
 const int LEVELS = 128;                     // quarter octaves of the expected magnitude
 const int SIGN_LIMIT = 255;                 // as SLOW_LIMIT, for signs
@@ -64,6 +66,17 @@ struct Classes {
 };
 const Classes classes;
 FHASH_INLINE int small(int v) { return classes.of[min(v, 141)]; }
+
+// State of the trellis that follows, by the lowest bit of the index; the class of a state is its
+// lowest bit.
+const uint8_t TRELLIS_NEXT[8][2] = {{0, 2}, {5, 7}, {1, 3}, {6, 4}, {2, 0}, {4, 6}, {3, 1}, {7, 5}};
+const int NO_TRELLIS = -3;  // an integer that the quantiser of its state does not have
+
+// The state after n zeros, which repeat after at most four.
+FHASH_INLINE int after_zeros(int state, int64_t n) {
+    for (n &= 3; n > 0; n--) state = TRELLIS_NEXT[state][0];
+    return state;
+}
 
 // 0 for a negative number, 1 for 0, 2 for a positive number.
 FHASH_INLINE int sign_of(int32_t v) { return v > 0 ? 2 : v < 0 ? 0 : 1; }

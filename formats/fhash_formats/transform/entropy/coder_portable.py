@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.errors import DamagedFileError
+from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.entropy.mixing_portable import (
     ARRAYS,
     LEARNING_RATE,
@@ -53,6 +53,12 @@ from fhash_formats.transform.entropy.table import (
     REFERENCES,
     SHIFT,
 )
+from fhash_formats.transform.entropy.two_quantisers import (
+    AFTER,
+    MISPLACED,
+    NO_TRELLIS,
+    after_zeros,
+)
 
 __all__ = ["decode", "encode"]
 
@@ -62,6 +68,9 @@ SIGN_CONTEXTS = 3
 """Estimates that are mixed for a sign."""
 UNARY = 14
 """Magnitudes from this one on are coded by an escape code."""
+SHARED = 2
+"""Decisions from this one on are one for both quantisers; those of class 1 before it have the slots
+and weights from UNARY on."""
 SIGN_LIMIT = 255
 """Observations after which the slow rate of an estimate of a sign stays."""
 MAX_MAGNITUDE = 4095
@@ -111,6 +120,8 @@ DECODE = 1
 """Mode of a run that decodes."""
 CHOOSE = 2
 """Mode of a run that encodes magnitudes which it chooses by rate and distortion."""
+TRELLIS = 4
+"""Added to ENCODE or DECODE: the integers are those of two quantisers."""
 
 SIZE = COLUMNS
 """First of four columns that follow those of the table: lengths of the band along t, z, y, x."""
@@ -162,30 +173,39 @@ def encode(
     scaled: npt.NDArray[np.float32] | None,
     weight: float,
     state: State,
+    trellis: bool,
 ) -> bytes:
     """Code integers (t, z, y, x), in C order, and adapt the state.
 
-    With `scaled` the integers are chosen anew, in place.
+    With `scaled` the integers are chosen anew, in place. With `trellis` they are those of two
+    quantisers; raises InputError for others.
     """
     engine = _engine()
     real = (np.zeros(0) if scaled is None else np.asarray(scaled, dtype=np.float64)).ravel()
-    mode = ENCODE if scaled is None else CHOOSE
+    mode = TRELLIS if trellis else ENCODE if scaled is None else CHOOSE
+    shape = integers.shape
     memory = memory_of(state, engine is not None)
     q: Sequence
     if engine is None:
         q = integers.ravel().tolist()
-        out = _start(engine, mode, q, real.tolist(), weight, integers.shape, table, memory, b"")[1]
+        code, out = _start(engine, mode, q, real.tolist(), weight, shape, table, memory, b"")
         if mode == CHOOSE:
             integers[:] = np.array(q, dtype=np.int32).reshape(integers.shape)
     else:
         q = integers.reshape(-1)
-        out = _start(engine, mode, q, real, weight, integers.shape, table, memory, b"")[1]
+        code, out = _start(engine, mode, q, real, weight, shape, table, memory, b"")
+    if code < 0:
+        raise InputError(MISPLACED)
     keep_memory(memory, state)
     return bytes(out)
 
 
 def decode(
-    integers: npt.NDArray[np.int32], table: npt.NDArray[np.int32], data: bytes, state: State
+    integers: npt.NDArray[np.int32],
+    table: npt.NDArray[np.int32],
+    data: bytes,
+    state: State,
+    trellis: bool,
 ) -> None:
     """Decode into integers (t, z, y, x), which are zeros in C order.
 
@@ -195,7 +215,8 @@ def decode(
     q: Sequence = [0] * integers.size if engine is None else integers.reshape(-1)
     real: Sequence = [] if engine is None else np.zeros(0)
     memory = memory_of(state, engine is not None)
-    code = _start(engine, DECODE, q, real, 0.0, integers.shape, table, memory, data)[0]
+    mode = DECODE | TRELLIS if trellis else DECODE
+    code = _start(engine, mode, q, real, 0.0, integers.shape, table, memory, data)[0]
     if code < 0:
         raise DamagedFileError("the coded integers are damaged")
     if engine is None:
@@ -206,7 +227,7 @@ def _engine() -> Callable[..., Any] | None:
     """`_run` compiled, or None where numba cannot be imported."""
     helpers = (
         *(_small, _sign, _context_mix, _choose, _add_centre, _add_neighbour, _prepare),
-        *(_any_nonzero, _find_references, _code_escape),
+        *(_any_nonzero, _find_references, _code_escape, after_zeros),
     )
     return compiled(_run, helpers)
 
@@ -493,8 +514,10 @@ def _run(
     span: Sequence,
     data: Sequence,
 ) -> tuple[int, list[int]]:
-    """Code all bands: 0, or -1 for bytes that no encoder writes; and the bytes."""
-    decoding = mode == DECODE
+    """Code all bands: 0, -1 for bytes that no encoder writes, or NO_TRELLIS; and the bytes."""
+    two_quantisers = mode >= TRELLIS
+    mode -= TRELLIS if two_quantisers else 0
+    decoding, state, one = mode == DECODE, 0, 0
     out = [0 for _ in range(0)]
     stream = Stream(decoding, span, data, out)
     rate, log, small = tables.rate, tables.log, tables.small
@@ -520,6 +543,7 @@ def _run(
         some = code_simple(some, EMPTIES + kind, stream, memory, rate)
         work.any[number] = some
         if not some:
+            state = after_zeros(state, n0 * n1 * n2 * n3, AFTER)
             continue
         # Strides along y, z and t: of magnitudes (m2, m1, m0) and of rows (1, r1, r0).
         r1, r0, m2 = n2, n1 * n2, n3 + 2 * PADDING
@@ -541,6 +565,7 @@ def _run(
                 at = ROWS + (2 if n3 > 24 else 0) + (4 if r == 0 else 0)
                 at += 1 if y > 1 and work.filled[f - 2] else 0
                 if not code_simple(some, at, stream, memory, rate):
+                    state = after_zeros(state, n3, AFTER)
                     continue
 
             offset = 160 - log16(_prepare(t, z, y, r, band, table, work, width), log)
@@ -572,15 +597,20 @@ def _run(
                 context[5] = (both * 12 + parent) * KINDS + kind
 
                 # The zero flag.
-                first, second = kind * LANES, SECOND + coarse * LANES
-                p = _context_mix(0, where, inputs, context, first, second, memory, tables)
+                one = state & 1 if two_quantisers else 0  # class of the quantiser
+                k = UNARY if one else 0
+                first = (k * KINDS + kind) * LANES
+                second = SECOND + (k * 64 + coarse) * LANES
+                p = _context_mix(k, where, inputs, context, first, second, memory, tables)
                 at = begin + x
                 value = 0 if decoding else q[at]
                 if mode == CHOOSE:
                     best = _choose(abs(scaled[at]), p, price, first, second, memory, tables, work)
                     value = -best if scaled[at] < 0 else best
                     q[at] = value
-                magnitude = abs(value)
+                if one and value and not value & 1 or two_quantisers and not one and value & 1:
+                    return NO_TRELLIS, out
+                magnitude = (abs(value) + one) // 2 if two_quantisers else abs(value)
                 zero = code_bit(1 if magnitude == 0 else 0, p, stream)
                 learn(
                     CONTEXTS,
@@ -596,6 +626,7 @@ def _run(
                     rate,
                 )
                 if zero:
+                    state = AFTER[2 * state]
                     continue
                 work.filled[f] = 1
 
@@ -630,9 +661,10 @@ def _run(
                 # The magnitude.
                 k = 1
                 while k < UNARY:
-                    first += BY_KIND
-                    second += BY_LEVEL
-                    p = _context_mix(k, where, inputs, context, first, second, memory, tables)
+                    d = UNARY + k if one and k < SHARED else k
+                    first = (d * KINDS + kind) * LANES
+                    second = SECOND + (d * 64 + coarse) * LANES
+                    p = _context_mix(d, where, inputs, context, first, second, memory, tables)
                     more = code_bit(1 if magnitude > k else 0, p, stream)
                     learn(
                         CONTEXTS,
@@ -656,7 +688,9 @@ def _run(
                         return -1, out
                 if decoding:
                     magnitude = k
+                    k = min(2 * k - one, 0x7FFFFFFF) if two_quantisers else k
                     q[at] = -k if negative else k
+                state = AFTER[2 * state + (magnitude & 1)]
                 m[row + x] = min(magnitude, MAX_MAGNITUDE)
 
     if not decoding:

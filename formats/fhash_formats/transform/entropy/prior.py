@@ -98,11 +98,24 @@ def blank_state() -> State:
 
 
 @cache
-def prior_state() -> State:
-    """The prior of integers; its arrays are read-only."""
+def prior_state(trellis: bool = False) -> State:
+    """The prior of integers, or of indices of two quantisers; its arrays are read-only."""
     state = unpack_state(zlib.decompress(_FILE.read_bytes()), blank_state())
     state.slots[:] = _reordered(state.slots, for_file=False)
+    if trellis:
+        _share(state)
     return state.frozen()
+
+
+def _share(state: State) -> None:
+    """Begin the decisions of class 1 of two quantisers, 14 and 15, as those of class 0."""
+    contexts = sum(SIZES) * DECISIONS
+    slots = state.slots[:contexts].reshape(-1, DECISIONS, 4)
+    slots[:, 14:] = slots[:, :2]
+    weights = (KINDS + 64) * DECISIONS * LANES
+    for sets in np.split(state.weights[:weights], [KINDS * DECISIONS * LANES]):
+        by_decision = sets.reshape(DECISIONS, -1)
+        by_decision[14:] = by_decision[:2]
 
 
 def unpack_state(data: bytes, state: State) -> State:

@@ -17,6 +17,7 @@ from fhash_formats.transform.axes.lifting import Transform
 from fhash_formats.transform.entropy.coder import MAX_INTEGER, encode_integers
 from fhash_formats.transform.entropy.predict import encode_predicted, integers_of
 from fhash_formats.transform.entropy.predictor import Predictor
+from fhash_formats.transform.entropy.trellis import choose_levels
 from fhash_formats.transform.tile.decoding import (
     blank_unoccupied,
     linear_values,
@@ -338,16 +339,15 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
     Free values are those that do not count, and those at an end of the range that decode to values
     beyond it, since the decoder clips them. `target` is changed in place.
     """
-    settings, weight = task.settings, task.coding.weight
+    settings = task.settings
     margin = (settings.high - settings.low) * _END_MARGIN
     low = settings.low - settings.center + margin
     high = settings.high - settings.center - margin
     coefficients = transform.forward(target)
     for _ in range(task.coding.rounds):
-        integers, scaled = quantise(coefficients, settings.step)
-        if weight > 0:
-            table = band_table(settings.transform, task.shape)
-            integers = encode_integers(integers, table, scaled=scaled, weight=weight).integers
+        integers = _tried(coefficients, task)
+        if integers is None:
+            break
         rebuilt = transform.inverse(
             dequantise(integers, settings.step, settings.offsets, settings.dtype)
         )
@@ -357,19 +357,53 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
     return coefficients
 
 
+def _tried(coefficients: Values, task: _Task) -> Integers | None:
+    """The integers of coefficients, chosen as for coding; None where the trellis has none."""
+    settings, weight = task.settings, task.coding.weight
+    if settings.trellis:
+        return _on_trellis(coefficients, task)
+    integers, scaled = quantise(coefficients, settings.step)
+    if weight <= 0:
+        return integers
+    table = band_table(settings.transform, task.shape)
+    return encode_integers(
+        integers, table, scaled=scaled, weight=weight, coder=settings.coder
+    ).integers
+
+
+def _on_trellis(coefficients: Values, task: _Task) -> Integers | None:
+    """The integers of the cheapest path through the trellis; None where one would be too large."""
+    settings = task.settings
+    scaled = coefficients * settings.dtype.type(1.0 / settings.step)
+    # Written so that it holds for NaN as well.
+    if not max(-float(scaled.min()), float(scaled.max())) < LARGEST:
+        return None
+    return choose_levels(
+        scaled, band_table(settings.transform, task.shape), task.coding.weight
+    )
+
+
 def _code(coefficients: Values, task: _Task) -> tuple[bytes, Integers] | None:
     """The coded coefficients, and the integers that they decode to; None where one is too large."""
-    table, weight = band_table(task.settings.transform, task.shape), task.coding.weight
-    integers, scaled = quantise(coefficients, task.settings.step)
+    settings, weight = task.settings, task.coding.weight
+    table, coder = band_table(settings.transform, task.shape), settings.coder
+    if settings.trellis:
+        path = _on_trellis(coefficients, task)
+        if path is None:
+            return None
+        return encode_integers(path, table, coder=coder, trellis=True).data, path
+    integers, scaled = quantise(coefficients, settings.step)
     largest = max(-int(integers.min()), int(integers.max()))
     if largest >= LARGEST:
         return None
-    coded = encode_integers(integers, table, scaled=scaled if weight > 0 else None, weight=weight)
+    coded = encode_integers(
+        integers, table, scaled=scaled if weight > 0 else None, weight=weight, coder=coder
+    )
     chosen = coded.integers
-    if largest >= MAX_CHOSEN and weight > 0 and task.settings.double:
+    if largest >= MAX_CHOSEN and weight > 0 and settings.double:
         large = np.abs(integers) >= MAX_CHOSEN
-        nearest = np.rint(coefficients / task.settings.step).astype(np.int32)
+        nearest = np.rint(coefficients / settings.step).astype(np.int32)
         chosen = np.where(large, nearest, chosen)
     if (task.coding.passes > 1 and weight > 0) or chosen is not coded.integers:
-        coded = encode_integers(chosen, table)
+        coded = encode_integers(chosen, table, coder=coder)
     return coded.data, coded.integers
