@@ -14,6 +14,7 @@ from fhash_codec.compact.choices.head import HeadHistory
 from fhash_codec.compact.choices.head_samples import BATCH_VOXELS
 from fhash_codec.compact.coded_table import (
     CodedTable,
+    DecodedTiles,
     model_header,
 )
 from fhash_codec.compact.goal import promise
@@ -53,7 +54,7 @@ def encode_compact(
     config: EncodeConfig,
     mask: npt.ArrayLike | None,
     progress: Progress,
-    complete: Callable[[dict[str, Any]], dict[str, Any]],
+    complete: Callable[[dict[str, Any], DecodedTiles], dict[str, Any]],
 ) -> dict[str, Any]:
     """Code the values of a series and write them; the header.
 
@@ -61,7 +62,8 @@ def encode_compact(
     quantiser allows that.
 
     mask: booleans (t, z, y, x) or (z, y, x), one more feature.
-    complete: measures what is written, and returns a header with its quality.
+    complete: measures what is written, and returns a header with its quality. Its second argument
+        are the tiles whose decoded values are known.
 
     Warns (FhashWarning) where the native library is missing.
     """
@@ -93,7 +95,7 @@ def encode_compact(
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
         own = _header(selection, table, config, seconds)
         own["required_features"] += coordinate_features(described["coordinates"])
-        header = complete(source | described | own)
+        header = complete(source | described | own, table.decoded)
         overhead = writer.size(header) - table.outcome.size
         if config.ratio is None or ByteWindow.of(table.plan.goal, overhead).holds(table):
             break

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from math import prod
 from typing import Any
 
 from fhash_codec.compact.attempt import Attempt, GainLog, PlanTask
@@ -44,6 +45,8 @@ MAX_VALUE = 1e145
 """Largest magnitude of a value whose squared errors fit float64."""
 MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
+MAX_BYTES_KEPT = 128 << 20
+"""Largest size of the box over all steps, in bytes, whose decoded values effort 1 keeps."""
 STAGES = 7
 """Number of parts of the planning that its progress counts."""
 
@@ -68,6 +71,8 @@ class CodingPlan:
     """Training of the head; empty without one."""
     tiling: Tiling | None = None
     """Choice of the tiles; None where they were asked for."""
+    keeps_decoded: bool = False
+    """Whether all tiles are kept as they decode, to be measured without being decoded again."""
 
 
 def plan(
@@ -256,5 +261,11 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
         data_range=goal.data_range,
         workers=task.workers,
     )
-    settings = with_step(settings, step, goal)
-    return CodingPlan(blocks=tiled, settings=settings, coding=coding, goal=goal, tiling=tiling)
+    return CodingPlan(
+        blocks=tiled,
+        settings=with_step(settings, step, goal),
+        coding=coding,
+        goal=goal,
+        tiling=tiling,
+        keeps_decoded=prod(tiled.shape) * tiled.dtype.itemsize <= MAX_BYTES_KEPT,
+    )

@@ -30,6 +30,7 @@ from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection, select_features
 from fhash_codec.measure.bulk import find_bulk
 from fhash_codec.measure.metrics import measure_quality
+from fhash_codec.measure.ssim import BUDGET
 from fhash_codec.progress import silent
 from fhash_codec.stage_clock import recording
 from fhash_formats.series import Series
@@ -314,7 +315,7 @@ def _measuring(blocks: Blocks, look: Look) -> tuple[float, float]:
     values = np.nan_to_num(values.astype(np.float32))
     changed = values + np.float32(look.task.goal.expected_error)
     rates = []
-    for with_ssim in (False, True):
+    for ssim_budget in (0, BUDGET):
         begun = now()
         measure_quality(
             lambda step: values[step],
@@ -322,7 +323,7 @@ def _measuring(blocks: Blocks, look: Look) -> tuple[float, float]:
             steps,
             look.task.goal.data_range,
             0.0,
-            with_ssim=with_ssim,
+            ssim_budget=ssim_budget,
         )
         rates.append((now() - begun) / (steps * plane))
     return rates[0], max(rates[1] - rates[0], 0.0)

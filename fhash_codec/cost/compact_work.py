@@ -37,9 +37,11 @@ from fhash_codec.compact.stages import (
     TRIAL_VERTICES,
 )
 from fhash_codec.compact.tiles.access import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
+from fhash_codec.comparison import ssim_budget
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.compact_probe import Look, Rates
 from fhash_codec.cost.head_probe import HeadProbe, updates_of
+from fhash_codec.encoding import DECODED_AGAIN
 from fhash_codec.measure.ssim import ssim_steps
 from fhash_formats.support.threads import usable_threads
 from fhash_formats.transform.head.inputs import CROSS
@@ -138,7 +140,7 @@ def stage_seconds(
     if _estimated(look, config):
         trials = work.wall(rates.trial, rates.sample.blocks.tile, 8)
         return seconds | {
-            "estimate": 4 * look.costing + trials,
+            "estimate": 2 * look.costing + trials,
             "coding": _all_tiles(work, rates.trial),
         }
     seconds["first guess"] = look.guessing
@@ -285,9 +287,11 @@ def _measuring(work: _Work, head: HeadProbe | None) -> float:
     rates, look = work.rates, work.look
     steps, plane = look.shape[0], prod(look.task.blocks.shape[1:])
     decode = rates.decode + (0.0 if head is None else head.final)
-    measured = 0 if "ssim" in work.config.without else len(ssim_steps(steps, plane))
+    budget = ssim_budget(work.config)
+    measured = len(ssim_steps(steps, plane, budget)) if budget else 0
+    again = 1.0 / DECODED_AGAIN if _estimated(look, work.config) else 1.0
     return (
-        work.wall(decode, look.tile, work.tiles(look.tile))
+        again * work.wall(decode, look.tile, work.tiles(look.tile))
         + rates.compare * work.vertices
         + rates.ssim * measured * plane
     )
