@@ -18,6 +18,7 @@ from fhash_codec.comparison import measure
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.header import brief_quality
+from fhash_codec.lean_header import lean
 from fhash_codec.paper.encode import encode_paper
 from fhash_codec.progress import Progress, silent
 from fhash_codec.promises import missed_promise, remarks
@@ -166,7 +167,8 @@ class _Measured:
             self.quality = measure(self._series, volume, self._progress, with_ssim=with_ssim)
         low, high = header["value_range"]
         steps = header["domain"]["shape"][0]
-        return {**header, "quality": brief_quality(self.quality, high - low, steps)}
+        header = {**header, "quality": brief_quality(self.quality, high - low, steps)}
+        return lean(header) if self._config.profile == "compact" else header
 
     def figures(self, header: dict[str, Any]) -> dict[str, Any]:
         """Figures that a promise is checked by; see `report`."""
@@ -177,7 +179,7 @@ class _Measured:
             "quality": self.quality,
             "data_range": high - low,
             "ratio": raw_bytes / self._writer.size(header),
-            "promised": header["config"],
+            "promised": self._config.to_dict() | header["config"],
         }
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import lean_header
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.scan import Scan
 from fhash_codec.measure.value_range import ValueRange
@@ -30,7 +31,10 @@ MISSING_CHUNK_BYTES = 1 << 20
 """Bytes of one chunk of the missing-value masks. A member for each step would cost 130 bytes."""
 
 MAX_POINTS = 24
-"""Points of a training history that a file keeps at most."""
+"""Points of a training history that a file of the profile paper keeps at most."""
+
+HEAD_POINTS = 8
+"""Points that a file of the profile compact keeps at most, of the training of its head."""
 
 DIGITS = 6
 """Significant digits of a figure over all steps."""
@@ -182,14 +186,14 @@ def brief_quality(
 
 
 def brief_history(
-    history: Sequence[Mapping[str, float | None]], *, timings: bool
+    history: Sequence[Mapping[str, float | None]], *, timings: bool, most: int = MAX_POINTS
 ) -> list[dict[str, float]]:
-    """A training history as a header has it: at most MAX_POINTS points, the last point included.
+    """A training history as a header has it: at most so many points, the last point included.
 
     Seconds are rounded to milliseconds, PSNR to hundredths of a dB. Figures without a finite value,
     such as the PSNR of exact values, are left out. timings: keep the seconds.
     """
-    count = min(len(history), MAX_POINTS)
+    count = min(len(history), most)
     chosen = [history[(number + 1) * len(history) // count - 1] for number in range(count)]
     points = [
         {
@@ -233,8 +237,10 @@ def full_header(header: Mapping[str, Any]) -> dict[str, Any]:
     """A header with the figures of steps and of the training in one shape, whatever the file has.
 
     `quality.per_step` is a list with step, psnr, rmse and max_abs_error of each step, and `history`
-    a list of points, both as a report has them. `config` has every setting.
+    a list of points, both as a report has them. `config` has every setting, and lean headers are
+    filled up.
     """
+    header = lean_header.full(header)
     full = {**header, "history": history_points(header.get("history", ()))}
     full["config"] = full_config(header)
     quality = header.get("quality", {})
@@ -251,11 +257,15 @@ def full_config(header: Mapping[str, Any]) -> dict[str, Any]:
     """Every setting that a file was made with.
 
     Files of the profile compact before version 1.3 hold only what differs from the defaults, the
-    promise included. The other settings had their defaults.
+    promise included. The other settings had their defaults. Those of lean headers are in the
+    format.
     """
     config = header.get("config", {})
     profile = header.get("model", {}).get("profile", "compact")
-    return {**EncodeConfig(profile=profile).to_dict(), **config}
+    defaults = EncodeConfig(profile=profile).to_dict()
+    if lean_header.may_be_lean(header):
+        defaults |= lean_header.CONFIG_DEFAULTS
+    return {**defaults, **config}
 
 
 def _steps(per_step: Any, data_range: float) -> list[dict[str, Any]]:

@@ -35,7 +35,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("numcodecs_codec", "zarr_codec", "zarr_parts"),
     ),
     "fhash_codec": (
-        ("config", "native", "progress", "stage_clock"),
+        ("config", "lean_header", "native", "progress", "stage_clock"),
         ("measure", "training"),
         ("coreset",),
         ("header", "indexing"),
@@ -67,7 +67,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
     "fhash_cli": (
         ("durations", "intervals", "progress_bar"),
         ("base_command", "conversion", "options", "output", "scene_types", "selection"),
-        ("animation_options", "card_rows", "gallery", "scene_options", "simulating"),
+        ("animation_options", "card_rows", "gallery", "peer_options"),
+        ("scene_options", "simulating"),
         ("source_listing",),
         ("commands",),
         ("main",),
@@ -88,7 +89,6 @@ LONG_ON_PURPOSE = {
 
 WITHOUT_MIRROR: dict[str, str] = {
     "fhash_codec.compact.attempt": "records of the stages: compact/test_stages.py",
-    "fhash_codec.compact.choices.head_samples": "inputs of choices/test_head_training.py",
     "fhash_codec.compact.choices.head_network_portable": "twin: choices/test_head_network.py",
     "fhash_codec.rendering.picture.plan": "a record: picture/test_planning.py, test_explain.py",
     "fhash_codec.selftest.checks.properties": "a list of checks: selftest/test_runner.py",

@@ -23,18 +23,24 @@ from fhash_codec.compact.tiles_to_size import ByteWindow
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.selection import FeatureSelection, select_features
-from fhash_codec.header import brief_history, describe_source, history_columns, write_series
+from fhash_codec.header import (
+    HEAD_POINTS,
+    brief_history,
+    describe_source,
+    history_columns,
+    write_series,
+)
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress
 from fhash_codec.stage_clock import stage
 from fhash_formats import native
-from fhash_formats.container import ContainerWriter
+from fhash_formats.container import ContainerWriter, coordinate_features
 from fhash_formats.errors import FhashWarning
 from fhash_formats.series import Series
 
-HEADER_BYTES = 1200
+HEADER_BYTES = 750
 """Bytes that a header has at least beside the description of the source, approximately."""
-STEP_BYTES = 12
+STEP_BYTES = 5
 """Approximate bytes of the figures of a step in a header."""
 WRITINGS = 4
 """Times that a file is written at most for a promised ratio."""
@@ -84,7 +90,9 @@ def encode_compact(
         with stage("writing", "tiles"):
             table.parts.write(writer)
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
-        header = complete(source | described | _header(selection, table, config, seconds))
+        own = _header(selection, table, config, seconds)
+        own["required_features"] += coordinate_features(described["coordinates"])
+        header = complete(source | described | own)
         overhead = writer.size(header) - table.outcome.size
         if config.ratio is None or ByteWindow.of(table.plan.goal, overhead).holds(table):
             break
@@ -121,7 +129,9 @@ def _header(
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": _described(table.bulk)},
         "training": _training(trained, timings=config.timings),
-        "history": history_columns(brief_history(trained, timings=config.timings)),
+        "history": history_columns(
+            brief_history(trained, timings=config.timings, most=HEAD_POINTS)
+        ),
     }
 
 

@@ -40,6 +40,12 @@ SLACK = 0.5
 """dB above a quality at which its search ends."""
 PEER_SHARE = 0.15
 """Share of the time left for encoding that a peer may take at a quality."""
+LAYOUTS = {
+    "SZ3": ("frame", "series"),
+    "SPERR": ("frame", "plane"),
+    "ZFP": ("frame", "series"),
+}
+"""Layouts of each peer that are tried; `fhash bench rate` tries more."""
 USUAL_RATE = 20e6
 """Bytes a second of a peer that was not measured yet."""
 
@@ -120,7 +126,9 @@ class PeerEncodings:
         self._searches[wish.codec] = [
             (variant, self._search(variant))
             for variant in variants[wish.codec]
-            if "psnr" in variant.goals and variant.mode != "rate"
+            if "psnr" in variant.goals
+            and variant.mode != "rate"
+            and variant.layout in LAYOUTS[wish.codec]
         ]
         return True
 
@@ -159,7 +167,7 @@ class PeerEncodings:
             pass
         seconds = time.perf_counter() - begun
         with opened_file(self._path) as file:
-            decoded, count = read_all(file, variant), stored_bytes(file)
+            decoded, count = read_all(file, variant, self._values.shape), stored_bytes(file)
         errors = facts.errors()
         for step, frame in enumerate(decoded):
             errors.add(step, self._series.read(step), frame)

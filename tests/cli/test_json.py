@@ -19,7 +19,7 @@ import fhash_codec
 from fhash_cli.main import COMMANDS
 from fhash_codec.bench import train
 from fhash_codec.bench.pictures.results import RenderBench
-from fhash_codec.bench.rate.results import Access, Point, RateBench, Speed
+from fhash_codec.bench.rate.results import Access, Point, RateBench, Speed, TilePrice
 from fhash_codec.cost.results import (
     Advice,
     CostReport,
@@ -240,8 +240,10 @@ def test_bench_rate() -> None:
         setting="", as_asked=None,
     )  # fmt: skip
     speed = Speed(
-        codec="SZ3", setting="", psnr=40.0, encode_mb_s=1.0, decode_mb_s=2.0, encode_runs=3
-    )
+        codec="SZ3", setting="", psnr=40.0, encode_mb_s=1.0, decode_mb_s=2.0,
+        encode_core_mb_s=1.0, decode_core_mb_s=2.0, encode_runs=3,
+    )  # fmt: skip
+    tiles = TilePrice(goal="psnr", asked=40.0, bytes=9, one_tile_bytes=8, price=1.125, steps=1)
     access = Access(
         codec="SZ3", setting="", region=(1, 2, 3), bytes=9, psnr=None, milliseconds=0.5,
         bytes_read=9,
@@ -249,9 +251,14 @@ def test_bench_rate() -> None:
     result = RateBench(
         series="a", shape=(1, 2, 3, 4), dtype="float32", raw_bytes=96, value_range=(0.0, 1.0),
         missing=0, points=(point, replace(point, codec="fhash compact")), speeds=(speed,),
-        access=(access,), refused={"ZFP": "no"}, machine={}, notes=("a",),
+        access=(access,), tiles=(tiles,), refused={"ZFP": "no"}, machine={}, notes=("a",),
     )  # fmt: skip
     check("bench rate", json.loads(json.dumps(result.to_dict())))
+
+
+def test_bench_table(fhash: Fhash, data: Path, tmp_path: Path) -> None:
+    words = ["bench", "table", data, "--target", "40", "--peer", "SZ3", "--effort", "1"]
+    check("bench table", parsed(fhash(*words, "-o", tmp_path, "--json", "-q")))
 
 
 def test_bench_ablate(fhash: Fhash, data: Path) -> None:

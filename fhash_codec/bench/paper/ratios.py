@@ -182,6 +182,7 @@ class _Files:
             names=PEERS,
             profiles=("compact",),
             speed=False,
+            price_tiles=False,
             progress=self.progress,
         )
         self.refused += [f"{name} not measured: {why}" for name, why in bench.refused.items()]

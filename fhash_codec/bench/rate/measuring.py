@@ -4,33 +4,32 @@ speed."""
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.bench.rate.clock import Spent, spent
+from fhash_codec.bench.rate.coded import AnyVariant, PeerFiles, there_and_back
 from fhash_codec.bench.rate.own import Own, promised, trial_of
-from fhash_codec.bench.rate.peers import (
-    SMALL_CHUNK,
-    Variant,
-    filled,
-    opened_file,
-    read_all,
-    read_region,
-    small_chunks,
-    stored,
-    stored_bytes,
-    touched_bytes,
+from fhash_codec.bench.rate.peers import SMALL_CHUNK, Variant, filled, small_chunks
+from fhash_codec.bench.rate.programs.program import ProgramVariant, folder_of
+from fhash_codec.bench.rate.results import OWN, Access, Point, Speed, TilePrice
+from fhash_codec.bench.rate.search import Search, Trial
+from fhash_codec.bench.rate.timing import (
+    LONG_SECONDS,
+    PLACES,
+    RUNS,
+    Read,
+    access_of,
+    shown_psnr,
+    speed_of,
 )
-from fhash_codec.bench.rate.results import OWN, Access, Point, Speed
-from fhash_codec.bench.rate.search import EXACT, Search, Trial
 from fhash_codec.config import EncodeConfig
-from fhash_codec.coreset.boxes import Box
 from fhash_codec.measure.metrics import Errors
 from fhash_codec.progress import Progress
 from fhash_codec.training.devices import need_torch
@@ -46,14 +45,9 @@ BOUND_SLACK = 0.1
 """dB of the largest error below the bound at which a search ends."""
 UNIFORM = 20 * math.log10(math.sqrt(3))
 """dB by which the RMSE of a uniformly distributed error lies below the tolerance."""
-RUNS = 3
-"""Runs of which the best counts."""
-LONG_SECONDS = 20.0
-"""Seconds of encoding after which there is no further run."""
-PLACES = 8
-"""Random places at which access is measured."""
-REGION = 16
-"""Vertices of a region along each axis."""
+ONE_TILE_VERTICES = 12_000_000
+"""Vertices that are coded as one tile at most, to find the price of tiles; of longer series some
+steps in the middle."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,11 +65,17 @@ class Best:
     setting: str
     reached: bool
     as_asked: bool | None
-    how: Variant | EncodeConfig
+    how: AnyVariant | EncodeConfig
 
 
 class Bench:
-    """One run of the bench: the data, and the best trial so far by quality and codec."""
+    """One run of the bench: the data, and the best trial so far by quality and codec.
+
+    Attributes:
+        price_tiles: whether the profile compact is also encoded as one tile.
+    """
+
+    price_tiles = True
 
     def __init__(
         self,
@@ -87,17 +87,20 @@ class Bench:
         progress: Progress,
     ) -> None:
         self.series, self.folder, self.goals, self.progress = series, folder, goals, progress
+        self.value_range, self.missing = value_range, missing
         self.range = value_range[1] - value_range[0]
         floats = np.asarray(series.values, dtype=decoded_type(series.dtype))
         self.filled: npt.NDArray[Any] = filled(floats) if missing else floats
         self.own = Own(series, self.range, folder)
+        self._crop: Own | None = None
         self.best: dict[tuple[str, float], dict[str, Best]] = {goal: {} for goal in goals}
         self.refused: dict[str, str] = {}
         self.speeds: list[Speed] = []
         self.access: list[Access] = []
+        self.tiles: list[TilePrice] = []
         self.done, self.total = 0, 1
 
-    def search(self, variant: Variant) -> None:
+    def search(self, variant: AnyVariant) -> None:
         """Find the smallest size of a variant for each of its goals.
 
         The codec keeps the best of its variants.
@@ -137,13 +140,12 @@ class Bench:
             )
             self._keep((goal, asked), best)
 
-    def _search(self, variant: Variant) -> Search:
+    def _search(self, variant: AnyVariant) -> Search:
         """The trials of a variant on these data."""
         values = self._values(variant)
 
         def measure(level: float) -> Trial:
-            with stored(values, variant, self.range, level) as file:
-                decoded, count = read_all(file, variant), stored_bytes(file)
+            decoded, count = there_and_back(values, variant, self.range, level, self.folder)
             errors = Errors(self.range)
             for step, frame in enumerate(decoded):
                 errors.add(step, self.series.read(step), frame)
@@ -178,6 +180,39 @@ class Bench:
                 how=config,
             )
             self._keep((goal, asked), best)
+            if profile == "compact" and self.price_tiles:
+                self._price_tiles(goal, asked, config, trial)
+
+    def _price_tiles(self, goal: str, asked: float, config: EncodeConfig, trial: Trial) -> None:
+        """Encode as one tile, too, unless the file has one."""
+        steps, *space = self.series.shape
+        most = max(1, ONE_TILE_VERTICES // math.prod(space))
+        own, count = self.own, trial.bytes
+        if steps > most:
+            own, steps = self._cropped(most), most
+            count = own.trial(config).bytes
+        whole = replace(config, tile="whole")
+        one = count if own.has_one_tile(config) else own.trial(whole).bytes
+        self.tiles.append(
+            TilePrice(
+                goal=goal,
+                asked=asked,
+                bytes=count,
+                one_tile_bytes=one,
+                price=count / one,
+                steps=steps,
+            )
+        )
+
+    def _cropped(self, steps: int) -> Own:
+        """Encodings of so many steps in the middle of the series."""
+        if self._crop is None:
+            first = (self.series.shape[0] - steps) // 2
+            folder = self.folder / "crop"
+            folder.mkdir()
+            values = self.series.values[first : first + steps]
+            self._crop = Own(ArraySeries(values, name=self.series.name), self.range, folder)
+        return self._crop
 
     def _keep(self, goal: tuple[str, float], new: Best) -> None:
         """Keep a trial unless the codec has a better one: one that reached the goal, then fewer
@@ -195,7 +230,7 @@ class Bench:
                 asked=asked,
                 reached=best.reached,
                 bytes=best.trial.bytes,
-                psnr=_shown(best.trial),
+                psnr=shown_psnr(best.trial),
                 max_error=best.trial.max_error,
                 setting=best.setting,
                 as_asked=best.as_asked,
@@ -204,36 +239,49 @@ class Bench:
             for best in codecs.values()
         ]
 
-    def measure_speed(self, target: float, variants: Mapping[str, Sequence[Variant]]) -> None:
+    def measure_speed(self, target: float, variants: Mapping[str, Sequence[AnyVariant]]) -> None:
         """Measure encoding, decoding and access of each codec at its setting for a PSNR.
 
-        Peers are also measured with small chunks at the same PSNR.
+        Peers that are filters are also measured with small chunks at the same PSNR.
         """
         codecs = self.best["psnr", target].values()
         for number, best in enumerate(codecs):
-            if isinstance(best.how, EncodeConfig):
-                self._speed_of_own(best, best.how)
-            else:
-                self._speed_of_peer(best, best.how)
-                self._access_of_peer(best.how, best.trial)
-                if max(self.series.shape[1:]) > SMALL_CHUNK:
-                    self._small_access(small_chunks(variants[best.codec]), target)
+            self.time(best)
+            if isinstance(best.how, Variant) and max(self.series.shape[1:]) > SMALL_CHUNK:
+                filters = [one for one in variants[best.codec] if isinstance(one, Variant)]
+                self._small_access(small_chunks(filters), target)
             self.progress("timing", number + 1, len(codecs), best.codec)
 
-    def _speed_of_peer(self, best: Best, variant: Variant) -> None:
-        values, path = self._values(variant), self.folder / "peer.h5"
+    def time(self, best: Best) -> None:
+        """Measure encoding, decoding and access of a trial that was kept."""
+        if isinstance(best.how, EncodeConfig):
+            config, own = best.how, self.own
+            while (
+                len(own.times[config]) < RUNS
+                and sum(run.wall for run in own.times[config]) < LONG_SECONDS
+            ):
+                own.encode(config)
+            decoding = [own.decode(config) for _ in range(RUNS)]
+            self._add(best, own.times[config], decoding, partial(own.read_region, config))
+            return
+        with folder_of(self.folder) as folder:
+            files = self._files(best.how, best.trial, folder)
+            encoding = [spent(files.encode)]
+            while len(encoding) < RUNS and sum(run.wall for run in encoding) < LONG_SECONDS:
+                encoding.append(spent(files.encode))
+            decoding = [spent(files.decode) for _ in range(RUNS)]
+            self._add(best, encoding, decoding, files.read_region)
 
-        def encode() -> None:
-            with stored(values, variant, self.range, best.trial.level, path):
-                pass
-
-        def decode() -> None:
-            with opened_file(path) as file:
-                read_all(file, variant)
-
-        self._add_speed(
-            best, [_timed(encode) for _ in range(RUNS)], [_timed(decode) for _ in range(RUNS)]
-        )
+    def _add(
+        self, best: Best, encoding: Sequence[Spent], decoding: Sequence[Spent], read: Read
+    ) -> None:
+        """Keep the speed and the access of a trial."""
+        named = (best.codec, best.setting, best.trial)
+        raw_bytes = self.series.values.nbytes
+        self.speeds.append(speed_of(*named, raw_bytes, encoding, decoding))
+        # A program decodes everything for a region, at any place.
+        count = 1 if isinstance(best.how, ProgramVariant) else PLACES
+        self.access.append(access_of(*named, self.series.shape, read, count))
 
     def _small_access(self, variant: Variant, target: float) -> None:
         try:
@@ -242,91 +290,18 @@ class Bench:
             )
         except InputError as error:
             self.refused[variant.name] = str(error)
-        else:
-            if trial is not None:
-                self._access_of_peer(variant, trial)
-
-    def _access_of_peer(self, variant: Variant, trial: Trial) -> None:
-        path = self.folder / "peer.h5"
-        with stored(self._values(variant), variant, self.range, trial.level, path):
-            pass
-
-        def read(step: int, box: Box) -> tuple[int, float]:
-            begun = time.perf_counter()
-            with opened_file(path) as file:
-                read_region(file, variant, step, box)
-            spent = time.perf_counter() - begun
-            with opened_file(path) as file:
-                return touched_bytes(file, variant, step, box), spent
-
-        self._add_access(variant.peer, variant.name, trial, read)
-
-    def _speed_of_own(self, best: Best, config: EncodeConfig) -> None:
-        while len(self.own.seconds[config]) < RUNS and sum(self.own.seconds[config]) < LONG_SECONDS:
-            self.own.encode(config)
-        self._add_speed(
-            best, self.own.seconds[config], [self.own.decode(config) for _ in range(RUNS)]
-        )
-        self._add_access(
-            best.codec,
-            best.setting,
-            best.trial,
-            lambda step, box: self.own.read_region(config, step, box),
-        )
-
-    def _add_speed(self, best: Best, encoding: Sequence[float], decoding: Sequence[float]) -> None:
-        megabytes = self.series.values.nbytes / 1e6
-        self.speeds.append(
-            Speed(
-                codec=best.codec,
-                setting=best.setting,
-                psnr=_shown(best.trial),
-                encode_mb_s=megabytes / min(encoding),
-                decode_mb_s=megabytes / min(decoding),
-                encode_runs=len(encoding),
+            return
+        if trial is None:
+            return
+        with folder_of(self.folder) as folder:
+            files = self._files(variant, trial, folder)
+            files.encode()
+            self.access.append(
+                access_of(variant.peer, variant.name, trial, self.series.shape, files.read_region)
             )
-        )
 
-    def _add_access(
-        self, codec: str, setting: str, trial: Trial, read: Callable[[int, Box], tuple[int, float]]
-    ) -> None:
-        """Read regions at the same places for every codec; the first is a warm-up."""
-        rng = np.random.default_rng(0)
-        steps, *space = self.series.shape
-        size = [min(REGION, n) for n in space]
-        measured = []
-        for place in range(PLACES + 1):
-            low = [
-                int(rng.integers(0, n - length + 1)) for n, length in zip(space, size, strict=True)
-            ]
-            step = int(rng.integers(0, steps))
-            box = Box.of_shape(size).shift(low)
-            if place:
-                measured.append(read(step, box))
-            else:
-                read(step, box)
-        self.access.append(
-            Access(
-                codec=codec,
-                setting=setting,
-                region=(size[0], size[1], size[2]),
-                bytes=trial.bytes,
-                psnr=_shown(trial),
-                milliseconds=1000 * median(seconds for _, seconds in measured),
-                bytes_read=round(median(touched for touched, _ in measured)),
-            )
-        )
+    def _files(self, variant: AnyVariant, trial: Trial, folder: Path) -> PeerFiles:
+        return PeerFiles(self._values(variant), variant, self.range, trial.level, folder)
 
-    def _values(self, variant: Variant) -> npt.NDArray[Any]:
+    def _values(self, variant: AnyVariant) -> npt.NDArray[Any]:
         return self.series.values if variant.lossless else self.filled
-
-
-def _shown(trial: Trial) -> float | None:
-    """PSNR in dB, None where nothing differs."""
-    return None if trial.psnr == EXACT else trial.psnr
-
-
-def _timed(work: Callable[[], object]) -> float:
-    begun = time.perf_counter()
-    work()
-    return time.perf_counter() - begun

@@ -7,10 +7,12 @@ import dataclasses
 import time
 from collections.abc import Mapping
 from contextlib import suppress
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import fhash_codec
+from fhash_codec.bench.rate.clock import Spent, spent
 from fhash_codec.bench.rate.search import EXACT, Trial
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.boxes import Box
@@ -48,7 +50,7 @@ class Own:
     """Encodings of one series, each made once, and their figures.
 
     Attributes:
-        seconds: times of each encoding so far, by its settings.
+        times: of each encoding so far, by its settings.
     """
 
     def __init__(self, series: Series, data_range: float, folder: Path) -> None:
@@ -61,17 +63,23 @@ class Own:
         self._folder = folder
         self._paths: dict[EncodeConfig, Path] = {}
         self._trials: dict[EncodeConfig, Trial] = {}
-        self.seconds: dict[EncodeConfig, list[float]] = {}
+        self.times: dict[EncodeConfig, list[Spent]] = {}
 
-    def encode(self, config: EncodeConfig) -> float:
-        """Encode once more; the seconds it took."""
+    def encode(self, config: EncodeConfig) -> None:
+        """Encode once more, and keep how long it took."""
         path = self._paths.setdefault(config, self._folder / f"{len(self._paths)}.fhz")
-        begun = time.perf_counter()
-        with suppress(QualityError):  # the file is written, and what it reaches is measured here
-            fhash_codec.encode(self._series, path, config, force=True)
-        spent = time.perf_counter() - begun
-        self.seconds.setdefault(config, []).append(spent)
-        return spent
+
+        def encode() -> None:
+            with suppress(QualityError):  # the file is written, and what it reaches is measured
+                fhash_codec.encode(self._series, path, config, force=True)
+
+        self.times.setdefault(config, []).append(spent(encode))
+
+    def has_one_tile(self, config: EncodeConfig) -> bool:
+        """Whether the file with these settings, of the profile compact, has a single tile."""
+        with fhash_codec.open(self._paths[config]) as volume:
+            table = volume.container.arrays["tables/level_1"]
+            return prod(table.grid) == 1
 
     def trial(self, config: EncodeConfig) -> Trial:
         """Figures of the file with these settings, from every decoded frame."""
@@ -84,13 +92,15 @@ class Own:
             self._trials[config] = trial_of(errors, 0.0, self._paths[config].stat().st_size)
         return self._trials[config]
 
-    def decode(self, config: EncodeConfig) -> float:
-        """Open the file and decode every frame; seconds."""
-        begun = time.perf_counter()
-        with fhash_codec.open(self._paths[config]) as volume:
-            for step in range(volume.shape[0]):
-                volume.read(step)
-        return time.perf_counter() - begun
+    def decode(self, config: EncodeConfig) -> Spent:
+        """Open the file and decode every frame; what it took."""
+
+        def decode() -> None:
+            with fhash_codec.open(self._paths[config]) as volume:
+                for step in range(volume.shape[0]):
+                    volume.read(step)
+
+        return spent(decode)
 
     def read_region(self, config: EncodeConfig, step: int, region: Box) -> tuple[int, float]:
         """Open the file and read a region of one step; bytes read of the file, and seconds."""

@@ -21,21 +21,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from fhash_codec.bench.rate.layouts import Spans, Values, joined, parts_of, spans_of
 from fhash_codec.coreset.boxes import Box
 from fhash_formats.errors import InputError, MissingDependencyError
 
-Values = npt.NDArray[Any]
 Filter = Mapping[str, Any]
 
 LADDER = 20 * math.log10(2)
 """dB between settings that are powers of two apart."""
 SMALL_CHUNK = 32
 """Vertices along an axis of a chunk, as a user who reads regions would choose."""
-LAYOUTS = {"frame": 0, "plane": 1, "series": None}
-"""Axis that each layout cuts into datasets: a chunk is one step, all steps of one z, or
-everything."""
 MAX_CHUNK = 2**31
 """Bytes of the largest chunk; HDF5 allows less than 4 GiB."""
 
@@ -51,7 +47,7 @@ class Variant:
     Attributes:
         peer: its name.
         mode: the kind of its setting, for people.
-        layout: one of LAYOUTS.
+        layout: one of `layouts.LAYOUTS`; a dataset holds one of its parts.
         goals: qualities it is tried for, `psnr`, `bound` or both.
         setting: gives the HDF5 filter for (part of the data, range of the data, level). A level is
             a quality in dB: a uniform tolerance of range * 10^(-level / 20) stands at `level`.
@@ -113,7 +109,7 @@ def _sz3(plugins: Any) -> tuple[Variant, ...]:
 
     return tuple(
         Variant(peer="SZ3", mode="tolerance", layout=layout, goals=BOTH, setting=absolute)
-        for layout in ("frame", "series")
+        for layout in ("frame", "plane", "series", "folded")
     )
 
 
@@ -135,7 +131,7 @@ def _sperr(plugins: Any) -> tuple[Variant, ...]:
     return tuple(
         Variant(peer="SPERR", mode=mode, layout=layout, goals=(goal,), setting=setting)
         for mode, goal, setting in modes
-        for layout in ("frame", "plane")
+        for layout in ("frame", "plane", "folded")
     )
 
 
@@ -147,7 +143,7 @@ def _zfp(plugins: Any) -> tuple[Variant, ...]:
         Variant(
             peer="ZFP", mode="tolerance", layout=layout, goals=BOTH, setting=accuracy, step=LADDER
         )
-        for layout in ("frame", "series")
+        for layout in ("frame", "plane", "series")
     )
 
 
@@ -209,13 +205,10 @@ def stored(
 
     if variant.prepare is not None:
         values = variant.prepare(values, level)
-    axis = LAYOUTS[variant.layout]
     place: dict[str, Any] = {"driver": "core", "backing_store": False} if path is None else {}
     with h5py.File(path or f"{id(values)}.h5", "w", rdcc_nbytes=0, **place) as file:
         try:
-            for number, part in enumerate(
-                [values] if axis is None else np.moveaxis(values, axis, 0)
-            ):
+            for number, part in enumerate(parts_of(values, variant.layout)):
                 filters = variant.setting(part, data_range, level)
                 file.create_dataset(
                     str(number),
@@ -241,27 +234,29 @@ def stored_bytes(file: Any) -> int:
     return sum(int(dataset.id.get_storage_size()) for dataset in file.values())
 
 
-def read_all(file: Any, variant: Variant) -> Values:
-    """Every value (t, z, y, x), decoded."""
-    axis = LAYOUTS[variant.layout]
-    if axis is None:
-        return np.asarray(file["0"][...])
-    return np.moveaxis(np.stack([file[str(number)][...] for number in range(len(file))]), 0, axis)
+def read_all(file: Any, variant: Variant, shape: tuple[int, ...]) -> Values:
+    """Every value of a series of `shape` (t, z, y, x), decoded."""
+    parts = [file[str(number)][...] for number in range(len(file))]
+    return joined(parts, variant.layout, shape)
 
 
-def read_region(file: Any, variant: Variant, step: int, region: Box) -> Values:
-    """A region (z, y, x) of one step."""
+def read_region(
+    file: Any, variant: Variant, shape: tuple[int, ...], step: int, region: Box
+) -> Values:
+    """A region (z, y, x) of one step of a series of `shape`."""
     parts = [
         dataset[tuple(slice(*span) for span in spans)]
-        for dataset, spans in _parts(file, variant, step, region)
+        for dataset, spans in _parts(file, variant, shape, step, region)
     ]
     return np.concatenate([part.reshape(-1, *part.shape[-2:]) for part in parts])
 
 
-def touched_bytes(file: Any, variant: Variant, step: int, region: Box) -> int:
+def touched_bytes(
+    file: Any, variant: Variant, shape: tuple[int, ...], step: int, region: Box
+) -> int:
     """Stored bytes of the chunks that a region of one step meets."""
     total = 0
-    for dataset, spans in _parts(file, variant, step, region):
+    for dataset, spans in _parts(file, variant, shape, step, region):
         firsts = [
             range(low // n * n, high, n)
             for (low, high), n in zip(spans, dataset.chunks, strict=True)
@@ -274,15 +269,11 @@ def touched_bytes(file: Any, variant: Variant, step: int, region: Box) -> int:
 
 
 def _parts(
-    file: Any, variant: Variant, step: int, region: Box
-) -> list[tuple[Any, list[tuple[int, int]]]]:
+    file: Any, variant: Variant, shape: tuple[int, ...], step: int, region: Box
+) -> list[tuple[Any, Spans]]:
     """The datasets that hold a region of one step, with its spans in them."""
-    time = (step, step + 1)
-    if variant.layout == "frame":
-        return [(file[str(step)], [*region])]
-    if variant.layout == "plane":
-        return [(file[str(number)], [time, *region[1:]]) for number in range(*region[0])]
-    return [(file["0"], [time, *region])]
+    found = spans_of(variant.layout, shape, step, region)
+    return [(file[str(number)], spans) for number, spans in found]
 
 
 def filled(values: Values) -> Values:

@@ -10,15 +10,17 @@ from typing import Any
 import numpy as np
 
 from fhash_codec.bench.machine import machine
+from fhash_codec.bench.rate.coded import AnyVariant
 from fhash_codec.bench.rate.measuring import Bench
 from fhash_codec.bench.rate.own import PROFILES, promised
 from fhash_codec.bench.rate.peers import peers
+from fhash_codec.bench.rate.programs.registry import PROGRAMS, programs
 from fhash_codec.bench.rate.results import PEERS, RateBench
 from fhash_codec.coreset.scan import scan
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.progress import Progress, silent
 from fhash_formats.errors import InputError
-from fhash_formats.series import ArraySeries
+from fhash_formats.series import ArraySeries, Series
 
 TARGETS = (35.0, 40.0, 45.0, 50.0, 60.0)
 """PSNR in dB."""
@@ -30,13 +32,17 @@ NOTES = (
     "the whole series is held in memory",
     "bytes of a peer are those of its stored chunks alone, the structure of its file is left out;"
     " bytes of fhash are the whole file",
-    "of every peer the smallest of its layouts and modes counts;"
+    "of every peer the smallest of its layouts and modes counts, which points name;"
     " for a bound, the coarsest setting whose decoded values keep it",
     "tolerances of ZFP are powers of two and BitRound keeps whole bits:"
     " both may exceed what was asked by up to 6 dB, as their PSNR says",
     "peers run on one thread as HDF5 filters; fhash takes the threads it takes by default",
+    "the price of tiles sets the bytes of the default beside those of one tile at the same promise",
+    "MB/s of a core are 10^6 bytes of the array for each second that all cores together spent in"
+    " user mode; a program's own start counts",
     "access opens the file anew, the operating system has it in memory; bytes read are those of"
-    " whole chunks for a peer, and all that is read of the file, directory included, for fhash",
+    " whole chunks for a peer, and all that is read of the file, directory included, for fhash;"
+    " a program decodes everything",
 )
 
 
@@ -47,8 +53,10 @@ def bench_rate(
     targets: Sequence[float] = TARGETS,
     bounds: Sequence[float] = BOUNDS,
     names: Sequence[str] = PEERS,
+    named: Mapping[str, str] | None = None,
     profiles: Sequence[str] = PROFILES,
     speed: bool = True,
+    price_tiles: bool = True,
     progress: Progress = silent,
 ) -> RateBench:
     """Measure fhash's profiles and its peers on a series, which is held in memory.
@@ -62,31 +70,26 @@ def bench_rate(
         targets: PSNR in dB over every finite value of all frames, with the range of the series.
         bounds: largest errors as shares of that range.
         names: peers, of PEERS.
+        named: paths of programs by their names, of PROGRAMS, which are peers as well.
         profiles: profiles of fhash.
+        price_tiles: also encode the profile compact as one tile.
         speed: also measure encoding, decoding and access, at the target nearest to SPEED_AT.
 
-    Raises InputError for what cannot be measured, MissingDependencyError without hdf5plugin.
+    Raises InputError for what cannot be measured, or a path without a program;
+    MissingDependencyError without hdf5plugin.
     """
     settings = settings or {}
-    _check(settings, targets, bounds, names, profiles)
-    variants = peers() if names else {}
+    check(settings, targets, bounds, [*names, *(named or {})], profiles)
+    variants, refused = all_variants(names, named or {})
     with (
         open_source(source) as series,
         tempfile.TemporaryDirectory(prefix="fhash-bench-") as folder,
     ):
-        scanned = scan(series, progress)
-        value_range = (scanned.value_range.low, scanned.value_range.high)
-        if value_range[0] == value_range[1]:
-            raise InputError(
-                f"{series.source}: '{series.name}' is constant; there is no quality to compare"
-            )
-        values = np.stack(list(series.frames()))
-        missing = values.size - scanned.finite_count
-        plain = ArraySeries(values, name=series.name, units=series.units, coords=series.coords)
-        goals = [("psnr", target) for target in sorted(targets)]
-        goals += [("bound", bound) for bound in sorted(bounds, reverse=True)]
-        bench = Bench(plain, value_range, missing, Path(folder), goals, progress)
-        chosen = [variant for name in names for variant in variants[name]]
+        goals = goals_of(targets, bounds)
+        bench = bench_of(series, Path(folder), goals, progress)
+        bench.refused.update(refused)
+        bench.price_tiles = price_tiles
+        chosen = [variant for several in variants.values() for variant in several]
         peer_trials = sum(goal in variant.goals for variant in chosen for goal, _ in goals)
         bench.total = peer_trials + len(goals) * len(profiles)
         for variant in chosen:
@@ -100,19 +103,54 @@ def bench_rate(
             series=f"{series.source} {series.name}",
             shape=series.shape,
             dtype=series.dtype.name,
-            raw_bytes=values.nbytes,
-            value_range=value_range,
-            missing=missing,
+            raw_bytes=bench.series.values.nbytes,
+            value_range=bench.value_range,
+            missing=bench.missing,
             points=tuple(bench.points()),
             speeds=tuple(bench.speeds),
             access=tuple(bench.access),
+            tiles=tuple(bench.tiles),
             refused=bench.refused,
             machine=machine(),
             notes=NOTES,
         )
 
 
-def _check(
+def all_variants(
+    names: Sequence[str], named: Mapping[str, str]
+) -> tuple[dict[str, Sequence[AnyVariant]], dict[str, str]]:
+    """Variants of peers and of programs by codec, and why programs were left out.
+
+    Raises InputError for a path without a program, MissingDependencyError without hdf5plugin.
+    """
+    filters = peers() if names else {}
+    found, refused = programs(named)
+    return {**{name: filters[name] for name in names}, **found}, refused
+
+
+def goals_of(targets: Sequence[float], bounds: Sequence[float]) -> list[tuple[str, float]]:
+    """Goals and what is asked: PSNR from low to high, then bounds from wide to narrow."""
+    goals = [("psnr", target) for target in sorted(targets)]
+    return goals + [("bound", bound) for bound in sorted(bounds, reverse=True)]
+
+
+def bench_of(
+    series: Series, folder: Path, goals: list[tuple[str, float]], progress: Progress
+) -> Bench:
+    """A bench of a series, which it holds in memory; raises InputError for a constant one."""
+    scanned = scan(series, progress)
+    value_range = (scanned.value_range.low, scanned.value_range.high)
+    if value_range[0] == value_range[1]:
+        raise InputError(
+            f"{series.source}: '{series.name}' is constant; there is no quality to compare"
+        )
+    values = np.stack(list(series.frames()))
+    missing = values.size - scanned.finite_count
+    plain = ArraySeries(values, name=series.name, units=series.units, coords=series.coords)
+    return Bench(plain, value_range, missing, folder, goals, progress)
+
+
+def check(
     settings: Mapping[str, Any],
     targets: Sequence[float],
     bounds: Sequence[float],
@@ -120,7 +158,8 @@ def _check(
     profiles: Sequence[str],
 ) -> None:
     """Raise InputError for arguments of `bench_rate` that are not allowed."""
-    for what, given, allowed in (("peer", names, PEERS), ("profile", profiles, PROFILES)):
+    every = (*PEERS, *PROGRAMS)
+    for what, given, allowed in (("peer", names, every), ("profile", profiles, PROFILES)):
         for name in given:
             if name not in allowed:
                 raise InputError(f"{what} is '{name}'; allowed: {', '.join(allowed)}")

@@ -40,13 +40,21 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True)
 class Speed:
-    """Speed of a codec at a quality in 10^6 bytes of raw data a second, the best of some runs."""
+    """Speed of a codec at a quality in 10^6 bytes of raw data a second, the best of some runs.
+
+    Attributes:
+        encode_mb_s, decode_mb_s: by the clock on the wall.
+        encode_core_mb_s, decode_core_mb_s: by the time of all cores in user mode, so those of one.
+        encode_runs: runs of encoding.
+    """
 
     codec: str
     setting: str
     psnr: float | None
     encode_mb_s: float
     decode_mb_s: float
+    encode_core_mb_s: float
+    decode_core_mb_s: float
     encode_runs: int
 
 
@@ -71,10 +79,32 @@ class Access:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TilePrice:
+    """Bytes of the default tiles of fhash beside those of one tile, at a quality.
+
+    Attributes:
+        goal, asked: the quality, as of `Point`.
+        bytes: of the file as it is encoded.
+        one_tile_bytes: of a file with one tile.
+        price: the first over the second.
+        steps: of the series that were encoded for both; fewer than it has where one tile would be
+            too large.
+    """
+
+    goal: str
+    asked: float
+    bytes: int
+    one_tile_bytes: int
+    price: float
+    steps: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class RateBench:
     """Everything that `bench_rate` measured.
 
     Attributes:
+        tiles: price of the tiles of the profile compact at each quality.
         missing: number of values that are not finite. Lossy peers were given neighbouring values in
             their place.
         refused: for each codec or variant that could not be measured, the reason.
@@ -90,6 +120,7 @@ class RateBench:
     points: tuple[Point, ...]
     speeds: tuple[Speed, ...]
     access: tuple[Access, ...]
+    tiles: tuple[TilePrice, ...]
     refused: dict[str, str]
     machine: dict[str, Any]
     notes: tuple[str, ...]

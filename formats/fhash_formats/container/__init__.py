@@ -30,7 +30,7 @@ The tests prove that the zarr library reads every array equal.
     writer           ContainerWriter: a file for writing
 """
 
-from fhash_formats.container.coordinates import describe_coordinates
+from fhash_formats.container.coordinates import coordinate_features, describe_coordinates
 from fhash_formats.container.header import FORMAT_VERSION, validate_header
 from fhash_formats.container.reader import Container, is_container
 from fhash_formats.container.sharding import shard_order, shard_shape
@@ -42,6 +42,7 @@ __all__ = [
     "Container",
     "ContainerWriter",
     "StoredArray",
+    "coordinate_features",
     "describe_coordinates",
     "is_container",
     "shard_order",

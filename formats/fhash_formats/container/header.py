@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from fhash_formats.container.array import DTYPES
+from fhash_formats.container.coordinates import FEATURE as ULPS_FEATURE
 from fhash_formats.container.coordinates import MAX_RULED, check_positions
 from fhash_formats.container.record import MAX_LENGTH, Record
 from fhash_formats.errors import DamagedFileError, UnsupportedFileError
@@ -37,6 +38,7 @@ KNOWN_FEATURES = frozenset(
         "mask",
         "predictor",
         "trellis",
+        ULPS_FEATURE,
     }
 )
 """Names in `required_features` that this version understands."""
@@ -236,6 +238,12 @@ def _check_coordinates(top: Record, shape: Sequence[int]) -> None:
                     length <= MAX_RULED, axis, f"an array for more than {MAX_RULED} positions"
                 )
                 check_positions(coordinates.record(axis), length)
+                top.need(
+                    not coordinates.record(axis).has("ulps")
+                    or ULPS_FEATURE in top.texts("required_features"),
+                    "required_features",
+                    f"{ULPS_FEATURE} for positions that differ from their rule",
+                )
 
 
 def _largest_decoded(source: np.dtype[Any]) -> float:

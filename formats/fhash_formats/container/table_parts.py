@@ -14,11 +14,19 @@ from fhash_formats.container.apart import HEAD_ARRAY, MASK_ARRAY, TABLE, place_h
 from fhash_formats.container.coding import CRC32C, HEAD, MASK, Codec, transform_codecs
 from fhash_formats.container.sharding import shard_shape
 from fhash_formats.container.writer import ContainerWriter
+from fhash_formats.transform.head.head import NeighbourHead
 from fhash_formats.transform.parts import FEATURE, head_parameters
 from fhash_formats.transform.tile.apart import split_mask
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["TableParts"]
+
+APART_BYTES = 1 << 17
+"""Bytes of all streams from which on head and masks have arrays of their own.
+
+Such an array takes 520 to 600 bytes for its documents and its entries in the ZIP, which is then
+less than 0.5 % of the file.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +39,7 @@ class TableParts:
         tile: shape of a tile.
         settings: settings that all tiles share.
         streams: stream of each tile, in C order of their grid, masks included.
+        apart: whether head and masks have arrays of their own; by default from APART_BYTES on.
     """
 
     shape: tuple[int, ...]
@@ -38,36 +47,50 @@ class TableParts:
     tile: tuple[int, ...]
     settings: TileSettings
     streams: Sequence[bytes]
+    apart: bool | None = None
+
+    @cached_property
+    def _apart(self) -> bool:
+        """Whether head and masks have arrays of their own."""
+        if self.apart is not None:
+            return self.apart
+        return sum(len(stream) for stream in self.streams) >= APART_BYTES
 
     @cached_property
     def _split(self) -> tuple[Sequence[bytes], Sequence[bytes] | None]:
-        """The streams without masks, and the masks; None where no tile has a section of them."""
-        if self.settings.mask is not None:
+        """The streams without masks, and the masks; None where they stay in the streams."""
+        if self._apart and self.settings.mask is not None:
             tiles, masks = zip(*map(split_mask, self.streams), strict=True)
             if any(masks):
                 return tiles, masks
         return self.streams, None
 
     @property
+    def _head(self) -> NeighbourHead | None:
+        """The head that has an array of its own."""
+        return self.settings.head if self._apart else None
+
+    @property
     def features(self) -> list[str]:
         """Features of the format that a reader of the parts must know."""
-        apart = self.settings.head is not None or self._split[1] is not None
+        apart = self._head is not None or self._split[1] is not None
         return ["transform", *([FEATURE] if apart else []), *self.settings.features]
 
     def write(self, writer: ContainerWriter) -> None:
-        """Write the table, and after it its head and its masks, where it has them.
+        """Write the table, and after it the head and the masks that have arrays of their own.
 
-        They stand in arrays of their own, so that a reader finds the parts of the model by name.
+        There a reader finds the parts of the model by name. In a small file they stay in the codec
+        and in the tiles.
         """
         codec, *checks = transform_codecs(self.settings)
         tiles, masks = self._split
-        if self.settings.head is not None:
+        if self._head is not None:
             codec = place_head(codec)
         if masks is not None:
             codec = place_masks(codec)
         self._write_tiles(writer, TABLE, tiles, self.dtype, [codec, *checks])
-        if self.settings.head is not None:
-            packed = self.settings.head.to_bytes()
+        if self._head is not None:
+            packed = self._head.to_bytes()
             shape = head_parameters(packed).shape
             writer.add_array(
                 HEAD_ARRAY,

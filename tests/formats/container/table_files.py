@@ -62,6 +62,7 @@ def write_table(path: Path, header: dict[str, Any], parts: TableParts, *, apart:
     """A container with the table: in its parts, or as versions before 1.4 wrote it; its path."""
     with ContainerWriter(path, force=True) as writer:
         if apart:
+            parts = replace(parts, apart=True)
             parts.write(writer)
             features = parts.features
         else:

@@ -10,10 +10,17 @@ import pytest
 from fhash_formats.container import (
     Container,
     ContainerWriter,
+    coordinate_features,
     describe_coordinates,
     validate_header,
 )
-from fhash_formats.container.coordinates import MAX_LISTED, MAX_RULED, describe_positions, positions
+from fhash_formats.container.coordinates import (
+    MAX_LISTED,
+    MAX_RULED,
+    MAX_ULPS,
+    describe_positions,
+    positions,
+)
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.series import Coordinate, index_coordinate
 
@@ -41,6 +48,15 @@ LISTED = {
     "negative zero": (np.array([-0.0, 1.0, 2.0]), "float32"),
     "repeated": (np.array([0.0, 1.0, 1.0, 1.0]), "float32"),
     "a range beyond float64": (np.array([-1.7e308, 1.7e308]), None),
+}
+NEARLY = {
+    "cell centres": ((np.arange(48) + 0.5) / 48, "float64"),
+    "fractions": (np.arange(80) / 80, "float64"),
+    "middles around 0": ((np.arange(100) + 0.5) / 100 * 2 - 1, "float64"),
+    "means of edges": (
+        (lambda edges: 0.5 * (edges[1:] + edges[:-1]))(np.linspace(-9.3, -0.1, 301)),
+        "float64",
+    ),
 }
 ARRAYS = {
     "not finite": np.array([0.0, np.nan]),
@@ -72,6 +88,31 @@ def test_lists(case) -> None:
     description = there_and_back(values)
     assert len(description["values"]) == values.size
     assert description.get("dtype") == dtype
+
+
+@pytest.mark.parametrize("case", NEARLY)
+def test_rules_that_hold_but_for_a_few_units_in_the_last_place(case) -> None:
+    values, dtype = NEARLY[case]
+    description = there_and_back(values)
+    assert len(description["ulps"]) == values.size
+    assert 0 < max(map(abs, description["ulps"])) <= MAX_ULPS
+    assert len(json.dumps(description)) < 5 * values.size + 60
+    assert description.get("dtype", "float64") == dtype
+    assert coordinate_features({"z": description, "y": {}}) == ["ulps"]
+    assert coordinate_features({"z": {"values": [1.0]}, "y": {}}) == []
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_ulps_lead_over_zero_and_no_farther_than_infinity(dtype) -> None:
+    tiny, most = float(np.finfo(dtype).smallest_subnormal), float(np.finfo(dtype).max)
+    rule = {"start": 0, "step": 0, "dtype": dtype, "ulps": [0, 1, -2, 3]}
+    np.testing.assert_array_equal(positions(rule, 4), [0, tiny, -2 * tiny, 3 * tiny])
+    rule = {"start": tiny, "step": -2 * tiny, "dtype": dtype, "ulps": [-1, 1]}
+    result = positions(rule, 2)
+    np.testing.assert_array_equal(result, [0, 0])
+    assert not np.signbit(result).any()
+    rule = {"start": -most, "step": 0, "dtype": dtype, "ulps": [-1, -(2**31) + 1, 0]}
+    np.testing.assert_array_equal(positions(rule, 3), [-np.inf, -np.inf, -most])
 
 
 @pytest.mark.parametrize("case", ARRAYS)
@@ -137,6 +178,22 @@ def test_coordinates_of_a_series_come_back(tmp_path, samples) -> None:
                 dict(given[axis].attributes),
             )
             np.testing.assert_array_equal(coordinate.values, given[axis].values)
+
+
+def test_ulps_need_their_feature_and_a_rule(tmp_path, samples) -> None:
+    header = samples.compact_header()
+    header["coordinates"]["y"] = {"ulps": [0, 1, 0, -1, 0]}
+    with pytest.raises(InputError, match="ulps for positions that differ from their rule"):
+        write(tmp_path / "a.fhz", header)
+    header["required_features"] = [*header["required_features"], "ulps"]
+    write(tmp_path / "a.fhz", header)
+    for wrong in ([0], [0, 0.5, 0, 0, 0], [0, 2**31, 0, 0, 0], None):
+        header["coordinates"]["y"] = {"ulps": wrong}
+        with pytest.raises(InputError, match="ulps"):
+            write(tmp_path / "b.fhz", header)
+    header["coordinates"]["y"] = {"values": [0, 1, 2, 3, 4], "ulps": [0] * 5}
+    with pytest.raises(InputError, match="a rule, and no values"):
+        write(tmp_path / "b.fhz", header)
 
 
 def test_an_axis_without_positions_is_refused(tmp_path, samples) -> None:

@@ -45,12 +45,9 @@ int64_t fhash_transform_forward_f32(const float*, float*, const int64_t*, const 
 int64_t fhash_transform_forward_f64(const double*, double*, const int64_t*, const int64_t*,
                                     const int64_t*, const int64_t*, const double* const*,
                                     const double*, const double*);
-int64_t fhash_head_apply(const float*, int64_t, int64_t, int64_t, int64_t, int64_t, const int64_t*,
-                         const float*, const float*, const float*, float, float, float, float,
+int64_t fhash_head_apply(const float*, const int64_t*, int64_t, int64_t, int64_t, const int64_t*,
+                         const float*, const float*, const float*, const float*, int64_t, int64_t,
                          float*);
-int64_t fhash_head_apply_cross(const float*, int64_t, int64_t, int64_t, int64_t, int64_t,
-                               const int64_t*, const float*, const float*, const float*, float,
-                               float, float, float, float*);
 int64_t fhash_clip_f32(float*, int64_t, double, double, double);
 int64_t fhash_clip_f64(double*, int64_t, double, double, double);
 int64_t fhash_correct_f32_f32(const float*, const std::int32_t*, int64_t, double, float*);
@@ -200,10 +197,12 @@ void head(Reader& in) {
     std::vector<float> values(static_cast<std::size_t>(volume(shape))), out(values.size());
     const std::vector<float> some = in.numbers<float>(32);
     for (std::size_t i = 0; i < values.size(); i++) values[i] = some[(i * i / 5) % some.size()];
-    const auto function = cross ? fhash_head_apply_cross : fhash_head_apply;
-    function(values.data(), shape[0], shape[1], shape[2], shape[3], hidden + 1, widths.data(),
-             weights.data(), biases.data(), scales.data(), low, high, 0.5F / sigma, unit,
-             out.data());
+    const float constants[] = {low, high, 0.5F / sigma, unit};
+    const int64_t rows = shape[1] * shape[2], first = in.within(0, rows);
+    const int64_t last = in.within(first, rows), lanes = in.within(0, 5);
+    fhash_head_apply(values.data(), shape.data(), first, last, hidden + 1, widths.data(),
+                     weights.data(), biases.data(), scales.data(), constants, cross, lanes,
+                     out.data());
 }
 
 void values(Reader& in) {

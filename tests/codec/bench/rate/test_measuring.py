@@ -81,4 +81,4 @@ def test_what_a_filter_refuses_is_said(field: Field) -> None:
     )
     assert {point.codec for point in result.points} == {"ZFP"}
     assert all(name.startswith("SPERR ") for name in result.refused)
-    assert len(result.refused) == 6
+    assert len(result.refused) == 9

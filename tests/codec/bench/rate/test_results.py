@@ -16,6 +16,7 @@ def result(points: tuple[Point, ...]) -> RateBench:
         points=points,
         speeds=(),
         access=(),
+        tiles=(),
         refused={},
         machine={},
         notes=(),
