@@ -144,8 +144,8 @@ def magnitude_work(
         np.zeros(MIX_INPUTS, np.int64),
     ]
     if compiled:
-        return MagnitudeWork(LINEAR_ARRAYS, *sequences, strides)
-    return MagnitudeWork(LINEAR_LISTS, *(each.tolist() for each in sequences), strides)
+        return MagnitudeWork(LINEAR_ARRAYS, *[*sequences, strides])
+    return MagnitudeWork(LINEAR_LISTS, *[*(each.tolist() for each in sequences), strides])
 
 
 def gather_magnitudes(
