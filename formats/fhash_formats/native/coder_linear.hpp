@@ -27,11 +27,11 @@ const int64_t MAGNITUDE_LINEAR = SIGN_END;
 const int64_t MIXING = MAGNITUDE_LINEAR + int64_t(DECISIONS) * KINDS * 2 * INPUTS;
 const int64_t SHARES = MIXING + int64_t(DECISIONS) * (64 + 64 + 343 + 512) * SET_NUMBERS;
 
-// Rate of a set after n uses, in 1/256 of the rate 1/16 of `learn`: it falls to a ninth.
+// Rate of a set after n uses, in 1/256: it falls from 127, so that steps stay in 16 bits, to 48.
 struct SetRates {
     int32_t of[MAX_USES / 32 + 1];
     SetRates() {
-        for (int i = 0; i <= MAX_USES / 32; i++) of[i] = 48 + 384 / (1 + i);
+        for (int i = 0; i <= MAX_USES / 32; i++) of[i] = min(48 + 384 / (1 + i), 127);
     }
 };
 const SetRates set_rates;
@@ -57,6 +57,57 @@ struct Guess {
     int32_t* shares;
     int logit, logits[SETS], p;
 };
+
+#if defined(FHASH_SSE2)
+
+// The logit of each set.
+FHASH_INLINE void find_logits(Guess& to) {
+    const __m128i* const in = reinterpret_cast<const __m128i*>(to.inputs);
+    const __m128i low = _mm_load_si128(in), high = _mm_load_si128(in + 1);
+    __m128i dots[SETS];
+    for (int m = 0; m < SETS; m++) {
+        const __m128i* const at = reinterpret_cast<const __m128i*>(to.sets[m]->weights);
+        dots[m] = _mm_add_epi32(_mm_madd_epi16(_mm_loadu_si128(at), low),
+                                _mm_madd_epi16(_mm_loadu_si128(at + 1), high));
+    }
+    const __m128i one = _mm_add_epi32(_mm_unpacklo_epi32(dots[0], dots[1]),
+                                      _mm_unpackhi_epi32(dots[0], dots[1]));
+    const __m128i two = _mm_add_epi32(_mm_unpacklo_epi32(dots[2], dots[3]),
+                                      _mm_unpackhi_epi32(dots[2], dots[3]));
+    const __m128i sums = _mm_add_epi32(_mm_unpacklo_epi64(one, two), _mm_unpackhi_epi64(one, two));
+    __m128i logits = _mm_packs_epi32(_mm_srai_epi32(sums, 14), _mm_setzero_si128());
+    logits = _mm_min_epi16(_mm_max_epi16(logits, _mm_set1_epi16(-STRETCH_MAX)),
+                           _mm_set1_epi16(STRETCH_MAX));
+    logits = _mm_srai_epi32(_mm_unpacklo_epi16(logits, logits), 16);
+    _mm_storeu_si128(reinterpret_cast<__m128i*>(to.logits), logits);
+}
+
+// A step of the weights of a set along the inputs.
+FHASH_INLINE void follow_all(int16_t* weights, const int16_t* inputs, int16_t step) {
+    const __m128i* const in = reinterpret_cast<const __m128i*>(inputs);
+    const __m128i by = _mm_set1_epi16(step);
+    follow(weights, rounded_high(by, _mm_load_si128(in)));
+    follow(weights + 8, rounded_high(by, _mm_load_si128(in + 1)));
+}
+
+#else
+
+FHASH_INLINE void find_logits(Guess& to) {
+    for (int m = 0; m < SETS; m++) {
+        int32_t dot = 0;
+        for (int i = 0; i < MIX_INPUTS; i++) dot += to.sets[m]->weights[i] * to.inputs[i];
+        to.logits[m] = min(max(dot >> 14, -STRETCH_MAX), STRETCH_MAX);
+    }
+}
+
+FHASH_INLINE void follow_all(int16_t* weights, const int16_t* inputs, int16_t step) {
+    for (int i = 0; i < MIX_INPUTS; i++) {
+        const int32_t weight = weights[i] + ((step * inputs[i] + 32768) >> 16);
+        weights[i] = (int16_t)min(max(weight, -32767), 32767);
+    }
+}
+
+#endif
 
 struct Magnitudes {
     LinearSets<INPUTS> linear;
@@ -139,13 +190,9 @@ struct Magnitudes {
         to.sets[2] = first[2] + k * 343 + (near * 7 + vertex.both) * 7 + vertex.parent;
         to.sets[3] = first[3] + k * 512 + bin * 8 + near;
         to.shares = shares.data() + number * SETS;
+        find_logits(to);
         int32_t sum = 0;
-        for (int m = 0; m < SETS; m++) {
-            int32_t dot = 0;
-            for (int i = 0; i < MIX_INPUTS; i++) dot += to.sets[m]->weights[i] * to.inputs[i];
-            to.logits[m] = min(max(dot >> 14, -STRETCH_MAX), STRETCH_MAX);
-            sum += to.shares[m] * to.logits[m];
-        }
+        for (int m = 0; m < SETS; m++) sum += to.shares[m] * to.logits[m];
         sum = min(max(sum >> 16, -STRETCH_MAX), STRETCH_MAX);
         return to.p = tables.squash[sum + STRETCH_MAX];
     }
@@ -159,10 +206,7 @@ struct Magnitudes {
             MixingSet& set = *now.sets[m];
             const int32_t own = target - tables.squash[now.logits[m] + STRETCH_MAX];
             const int32_t step = (own * set_rates.of[set.uses >> 5]) >> 8;
-            for (int i = 0; i < MIX_INPUTS; i++) {
-                const int32_t weight = set.weights[i] + ((step * now.inputs[i] + 32768) >> 16);
-                set.weights[i] = (int16_t)min(max(weight, -32767), 32767);
-            }
+            follow_all(set.weights, now.inputs, (int16_t)step);
             if (set.uses < MAX_USES) set.uses++;
         }
         learn_slots<CONTEXTS>(now.contexts, bit, SLOW_LIMIT);

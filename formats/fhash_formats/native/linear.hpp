@@ -77,11 +77,29 @@ template <int N> struct Linear {
         return min(max((int32_t)dot >> 14, -LINEAR_MAX), LINEAR_MAX);
     }
 
-    // Learn from the bit that came. logit: that of the same inputs.
-    FHASH_INLINE void learn(const int16_t* FHASH_RESTRICT inputs, int logit, int bit,
-                            const int16_t* table) {
-        const int32_t p = tables.squash[logit + STRETCH_MAX];
-        const int32_t error = ((bit ? 65535 : 0) - p) >> 1;
+#if defined(FHASH_SSE2)
+    // As below, eight weights at a time.
+    FHASH_INLINE void adapt(const int16_t* FHASH_RESTRICT inputs, int16_t error) {
+        const __m128i e = _mm_set1_epi16(error), most = _mm_set1_epi16(GRADIENT_MAX);
+        const __m128i least = _mm_set1_epi16(-GRADIENT_MAX), low = _mm_set1_epi16(-32767);
+        for (int i = 0; i < N; i += 8) {
+            const __m128i in = _mm_loadu_si128((const __m128i*)(inputs + i));
+            const __m128i rate = _mm_loadu_si128((const __m128i*)(rates + i));
+            __m128i* const weight = (__m128i*)(weights + i);
+            __m128i* const sum = (__m128i*)(sums + i);
+            const __m128i gradient =
+                _mm_min_epi16(_mm_max_epi16(rounded_high(e, in), least), most);
+            // Within 16 bits: 128 gradients.
+            const __m128i step = rounded_high(_mm_slli_epi16(gradient, 7), rate);
+            const __m128i now = _mm_adds_epi16(_mm_loadu_si128(weight), step);
+            _mm_storeu_si128(weight, _mm_max_epi16(now, low));
+            const __m128i square = _mm_srli_epi16(_mm_mullo_epi16(gradient, gradient), 4);
+            _mm_storeu_si128(sum, _mm_add_epi16(_mm_loadu_si128(sum), square));
+        }
+    }
+#else
+    // A step of each weight along its gradient, and the square of that.
+    FHASH_INLINE void adapt(const int16_t* FHASH_RESTRICT inputs, int16_t error) {
         for (int i = 0; i < N; i++) {
             const int32_t wide = (error * inputs[i] + 32768) >> 16;
             const int32_t gradient = min(max(wide, -GRADIENT_MAX), GRADIENT_MAX);
@@ -89,6 +107,15 @@ template <int N> struct Linear {
             weights[i] = (int16_t)min(max(weight, -32767), 32767);
             sums[i] = (uint16_t)(sums[i] + ((gradient * gradient) >> 4));
         }
+    }
+#endif
+
+    // Learn from the bit that came. logit: that of the same inputs.
+    FHASH_INLINE void learn(const int16_t* FHASH_RESTRICT inputs, int logit, int bit,
+                            const int16_t* table) {
+        const int32_t p = tables.squash[logit + STRETCH_MAX];
+        const int32_t error = ((bit ? 65535 : 0) - p) >> 1;
+        adapt(inputs, (int16_t)error);
         if (++uses % PERIOD) return;
         for (int i = 0; i < N; i++) {
             squares[i] = (uint16_t)(squares[i] + (((sums[i] >> 1) - squares[i] + 8) >> 4));

@@ -226,6 +226,11 @@ template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now, i
     return now.p = squashed(_mm_cvtsi128_si32(dot) + more);
 }
 
+// (a * b + 32768) >> 16
+FHASH_INLINE __m128i rounded_high(__m128i a, __m128i b) {
+    return _mm_add_epi16(_mm_mulhi_epi16(a, b), _mm_srli_epi16(_mm_mullo_epi16(a, b), 15));
+}
+
 // Add a step to eight weights, within +-32767.
 FHASH_INLINE void follow(int16_t* weights, __m128i step) {
     __m128i* const at = reinterpret_cast<__m128i*>(weights);
@@ -276,10 +281,7 @@ template <int N, bool PAIR, int RATE, int N_MAX>
 FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
     const __m128i error = _mm_set1_epi16((int16_t)((((bit ? 65535 : 0) - now.p) * RATE) >> 4));
     for (int v = 0; 4 * v < N; v++) {
-        // (error * input + 32768) >> 16
-        const __m128i in = now.inputs[v];
-        const __m128i rounding = _mm_srli_epi16(_mm_mullo_epi16(error, in), 15);
-        const __m128i step = _mm_add_epi16(_mm_mulhi_epi16(error, in), rounding);
+        const __m128i step = rounded_high(error, now.inputs[v]);
         follow(now.first + 8 * v, step);
         if (PAIR) follow(now.second + 8 * v, step);
     }

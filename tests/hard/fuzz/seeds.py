@@ -106,7 +106,7 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             file.write(struct.pack("<q", len(data)) + data)
 
         labels = blank_label_state(), blank_label_state(wide=True)
-        coders = [prior_state(coder) for coder in CODERS[:2]]
+        coders = [prior_state(coder) for coder in CODERS]
         for state in (*coders, mask_prior_state(), blank_state(), *labels):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
@@ -147,7 +147,7 @@ def write_seeds(
     for number, (shape, table) in enumerate(bands):
         for scale in (0.5, 30.0, 1e8):
             integers = (rng.laplace(0, scale, shape)).astype(np.int32)
-            for model, coder in enumerate(CODERS[:2]):
+            for model, coder in enumerate(CODERS):
                 data = encode_integers(integers, table, coder=coder).data
                 put(CODER, struct.pack("<HB", number, model), data)
     for number, (shape, predictor) in enumerate(passes):

@@ -113,7 +113,7 @@ void of_integers(Reader& in) {
     for (std::size_t i = 0; i < scaled.size(); i++)
         scaled[i] =
             static_cast<float>(q[i]) + static_cast<float>(static_cast<int>(i % 15) - 7) / 16;
-    const std::vector<std::int32_t> decoded = there_and_back(with, q, scaled, lambda, room, how >> 1 & 1);
+    const std::vector<std::int32_t> decoded = there_and_back(with, q, scaled, lambda, room, (how >> 1) % 3);
     for (std::size_t i = 0; i < q.size(); i++)
         require(decoded[i] == (inside(number)[i] ? q[i] : 0), "other integers");
 }

@@ -71,7 +71,7 @@ namespace {
 void decode_integers(Reader& in) {
     const Bands& with = setups().bands[in.word() % setups().bands.size()];
     const std::uint8_t how = in.byte();
-    const int64_t model = how % 2, trellis = how >> 4 & 1;
+    const int64_t model = how % 3, trellis = how >> 4 & 1;
     const State& prior = setups().coders[model];
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();

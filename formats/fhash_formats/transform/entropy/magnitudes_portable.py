@@ -144,8 +144,8 @@ def magnitude_work(
         np.zeros(MIX_INPUTS, np.int64),
     ]
     if compiled:
-        return MagnitudeWork(LINEAR_ARRAYS, *sequences, strides)
-    return MagnitudeWork(LINEAR_LISTS, *(each.tolist() for each in sequences), strides)
+        return MagnitudeWork(LINEAR_ARRAYS, *[*sequences, strides])
+    return MagnitudeWork(LINEAR_LISTS, *[*(each.tolist() for each in sequences), strides])
 
 
 def gather_magnitudes(
@@ -246,7 +246,7 @@ def learn_magnitude(
         first = guess[SET_AT + m]
         uses = weights[first + MIX_INPUTS]
         own = target - tables.squash[logit + STRETCH_MAX]
-        step = (own * (48 + 384 // (1 + (uses >> 5)))) >> 8
+        step = (own * min(48 + 384 // (1 + (uses >> 5)), 127)) >> 8
         for i in range(2 * CONTEXTS + 2):
             weight = weights[first + i] + ((step * mixed[i] + 32768) >> 16)
             weights[first + i] = min(max(weight, -32767), 32767)

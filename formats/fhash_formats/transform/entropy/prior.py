@@ -21,9 +21,12 @@ __all__ = [
     "CODERS",
     "State",
     "blank_state",
+    "pack_linear",
     "pack_prior",
+    "pack_signs",
     "pack_state",
     "prior_state",
+    "unpack_signs",
     "unpack_state",
 ]
 
@@ -69,7 +72,12 @@ SIMPLES = LEVELS * 64 + 8 + KINDS
 TRUST = 12
 """Highest count in the prior; it is low, so that a tile soon follows its own statistics."""
 
+SIGN_END = BASE_WEIGHTS + KINDS * (SIGN_SET + 2 * SIGN_INPUTS)
+"""Numbers of the coder "signs" in `State.weights`; those of "linear" follow."""
+
 _FILE = Path(__file__).with_name("prior.bin")
+_SIGNS_FILE = Path(__file__).with_name("prior_signs.bin")
+_LINEAR_FILE = Path(__file__).with_name("prior_linear.bin")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,6 +158,9 @@ def prior_state(coder: str = CODERS[0], trellis: bool = False) -> State:
         state.slots[: len(old.slots)] = old.slots
         state.weights[: len(old.weights)] = old.weights
         state.simples[:] = old.simples
+        unpack_signs(_SIGNS_FILE.read_bytes(), state)
+    if coder == CODERS[2]:
+        state.weights[SIGN_END:] = _unpack_numbers(_LINEAR_FILE.read_bytes())
     if trellis:
         _share(state)
     return state.frozen()
@@ -164,6 +175,50 @@ def _share(state: State) -> None:
     for sets in np.split(state.weights[:weights], [KINDS * DECISIONS * LANES]):
         by_decision = sets.reshape(DECISIONS, -1)
         by_decision[14:] = by_decision[:2]
+    if len(state.weights) == SIGN_END:
+        return
+    sizes = [KINDS * 2 * INPUTS, *(classes * SET_NUMBERS for classes in SET_CLASSES), KINDS * SETS]
+    for numbers in np.split(state.weights[SIGN_END:], DECISIONS * np.cumsum(sizes)[:-1]):
+        by_decision = numbers.reshape(DECISIONS, -1)
+        by_decision[14:] = by_decision[:2]
+
+
+def pack_signs(state: State) -> bytes:
+    """What a learned state has beyond a blank one of "contexts" for signs, as a file.
+
+    These are the further estimates, each as its logit plus 256 times its count; then the mixing
+    weights of signs and their linear predictors.
+    """
+    slots = state.slots[SLOTS:]
+    numbers = _logits(slots).astype(np.int32)
+    numbers += 256 * np.minimum(slots[:, 2], TRUST).astype(np.int32)
+    return _pack_numbers(np.concatenate([numbers, state.weights[BASE_WEIGHTS:SIGN_END]]))
+
+
+def unpack_signs(data: bytes, state: State) -> None:
+    """Fill a state from the bytes of `pack_signs`."""
+    slots, weights = np.split(_unpack_numbers(data), [len(state.slots) - SLOTS])
+    state.slots[SLOTS:, 0] = state.slots[SLOTS:, 1] = _PROBABILITIES[slots & 255]
+    state.slots[SLOTS:, 2] = slots >> 8
+    state.weights[BASE_WEIGHTS:SIGN_END] = weights
+
+
+def pack_linear(state: State) -> bytes:
+    """What a learned state of "linear" has beyond one of "signs", as a file."""
+    return _pack_numbers(state.weights[SIGN_END:])
+
+
+def _pack_numbers(numbers: npt.NDArray[np.int32]) -> bytes:
+    """Numbers from -2^23 to 2^23 - 1, deflated: all low bytes, all middle ones, all high ones."""
+    planes = numbers.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3]
+    return zlib.compress(np.ascontiguousarray(planes.T).tobytes(), 9)
+
+
+def _unpack_numbers(data: bytes) -> npt.NDArray[np.int32]:
+    planes = np.frombuffer(zlib.decompress(data), dtype=np.uint8).reshape(3, -1).astype(np.int32)
+    numbers: npt.NDArray[np.int32]
+    numbers = planes[0] | (planes[1] << 8) | (((planes[2] ^ 128) - 128) << 16)
+    return numbers
 
 
 def unpack_state(data: bytes, state: State) -> State:
@@ -213,15 +268,21 @@ def _reordered(slots: npt.NDArray[np.uint16], *, for_file: bool) -> npt.NDArray[
     return result
 
 
-def pack_state(state: State) -> bytes:
-    """A learned state as bytes, not deflated: probabilities rounded, counts at most TRUST."""
-    slow = state.slots[:, 0]
+def _logits(slots: npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
+    """The nearest logit of each estimate; even odds where nothing was observed."""
+    slow = slots[:, 0]
     upper = np.searchsorted(_PROBABILITIES, slow).clip(1, 255)
     below = _PROBABILITIES[upper - 1].astype(np.int32)
     above = _PROBABILITIES[upper].astype(np.int32)
     logits = np.where(slow - below < above - slow, upper - 1, upper).astype(np.uint8)
+    logits[slots[:, 2] == 0] = 128
+    return logits
+
+
+def pack_state(state: State) -> bytes:
+    """A learned state as bytes, not deflated: probabilities rounded, counts at most TRUST."""
     counts = np.minimum(state.slots[:, 2], TRUST).astype(np.uint8)
-    logits[counts == 0] = 128
+    logits = _logits(state.slots)
     sections = [
         logits,
         counts,

@@ -134,7 +134,7 @@ def sign_work(
 def octaves(value: int, two: int, log: Sequence) -> int:
     """The logarithm of an integer's magnitude, with its sign; of its index with two quantisers."""
     magnitude = (abs(value) + 1) >> 1 if two else abs(value)
-    size = log[min(magnitude, MAX_MAGNITUDE)]
+    size = int(log[min(magnitude, MAX_MAGNITUDE)])
     return -size if value < 0 else size
 
 

@@ -251,7 +251,8 @@ def _transformed_integers(
     integers = decode_integers(body, shape, table, coder=settings.coder, trellis=settings.trellis)
     residual = None
     if stream.residual is not None:
-        residual = decode_integers(stream.residual, shape, single_band(shape))
+        table = single_band(shape)
+        residual = decode_integers(stream.residual, shape, table, coder=settings.residual_coder)
     _check_digest(stream, integers, residual)
     return integers, transform, residual
 

@@ -28,7 +28,16 @@ _REQUIRED = frozenset({"transform", "step", "center", "range"})
 """Keys of settings that have no default."""
 _SWITCHES = ("double", "clip", "labels", "many_labels", "trellis")
 """Keys of settings that are true or false."""
-_KEYS = _REQUIRED | {"offsets", "quantum", "head", "mask", "predictor", "coder", *_SWITCHES}
+_KEYS = _REQUIRED | {
+    "offsets",
+    "quantum",
+    "head",
+    "mask",
+    "predictor",
+    "coder",
+    "residual_coder",
+    *_SWITCHES,
+}
 """All keys of settings."""
 _LISTS = "range is [low, high] and offsets are three whole numbers, six with trellis"
 """Message for a range or offsets that are no lists."""
@@ -59,6 +68,7 @@ class TileSettings:
         labels: whether tiles may be coded as labels, without loss.
         many_labels: whether such tiles may have 65,536 labels instead of 256; needs `labels`.
         coder: model by which coefficients are coded; see `CODERS` in entropy/coder.py.
+        residual_coder: model by which the residual is coded.
         trellis: whether coefficients are quantised by two quantisers in turn (entropy/trellis.py).
             Integers are then in steps, of which each quantiser has every other one. Needs a coder
             other than "contexts".
@@ -78,7 +88,8 @@ class TileSettings:
     clip: bool = False
     labels: bool = False
     many_labels: bool = False
-    coder: str = "contexts"
+    coder: str = CODERS[0]
+    residual_coder: str = CODERS[0]
     trellis: bool = False
 
     def __post_init__(self) -> None:
@@ -99,8 +110,10 @@ class TileSettings:
                 f"offsets are {self.offsets!r:.60}; {'six' if self.trellis else 'three'} whole "
                 f"numbers within +-{OFFSET_UNIT} are needed"
             )
-        if self.coder not in CODERS:
-            raise InputError(f"coder is {self.coder!r:.40}; known: {', '.join(CODERS)}")
+        for name in ("coder", "residual_coder"):
+            if getattr(self, name) not in CODERS:
+                known = ", ".join(CODERS)
+                raise InputError(f"{name} is {getattr(self, name)!r:.40}; known: {known}")
         if self.trellis and self.coder == CODERS[0]:
             raise InputError(f"trellis needs a coder other than {CODERS[0]}")
         if self.head is not None and self.double:
@@ -124,8 +137,8 @@ class TileSettings:
             "clip": self.clip,
             "labels": self.labels,
             "many-labels": self.many_labels,
-            "coder-signs": self.coder == "signs",
-            "coder-linear": self.coder == "linear",
+            "coder-signs": "signs" in (self.coder, self.residual_coder),
+            "coder-linear": "linear" in (self.coder, self.residual_coder),
             "trellis": self.trellis,
         }
         return tuple(name for name, is_used in used.items() if is_used)
@@ -156,8 +169,9 @@ class TileSettings:
             result["labels"] = True
         if self.many_labels:
             result["many_labels"] = True
-        if self.coder != CODERS[0]:
-            result["coder"] = self.coder
+        for name in ("coder", "residual_coder"):
+            if getattr(self, name) != CODERS[0]:
+                result[name] = getattr(self, name)
         if self.trellis:
             result["trellis"] = True
         return result
@@ -190,6 +204,7 @@ class TileSettings:
             offsets=tuple(offsets),
             **switches,
             coder=values.get("coder", CODERS[0]),
+            residual_coder=values.get("residual_coder", CODERS[0]),
             quantum=values.get("quantum", 0.0),
             head=None if head is None else NeighbourHead.from_bytes(head),
             mask=None if mask is None else MaskLevels.from_dict(mask),

@@ -10,7 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from fhash_formats.transform.entropy import prior
-from fhash_formats.transform.entropy.coder import decode_block, encode_block, encode_integers
+from fhash_formats.transform.entropy.coder import (
+    CODERS,
+    decode_block,
+    encode_block,
+    encode_integers,
+)
 from fhash_formats.transform.entropy.prior import blank_state, pack_prior
 from fhash_formats.transform.entropy.table import single_band
 
@@ -53,6 +58,44 @@ def test_a_packed_prior_is_a_state(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     off = np.abs(logit(again.slots[seen, 0]) - exact)
     assert off[np.abs(exact) < 10].max() < 1 / 12
     assert prior.prior_state.__wrapped__().slots.flags.writeable is False
+
+
+def test_packed_priors_of_the_linear_coders_are_their_state() -> None:
+    state = prior.prior_state("linear").copy()
+    encode_integers(make(), single_band(SHAPE), state=state, coder="linear")
+    again = blank_state("linear")
+    prior.unpack_signs(prior.pack_signs(state), again)
+    numbers = prior._unpack_numbers(prior.pack_linear(state))
+    assert (
+        again.weights[prior.BASE_WEIGHTS : prior.SIGN_END]
+        == state.weights[prior.BASE_WEIGHTS : prior.SIGN_END]
+    ).all()
+    assert (numbers == state.weights[prior.SIGN_END :]).all()
+    assert again.slots[prior.SLOTS :, 2].max() == prior.TRUST
+    seen = state.slots[prior.SLOTS :, 2] > 0
+    exact = logit(state.slots[prior.SLOTS :, 0][seen].clip(2, 65534))
+    off = np.abs(logit(again.slots[prior.SLOTS :, 0][seen]) - exact)
+    assert off[np.abs(exact) < 10].max() < 1 / 12
+
+
+@pytest.mark.parametrize("coder", ["signs", "linear"])
+def test_numbers_of_the_linear_coders_are_within_their_types(coder: str) -> None:
+    state = prior.prior_state(coder)
+    weights = state.weights[prior.BASE_WEIGHTS :]
+    assert len(weights) == len(blank_state(coder).weights) - prior.BASE_WEIGHTS
+    assert weights.min() >= -32767
+    assert weights[: prior.SIGN_END - prior.BASE_WEIGHTS].max() <= 32767
+    assert weights.max() <= 131071
+
+
+@pytest.mark.parametrize("coder", CODERS)
+def test_both_quantisers_begin_alike(coder: str) -> None:
+    plain, two = prior.prior_state(coder), prior.prior_state(coder, trellis=True)
+    assert len(plain.weights) == len(two.weights)
+    contexts = sum(prior.SIZES) * prior.DECISIONS
+    for state in (plain, two):
+        slots = state.slots[:contexts].reshape(-1, prior.DECISIONS, 4)
+        assert (slots[:, 14:] == slots[:, :2]).all() == (state is two)
 
 
 def logit(p: NDArray[Any]) -> NDArray[np.float64]:

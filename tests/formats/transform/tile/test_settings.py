@@ -22,6 +22,7 @@ from fhash_formats.transform.tile.settings import TileSettings
         {"mask": MaskLevels(), "quantum": 0.0},
         {"clip": True},
         {"coder": "signs"},
+        {"residual_coder": "linear"},
         {"coder": "linear", "trellis": True, "offsets": (-5, -1, 0, 0, 1, -128)},
         {"coder": "signs", "trellis": True, "offsets": (0,) * 6},
     ],
@@ -52,6 +53,7 @@ def test_defaults_are_left_out_of_json() -> None:
         ({"coder": "signs", "trellis": True}, "six whole numbers"),
         ({"coder": "sign"}, "coder is 'sign'; known: contexts, signs, linear"),
         ({"coder": 1}, "coder is 1"),
+        ({"residual_coder": "no"}, "residual_coder is 'no'; known: contexts, signs, linear"),
         ({"trellis": True, "offsets": (0,) * 6}, "trellis needs a coder"),
     ],
 )
@@ -89,5 +91,6 @@ def test_features_name_what_a_reader_must_support() -> None:
     assert SETTINGS.features == ()
     assert replace(SETTINGS, mask=MaskLevels()).features == ("mask",)
     assert replace(SETTINGS, coder="signs").features == ("coder-signs",)
+    assert replace(SETTINGS, residual_coder="linear").features == ("coder-linear",)
     two = replace(SETTINGS, coder="linear", trellis=True, offsets=(0,) * 6)
     assert two.features == ("coder-linear", "trellis")
