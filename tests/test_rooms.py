@@ -89,11 +89,12 @@ LONG_ON_PURPOSE = {
 
 WITHOUT_MIRROR: dict[str, str] = {
     "fhash_codec.compact.attempt": "records of the stages: compact/test_stages.py",
-    "fhash_codec.compact.choices.head_samples": "inputs of choices/test_head_training.py",
     "fhash_codec.compact.choices.head_network_portable": "twin: choices/test_head_network.py",
     "fhash_codec.rendering.picture.plan": "a record: picture/test_planning.py, test_explain.py",
     "fhash_codec.selftest.checks.properties": "a list of checks: selftest/test_runner.py",
     "fhash_formats.transform.entropy.coder_portable": "held against the C++: test_coder.py",
+    "fhash_formats.transform.entropy.magnitudes_portable": "held against the C++: test_coder.py",
+    "fhash_formats.transform.entropy.signs_portable": "held against the C++: test_coder.py",
     "fhash_formats.transform.entropy.labels_portable": "held against the C++: test_labels.py",
     "fhash_formats.transform.entropy.mask_portable": "held against the C++: test_mask.py",
     "fhash_formats.transform.entropy.predict_portable": "held against the C++: test_predict.py",

@@ -19,6 +19,7 @@ from fhash_codec.compact.choices.fillings import choose_filling
 from fhash_codec.compact.choices.head import choose_head
 from fhash_codec.compact.choices.mask import mask_levels
 from fhash_codec.compact.choices.predictor import choose_predictor
+from fhash_codec.compact.choices.quantiser import allows_trellis, off_trellis, on_trellis
 from fhash_codec.compact.choices.step import find_step, require_reach, with_step
 from fhash_codec.compact.choices.transform import choose_transform, refit, usual_transform
 from fhash_codec.compact.tiles.blocks import Blocks
@@ -63,6 +64,8 @@ MIN_HEAD_EFFORT = 5
 """Least effort that trains a head."""
 SAMPLE_WHY = "tiles on which the choices are tried"
 """Reason for the stage that reads and fills a sample."""
+HEAD_TRIES = 3
+"""Trials of the step with a head: the search begins within some hundredths of a dB of its end."""
 REFITS = 3
 """Times that the data's own bases are made anew for another step."""
 SAME_STEP = 0.1
@@ -162,7 +165,13 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 
 
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Choose the step that keeps the promise, and fit the data's own bases to it."""
+    """Choose the step that keeps the promise, and fit the data's own bases to it.
+
+    From here on the trellis takes the place of the plain quantiser.
+    """
+    if allows_trellis(attempt.settings, task.goal, task.config.effort):
+        settings, coding = on_trellis(attempt.settings, attempt.coding)
+        attempt = replace(attempt, settings=settings, coding=coding)
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
         return _searched_step(task, attempt)
 
@@ -199,8 +208,11 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
         skip("head", reason)
         return attempt
 
-    def find(settings: TileSettings, tried: list[Outcome]) -> tuple[TileSettings, Outcome]:
-        return find_step(attempt.sample, settings, attempt.coding, goal, tries=4, tried=tried)
+    def find(settings: TileSettings) -> tuple[TileSettings, Outcome]:
+        return find_step(attempt.sample, settings, attempt.coding, goal, tries=HEAD_TRIES)
+
+    def look(settings: TileSettings) -> Outcome:
+        return attempt.sample.run(settings, goal.bounded(attempt.coding))
 
     settings, outcome, history = choose_head(
         attempt.sample,
@@ -208,6 +220,7 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
         attempt.outcome,
         attempt.coding,
         find,
+        look,
         attempt.tried,
         strict=goal.error is not None,
         data_range=goal.data_range,
@@ -262,6 +275,8 @@ def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
         )
     outcome = replace(attempt.outcome, size=size)
     kept = settings.predictor is not None
+    if kept and settings.trellis:
+        settings, _ = off_trellis(settings, attempt.coding)  # no tile has coefficients
     task.gains.note("prediction" if kept else "prediction (left out)", outcome)
     return replace(attempt, settings=settings, outcome=outcome)
 

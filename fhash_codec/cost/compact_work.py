@@ -11,18 +11,18 @@ from dataclasses import dataclass
 from math import prod
 
 from fhash_codec.compact.choices.head import (
-    EFFORTS,
-    GAIN_BESIDES,
-    GAIN_FACTOR,
     MIN_BYTES,
     MIN_GAIN,
-    PERCEPTRON,
-    PERCEPTRON_LONGER,
+    NEAR_GAIN,
     TRAINING_VERTICES,
+)
+from fhash_codec.compact.choices.head_prospects import (
+    EFFORTS,
     TRIAL_BUDGET,
+    TRIAL_HEAD,
     Budget,
-    best_widths,
-    most_saved,
+    expected_gain,
+    likely_heads,
 )
 from fhash_codec.compact.choices.labels import is_hopeless
 from fhash_codec.compact.choices.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
@@ -42,13 +42,15 @@ from fhash_codec.cost.compact_probe import Look, Rates
 from fhash_codec.cost.head_probe import HeadProbe, updates_of
 from fhash_codec.measure.ssim import ssim_steps
 from fhash_formats.support.threads import usable_threads
-from fhash_formats.transform.head.inputs import CROSS, INPUTS
+from fhash_formats.transform.head.inputs import CROSS
 from fhash_formats.transform.tile.sections import Shape
 
 __all__ = ["stage_seconds"]
 
 TRIES = 2.5
 """Trials of a search for the step of a PSNR."""
+HEAD_TRIES = 1.5
+"""Trials of that search with the head that is kept, after the one by which heads are compared."""
 NEAR_TRIES = 1.5
 """Trials of that search where it begins near its end: for another tile, or the same sample."""
 TRIAL_SHARE = 0.8
@@ -191,8 +193,6 @@ def _choices(work: _Work) -> dict[str, float]:
     usual = NEAR_TRIES if searched == tried and config.effort > 1 else TRIES
     tries = work.tries(usual + (REFIT_TRIES if rates.has_bases else 0))
     seconds["step"] = tries * once
-    if rates.has_bases:
-        seconds["bases"] = seconds.get("bases", 0.0) + 2 * 3 * rates.basis * work.vertices
     return seconds
 
 
@@ -224,33 +224,28 @@ def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
     gain = GAIN_AFTER * head.gain_db
     if gain < MIN_GAIN:
         return seconds
-    expected = GAIN_FACTOR * gain + GAIN_BESIDES
-    widths = best_widths(size, expected, EXCHANGE, config.effort)
-    if widths is None and most_saved(size, expected, EXCHANGE) <= 0:
+    shapes = likely_heads(size, expected_gain(gain), EXCHANGE, config.effort)
+    if not shapes:
         return seconds
-    budget = EFFORTS[config.effort].budget
-    search = work.tries(TRIES) * work.wall(rates.search + head.final, tile, searched)
-    single = work.tries(TRIES) * searched * prod(tile) * (rates.search + head.final)
-    perceptron = _training(
-        head, budget.times(PERCEPTRON_LONGER), _products(PERCEPTRON.widths, 1) / _USUAL, 1 / 3
-    )
-    parts = [perceptron]
-    if widths:
-        parts.append(_training(head, budget, _products(widths, len(CROSS)) / _USUAL, 1.0))
-    # Each training takes one thread; the searches take turns on all of them.
+    spent = EFFORTS[config.effort]
+    parts = [
+        _training(
+            head,
+            spent.budget_of(shape),
+            shape.products / TRIAL_HEAD.products,
+            1.0 if shape.cross else 1 / len(CROSS),
+        )
+        for shape in shapes
+    ]
+    # Each training takes one thread.
     alone = max(max(parts), sum(parts) / threads)
-    wider = work.wall(rates.search, tile, work.tiles(tile, TRAINING_VERTICES))
-    searches = min(len(parts) * search, len(parts) * single / threads + search)
-    return seconds | {"head": wider + alone + searches}
-
-
-def _products(widths: tuple[int, int], looked_at: int) -> float:
-    """Multiplications of a network for a voxel."""
-    first, second = widths
-    return looked_at * (INPUTS * first + first * second) + second
-
-
-_USUAL = _products((8, 8), len(CROSS))
+    again = gain > NEAR_GAIN or searched < work.tiles(tile)
+    wider = work.wall(rates.search, tile, work.tiles(tile, TRAINING_VERTICES)) if again else 0.0
+    strict = bool(look.task.goal.error)
+    looks = 0 if strict and len(shapes) == 1 else len(shapes)
+    tries = looks + work.tries(HEAD_TRIES)
+    search = tries * work.wall(rates.search + head.final, tile, searched)
+    return seconds | {"head": wider + alone + search}
 
 
 def _training(head: HeadProbe, budget: Budget, work: float, sampling: float) -> float:

@@ -16,7 +16,7 @@ from fhash_formats.native import ARRAY, INTEGER, REAL, Prototypes, load_library
 
 __all__ = ["ABI_VERSION", "PROTOTYPES", "library"]
 
-ABI_VERSION = 3
+ABI_VERSION = 4
 """Number that `fhash_codec_abi_version()` must return; it equals `FHASH_CODEC_ABI` in codec.cpp."""
 
 _KINDS = ("f32", "f64")
@@ -51,6 +51,11 @@ PROTOTYPES: Prototypes = {
     **{f"fhash_histogram_{kind}": _HISTOGRAM for kind in _KINDS},
     **{f"fhash_ssim_{kind}": _SSIM for kind in _KINDS},
     "fhash_magnitudes": (ARRAY, INTEGER, INTEGER, ARRAY, ARRAY),
+    # head_inputs.cpp
+    "fhash_head_inputs": (
+        *(*(ARRAY,) * 4, INTEGER, ARRAY, ARRAY, INTEGER),
+        *(*(REAL,) * 4, ARRAY),
+    ),
     # train_head.cpp
     "fhash_head_learn": (*(ARRAY,) * 10, INTEGER, INTEGER, INTEGER),
     "fhash_head_errors": (*(ARRAY,) * 6, INTEGER, ARRAY),

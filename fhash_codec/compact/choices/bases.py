@@ -6,7 +6,7 @@ small file they are a fifth of it; a head also corrects what they leave.
 
 from __future__ import annotations
 
-from fhash_codec.compact.choices.head import octave
+from fhash_codec.compact.choices.head import octave_gain
 from fhash_codec.compact.choices.step import find_step
 from fhash_codec.compact.choices.transform import basis_bytes, refit
 from fhash_codec.compact.goal import Goal
@@ -49,7 +49,7 @@ def coarser_bases(
             if goal.error is None:
                 # The rest of the difference in quality between the two searches, in bytes.
                 missing = outcome.psnr(goal.data_range) - new.psnr(goal.data_range)
-                cost += outcome.size * (2 ** (missing / octave(tried, goal.data_range)) - 1)
+                cost += outcome.size * (2 ** (missing / octave_gain(tried, goal.data_range)) - 1)
             if cost >= lowest:
                 break
             best, lowest = (found, new), cost

@@ -1,7 +1,11 @@
-"""Training samples of the neighbourhood head: voxels drawn from decoded tiles. numpy only."""
+"""Training samples of the neighbourhood head: voxels drawn from decoded tiles.
+
+Native code (fhash_codec/native/head_inputs.cpp) and numpy compute the same inputs.
+"""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -9,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec import native
 from fhash_formats.transform.head.head_portable import centre_inputs, clip, compress
 from fhash_formats.transform.head.inputs import INPUTS, OFFSETS
 
@@ -144,10 +149,9 @@ def batches(
     inputs = np.empty((count * blocks, INPUTS, len(offsets), BLOCK_VOXELS), dtype=np.int16)
     first = 0
     for pair, voxels in zip(pairs, drawn, strict=True):
-        for piece in _inputs(pair.decoded, voxels.places, offsets, value_range):
-            block, slot = np.divmod(order[first : first + piece.shape[2]], BLOCK_VOXELS)
-            inputs[block, :, :, slot] = piece.transpose(2, 0, 1)
-            first += piece.shape[2]
+        slots = order[first : first + len(voxels.values)]
+        _fill_slots(inputs, slots, pair.decoded, voxels.places, offsets, value_range)
+        first += len(slots)
 
     def batched(unordered: npt.NDArray[np.float64]) -> Integers:
         shuffled = np.empty_like(unordered)
@@ -164,6 +168,53 @@ def batches(
     )
 
 
+def _fill_slots(
+    inputs: npt.NDArray[np.int16],
+    slots: npt.NDArray[np.int64],
+    decoded: Floats,
+    places: npt.NDArray[np.int64],
+    offsets: Sequence[tuple[int, ...]],
+    value_range: ErrorRange,
+) -> None:
+    """Write the inputs of voxels of a tile into their slots.
+
+    inputs: of all voxels, (blocks, INPUTS, offsets, BLOCK_VOXELS).
+    slots: number of each of the n voxels of this tile among all voxels.
+    places: coordinates (4, n) of the voxels.
+    """
+    library = native.library()
+    if library is None:
+        first = 0
+        for piece in _inputs(decoded, places, offsets, value_range):
+            block, slot = np.divmod(slots[first : first + piece.shape[2]], BLOCK_VOXELS)
+            inputs[block, :, :, slot] = piece.transpose(2, 0, 1)
+            first += piece.shape[2]
+        return
+    inverse, unit = _scales(value_range)
+    arrays: tuple[npt.NDArray[Any], ...] = (
+        np.ascontiguousarray(decoded, dtype=np.float32),
+        np.array(decoded.shape, np.int64),
+        np.ascontiguousarray(places, np.int64),
+        np.ascontiguousarray(slots, np.int64),
+        np.array(OFFSETS, np.int64),
+        np.array(offsets, np.int64),
+    )
+    tile, shape, at, to, neighbours, seen = (ctypes.c_void_p(each.ctypes.data) for each in arrays)
+    code = library.fhash_head_inputs(
+        *(tile, shape, at, to, len(slots), neighbours, seen, len(offsets)),
+        *(float(value_range.low), float(value_range.high), float(inverse), float(unit)),
+        ctypes.c_void_p(inputs.ctypes.data),
+    )
+    assert code == 0, "offsets within the reach of a head"
+
+
+def _scales(value_range: ErrorRange) -> tuple[np.float32, np.float32]:
+    """Return 1 / (2 sigma), which scales differences, and 1024 over the length of the range."""
+    span = value_range.high - value_range.low
+    unit = np.float32(1024) / span if span > 0 else np.float32(0)
+    return np.float32(0.5) / value_range.sigma, unit
+
+
 def _inputs(
     decoded: Floats,
     places: npt.NDArray[np.int64],
@@ -177,8 +228,7 @@ def _inputs(
     places: coordinates (4, n) of the voxels.
     """
     low, high = value_range.low, value_range.high
-    inverse, span = np.float32(0.5) / value_range.sigma, high - low
-    unit = np.float32(1024) / span if span > 0 else np.float32(0)
+    inverse, unit = _scales(value_range)
     padded = np.pad(clip(decoded, low, high), ((1, 1), (2, 2), (2, 2), (2, 2)), mode="edge")
     flat, strides = padded.ravel(), np.array(padded.strides) // padded.itemsize
     origin = int(strides @ np.array((1, 2, 2, 2)))

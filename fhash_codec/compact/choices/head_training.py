@@ -31,8 +31,8 @@ from fhash_formats.transform.head.inputs import CROSS
 
 __all__ = ["TrainedHead", "train_head"]
 
-RATE = 1e-2
-"""Highest learning rate."""
+Doubles = npt.NDArray[np.float64]
+
 WARM_UP = 0.1
 """Share of the schedule in which the learning rate rises."""
 ROUNDED_FROM = 0.6
@@ -67,6 +67,7 @@ def train_head(
     high: float,
     updates: int,
     samples: int,
+    rate: float = 1e-2,
     hidden: tuple[int, int] = (12, 8),
     cross: bool = False,
     seed: int = 0,
@@ -81,6 +82,7 @@ def train_head(
     low, high: range that decoded values are clipped to.
     updates: number of training updates, 1 or more.
     samples: approximate number of voxels to learn from; a fifth as many measure the gain.
+    rate: highest learning rate.
     hidden: widths of the hidden layers.
     cross: whether the head looks at the hidden values of neighbours, see `NeighbourHead`.
     progress: called with the share of the training that is done, 0 to 1, after every few updates.
@@ -103,7 +105,7 @@ def train_head(
         batches(pairs, drawn, offsets, random, value_range) for drawn in (learned, tested)
     )
     networks = [Network(hidden, len(offsets), random) for _ in range(STARTS)]
-    history, network = _optimise(networks, training, held_out, updates, progress)
+    history, network = _optimise(networks, training, held_out, _rates(updates, rate), progress)
     head = NeighbourHead(
         layers=network.layers(),
         sigma=float(sigma),
@@ -132,15 +134,18 @@ def _optimise(
     networks: list[Network],
     training: Batches,
     held_out: Batches,
-    updates: int,
+    rates: Doubles,
     progress: Callable[[float], None] | None,
 ) -> tuple[list[tuple[float, int, float]], Network]:
     """Train networks, from some update on only the best; return its gains on the way and it.
 
     The gains are tuples (seconds, update, dB).
+
+    rates: learning rate of each update.
     """
     history: list[tuple[float, int, float]] = []
-    rates, roots = adam_factors(_rates(updates))
+    updates = len(rates)
+    factors, roots = adam_factors(rates)
     chosen, unrounded = (
         max(1, math.ceil(CHOSEN_AT * updates) - 1),
         math.floor(ROUNDED_FROM * updates),
@@ -153,7 +158,7 @@ def _optimise(
             network.learn(
                 training,
                 done + 1,
-                rates[done:pause],
+                factors[done:pause],
                 roots[done:pause],
                 as_in_file=done >= unrounded,
             )
@@ -169,7 +174,7 @@ def _optimise(
     return history, networks[0]
 
 
-def _rates(updates: int) -> npt.NDArray[np.float64]:
+def _rates(updates: int, highest: float) -> Doubles:
     """Return the learning rate of each update: a linear rise, then a smooth fall to 0.
 
     The fall is the cubic 1 - f**2 (3 - 2 f), within 0.01 of a half cosine. The last bit of a
@@ -177,7 +182,7 @@ def _rates(updates: int) -> npt.NDArray[np.float64]:
     """
     share = np.arange(1, updates + 1) / updates
     fall = np.maximum(share - WARM_UP, 0) / (1 - WARM_UP)
-    return RATE * np.where(share < WARM_UP, share / WARM_UP, 1 - fall * fall * (3 - 2 * fall))
+    return highest * np.where(share < WARM_UP, share / WARM_UP, 1 - fall * fall * (3 - 2 * fall))
 
 
 def _gain(network: Network, held_out: Batches, *, as_in_file: bool) -> float:

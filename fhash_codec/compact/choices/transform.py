@@ -15,6 +15,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.choices.quantiser import plain_step
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.stage_clock import stage
@@ -26,6 +27,8 @@ from fhash_formats.transform.tile.settings import TileSettings
 Result = TypeVar("Result")
 Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
 """Transforms along (t, z, y, x)."""
+Gram = npt.NDArray[np.float64]
+"""Products of lines (length, length)."""
 NONE = AxisTransform(kind="none")
 """Marks an axis without a transform."""
 MAX_BASIS_LENGTH = 128
@@ -37,6 +40,8 @@ PLANE_WAVELETS = (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3), (
 """
 LINE_WAVELETS = (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3), ("5/3", 1))
 """Kinds and depths tried along t and along z."""
+MATRICES_AT_ONCE = 64
+"""Matrices of lines whose products are held at once."""
 ERROR_PRICE = 0.8
 """Squared error in squared steps that is worth a byte."""
 BASIS_TEXT = 1.03
@@ -48,9 +53,12 @@ class TileSample(Protocol):
 
     Attributes:
         tiles: the tiles, all of one shape.
+        grams: products of the lines of all tiles, by axis and centre, once they were computed:
+            bases for other steps are fitted to them again.
     """
 
     tiles: list[Tile]
+    grams: dict[tuple[int, float], Gram]
 
     @property
     def allows_bases(self) -> bool:
@@ -277,19 +285,29 @@ class _Bases:
 
         A direction that the basis drops cannot be restored by any coefficient.
         """
-        length = self._sample.tiles[0].values.shape[axis]
-        gram = np.zeros((length, length))
-        for tile_gram in self._sample.map_all(lambda tile: self._gram(tile.values, axis)):
-            gram += tile_gram
-        return fit_basis(gram, self._settings.step)
+        grams, key = self._sample.grams, (axis, self._settings.center)
+        if key not in grams:
+            length = self._sample.tiles[0].values.shape[axis]
+            gram = np.zeros((length, length))
+            for tile_gram in self._sample.map_all(lambda tile: self._gram(tile.values, axis)):
+                gram += tile_gram
+            grams[key] = gram
+        return fit_basis(grams[key], plain_step(self._settings))
 
-    def _gram(self, values: npt.NDArray[np.generic], axis: int) -> npt.NDArray[np.float64]:
+    def _gram(self, values: npt.NDArray[np.generic], axis: int) -> Gram:
         """Return the products of the lines of a tile along an axis, (length, length)."""
         # Values that do not count are kept: zeroing them would create an edge that dominates.
         centred = values.astype(np.float64) - self._settings.center
         centred[~np.isfinite(centred)] = 0.0
-        columns = np.moveaxis(centred, axis, 0).reshape(values.shape[axis], -1)
-        return columns @ columns.T
+        length = values.shape[axis]
+        lines = centred.reshape(math.prod(values.shape[:axis]), length, -1)
+        if lines.shape[2] == 1:
+            last: Gram = lines[:, :, 0].T @ lines[:, :, 0]
+            return last
+        gram = np.zeros((length, length))
+        for matrices in np.array_split(lines, -(-len(lines) // MATRICES_AT_ONCE)):
+            gram += np.matmul(matrices, matrices.transpose(0, 2, 1)).sum(axis=0)
+        return gram
 
 
 class _CountedBases(_Bases):

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from math import prod
 from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +19,9 @@ from fhash_formats.support.threads import map_ahead
 from fhash_formats.transform.tile.settings import TileSettings
 
 Result = TypeVar("Result")
-
+Grams = dict[tuple[int, float], npt.NDArray[np.float64]]
+"""Products of lines by axis and centre."""
+_grams: WeakKeyDictionary[Blocks, Grams] = WeakKeyDictionary()
 
 GOLDEN_RATIO = 0.6180339887498949
 """Fractional part of the golden ratio: its multiples modulo 1 are spread evenly."""
@@ -67,6 +70,8 @@ class Sample:
         weights: number of tiles of the series that each of them stands for.
         complete: whether the sample has all tiles with vertices that count.
         counted: approximate number of vertices that count in the series.
+        grams: products of lines of all tiles of the series, see `choices.transform.TileSample`;
+            samples of the same grid share them.
     """
 
     def __init__(
@@ -97,6 +102,7 @@ class Sample:
         self.complete = count == len(indices)
         self.counted = sum(weight * tile.counted_vertices for _, tile, weight in tiles)
         self.blocks = blocks
+        self.grams = _grams.setdefault(blocks, {})
         self._pool, self._costs, self._source = pool, costs, self.tiles
         self._filling: tuple[TileSettings, int] | None = None
         self.tick = tick

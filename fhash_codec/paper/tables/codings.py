@@ -20,7 +20,12 @@ from math import prod
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.choices.transform import Result, choose_transform, usual_transform
+from fhash_codec.compact.choices.transform import (
+    Gram,
+    Result,
+    choose_transform,
+    usual_transform,
+)
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, OFFSETS, WEIGHT, Coding, Outcome, code
 from fhash_codec.paper.architecture import Architecture
@@ -211,6 +216,7 @@ class _Trials:
         counts = [int(np.count_nonzero(table.needed(region))) for region in self._regions]
         self._complete = sum(counts) == prod(table.shape[:4])
         self.tiles = [self._tile(self._regions[counts.index(max(counts))])]
+        self.grams: dict[tuple[int, float], Gram] = {}
 
     @property
     def allows_bases(self) -> bool:

@@ -30,11 +30,14 @@ KNOWN_FEATURES = frozenset(
         "apart",
         "clip",
         "coded-occupancy",
+        "coder-linear",
+        "coder-signs",
         "cross",
         "labels",
         "many-labels",
         "mask",
         "predictor",
+        "trellis",
         ULPS_FEATURE,
     }
 )

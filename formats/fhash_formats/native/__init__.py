@@ -33,7 +33,7 @@ __all__ = [
     "load_library",
 ]
 
-ABI_VERSION = 8
+ABI_VERSION = 9
 """Number that `fhash_abi_version()` must return; it equals `FHASH_ABI` in core.hpp."""
 
 ARRAY = ctypes.c_void_p
@@ -52,9 +52,11 @@ _SIZED = (ARRAY, INTEGER)
 _STATE = _SIZED * 3
 """Slots, weights and simple estimates of an adaptive coder (`State`), each with its length."""
 _TRANSFORM = (ARRAY,) * 9
-_HEAD = (ARRAY, *(INTEGER,) * 5, *(ARRAY,) * 4, *(FLOAT,) * 4, ARRAY)
+_HEAD = (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, INTEGER, ARRAY)
 _QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
-_DEQUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, REAL, ARRAY)
+_DEQUANTISE = (ARRAY, INTEGER, REAL, ARRAY, ARRAY)
+_TRELLIS = (*(ARRAY,) * 3, INTEGER, *(ARRAY,) * 3)
+_TRELLIS_COUNT = (*(ARRAY,) * 3, INTEGER, *(ARRAY,) * 2)
 _WITHIN = (ARRAY, ARRAY, ARRAY, INTEGER, REAL)
 _CLIP = (ARRAY, INTEGER, REAL, REAL, REAL)
 _FREE = (ARRAY, ARRAY, ARRAY, INTEGER, REAL, REAL)
@@ -65,8 +67,19 @@ _PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
 
 PROTOTYPES: Prototypes = {
     # coder.cpp
-    "fhash_encode": (ARRAY, ARRAY, REAL, ARRAY, *_SIZED, *_STATE, INTEGER, *_SIZED),
-    "fhash_decode": (ARRAY, ARRAY, *_SIZED, *_STATE, *_SIZED),
+    "fhash_encode": (
+        ARRAY,
+        ARRAY,
+        REAL,
+        INTEGER,
+        INTEGER,
+        ARRAY,
+        *_SIZED,
+        *_STATE,
+        INTEGER,
+        *_SIZED,
+    ),
+    "fhash_decode": (ARRAY, INTEGER, INTEGER, ARRAY, *_SIZED, *_STATE, *_SIZED),
     # mask.cpp
     "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
     "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),
@@ -83,10 +96,13 @@ PROTOTYPES: Prototypes = {
     **{f"fhash_transform_inverse_{kind}": _TRANSFORM for kind in _TYPES},
     # head.cpp
     "fhash_head_apply": _HEAD,
-    "fhash_head_apply_cross": _HEAD,
     # quantise.cpp
     **{f"fhash_quantise_{kind}": _QUANTISE for kind in _TYPES},
     **{f"fhash_dequantise_{kind}": _DEQUANTISE for kind in _TYPES},
+    # trellis.cpp
+    "fhash_trellis_count": _TRELLIS_COUNT,
+    **{f"fhash_trellis_guess_{kind}": _TRELLIS_COUNT for kind in _TYPES},
+    **{f"fhash_trellis_choose_{kind}": _TRELLIS for kind in _TYPES},
     # values.cpp
     **{f"fhash_within_{kind}": _WITHIN for kind in _TYPES},
     **{f"fhash_clip_{kind}": _CLIP for kind in _TYPES},

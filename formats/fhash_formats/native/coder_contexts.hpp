@@ -17,11 +17,14 @@ const int CONTEXTS = 6, SIGN_CONTEXTS = 3;  // estimates of a magnitude, and of 
 const int LANES = 12, SET = padded(LANES);  // weights of a set: of the caller, and as kept here
 const int DECISIONS = 16;                   // slots of a context
 const int UNARY = 14;                       // magnitudes from this one on have an escape code
+const int SHARED = 2;  // decisions from this one on are one for both quantisers; those of class 1
+                       // before it have the slots and weights from UNARY on
 const int KINDS = 64;                       // kinds of bands
 const int LEVELS = 128;                     // quarter octaves of the expected magnitude
 const int SIGN_LIMIT = 255;                 // as SLOW_LIMIT, for signs
 const int MAX_MAGNITUDE = 4095;             // as contexts see it, so that sums stay in 32 bits
 const int PADDING = 2;                      // zeros beside a row of magnitudes
+const int LOG_PADDING = 4;                  // zeros beside a row of logarithms
 const int VECTOR = 16;  // sums over a row are made for a multiple of it; those beyond are not used
 
 // Columns of the table of bands (transform/entropy/table.py). LOW, HIGH and SHIFT are the first of
@@ -46,6 +49,7 @@ const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET, SIGNS = SECOND + 64 * D
 const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;
 
 enum Mode { ENCODE, DECODE, CHOOSE };  // CHOOSE encodes magnitudes chosen by rate and distortion
+enum Model { BY_CONTEXTS, BY_SIGNS, BY_LINEAR };  // what predicts, in the order of CODERS in coder.py
 
 // Class, 0 to 6, of a magnitude or of a sum of some. No table, so that the compiler makes vectors.
 FHASH_INLINE int seven(int v) { return (v > 0) + (v > 1) + (v > 2) + (v > 4) + (v > 6) + (v > 9); }
@@ -64,6 +68,17 @@ struct Classes {
 };
 const Classes classes;
 FHASH_INLINE int small(int v) { return classes.of[min(v, 141)]; }
+
+// State of the trellis that follows, by the lowest bit of the index; the class of a state is its
+// lowest bit.
+const uint8_t TRELLIS_NEXT[8][2] = {{0, 2}, {5, 7}, {1, 3}, {6, 4}, {2, 0}, {4, 6}, {3, 1}, {7, 5}};
+const int NO_TRELLIS = -3;  // an integer that the quantiser of its state does not have
+
+// The state after n zeros, which repeat after at most four.
+FHASH_INLINE int after_zeros(int state, int64_t n) {
+    for (n &= 3; n > 0; n--) state = TRELLIS_NEXT[state][0];
+    return state;
+}
 
 // 0 for a negative number, 1 for 0, 2 for a positive number.
 FHASH_INLINE int sign_of(int32_t v) { return v > 0 ? 2 : v < 0 ? 0 : 1; }
@@ -96,6 +111,7 @@ struct Band {
     int64_t stride[3];                 // of magnitudes, along t, z and y
     std::vector<uint16_t> magnitudes;  // rows with PADDING zeros at both ends
     std::vector<uint8_t> filled;       // by row: whether it has a magnitude above 0
+    std::vector<int16_t> logs;         // rows of logarithms, see coder_signs.hpp
     bool any;                          // whether the band has one
 };
 

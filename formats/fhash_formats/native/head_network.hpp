@@ -1,25 +1,20 @@
-// The network of the neighbourhood head, and its inputs from rows of voxels.
+// The network of the neighbourhood head as its kernels take it.
 //
-// Inputs and activations are integers held in floats, and their weighted sums stay below 2^24: each
-// sum is exact in any order, fused or not. All other operations are rounded one by one, in the
-// order written here.
+// Inputs and activations are integers of 16 bits, weights are integers of 6 bits, and a weighted
+// sum stays below 2^24: it is exact in any order, and as a float. All other operations are rounded
+// one by one.
 #pragma once
 
-#include <cstring>
+#include <memory>
+#include <new>
 
 #include "core.hpp"
-
-// Contraction is allowed again for `accumulate` only, whose sums are exact integers.
-#if defined(__GNUC__) && !defined(__clang__)
-#define EXACT_SUMS __attribute__((optimize("fp-contract=fast")))
-#else
-#define EXACT_SUMS
-#endif
+#include "head_lanes.hpp"
 
 namespace {
 
 constexpr std::int64_t BLOCK = 64;   // most voxels along x that are evaluated together
-constexpr std::int64_t LANES = 16;   // the voxels of a shorter block are a multiple of this
+constexpr std::int64_t GROUP = 16;   // the voxels of a shorter block are a multiple of this
 constexpr std::int64_t HALO = 2;     // the farthest neighbour along an axis
 constexpr std::int64_t INPUTS = 28;  // 26 neighbours, two functions of the centre
 constexpr std::int64_t NEIGHBOURS = INPUTS - 2;
@@ -27,8 +22,7 @@ constexpr std::int64_t MAX_WIDTH = 64;
 constexpr std::int64_t MAX_LAYERS = 4;
 constexpr std::int64_t CROSS = 9;             // a voxel, and the first 8 of the OFFSETS
 constexpr std::int64_t MAX_CROSS_WIDTH = 14;  // first-layer outputs that a cross may take
-constexpr float LIMIT = 4095.0F;              // largest magnitude of an input or activation
-constexpr int ONE_BITS = 0x3f800000, SIGN_BIT = static_cast<int>(0x80000000U);
+constexpr std::int64_t MAX_PAIRS = CROSS * MAX_CROSS_WIDTH / 2;  // of the inputs of a layer
 
 // Offsets along (t, z, y, x) to the neighbours, in the order of the inputs.
 constexpr int OFFSETS[NEIGHBOURS][4] = {
@@ -39,6 +33,7 @@ constexpr int OFFSETS[NEIGHBOURS][4] = {
     {0, 1, -1, 0},   {0, 1, 1, 0},
 };
 
+// A network as the caller gives it.
 struct Network {
     std::int64_t layers;
     const std::int64_t* widths;  // of the inputs, then of each layer: layers + 1 numbers
@@ -51,127 +46,64 @@ struct Range {
     float low, high, inverse, unit;  // inverse = 1 / (2 sigma); unit = 1024 / (high - low)
 };
 
-FHASH_INLINE int bits_of(float value) {
-    int bits;
-    std::memcpy(&bits, &value, sizeof bits);
-    return bits;
-}
-
-FHASH_INLINE float float_of(int bits) {
-    float value;
-    std::memcpy(&value, &bits, sizeof value);
-    return value;
-}
-
-// floor(512 log2(1 + |d|)) with the sign of d, at most 4095. The logarithm is linear between powers
-// of two.
-FHASH_INLINE float compressed(float d) {
-    const int sign = bits_of(d) & SIGN_BIT;
-    const float magnitude = float_of(bits_of(d) ^ sign);
-    int octaves = (bits_of(magnitude + 1.0F) - ONE_BITS) >> 14;
-    octaves = octaves < 4095 ? octaves : 4095;
-    return float_of(bits_of(static_cast<float>(octaves)) | sign);
-}
-
 // The position of a clipped value in the range, an integer in [-512, 512].
-FHASH_INLINE float position(float value, const Range& range) {
+FHASH_INLINE int position(float value, const Range& range) {
     const float place = (value - range.low) * range.unit + 0.5F;
-    return static_cast<float>(static_cast<int>(place < 1024.0F ? place : 1024.0F) - 512);
+    return static_cast<int>(place < 1024.0F ? place : 1024.0F) - 512;
 }
 
-FHASH_INLINE float clipped(float value, const Range& range) {
-    const float raised = value > range.low ? value : range.low;  // NaN becomes low
-    return raised < range.high ? raised : range.high;
-}
+// One layer for the kernels.
+struct Stage {
+    std::int64_t inputs = 0;   // pairs
+    std::int64_t outputs = 0;  // a multiple of `tile`; those that were added are 0
+    std::int64_t tile = 0;     // outputs that are summed together
+    float scale = 0.0F;
+    std::unique_ptr<std::int32_t[]> held;  // the weights
+    const std::int32_t* weights = nullptr;  // of each tile of outputs: (inputs, tile) pairs
+    float biases[MAX_WIDTH + 8] = {};
+};
 
-FHASH_CLONES void neighbour_inputs(const float* FHASH_RESTRICT row,
-                                   const float* FHASH_RESTRICT centre, float inverse,
-                                   std::int64_t groups, float* FHASH_RESTRICT inputs) {
-    for (std::int64_t i = 0; i < groups * LANES; ++i)
-        inputs[i] = compressed((row[i] - centre[i]) * inverse);
-}
+// The functions of head_kernels.hpp for one set of lanes.
+struct Kernels {
+    void (*first_inputs)(const float* const*, const float*, const Range&, std::int64_t,
+                         std::int32_t*);
+    void (*hidden_layer)(const std::int32_t* const*, const Stage&, std::int64_t, std::int32_t*,
+                         std::int64_t);
+    float (*last_layer)(const std::int32_t* const*, const Stage&, const float*, const Range&,
+                        std::int64_t, float*);
+    void (*correct_all)(const float*, float, const Range&, std::int64_t, float*);
+    int tile;  // most outputs that a hidden layer sums together
+};
 
-FHASH_CLONES void centre_inputs(const float* FHASH_RESTRICT centre, const Range& bounds,
-                                std::int64_t groups, float* FHASH_RESTRICT inputs) {
-    const Range range = bounds;
-    for (std::int64_t i = 0; i < groups * LANES; ++i) {
-        inputs[i] = position(centre[i], range);
-        inputs[BLOCK + i] = compressed((centre[i] - range.low) * range.inverse);
+// Fill a stage. repeats: how many times each input stands in the weights, one after the other:
+// CROSS for the second layer of a cross, whose pairs are of two inputs at the same place. last:
+// whether it is the last layer. False where memory ran out.
+inline bool make_stage(const float* weights, const float* biases, float scale, std::int64_t inputs,
+                       std::int64_t outputs, std::int64_t repeats, bool last, int most,
+                       Stage& stage) {
+    const std::int64_t tiles = (outputs + most - 1) / most;
+    stage.tile = last ? 1 : ((outputs + tiles - 1) / tiles + 1) / 2 * 2;
+    stage.outputs = (outputs + stage.tile - 1) / stage.tile * stage.tile;
+    const std::int64_t single = inputs / repeats, halves = (single + 1) / 2;
+    stage.inputs = halves * repeats;
+    stage.scale = scale;
+    stage.held.reset(new (std::nothrow) std::int32_t[stage.inputs * stage.outputs]());
+    if (!stage.held) return false;
+    stage.weights = stage.held.get();
+    for (std::int64_t o = 0; o < outputs; ++o) {
+        stage.biases[o] = biases[o];
+        std::int32_t* const tile = stage.held.get() + o / stage.tile * stage.tile * stage.inputs;
+        for (std::int64_t k = 0; k < repeats; ++k)
+            for (std::int64_t half = 0; half < halves; ++half) {
+                const float* const from = weights + o * inputs + k;
+                const int one = static_cast<int>(from[2 * half * repeats]);
+                const bool paired_up = 2 * half + 1 < single;
+                const int two =
+                    paired_up ? static_cast<int>(from[(2 * half + 1) * repeats]) : 0;
+                tile[(k * halves + half) * stage.tile + o % stage.tile] = paired(one, two);
+            }
     }
-}
-
-// sums[o] = sum over k of weights[o, k] * inputs[k], for the voxels of the groups.
-template <int OUTPUTS>
-FHASH_INLINE void accumulate_group(const float* FHASH_RESTRICT inputs, std::int64_t n,
-                                   const float* FHASH_RESTRICT weights, std::int64_t groups,
-                                   float* FHASH_RESTRICT sums) {
-    const std::int64_t count = groups * LANES;
-    for (int o = 0; o < OUTPUTS; ++o)
-        for (std::int64_t i = 0; i < count; ++i) sums[o * BLOCK + i] = 0.0F;
-    std::int64_t k = 0;
-    for (; k + 4 <= n; k += 4) {
-        const float* FHASH_RESTRICT in = inputs + k * BLOCK;
-        float w[OUTPUTS][4];
-        for (int o = 0; o < OUTPUTS; ++o)
-            for (int j = 0; j < 4; ++j) w[o][j] = weights[o * n + k + j];
-        for (std::int64_t i = 0; i < count; ++i) {
-            const float a = in[i], b = in[BLOCK + i], c = in[2 * BLOCK + i], d = in[3 * BLOCK + i];
-            for (int o = 0; o < OUTPUTS; ++o)
-                sums[o * BLOCK + i] = sums[o * BLOCK + i] + w[o][0] * a + w[o][1] * b +
-                                      w[o][2] * c + w[o][3] * d;
-        }
-    }
-    for (; k < n; ++k)
-        for (int o = 0; o < OUTPUTS; ++o)
-            for (std::int64_t i = 0; i < count; ++i)
-                sums[o * BLOCK + i] += weights[o * n + k] * inputs[k * BLOCK + i];
-}
-
-FHASH_CLONES EXACT_SUMS void accumulate(const float* inputs, std::int64_t n, const float* weights,
-                                        std::int64_t outputs, std::int64_t groups, float* sums) {
-    std::int64_t o = 0;
-    for (; o + 2 <= outputs; o += 2)
-        accumulate_group<2>(inputs, n, weights + o * n, groups, sums + o * BLOCK);
-    for (; o < outputs; ++o)
-        accumulate_group<1>(inputs, n, weights + o * n, groups, sums + o * BLOCK);
-}
-
-// Sums to activations: leaky, clipped, rounded half to even.
-FHASH_CLONES void activate(float* FHASH_RESTRICT values, float scale, float bias,
-                           std::int64_t groups) {
-    constexpr float ROUNDING = 12582912.0F;  // 1.5 * 2^23: adding and subtracting it rounds
-    for (std::int64_t i = 0; i < groups * LANES; ++i) {
-        const float p = values[i] * scale + bias;
-        // Computed for all: a product under a condition is not vectorised without masks.
-        const float less = 0.125F * p;
-        const float leaky = less > p ? less : p;
-        const float above = leaky > -LIMIT ? leaky : -LIMIT;
-        const float within = above < LIMIT ? above : LIMIT;
-        values[i] = (within + ROUNDING) - ROUNDING;
-    }
-}
-
-// The correction of the voxels; it lies in one of the two buffers.
-inline float* evaluate(const Network& network, std::int64_t groups, float* inputs,
-                       float* outputs) {
-    const float* weights = network.weights;
-    const float* biases = network.biases;
-    for (std::int64_t layer = 0; layer < network.layers; ++layer) {
-        const std::int64_t n = network.widths[layer], width = network.widths[layer + 1];
-        accumulate(inputs, n, weights, width, groups, outputs);
-        if (layer + 1 < network.layers)
-            for (std::int64_t o = 0; o < width; ++o)
-                activate(outputs + o * BLOCK, network.scales[layer], biases[o], groups);
-        else
-            for (std::int64_t i = 0; i < groups * LANES; ++i)
-                outputs[i] = outputs[i] * network.scales[layer] + biases[0];
-        weights += n * width;
-        biases += width;
-        float* const swapped = inputs;
-        inputs = outputs;
-        outputs = swapped;
-    }
-    return inputs;
+    return true;
 }
 
 }  // namespace

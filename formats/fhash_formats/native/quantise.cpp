@@ -20,15 +20,18 @@ FHASH_INLINE void quantise(const T* in, std::int64_t count, T scale, T rounding,
     }
 }
 
-// one, two, more: offsets of magnitudes 1, 2 and more, in steps.
+// shifts: offsets of magnitudes 1, 2, 3, 4, odd ones from 5 on and even ones from 6 on, in steps.
 template <class T>
-FHASH_INLINE void dequantise(const std::int32_t* in, std::int64_t count, T step, T one, T two,
-                             T more, T* out) {
-    const T offsets[4] = {0, one, two, more}, signs[2] = {1, -1};
+FHASH_INLINE void dequantise(const std::int32_t* in, std::int64_t count, T step,
+                             const double* shifts, T* out) {
+    T offsets[8] = {0};
+    for (int i = 0; i < 6; i++) offsets[i + 1] = (T)shifts[i];
+    const T signs[2] = {1, -1};
     for (std::int64_t i = 0; i < count; i++) {
         const std::int32_t q = in[i], magnitude = q < 0 ? -q : q;
         // Offsets from a table and the sign as a factor keep the loop free of branches.
-        const T value = ((T)magnitude + offsets[magnitude < 3 ? magnitude : 3]) * step;
+        const std::int32_t number = magnitude < 5 ? magnitude : 6 - (magnitude & 1);
+        const T value = ((T)magnitude + offsets[number]) * step;
         out[i] = value * signs[q < 0];
     }
 }
@@ -38,9 +41,9 @@ FHASH_INLINE void dequantise(const std::int32_t* in, std::int64_t count, T step,
                                       std::int32_t* out, float* scaled) { \
         quantise<T>(in, n, scale, rounding, largest, out, scaled); \
     } \
-    FHASH_CLONES void dequantise_cloned(const std::int32_t* in, std::int64_t n, T step, T one, \
-                                        T two, T more, T* out) { \
-        dequantise<T>(in, n, step, one, two, more, out); \
+    FHASH_CLONES void dequantise_cloned(const std::int32_t* in, std::int64_t n, T step, \
+                                        const double* shifts, T* out) { \
+        dequantise<T>(in, n, step, shifts, out); \
     }
 
 FHASH_CLONED(float)
@@ -61,12 +64,12 @@ FHASH_EXPORT std::int64_t fhash_quantise_f64(const double* in, std::int64_t n, d
     return 0;
 }
 FHASH_EXPORT std::int64_t fhash_dequantise_f32(const std::int32_t* in, std::int64_t n, double step,
-                                               double one, double two, double more, float* out) {
-    dequantise_cloned(in, n, (float)step, (float)one, (float)two, (float)more, out);
+                                               const double* shifts, float* out) {
+    dequantise_cloned(in, n, (float)step, shifts, out);
     return 0;
 }
 FHASH_EXPORT std::int64_t fhash_dequantise_f64(const std::int32_t* in, std::int64_t n, double step,
-                                               double one, double two, double more, double* out) {
-    dequantise_cloned(in, n, step, one, two, more, out);
+                                               const double* shifts, double* out) {
+    dequantise_cloned(in, n, step, shifts, out);
     return 0;
 }

@@ -22,6 +22,8 @@ ITEMS_PER_THREAD = 8
 """Items of `share_out` for each thread; with fewer a further thread does not pay."""
 SHARES_PER_THREAD = 4
 """Shares of `share_out` for each thread."""
+PART = 1 << 19
+"""Values of a part of `row_parts`, at least; with fewer a further thread does not pay."""
 
 
 def usable_threads(threads: int | None = None) -> int:
@@ -103,6 +105,12 @@ def share_out(work: Callable[[Sequence[Item]], None], items: Sequence[Item], thr
     shares = min(SHARES_PER_THREAD * workers, len(items))
     for _ in in_threads(work, [items[share::shares] for share in range(shares)], workers):
         pass
+
+
+def row_parts(rows: int, row: int, threads: int) -> list[tuple[int, int]]:
+    """Parts (first, end) of `rows` rows of `row` values each, one for each thread that pays."""
+    count = max(1, min(threads, rows, rows * row // PART))
+    return [(rows * part // count, rows * (part + 1) // count) for part in range(count)]
 
 
 def thread_pool() -> ThreadPoolExecutor:

@@ -14,7 +14,7 @@ import pytest
 import fhash_codec
 from fhash_codec import EncodeConfig
 from fhash_codec.compact.attempt import GainLog, PlanTask
-from fhash_codec.compact.choices.head import EFFORTS, Budget, Effort
+from fhash_codec.compact.choices.head_prospects import EFFORTS, Budget, Effort
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.stages import (
     choose_step,
@@ -80,7 +80,7 @@ def test_more_effort_is_no_larger_and_keeps_the_promise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field: Field
 ) -> None:
     budget = Budget(updates=200, samples=40_000)
-    monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget))
+    monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget, perceptron=budget))
     source = field((4, 12, 16, 16))
     reports = [
         fhash_codec.encode(source, tmp_path / f"{n}.fhz", EncodeConfig(effort=n, psnr=45.0))

@@ -13,9 +13,11 @@ from fhash_formats.errors import InputError
 from fhash_formats.support import threads as parallel
 from fhash_formats.support.threads import (
     ITEMS_PER_THREAD,
+    PART,
     SHARES_PER_THREAD,
     in_threads,
     map_ahead,
+    row_parts,
     share_out,
     thread_pool,
     usable_threads,
@@ -175,3 +177,10 @@ def test_what_was_not_begun_is_left_out_after_a_failure(monkeypatch: pytest.Monk
     with thread_pool() as pool, pytest.raises(ValueError, match="two"):
         list(map_ahead(pool, work, range(100), 8))
     assert len(begun) < 100
+
+
+@pytest.mark.parametrize(("rows", "row", "threads"), [(1, 5, 4), (7, PART, 3), (2, PART, 9)])
+def test_parts_hold_each_row_once_and_pay(rows: int, row: int, threads: int) -> None:
+    parts = row_parts(rows, row, threads)
+    assert [number for first, end in parts for number in range(first, end)] == list(range(rows))
+    assert len(parts) == max(1, min(threads, rows, rows * row // PART))

@@ -23,7 +23,7 @@ void march(Reader& in);  // target_march.cpp
 #endif
 
 extern "C" {
-int64_t fhash_decode(std::int32_t*, const int64_t*, const std::int32_t*, int64_t,
+int64_t fhash_decode(std::int32_t*, int64_t, int64_t, const int64_t*, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
 int64_t fhash_decode_mask(std::uint8_t*, const std::uint8_t*, const std::uint8_t*, const int64_t*,
@@ -45,12 +45,9 @@ int64_t fhash_transform_forward_f32(const float*, float*, const int64_t*, const 
 int64_t fhash_transform_forward_f64(const double*, double*, const int64_t*, const int64_t*,
                                     const int64_t*, const int64_t*, const double* const*,
                                     const double*, const double*);
-int64_t fhash_head_apply(const float*, int64_t, int64_t, int64_t, int64_t, int64_t, const int64_t*,
-                         const float*, const float*, const float*, float, float, float, float,
+int64_t fhash_head_apply(const float*, const int64_t*, int64_t, int64_t, int64_t, const int64_t*,
+                         const float*, const float*, const float*, const float*, int64_t, int64_t,
                          float*);
-int64_t fhash_head_apply_cross(const float*, int64_t, int64_t, int64_t, int64_t, int64_t,
-                               const int64_t*, const float*, const float*, const float*, float,
-                               float, float, float, float*);
 int64_t fhash_clip_f32(float*, int64_t, double, double, double);
 int64_t fhash_clip_f64(double*, int64_t, double, double, double);
 int64_t fhash_correct_f32_f32(const float*, const std::int32_t*, int64_t, double, float*);
@@ -73,10 +70,12 @@ namespace {
 
 void decode_integers(Reader& in) {
     const Bands& with = setups().bands[in.word() % setups().bands.size()];
-    const State& prior = setups().coder;
+    const std::uint8_t how = in.byte();
+    const int64_t model = how % 2, trellis = how >> 4 & 1;
+    const State& prior = setups().coders[model];
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();
-    fhash_decode(q.data(), with.shape.data(), with.table.data(),
+    fhash_decode(q.data(), model, trellis, with.shape.data(), with.table.data(),
                  static_cast<int64_t>(with.table.size() / 29), prior.slots.data(),
                  static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(),
                  static_cast<int64_t>(prior.weights.size()), prior.simples.data(),
@@ -198,10 +197,12 @@ void head(Reader& in) {
     std::vector<float> values(static_cast<std::size_t>(volume(shape))), out(values.size());
     const std::vector<float> some = in.numbers<float>(32);
     for (std::size_t i = 0; i < values.size(); i++) values[i] = some[(i * i / 5) % some.size()];
-    const auto function = cross ? fhash_head_apply_cross : fhash_head_apply;
-    function(values.data(), shape[0], shape[1], shape[2], shape[3], hidden + 1, widths.data(),
-             weights.data(), biases.data(), scales.data(), low, high, 0.5F / sigma, unit,
-             out.data());
+    const float constants[] = {low, high, 0.5F / sigma, unit};
+    const int64_t rows = shape[1] * shape[2], first = in.within(0, rows);
+    const int64_t last = in.within(first, rows), lanes = in.within(0, 5);
+    fhash_head_apply(values.data(), shape.data(), first, last, hidden + 1, widths.data(),
+                     weights.data(), biases.data(), scales.data(), constants, cross, lanes,
+                     out.data());
 }
 
 void values(Reader& in) {

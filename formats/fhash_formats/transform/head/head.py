@@ -23,13 +23,14 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.threads import in_threads, row_parts, usable_threads
 from fhash_formats.transform.head.head_portable import apply_cross, apply_network
 from fhash_formats.transform.head.inputs import CROSS, INPUTS
 from fhash_formats.transform.head.weights import (
@@ -69,6 +70,8 @@ _ACTIVATION_UNIT = 128.0
 """Integer steps of an activation in 1."""
 _CROSSED = 0x82
 """First byte of a packed head with a cross, in place of the number of its hidden layers (two)."""
+_WIDEST_LANES = 0
+"""Lanes with which the native library computes (head.cpp): the widest that this machine has."""
 _MAX_WEIGHT_BYTES = 3
 """Bytes that a weight takes at most (22 bits), which bounds the work on hostile bytes."""
 
@@ -217,11 +220,14 @@ class NeighbourHead:
             unit = np.float32(0)
         return _Constants(weights, scales, biases, low, high, np.float32(0.5) / sigma, unit)
 
-    def apply(self, decoded: Floats) -> Floats:
+    def apply(self, decoded: Floats, *, in_place: bool = False) -> Floats:
         """The decoded values, each corrected and clipped to [low, high]; a new array.
 
-        decoded: the tile (t, z, y, x), float32 in data units; NaN counts as low. Raises InputError
-        for another dtype or rank.
+        Args:
+            decoded: the tile (t, z, y, x), float32 in data units; NaN counts as low.
+            in_place: whether `decoded` may be overwritten, and be the result.
+
+        Raises InputError for another dtype or rank.
         """
         if decoded.dtype != np.float32 or decoded.ndim != 4:
             raise InputError(
@@ -233,35 +239,46 @@ class NeighbourHead:
         library = native.library()
         if library is None:
             return (apply_cross if self.cross else apply_network)(decoded, *self._constants)
-        return self._apply_native(library, np.ascontiguousarray(decoded))
+        return self._apply_native(library, np.ascontiguousarray(decoded), in_place)
 
-    def _apply_native(self, library: ctypes.CDLL, source: Floats) -> Floats:
-        constants = self._constants
-        out = np.empty(source.shape, dtype=np.float32)
-        weights = np.concatenate([weight.ravel() for weight in constants.weights])
-        biases = np.concatenate(constants.biases)
-        scales = np.array(constants.scales, dtype=np.float32)
-        widths = np.array([INPUTS, *self.hidden, 1], dtype=np.int64)
-        function = library.fhash_head_apply_cross if self.cross else library.fhash_head_apply
-        code = function(
-            ctypes.c_void_p(source.ctypes.data),
-            *(ctypes.c_int64(length) for length in source.shape),
-            ctypes.c_int64(len(self.layers)),
-            ctypes.c_void_p(widths.ctypes.data),
-            ctypes.c_void_p(weights.ctypes.data),
-            ctypes.c_void_p(biases.ctypes.data),
-            ctypes.c_void_p(scales.ctypes.data),
-            ctypes.c_float(float(constants.low)),
-            ctypes.c_float(float(constants.high)),
-            ctypes.c_float(float(constants.inverse)),
-            ctypes.c_float(float(constants.unit)),
-            ctypes.c_void_p(out.ctypes.data),
-        )
-        if code != 0:
-            raise MemoryError(
-                f"no memory to apply a head to a tile of shape {source.shape} (code {code})"
+    def _apply_native(self, library: ctypes.CDLL, source: Floats, in_place: bool) -> Floats:
+        rows = source.shape[1] * source.shape[2]
+        parts = row_parts(rows, source.size // rows, usable_threads())
+        # Threads read the rows of others around theirs, so that they need another array.
+        out = source if in_place and len(parts) == 1 else np.empty_like(source)
+        arguments = self._native_arguments
+
+        def correct(part: tuple[int, int]) -> None:
+            code = library.fhash_head_apply(
+                ctypes.c_void_p(source.ctypes.data),
+                (ctypes.c_int64 * 4)(*source.shape),
+                *part,
+                len(self.layers),
+                *(array.ctypes.data_as(ctypes.c_void_p) for array in arguments),
+                self.cross,
+                _WIDEST_LANES,
+                ctypes.c_void_p(out.ctypes.data),
             )
+            if code != 0:
+                raise MemoryError(
+                    f"no memory to apply a head to a tile of shape {source.shape} (code {code})"
+                )
+
+        for _ in in_threads(correct, parts):
+            pass
         return out
+
+    @cached_property
+    def _native_arguments(self) -> tuple[npt.NDArray[Any], ...]:
+        """Widths, weights, biases, scales, and the constants of the clip range."""
+        constants = self._constants
+        return (
+            np.array([INPUTS, *self.hidden, 1], dtype=np.int64),
+            np.concatenate([weight.ravel() for weight in constants.weights]),
+            np.concatenate(constants.biases),
+            np.array(constants.scales, dtype=np.float32),
+            np.array(constants[3:], dtype=np.float32),
+        )
 
     def to_bytes(self) -> bytes:
         """The packed head; `from_bytes` is the inverse. All numbers are little-endian.

@@ -227,7 +227,8 @@ def _decode_transformed(
         return within_range(values, settings), None
     linear = linear_values(integers, transform, settings)
     mask = None if stream.mask is None else _unpack_mask(stream.mask, linear, settings)
-    base = linear if settings.head is None else settings.head.apply(linear)
+    # The mask is decoded by now, so that the head may overwrite what it corrects.
+    base = linear if settings.head is None else settings.head.apply(linear, in_place=True)
     values = corrected(base, residual, settings.quantum, kind)
     # Without a residual the values are within the range, and finite.
     if residual is not None and settings.quantum * 2.0**31 > largest / 2 and np.isinf(values).any():
@@ -246,7 +247,8 @@ def _transformed_integers(
         raise DamagedFileError(
             f"the settings of a coded tile do not fit its shape: {error}"
         ) from error
-    integers = decode_integers(body, shape, band_table(settings.transform, shape))
+    table = band_table(settings.transform, shape)
+    integers = decode_integers(body, shape, table, coder=settings.coder, trellis=settings.trellis)
     residual = None
     if stream.residual is not None:
         residual = decode_integers(stream.residual, shape, single_band(shape))

@@ -17,6 +17,7 @@ from fhash_formats.transform.axes.lifting import Transform
 from fhash_formats.transform.entropy.coder import MAX_INTEGER, encode_integers
 from fhash_formats.transform.entropy.predict import encode_predicted, integers_of
 from fhash_formats.transform.entropy.predictor import Predictor
+from fhash_formats.transform.entropy.trellis import choose_levels
 from fhash_formats.transform.tile.decoding import (
     blank_unoccupied,
     linear_values,
@@ -63,7 +64,7 @@ _END_MARGIN = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class Coding:
-    """Options of the encoder: how hard it works, and what it keeps. A decoder needs none of them.
+    """Options of the encoder: how hard it works, what it keeps. A decoder needs none of them.
 
     Attributes:
         weight: squared quantiser steps that a bit is worth in rate-distortion optimisation; 0 for
@@ -71,7 +72,8 @@ class Coding:
         error: bound on |decoded - value| at every counted value, in units of the values. It is kept
             strictly; a tile that cannot keep it is stored without loss. None for no bound.
         rounds: how often the values that are free to change are replaced by their decoded values.
-        passes: 2 codes the integers that the optimisation chose once more; 1 does not.
+        passes: 2 codes the integers that the optimisation chose once more, or searches the path
+            through the trellis once more; 1 does not.
         filled: whether the values that are not counted are a good filling already, such as repeated
             border values. Otherwise the encoder looks for a better one.
         density: how thoroughly it looks; see `filling.filled`.
@@ -338,16 +340,15 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
     Free values are those that do not count, and those at an end of the range that decode to values
     beyond it, since the decoder clips them. `target` is changed in place.
     """
-    settings, weight = task.settings, task.coding.weight
+    settings = task.settings
     margin = (settings.high - settings.low) * _END_MARGIN
     low = settings.low - settings.center + margin
     high = settings.high - settings.center - margin
     coefficients = transform.forward(target)
     for _ in range(task.coding.rounds):
-        integers, scaled = quantise(coefficients, settings.step)
-        if weight > 0:
-            table = band_table(settings.transform, task.shape)
-            integers = encode_integers(integers, table, scaled=scaled, weight=weight).integers
+        integers = _tried(coefficients, task)
+        if integers is None:
+            break
         rebuilt = transform.inverse(
             dequantise(integers, settings.step, settings.offsets, settings.dtype)
         )
@@ -357,19 +358,55 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
     return coefficients
 
 
+def _tried(coefficients: Values, task: _Task) -> Integers | None:
+    """The integers of coefficients, chosen as for coding; None where the trellis has none."""
+    settings, weight = task.settings, task.coding.weight
+    if settings.trellis:
+        return _on_trellis(coefficients, task)
+    integers, scaled = quantise(coefficients, settings.step)
+    if weight <= 0:
+        return integers
+    table = band_table(settings.transform, task.shape)
+    return encode_integers(
+        integers, table, scaled=scaled, weight=weight, coder=settings.coder
+    ).integers
+
+
+def _on_trellis(coefficients: Values, task: _Task, passes: int = 1) -> Integers | None:
+    """The integers of the cheapest path through the trellis; None where one would be too large.
+
+    passes: how often the path is searched.
+    """
+    settings = task.settings
+    scaled = coefficients * settings.dtype.type(1.0 / settings.step)
+    # Written so that it holds for NaN as well.
+    if not max(-float(scaled.min()), float(scaled.max())) < LARGEST:
+        return None
+    table = band_table(settings.transform, task.shape)
+    return choose_levels(scaled, table, task.coding.weight, passes)
+
+
 def _code(coefficients: Values, task: _Task) -> tuple[bytes, Integers] | None:
     """The coded coefficients, and the integers that they decode to; None where one is too large."""
-    table, weight = band_table(task.settings.transform, task.shape), task.coding.weight
-    integers, scaled = quantise(coefficients, task.settings.step)
+    settings, weight = task.settings, task.coding.weight
+    table, coder = band_table(settings.transform, task.shape), settings.coder
+    if settings.trellis:
+        path = _on_trellis(coefficients, task, task.coding.passes)
+        if path is None:
+            return None
+        return encode_integers(path, table, coder=coder, trellis=True).data, path
+    integers, scaled = quantise(coefficients, settings.step)
     largest = max(-int(integers.min()), int(integers.max()))
     if largest >= LARGEST:
         return None
-    coded = encode_integers(integers, table, scaled=scaled if weight > 0 else None, weight=weight)
+    coded = encode_integers(
+        integers, table, scaled=scaled if weight > 0 else None, weight=weight, coder=coder
+    )
     chosen = coded.integers
-    if largest >= MAX_CHOSEN and weight > 0 and task.settings.double:
+    if largest >= MAX_CHOSEN and weight > 0 and settings.double:
         large = np.abs(integers) >= MAX_CHOSEN
-        nearest = np.rint(coefficients / task.settings.step).astype(np.int32)
+        nearest = np.rint(coefficients / settings.step).astype(np.int32)
         chosen = np.where(large, nearest, chosen)
     if (task.coding.passes > 1 and weight > 0) or chosen is not coded.integers:
-        coded = encode_integers(chosen, table)
+        coded = encode_integers(chosen, table, coder=coder)
     return coded.data, coded.integers

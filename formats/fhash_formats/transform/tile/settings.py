@@ -16,6 +16,7 @@ import numpy as np
 
 from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.axes.spec import TransformSpec
+from fhash_formats.transform.entropy.coder import CODERS
 from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.entropy.predictor import Predictor
 from fhash_formats.transform.head.head import NeighbourHead
@@ -25,11 +26,11 @@ __all__ = ["TileSettings"]
 
 _REQUIRED = frozenset({"transform", "step", "center", "range"})
 """Keys of settings that have no default."""
-_SWITCHES = ("double", "clip", "labels", "many_labels")
+_SWITCHES = ("double", "clip", "labels", "many_labels", "trellis")
 """Keys of settings that are true or false."""
-_KEYS = _REQUIRED | {"offsets", "quantum", "head", "mask", "predictor", *_SWITCHES}
+_KEYS = _REQUIRED | {"offsets", "quantum", "head", "mask", "predictor", "coder", *_SWITCHES}
 """All keys of settings."""
-_LISTS = "range is [low, high] and offsets are three whole numbers"
+_LISTS = "range is [low, high] and offsets are three whole numbers, six with trellis"
 """Message for a range or offsets that are no lists."""
 
 
@@ -43,7 +44,8 @@ class TileSettings:
         center: value that is coded as zero, in units of the values.
         low: lower end of the range to which values are clipped, before head and residual.
         high: upper end of that range.
-        offsets: reconstruction offsets of magnitudes 1, 2 and more, in 1/128 step.
+        offsets: reconstruction offsets of magnitudes 1, 2 and more, in 1/128 step. With `trellis`
+            six: of magnitudes 1, 2, 3, 4, of odd ones from 5 on, and of even ones from 6 on.
         double: whether the arithmetic is in float64; otherwise it is in float32.
         quantum: step of the residual that keeps a bound, in units of the values; 0 without bound.
         head: the trained correction; None for none.
@@ -56,6 +58,10 @@ class TileSettings:
             version 1.1 never are.
         labels: whether tiles may be coded as labels, without loss.
         many_labels: whether such tiles may have 65,536 labels instead of 256; needs `labels`.
+        coder: model by which coefficients are coded; see `CODERS` in entropy/coder.py.
+        trellis: whether coefficients are quantised by two quantisers in turn (entropy/trellis.py).
+            Integers are then in steps, of which each quantiser has every other one. Needs a coder
+            other than "contexts".
     """
 
     transform: TransformSpec
@@ -63,7 +69,7 @@ class TileSettings:
     center: float
     low: float
     high: float
-    offsets: tuple[int, int, int] = (0, 0, 0)
+    offsets: tuple[int, ...] = (0, 0, 0)
     double: bool = False
     quantum: float = 0.0
     head: NeighbourHead | None = None
@@ -72,6 +78,8 @@ class TileSettings:
     clip: bool = False
     labels: bool = False
     many_labels: bool = False
+    coder: str = "contexts"
+    trellis: bool = False
 
     def __post_init__(self) -> None:
         for name in ("step", "center", "low", "high", "quantum"):
@@ -84,13 +92,17 @@ class TileSettings:
         smallest, largest = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
         if not (self.double or smallest < self.step < largest):
             raise InputError(f"step {self.step} is not for float32")
-        if len(self.offsets) != 3 or not all(
+        if len(self.offsets) != (6 if self.trellis else 3) or not all(
             type(offset) is int and abs(offset) <= OFFSET_UNIT for offset in self.offsets
         ):
             raise InputError(
-                f"offsets are {self.offsets!r:.60}; "
-                f"three whole numbers within +-{OFFSET_UNIT} are needed"
+                f"offsets are {self.offsets!r:.60}; {'six' if self.trellis else 'three'} whole "
+                f"numbers within +-{OFFSET_UNIT} are needed"
             )
+        if self.coder not in CODERS:
+            raise InputError(f"coder is {self.coder!r:.40}; known: {', '.join(CODERS)}")
+        if self.trellis and self.coder == CODERS[0]:
+            raise InputError(f"trellis needs a coder other than {CODERS[0]}")
         if self.head is not None and self.double:
             raise InputError("a head works in float32 only")
         if self.many_labels and not self.labels:
@@ -112,6 +124,9 @@ class TileSettings:
             "clip": self.clip,
             "labels": self.labels,
             "many-labels": self.many_labels,
+            "coder-signs": self.coder == "signs",
+            "coder-linear": self.coder == "linear",
+            "trellis": self.trellis,
         }
         return tuple(name for name, is_used in used.items() if is_used)
 
@@ -141,6 +156,10 @@ class TileSettings:
             result["labels"] = True
         if self.many_labels:
             result["many_labels"] = True
+        if self.coder != CODERS[0]:
+            result["coder"] = self.coder
+        if self.trellis:
+            result["trellis"] = True
         return result
 
     @classmethod
@@ -153,13 +172,13 @@ class TileSettings:
         if missing:
             raise InputError(f"setting {missing[0]} is missing")
         low, high = _range(values["range"])
-        offsets = values.get("offsets", [0, 0, 0])
-        if not isinstance(offsets, list | tuple):
-            raise InputError(_LISTS)
         switches = {name: values.get(name, False) for name in _SWITCHES}
         for name, switch in switches.items():
             if not isinstance(switch, bool):
                 raise InputError(f"{name} is true or false")
+        offsets = values.get("offsets", [0] * (6 if switches["trellis"] else 3))
+        if not isinstance(offsets, list | tuple):
+            raise InputError(_LISTS)
         head = _unpack_head(values.get("head"))
         mask, predictor = values.get("mask"), values.get("predictor")
         return cls(
@@ -170,6 +189,7 @@ class TileSettings:
             high=high,
             offsets=tuple(offsets),
             **switches,
+            coder=values.get("coder", CODERS[0]),
             quantum=values.get("quantum", 0.0),
             head=None if head is None else NeighbourHead.from_bytes(head),
             mask=None if mask is None else MaskLevels.from_dict(mask),

@@ -1,6 +1,7 @@
 """Coefficients to integers and back.
 
-The quantiser is uniform with a dead zone; the encoder measures the reconstruction points.
+The quantiser is uniform with a dead zone; the encoder measures the reconstruction points. Dependent
+quantisation chooses its integers elsewhere (entropy/trellis.py), and comes back in the same way.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 
-__all__ = ["LARGEST", "OFFSET_UNIT", "ROUNDING", "dequantise", "quantise"]
+__all__ = ["LARGEST", "OFFSET_UNIT", "ROUNDING", "Offsets", "dequantise", "quantise"]
 
 OFFSET_UNIT = 128
 """Units in a quantiser step, for reconstruction offsets."""
@@ -26,6 +27,8 @@ LARGEST = 1_000_000_000.0
 """Largest magnitude of an integer; larger ones are clipped."""
 
 Values = npt.NDArray[Any]
+Offsets = tuple[int, ...]
+"""Reconstruction offsets by magnitude, three or six, in 1/OFFSET_UNIT step; see `dequantise`."""
 
 
 def quantise(
@@ -64,7 +67,7 @@ def quantise(
 def dequantise(
     integers: npt.NDArray[np.int32],
     step: float,
-    offsets: tuple[int, int, int],
+    offsets: Offsets,
     dtype: npt.DTypeLike,
 ) -> Values:
     """The coefficients sign(q) (|q| + offset / OFFSET_UNIT) step of integers q; 0 for 0.
@@ -72,15 +75,18 @@ def dequantise(
     Args:
         integers: integers q.
         step: quantiser step, in units of the coefficients.
-        offsets: offset for |q| = 1, for |q| = 2, and for larger ones, in 1/OFFSET_UNIT step.
+        offsets: offsets in 1/OFFSET_UNIT step, three or six: for |q| = 1, for |q| = 2, and for
+            larger ones; or for 1, 2, 3, 4, odd ones from 5 on, and even ones from 6 on.
         dtype: type of the coefficients, float32 or float64.
     """
     kind: np.dtype[Any] = np.dtype(dtype)
-    one, two, more = (offset / OFFSET_UNIT for offset in offsets)
+    six = offsets if len(offsets) == 6 else (*offsets[:2], *offsets[2:] * 4)
+    shifts = np.array(six, dtype=np.float64) / OFFSET_UNIT
     library = native.library()
     if library is None:
         magnitude = np.abs(integers)
-        offset = np.array([0.0, one, two, more], dtype=kind)[np.minimum(magnitude, 3)]
+        number = np.where(magnitude < 5, magnitude, 6 - (magnitude & 1))
+        offset = np.concatenate([[0.0], shifts]).astype(kind)[number]
         with np.errstate(over="ignore"):
             value: Values = (magnitude.astype(kind) + offset) * np.array(step, dtype=kind)
         return np.where(integers < 0, -value, value)
@@ -88,7 +94,8 @@ def dequantise(
     getattr(library, f"fhash_dequantise_f{kind.itemsize * 8}")(
         ctypes.c_void_p(source.ctypes.data),
         ctypes.c_int64(source.size),
-        *(ctypes.c_double(number) for number in (step, one, two, more)),
+        ctypes.c_double(step),
+        ctypes.c_void_p(shifts.ctypes.data),
         ctypes.c_void_p(result.ctypes.data),
     )
     return result

@@ -14,18 +14,8 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.compact.choices.head import (
-    EFFORTS,
-    GAIN_BY_WIDTHS,
-    MIN_BYTES,
-    Budget,
-    Effort,
-    Shape,
-    _side_by_side,
-    best_widths,
-    choose_head,
-    most_saved,
-)
+from fhash_codec.compact.choices.head import MIN_BYTES, _side_by_side, choose_head
+from fhash_codec.compact.choices.head_prospects import EFFORTS, Budget, Effort, Shape
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
@@ -54,7 +44,7 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
     )
     budget = Budget(updates=200, samples=40_000)
     monkeypatch.setattr("fhash_codec.compact.choices.head.TRIAL_BUDGET", budget)
-    monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget))
+    monkeypatch.setitem(EFFORTS, 5, Effort(candidates=4, budget=budget, perceptron=budget))
     source, sizes, calls = fronts(), {}, []
 
     def progress(stage: str, done: int, total: int, note: str) -> None:
@@ -82,27 +72,6 @@ def test_under_a_bound_a_head_makes_files_smaller_and_the_bound_is_kept(
     assert list(dict.fromkeys(stages)) == [
         "scanning", "selecting", "planning", "training", "coding", "measuring", "writing",
     ]  # fmt: skip
-
-
-def test_a_small_file_gets_no_head_and_a_large_one_a_large_head() -> None:
-    def widths(size: float, gain: float = 0.5, effort: int = 9) -> tuple[int, int] | None:
-        return best_widths(size, gain, 4.5, effort)
-
-    assert widths(1_000) is None
-    chosen = [widths(size) for size in (1e4, 2e4, 3e4, 1e5, 3e5, 1e6)]
-    ranks = [list(GAIN_BY_WIDTHS).index(each) for each in chosen if each is not None]
-    assert ranks == sorted(ranks)
-    assert len(set(ranks)) > 2
-    # Weights cost decoding time, whatever the size of the file: a small gain pays for few of them.
-    assert widths(1e9, gain=3.0) == (14, 24)
-    assert widths(1e9, gain=3.0, effort=5) == (12, 12)
-    assert widths(1e6, gain=0.01) is None
-
-
-def test_a_perceptron_that_cannot_pay_is_told_from_its_size_and_the_gain_of_the_trial() -> None:
-    assert most_saved(20_000, 0.03, 4.5) < 0
-    assert most_saved(20_000, 0.5, 4.5) > 0
-    assert most_saved(500_000, 0.03, 4.5) > 0
 
 
 def test_an_interruption_ends_the_trainings_of_other_threads() -> None:
@@ -145,7 +114,7 @@ def test_no_head_is_tried_on_a_file_that_is_too_small_for_it(size: int) -> None:
     def choose() -> Any:
         return choose_head(
             cast(Sample, NoSample()), settings, outcome, Coding(),
-            cast(Any, None), [], strict=False, data_range=1.0, effort=5, seed=0,
+            cast(Any, None), cast(Any, None), [], strict=False, data_range=1.0, effort=5, seed=0,
         )  # fmt: skip
 
     if size < MIN_BYTES:

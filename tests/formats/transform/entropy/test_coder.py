@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from trellises import of_two_quantisers
 
 from fhash_formats import native
-from fhash_formats.errors import DamagedFileError
+from fhash_formats.errors import DamagedFileError, InputError
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.basis import fit_basis
 from fhash_formats.transform.axes.spec import WAVELETS, AxisTransform, TransformSpec
 from fhash_formats.transform.entropy import mixing_portable
 from fhash_formats.transform.entropy.coder import (
+    CODERS,
     MAX_INTEGER,
     Encoded,
     decode_block,
@@ -211,6 +213,66 @@ def rows_that_are_chosen_away() -> NDArray[np.float32]:
     scaled[:, :, :300, 3] = 0.56
     scaled[:, :, 300:] = np.random.default_rng(0).integers(-(2**29), 2**29, (300, 16))
     return scaled
+
+
+def trellis_integers(kind: str, shape: Shape, table: Table) -> Integers:
+    indices = make(kind, shape).clip(-(MAX_INTEGER // 2), MAX_INTEGER // 2)
+    return of_two_quantisers(indices, table)
+
+
+@pytest.mark.parametrize("coder", CODERS)
+@pytest.mark.parametrize("trellis", [False, True])
+@pytest.mark.parametrize("content", ["zero", "sparse", "dense", "mixed", "huge"])
+@pytest.mark.parametrize("kinds", [NONE, PACKETS, BASES])
+@pytest.mark.parametrize("shape", [(1, 1, 1, 1), (2, 3, 5, 7), (3, 2, 37, 2), (5, 4, 13, 31)])
+def test_each_coder_gives_the_same_from_each_engine(
+    shape: Shape,
+    kinds: tuple[str, ...],
+    content: str,
+    trellis: bool,
+    coder: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    table = table_of(kinds, 3, shape)
+    integers = inside(make(content, shape), table)
+    if trellis:
+        integers = trellis_integers(content, shape, table)
+    coded = []
+    for name in ("native", "compiled"):
+        with monkeypatch.context() as patch:
+            use(name, patch)
+            state = blank_state(coder)
+            encoded = encode_integers(integers, table, state=state, coder=coder, trellis=trellis)
+            coded.append((encoded.data, state.slots.tobytes(), state.weights.tobytes()))
+            encoded = encode_integers(integers, table, coder=coder, trellis=trellis)
+            again = decode_integers(encoded.data, shape, table, coder=coder, trellis=trellis)
+            assert np.array_equal(again, integers)
+    assert coded[0] == coded[1]
+
+
+def test_integers_of_the_other_quantiser_are_refused(engine: str) -> None:
+    shape = (1, 2, 3, 30)
+    integers = trellis_integers("dense", shape, single_band(shape))
+    flat = integers.ravel()
+    at = int(np.flatnonzero(flat)[5])
+    flat[at] += 1 if flat[at] > 0 else -1
+    with pytest.raises(InputError, match="quantiser of its place"):
+        encode_integers(integers, single_band(shape), trellis=True)
+
+
+def test_two_quantisers_and_a_choice_do_not_go_together() -> None:
+    scaled = coefficients((1, 1, 2, 3))
+    with pytest.raises(InputError, match="chosen before"):
+        encode_integers(nearest(scaled), single_band(scaled.shape), scaled=scaled, trellis=True)
+
+
+@pytest.mark.parametrize("unknown", ["context", "", "Signs"])
+def test_unknown_coders_are_refused(unknown: str) -> None:
+    integers = make("dense", (1, 1, 2, 3))
+    with pytest.raises(InputError, match="known: contexts, signs, linear"):
+        encode_integers(integers, single_band(integers.shape), coder=unknown)
+    with pytest.raises(InputError, match="known: contexts, signs, linear"):
+        decode_integers(b"", integers.shape, single_band(integers.shape), coder=unknown)
 
 
 @pytest.mark.parametrize("choosing", [False, True])

@@ -7,6 +7,8 @@ import pytest
 from heads import HIGH, LOW, Floats, random_head, random_tile
 
 from fhash_formats import native
+from fhash_formats.support import threads
+from fhash_formats.transform.head import head as head_module
 from fhash_formats.transform.head.head import (
     MAX_CROSS_WIDTH,
     MAX_WEIGHT,
@@ -53,6 +55,36 @@ def test_native_and_portable_give_the_same_bits(
     tile = random_tile(shape)
     fast, slow = both(random_head(cross=cross), tile, monkeypatch)
     assert_same_bits(fast, slow)
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize(
+    ("hidden", "cross"),
+    [((12, 8), False), ((13, 7), False), ((64, 64, 64), False), ((4, 8), True), ((13, 5), True)],
+)
+def test_all_lanes_give_the_same_bits(
+    hidden: tuple[int, ...], cross: bool, lanes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    head, tile = random_head(hidden, cross=cross), random_tile((3, 4, 5, 85))
+    _, slow = both(head, tile, monkeypatch)
+    monkeypatch.setattr(head_module, "_WIDEST_LANES", lanes)
+    try:
+        assert_same_bits(head.apply(tile), slow)
+    except MemoryError as error:
+        pytest.skip(f"this machine has no such lanes: {error}")
+
+
+@pytest.mark.parametrize("shape", [(3, 4, 5, 20), (2, 1, 17, 9), (3, 11, 1, 40), (1, 1, 2, 3)])
+@pytest.mark.parametrize("cross", [False, True])
+def test_parts_and_places_give_the_same_bits(
+    cross: bool, shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    head, tile = random_head(cross=cross), random_tile(shape)
+    _, slow = both(head, tile, monkeypatch)
+    assert_same_bits(head.apply(tile.copy(), in_place=True), slow)
+    monkeypatch.setattr(threads, "PART", 1)
+    monkeypatch.setenv("FHASH_THREADS", "3")
+    assert_same_bits(head.apply(tile, in_place=True), slow)
 
 
 @pytest.mark.parametrize("hidden", [(1,), (13, 7), (64, 64, 64), (5, 3, 1)])

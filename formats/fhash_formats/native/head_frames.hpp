@@ -1,0 +1,259 @@
+// The frames of a tile that the head looks at, and the outputs of its first layer.
+#pragma once
+
+#include <memory>
+#include <new>
+
+#include "core.hpp"
+#include "head_network.hpp"
+
+namespace {
+
+struct Extremes {
+    float low, high;
+};
+
+FHASH_INLINE float clipped(float value, const Range& range) {
+    const float raised = value > range.low ? value : range.low;  // NaN becomes low
+    return raised < range.high ? raised : range.high;
+}
+
+// The extremes of a block with its halo, in columns that a vector holds.
+FHASH_INLINE Extremes extremes_of(const float* start) {
+    float low[GROUP], high[GROUP];
+    for (int i = 0; i < GROUP; ++i) low[i] = high[i] = start[BLOCK + 2 * HALO - GROUP + i];
+    for (int at = 0; at < BLOCK; at += GROUP)
+        for (int i = 0; i < GROUP; ++i) {
+            low[i] = start[at + i] < low[i] ? start[at + i] : low[i];
+            high[i] = start[at + i] > high[i] ? start[at + i] : high[i];
+        }
+    for (int half = GROUP / 2; half > 0; half /= 2)
+        for (int i = 0; i < half; ++i) {
+            low[i] = low[i + half] < low[i] ? low[i + half] : low[i];
+            high[i] = high[i + half] > high[i] ? high[i + half] : high[i];
+        }
+    return {low[0], high[0]};
+}
+
+// Load one clipped frame, each row with its edge values repeated to whole blocks and a halo, and
+// the extremes of each block with its halo.
+FHASH_CLONES void load_rows(const float* FHASH_RESTRICT source, std::int64_t rows, std::int64_t x,
+                            std::int64_t pitch, const Range& bounds, float* FHASH_RESTRICT frame,
+                            Extremes* FHASH_RESTRICT extremes) {
+    const Range range = bounds;
+    const std::int64_t blocks = (pitch - 2 * HALO) / BLOCK;
+    for (std::int64_t r = 0; r < rows; ++r) {
+        const float* const in = source + r * x;
+        float* const row = frame + r * pitch;
+        for (std::int64_t i = 0; i < x; ++i) row[HALO + i] = clipped(in[i], range);
+        for (std::int64_t i = 0; i < HALO; ++i) row[i] = row[HALO];
+        for (std::int64_t i = HALO + x; i < pitch; ++i) row[i] = row[HALO + x - 1];
+        for (std::int64_t b = 0; b < blocks; ++b)
+            extremes[r * blocks + b] = extremes_of(row + b * BLOCK);
+    }
+}
+
+FHASH_INLINE std::int64_t clamped(std::int64_t index, std::int64_t size) {
+    return index < 0 ? 0 : index < size ? index : size - 1;
+}
+
+FHASH_INLINE std::int64_t groups_of(std::int64_t n) { return (n + GROUP - 1) / GROUP; }
+
+// Whether the inputs of the neighbours are 0 in all of a block. All its voxels then have the same
+// two inputs of the centre: position and distance.
+struct Flat {
+    bool level;
+    int position, distance;
+
+    bool same(const Flat& other) const {
+        return level && other.level && position == other.position && distance == other.distance;
+    }
+};
+
+// Some rows (z, y) of a frame, counted through the frame.
+struct Rows {
+    std::int64_t begin, end;
+};
+
+// The clipped frames t - 1, t and t + 1 of a tile, with edges repeated, and the inputs of their
+// voxels.
+class Frames {
+public:
+    const std::int64_t t, z, y, x, rows, blocks, pitch, held;
+
+    Frames(const float* source, const std::int64_t* shape, const Range& bounds)
+        : t(shape[0]),
+          z(shape[1]),
+          y(shape[2]),
+          x(shape[3]),
+          rows(z * y),
+          blocks((x + BLOCK - 1) / BLOCK),
+          pitch(blocks * BLOCK + 2 * HALO),
+          held(t < 3 ? t : 3),
+          range(bounds),
+          decoded(source),
+          frames(new (std::nothrow) float[held * rows * pitch]),
+          extremes(new (std::nothrow) Extremes[held * rows * blocks]) {}
+
+    bool allocated() const { return frames && extremes; }
+
+    // Some rows, and those that lie up to `reach` vertices beside them along z and y.
+    Rows around(const Rows& some, std::int64_t reach) const {
+        const std::int64_t more = reach * ((z > 1 ? y : 0) + 1);
+        return {some.begin > more ? some.begin - more : 0,
+                some.end < rows - more ? some.end + more : rows};
+    }
+
+    void load(std::int64_t step, const Rows& some) {
+        const std::int64_t slot = step % held * rows + some.begin;
+        load_rows(decoded + (step * rows + some.begin) * x, some.end - some.begin, x, pitch, range,
+                  frames.get() + slot * pitch, extremes.get() + slot * blocks);
+    }
+
+    std::int64_t row(std::int64_t step, std::int64_t zi, std::int64_t yi) const {
+        return step % held * rows + zi * y + yi;
+    }
+
+    // The rows of the first `count` neighbours of row r of a frame.
+    void neighbours(std::int64_t step, std::int64_t r, std::int64_t count,
+                    std::int64_t* row_of) const {
+        for (std::int64_t k = 0; k < count; ++k)
+            row_of[k] = row(clamped(step + OFFSETS[k][0], t), clamped(r / y + OFFSETS[k][1], z),
+                            clamped(r % y + OFFSETS[k][2], y));
+    }
+
+    const float* block(std::int64_t row_index, std::int64_t b) const {
+        return frames.get() + row_index * pitch + b * BLOCK + HALO;
+    }
+
+    std::int64_t length(std::int64_t b) const {
+        return x - b * BLOCK < BLOCK ? x - b * BLOCK : BLOCK;
+    }
+
+    // Every operation is monotone: if the difference of the extremes of a block and its neighbours
+    // has the input 0, so has every difference in it.
+    Flat flatness(std::int64_t own, const std::int64_t* row_of, std::int64_t b) const {
+        Extremes all = extremes[own * blocks + b];
+        if (compressed((all.high - all.low) * range.inverse) != 0) return {false, 0, 0};
+        for (int k = 0; k < NEIGHBOURS; ++k) {
+            const Extremes e = extremes[row_of[k] * blocks + b];
+            all.low = e.low < all.low ? e.low : all.low;
+            all.high = e.high > all.high ? e.high : all.high;
+        }
+        const int lowest = position(all.low, range);
+        const int distance = compressed((all.low - range.low) * range.inverse);
+        const bool level = compressed((all.high - all.low) * range.inverse) == 0 &&
+                           position(all.high, range) == lowest &&
+                           compressed((all.high - range.low) * range.inverse) == distance;
+        return {level, lowest, distance};
+    }
+
+    // The inputs of the first layer, in `room`; a row of pairs for each two inputs in `inputs`.
+    void gather(const Kernels& kernels, std::int64_t own, const std::int64_t* row_of,
+                std::int64_t b, std::int64_t groups, std::int32_t* room,
+                const std::int32_t** inputs) const {
+        const float* moved[NEIGHBOURS];
+        for (int k = 0; k < NEIGHBOURS; ++k) moved[k] = block(row_of[k], b) + OFFSETS[k][3];
+        kernels.first_inputs(moved, block(own, b), range, groups, room);
+        for (int pair = 0; pair < INPUTS / 2; ++pair) inputs[pair] = room + pair * BLOCK;
+    }
+
+    const Range range;
+
+private:
+    const float* decoded;
+    std::unique_ptr<float[]> frames;
+    std::unique_ptr<Extremes[]> extremes;
+};
+
+// First-layer outputs of the frames t - 1, t and t + 1. A row holds its pairs of outputs one after
+// the other, with the edges repeated once.
+class Hidden {
+public:
+    Hidden(const Frames& source, const Kernels& kernels_, const Stage& stage)
+        : frames(source),
+          kernels(kernels_),
+          first(stage),
+          width(stage.outputs / 2),
+          pitch(source.blocks * BLOCK + 2),
+          values(new (std::nothrow) std::int32_t[source.held * source.rows * width * pitch]()),
+          flats(new (std::nothrow) Flat[source.held * source.rows * source.blocks]) {}
+
+    bool allocated() const { return values && flats; }
+
+    // Compute the outputs of some rows of one frame.
+    void fill(std::int64_t step, const Rows& some, std::int32_t* room) {
+        for (std::int64_t r = some.begin; r < some.end; ++r) {
+            std::int64_t row_of[NEIGHBOURS];
+            frames.neighbours(step, r, NEIGHBOURS, row_of);
+            const std::int64_t own = frames.row(step, 0, r);
+            for (std::int64_t b = 0; b < frames.blocks; ++b) fill_block(own, row_of, b, room);
+            std::int32_t* const row = values.get() + own * width * pitch;
+            for (std::int64_t o = 0; o < width; ++o) {
+                row[o * pitch] = row[o * pitch + 1];
+                row[o * pitch + 1 + frames.x] = row[o * pitch + frames.x];
+            }
+        }
+    }
+
+    // The inputs of the second layer: the outputs of the first at the voxel and at its neighbours
+    // of the cross, where they lie.
+    void gather(const Kernels&, std::int64_t own, const std::int64_t* row_of, std::int64_t b,
+                std::int64_t, std::int32_t*, const std::int32_t** inputs) const {
+        for (std::int64_t k = 0; k < CROSS; ++k) {
+            const std::int64_t row = k == 0 ? own : row_of[k - 1];
+            const std::int64_t shift = 1 + b * BLOCK + (k == 0 ? 0 : OFFSETS[k - 1][3]);
+            const std::int32_t* const source = values.get() + row * width * pitch + shift;
+            for (std::int64_t o = 0; o < used; ++o) *inputs++ = source + o * pitch;
+        }
+    }
+
+    // The flatness of a block. It is level only where the block and all blocks that its cross
+    // reaches have the same constant outputs.
+    Flat flatness(std::int64_t own, const std::int64_t* row_of, std::int64_t b) const {
+        const Flat* const here = &flats[own * frames.blocks + b];
+        Flat flat = *here;
+        flat.level = flat.level && (b == 0 || flat.same(here[-1])) &&
+                     (b + 1 == frames.blocks || flat.same(here[1]));
+        for (std::int64_t k = 0; k < CROSS - 1; ++k)
+            flat.level = flat.same(flats[row_of[k] * frames.blocks + b]);
+        return flat;
+    }
+
+private:
+    void fill_block(std::int64_t own, const std::int64_t* row_of, std::int64_t b,
+                    std::int32_t* room) {
+        const std::int64_t groups = groups_of(frames.length(b));
+        std::int32_t* const target = values.get() + own * width * pitch + 1 + b * BLOCK;
+        const Flat flat = frames.flatness(own, row_of, b);
+        flats[own * frames.blocks + b] = flat;
+        if (flat.same(last)) {
+            for (std::int64_t o = 0; o < width; ++o)
+                for (std::int64_t i = 0; i < groups * GROUP; ++i)
+                    target[o * pitch + i] = constant[o];
+            return;
+        }
+        const std::int32_t* inputs[INPUTS / 2];
+        frames.gather(kernels, own, row_of, b, groups, room, inputs);
+        kernels.hidden_layer(inputs, first, groups, target, pitch);
+        if (!flat.level) return;
+        last = flat;
+        for (std::int64_t o = 0; o < width; ++o) constant[o] = target[o * pitch];
+    }
+
+    const Frames& frames;
+    const Kernels& kernels;
+    const Stage& first;
+
+public:
+    std::int64_t used = 0;  // pairs of outputs that the second layer takes
+
+private:
+    const std::int64_t width, pitch;
+    std::unique_ptr<std::int32_t[]> values;
+    std::unique_ptr<Flat[]> flats;
+    Flat last{false, 0, 0};
+    std::int32_t constant[MAX_WIDTH];
+};
+
+}  // namespace
