@@ -32,6 +32,7 @@ COMPACT = [
     "compact-1.3-plain-labels",
     "compact-1.4-cross",
     "compact-1.4-head",
+    "compact-1.5-lean-head",
 ]
 NAMES = [
     "paper-1.0-plain",

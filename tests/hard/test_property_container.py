@@ -15,7 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from properties import Draw, arrays, chunks, looking, one_line, same
 
-from fhash_formats.container import Container, ContainerWriter, describe_coordinates, shard_order
+from fhash_formats.container import (
+    Container,
+    ContainerWriter,
+    coordinate_features,
+    describe_coordinates,
+    shard_order,
+)
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, AXIS_NAMES, Coordinate
 
@@ -245,7 +251,8 @@ def test_any_positions_come_back_to_the_last_bit(
                 )
 
     with places() as (path, _):
-        write(path, extra, coordinates=described)
+        features = ["transform", *coordinate_features(described)]
+        write(path, extra, coordinates=described, required_features=features)
         with Container.open(path) as container:
             for axis, stored in AXIS_NAMES.items():
                 assert same(container.coordinate(stored).values, coords[axis].values)
