@@ -16,7 +16,7 @@ from fhash_formats.transform.axes.basis import MAX_LENGTH, Basis, fit_basis
 from fhash_formats.transform.axes.spec import AxisTransform
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["MAX_BASIS_LENGTH", "Bases", "CountedBases", "TileSample"]
+__all__ = ["MAX_BASIS_LENGTH", "Bases", "CountedBases", "Result", "TileSample"]
 
 Result = TypeVar("Result")
 MAX_BASIS_LENGTH = 128

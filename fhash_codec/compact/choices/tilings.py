@@ -21,6 +21,7 @@ from fhash_codec.compact.choices.transform import (
     wavelet,
 )
 from fhash_codec.compact.tiles.access import (
+    MARGIN,
     MAX_WHOLE_VERTICES,
     PRICES,
     Tiling,
@@ -44,8 +45,6 @@ FITTED_LINES = 1 << 15
 """Lines of a series that the data's own bases are fitted on, for trials."""
 MIN_LINES = 256
 """The least of them in each tile."""
-MARGIN = 0.035
-"""Part of an allowed price that a trial may not take: the files may differ by more."""
 TRIALS = 6
 """Tilings that are coded at most."""
 STEEPNESS = 0.75
@@ -206,7 +205,7 @@ class _Cuts:
 
     def extra(self, tile: Shape) -> float:
         """Return the extra bytes that a tile is likely to cost, as a share."""
-        return self.share * self.ratio(tile) ** STEEPNESS
+        return self.share * math.pow(self.ratio(tile), STEEPNESS)
 
 
 def _blame(cuts: list[_Cuts], tile: Shape, factor: float) -> None:

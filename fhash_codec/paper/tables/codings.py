@@ -20,7 +20,8 @@ from math import prod
 import numpy as np
 import numpy.typing as npt
 
-from fhash_codec.compact.choices.transform import Result, choose_transform, usual_transform
+from fhash_codec.compact.choices.bases import Result
+from fhash_codec.compact.choices.transform import choose_transform, usual_transform
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, OFFSETS, WEIGHT, Coding, Outcome, code
 from fhash_codec.paper.architecture import Architecture
