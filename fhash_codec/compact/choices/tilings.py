@@ -14,6 +14,7 @@ from math import prod
 
 from fhash_codec.compact.attempt import PlanTask
 from fhash_codec.compact.choices.bases import MAX_BASIS_LENGTH
+from fhash_codec.compact.choices.step import find_step
 from fhash_codec.compact.choices.transform import (
     ERROR_PRICE,
     rough_transform,
@@ -21,6 +22,7 @@ from fhash_codec.compact.choices.transform import (
     wavelet,
 )
 from fhash_codec.compact.tiles.access import (
+    MARGIN,
     MAX_WHOLE_VERTICES,
     PRICES,
     Tiling,
@@ -44,8 +46,6 @@ FITTED_LINES = 1 << 15
 """Lines of a series that the data's own bases are fitted on, for trials."""
 MIN_LINES = 256
 """The least of them in each tile."""
-MARGIN = 0.035
-"""Part of an allowed price that a trial may not take: the files may differ by more."""
 TRIALS = 6
 """Tilings that are coded at most."""
 STEEPNESS = 0.75
@@ -77,20 +77,46 @@ class _Trials:
             if self._settings.labels:
                 outcome = self._sample(tile, 1 << 62).run(self._settings, self._coding)
                 return self._note(tile, outcome, self._settings)
-            sample = self._sample(tile, PICKED_VERTICES)
-            settings, tried = rough_transform(
-                sample,
-                self._settings,
-                self._coding,
-                self._known_for(tile),
-                max(FITTED_LINES // prod(sample.blocks.grid), MIN_LINES),
-            )
-            for axis in (0, 1):
-                self._known.setdefault((axis, tile[axis]), settings.transform.axes[axis])
-            if tried is None or not sample.complete:
+            settings, tried = self._picked(tile)
+            if tried is None:
                 tried = self._sample(tile, 1 << 62).run(settings, self._coding)
             self._note(tile, tried, settings)
         return self.sizes[tile]
+
+    def settle(self, whole: Shape, in_space: Shape | None) -> None:
+        """Look for the step that keeps the promise with one tile, which all trials then take.
+
+        The first guess knows no good transform, and its step may be far too fine. With other tiles
+        another step may be better; at that of one tile they then seem to cost more, never less.
+
+        whole: of one tile.
+        in_space: tile of all steps, on which transforms are tried sooner than on all vertices.
+        """
+        goal, settings = self._task.goal, self._settings
+        if settings.labels or goal.size is not None or (not goal.error and not goal.psnr):
+            return
+        if in_space is not None:
+            self._picked(in_space)
+        found, _ = self._picked(whole)
+        coding = replace(self._coding, error=None)
+        sample = self._sample(whole, 1 << 62)
+        found, outcome = find_step(sample, found, coding, goal, tries=2)
+        self._settings = replace(found, transform=settings.transform)
+        self._note(whole, outcome, found)
+
+    def _picked(self, tile: Shape) -> tuple[TileSettings, Outcome | None]:
+        """Return settings with a transform, and the outcome of the series if it was coded."""
+        sample = self._sample(tile, PICKED_VERTICES)
+        settings, tried = rough_transform(
+            sample,
+            self._settings,
+            self._coding,
+            self._known_for(tile),
+            max(FITTED_LINES // prod(sample.blocks.grid), MIN_LINES),
+        )
+        for axis in (0, 1):
+            self._known.setdefault((axis, tile[axis]), settings.transform.axes[axis])
+        return settings, tried if sample.complete else None
 
     def price(self, tile: Shape) -> float:
         """Return the bytes of a tiling as a multiple of the fewest of those tried."""
@@ -151,6 +177,7 @@ def _search(trials: _Trials, shape: Shape, allowed: float) -> Shape:
     if candidates == [shape]:
         return shape
     in_space, in_time = _cut_in_space(candidates, shape), _cut_in_time(candidates, shape)
+    trials.settle(shape, in_space)
     for tile in (in_space, shape, in_time):
         if tile is not None:
             trials.size(tile)
@@ -206,7 +233,7 @@ class _Cuts:
 
     def extra(self, tile: Shape) -> float:
         """Return the extra bytes that a tile is likely to cost, as a share."""
-        return self.share * self.ratio(tile) ** STEEPNESS
+        return self.share * math.pow(self.ratio(tile), STEEPNESS)
 
 
 def _blame(cuts: list[_Cuts], tile: Shape, factor: float) -> None:

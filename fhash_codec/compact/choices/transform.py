@@ -28,7 +28,7 @@ PLANE_WAVELETS = (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3), (
 """
 LINE_WAVELETS = (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3), ("5/3", 1))
 """Kinds and depths tried along t and along z."""
-ROUGH_WAVELETS = (("haar", 2), ("9/7", 1))
+ROUGH_WAVELETS = (("haar", 2), ("9/7", 1), ("9/7", 3))
 """Kinds and depths tried beside the usual ones where tilings are compared."""
 ERROR_PRICE = 0.8
 """Squared error in squared steps that is worth a byte."""

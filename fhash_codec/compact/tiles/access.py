@@ -14,6 +14,7 @@ from fhash_codec.compact.tiles.tiling import MAX_VERTICES
 from fhash_formats.transform.tile.sections import Shape
 
 __all__ = [
+    "MARGIN",
     "MAX_WHOLE_VERTICES",
     "PRICES",
     "Tiling",
@@ -30,6 +31,8 @@ MAX_WHOLE_VERTICES = 12 << 20
 
 PRICES = {"fast": 1.5, "balanced": 1.1, "small": 1.0}
 """Bytes that tiles may take, as a multiple of those of the best tiling, by the wish for access."""
+MARGIN = 0.035
+"""Part of an allowed price that no trial and no estimate may take: the files may differ by more."""
 REGION = 16
 """Vertices of a region along each axis in space; it is of one step."""
 FAST_ENOUGH = 1 << 16
@@ -38,12 +41,12 @@ LENGTHS = (1024, 512, 256, 128, 64, 32, 16, 8, 4, 2, 1)
 """Lengths in steps that tiles are tried at, approximately."""
 EDGES = (256, 192, 128, 96, 64, 48, 32, 24, 16)
 """Edges in space in vertices that tiles are tried at, approximately."""
-CUT_IN_SPACE = 4.5
+CUT_IN_SPACE = 6.0
 """Share of the bytes that a cut across space costs, times the vertices between such cuts.
 
 The most that was found on series of many kinds where nothing is tried (effort 1).
 """
-CUT_IN_TIME = 1.5
+CUT_IN_TIME = 10.0
 """The same of a cut in time, by steps."""
 BYTES_OF_TILE = 100
 """Bytes that each further tile costs: its place in the file, and the beginning of its coder."""
@@ -167,7 +170,8 @@ def cheap_tiling(shape: Shape, size: float, access: str) -> Tiling:
     prices = [foretold_price(shape, tile, size) for tile in tiles]
     # The best tiling of a long series is no single tile.
     lowest = min(prices)
+    allowed = max(PRICES[access] - MARGIN, 1.0)
     for tile, told in zip(tiles, prices, strict=True):
-        if told <= PRICES[access] * lowest:
+        if told <= allowed * lowest:
             return Tiling(tile=tile, price=told / lowest)
     raise AssertionError("the lowest price is allowed")
