@@ -19,7 +19,8 @@ from fhash_codec.compact.choices.head import choose_head
 from fhash_codec.compact.choices.mask import mask_levels
 from fhash_codec.compact.choices.predictor import choose_predictor
 from fhash_codec.compact.choices.quantiser import allows_trellis, off_trellis, on_trellis
-from fhash_codec.compact.choices.step import find_step, require_reach, with_step
+from fhash_codec.compact.choices.search import SLOPE
+from fhash_codec.compact.choices.step import AIM, CLOSE, find_step, require_reach, with_step
 from fhash_codec.compact.choices.tilings import choose_tiling
 from fhash_codec.compact.choices.transform import (
     choose_transform,
@@ -61,6 +62,11 @@ SAMPLE_WHY = "tiles on which the choices are tried"
 """Reason for the stage that reads and fills a sample."""
 HEAD_TRIES = 3
 """Trials of the step with a head: the search begins within some hundredths of a dB of its end."""
+NEAR = 0.03
+"""Distance in dB from the promise at which the search for a step ends before a head is tried.
+
+Candidates are compared at equal quality, and the step is searched once more for the best.
+"""
 REFITS = 3
 """Times that the data's own bases are made anew for another step."""
 SAME_STEP = 0.1
@@ -201,7 +207,10 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
     tries = 3 if task.config.effort == 1 else 5
     tried: list[Outcome] = []
-    settings, outcome = find_step(sample, attempt.settings, coding, goal, tries=tries, tried=tried)
+    close = CLOSE if _without_head(task, attempt) else NEAR
+    settings, outcome = find_step(
+        sample, attempt.settings, coding, goal, tries=tries, tried=tried, close=close
+    )
     if goal.psnr is None and outcome.count:
         error = math.sqrt(outcome.squares / outcome.count)
         settings = _with_mask(task, sample, settings, error)
@@ -211,7 +220,7 @@ def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
         if refitted is settings:
             break
         step_before = settings.step
-        settings, outcome = find_step(sample, refitted, coding, goal, tried=tried)
+        settings, outcome = find_step(sample, refitted, coding, goal, tried=tried, close=close)
         if abs(math.log(settings.step / step_before)) < SAME_STEP:
             break
     if task.config.effort > 1:
@@ -242,14 +251,32 @@ def try_head(task: PlanTask, attempt: Attempt) -> Attempt:
         find,
         look,
         attempt.tried,
-        strict=goal.error is not None,
+        aim=None if goal.psnr is None else goal.psnr + AIM,
         data_range=goal.data_range,
         effort=config.effort,
         seed=config.seed,
         parts=task.parts,
     )
+    if settings.head is None:
+        settings, outcome = _at_the_promise(task, attempt)
     task.gains.note("head" if settings.head is not None else "head (left out)", outcome)
     return replace(attempt, settings=settings, outcome=outcome, history=history)
+
+
+def _at_the_promise(task: PlanTask, attempt: Attempt) -> tuple[TileSettings, Outcome]:
+    """Return the settings of an attempt with the step that keeps the promise, and their outcome.
+
+    The search before the head ends near that step.
+    """
+    goal = task.goal
+    if goal.psnr is None:
+        return attempt.settings, attempt.outcome
+    missing = goal.psnr + AIM - attempt.outcome.psnr(goal.data_range)
+    if abs(missing) < CLOSE or math.isinf(missing):
+        return attempt.settings, attempt.outcome
+    settings = attempt.settings
+    settings = replace(settings, step=settings.step * math.exp(-missing / SLOPE))
+    return find_step(attempt.sample, settings, attempt.coding, goal, tries=HEAD_TRIES)
 
 
 def _without_head(task: PlanTask, attempt: Attempt) -> str:
@@ -257,6 +284,8 @@ def _without_head(task: PlanTask, attempt: Attempt) -> str:
     goal, effort = task.goal, task.config.effort
     if effort < MIN_HEAD_EFFORT:
         return f"effort {effort} trains none; from {MIN_HEAD_EFFORT} on"
+    if "head" in task.config.without:
+        return "--without head"
     if goal.size is not None:
         return "a promised ratio: the step changes once the whole file is known"
     if goal.error == 0 or goal.data_range <= 0:
@@ -342,5 +371,5 @@ def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
         settings = _transform_of_large_tile(task, attempt)
     else:
         settings, _ = choose_transform(sample, attempt.settings, goal.bounded(coding))
-    settings, outcome = find_step(sample, settings, coding, goal, tries=4)
+    settings, outcome = find_step(sample, settings, coding, goal, tries=4, close=NEAR)
     return replace(attempt, settings=settings, outcome=outcome)

@@ -63,6 +63,8 @@ PICKS = 5
 """Trials of a transform for each of them, on a part of the series."""
 REFIT_TRIES = 4
 """Further trials where the data's own bases are fitted again."""
+NEAR_REFIT_TRIES = 1.5
+"""Such trials before a head is tried, which needs the step less precisely."""
 BOUND_TRIALS = 8
 """Trials of a search for the step under a bound."""
 SIZE_TRIES = 3
@@ -201,7 +203,8 @@ def _choices(work: _Work) -> dict[str, float]:
             seconds["filling"] = 4 * fill + 4 * work.tries(2.5) * once
         seconds["sample"] += 2 * fill
     usual = NEAR_TRIES if searched == tried and config.effort > 1 else TRIES
-    tries = work.tries(usual + (REFIT_TRIES if rates.has_bases else 0))
+    refits = NEAR_REFIT_TRIES if config.effort >= MIN_HEAD_EFFORT else REFIT_TRIES
+    tries = work.tries(usual + (refits if rates.has_bases else 0))
     seconds["step"] = tries * once
     return seconds
 

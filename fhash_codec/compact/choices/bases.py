@@ -24,8 +24,6 @@ Gram = npt.NDArray[np.float64]
 """Products of lines (length, length)."""
 MAX_BASIS_LENGTH = 128
 """Longest axis in vertices that gets a basis of the data's own: longer factors cost too much."""
-MATRICES_AT_ONCE = 64
-"""Matrices of lines whose products are held at once."""
 
 
 class TileSample(Protocol):
@@ -101,9 +99,8 @@ class Bases:
         if planes.shape[2] == 1:
             last: Gram = planes[:, :, 0].T @ planes[:, :, 0]
             return last * share
-        gram = np.zeros((planes.shape[1], planes.shape[1]))
-        for matrices in np.array_split(planes, -(-len(planes) // MATRICES_AT_ONCE)):
-            gram += np.matmul(matrices, matrices.transpose(0, 2, 1)).sum(axis=0)
+        columns = planes.transpose(1, 0, 2).reshape(planes.shape[1], -1)
+        gram: Gram = columns @ columns.T
         return gram * share
 
 

@@ -47,7 +47,7 @@ NEAR_GAIN = 0.2
 POINTLESS = 0.005
 """Share of the bytes that a head must cost before the step is searched: then it is left out."""
 CLOSE = 0.004
-"""Distance in dB from the quality without a head at which no further step is tried."""
+"""Distance in dB from the PSNR that is searched for at which no further step is tried."""
 MIN_BYTES = 900
 """Bytes of coded tiles below which a head cannot save what it takes.
 
@@ -72,7 +72,7 @@ def choose_head(
     look: Callable[[TileSettings], Outcome],
     tried: list[Outcome],
     *,
-    strict: bool,
+    aim: float | None,
     data_range: float,
     effort: int,
     seed: int,
@@ -88,8 +88,8 @@ def choose_head(
     find_step: search for the step that keeps the promise with a head.
     look: codes the sample once, as that search does.
     tried: outcomes of that search without a head.
-    strict: whether the promise is a bound, which all outcomes keep; else sizes are compared at
-        the same PSNR.
+    aim: PSNR in dB that is searched for, at which sizes are compared; None for a bound, which all
+        outcomes keep.
     data_range: range of the values, in data units.
     parts: progress of the planning, which is told about the training.
     """
@@ -122,7 +122,7 @@ def choose_head(
             return training.run(pairs, coarser, shape, EFFORTS[effort].budget_of(shape), tell)
 
         heads = [head for head in _side_by_side(shapes, train, parts) if head is not None]
-        without = _Compared(outcome, octave, strict=strict, data_range=data_range)
+        without = _Compared(outcome, octave, aim, data_range)
         best = _searched(without, [(head, coarser) for head in heads], find_step, look)
     if best is None:
         return settings, outcome, []
@@ -140,8 +140,8 @@ class _Compared:
     """Outcome without a head."""
     octave: float
     """dB that an octave of bytes buys."""
-    strict: bool
-    """Whether the promise is a bound, which all outcomes keep."""
+    aim: float | None
+    """PSNR in dB that is searched for; None for a bound, which all outcomes keep."""
     data_range: float
     """Range of the values, in data units."""
 
@@ -154,7 +154,7 @@ class _Compared:
         size = candidate.outcome.size
         own_bytes = len(candidate.trained.head.to_bytes()) + head_bytes(size)
         extra: float = size - self.outcome.size + own_bytes
-        if self.strict:
+        if self.aim is None:
             return extra
         return extra + self.outcome.size * (2 ** (self.missing(candidate) / self.octave) - 1)
 
@@ -175,14 +175,14 @@ def _searched(
     if not heads:
         return None
     trained = [(head, replace(settings, head=head.head)) for head, settings in heads]
-    if without.strict and len(trained) == 1:
+    if without.aim is None and len(trained) == 1:
         head, settings = trained[0]
         return _Candidate(head, *find_step(settings))
     candidates = [_Candidate(head, settings, look(settings)) for head, settings in trained]
     best = min(candidates, key=without.extra_bytes)
-    if without.strict:
+    if without.aim is None:
         return _Candidate(best.trained, *find_step(best.settings))
-    missing = without.missing(best)
+    missing = without.aim - best.outcome.psnr(without.data_range)
     if abs(missing) < CLOSE or without.extra_bytes(best) > POINTLESS * without.outcome.size:
         return best
     nearer = replace(best.settings, step=best.settings.step * math.exp(-missing / SLOPE))

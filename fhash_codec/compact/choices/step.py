@@ -23,7 +23,7 @@ from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.errors import InputError
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["find_step", "psnr_search", "require_reach", "with_step"]
+__all__ = ["AIM", "find_step", "psnr_search", "require_reach", "with_step"]
 
 MAX_STEP_SHARE = 16.0
 """Largest step as a multiple of the value range: with a larger one nothing at all is coded."""
@@ -112,6 +112,7 @@ def find_step(
     *,
     tries: int = 5,
     tried: list[Outcome] | None = None,
+    close: float = CLOSE,
 ) -> tuple[TileSettings, Outcome]:
     """Return settings with the step that keeps the promise on the sample, and their outcome.
 
@@ -119,6 +120,7 @@ def find_step(
 
     tries: number of trials for a PSNR; the other searches derive theirs from it.
     tried: list to which a search for a PSNR appends all its outcomes.
+    close: distance in dB from the PSNR at which a search for it ends.
 
     Raises InputError for a ratio that is out of reach.
     """
@@ -126,7 +128,7 @@ def find_step(
         if goal.data_range == 0:
             return settings, sample.run(settings, coding)
         outcomes = [] if tried is None else tried
-        return _step_for_psnr(sample, settings, coding, goal.psnr, goal.data_range, tries, outcomes)
+        return _step_for_psnr(sample, settings, coding, goal, tries, outcomes, close)
     if goal.error is not None:
         if goal.error == 0:
             return settings, sample.run(settings, replace(coding, error=0.0))
@@ -145,13 +147,14 @@ def _step_for_psnr(
     sample: Sample,
     settings: TileSettings,
     coding: Coding,
-    psnr: float,
-    data_range: float,
+    goal: Goal,
     tries: int,
     tried: list[Outcome],
+    close: float,
 ) -> tuple[TileSettings, Outcome]:
-    """Search for the step of a PSNR; the trial nearest to it."""
-    target = psnr + AIM
+    """Search for the step of the PSNR of a goal; the trial nearest to it."""
+    assert goal.psnr is not None
+    target = goal.psnr + AIM
     search = psnr_search(settings)
     best: tuple[float, TileSettings, Outcome] | None = None
     for trial in range(tries):
@@ -159,10 +162,10 @@ def _step_for_psnr(
             settings = replace(settings, step=search.step_for(target))
         outcome = sample.run(settings, coding)
         tried.append(outcome)
-        reached = outcome.psnr(data_range)
+        reached = outcome.psnr(goal.data_range)
         if best is None or abs(reached - target) < abs(best[0] - target):
             best = (reached, settings, outcome)
-        if abs(reached - target) < CLOSE or math.isinf(reached):
+        if abs(reached - target) < close or math.isinf(reached):
             break
         search.add(settings.step, reached)
     assert best is not None

@@ -114,7 +114,7 @@ def test_no_head_is_tried_on_a_file_that_is_too_small_for_it(size: int) -> None:
     def choose() -> Any:
         return choose_head(
             cast(Sample, NoSample()), settings, outcome, Coding(),
-            cast(Any, None), cast(Any, None), [], strict=False, data_range=1.0, effort=5, seed=0,
+            cast(Any, None), cast(Any, None), [], aim=50.0, data_range=1.0, effort=5, seed=0,
         )  # fmt: skip
 
     if size < MIN_BYTES:
