@@ -98,6 +98,7 @@ WITHOUT_MIRROR: dict[str, str] = {
     "fhash_formats.transform.entropy.labels_portable": "held against the C++: test_labels.py",
     "fhash_formats.transform.entropy.mask_portable": "held against the C++: test_mask.py",
     "fhash_formats.transform.entropy.predict_portable": "held against the C++: test_predict.py",
+    "fhash_formats.transform.entropy.trellis_portable": "held against the C++: test_trellis.py",
     "fhash_formats.transform.entropy.rows_portable": "of mask and label twins: test_mask.py",
 }
 """Modules without a test file of their own, and where their behaviour is tested instead."""

@@ -18,7 +18,13 @@ from fhash_codec.compact.choices.fillings import choose_filling
 from fhash_codec.compact.choices.head import choose_head
 from fhash_codec.compact.choices.mask import mask_levels
 from fhash_codec.compact.choices.predictor import choose_predictor
-from fhash_codec.compact.choices.quantiser import allows_trellis, off_trellis, on_trellis
+from fhash_codec.compact.choices.quantiser import (
+    allows_trellis,
+    is_smaller,
+    off_trellis,
+    on_trellis,
+    step_after,
+)
 from fhash_codec.compact.choices.search import SLOPE
 from fhash_codec.compact.choices.step import AIM, CLOSE, find_step, require_reach, with_step
 from fhash_codec.compact.choices.tilings import choose_tiling
@@ -99,6 +105,7 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
         high=value_range.high,
         offsets=OFFSETS,
         double=True,
+        coder="signs",
     )
     return with_step(settings, step, goal)
 
@@ -191,15 +198,36 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 
 
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Choose the step that keeps the promise, and fit the data's own bases to it.
-
-    From here on the trellis takes the place of the plain quantiser.
-    """
-    if allows_trellis(attempt.settings, task.goal, task.config.effort):
-        settings, coding = on_trellis(attempt.settings, attempt.coding)
-        attempt = replace(attempt, settings=settings, coding=coding)
+    """Choose quantiser and step that keep the promise, and fit the data's own bases to the step."""
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
-        return _searched_step(task, attempt)
+        if not allows_trellis(attempt.settings, task.goal, task.config.effort):
+            return _searched_step(task, attempt)
+        return _searched_step(task, _choose_quantiser(task, attempt))
+
+
+def _choose_quantiser(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Return the attempt with the trellis if that makes the sample smaller, and a better step.
+
+    The trial of the plain quantiser tells where the search for the step begins.
+    """
+    sample, goal = attempt.sample, task.goal
+    plain = sample.run(attempt.settings, goal.bounded(attempt.coding))
+    attempt = replace(
+        attempt,
+        settings=replace(attempt.settings, step=step_after(attempt.settings, plain, goal)),
+        outcome=plain,
+    )
+    settings, coding = on_trellis(attempt.settings, attempt.coding)
+    tried: list[Outcome] = []
+    outcome = sample.run(settings, goal.bounded(coding))
+    tried.append(outcome)
+    if goal.psnr is not None:
+        settings = replace(settings, step=step_after(settings, outcome, goal))
+        outcome = sample.run(settings, coding)
+        tried.append(outcome)
+    if not is_smaller(outcome, plain, tried, goal):
+        return attempt
+    return replace(attempt, settings=settings, coding=coding, outcome=outcome)
 
 
 def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -325,7 +353,7 @@ def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
     outcome = replace(attempt.outcome, size=size)
     kept = settings.predictor is not None
     if kept and settings.trellis:
-        settings, _ = off_trellis(settings, attempt.coding)  # no tile has coefficients
+        settings, _ = off_trellis(settings, attempt.coding)  # no tile has coefficients now
     task.gains.note("prediction" if kept else "prediction (left out)", outcome)
     return replace(attempt, settings=settings, outcome=outcome)
 

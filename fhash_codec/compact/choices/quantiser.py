@@ -1,18 +1,30 @@
 """Choice of the quantiser: plain, or two in turn on a trellis (dependent quantisation).
 
 Transforms, tiles and fill values are chosen with the plain quantiser, which is as good for that.
-Then the trellis takes its place, with a step at which it errs about as much.
+Then the trellis takes its place where it makes the sample smaller at the same quality. It does so
+for most series. It does not for few coefficients, whose statistics it splits in two, nor where
+neighbours foretell the signs, which then are less regular.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
+from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
 from fhash_codec.compact.goal import Goal
-from fhash_codec.compact.tiles.coding import OFFSETS, WEIGHT, Coding
+from fhash_codec.compact.tiles.coding import OFFSETS, WEIGHT, Coding, Outcome
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["MIN_EFFORT", "SHARE", "allows_trellis", "off_trellis", "on_trellis", "plain_step"]
+__all__ = [
+    "allows_trellis",
+    "is_smaller",
+    "off_trellis",
+    "on_trellis",
+    "plain_step",
+    "step_after",
+]
 
 MIN_EFFORT = 2
 """Least effort that uses the trellis."""
@@ -54,3 +66,29 @@ def off_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, C
 def plain_step(settings: TileSettings) -> float:
     """Return the step with which the plain quantiser errs about as much, in units of the values."""
     return settings.step / SHARE if settings.trellis else settings.step
+
+
+def step_after(settings: TileSettings, outcome: Outcome, goal: Goal) -> float:
+    """Return the step at which a promised PSNR should be reached, by one outcome of the settings.
+
+    For other promises it is the step of the settings.
+    """
+    psnr = outcome.psnr(goal.data_range)
+    if goal.psnr is None or not math.isfinite(psnr):
+        return settings.step
+    moved = (psnr - goal.psnr) / SLOPE
+    return settings.step * math.exp(min(max(moved, -1.0), 1.0))
+
+
+def is_smaller(outcome: Outcome, plain: Outcome, tried: Sequence[Outcome], goal: Goal) -> bool:
+    """Whether the trellis takes fewer bytes than the plain quantiser at the same quality.
+
+    outcome: with the trellis.
+    plain: with the plain quantiser, at about the same quality.
+    tried: outcomes with the trellis at several steps, which tell what a difference is worth.
+    """
+    better = plain.psnr(goal.data_range) - outcome.psnr(goal.data_range)
+    if goal.error is not None or not math.isfinite(better) or not plain.size:
+        return outcome.size < plain.size
+    points = [(math.log2(one.size), one.psnr(goal.data_range)) for one in tried if one.size]
+    return outcome.size < plain.size * 2 ** (-better / exchange(points, EXCHANGE))

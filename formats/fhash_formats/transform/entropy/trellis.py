@@ -76,7 +76,8 @@ def rates_of(counts: npt.NDArray[np.int64], weight: float) -> Integers:
     share = mean / (1 + mean)
     chance = (smooth + PRIOR_COUNT * (1 - share) * share**index) / (total + PRIOR_COUNT)
     bits = -np.log2(np.maximum(chance, 1e-9)) + np.where(index > 0, SIGN_BITS, 0.0)
-    return np.minimum(np.rint(bits * weight * COST), MAX_RATE_COST).astype(np.int32)
+    costs: Integers = np.minimum(np.rint(bits * weight * COST), MAX_RATE_COST).astype(np.int32)
+    return costs
 
 
 def _counted(

@@ -195,7 +195,8 @@ def _weights(row: npt.NDArray[np.int32], sizes: Any) -> npt.NDArray[np.int64]:
     number = sum(row[REFERENCES + k * REFERENCE_COLUMNS] >= 0 for k in range(REFERENCE_COUNT))
     weight = along_t[:, None, None] + along_z[:, None] + along_y
     total: npt.NDArray[np.int64] = weight[..., None] + LEFT + LEFT2
-    return total + number * (REFERENCE + 2 * AROUND)
+    total += number * (REFERENCE + 2 * AROUND)
+    return total
 
 
 def _buckets(found: list[Integers], row: npt.NDArray[np.int32], table: Table) -> Integers:
@@ -236,7 +237,9 @@ def _cost(error: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
     """The costs of errors in steps."""
     # Candidates that are not looked at may be far away.
     near = np.minimum(error, np.float32(100))
-    return (near * near * np.float32(COST) + np.float32(0.5)).astype(np.int64)
+    costs: npt.NDArray[np.int64]
+    costs = (near * near * np.float32(COST) + np.float32(0.5)).astype(np.int64)
+    return costs
 
 
 def _candidates(

@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.lifting import Transform
-from fhash_formats.transform.entropy.coder import MAX_INTEGER, encode_integers
+from fhash_formats.transform.entropy.coder import MAX_INTEGER
 from fhash_formats.transform.entropy.predict import encode_predicted, integers_of
 from fhash_formats.transform.entropy.predictor import Predictor
-from fhash_formats.transform.entropy.trellis import choose_levels
 from fhash_formats.transform.tile.decoding import (
     blank_unoccupied,
     linear_values,
@@ -26,6 +24,7 @@ from fhash_formats.transform.tile.decoding import (
     within_range,
 )
 from fhash_formats.transform.tile.filling import filled
+from fhash_formats.transform.tile.integers import choose_integers, code_coefficients
 from fhash_formats.transform.tile.labelled import build_labelled_stream
 from fhash_formats.transform.tile.sections import (
     Shape,
@@ -44,19 +43,12 @@ from fhash_formats.transform.values.elementwise import (
     residual_of,
     within,
 )
-from fhash_formats.transform.values.quantise import LARGEST, dequantise, quantise
+from fhash_formats.transform.values.quantise import dequantise
 
 __all__ = ["CodedTile", "Coding", "encode_tile", "exact_tile", "labelled_tile"]
 
 Values = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
-Integers = npt.NDArray[np.int32]
-
-MAX_CHOSEN = 1 << 22
-"""Magnitude from which on an integer is the nearest one, and is not chosen by its cost.
-
-The choice compares coefficients in float32, which no longer holds their fractions.
-"""
 
 _END_MARGIN = 1e-4
 """Values within this share of the range from one of its ends count as lying at that end."""
@@ -299,7 +291,7 @@ def _transformed_tile(task: _Task) -> CodedTile:
     transform = transform_for(settings, task.shape)
     target = _target(task, transform)
     coefficients = _free_coefficients(task, transform, target)
-    coded = _code(coefficients, task)
+    coded = code_coefficients(coefficients, settings, task.coding.weight, task.coding.passes)
     if coded is None:
         return task.exact()
     data, integers = coded
@@ -347,7 +339,7 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
     high = settings.high - settings.center - margin
     coefficients = transform.forward(target)
     for _ in range(task.coding.rounds):
-        integers = _tried(coefficients, task)
+        integers = choose_integers(coefficients, settings, task.coding.weight)
         if integers is None:
             break
         rebuilt = transform.inverse(
@@ -357,57 +349,3 @@ def _free_coefficients(task: _Task, transform: Transform, target: Values) -> Val
             break
         coefficients = transform.forward(target)
     return coefficients
-
-
-def _tried(coefficients: Values, task: _Task) -> Integers | None:
-    """The integers of coefficients, chosen as for coding; None where the trellis has none."""
-    settings, weight = task.settings, task.coding.weight
-    if settings.trellis:
-        return _on_trellis(coefficients, task)
-    integers, scaled = quantise(coefficients, settings.step)
-    if weight <= 0:
-        return integers
-    table = band_table(settings.transform, task.shape)
-    return encode_integers(
-        integers, table, scaled=scaled, weight=weight, coder=settings.coder
-    ).integers
-
-
-def _on_trellis(coefficients: Values, task: _Task, passes: int = 1) -> Integers | None:
-    """The integers of the cheapest path through the trellis; None where one would be too large.
-
-    passes: how often the path is searched.
-    """
-    settings = task.settings
-    scaled = coefficients * settings.dtype.type(1.0 / settings.step)
-    # Written so that it holds for NaN as well.
-    if not max(-float(scaled.min()), float(scaled.max())) < LARGEST:
-        return None
-    table = band_table(settings.transform, task.shape)
-    return choose_levels(scaled, table, task.coding.weight, passes)
-
-
-def _code(coefficients: Values, task: _Task) -> tuple[bytes, Integers] | None:
-    """The coded coefficients, and the integers that they decode to; None where one is too large."""
-    settings, weight = task.settings, task.coding.weight
-    table, coder = band_table(settings.transform, task.shape), settings.coder
-    if settings.trellis:
-        path = _on_trellis(coefficients, task, task.coding.passes)
-        if path is None:
-            return None
-        return encode_integers(path, table, coder=coder, trellis=True).data, path
-    integers, scaled = quantise(coefficients, settings.step)
-    largest = max(-int(integers.min()), int(integers.max()))
-    if largest >= LARGEST:
-        return None
-    coded = encode_integers(
-        integers, table, scaled=scaled if weight > 0 else None, weight=weight, coder=coder
-    )
-    chosen = coded.integers
-    if largest >= MAX_CHOSEN and weight > 0 and settings.double:
-        large = np.abs(integers) >= MAX_CHOSEN
-        nearest = np.rint(coefficients / settings.step).astype(np.int32)
-        chosen = np.where(large, nearest, chosen)
-    if (task.coding.passes > 1 and weight > 0) or chosen is not coded.integers:
-        coded = encode_integers(chosen, table, coder=coder)
-    return coded.data, coded.integers

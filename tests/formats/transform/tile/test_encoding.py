@@ -11,7 +11,8 @@ from specs import spec_of
 from tiles import SETTINGS, SHAPE, same, wave
 
 from fhash_formats.transform.tile.decoding import decode_tile
-from fhash_formats.transform.tile.encoding import MAX_CHOSEN, Coding, encode_tile, exact_tile
+from fhash_formats.transform.tile.encoding import Coding, encode_tile, exact_tile
+from fhash_formats.transform.tile.integers import MAX_CHOSEN
 from fhash_formats.transform.values.quantise import LARGEST
 
 

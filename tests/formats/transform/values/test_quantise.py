@@ -35,6 +35,17 @@ def test_offsets_depend_on_the_magnitude(
     assert values.tolist() == [0.0, 1.0, -1.0, 3.5, 6.0, -14.0]
 
 
+@pytest.mark.parametrize("setting", ["0", "1"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_six_offsets_tell_odd_from_even(
+    dtype: Any, setting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FHASH_NATIVE", setting)
+    integers = np.array([0, 1, -2, 3, -4, 5, 6, -7, 1000], np.int32)
+    values = dequantise(integers, 1.0, (64, 32, 16, 8, -64, -32), dtype)
+    assert values.tolist() == [0.0, 1.5, -2.25, 3.125, -4.0625, 4.5, 5.75, -6.5, 999.75]
+
+
 @pytest.mark.skipif(native.library() is None, reason="the native library was not built here")
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_both_engines_give_the_same_bits(dtype: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,6 +54,8 @@ def test_both_engines_give_the_same_bits(dtype: Any, monkeypatch: pytest.MonkeyP
     for setting in ("1", "0"):
         monkeypatch.setenv("FHASH_NATIVE", setting)
         integers, scaled = quantise(coefficients, 0.3)
-        values = dequantise(integers, 0.3, (-5, -1, 0), dtype)
-        results.append((integers.tobytes(), scaled.tobytes(), values.tobytes()))
+        three = dequantise(integers, 0.3, (-5, -1, 0), dtype)
+        six = dequantise(integers, 0.3, (17, -10, -5, -3, -2, -1), dtype)
+        arrays = (integers, scaled, three, six)
+        results.append([array.tobytes() for array in arrays])
     assert results[0] == results[1]
