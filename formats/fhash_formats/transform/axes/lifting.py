@@ -90,18 +90,23 @@ class _Plan:
             )
         )
 
+    @cached_property
+    def _native_matrices(self) -> list[Values | None]:
+        """The matrices as the library takes them: along x transposed, so that its rows lie along
+        the results.
+        """
+        return [
+            None if matrix is None else np.ascontiguousarray(matrix.T if axis == 3 else matrix)
+            for axis, matrix in enumerate(self.matrices)
+        ]
+
     def _native_arguments(self, source: Values, result: Values, inverse: bool) -> list[Any]:
         """The arguments of the native transforms."""
         rank_axis = 1 if inverse else 0
         ranks = [0 if matrix is None else matrix.shape[rank_axis] for matrix in self.matrices]
-        # Along x the library takes the transpose, so that its rows lie along the results.
-        matrices = [
-            None if matrix is None else np.ascontiguousarray(matrix.T if axis == 3 else matrix)
-            for axis, matrix in enumerate(self.matrices)
-        ]
         four = ctypes.c_int64 * 4
+        matrices = self._native_matrices
         pointers = (ctypes.c_void_p * 4)(*(None if m is None else m.ctypes.data for m in matrices))
-        pointers.matrices = matrices  # kept alive as long as their addresses
         return [
             source.ctypes.data_as(ctypes.c_void_p),
             result.ctypes.data_as(ctypes.c_void_p),
