@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.measure.between import NeighboursOf, neighbours_of
 from fhash_codec.measure.bulk import find_bulk
 from fhash_codec.measure.metrics import measure_quality
+from fhash_codec.measure.ssim import BUDGET as SSIM_BUDGET
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.report import report
@@ -21,6 +23,16 @@ from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
 from fhash_formats.errors import InputError
 from fhash_formats.series import AXES, Series
+
+QUICK_SSIM_BUDGET = 1 << 20
+"""Vertices whose SSIM is measured after an encoding at effort 1."""
+
+
+def ssim_budget(config: EncodeConfig) -> int:
+    """Vertices whose SSIM is measured after an encoding; 0 for none."""
+    if "ssim" in config.without:
+        return 0
+    return QUICK_SSIM_BUDGET if config.effort == 1 else SSIM_BUDGET
 
 
 def diff(source: Source, path: str | Path, *, progress: Progress = silent) -> dict[str, Any]:
@@ -76,11 +88,11 @@ def _is_index(positions: npt.NDArray[np.float64]) -> bool:
 
 
 def measure(
-    series: Series, volume: Volume, progress: Progress, *, with_ssim: bool = True
+    series: Series, volume: Volume, progress: Progress, *, ssim_budget: int = SSIM_BUDGET
 ) -> dict[str, Any]:
     """Measure every decoded step of a volume against its series: `metrics.Quality` as JSON values.
 
-    with_ssim: measure the SSIM, too; else it is None.
+    ssim_budget: vertices whose SSIM is measured; with 0 it is None.
 
     The bulk is that of the volume's header; it is found in the series if the header knows none.
     Raises InputError if the series changed since it was opened.
@@ -97,7 +109,7 @@ def measure(
         progress,
         bulk=_bulk(series, volume),
         neighbours=_neighbours(series, volume),
-        with_ssim=with_ssim,
+        ssim_budget=ssim_budget,
     )
     series.check()
     return quality.to_dict()

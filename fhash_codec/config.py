@@ -33,6 +33,9 @@ OPTIONAL_STAGES = ("tiles", "transform", "filling", "head", "predictor", "ssim")
 STAGES_OF_PAPER = ("ssim",)
 """Those of them that the profile paper has."""
 
+ACCESSES = ("fast", "balanced", "small")
+"""Wishes for access to regions, those that may cost the most bytes first."""
+
 PAIR = ("psnr", "psnr_bulk")
 """Promises that may be given together."""
 
@@ -211,6 +214,13 @@ class EncodeConfig:
         "'auto', or 'whole' for one tile",
         profile="compact",
     )
+    access: str = option(
+        "balanced",
+        "compact: bytes that small tiles may cost, by which a region is read sooner: 'fast' for up "
+        "to 1.5 times those of the best tiles, 'balanced' for up to 1.1, 'small' for none",
+        choices=ACCESSES,
+        profile="compact",
+    )
     without: tuple[str, ...] = option(
         (),
         "stages to leave out, which then take no time: tiles, transform, filling, head, predictor "
@@ -249,6 +259,11 @@ class EncodeConfig:
             )
         self._check_profile()
         self._check_without()
+        if self.access != "balanced" and self.tile != "auto":
+            raise InputError(
+                f"access '{self.access}' and tile '{self.tile}' are given; a tile that is named "
+                "leaves nothing to choose: give one of them"
+            )
         self._check_promises()
 
     @property

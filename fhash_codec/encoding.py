@@ -11,10 +11,12 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.coded_table import DecodedTiles
 from fhash_codec.compact.encode import encode_compact
-from fhash_codec.comparison import measure
+from fhash_codec.comparison import measure, ssim_budget
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import Source, open_source
 from fhash_codec.header import brief_quality
@@ -27,11 +29,14 @@ from fhash_codec.stage_clock import recording, skip, stage
 from fhash_codec.training.devices import choose_device, need_torch
 from fhash_codec.volume import Volume
 from fhash_codec.volume import open as open_volume
-from fhash_formats.container import ContainerWriter
+from fhash_formats.container import Container, ContainerWriter
 from fhash_formats.errors import FhashWarning, InputError, QualityError
 from fhash_formats.series import Series
 from fhash_formats.support.atomic import check_output
 
+DECODED_AGAIN = 8
+"""Tiles of which one is decoded from the file where the encoder knows their decoded values."""
+_NONE_DECODED: DecodedTiles = {}
 PREDICTED = ("seconds", "bytes", "psnr")
 """Figures of a prediction that a header keeps."""
 
@@ -155,16 +160,27 @@ class _Measured:
         self._writer, self._series, self._progress = writer, series, progress
         self._config = config
 
-    def complete(self, header: dict[str, Any]) -> dict[str, Any]:
-        """The header with the quality of the arrays written so far, as they decode."""
-        with_ssim = "ssim" not in self._config.without
-        if not with_ssim:
+    def complete(
+        self, header: dict[str, Any], decoded: DecodedTiles = _NONE_DECODED
+    ) -> dict[str, Any]:
+        """The header with the quality of the arrays written so far, as they decode.
+
+        decoded: tiles whose decoded values the encoder knows. The written bytes of all tiles are
+            checked by their checksums, and one tile of DECODED_AGAIN is decoded from them.
+        """
+        if "ssim" in self._config.without:
             skip("ssim", "--without ssim")
+        why = "errors of the written bytes, as a reader decodes them"
+        if decoded:
+            why = f"errors as the encoder decoded them, 1 tile of {DECODED_AGAIN} from the file"
         with (
-            stage("measuring", "errors of the written bytes, as a reader decodes them"),
+            stage("measuring", why),
             Volume(self._writer.preview(header)) as volume,
         ):
-            self.quality = measure(self._series, volume, self._progress, with_ssim=with_ssim)
+            if decoded:
+                _take_decoded(volume.container, decoded)
+            vertices = ssim_budget(self._config)
+            self.quality = measure(self._series, volume, self._progress, ssim_budget=vertices)
         low, high = header["value_range"]
         steps = header["domain"]["shape"][0]
         header = {**header, "quality": brief_quality(self.quality, high - low, steps)}
@@ -181,6 +197,18 @@ class _Measured:
             "ratio": raw_bytes / self._writer.size(header),
             "promised": self._config.to_dict() | header["config"],
         }
+
+
+def _take_decoded(container: Container, decoded: DecodedTiles) -> None:
+    """Give a container the decoded values of its table, so that it decodes few tiles of them."""
+    name = "tables/level_1"
+    for number, (index, values) in enumerate(decoded.items()):
+        if number % DECODED_AGAIN == 0:
+            read = container.arrays[name].decode_chunk(index)
+            assert np.array_equal(read, values, equal_nan=values.dtype.kind == "f"), (
+                f"tile {index} decodes to other values than its encoder found"
+            )
+    container.take_decoded(name, decoded)
 
 
 def missed_path(path: Path) -> Path:

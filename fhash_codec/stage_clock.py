@@ -67,6 +67,10 @@ class StageClock:
         """Record that a stage is left out; one that was entered before stays as it is."""
         self._record(name, why)
 
+    def tell(self, name: str, why: str) -> None:
+        """Replace the reason of a stage by what came of it."""
+        self._record(name, why).why = why
+
     def attribute(self, name: str, why: str, seconds: float) -> None:
         """Count seconds of the open stage for another one, whose work lies between its own."""
         part = self._record(name, why)
@@ -134,3 +138,10 @@ def attribute(name: str, why: str, seconds: float) -> None:
     clock = _clock.get()
     if clock is not None:
         clock.attribute(name, why, seconds)
+
+
+def tell(name: str, why: str) -> None:
+    """Replace the reason of a stage by what came of it; see `StageClock.tell`."""
+    clock = _clock.get()
+    if clock is not None:
+        clock.tell(name, why)

@@ -93,6 +93,8 @@ WITHOUT_MIRROR: dict[str, str] = {
     "fhash_codec.rendering.picture.plan": "a record: picture/test_planning.py, test_explain.py",
     "fhash_codec.selftest.checks.properties": "a list of checks: selftest/test_runner.py",
     "fhash_formats.transform.entropy.coder_portable": "held against the C++: test_coder.py",
+    "fhash_formats.transform.entropy.magnitudes_portable": "held against the C++: test_coder.py",
+    "fhash_formats.transform.entropy.signs_portable": "held against the C++: test_coder.py",
     "fhash_formats.transform.entropy.labels_portable": "held against the C++: test_labels.py",
     "fhash_formats.transform.entropy.mask_portable": "held against the C++: test_mask.py",
     "fhash_formats.transform.entropy.predict_portable": "held against the C++: test_predict.py",

@@ -10,6 +10,7 @@ from typing import Any
 
 from fhash_codec.compact.choices.head import HeadHistory
 from fhash_codec.compact.goal import Goal
+from fhash_codec.compact.tiles.access import Tiling
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
@@ -84,3 +85,5 @@ class Attempt:
     """Outcomes on the way of the search for the PSNR, without a head."""
     history: HeadHistory = field(default_factory=list)
     """Training of the head."""
+    tiling: Tiling | None = None
+    """Choice of the tiles; None where they were asked for."""

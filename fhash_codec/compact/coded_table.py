@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+import numpy.typing as npt
+
 from fhash_codec.compact.plan import CodingPlan
+from fhash_codec.compact.tiles.blocks import Index
 from fhash_codec.compact.tiles.coding import Outcome
 from fhash_codec.config import EncodeConfig
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.container.table_parts import TableParts
 
-__all__ = ["CodedTable", "model_header"]
+__all__ = ["CodedTable", "DecodedTiles", "model_header"]
+
+DecodedTiles = Mapping[Index, npt.NDArray[Any]]
+"""Tiles as they decode, in the type of the source."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +32,8 @@ class CodedTable:
     """Stream of each tile, in C order."""
     outcome: Outcome
     """Size and error of all tiles."""
+    decoded: DecodedTiles = field(default_factory=dict)
+    """All tiles as they decode, where the plan keeps them."""
     bulk: ValueRange | None = None
     """Bulk of the values that count, in data units; None if they have none."""
 

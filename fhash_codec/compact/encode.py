@@ -14,12 +14,14 @@ from fhash_codec.compact.choices.head import HeadHistory
 from fhash_codec.compact.choices.head_samples import BATCH_VOXELS
 from fhash_codec.compact.coded_table import (
     CodedTable,
+    DecodedTiles,
     model_header,
 )
 from fhash_codec.compact.goal import promise
 from fhash_codec.compact.tiles.blocks import fits_memory
 from fhash_codec.compact.tiles_to_promise import code_series, resized
 from fhash_codec.compact.tiles_to_size import ByteWindow
+from fhash_codec.compact.tiling_record import tiling_header
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Everything
 from fhash_codec.coreset.selection import FeatureSelection, select_features
@@ -52,7 +54,7 @@ def encode_compact(
     config: EncodeConfig,
     mask: npt.ArrayLike | None,
     progress: Progress,
-    complete: Callable[[dict[str, Any]], dict[str, Any]],
+    complete: Callable[[dict[str, Any], DecodedTiles], dict[str, Any]],
 ) -> dict[str, Any]:
     """Code the values of a series and write them; the header.
 
@@ -60,7 +62,8 @@ def encode_compact(
     quantiser allows that.
 
     mask: booleans (t, z, y, x) or (z, y, x), one more feature.
-    complete: measures what is written, and returns a header with its quality.
+    complete: measures what is written, and returns a header with its quality. Its second argument
+        are the tiles whose decoded values are known.
 
     Warns (FhashWarning) where the native library is missing.
     """
@@ -92,7 +95,7 @@ def encode_compact(
         seconds = round(time.perf_counter() - begun, 3) if config.timings else None
         own = _header(selection, table, config, seconds)
         own["required_features"] += coordinate_features(described["coordinates"])
-        header = complete(source | described | own)
+        header = complete(source | described | own, table.decoded)
         overhead = writer.size(header) - table.outcome.size
         if config.ratio is None or ByteWindow.of(table.plan.goal, overhead).holds(table):
             break
@@ -113,6 +116,7 @@ def _header(
     """
     extent = selection.extent
     trained = table.plan.history
+    tiling = tiling_header(table, timings=config.timings, quick=config.effort == 1)
     return {
         "encoder": {
             "version": version("fhash"),
@@ -124,7 +128,7 @@ def _header(
         "feature_bounding_box": [list(span) for span in extent.box],
         "features": [str(feature) for feature in selection.features],
         "coreset_fraction": extent.fraction,
-        "model": model_header(table, config),
+        "model": model_header(table, config) | ({} if tiling is None else {"tiling": tiling}),
         "config": config.to_dict() | promise(config, selection.scanned.value_range, table.bulk),
         # The figures are measured on the written bytes, within this bulk.
         "quality": {"bulk": _described(table.bulk)},

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from math import prod
 from typing import Any
 
 from fhash_codec.compact.attempt import Attempt, GainLog, PlanTask
@@ -20,13 +21,15 @@ from fhash_codec.compact.stages import (
     fill_tiles,
     first_guess,
     first_settings,
+    refit_bases,
     try_head,
     try_predictor,
 )
+from fhash_codec.compact.tiles.access import Tiling, cheap_tiling
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import OFFSETS, Coding
 from fhash_codec.compact.tiles.sample import Sample
-from fhash_codec.compact.tiles.tiling import first_tile, parse_tile, tile_for
+from fhash_codec.compact.tiles.tiling import first_tile, parse_tile
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.features import Feature
 from fhash_codec.measure.value_range import ValueRange
@@ -42,7 +45,9 @@ MAX_VALUE = 1e145
 """Largest magnitude of a value whose squared errors fit float64."""
 MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
-STAGES = 6
+MAX_BYTES_KEPT = 128 << 20
+"""Largest size of the box over all steps, in bytes, whose decoded values effort 1 keeps."""
+STAGES = 7
 """Number of parts of the planning that its progress counts."""
 
 
@@ -64,6 +69,10 @@ class CodingPlan:
     """Size of the file after each stage, see `GainLog`."""
     history: HeadHistory = field(default_factory=list)
     """Training of the head; empty without one."""
+    tiling: Tiling | None = None
+    """Choice of the tiles; None where they were asked for."""
+    keeps_decoded: bool = False
+    """Whether all tiles are kept as they decode, to be measured without being decoded again."""
 
 
 def plan(
@@ -152,6 +161,7 @@ def _by_trial(
         goal=task.goal,
         gains=task.gains.entries,
         history=attempt.history,
+        tiling=attempt.tiling,
     )
 
 
@@ -162,6 +172,7 @@ def _improved(task: PlanTask, attempt: Attempt) -> Attempt:
         ("fill values", fill_tiles),
         ("quantiser step", choose_step),
         ("head", try_head),
+        ("coarser bases", refit_bases),
         ("prediction", try_predictor),
     ):
         task.parts.begin(part)
@@ -177,6 +188,7 @@ def _label_plan(task: PlanTask, labelled: Attempt) -> CodingPlan:
         coding=task.goal.bounded(labelled.coding),
         goal=task.goal,
         gains=task.gains.entries,
+        tiling=labelled.tiling,
     )
 
 
@@ -231,11 +243,13 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
     goal = task.goal
     assert goal.psnr is not None
     assert goal.even_psnr is not None
+    tiling = None
     if task.fixed_tile is None:
         size = estimated_size(
             tiled, settings, psnr=goal.even_psnr, data_range=goal.data_range, workers=task.workers
         )
-        tiled = task.blocks.retile(tile_for(task.blocks.shape, size))
+        tiling = cheap_tiling(task.blocks.shape, size, task.config.access)
+        tiled = task.blocks.retile(tiling.tile)
     settings = replace(settings, transform=usual_transform(tiled.tile))
     coding = Coding(filled=True, density=0, bulk=goal.bulk)
     step = estimated_step(
@@ -248,5 +262,10 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
         workers=task.workers,
     )
     return CodingPlan(
-        blocks=tiled, settings=with_step(settings, step, goal), coding=coding, goal=goal
+        blocks=tiled,
+        settings=with_step(settings, step, goal),
+        coding=coding,
+        goal=goal,
+        tiling=tiling,
+        keeps_decoded=prod(tiled.shape) * tiled.dtype.itemsize <= MAX_BYTES_KEPT,
     )

@@ -6,26 +6,32 @@ Another order of the trials would give other bytes in the file.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from math import prod
 
 import numpy as np
 
 from fhash_codec.compact.attempt import Attempt, PlanTask
+from fhash_codec.compact.choices.coarser_bases import coarser_bases
 from fhash_codec.compact.choices.estimate import tile_costs
 from fhash_codec.compact.choices.fillings import choose_filling
 from fhash_codec.compact.choices.head import choose_head
 from fhash_codec.compact.choices.mask import mask_levels
 from fhash_codec.compact.choices.predictor import choose_predictor
+from fhash_codec.compact.choices.quantiser import allows_trellis, off_trellis, on_trellis
 from fhash_codec.compact.choices.step import find_step, require_reach, with_step
-from fhash_codec.compact.choices.transform import choose_transform, refit, usual_transform
+from fhash_codec.compact.choices.tilings import choose_tiling
+from fhash_codec.compact.choices.transform import (
+    choose_transform,
+    own_or_found,
+    refit,
+    usual_transform,
+)
+from fhash_codec.compact.tiles.access import Tiling, cheap_tiling, part_of
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
-from fhash_codec.compact.tiles.tiling import even_tile, tile_for
-from fhash_codec.stage_clock import skip, stage
-from fhash_formats.transform.tile.sections import Shape
+from fhash_codec.stage_clock import skip, stage, tell
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = [
@@ -34,7 +40,7 @@ __all__ = [
     "fill_tiles",
     "first_guess",
     "first_settings",
-    "other_tiles",
+    "refit_bases",
     "try_head",
     "try_predictor",
 ]
@@ -47,16 +53,8 @@ SAMPLE_VERTICES = 6 << 20
 """Vertices coded for each trial of a step."""
 MAX_SEARCHED_VERTICES = 12 << 20
 """Vertices up to which a series is searched whole instead of on a sample."""
-PRICE_OF_TILES = 1.3
-"""Factor by which smaller tiles may make a file larger: random access is worth it."""
-MAX_TILE_VERTICES = 12 << 20
-"""Vertices of a tile that is chosen for its bytes alone: a larger one takes long to decode."""
-SMALL_FILE_BYTES = 60_000
-"""Bytes up to which a file is read in a moment as a whole, so that its tiles may be large."""
-MAX_TILE_STEPS = 32
-"""Longest tile in time steps that may span the whole series for its bytes alone."""
-PRICE_OF_STEPS = 0.97
-"""Size ratio below which slower access to a single step is accepted."""
+LARGE = 1.5
+"""Vertices of a tile, in TRIAL_VERTICES, from which on a part of it stands for it in trials."""
 MIN_HEAD_EFFORT = 5
 """Least effort that trains a head."""
 SAMPLE_WHY = "tiles on which the choices are tried"
@@ -111,17 +109,19 @@ def first_guess(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Attemp
 
 
 def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Choose the tiles, by the size of the first guess and by trial, and the transform."""
-    tiled = attempt.sample.blocks
+    """Choose the tiles, by trial or by the size of the first guess, and the transform."""
+    tiled, tiling = attempt.sample.blocks, attempt.tiling
     if task.fixed_tile is None:
-        tiled = task.blocks.retile(tile_for(task.blocks.shape, attempt.outcome.size))
+        tiling = _tiling(task, attempt)
+        tiled = task.blocks.retile(tiling.tile)
+    else:
+        skip("tiles", f"--tile {task.config.tile}")
     settings = replace(attempt.settings, transform=usual_transform(tiled.tile))
     with stage("sample", SAMPLE_WHY):
         sample = _sample(task, tiled, settings, TRIAL_VERTICES)
-    attempt = replace(attempt, sample=sample, settings=settings)
+    attempt = replace(attempt, sample=sample, settings=settings, tiling=tiling)
     if task.config.effort == 1:
-        for name in ("transform", "tiles"):
-            skip(name, "effort 1 tries none; from 2 on")
+        skip("transform", "effort 1 tries none; from 2 on")
         return attempt
     if _asked(task, "transform"):
         with stage("transform", f"trials along each axis, at effort {task.config.effort}"):
@@ -129,14 +129,37 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
     else:
         with stage("step", "size of the tiles where the promise is kept"):
             attempt = _choose_transform(task, attempt)
-    if task.fixed_tile is not None:
-        skip("tiles", f"--tile {task.config.tile}")
-    elif _asked(task, "tiles"):
-        attempt = _tryother_tiles(task, attempt)
     vertices = prod(task.blocks.shape)
     searched = MAX_SEARCHED_VERTICES if vertices <= MAX_SEARCHED_VERTICES else SAMPLE_VERTICES
     with stage("sample", SAMPLE_WHY):
         return replace(attempt, sample=attempt.sample.wider(searched))
+
+
+def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
+    """Return settings with a transform that is chosen on a part of a large tile.
+
+    The part has all steps and all of z where it can; what it cannot tell, bases as long as the
+    tile, competes with its choice on the sample itself.
+    """
+    sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
+    part = task.blocks.window(part_of(sample.blocks.tile, TRIAL_VERTICES))
+    usual = replace(attempt.settings, transform=usual_transform(part.tile))
+    small = Sample(part, TRIAL_VERTICES, task.workers, tick=task.parts.tick).filled(usual, 1)
+    found = choose_transform(small, usual, coding)[0].transform.axes
+    return own_or_found(sample, attempt.settings, found, coding)
+
+
+def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:
+    """Return the choice of the tiles: by trial from effort 2 on."""
+    access, config = task.config.access, task.config
+    if config.effort == 1 or not _asked(task, "tiles"):
+        if config.effort == 1:
+            skip("tiles", "effort 1 foretells what tiles cost; from 2 on they are tried")
+        return cheap_tiling(task.blocks.shape, attempt.outcome.size, access)
+    with stage("tiles", f"trials for --access {access}"):
+        tiling = choose_tiling(task, attempt.settings, attempt.coding, access)
+    tell("tiles", f"--access {access}: {tiling.describe()}")
+    return tiling
 
 
 def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
@@ -162,7 +185,13 @@ def fill_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 
 
 def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Choose the step that keeps the promise, and fit the data's own bases to it."""
+    """Choose the step that keeps the promise, and fit the data's own bases to it.
+
+    From here on the trellis takes the place of the plain quantiser.
+    """
+    if allows_trellis(attempt.settings, task.goal, task.config.effort):
+        settings, coding = on_trellis(attempt.settings, attempt.coding)
+        attempt = replace(attempt, settings=settings, coding=coding)
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
         return _searched_step(task, attempt)
 
@@ -237,6 +266,21 @@ def _without_head(task: PlanTask, attempt: Attempt) -> str:
     return ""
 
 
+def refit_bases(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Make the data's own bases anew for the final step, and keep them if the file is smaller."""
+    if task.config.effort == 1 or task.goal.size is not None:
+        return attempt
+    found = coarser_bases(
+        attempt.sample, attempt.settings, attempt.outcome, attempt.coding, task.goal
+    )
+    if found is None:
+        return attempt
+    settings, outcome = found
+    kept = settings is not attempt.settings
+    task.gains.note("coarser bases" if kept else "coarser bases (left out)", outcome)
+    return replace(attempt, settings=settings, outcome=outcome)
+
+
 def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
     """Train a predictor for a strict bound, and keep it if the file gets smaller by it."""
     goal, effort = task.goal, task.config.effort
@@ -251,6 +295,8 @@ def try_predictor(task: PlanTask, attempt: Attempt) -> Attempt:
         )
     outcome = replace(attempt.outcome, size=size)
     kept = settings.predictor is not None
+    if kept and settings.trellis:
+        settings, _ = off_trellis(settings, attempt.coding)  # no tile has coefficients
     task.gains.note("prediction" if kept else "prediction (left out)", outcome)
     return replace(attempt, settings=settings, outcome=outcome)
 
@@ -286,72 +332,15 @@ def _with_mask(
     return replace(settings, mask=levels)
 
 
-def _choose_transform(task: PlanTask, attempt: Attempt, *, quick: bool = False) -> Attempt:
-    """Choose the transform by trial, and the step that keeps the promise with it.
-
-    Attempts with other tiles are compared at this step: at equal quality.
-    """
+def _choose_transform(task: PlanTask, attempt: Attempt) -> Attempt:
+    """Choose the transform by trial, and the step that keeps the promise with it."""
     sample, coding, goal = attempt.sample, attempt.coding, task.goal
     if "transform" in task.config.without:
         usual = usual_transform(sample.blocks.tile)
         settings = replace(attempt.settings, transform=usual)
+    elif prod(sample.blocks.tile) > LARGE * TRIAL_VERTICES:
+        settings = _transform_of_large_tile(task, attempt)
     else:
-        settings, _ = choose_transform(sample, attempt.settings, goal.bounded(coding), quick=quick)
-    settings, outcome = find_step(sample, settings, coding, goal, tries=3 if quick else 4)
+        settings, _ = choose_transform(sample, attempt.settings, goal.bounded(coding))
+    settings, outcome = find_step(sample, settings, coding, goal, tries=4)
     return replace(attempt, settings=settings, outcome=outcome)
-
-
-def _tryother_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Try larger and longer tiles, and keep them if the file gets much smaller by them."""
-    tiled = attempt.sample.blocks
-    others = other_tiles(tiled.shape, tiled.tile, attempt.outcome.size, complete=tiled.complete)
-    if not others:
-        skip("tiles", "no other tile is worth the slower access to a region")
-        return attempt
-    with stage("tiles", "trials of larger and longer tiles, for a small file or a sparse coreset"):
-        return _best_tiles(task, attempt, others)
-
-
-def _best_tiles(task: PlanTask, attempt: Attempt, others: Sequence[Shape]) -> Attempt:
-    """Return the best of the attempt and those with other tiles, larger ones at a price."""
-    tiled = attempt.sample.blocks
-    max_vertices = MAX_TILE_VERTICES if tiled.complete else TRIAL_VERTICES
-    for tile in others:
-        settings = attempt.settings
-        sample = _sample(task, task.blocks.retile(tile), settings, max_vertices)
-        other = _choose_transform(task, replace(attempt, sample=sample), quick=True)
-        larger_in_space = prod(tile[1:]) > prod(tiled.tile[1:])
-        max_ratio = 1 / PRICE_OF_TILES if larger_in_space else PRICE_OF_STEPS
-        if other.outcome.size < attempt.outcome.size * max_ratio:
-            attempt = other
-    if not tiled.complete and attempt.sample.blocks.tile != tiled.tile:
-        attempt = _choose_transform(task, attempt)
-    return attempt
-
-
-def other_tiles(shape: Shape, tile: Shape, size: float, *, complete: bool) -> list[Shape]:
-    """Return tiles to try beside the usual one.
-
-    shape: of the box over all steps.
-    tile: the usual one.
-    size: bytes of the tiles.
-    complete: whether all vertices of the box count.
-
-    For a small file: all space in one tile, and the whole series in one tile. They make random
-    access slower, so they must save much, and they must not be too large to decode.
-
-    For a series that is partly outside the coreset: as many tiles, each of all steps. Where few
-    vertices count, those of other steps help to fill the rest.
-    """
-    tiles: list[Shape] = []
-    if size <= SMALL_FILE_BYTES:
-        steps = -(-shape[0] // -(-shape[0] // max(tile[0], 8)))
-        tiles += [(steps, *shape[1:]), shape]
-    if not complete and shape[0] <= MAX_TILE_STEPS and tile[0] < shape[0]:
-        count = prod(-(-n // length) for n, length in zip(shape, tile, strict=True))
-        tiles.append(even_tile(shape, count, shape[0]))
-    return [
-        other
-        for other in dict.fromkeys(tiles)
-        if prod(other) <= MAX_TILE_VERTICES and other != tile
-    ]

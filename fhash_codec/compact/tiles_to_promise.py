@@ -19,7 +19,7 @@ from fhash_codec.compact.choices.transform import refit, usual_transform
 from fhash_codec.compact.coded_table import CodedTable
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.plan import CodingPlan, plan
-from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile
+from fhash_codec.compact.tiles.blocks import Blocks, Index, Tile, Values
 from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Outcome, code, total
 from fhash_codec.compact.tiles_to_size import ByteWindow, code_to_size
 from fhash_codec.config import EncodeConfig
@@ -32,7 +32,7 @@ from fhash_formats.support.threads import map_ahead, thread_pool, usable_threads
 
 __all__ = ["code_series", "resized"]
 
-OVERHEAD_BYTES = 3000
+OVERHEAD_BYTES = 2000
 """Approximate bytes of a container without its tiles, for the sizes after each stage."""
 PASSES = 4
 """Times that all tiles are coded at most for a promise that the sample did not foretell."""
@@ -261,19 +261,29 @@ def _code_all(
             return filled_tiles[index]
         return index if blocks.in_memory else blocks.read(index)
 
-    def work(source: Index | Tile) -> tuple[bytes, Outcome]:
+    keeps_decoded = coding_plan.keeps_decoded
+
+    def work(source: Index | Tile) -> tuple[bytes, Outcome, Values | None]:
         tile = source if isinstance(source, Tile) else blocks.read(source)
         coded, outcome = code(tile, coding_plan.settings, coding_plan.coding)
-        return coded.data, outcome
+        return coded.data, outcome, coded.decoded if keeps_decoded else None
 
     streams: list[bytes] = []
+    decoded_tiles: list[Values | None] = []
     outcomes: list[Outcome] = []
     sources = (source(index) for index in blocks.indices())
     with stage(
         "coding", "all tiles, once for each step of the quantiser until the promise is kept"
     ):
-        for data, outcome in map_ahead(workers, work, sources, 2 * usable_threads()):
+        for data, outcome, values in map_ahead(workers, work, sources, 2 * usable_threads()):
             streams.append(data)
             outcomes.append(outcome)
+            decoded_tiles.append(values)
             progress("coding", len(streams), prod(blocks.grid), note)
-    return CodedTable(plan=coding_plan, streams=streams, outcome=total(outcomes))
+    kept = zip(blocks.indices(), decoded_tiles, strict=True)
+    return CodedTable(
+        plan=coding_plan,
+        streams=streams,
+        outcome=total(outcomes),
+        decoded={index: values for index, values in kept if values is not None},
+    )

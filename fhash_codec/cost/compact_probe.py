@@ -21,14 +21,16 @@ from fhash_codec.compact.choices.step import find_step
 from fhash_codec.compact.choices.transform import likely_transform, usual_transform
 from fhash_codec.compact.goal import goal_of
 from fhash_codec.compact.stages import first_guess, first_settings
+from fhash_codec.compact.tiles.access import cheap_tiling
 from fhash_codec.compact.tiles.blocks import Blocks, Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome, code, total
 from fhash_codec.compact.tiles.sample import Sample
-from fhash_codec.compact.tiles.tiling import even_tile, first_tile, parse_tile, tile_for
+from fhash_codec.compact.tiles.tiling import even_tile, first_tile, parse_tile
 from fhash_codec.config import EncodeConfig
 from fhash_codec.coreset.selection import FeatureSelection, select_features
 from fhash_codec.measure.bulk import find_bulk
 from fhash_codec.measure.metrics import measure_quality
+from fhash_codec.measure.ssim import BUDGET
 from fhash_codec.progress import silent
 from fhash_codec.stage_clock import recording
 from fhash_formats.series import Series
@@ -39,7 +41,7 @@ from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = ["Look", "Rates", "coded_tiles", "look_at", "now", "probe_rates", "search_coding"]
 
-OVERHEAD_BYTES = 3000
+OVERHEAD_BYTES = 2000
 """Approximate bytes of a container without its tiles."""
 PROBE_VERTICES = 1 << 17
 """Vertices of a probed tile; larger ones are cut to about this size."""
@@ -141,7 +143,7 @@ def look_at(part: Series, steps: int, config: EncodeConfig, workers: ThreadPoolE
         selection=selection,
         attempt=attempt,
         labels=labels,
-        tile=fixed or tile_for(shape, size),
+        tile=fixed or cheap_tiling(shape, size, config.access).tile,
         shape=shape,
         share=share,
         selecting=selecting,
@@ -313,7 +315,7 @@ def _measuring(blocks: Blocks, look: Look) -> tuple[float, float]:
     values = np.nan_to_num(values.astype(np.float32))
     changed = values + np.float32(look.task.goal.expected_error)
     rates = []
-    for with_ssim in (False, True):
+    for ssim_budget in (0, BUDGET):
         begun = now()
         measure_quality(
             lambda step: values[step],
@@ -321,7 +323,7 @@ def _measuring(blocks: Blocks, look: Look) -> tuple[float, float]:
             steps,
             look.task.goal.data_range,
             0.0,
-            with_ssim=with_ssim,
+            ssim_budget=ssim_budget,
         )
         rates.append((now() - begun) / (steps * plane))
     return rates[0], max(rates[1] - rates[0], 0.0)

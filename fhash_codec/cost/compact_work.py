@@ -27,19 +27,21 @@ from fhash_codec.compact.choices.head_prospects import (
 from fhash_codec.compact.choices.labels import is_hopeless
 from fhash_codec.compact.choices.predictor import TRIAL_VERTICES as PREDICTED_VERTICES
 from fhash_codec.compact.choices.search import EXCHANGE
+from fhash_codec.compact.choices.tilings import PICKED_VERTICES, largest_tile
 from fhash_codec.compact.choices.transform import count_trials
 from fhash_codec.compact.stages import (
+    LARGE,
     MAX_SEARCHED_VERTICES,
-    MAX_TILE_VERTICES,
     MIN_HEAD_EFFORT,
     SAMPLE_VERTICES,
     TRIAL_VERTICES,
-    other_tiles,
 )
-from fhash_codec.compact.tiles.tiling import tile_for
+from fhash_codec.compact.tiles.access import MAX_WHOLE_VERTICES, cheap_tiling, tiles_to_try
+from fhash_codec.comparison import ssim_budget
 from fhash_codec.config import EncodeConfig
 from fhash_codec.cost.compact_probe import Look, Rates
 from fhash_codec.cost.head_probe import HeadProbe, updates_of
+from fhash_codec.encoding import DECODED_AGAIN
 from fhash_codec.measure.ssim import ssim_steps
 from fhash_formats.support.threads import usable_threads
 from fhash_formats.transform.head.inputs import CROSS
@@ -55,6 +57,10 @@ NEAR_TRIES = 1.5
 """Trials of that search where it begins near its end: for another tile, or the same sample."""
 TRIAL_SHARE = 0.8
 """Time of coding with a candidate for the transform, as a share of that with the usual one."""
+TILINGS = 4
+"""Tilings that are coded to choose the tiles."""
+PICKS = 5
+"""Trials of a transform for each of them, on a part of the series."""
 REFIT_TRIES = 4
 """Further trials where the data's own bases are fitted again."""
 BOUND_TRIALS = 8
@@ -134,7 +140,7 @@ def stage_seconds(
     if _estimated(look, config):
         trials = work.wall(rates.trial, rates.sample.blocks.tile, 8)
         return seconds | {
-            "estimate": 4 * look.costing + trials,
+            "estimate": 2 * look.costing + trials,
             "coding": _all_tiles(work, rates.trial),
         }
     seconds["first guess"] = look.guessing
@@ -177,6 +183,10 @@ def _choices(work: _Work) -> dict[str, float]:
         if "transform" in config.without:
             trials = bases = 0
         coding = TRIAL_SHARE * work.wall(rates.trial, tile, trials * tried)
+        if prod(tile) > LARGE * TRIAL_VERTICES:
+            # A part stands for the tile in all trials but two.
+            parts = trials * TRIAL_VERTICES / usable_threads() + 2 * prod(tile)
+            coding = TRIAL_SHARE * rates.trial * parts
         seconds["transform"] = coding + search
         seconds["bases"] = bases * rates.basis * work.vertices
         if look.task.fixed_tile is None and "tiles" not in config.without:
@@ -197,17 +207,18 @@ def _choices(work: _Work) -> dict[str, float]:
 
 
 def _tiles(work: _Work) -> float:
-    """Seconds of the trials of other tiles."""
+    """Seconds of the trials of tilings, see fhash_codec/compact/choices/tilings.py."""
     look, rates = work.look, work.rates
-    blocks = look.task.blocks
-    most = MAX_TILE_VERTICES if blocks.complete else TRIAL_VERTICES
-    seconds = 0.0
-    for tile in other_tiles(look.shape, look.tile, work.bytes_of_tiles, complete=blocks.complete):
-        count = work.tiles(tile, most)
-        seconds += look.costing + TRIAL_SHARE * work.wall(rates.trial, tile, 3 * count)
-        seconds += work.tries(NEAR_TRIES) * TRIAL_SHARE * work.wall(rates.trial, tile, count)
-        seconds += 3 * rates.basis * work.vertices
-    return seconds
+    shape = look.shape
+    whole = work.vertices <= MAX_WHOLE_VERTICES
+    tried = shape if whole else largest_tile(shape)
+    if tiles_to_try(tried, MAX_WHOLE_VERTICES) == [tried]:
+        return 0.0
+    # Some of the tilings have few tiles, which leave a thread without work.
+    share = (1 + 1 / usable_threads()) / 2
+    picked = PICKS * min(PICKED_VERTICES, prod(tried)) / usable_threads()
+    once = share * prod(tried) + picked
+    return look.costing + TILINGS * TRIAL_SHARE * rates.trial * once
 
 
 def _head(work: _Work, head: HeadProbe) -> dict[str, float]:
@@ -267,7 +278,7 @@ def _all_tiles(work: _Work, rate: float) -> float:
     """Seconds of coding all tiles once."""
     tile = work.look.tile
     if _estimated(work.look, work.config) and work.look.task.fixed_tile is None:
-        tile = tile_for(work.look.shape, work.bytes_of_tiles)
+        tile = cheap_tiling(work.look.shape, work.bytes_of_tiles, work.config.access).tile
     return work.wall(rate, tile, work.tiles(tile))
 
 
@@ -276,9 +287,11 @@ def _measuring(work: _Work, head: HeadProbe | None) -> float:
     rates, look = work.rates, work.look
     steps, plane = look.shape[0], prod(look.task.blocks.shape[1:])
     decode = rates.decode + (0.0 if head is None else head.final)
-    measured = 0 if "ssim" in work.config.without else len(ssim_steps(steps, plane))
+    budget = ssim_budget(work.config)
+    measured = len(ssim_steps(steps, plane, budget)) if budget else 0
+    again = 1.0 / DECODED_AGAIN if _estimated(look, work.config) else 1.0
     return (
-        work.wall(decode, look.tile, work.tiles(look.tile))
+        again * work.wall(decode, look.tile, work.tiles(look.tile))
         + rates.compare * work.vertices
         + rates.ssim * measured * plane
     )

@@ -20,7 +20,7 @@ from fhash_codec.measure.between import (
     NeighboursOf,
 )
 from fhash_codec.measure.errors import BulkQuality, Errors, StepQuality, psnr
-from fhash_codec.measure.ssim import SIGMA, WINDOW, ssim, ssim_steps
+from fhash_codec.measure.ssim import BUDGET, SIGMA, WINDOW, ssim, ssim_steps
 from fhash_codec.measure.sums import ErrorSums, Values
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
@@ -209,7 +209,7 @@ def measure_quality(
     *,
     bulk: ValueRange | None = None,
     neighbours: NeighboursOf | None = None,
-    with_ssim: bool = True,
+    ssim_budget: int = BUDGET,
 ) -> Quality:
     """Compare all steps of a decoded series with the original.
 
@@ -219,7 +219,7 @@ def measure_quality(
     background: decoded value outside the coreset for the figures over the domain, in data units.
     bulk: of the original series, in data units (`find_bulk`); no figures of it if None.
     neighbours: of the key frames, see `neighbours_of`; None if every step is a key frame.
-    with_ssim: measure the SSIM; else it is None, of no step.
+    ssim_budget: vertices whose SSIM is measured (`ssim_steps`); with 0 it is None, of no step.
 
     At most FRAMES_HELD frames of each series are in memory. The SSIM is measured over the coreset
     of evenly spaced steps (`ssim_steps`). Raises InputError for frames of different shapes.
@@ -243,7 +243,7 @@ def measure_quality(
             original, decoded = original_frames(step), decode(step)
             comparer.seconds += time.perf_counter() - reading
             if step == 0:
-                measured = ssim_steps(steps, original.size) if with_ssim else []
+                measured = ssim_steps(steps, original.size, ssim_budget) if ssim_budget else []
             at_once = max(1, min(FRAMES_HELD, steps, VERTICES_HELD // max(original.size, 1)))
             while len(waiting) >= at_once:
                 collect()

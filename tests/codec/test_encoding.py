@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig, InputError, OutputError, OutputExistsError, QualityError
+from fhash_codec.compact.tiles.coding import code
 from fhash_codec.encoding import DATA_SUFFIXES
 from fhash_formats.readers import REGISTRY
 from fhash_formats.writers.mesh import MESH_SUFFIXES
@@ -295,3 +298,24 @@ def test_no_container_has_the_name_of_a_data_file(tmp_path, field) -> None:
     with pytest.raises(InputError, match=r"not a \.NC file; give it a name that ends in \.fhz"):
         fhash_codec.encode(field(), tmp_path / "a.NC", FAST)
     assert not list(tmp_path.iterdir())
+
+
+def test_effort_1_tells_what_a_reader_measures(field, tmp_path) -> None:
+    figures = fhash_codec.encode(field(), tmp_path / "a.fhz", EncodeConfig(psnr=45.0, effort=1))
+    measured = fhash_codec.diff(field(), tmp_path / "a.fhz")
+    for name in ("psnr", "rmse", "max_abs_error", "bulk", "per_step"):
+        assert figures["quality"][name] == measured["quality"][name]
+    assert figures["quality"]["psnr"] >= 45
+
+
+def test_effort_1_finds_a_coder_that_does_not_decode_what_it_coded(
+    field, tmp_path, monkeypatch
+) -> None:
+    def wrong(tile, settings, coding):
+        coded, outcome = code(tile, settings, coding)
+        return replace(coded, decoded=coded.decoded + 1), outcome
+
+    monkeypatch.setattr("fhash_codec.compact.tiles_to_promise.code", wrong)
+    with pytest.raises(AssertionError, match="decodes to other values"):
+        fhash_codec.encode(field(), tmp_path / "a.fhz", EncodeConfig(psnr=45.0, effort=1))
+    assert not (tmp_path / "a.fhz").exists()

@@ -161,8 +161,24 @@ def _predicted(info: dict[str, Any]) -> list[tuple[str, str]]:
     return [("predicted", f"{', '.join(parts)}{was}, {size(info['bytes'])}")]
 
 
+def tiling_text(info: dict[str, Any]) -> str:
+    """The price of the tiles and the time for a region, as far as the header says them."""
+    told = info["model"].get("tiling", {})
+    text = ""
+    if "price" in told:
+        best = told["best"]
+        against = "one tile" if best == info["model"]["levels"][0] else f"tiles of {extent(best)}"
+        more = told["price"] - 1
+        text = f", {more:.0%} above {against}" if more > 0 else ", the fewest bytes of all tried"
+        if not told["tried"]:
+            text = f", at most about {more:.0%} above {against}" if more > 0 else ""
+    if "region_ms" in told:
+        text += f"; regions {number(told['region_ms'], 'ms', digits=2)}"
+    return text
+
+
 def _compact(volume: Volume, info: dict[str, Any]) -> list[tuple[str, str]]:
     encoder = info["encoder"] if "steps" in info["training"] else info["training"]
     seconds = encoder.get("seconds")
     took = "" if seconds is None else f", encoded in {number(seconds, 's', digits=3)}"
-    return [("tiles", f"{extent(volume.chunks)} vertices{took}")]
+    return [("tiles", f"{extent(volume.chunks)} vertices{tiling_text(info)}{took}")]

@@ -20,6 +20,7 @@ from fhash_codec import native
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.blocks import Blocks, Index
 from fhash_codec.compact.tiles.coding import MIN_STEP_SHARE, Coding, code
+from fhash_codec.compact.tiles.sample import spread_order
 from fhash_codec.compact.tiles.tiling import even_tile
 from fhash_codec.measure.bulk import BULK_SHARE
 from fhash_formats.transform.tile.decoding import transform_for
@@ -31,6 +32,8 @@ DEAD_ZONE = 0.8
 """Share of the step below which a coefficient becomes 0."""
 SPREAD = 0.1
 """Mean square of the error of the other coefficients, in squared steps."""
+ROUGH_VERTICES = 1 << 20
+"""Vertices of the tiles whose coefficients give a first idea of the size."""
 TRIALS = 8
 """Tiles that are coded at most to measure the error of the estimate."""
 TRIAL_VERTICES = 1 << 18
@@ -136,9 +139,13 @@ def estimated_size(
 
     The series must be as in `estimated_step`.
     """
-    series = _sum(_tile_magnitudes(blocks, settings, workers))
-    error = _squared_error(blocks, psnr, data_range)
-    return series.size(series.step(error, data_range * MIN_STEP_SHARE))
+    indices = list(blocks.indices())
+    count = min(len(indices), max(1, ROUGH_VERTICES // math.prod(blocks.tile)))
+    some = [indices[number] for number in sorted(spread_order(len(indices))[:count])]
+    share = count / len(indices)
+    series = _sum(_tile_magnitudes(blocks, settings, workers, some))
+    error = _squared_error(blocks, psnr, data_range) * share
+    return series.size(series.step(error, data_range * MIN_STEP_SHARE)) / share
 
 
 def estimated_step(
@@ -160,16 +167,17 @@ def estimated_step(
     """
     min_step = data_range * MIN_STEP_SHARE
     error = _squared_error(blocks, psnr, data_range)
-    series = _sum(_tile_magnitudes(blocks, settings, workers))
+    tiles = _tile_magnitudes(blocks, settings, workers)
+    series = _sum(tiles)
     step = series.step(_squared_error(blocks, even_psnr or psnr, data_range), min_step)
     if math.prod(blocks.tile) > TRIAL_VERTICES:
         # Large tiles take long to code, and smaller ones tell as much.
         parts = math.prod(blocks.tile) // TRIAL_VERTICES + 1
         blocks = blocks.retile(even_tile(blocks.tile, parts, TRIAL_STEPS))
         settings = replace(settings, transform=usual_transform(blocks.tile))
+        tiles = _tile_magnitudes(blocks, settings, workers)
     settings = replace(settings, step=step)
     indices = list(blocks.indices())
-    tiles = _tile_magnitudes(blocks, settings, workers)
 
     def measured_to_estimated(number: int) -> tuple[float, float]:
         outcome = code(blocks.read(indices[number]), settings, coding)[1]
@@ -197,9 +205,12 @@ def _squared_error(blocks: Blocks, psnr: float, data_range: float) -> float:
 
 
 def _tile_magnitudes(
-    blocks: Blocks, settings: TileSettings, workers: ThreadPoolExecutor
+    blocks: Blocks,
+    settings: TileSettings,
+    workers: ThreadPoolExecutor,
+    indices: Sequence[Index] | None = None,
 ) -> list[Magnitudes]:
-    """Return the magnitudes of the coefficients of each tile, in C order."""
+    """Return the magnitudes of the coefficients of some tiles; of all, in C order, if None."""
     # Only the kinds of the transform matter; float32 is precise enough.
     transform = transform_for(replace(settings, double=False, step=1.0), blocks.tile)
 
@@ -210,7 +221,7 @@ def _tile_magnitudes(
             values[~np.isfinite(values)] = 0
             return magnitudes(transform.forward(values))
 
-    return list(workers.map(tile_magnitudes, blocks.indices()))
+    return list(workers.map(tile_magnitudes, blocks.indices() if indices is None else indices))
 
 
 def _sum(tiles: Sequence[Magnitudes]) -> Magnitudes:

@@ -11,14 +11,13 @@ from threading import Event
 from typing import NamedTuple
 
 from fhash_codec.compact.choices.head_prospects import (
-    ARRAY_BYTES,
     EFFORTS,
-    HISTORY_BYTES,
     TRIAL_BUDGET,
     TRIAL_HEAD,
     Budget,
     Shape,
     expected_gain,
+    head_bytes,
     likely_heads,
 )
 from fhash_codec.compact.choices.head_samples import Pair
@@ -30,7 +29,7 @@ from fhash_codec.progress import Parts
 from fhash_codec.stage_clock import skip, stage
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["HeadHistory", "choose_head", "training_pairs"]
+__all__ = ["HeadHistory", "choose_head", "octave_gain", "training_pairs"]
 
 HeadHistory = list[dict[str, float | None]]
 """Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
@@ -49,10 +48,10 @@ POINTLESS = 0.005
 """Share of the bytes that a head must cost before the step is searched: then it is left out."""
 CLOSE = 0.004
 """Distance in dB from the quality without a head at which no further step is tried."""
-MIN_BYTES = 3200
+MIN_BYTES = 900
 """Bytes of coded tiles below which a head cannot save what it takes.
 
-The smallest head takes some 1,300 bytes with array and history, and none saves 40 % of the tiles.
+The smallest head takes some 250 bytes with its history, and few save 30 % of the tiles.
 """
 
 
@@ -106,7 +105,7 @@ def choose_head(
     if trial is None or trial.gain_db < MIN_GAIN:
         skip("head", "its trial gains nothing")
         return settings, outcome, []
-    octave = _octave(tried, data_range)
+    octave = octave_gain(tried, data_range)
     shapes = likely_heads(outcome.size, expected_gain(trial.gain_db), octave, effort)
     if not shapes:
         gained = f"its trial gained {trial.gain_db:.2f} dB"
@@ -152,8 +151,9 @@ class _Compared:
 
     def extra_bytes(self, candidate: _Candidate) -> float:
         """Return the bytes more than without a head, at the same quality."""
-        head_bytes = len(candidate.trained.head.to_bytes()) + ARRAY_BYTES + HISTORY_BYTES
-        extra: float = candidate.outcome.size - self.outcome.size + head_bytes
+        size = candidate.outcome.size
+        own_bytes = len(candidate.trained.head.to_bytes()) + head_bytes(size)
+        extra: float = size - self.outcome.size + own_bytes
         if self.strict:
             return extra
         return extra + self.outcome.size * (2 ** (self.missing(candidate) / self.octave) - 1)
@@ -240,7 +240,7 @@ def _finite(psnr: float) -> float | None:
     return psnr if math.isfinite(psnr) else None
 
 
-def _octave(tried: list[Outcome], data_range: float) -> float:
+def octave_gain(tried: list[Outcome], data_range: float) -> float:
     """Return the dB that an octave of bytes buys."""
     points = [
         (math.log2(outcome.size), outcome.psnr(data_range)) for outcome in tried if outcome.size

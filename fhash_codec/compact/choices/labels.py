@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import prod
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.attempt import Attempt, PlanTask
+from fhash_codec.compact.choices.tilings import choose_tiling
+from fhash_codec.compact.tiles.access import Tiling, cheap_tiling
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
-from fhash_codec.compact.tiles.tiling import tile_for
 from fhash_codec.measure.value_range import ValueRange
 from fhash_formats.transform.axes.basis import MAX_LENGTH
 from fhash_formats.transform.entropy.labels import MAX_LABELS, MAX_NARROW
@@ -28,11 +28,6 @@ LOOK_VERTICES = 1 << 18
 """Vertices that are looked at, and coded for the size estimate."""
 CLEARLY = 3
 """Ratio of deflated tiles to tiles of labels from which on nothing else is tried."""
-SMALL_FILE_BYTES = 60_000
-"""Bytes up to which a file is read in a moment as a whole, so that it may be one tile."""
-MAX_TILE_VERTICES = 12 << 20
-"""Vertices of a tile that is chosen for its bytes alone: a larger one takes long to decode."""
-
 HOPELESS = 1.25
 """Size of the first guess, as a multiple of that of labels, from which on nothing else is tried."""
 ENERGY = 0.99
@@ -143,16 +138,24 @@ def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelT
         ]
     )
     clearly = CLEARLY * outcome.size <= sample.run(settings, exact).size
+    tiling = None
     if task.fixed_tile is None:
-        tile = tile_for(task.blocks.shape, outcome.size)
-        shape = task.blocks.shape
-        if outcome.size <= SMALL_FILE_BYTES and prod(shape) <= MAX_TILE_VERTICES:
-            tile = shape
-        sample = Sample(task.blocks.retile(tile), LOOK_VERTICES, task.workers)
+        tiling = _tiling(task, settings, coding, outcome.size)
+        sample = Sample(task.blocks.retile(tiling.tile), LOOK_VERTICES, task.workers)
     settings = replace(settings, many_labels=_may_be_many(task.value_range, sample))
     task.gains.note("labels", outcome)
-    attempt = Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
+    attempt = Attempt(
+        sample=sample, settings=settings, outcome=outcome, coding=coding, tiling=tiling
+    )
     return LabelTrial(attempt=attempt, clearly=clearly, entropy=entropy, rank=rank)
+
+
+def _tiling(task: PlanTask, settings: TileSettings, coding: Coding, size: float) -> Tiling:
+    """Return the choice of the tiles for labels: by trial from effort 2 on."""
+    access, config = task.config.access, task.config
+    if config.effort == 1 or "tiles" in config.without:
+        return cheap_tiling(task.blocks.shape, size, access)
+    return choose_tiling(task, settings, coding, access)
 
 
 def _entropy(values: npt.NDArray[Any]) -> float:

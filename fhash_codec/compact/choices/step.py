@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fhash_codec.compact.choices.quantiser import plain_step
 from fhash_codec.compact.choices.search import (
     EXCHANGE,
     SLOPE,
@@ -174,9 +175,11 @@ def _step_for_bound(
     """Search for the step at which coefficients and residual together cost least."""
     dtype = sample.blocks.dtype
     rounding = float(np.finfo(dtype).eps) / 2 if dtype.kind == "f" else 0.0
+    plain = plain_step(settings)
+    share = settings.step / plain
 
     def settings_of(number: int) -> TileSettings | None:
-        step = error * 2 ** (number / STEPS_TO_OCTAVE)
+        step = error * 2 ** (number / STEPS_TO_OCTAVE) * share
         stepped = with_step(replace(settings, head=None), step, goal, rounding)
         if settings.head is None:
             return stepped
@@ -193,7 +196,7 @@ def _step_for_bound(
         ]
 
     # Rounded up: with a head, a smaller step could need float64.
-    number = math.ceil(STEPS_TO_OCTAVE * math.log2(settings.step / error) - 1e-6)
+    number = math.ceil(STEPS_TO_OCTAVE * math.log2(plain / error) - 1e-6)
     start = min(max(number, 0), MAX_STEP_NUMBER)
     return cheapest(run, start, MAX_STEP_NUMBER, strides=(2,) if quick else (2, 1))
 

@@ -8,30 +8,19 @@ are decided one after the other.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Protocol, TypeVar
 
-import numpy as np
-import numpy.typing as npt
-
-from fhash_codec.compact.tiles.blocks import Tile
+from fhash_codec.compact.choices.bases import Bases, CountedBases, TileSample
 from fhash_codec.compact.tiles.coding import Coding, Outcome
-from fhash_codec.stage_clock import stage
-from fhash_formats.transform.axes.basis import MAX_LENGTH, Basis, fit_basis
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
-Result = TypeVar("Result")
 Axes = tuple[AxisTransform, AxisTransform, AxisTransform, AxisTransform]
 """Transforms along (t, z, y, x)."""
-Gram = npt.NDArray[np.float64]
-"""Products of lines (length, length)."""
 NONE = AxisTransform(kind="none")
 """Marks an axis without a transform."""
-MAX_BASIS_LENGTH = 128
-"""Longest axis in vertices that gets a basis of the data's own: longer factors cost too much."""
 PLANE_WAVELETS = (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3), ("5/3", 2))
 """Kinds and depths tried along y and x.
 
@@ -39,36 +28,12 @@ PLANE_WAVELETS = (("9/7", 2), ("9/7", 3), ("9/7", 4), ("9/7", 5), ("haar", 3), (
 """
 LINE_WAVELETS = (("haar", 1), ("haar", 2), ("9/7", 1), ("9/7", 2), ("9/7", 3), ("5/3", 1))
 """Kinds and depths tried along t and along z."""
-MATRICES_AT_ONCE = 64
-"""Matrices of lines whose products are held at once."""
+ROUGH_WAVELETS = (("haar", 2), ("9/7", 1))
+"""Kinds and depths tried beside the usual ones where tilings are compared."""
 ERROR_PRICE = 0.8
 """Squared error in squared steps that is worth a byte."""
-
-
-class TileSample(Protocol):
-    """Tiles on which transforms are tried, such as a `Sample`.
-
-    Attributes:
-        tiles: the tiles, all of one shape.
-        grams: products of the lines of all tiles, by axis and centre, once they were computed:
-            bases for other steps are fitted to them again.
-    """
-
-    tiles: list[Tile]
-    grams: dict[tuple[int, float], Gram]
-
-    @property
-    def allows_bases(self) -> bool:
-        """Whether bases of the data's own may be computed."""
-        ...
-
-    def map_all(self, work: Callable[[Tile], Result]) -> Iterator[Result]:
-        """Yield the results of `work` for all tiles that the sample stands for."""
-        ...
-
-    def run_all(self, trials: Sequence[tuple[TileSettings, Coding]]) -> list[Outcome]:
-        """Return the size and the error that the tiles have with each settings and coding."""
-        ...
+BASIS_TEXT = 1.03
+"""Bytes in the file for each byte of a packed basis: it stands there as deflated base64."""
 
 
 def wavelet(kind: str, depth: int, length: int) -> AxisTransform:
@@ -98,7 +63,7 @@ def choose_transform(
         plane and along z.
     """
     shape: Shape = sample.tiles[0].values.shape
-    bases = _Bases(sample, settings)
+    bases = Bases(sample, settings)
     if quick:
         trials = _quick_trials(shape, settings.transform.axes, bases)
         costs = _costs(sample, settings, trials, coding)
@@ -131,7 +96,7 @@ def likely_transform(sample: TileSample, settings: TileSettings, coding: Coding)
     The usual transform competes with the data's own bases along time, in space, and along both.
     """
     shape: Shape = sample.tiles[0].values.shape
-    bases, usual = _Bases(sample, settings), usual_transform(shape).axes
+    bases, usual = Bases(sample, settings), usual_transform(shape).axes
     trials = [usual]
     in_space, in_time = bases.possible(*shape[1:]), bases.possible(shape[0])
     if in_space:
@@ -142,6 +107,71 @@ def likely_transform(sample: TileSample, settings: TileSettings, coding: Coding)
     return replace(settings, transform=TransformSpec(axes=trials[costs.index(min(costs))]))
 
 
+def rough_transform(
+    sample: TileSample,
+    settings: TileSettings,
+    coding: Coding,
+    known: dict[int, AxisTransform],
+    lines: int,
+) -> tuple[TileSettings, Outcome | None]:
+    """Return settings with a good transform by very few trials, to compare tilings with.
+
+    Beside them is their outcome on the sample; None where nothing was tried.
+
+    known: transforms of axes that need no trial, such as those of the same axis elsewhere.
+    lines: of each tile, that the data's own bases are fitted on.
+    """
+    shape: Shape = sample.tiles[0].values.shape
+    bases = Bases(sample, settings, lines)
+    axes = _changed(usual_transform(shape).axes, known)
+    best: tuple[float, Axes, Outcome | None] = (math.inf, axes, None)
+    for axis in (0, 1):
+        if axis in known or shape[axis] == 1:
+            continue
+        tried = [wavelet(kind, depth, shape[axis]) for kind, depth in ROUGH_WAVELETS]
+        kinds = list(dict.fromkeys([best[1][axis], *tried]))
+        if axis == 0 and bases.possible(shape[0]):
+            kinds.append(bases.along(0))
+        trials = [_changed(best[1], {axis: kind}) for kind in kinds]
+        fresh = [trial for trial in trials if best[2] is None or trial != best[1]]
+        best = min([best, *_tried(sample, settings, fresh, coding)], key=lambda trial: trial[0])
+    if bases.possible(*shape[1:]):
+        own = (best[1][0], bases.along(1), bases.along(2), bases.along(3))
+        trials = [own] if best[2] is not None else [axes, own]
+        best = min([best, *_tried(sample, settings, trials, coding)], key=lambda trial: trial[0])
+    return replace(settings, transform=TransformSpec(axes=best[1])), best[2]
+
+
+def own_or_found(
+    sample: TileSample, settings: TileSettings, found: Axes, coding: Coding
+) -> TileSettings:
+    """Return settings with transforms that were found on a part, or with own bases in space.
+
+    found: the transforms along (t, z, y, x); bases among them are made anew for the sample.
+    """
+    shape: Shape = sample.tiles[0].values.shape
+    bases = Bases(sample, settings)
+    axes = _changed(
+        found,
+        {
+            axis: (
+                bases.along(axis)
+                if transform.basis is not None and bases.possible(shape[axis])
+                else _fitted(transform, shape[axis])
+            )
+            for axis, transform in enumerate(found)
+        },
+    )
+    usual = usual_transform(shape).axes
+    trials = [axes]
+    if axes[3].basis is not None:
+        trials.append((*axes[:2], *usual[2:]))
+    elif bases.possible(*shape[1:]):
+        trials.append((axes[0], bases.along(1), bases.along(2), bases.along(3)))
+    costs = _costs(sample, settings, trials, coding) if len(trials) > 1 else [0.0]
+    return replace(settings, transform=TransformSpec(axes=trials[costs.index(min(costs))]))
+
+
 def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     """Return the codings of a sample by `choose_transform`, and the bases that it fits.
 
@@ -149,7 +179,7 @@ def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     in_memory: whether the series is, so that bases are possible.
     """
 
-    bases = _CountedBases(in_memory)
+    bases = CountedBases(in_memory)
     axes = usual_transform(shape).axes
     groups = (
         _plane_trials(shape, bases),
@@ -160,15 +190,23 @@ def count_trials(shape: Shape, *, in_memory: bool) -> tuple[int, int]:
     return trials, len(bases.fitted)
 
 
-def refit(sample: TileSample, settings: TileSettings) -> TileSettings:
+def basis_bytes(transform: TransformSpec) -> float:
+    """Return the bytes that the data's own bases take in the file."""
+    packed = (axis.basis.to_bytes() for axis in transform.axes if axis.basis is not None)
+    return BASIS_TEXT * sum(map(len, packed))
+
+
+def refit(sample: TileSample, settings: TileSettings, coarser: float = 1.0) -> TileSettings:
     """Return settings with the data's own bases made anew for their step.
 
     Settings without such bases are returned themselves, the same object.
+
+    coarser: factor of the step that the bases are as precise as.
     """
     axes = settings.transform.axes
     if not any(axis.basis is not None for axis in axes):
         return settings
-    bases = _Bases(sample, settings)
+    bases = Bases(sample, replace(settings, step=coarser * settings.step))
     fresh = {
         number: bases.along(number) for number, axis in enumerate(axes) if axis.basis is not None
     }
@@ -181,7 +219,7 @@ def _changed(axes: Axes, change: dict[int, AxisTransform]) -> Axes:
     return t, z, y, x
 
 
-def _quick_trials(shape: Shape, axes: Axes, bases: _Bases) -> list[Axes]:
+def _quick_trials(shape: Shape, axes: Axes, bases: Bases) -> list[Axes]:
     """Return the usual transform, the kinds of `axes`, and bases where they are possible."""
     usual = usual_transform(shape).axes
     t, z, y, x = (_fitted(axis, length) for axis, length in zip(axes, shape, strict=True))
@@ -202,10 +240,16 @@ def _costs(
     sample: TileSample, settings: TileSettings, trials: Sequence[Axes], coding: Coding
 ) -> list[float]:
     """Return J of each trial."""
+    return [cost for cost, _, _ in _tried(sample, settings, trials, coding)]
+
+
+def _tried(
+    sample: TileSample, settings: TileSettings, trials: Sequence[Axes], coding: Coding
+) -> list[tuple[float, Axes, Outcome]]:
+    """Return J of each trial, beside the trial and its outcome."""
 
     def cost(axes: Axes, outcome: Outcome) -> float:
-        # The file has a basis as text of 4/3 of its bytes.
-        bases = sum(len(axis.basis.to_bytes()) * 4 / 3 for axis in axes if axis.basis is not None)
+        bases = basis_bytes(TransformSpec(axes=axes))
         # Under a bound, bytes of the residual correct the errors already.
         error = 0.0
         if coding.error is None:
@@ -215,7 +259,9 @@ def _costs(
     outcomes = sample.run_all(
         [(replace(settings, transform=TransformSpec(axes=axes)), coding) for axes in trials]
     )
-    return [cost(axes, outcome) for axes, outcome in zip(trials, outcomes, strict=True)]
+    return [
+        (cost(axes, outcome), axes, outcome) for axes, outcome in zip(trials, outcomes, strict=True)
+    ]
 
 
 def _plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTransform]:
@@ -226,7 +272,7 @@ def _plane(kind: str, depth: int, y: int, x: int) -> tuple[AxisTransform, AxisTr
     return wavelet(kind, depth, y), wavelet(kind, depth, x)
 
 
-def _plane_trials(shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+def _plane_trials(shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransform]]:
     """Yield the transforms tried along y and x."""
     y, x = shape[2:]
     for kind, depth in PLANE_WAVELETS:
@@ -237,7 +283,7 @@ def _plane_trials(shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransfo
         yield {2: bases.along(2), 3: bases.along(3)}
 
 
-def _line_trials(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, AxisTransform]]:
+def _line_trials(axis: int, shape: Shape, bases: Bases) -> Iterator[dict[int, AxisTransform]]:
     """Yield the transforms tried along one axis."""
     length = shape[axis]
     if length == 1:
@@ -248,77 +294,3 @@ def _line_trials(axis: int, shape: Shape, bases: _Bases) -> Iterator[dict[int, A
             yield {axis: AxisTransform(kind=kind, depth=depth)}
     if bases.possible(length):
         yield {axis: bases.along(axis)}
-
-
-class _Bases:
-    """The data's own bases along the axes of a tile, computed when they are asked for."""
-
-    def __init__(self, sample: TileSample, settings: TileSettings) -> None:
-        self._sample, self._settings = sample, settings
-        self._cache: dict[int, AxisTransform] = {}
-
-    def possible(self, *lengths: int) -> bool:
-        """Whether axes of these lengths can have a basis; only a series in memory can."""
-        allowed = self._sample.allows_bases
-        return allowed and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
-
-    def along(self, axis: int) -> AxisTransform:
-        """Return the basis along an axis, as precise as the step of the settings needs."""
-        if axis not in self._cache:
-            with stage("bases", "the data's own bases, which compete as transforms of short axes"):
-                basis = self._fitted(axis)
-            self._cache[axis] = AxisTransform(kind="klt", basis=basis)
-        return self._cache[axis]
-
-    def _fitted(self, axis: int) -> Basis:
-        """Return the basis of all tiles.
-
-        A direction that the basis drops cannot be restored by any coefficient.
-        """
-        grams, key = self._sample.grams, (axis, self._settings.center)
-        if key not in grams:
-            length = self._sample.tiles[0].values.shape[axis]
-            gram = np.zeros((length, length))
-            for tile_gram in self._sample.map_all(lambda tile: self._gram(tile.values, axis)):
-                gram += tile_gram
-            grams[key] = gram
-        return fit_basis(grams[key], self._settings.step)
-
-    def _gram(self, values: npt.NDArray[np.generic], axis: int) -> Gram:
-        """Return the products of the lines of a tile along an axis, (length, length)."""
-        # Values that do not count are kept: zeroing them would create an edge that dominates.
-        centred = values.astype(np.float64) - self._settings.center
-        centred[~np.isfinite(centred)] = 0.0
-        length = values.shape[axis]
-        lines = centred.reshape(math.prod(values.shape[:axis]), length, -1)
-        if lines.shape[2] == 1:
-            last: Gram = lines[:, :, 0].T @ lines[:, :, 0]
-            return last
-        gram = np.zeros((length, length))
-        for matrices in np.array_split(lines, -(-len(lines) // MATRICES_AT_ONCE)):
-            gram += np.matmul(matrices, matrices.transpose(0, 2, 1)).sum(axis=0)
-        return gram
-
-
-class _CountedBases(_Bases):
-    """Bases that are counted and not fitted.
-
-    Attributes:
-        fitted: axes along which the encoder would fit one.
-    """
-
-    def __init__(self, in_memory: bool) -> None:
-        self.fitted: set[int] = set()
-        self._in_memory = in_memory
-
-    def possible(self, *lengths: int) -> bool:
-        """Whether axes of these lengths can have a basis."""
-        return self._in_memory and min(lengths) > 1 and max(lengths) <= MAX_BASIS_LENGTH
-
-    def along(self, axis: int) -> AxisTransform:
-        """Return what stands for a basis along an axis, other than the usual one, and count it."""
-        self.fitted.add(axis)
-        return AxisTransform(kind="haar", depth=1)
-
-
-assert MAX_BASIS_LENGTH <= MAX_LENGTH

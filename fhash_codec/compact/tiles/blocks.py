@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from itertools import product
 from math import prod
 from threading import Lock
@@ -79,24 +80,68 @@ class Blocks:
         self._series, self._extent = series, extent
         self.dtype: np.dtype[Any] = (series.source_dtype or series.dtype).newbyteorder("=")
         self.shape: Shape = (series.shape[0], *extent.box.shape)
+        self.complete = extent.samples == prod(self.shape)
+        self._box = _BoxInMemory()
+        self._cut(tile)
+
+    def _cut(self, tile: Shape) -> None:
         self.tile: Shape = tuple(min(n, length) for n, length in zip(tile, self.shape, strict=True))  # type: ignore[assignment]
         self.grid: Index = tuple(
             -(-length // n) for length, n in zip(self.shape, self.tile, strict=True)
         )  # type: ignore[assignment]
-        self.complete = extent.samples == prod(self.shape)
         self._last_layer: tuple[int, Tile] | None = None
-        self._box = _BoxInMemory()
 
     def retile(self, tile: Shape) -> Blocks:
         """Return the same series in other tiles; the box in memory is shared."""
-        other = Blocks(self._series, self._extent, tile)
-        other._box = self._box
+        other = copy(self)
+        other._cut(tile)
         return other
+
+    def window(self, shape: Shape) -> Blocks:
+        """Return a part of the box over some steps, as one tile in memory: where values vary most.
+
+        shape: of the part, at most that of the box.
+        """
+        first = (self.shape[0] - shape[0]) // 2
+        frame = self._step(first + shape[0] // 2)
+        places = product(
+            *(
+                sorted({0, (length - n) // 2, length - n})
+                for length, n in zip(self.shape[1:], shape[1:], strict=True)
+            )
+        )
+        regions = [
+            tuple(slice(low, low + n) for low, n in zip(place, shape[1:], strict=True))
+            for place in places
+        ]
+        region = max(regions, key=lambda region: _variation(frame, region))
+        tiles = [self._step(first + number) for number in range(shape[0])]
+        values = np.stack([tile.values[region] for tile in tiles])
+        counted = None
+        if tiles[0].counted is not None:
+            counted = np.stack([tile.counted[region] for tile in tiles if tile.counted is not None])
+        other = copy(self)
+        other._box, other.shape = _BoxInMemory(), shape
+        other.complete = counted is None or bool(counted.all())
+        other._box.content = Tile(values, None if other.complete else counted)
+        other._cut(shape)
+        return other
+
+    def _step(self, step: int) -> Tile:
+        """Return values and mask (z, y, x) of one step."""
+        if self.in_memory:
+            values, counted = self._whole()
+            return Tile(values[step], None if counted is None else counted[step])
+        values, counted = self._load(range(step, step + 1))
+        return Tile(values[0], None if counted is None else counted[0])
 
     @property
     def in_memory(self) -> bool:
         """Whether the box over all steps stays in memory."""
-        return prod(self.shape) * self.dtype.itemsize <= MAX_BYTES_IN_MEMORY
+        return (
+            self._box.content is not None
+            or prod(self.shape) * self.dtype.itemsize <= MAX_BYTES_IN_MEMORY
+        )
 
     def indices(self) -> Iterator[Index]:
         """Yield the indices of all tiles in C order."""
@@ -129,12 +174,7 @@ class Blocks:
         A series that does not stay in memory is read once, step by step.
         """
         for step in range(self.shape[0]):
-            if self.in_memory:
-                values, in_coreset = self._whole()
-                frame, mask = values[step], None if in_coreset is None else in_coreset[step]
-            else:
-                values, in_coreset = self._load(range(step, step + 1))
-                frame, mask = values[0], None if in_coreset is None else in_coreset[0]
+            frame, mask = self._step(step)
             yield frame if mask is None else frame[mask]
 
     def _whole(self) -> Tile:
@@ -169,3 +209,13 @@ class Blocks:
         if self.complete:
             return Tile(values, None)
         return Tile(values, np.stack([self._extent.mask(step) for step in steps]))
+
+
+def _variation(frame: Tile, region: tuple[slice, ...]) -> float:
+    """Return how much counted values of a region (z, y, x) of a step differ from neighbours."""
+    values, counted = frame
+    with np.errstate(all="ignore"):
+        part = values[region].astype(np.float64)
+        if counted is not None:
+            part[~counted[region]] = np.nan
+        return float(sum(np.nansum(np.abs(np.diff(part, axis=axis))) for axis in range(part.ndim)))

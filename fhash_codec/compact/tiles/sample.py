@@ -19,7 +19,7 @@ from fhash_formats.support.threads import map_ahead
 from fhash_formats.transform.tile.settings import TileSettings
 
 Result = TypeVar("Result")
-Grams = dict[tuple[int, float], npt.NDArray[np.float64]]
+Grams = dict[tuple[int, float, int | None], npt.NDArray[np.float64]]
 """Products of lines by axis and centre."""
 _grams: WeakKeyDictionary[Blocks, Grams] = WeakKeyDictionary()
 
@@ -70,7 +70,7 @@ class Sample:
         weights: number of tiles of the series that each of them stands for.
         complete: whether the sample has all tiles with vertices that count.
         counted: approximate number of vertices that count in the series.
-        grams: products of lines of all tiles of the series, see `choices.transform.TileSample`;
+        grams: products of lines of all tiles of the series, see `choices.bases.TileSample`;
             samples of the same grid share them.
     """
 

@@ -10,21 +10,15 @@ from fhash_formats.errors import InputError
 from fhash_formats.transform.stream import MAX_TILE_VERTICES
 from fhash_formats.transform.tile.sections import Shape
 
-__all__ = ["even_tile", "first_tile", "parse_tile", "tile_for"]
+__all__ = ["even_tile", "first_tile", "parse_tile"]
 
-TILE_BYTES = 1500
-"""Bytes that a tile should take at least."""
 TILE_VERTICES = 1 << 19
-"""Vertices that a tile should have at most once there are enough tiles for random access."""
-ENOUGH_TILES = 27
-"""Number of tiles that is enough for random access."""
+"""Vertices of the tiles for a first look, at most."""
 MAX_VERTICES = 4 << 20
 """Vertices of a tile at most, unless it is asked for or is the whole series.
 
 Several tiles are in memory at a time, each of them several times over.
 """
-TILE_STEPS = 4
-"""Time steps of a tile of a series that has many tiles."""
 FIRST_STEPS = 8
 """Time steps of the tiles for a first look."""
 MIN_LENGTH = 24
@@ -128,19 +122,3 @@ def _price(shape: Shape, tile: Shape, parts: list[int], tiles: int, steps: int) 
 def first_tile(shape: Shape) -> Shape:
     """Return the tile for a first look at a series."""
     return even_tile(shape, max(1, prod(shape) // TILE_VERTICES), min(shape[0], FIRST_STEPS))
-
-
-def tile_for(shape: Shape, size: float) -> Shape:
-    """Return the tile for a series that takes about `size` bytes.
-
-    There are more than ENOUGH_TILES tiles only where they would get too large.
-    """
-    tiles = max(
-        int(min(size / TILE_BYTES, max(ENOUGH_TILES, prod(shape) / TILE_VERTICES))),
-        -(-prod(shape) // MAX_VERTICES),
-    )
-    steps = shape[0]
-    if tiles > 1:
-        parts = -(-steps // TILE_STEPS) if tiles >= 16 else 1
-        steps = -(-steps // min(parts, max(1, tiles // 8)))
-    return even_tile(shape, max(1, tiles), steps)

@@ -20,9 +20,8 @@ from math import prod
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.compact.choices.bases import Gram, Result
 from fhash_codec.compact.choices.transform import (
-    Gram,
-    Result,
     choose_transform,
     usual_transform,
 )
@@ -216,7 +215,7 @@ class _Trials:
         counts = [int(np.count_nonzero(table.needed(region))) for region in self._regions]
         self._complete = sum(counts) == prod(table.shape[:4])
         self.tiles = [self._tile(self._regions[counts.index(max(counts))])]
-        self.grams: dict[tuple[int, float], Gram] = {}
+        self.grams: dict[tuple[int, float, int | None], Gram] = {}
 
     @property
     def allows_bases(self) -> bool:

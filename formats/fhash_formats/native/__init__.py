@@ -68,8 +68,19 @@ _PAIRS = ("f32_f32", "f32_f64", "f64_f32", "f64_f64")
 
 PROTOTYPES: Prototypes = {
     # coder.cpp
-    "fhash_encode": (ARRAY, ARRAY, REAL, INTEGER, ARRAY, *_SIZED, *_STATE, INTEGER, *_SIZED),
-    "fhash_decode": (ARRAY, INTEGER, ARRAY, *_SIZED, *_STATE, *_SIZED),
+    "fhash_encode": (
+        ARRAY,
+        ARRAY,
+        REAL,
+        INTEGER,
+        INTEGER,
+        ARRAY,
+        *_SIZED,
+        *_STATE,
+        INTEGER,
+        *_SIZED,
+    ),
+    "fhash_decode": (ARRAY, INTEGER, INTEGER, ARRAY, *_SIZED, *_STATE, *_SIZED),
     # mask.cpp
     "fhash_encode_mask": (*(ARRAY,) * 4, *_STATE, INTEGER, *_SIZED),
     "fhash_decode_mask": (*(ARRAY,) * 4, *_STATE, *_SIZED),

@@ -24,6 +24,7 @@ const int LEVELS = 128;                     // quarter octaves of the expected m
 const int SIGN_LIMIT = 255;                 // as SLOW_LIMIT, for signs
 const int MAX_MAGNITUDE = 4095;             // as contexts see it, so that sums stay in 32 bits
 const int PADDING = 2;                      // zeros beside a row of magnitudes
+const int LOG_PADDING = 4;                  // zeros beside a row of logarithms
 const int VECTOR = 16;  // sums over a row are made for a multiple of it; those beyond are not used
 
 // Columns of the table of bands (transform/entropy/table.py). LOW, HIGH and SHIFT are the first of
@@ -48,6 +49,7 @@ const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET, SIGNS = SECOND + 64 * D
 const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;
 
 enum Mode { ENCODE, DECODE, CHOOSE };  // CHOOSE encodes magnitudes chosen by rate and distortion
+enum Model { BY_CONTEXTS, BY_SIGNS, BY_LINEAR };  // what predicts, in the order of CODERS in coder.py
 
 // Class, 0 to 6, of a magnitude or of a sum of some. No table, so that the compiler makes vectors.
 FHASH_INLINE int seven(int v) { return (v > 0) + (v > 1) + (v > 2) + (v > 4) + (v > 6) + (v > 9); }
@@ -109,6 +111,7 @@ struct Band {
     int64_t stride[3];                 // of magnitudes, along t, z and y
     std::vector<uint16_t> magnitudes;  // rows with PADDING zeros at both ends
     std::vector<uint8_t> filled;       // by row: whether it has a magnitude above 0
+    std::vector<int16_t> logs;         // rows of logarithms, see coder_signs.hpp
     bool any;                          // whether the band has one
 };
 

@@ -164,9 +164,9 @@ FHASH_INLINE __m128i half(const void* from) {
     return _mm_loadl_epi64(static_cast<const __m128i*>(from));
 }
 
-// Probability of a 1, mixed from N estimates with one or two (PAIR) sets of weights.
-
-template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now) {
+// Probability of a 1, mixed from N estimates with one or two (PAIR) sets of weights. more: a term of
+// the sum that comes from elsewhere.
+template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now, int32_t more = 0) {
     const __m128i zero = _mm_setzero_si128();
     __m128i dot = zero;
     for (int v = 0; 4 * v < N; v++) {
@@ -179,10 +179,10 @@ template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now) {
         now.counts[v] = _mm_unpackhi_epi64(one, two);
         auto pace_of = [&](int i) FHASH_LAMBDA { return half(&tables.pace[s[i]->count]); };
         const __m128i pace = _mm_unpacklo_epi32(pace_of(0), n > 1 ? pace_of(1) : zero);
-        const __m128i more =
+        const __m128i others =
             n < 3 ? zero : _mm_unpacklo_epi32(pace_of(2), n > 3 ? pace_of(3) : zero);
-        now.rates[v] = _mm_unpacklo_epi64(pace, more);
-        const __m128i trust = _mm_unpackhi_epi64(pace, more);
+        now.rates[v] = _mm_unpacklo_epi64(pace, others);
+        const __m128i trust = _mm_unpackhi_epi64(pace, others);
         __m128i in = _mm_cvtsi32_si128((uint16_t)tables.stretch[s[0]->slow]);
         in = _mm_insert_epi16(in, tables.stretch[s[0]->fast], 1);
         if (n > 1) {
@@ -223,7 +223,7 @@ template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now) {
     }
     dot = _mm_add_epi32(dot, _mm_shuffle_epi32(dot, 0x4e));
     dot = _mm_add_epi32(dot, _mm_shuffle_epi32(dot, 0xb1));
-    return now.p = squashed(_mm_cvtsi128_si32(dot));
+    return now.p = squashed(_mm_cvtsi128_si32(dot) + more);
 }
 
 // Add a step to eight weights, within +-32767.
@@ -233,20 +233,13 @@ FHASH_INLINE void follow(int16_t* weights, __m128i step) {
     _mm_storeu_si128(at, _mm_max_epi16(sum, _mm_set1_epi16(-32767)));
 }
 
-// `learn` for a bit that is known where it is called.
-template <int N, bool PAIR, int RATE, int N_MAX>
-FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
-    const __m128i error = _mm_set1_epi16((int16_t)((((bit ? 65535 : 0) - now.p) * RATE) >> 4));
+// Adapt the estimates to a bit that is known where this is called.
+template <int N, int N_MAX>
+FHASH_INLINE void learn_slots_bit(Mixed<N_MAX>& now, const int bit, int limit) {
     const __m128i ones = _mm_set1_epi16((int16_t)-bit);
     for (int v = 0; 4 * v < N; v++) {
         const int n = min(N - 4 * v, 4);
         Slot* const* const s = now.slots + 4 * v;
-        // (error * input + 32768) >> 16
-        const __m128i in = now.inputs[v];
-        const __m128i rounding = _mm_srli_epi16(_mm_mullo_epi16(error, in), 15);
-        const __m128i step = _mm_add_epi16(_mm_mulhi_epi16(error, in), rounding);
-        follow(now.first + 8 * v, step);
-        if (PAIR) follow(now.second + 8 * v, step);
         // The distance of each probability from 1 (after a 1) or from 0 (after a 0) shrinks by its
         // rate. The product is rounded down for a 1 and up for a 0.
         __m128i far = _mm_xor_si128(now.chances[v], ones);
@@ -266,6 +259,33 @@ FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
     }
 }
 
+// Adapt the estimates alone to the bit that came after `mix`.
+template <int N, int N_MAX> FHASH_INLINE void learn_slots(Mixed<N_MAX>& now, int bit, int limit) {
+    if (bit) learn_slots_bit<N>(now, 1, limit);
+    else learn_slots_bit<N>(now, 0, limit);
+}
+
+// The inputs of the mixer as numbers, two per estimate; those up to a multiple of eight are 0.
+template <int N_MAX> FHASH_INLINE void inputs_of(const Mixed<N_MAX>& now, int16_t* to) {
+    for (int v = 0; 4 * v < N_MAX; v++)
+        _mm_storeu_si128(reinterpret_cast<__m128i*>(to + 8 * v), now.inputs[v]);
+}
+
+// `learn` for a bit that is known where it is called.
+template <int N, bool PAIR, int RATE, int N_MAX>
+FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
+    const __m128i error = _mm_set1_epi16((int16_t)((((bit ? 65535 : 0) - now.p) * RATE) >> 4));
+    for (int v = 0; 4 * v < N; v++) {
+        // (error * input + 32768) >> 16
+        const __m128i in = now.inputs[v];
+        const __m128i rounding = _mm_srli_epi16(_mm_mullo_epi16(error, in), 15);
+        const __m128i step = _mm_add_epi16(_mm_mulhi_epi16(error, in), rounding);
+        follow(now.first + 8 * v, step);
+        if (PAIR) follow(now.second + 8 * v, step);
+    }
+    learn_slots_bit<N>(now, bit, limit);
+}
+
 // Adapt weights and estimates to the bit that came after `mix`. limit: observations after which the
 // slow rate stays, at most SLOW_LIMIT.
 template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
@@ -276,8 +296,8 @@ FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
 
 #else
 
-template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now) {
-    int32_t dot = 0;
+template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now, int32_t more = 0) {
+    int32_t dot = more;
     for (int i = 0; i < N; i++) {
         const Slot* s = now.slots[i];
         const int trust = tables.pace[s->count].trust;
@@ -290,6 +310,21 @@ template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now) {
     return now.p = squashed(dot);
 }
 
+template <int N, int N_MAX> FHASH_INLINE void learn_slots(Mixed<N_MAX>& now, int bit, int limit) {
+    const int target = bit ? 65535 : 0;
+    for (int i = 0; i < N; i++) {
+        Slot* s = now.slots[i];
+        const Pace& pace = tables.pace[s->count];
+        s->slow = (uint16_t)(s->slow + (((target - s->slow) * (int64_t)pace.slow) >> 16));
+        s->fast = (uint16_t)(s->fast + (((target - s->fast) * (int64_t)pace.fast) >> 16));
+        if (s->count < limit) s->count++;
+    }
+}
+
+template <int N_MAX> FHASH_INLINE void inputs_of(const Mixed<N_MAX>& now, int16_t* to) {
+    for (int i = 0; i < 2 * N_MAX; i++) to[i] = (int16_t)now.inputs[i];
+}
+
 template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
 FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
     const int target = bit ? 65535 : 0, error = ((target - now.p) * RATE) >> 4;
@@ -298,13 +333,7 @@ FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
         now.first[i] = (int16_t)min(max(now.first[i] + step, -32767), 32767);
         if (PAIR) now.second[i] = (int16_t)min(max(now.second[i] + step, -32767), 32767);
     }
-    for (int i = 0; i < N; i++) {
-        Slot* s = now.slots[i];
-        const Pace& pace = tables.pace[s->count];
-        s->slow = (uint16_t)(s->slow + (((target - s->slow) * (int64_t)pace.slow) >> 16));
-        s->fast = (uint16_t)(s->fast + (((target - s->fast) * (int64_t)pace.fast) >> 16));
-        if (s->count < limit) s->count++;
-    }
+    learn_slots<N>(now, bit, limit);
 }
 
 #endif

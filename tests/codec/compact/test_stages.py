@@ -69,7 +69,8 @@ def test_under_a_bound_a_predictor_is_tried(tmp_path: Path, field: Field) -> Non
     figures = fhash_codec.encode(
         field((4, 8, 12, 16)), tmp_path / "a.fhz", EncodeConfig(effort=2, max_error_rel=1e-3)
     )
-    stages = [gain["what"] for gain in figures["gains"]]
+    whats = [gain["what"] for gain in figures["gains"]]
+    stages = [what for what in whats if not what.startswith("coarser bases")]
     assert stages[:2] == ["start", "transform by trial"]
     assert stages[2] in ("prediction", "prediction (left out)")
     assert stages[3:] == ["all tiles"]

@@ -11,6 +11,7 @@ from hostile_files import refused, replaced
 
 from fhash_formats.container import FORMAT_VERSION, Container, is_container
 from fhash_formats.container.coding import crc32c
+from fhash_formats.errors import DamagedFileError
 
 
 def test_header_comes_back(sample, samples) -> None:
@@ -40,6 +41,22 @@ def test_verify_reports_every_member(sample, samples) -> None:
         container.verify(lambda done, total: seen.append((done, total)))
     assert seen[-1][0] == seen[-1][1] == len(samples.unpack(sample.read_bytes()))
     assert [done for done, _ in seen] == list(range(seen[0][0], seen[-1][0] + 1))
+
+
+def test_chunks_whose_values_are_known_are_checked_and_not_decoded(sample) -> None:
+    with Container.open(sample) as container:
+        name = "tables/level_1"
+        first = (0,) * len(container.arrays[name].grid)
+        values = np.full_like(container.arrays[name].decode_chunk(first), 7)
+    with Container.open(sample) as container:
+        container.take_decoded(name, {first: values})
+        np.testing.assert_array_equal(container.arrays[name].decode_chunk(first), values)
+        member = next(iter(container.arrays[name].chunks.values()))
+    data = bytearray(sample.read_bytes())
+    data[member.data_offset] ^= 1
+    sample.write_bytes(data)
+    with Container.open(sample) as container, pytest.raises(DamagedFileError):
+        container.take_decoded(name, {first: values})
 
 
 def test_is_container(sample, tmp_path) -> None:

@@ -19,7 +19,7 @@ from fhash_formats.container import Container
 from fhash_formats.container.coding import TRANSFORM
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
-from fhash_formats.transform.entropy.coder import encode_integers
+from fhash_formats.transform.entropy.coder import CODERS, encode_integers
 from fhash_formats.transform.entropy.labels import blank_label_state, encode_labels
 from fhash_formats.transform.entropy.mask import encode_mask, mask_prior_state
 from fhash_formats.transform.entropy.predict import blank_state, encode_predicted
@@ -106,7 +106,8 @@ def write_setups(path: Path) -> tuple[list[Any], list[Any]]:
             file.write(struct.pack("<q", len(data)) + data)
 
         labels = blank_label_state(), blank_label_state(wide=True)
-        for state in (prior_state(), mask_prior_state(), blank_state(), *labels):
+        coders = [prior_state(coder) for coder in CODERS[:2]]
+        for state in (*coders, mask_prior_state(), blank_state(), *labels):
             for array in (state.slots, state.weights, state.simples):
                 put(array)
         file.write(struct.pack("<q", len(bands)))
@@ -146,7 +147,9 @@ def write_seeds(
     for number, (shape, table) in enumerate(bands):
         for scale in (0.5, 30.0, 1e8):
             integers = (rng.laplace(0, scale, shape)).astype(np.int32)
-            put(CODER, struct.pack("<H", number), encode_integers(integers, table).data)
+            for model, coder in enumerate(CODERS[:2]):
+                data = encode_integers(integers, table, coder=coder).data
+                put(CODER, struct.pack("<HB", number, model), data)
     for number, (shape, predictor) in enumerate(passes):
         weights = np.array(predictor.weights, np.int16).tobytes()
         smooth = np.cumsum(rng.integers(-3, 4, shape), axis=-1)
@@ -165,7 +168,7 @@ def write_seeds(
         data = coefficients_of(stream)
         setup = setup_of_bands.get((shape, band_table(settings.transform, shape).tobytes()))
         if data and setup is not None:
-            put(CODER, struct.pack("<H", setup), data)
+            put(CODER, struct.pack("<HB", setup, CODERS.index(settings.coder)), data)
     for shape in ((1, 1, 1, 3), (2, 3, 5, 17), (4, 8, 8, 24)):
         nothing = (np.zeros(shape, np.uint8),) * 2
         for density in (0.02, 0.5):

@@ -32,7 +32,8 @@ struct Passes {
 
 class Setups {
 public:
-    State coder, mask, predictor, labels, wide_labels;
+    State coders[2];  // by Model
+    State mask, predictor, labels, wide_labels;
     std::vector<Bands> bands;
     std::vector<Passes> passes;
 
@@ -42,7 +43,7 @@ public:
             std::fprintf(stderr, "FHASH_FUZZ_SETUPS names no file that can be read\n");
             std::exit(2);
         }
-        for (State* state : {&coder, &mask, &predictor, &labels, &wide_labels}) {
+        for (State* state : {&coders[0], &coders[1], &mask, &predictor, &labels, &wide_labels}) {
             get(file, state->slots);
             get(file, state->weights);
             get(file, state->simples);

@@ -8,10 +8,10 @@
 using std::int64_t;
 
 extern "C" {
-int64_t fhash_encode(std::int32_t*, const float*, double, const int64_t*, const std::int32_t*,
-                     int64_t, std::uint16_t*, int64_t, std::int32_t*, int64_t, std::uint16_t*,
+int64_t fhash_encode(std::int32_t*, const float*, double, int64_t, int64_t, const int64_t*,
+                     const std::int32_t*, int64_t, std::uint16_t*, int64_t, std::int32_t*, int64_t, std::uint16_t*,
                      int64_t, int64_t, std::uint8_t*, int64_t);
-int64_t fhash_decode(std::int32_t*, const int64_t*, const std::int32_t*, int64_t,
+int64_t fhash_decode(std::int32_t*, int64_t, int64_t, const int64_t*, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
 int64_t fhash_encode_mask(const std::uint8_t*, const std::uint8_t*, const std::uint8_t*,
@@ -64,13 +64,13 @@ std::vector<std::int32_t> bounded(Reader& in, int64_t n, std::int32_t most) {
 // must not change them.
 std::vector<std::int32_t> there_and_back(const Bands& with, std::vector<std::int32_t>& q,
                                          const std::vector<float>& scaled, double lambda,
-                                         std::size_t room) {
-    State state = setups().coder;
+                                         std::size_t room, int64_t model) {
+    State state = setups().coders[model];
     const std::vector<std::int32_t> given = q;
     const int64_t bands = static_cast<int64_t>(with.table.size() / 29);
     const std::vector<std::uint8_t> data = coded(room, [&](std::vector<std::uint8_t>& into) {
         q = given;
-        return fhash_encode(q.data(), scaled.empty() ? nullptr : scaled.data(), lambda,
+        return fhash_encode(q.data(), scaled.empty() ? nullptr : scaled.data(), lambda, model, 0,
                             with.shape.data(), with.table.data(), bands, state.slots.data(),
                             static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
                             static_cast<int64_t>(state.weights.size()), state.simples.data(),
@@ -80,7 +80,7 @@ std::vector<std::int32_t> there_and_back(const Bands& with, std::vector<std::int
     require(!scaled.empty() || q == given, "integers that the encoder changed");
     std::vector<std::int32_t> decoded(q.size(), 0);
     const int64_t code = fhash_decode(
-        decoded.data(), with.shape.data(), with.table.data(), bands, state.slots.data(),
+        decoded.data(), model, 0, with.shape.data(), with.table.data(), bands, state.slots.data(),
         static_cast<int64_t>(state.slots.size() / 4), state.weights.data(),
         static_cast<int64_t>(state.weights.size()), state.simples.data(),
         static_cast<int64_t>(state.simples.size() / 2), data.data(), length(data));
@@ -94,7 +94,7 @@ const std::vector<std::int32_t>& inside(std::size_t number) {
     if (covered[number].empty()) {
         const Bands& with = setups().bands[number];
         std::vector<std::int32_t> ones(static_cast<std::size_t>(volume(with.shape)), 1);
-        covered[number] = there_and_back(with, ones, {}, 0, 0);
+        covered[number] = there_and_back(with, ones, {}, 0, 0, 0);
     }
     return covered[number];
 }
@@ -103,7 +103,8 @@ void of_integers(Reader& in) {
     const std::size_t number = in.word() % setups().bands.size();
     const Bands& with = setups().bands[number];
     const std::size_t room = 4U * in.byte();
-    const bool choose = in.byte() & 1;
+    const std::uint8_t how = in.byte();
+    const bool choose = how & 1;
     const double lambda = choose ? std::ldexp(1.0, static_cast<int>(in.within(-20, 10))) : 0;
     // Magnitudes to choose are exact in float32.
     std::vector<std::int32_t> q =
@@ -112,7 +113,7 @@ void of_integers(Reader& in) {
     for (std::size_t i = 0; i < scaled.size(); i++)
         scaled[i] =
             static_cast<float>(q[i]) + static_cast<float>(static_cast<int>(i % 15) - 7) / 16;
-    const std::vector<std::int32_t> decoded = there_and_back(with, q, scaled, lambda, room);
+    const std::vector<std::int32_t> decoded = there_and_back(with, q, scaled, lambda, room, how >> 1 & 1);
     for (std::size_t i = 0; i < q.size(); i++)
         require(decoded[i] == (inside(number)[i] ? q[i] : 0), "other integers");
 }

@@ -23,7 +23,7 @@ void march(Reader& in);  // target_march.cpp
 #endif
 
 extern "C" {
-int64_t fhash_decode(std::int32_t*, const int64_t*, const std::int32_t*, int64_t,
+int64_t fhash_decode(std::int32_t*, int64_t, int64_t, const int64_t*, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
 int64_t fhash_decode_mask(std::uint8_t*, const std::uint8_t*, const std::uint8_t*, const int64_t*,
@@ -76,10 +76,12 @@ namespace {
 
 void decode_integers(Reader& in) {
     const Bands& with = setups().bands[in.word() % setups().bands.size()];
-    const State& prior = setups().coder;
+    const std::uint8_t how = in.byte();
+    const int64_t model = how % 2, trellis = how >> 4 & 1;
+    const State& prior = setups().coders[model];
     std::vector<std::int32_t> q(static_cast<std::size_t>(volume(with.shape)), 0);
     const std::vector<std::uint8_t> data = in.rest();
-    fhash_decode(q.data(), with.shape.data(), with.table.data(),
+    fhash_decode(q.data(), model, trellis, with.shape.data(), with.table.data(),
                  static_cast<int64_t>(with.table.size() / 29), prior.slots.data(),
                  static_cast<int64_t>(prior.slots.size() / 4), prior.weights.data(),
                  static_cast<int64_t>(prior.weights.size()), prior.simples.data(),

@@ -17,6 +17,8 @@ __all__ = ["variants"]
 
 UNIFORM = 20 * math.log10(math.sqrt(3))
 """dB by which the RMSE of a uniformly distributed error lies below the tolerance of a level."""
+HALF_RANGE = 20 * math.log10(2)
+"""dB by which the program's PSNR lies below ours: it is relative to half of the range."""
 LEAST_AXES = 3
 """Axes that an array must have."""
 
@@ -31,7 +33,7 @@ class Tthresh:
         """Write an array coded; see `Program`. Its axes go from the fastest to the slowest."""
         own = float(part.max()) - float(part.min())
         # The program's PSNR is relative to the range of what it is given.
-        psnr = level + UNIFORM + 20 * math.log10(max(own, 1e-9 * scale[1]) / scale[1])
+        psnr = level + UNIFORM - HALF_RANGE + 20 * math.log10(max(own, 1e-9 * scale[1]) / scale[1])
         lengths = [n for n in part.shape if n > 1]
         lengths += [1] * (LEAST_AXES - len(lengths))
         values, raw = as_float(part), file.with_suffix(".raw")

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fhash_formats import native
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.transform.entropy.prior import State, prior_state
+from fhash_formats.transform.entropy.prior import CODERS, State, prior_state
 from fhash_formats.transform.entropy.table import Table, single_band
 from fhash_formats.transform.entropy.two_quantisers import MISPLACED, NO_TRELLIS
 
@@ -33,11 +33,6 @@ __all__ = [
     "encode_integers",
     "state_arguments",
 ]
-
-CODERS = ("contexts", "signs", "linear")
-"""Models of the coefficients. All files before version 1.5 have "contexts": adaptive estimates by
-contexts. "signs" adds linear predictors of signs; "linear" has these, and linear predictors of
-magnitudes as well."""
 
 MAX_INTEGER = 2**30 - 1
 """Largest magnitude of an integer."""
@@ -90,7 +85,7 @@ def encode_integers(
     if trellis and scaled is not None:
         raise InputError("integers of a trellis are chosen before they are coded")
     keep = state is not None
-    state = prior_state(trellis) if state is None else state
+    state = prior_state(coder, trellis) if state is None else state
     given = np.ascontiguousarray(integers, dtype=np.int32)
     library = native.library()
     if library is None:
@@ -98,7 +93,7 @@ def encode_integers(
 
         integers = given.copy()
         adapted = state if keep else state.copy()
-        data = coder_portable.encode(integers, table, scaled, weight, adapted, trellis)
+        data = coder_portable.encode(integers, table, scaled, weight, adapted, coder, trellis)
         return Encoded(data=data, integers=integers)
     chosen = None if scaled is None else np.ascontiguousarray(scaled, dtype=np.float32)
     capacity = max(4096, given.size // 2)
@@ -110,6 +105,7 @@ def encode_integers(
             _pointer(integers),
             _pointer(chosen),
             weight,
+            CODERS.index(coder),
             trellis,
             (ctypes.c_int64 * 4)(*integers.shape),
             *array_arguments(table),
@@ -144,15 +140,17 @@ def decode_integers(
     if library is None:
         from fhash_formats.transform.entropy import coder_portable
 
-        coder_portable.decode(integers, table, bytes(data), prior_state(trellis).copy(), trellis)
+        state = prior_state(coder, trellis).copy()
+        coder_portable.decode(integers, table, bytes(data), state, coder, trellis)
         return integers
     source = np.frombuffer(data, dtype=np.uint8)
     code = library.fhash_decode(
         _pointer(integers),
+        CODERS.index(coder),
         trellis,
         (ctypes.c_int64 * 4)(*shape),
         *array_arguments(table),
-        *state_arguments(prior_state(trellis)),
+        *state_arguments(prior_state(coder, trellis)),
         *array_arguments(source),
     )
     if checked(code) < 0:

@@ -13,6 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.transform.entropy.linear_portable import linear_learn, linear_logit
+from fhash_formats.transform.entropy.magnitudes_portable import (
+    MagnitudeWork,
+    gather_magnitudes,
+    learn_magnitude,
+    magnitude_work,
+    predict_magnitude,
+)
 from fhash_formats.transform.entropy.mixing_portable import (
     ARRAYS,
     LEARNING_RATE,
@@ -34,6 +42,7 @@ from fhash_formats.transform.entropy.mixing_portable import (
     start_range,
 )
 from fhash_formats.transform.entropy.prior import (
+    CODERS,
     DECISIONS,
     KINDS,
     LANES,
@@ -41,6 +50,18 @@ from fhash_formats.transform.entropy.prior import (
     SIGN_SIZES,
     SIZES,
     State,
+)
+from fhash_formats.transform.entropy.signs_portable import (
+    SIGN_LIMIT,
+    SignWork,
+    code_linear_sign,
+    consistent,
+    find_places,
+    gather_signs,
+    log_at,
+    octaves,
+    sign,
+    sign_work,
 )
 from fhash_formats.transform.entropy.table import (
     BAND,
@@ -71,8 +92,6 @@ UNARY = 14
 SHARED = 2
 """Decisions from this one on are one for both quantisers; those of class 1 before it have the slots
 and weights from UNARY on."""
-SIGN_LIMIT = 255
-"""Observations after which the slow rate of an estimate of a sign stays."""
 MAX_MAGNITUDE = 4095
 """Largest magnitude that contexts see."""
 PADDING = 2
@@ -120,6 +139,8 @@ DECODE = 1
 """Mode of a run that decodes."""
 CHOOSE = 2
 """Mode of a run that encodes magnitudes which it chooses by rate and distortion."""
+LINEAR = 2
+"""Number in CODERS of the coder with linear predictors of magnitudes."""
 TRELLIS = 4
 """Added to ENCODE or DECODE: the integers are those of two quantisers."""
 
@@ -173,6 +194,7 @@ def encode(
     scaled: npt.NDArray[np.float32] | None,
     weight: float,
     state: State,
+    coder: str,
     trellis: bool,
 ) -> bytes:
     """Code integers (t, z, y, x), in C order, and adapt the state.
@@ -188,12 +210,13 @@ def encode(
     q: Sequence
     if engine is None:
         q = integers.ravel().tolist()
-        code, out = _start(engine, mode, q, real.tolist(), weight, shape, table, memory, b"")
+        values = real.tolist()
+        code, out = _start(engine, mode, coder, q, values, weight, shape, table, memory, b"")
         if mode == CHOOSE:
             integers[:] = np.array(q, dtype=np.int32).reshape(integers.shape)
     else:
         q = integers.reshape(-1)
-        code, out = _start(engine, mode, q, real, weight, shape, table, memory, b"")
+        code, out = _start(engine, mode, coder, q, real, weight, shape, table, memory, b"")
     if code < 0:
         raise InputError(MISPLACED)
     keep_memory(memory, state)
@@ -205,6 +228,7 @@ def decode(
     table: npt.NDArray[np.int32],
     data: bytes,
     state: State,
+    coder: str,
     trellis: bool,
 ) -> None:
     """Decode into integers (t, z, y, x), which are zeros in C order.
@@ -216,7 +240,7 @@ def decode(
     real: Sequence = [] if engine is None else np.zeros(0)
     memory = memory_of(state, engine is not None)
     mode = DECODE | TRELLIS if trellis else DECODE
-    code = _start(engine, mode, q, real, 0.0, integers.shape, table, memory, data)[0]
+    code = _start(engine, mode, coder, q, real, 0.0, integers.shape, table, memory, data)[0]
     if code < 0:
         raise DamagedFileError("the coded integers are damaged")
     if engine is None:
@@ -226,8 +250,11 @@ def decode(
 def _engine() -> Callable[..., Any] | None:
     """`_run` compiled, or None where numba cannot be imported."""
     helpers = (
-        *(_small, _sign, _context_mix, _choose, _add_centre, _add_neighbour, _prepare),
-        *(_any_nonzero, _find_references, _code_escape, after_zeros),
+        *(_small, _context_mix, _choose, _add_centre, _add_neighbour, _prepare),
+        *(_any_nonzero, _find_references, _code_escape, _code_sign, after_zeros),
+        *(code_linear_sign, consistent, find_places, gather_signs, log_at, octaves, sign),
+        *(linear_learn, linear_logit, _predict, _learn),
+        *(gather_magnitudes, predict_magnitude, learn_magnitude),
     )
     return compiled(_run, helpers)
 
@@ -235,6 +262,7 @@ def _engine() -> Callable[..., Any] | None:
 def _start(
     engine: Callable[..., Any] | None,
     mode: int,
+    coder: str,
     q: Sequence,
     scaled: Sequence,
     weight: float,
@@ -262,13 +290,47 @@ def _start(
         **dict.fromkeys(("inputs", "other_inputs"), LANES),
     }
     price = weight / 2048  # squared steps that 1/2048 bit is worth
+    signs = sign_work(coder, memory.weights, shape, mode >= TRELLIS, compiled=engine is not None)
+    magnitudes = magnitude_work(coder, memory.weights, signs.strides, compiled=engine is not None)
+    model = CODERS.index(coder)
     if engine is None:
         work = Work(**{name: [0] * length for name, length in lengths.items()})
         span: Sequence = [0] * 4
-        return _run(mode, q, scaled, price, shape, bands.tolist(), memory, LISTS, work, span, data)
+        rows = bands.tolist()
+        return _run(
+            mode,
+            model,
+            q,
+            scaled,
+            price,
+            shape,
+            rows,
+            memory,
+            LISTS,
+            work,
+            signs,
+            magnitudes,
+            span,
+            data,
+        )
     work = Work(**{name: np.zeros(length, dtype=np.int64) for name, length in lengths.items()})
     span, source = np.zeros(4, np.int64), np.frombuffer(data, dtype=np.uint8).astype(np.int64)
-    code, out = engine(mode, q, scaled, price, shape, bands, memory, ARRAYS, work, span, source)
+    code, out = engine(
+        mode,
+        model,
+        q,
+        scaled,
+        price,
+        shape,
+        bands,
+        memory,
+        ARRAYS,
+        work,
+        signs,
+        magnitudes,
+        span,
+        source,
+    )
     return code, out
 
 
@@ -277,10 +339,6 @@ def _small(v: int, small: Sequence) -> int:
     if v < 37:
         return int(small[v])
     return 9 if v <= 64 else 10 if v <= 140 else 11
-
-
-def _sign(v: int) -> int:
-    return 2 if v > 0 else 0 if v < 0 else 1
 
 
 def _any_nonzero(q: Sequence, begin: int, n: int) -> int:
@@ -306,40 +364,92 @@ def _context_mix(
     return mix(CONTEXTS, where, inputs, first, second, memory, tables)
 
 
+def _predict(
+    model: int,
+    k: int,
+    kind: int,
+    coarse: int,
+    near: int,
+    where: Sequence,
+    inputs: Sequence,
+    work: Work,
+    magnitudes: MagnitudeWork,
+    memory: Memory,
+    tables: Tables,
+) -> int:
+    """Probability of a 1 in decision k of the present vertex, by the model of the coder."""
+    if model == LINEAR:
+        for i in range(CONTEXTS):
+            where[i] = STARTS[i] + work.context[i] * DECISIONS + k
+        return predict_magnitude(k, where, near, magnitudes, memory, tables)
+    first, second = (k * KINDS + kind) * LANES, SECOND + (k * 64 + coarse) * LANES
+    return _context_mix(k, where, inputs, work.context, first, second, memory, tables)
+
+
+def _learn(
+    model: int,
+    k: int,
+    kind: int,
+    coarse: int,
+    p: int,
+    bit: int,
+    work: Work,
+    magnitudes: MagnitudeWork,
+    memory: Memory,
+    tables: Tables,
+) -> None:
+    """Learn from the bit that came after `_predict`, which returned p."""
+    if model == LINEAR:
+        learn_magnitude(k, bit, work.where, magnitudes, memory, tables)
+        return
+    first, second = (k * KINDS + kind) * LANES, SECOND + (k * 64 + coarse) * LANES
+    learn(
+        CONTEXTS,
+        work.where,
+        work.inputs,
+        first,
+        second,
+        p,
+        bit,
+        SLOW_LIMIT,
+        LEARNING_RATE,
+        memory,
+        tables.rate,
+    )
+
+
 def _choose(
     s: float,
     p: int,
     price: float,
-    first: int,
-    second: int,
+    model: int,
+    kind: int,
+    coarse: int,
+    near: int,
+    work: Work,
+    magnitudes: MagnitudeWork,
     memory: Memory,
     tables: Tables,
-    work: Work,
 ) -> int:
     """The magnitude next to `s` that costs least: the nearest one, one less, or zero."""
     s = s if s < 1e9 else 1e9
     nearest = int(s + 0.5)
     if nearest == 0 or nearest >= UNARY:
         return nearest
-    cost, where, inputs, context = tables.cost, work.other_where, work.other_inputs, work.context
+    cost, where, inputs = tables.cost, work.other_where, work.other_inputs
     zero = s * s + price * cost[p]
     other_than_zero = price * (cost[65536 - p] + 2048)
-    stop = _context_mix(
-        nearest,
-        where,
-        inputs,
-        context,
-        first + nearest * BY_KIND,
-        second + nearest * BY_LEVEL,
-        memory,
-        tables,
+    before = 0
+    if nearest > 1:
+        k = nearest - 1
+        before = _predict(
+            model, k, kind, coarse, near, where, inputs, work, magnitudes, memory, tables
+        )
+    stop = _predict(
+        model, nearest, kind, coarse, near, where, inputs, work, magnitudes, memory, tables
     )
     if nearest == 1:
         return 0 if zero <= (s - 1) * (s - 1) + price * cost[65536 - stop] + other_than_zero else 1
-    k = nearest - 1
-    before = _context_mix(
-        k, where, inputs, context, first + k * BY_KIND, second + k * BY_LEVEL, memory, tables
-    )
     same = (s - nearest) * (s - nearest) + price * (cost[before] + cost[65536 - stop])
     less = (s - nearest + 1) * (s - nearest + 1) + price * cost[65536 - before]
     if nearest == 2 and zero < min(same, less) + other_than_zero:
@@ -501,8 +611,55 @@ def _code_escape(magnitude: int, level: int, stream: Stream, memory: Memory, rat
     return min(v + UNARY - 1, 0x7FFFFFFF)
 
 
+def _code_sign(
+    bit: int,
+    q: Sequence,
+    at: int,
+    t: int,
+    z: int,
+    y: int,
+    x: int,
+    kind: int,
+    strides: tuple[int, int, int],
+    work: Work,
+    stream: Stream,
+    memory: Memory,
+    tables: Tables,
+) -> int:
+    """Code the sign of integer `at` by contexts alone; neighbours that do not exist count as 0."""
+    s0, s1, s2 = strides
+    left = sign(q[at - 1]) if x > 0 else 1
+    left2 = sign(q[at - 2]) if x > 1 else 1
+    up = sign(q[at - s2]) if y > 0 else 1
+    up2 = sign(q[at - 2 * s2]) if y > 1 else 1
+    below = sign(q[at - s1]) if z > 0 else 1
+    before = sign(q[at - s0]) if t > 0 else 1
+    where, inputs = work.where, work.inputs
+    where[0] = SIGN_STARTS[0] + kind * 27 + (left * 3 + up) * 3 + before
+    where[1] = SIGN_STARTS[1] + kind * 81 + (left * 3 + left2) * 9 + up * 3 + up2
+    where[2] = SIGN_STARTS[2] + kind * 27 + (before * 3 + below) * 3 + left
+    signs = SIGNS + kind * LANES
+    p = mix(SIGN_CONTEXTS, where, inputs, signs, -1, memory, tables)
+    bit = code_bit(bit, p, stream)
+    learn(
+        SIGN_CONTEXTS,
+        where,
+        inputs,
+        signs,
+        -1,
+        p,
+        bit,
+        SIGN_LIMIT,
+        LEARNING_RATE,
+        memory,
+        tables.rate,
+    )
+    return bit
+
+
 def _run(
     mode: int,
+    model: int,
     q: Sequence,
     scaled: Sequence,
     price: float,
@@ -511,6 +668,8 @@ def _run(
     memory: Memory,
     tables: Tables,
     work: Work,
+    signs: SignWork,
+    magnitudes: MagnitudeWork,
     span: Sequence,
     data: Sequence,
 ) -> tuple[int, list[int]]:
@@ -595,90 +754,118 @@ def _run(
                 context[3] = _small(near, small) * 144 + sides
                 context[4] = others + min(_small(work.around[3 * width + x], small), 6)
                 context[5] = (both * 12 + parent) * KINDS + kind
+                plain_near = near
 
                 # The zero flag.
                 one = state & 1 if two_quantisers else 0  # class of the quantiser
+                near = min(_small(near, small), 6)
+                if model == LINEAR:
+                    vertex = magnitudes.vertex
+                    vertex[0], vertex[1], vertex[2], vertex[6] = kind, coarse, plain_near, one
+                    vertex[3] = min(_small(before + below, small), 6)
+                    vertex[4] = min(parent, 6)
+                    vertex[5] = max(log16(expected, log) + offset + 4, 0) if expected else 0
+                    gather_magnitudes(q, band, table, t, z, y, x, magnitudes)
                 k = UNARY if one else 0
-                first = (k * KINDS + kind) * LANES
-                second = SECOND + (k * 64 + coarse) * LANES
-                p = _context_mix(k, where, inputs, context, first, second, memory, tables)
+                p = _predict(
+                    model, k, kind, coarse, near, where, inputs, work, magnitudes, memory, tables
+                )
                 at = begin + x
                 value = 0 if decoding else q[at]
                 if mode == CHOOSE:
-                    best = _choose(abs(scaled[at]), p, price, first, second, memory, tables, work)
+                    best = _choose(
+                        abs(scaled[at]),
+                        p,
+                        price,
+                        model,
+                        kind,
+                        coarse,
+                        near,
+                        work,
+                        magnitudes,
+                        memory,
+                        tables,
+                    )
                     value = -best if scaled[at] < 0 else best
                     q[at] = value
-                if one and value and not value & 1 or two_quantisers and not one and value & 1:
+                    if model == LINEAR:  # trials have overwritten the prediction
+                        _predict(
+                            model,
+                            k,
+                            kind,
+                            coarse,
+                            near,
+                            where,
+                            inputs,
+                            work,
+                            magnitudes,
+                            memory,
+                            tables,
+                        )
+                if (one and value and not value & 1) or (two_quantisers and not one and value & 1):
                     return NO_TRELLIS, out
                 magnitude = (abs(value) + one) // 2 if two_quantisers else abs(value)
                 zero = code_bit(1 if magnitude == 0 else 0, p, stream)
-                learn(
-                    CONTEXTS,
-                    where,
-                    inputs,
-                    first,
-                    second,
-                    p,
-                    zero,
-                    SLOW_LIMIT,
-                    LEARNING_RATE,
-                    memory,
-                    rate,
-                )
+                _learn(model, k, kind, coarse, p, zero, work, magnitudes, memory, tables)
                 if zero:
                     state = AFTER[2 * state]
                     continue
                 work.filled[f] = 1
 
-                # The sign: 0 for negative neighbours, 1 for zeros and none, 2 for positive ones.
-                left_sign = _sign(q[at - 1]) if x > 0 else 1
-                left2_sign = _sign(q[at - 2]) if x > 1 else 1
-                y_sign = _sign(q[at - s2]) if y > 0 else 1
-                y2_sign = _sign(q[at - 2 * s2]) if y > 1 else 1
-                z_sign = _sign(q[at - s1]) if z > 0 else 1
-                t_sign = _sign(q[at - s0]) if t > 0 else 1
-                sides = (left_sign * 3 + left2_sign) * 9 + y_sign * 3 + y2_sign
-                where[0] = SIGN_STARTS[0] + kind * 27 + (left_sign * 3 + y_sign) * 3 + t_sign
-                where[1] = SIGN_STARTS[1] + kind * 81 + sides
-                where[2] = SIGN_STARTS[2] + kind * 27 + (t_sign * 3 + z_sign) * 3 + left_sign
-                signs = SIGNS + kind * LANES
-                p = mix(SIGN_CONTEXTS, where, inputs, signs, -1, memory, tables)
-                negative = code_bit(1 if value < 0 else 0, p, stream)
-                learn(
-                    SIGN_CONTEXTS,
-                    where,
-                    inputs,
-                    signs,
-                    -1,
-                    p,
-                    negative,
-                    SIGN_LIMIT,
-                    LEARNING_RATE,
-                    memory,
-                    rate,
-                )
+                # The sign.
+                negative = 1 if value < 0 else 0
+                if model:
+                    negative = code_linear_sign(
+                        negative,
+                        q,
+                        band,
+                        table,
+                        kind,
+                        t,
+                        z,
+                        y,
+                        x,
+                        signs,
+                        stream,
+                        memory,
+                        tables,
+                    )
+                else:
+                    negative = _code_sign(
+                        negative,
+                        q,
+                        at,
+                        t,
+                        z,
+                        y,
+                        x,
+                        kind,
+                        (s0, s1, s2),
+                        work,
+                        stream,
+                        memory,
+                        tables,
+                    )
 
                 # The magnitude.
                 k = 1
                 while k < UNARY:
                     d = UNARY + k if one and k < SHARED else k
-                    first = (d * KINDS + kind) * LANES
-                    second = SECOND + (d * 64 + coarse) * LANES
-                    p = _context_mix(d, where, inputs, context, first, second, memory, tables)
-                    more = code_bit(1 if magnitude > k else 0, p, stream)
-                    learn(
-                        CONTEXTS,
+                    p = _predict(
+                        model,
+                        d,
+                        kind,
+                        coarse,
+                        near,
                         where,
                         inputs,
-                        first,
-                        second,
-                        p,
-                        more,
-                        SLOW_LIMIT,
-                        LEARNING_RATE,
+                        work,
+                        magnitudes,
                         memory,
-                        rate,
+                        tables,
                     )
+                    more = code_bit(1 if magnitude > k else 0, p, stream)
+                    _learn(model, d, kind, coarse, p, more, work, magnitudes, memory, tables)
                     if not more:
                         break
                     k += 1

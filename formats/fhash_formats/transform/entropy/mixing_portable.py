@@ -27,6 +27,7 @@ __all__ = [
     "LEARNING_RATE",
     "LISTS",
     "SLOW_LIMIT",
+    "STRETCH_MAX",
     "Memory",
     "Sequence",
     "Stream",
@@ -38,10 +39,12 @@ __all__ = [
     "finish",
     "keep_memory",
     "learn",
+    "learn_slots",
     "log16",
     "memory_of",
     "mix",
     "start_range",
+    "stretched",
 ]
 
 STRETCH_MAX = 2816
@@ -168,7 +171,8 @@ def compiled(
         return None
     numba, extending = modules
     shared: tuple[Callable[..., Any], ...]
-    shared = (code_bit, code_simple, start_range, finish, log16, mix, learn, code_mixed)
+    shared = (code_bit, code_simple, start_range, finish, log16, stretched, mix)
+    shared += (learn, learn_slots, code_mixed)
     with _LOCK:
         if run not in _COMPILED:
             for helper in {*shared, *helpers} - _JITABLE:
@@ -263,6 +267,19 @@ def log16(v: int, log: Sequence) -> int:
     return int(log[v >> shift]) + 16 * shift
 
 
+def stretched(n: int, where: Sequence, inputs: Sequence, memory: Memory, tables: Tables) -> None:
+    """Write the logits of n estimates to `inputs`, two for each; arguments as for `mix`."""
+    for i in range(n):
+        at = where[i]
+        slow, fast = tables.stretch[memory.slow[at]], tables.stretch[memory.fast[at]]
+        trust = memory.count[at] + 1
+        if trust < ALL_TRUST:
+            # Rounded towards 0.
+            slow = slow * trust // ALL_TRUST if slow >= 0 else -(-slow * trust // ALL_TRUST)
+            fast = fast * trust // ALL_TRUST if fast >= 0 else -(-fast * trust // ALL_TRUST)
+        inputs[2 * i], inputs[2 * i + 1] = slow, fast
+
+
 def mix(
     n: int,
     where: Sequence,
@@ -271,6 +288,7 @@ def mix(
     second: int,
     memory: Memory,
     tables: Tables,
+    more: int = 0,
 ) -> int:
     """Probability of a 1, in 1/65536, mixed from n estimates.
 
@@ -282,17 +300,12 @@ def mix(
         second: where the second set of weights begins, or a negative number for none.
         memory: the estimates and weights.
         tables: ARRAYS or LISTS.
+        more: a term of the sum that comes from elsewhere.
     """
-    weights, dot = memory.weights, 0
+    weights, dot = memory.weights, more
+    stretched(n, where, inputs, memory, tables)
     for i in range(n):
-        at = where[i]
-        slow, fast = tables.stretch[memory.slow[at]], tables.stretch[memory.fast[at]]
-        trust = memory.count[at] + 1
-        if trust < ALL_TRUST:
-            # Rounded towards 0.
-            slow = slow * trust // ALL_TRUST if slow >= 0 else -(-slow * trust // ALL_TRUST)
-            fast = fast * trust // ALL_TRUST if fast >= 0 else -(-fast * trust // ALL_TRUST)
-        inputs[2 * i], inputs[2 * i + 1] = slow, fast
+        slow, fast = inputs[2 * i], inputs[2 * i + 1]
         w, v = weights[first + 2 * i], weights[first + 2 * i + 1]
         if second >= 0:
             w, v = w + weights[second + 2 * i], v + weights[second + 2 * i + 1]
@@ -332,6 +345,14 @@ def learn(
         weights[first + i] = min(max(weights[first + i] + step, -32767), 32767)
         if second >= 0:
             weights[second + i] = min(max(weights[second + i] + step, -32767), 32767)
+    learn_slots(n, where, bit, limit, memory, rate)
+
+
+def learn_slots(
+    n: int, where: Sequence, bit: int, limit: int, memory: Memory, rate: Sequence
+) -> None:
+    """Adapt n estimates alone; arguments as for `learn`."""
+    target = 65535 if bit else 0
     for i in range(n):
         at = where[i]
         slow, fast, seen = memory.slow[at], memory.fast[at], memory.count[at]

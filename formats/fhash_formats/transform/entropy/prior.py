@@ -17,7 +17,20 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["State", "blank_state", "pack_prior", "pack_state", "prior_state", "unpack_state"]
+__all__ = [
+    "CODERS",
+    "State",
+    "blank_state",
+    "pack_prior",
+    "pack_state",
+    "prior_state",
+    "unpack_state",
+]
+
+CODERS = ("contexts", "signs", "linear")
+"""Models of the coefficients. All files before version 1.5 have "contexts": adaptive estimates by
+contexts. "signs" adds linear predictors of signs; "linear" has these, and linear predictors of
+magnitudes as well."""
 
 DECISIONS = 16
 """Decisions of a magnitude, each with estimates and weights of its own."""
@@ -31,8 +44,26 @@ SIZES = (LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS)
 """Contexts of a decision, for each of the six estimates that are mixed."""
 SIGN_SIZES = (KINDS * 27, KINDS * 81, KINDS * 27)
 """Contexts of a sign, for each of the three estimates that are mixed."""
+MORE_SIGN_SIZES = (KINDS * 108, KINDS * 27, KINDS * 81, KINDS * 54, KINDS * 25)
+"""Contexts of the five further estimates of a sign of the coders that predict signs linearly."""
+SIGN_SET = 24
+"""Weights of a sign of these coders: two per estimate, then that of the linear logit."""
+SIGN_INPUTS = 96
+"""Weights of a linear predictor of signs, each with a mean square of its gradient."""
+INPUTS = 64
+"""Weights of a linear predictor of magnitudes, each with a mean square of its gradient."""
+SET_CLASSES = (KINDS, 64, 343, 64 * 8)
+"""Classes of each of the four sets of mixing weights of the linear coder."""
+SETS = len(SET_CLASSES)
+"""Sets of mixing weights of the linear coder."""
+SET_NUMBERS = 17
+"""Numbers of such a set: two weights per estimate, of the logit, of a constant, two 0; its uses."""
+FIRST_SQUARE = 16
+"""Mean square of a gradient before anything is known, 1 is 16384."""
+BASE_WEIGHTS = (KINDS * DECISIONS + 64 * DECISIONS + KINDS) * LANES
+"""Weights of the mixing by contexts alone, which come first."""
 SLOTS = sum(SIZES) * DECISIONS + sum(SIGN_SIZES)
-"""Estimates that are mixed."""
+"""Estimates that are mixed by contexts alone."""
 SIMPLES = LEVELS * 64 + 8 + KINDS
 """Simple estimates: of the escape code, of empty rows and of empty bands."""
 TRUST = 12
@@ -87,21 +118,38 @@ class State:
         return self
 
 
-def blank_state() -> State:
+def blank_state(coder: str = CODERS[0]) -> State:
     """A state that has learned nothing: even odds, and weights that believe the estimates."""
-    weights = [
-        (KINDS * DECISIONS * LANES, 4423),
-        (64 * DECISIONS * LANES, 0),
-        (KINDS * LANES, 4096),
-    ]
-    return State.even(slots=SLOTS, weights=weights, simples=SIMPLES)
+    slots, weights = (
+        SLOTS,
+        [
+            (KINDS * DECISIONS * LANES, 4423),
+            (64 * DECISIONS * LANES, 0),
+            (KINDS * LANES, 4096),
+        ],
+    )
+    if coder != CODERS[0]:
+        slots += sum(MORE_SIGN_SIZES)
+        weights += [(16, 2048), (1, 8192), (7, 0)] * KINDS
+        weights += [(SIGN_INPUTS, 0), (SIGN_INPUTS, FIRST_SQUARE)] * KINDS
+    if coder == "linear":
+        weights += [(INPUTS, 0), (INPUTS, FIRST_SQUARE)] * (DECISIONS * KINDS)
+        weights += [(12, 2731), (1, 8192), (4, 0)] * (DECISIONS * sum(SET_CLASSES))
+        weights += [(SETS * DECISIONS * KINDS, 16384)]
+    return State.even(slots=slots, weights=weights, simples=SIMPLES)
 
 
 @cache
-def prior_state(trellis: bool = False) -> State:
-    """The prior of integers, or of indices of two quantisers; its arrays are read-only."""
-    state = unpack_state(zlib.decompress(_FILE.read_bytes()), blank_state())
-    state.slots[:] = _reordered(state.slots, for_file=False)
+def prior_state(coder: str = CODERS[0], trellis: bool = False) -> State:
+    """The prior of a coder of integers, or of indices of two quantisers; it is read-only."""
+    old = unpack_state(zlib.decompress(_FILE.read_bytes()), blank_state())
+    old.slots[:] = _reordered(old.slots, for_file=False)
+    state = old
+    if coder != CODERS[0]:
+        state = blank_state(coder)
+        state.slots[: len(old.slots)] = old.slots
+        state.weights[: len(old.weights)] = old.weights
+        state.simples[:] = old.simples
     if trellis:
         _share(state)
     return state.frozen()

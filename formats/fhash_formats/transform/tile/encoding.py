@@ -64,7 +64,7 @@ _END_MARGIN = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class Coding:
-    """Options of the encoder: how hard it works, and what it keeps. A decoder needs none of them.
+    """Options of the encoder: how hard it works, what it keeps. A decoder needs none of them.
 
     Attributes:
         weight: squared quantiser steps that a bit is worth in rate-distortion optimisation; 0 for
@@ -72,7 +72,8 @@ class Coding:
         error: bound on |decoded - value| at every counted value, in units of the values. It is kept
             strictly; a tile that cannot keep it is stored without loss. None for no bound.
         rounds: how often the values that are free to change are replaced by their decoded values.
-        passes: 2 codes the integers that the optimisation chose once more; 1 does not.
+        passes: 2 codes the integers that the optimisation chose once more, or searches the path
+            through the trellis once more; 1 does not.
         filled: whether the values that are not counted are a good filling already, such as repeated
             border values. Otherwise the encoder looks for a better one.
         density: how thoroughly it looks; see `filling.filled`.
@@ -371,16 +372,18 @@ def _tried(coefficients: Values, task: _Task) -> Integers | None:
     ).integers
 
 
-def _on_trellis(coefficients: Values, task: _Task) -> Integers | None:
-    """The integers of the cheapest path through the trellis; None where one would be too large."""
+def _on_trellis(coefficients: Values, task: _Task, passes: int = 1) -> Integers | None:
+    """The integers of the cheapest path through the trellis; None where one would be too large.
+
+    passes: how often the path is searched.
+    """
     settings = task.settings
     scaled = coefficients * settings.dtype.type(1.0 / settings.step)
     # Written so that it holds for NaN as well.
     if not max(-float(scaled.min()), float(scaled.max())) < LARGEST:
         return None
-    return choose_levels(
-        scaled, band_table(settings.transform, task.shape), task.coding.weight
-    )
+    table = band_table(settings.transform, task.shape)
+    return choose_levels(scaled, table, task.coding.weight, passes)
 
 
 def _code(coefficients: Values, task: _Task) -> tuple[bytes, Integers] | None:
@@ -388,7 +391,7 @@ def _code(coefficients: Values, task: _Task) -> tuple[bytes, Integers] | None:
     settings, weight = task.settings, task.coding.weight
     table, coder = band_table(settings.transform, task.shape), settings.coder
     if settings.trellis:
-        path = _on_trellis(coefficients, task)
+        path = _on_trellis(coefficients, task, task.coding.passes)
         if path is None:
             return None
         return encode_integers(path, table, coder=coder, trellis=True).data, path

@@ -55,3 +55,26 @@ def test_vertices_outside_the_coreset_do_not_count() -> None:
 def test_a_tile_is_empty_where_no_vertex_counts() -> None:
     assert Tile(VALUES, np.zeros(SHAPE, bool)).is_empty
     assert not Tile(VALUES, None).is_empty
+
+
+@pytest.mark.parametrize("in_memory", [True, False])
+@pytest.mark.parametrize("features", [("all",), ("interval:0:10",)])
+def test_a_window_is_the_part_where_values_vary_most(
+    monkeypatch: pytest.MonkeyPatch, in_memory: bool, features: tuple[str, ...]
+) -> None:
+    if not in_memory:
+        monkeypatch.setattr("fhash_codec.compact.tiles.blocks.MAX_BYTES_IN_MEMORY", 1)
+    monkeypatch.setattr(f"{__name__}.VALUES", VALUES.copy())
+    VALUES[:, :, :, :4] *= 0.01
+    blocks = blocks_of((5, 3, 7, 4), features)
+    window = blocks.window((3, 6, 7, 4))
+    assert window.shape == window.tile == (3, 6, 7, 4)
+    assert window.in_memory
+    part = window.read((0, 0, 0, 0))
+    np.testing.assert_array_equal(part.values, VALUES[1:4, :, :, 4:])
+    whole = blocks.retile(SHAPE).read((0, 0, 0, 0)).counted
+    assert (part.counted is None) == (whole is None) == window.complete
+    if part.counted is not None and whole is not None:
+        np.testing.assert_array_equal(part.counted, whole[1:4, :, :, 4:])
+    half = window.retile((3, 6, 7, 2))
+    np.testing.assert_array_equal(half.read((0, 0, 0, 1)).values, VALUES[1:4, :, :, 6:])

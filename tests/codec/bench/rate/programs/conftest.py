@@ -26,7 +26,8 @@ if "-s" in sys.argv:
     kind = {"float": "f4", "double": "f8"}[options["-t"]]
     values = np.fromfile(options["-i"], kind)
     assert values.size == np.prod(sizes)
-    step = np.ptp(values.astype(float)) * 10 ** (-float(options["-p"]) / 20) * 12 ** 0.5
+    # The program's PSNR is relative to half of the range.
+    step = np.ptp(values.astype(float)) / 2 * 10 ** (-float(options["-p"]) / 20) * 12 ** 0.5
     whole = np.rint(values / step).astype("i4")
     open(options["-c"], "wb").write(zlib.compress(pickle.dumps((whole, step, kind))))
 else:

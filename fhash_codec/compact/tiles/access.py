@@ -1,0 +1,173 @@
+"""Access to regions and its price: work for a region, prices that are allowed, tiles to try.
+
+A reader decodes whole tiles. Small ones let it read a region soon, and make the file larger: a cut
+breaks the correlation across it, and each tile begins to learn anew.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from math import prod
+
+from fhash_codec.compact.tiles.tiling import MAX_VERTICES
+from fhash_formats.transform.tile.sections import Shape
+
+__all__ = [
+    "MAX_WHOLE_VERTICES",
+    "PRICES",
+    "Tiling",
+    "TilingTrial",
+    "cheap_tiling",
+    "foretold_price",
+    "part_of",
+    "region_vertices",
+    "tiles_to_try",
+]
+
+MAX_WHOLE_VERTICES = 12 << 20
+"""Vertices of a series up to which it may be one tile: a larger one takes long to decode."""
+
+PRICES = {"fast": 1.5, "balanced": 1.1, "small": 1.0}
+"""Bytes that tiles may take, as a multiple of those of the best tiling, by the wish for access."""
+REGION = 16
+"""Vertices of a region along each axis in space; it is of one step."""
+FAST_ENOUGH = 1 << 16
+"""Vertices that decode in a moment, so that nothing smaller is worth any bytes."""
+LENGTHS = (1024, 512, 256, 128, 64, 32, 16, 8, 4, 2, 1)
+"""Lengths in steps that tiles are tried at, approximately."""
+EDGES = (256, 192, 128, 96, 64, 48, 32, 24, 16)
+"""Edges in space in vertices that tiles are tried at, approximately."""
+CUT_IN_SPACE = 4.5
+"""Share of the bytes that a cut across space costs, times the vertices between such cuts.
+
+The most that was found on series of many kinds where nothing is tried (effort 1).
+"""
+CUT_IN_TIME = 1.5
+"""The same of a cut in time, by steps."""
+BYTES_OF_TILE = 100
+"""Bytes that each further tile costs: its place in the file, and the beginning of its coder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TilingTrial:
+    """A tiling that was tried, or the one that was taken without."""
+
+    tile: Shape
+    size: float
+    """Bytes that the tiles take, at the quality of the first trial."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tiling:
+    """The chosen tiles, and what was tried."""
+
+    tile: Shape
+    price: float | None
+    """Bytes as a multiple of those of the best tiling; foretold where none was tried, and None for
+    tiles that were asked for."""
+    trials: list[TilingTrial] = field(default_factory=list)
+    part: Shape | None = None
+    """Shape of the part that the tilings were tried on; None for the whole series."""
+
+    @property
+    def best(self) -> Shape | None:
+        """Tile of the fewest bytes of those tried."""
+        return min(self.trials, key=lambda trial: trial.size).tile if self.trials else None
+
+    def describe(self) -> str:
+        """Return the tilings that were tried, with their prices, as one line."""
+        if not self.trials:
+            return f"foretold: {self.price:.2f} times the bytes of one tile"
+        least = min(trial.size for trial in self.trials)
+        told = ", ".join(
+            f"{' x '.join(map(str, trial.tile))} at {trial.size / least:.2f}"
+            for trial in self.trials
+        )
+        part = "" if self.part is None else f", on {' x '.join(map(str, self.part))} vertices"
+        return f"tried {told}{part}"
+
+
+def region_vertices(shape: Shape, tile: Shape, region: int = REGION) -> float:
+    """Return the vertices that a reader decodes for a region of one step, in the mean.
+
+    shape: of the box over all steps.
+    tile: of a tile.
+    region: vertices of the region along each axis in space.
+    """
+    mean = 1.0
+    for axis, (length, n) in enumerate(zip(shape, tile, strict=True)):
+        span = 1 if axis == 0 else min(region, length)
+        mean *= n if n >= length else n + span - 1
+    return mean
+
+
+def tiles_to_try(shape: Shape, max_vertices: int) -> list[Shape]:
+    """Return tiles of at most some vertices, those of the fastest region first.
+
+    Axes in space are cut into parts of about one edge, time into parts of about one length. Of the
+    tiles whose regions take no more than FAST_ENOUGH vertices, only the one of the slowest is
+    among them.
+    """
+    lengths = {_part(shape[0], length, even=False) for length in (shape[0], *LENGTHS)}
+    spaces = {
+        (_part(z, edge), _part(y, edge), _part(x, edge))
+        for z, y, x in [shape[1:]]
+        for edge in (max(shape[1:]), *EDGES)
+    }
+    tiles: list[Shape] = [(t, *space) for t in lengths for space in spaces]
+    tiles = [tile for tile in tiles if prod(tile) <= max_vertices]
+    tiles = sorted(tiles, key=lambda tile: (region_vertices(shape, tile), tile))
+    fast = sum(region_vertices(shape, tile) <= FAST_ENOUGH for tile in tiles)
+    return tiles[max(fast - 1, 0) :]
+
+
+def part_of(tile: Shape, vertices: int) -> Shape:
+    """Return the lengths of a part of a tile: x and y are shortened first, to 8 at least."""
+    lengths = list(tile)
+    for axis in (3, 2, 1, 0):
+        while prod(lengths) > vertices and lengths[axis] > 8:
+            lengths[axis] = max(8, lengths[axis] // 2)
+            other = {3: 2, 2: 3}.get(axis)
+            if other is not None and prod(lengths) > vertices and lengths[other] > lengths[axis]:
+                lengths[other] = max(8, lengths[other] // 2)
+    t, z, y, x = lengths
+    return t, z, y, x
+
+
+def _part(length: int, edge: int, *, even: bool = True) -> int:
+    """Return the length of equal parts of about `edge`; even, where there are several."""
+    parts = max(1, math.floor(length / edge + 0.5)) if even else -(-length // edge)
+    part = -(-length // parts)
+    # Even lengths keep the vertices of the first coarse level on one lattice.
+    return part + part % 2 if even and parts > 1 else part
+
+
+def foretold_price(shape: Shape, tile: Shape, size: float) -> float:
+    """Return the price of tiles that nothing was tried for: the most that is likely.
+
+    size: bytes of the series as one tile.
+    """
+    cuts = CUT_IN_TIME * (1 / tile[0] - 1 / shape[0])
+    cuts += CUT_IN_SPACE * sum(
+        1 / n - 1 / length for length, n in zip(shape[1:], tile[1:], strict=True) if n < length
+    )
+    count = prod(-(-length // n) for length, n in zip(shape, tile, strict=True))
+    return 1 + cuts + BYTES_OF_TILE * (count - 1) / max(size, 1.0)
+
+
+def cheap_tiling(shape: Shape, size: float, access: str) -> Tiling:
+    """Return the tiles of the fastest region whose foretold price is allowed.
+
+    size: bytes of the series, roughly.
+    access: the wish, a name of `PRICES`.
+    """
+    may_be_one = prod(shape) <= MAX_WHOLE_VERTICES
+    tiles = tiles_to_try(shape, MAX_WHOLE_VERTICES if may_be_one else MAX_VERTICES)
+    prices = [foretold_price(shape, tile, size) for tile in tiles]
+    # The best tiling of a long series is no single tile.
+    lowest = min(prices)
+    for tile, told in zip(tiles, prices, strict=True):
+        if told <= PRICES[access] * lowest:
+            return Tiling(tile=tile, price=told / lowest)
+    raise AssertionError("the lowest price is allowed")

@@ -1,0 +1,212 @@
+// Signs by linear prediction: the inputs, which are the signed logarithms of known neighbours.
+//
+// Bands keep these logarithms in rows with LOG_PADDING zeros at both ends. Rows that do not exist
+// are rows of zeros. Twin: transform/entropy/signs_portable.py.
+#pragma once
+
+#include "coder_contexts.hpp"
+#include "linear.hpp"
+
+namespace {
+
+const int SIGN_INPUTS = 96;   // see `gather_signs`
+const int MORE_SIGNS = 5;     // estimates of a sign besides SIGN_CONTEXTS; the last by the logit
+const int ALL_SIGNS = SIGN_CONTEXTS + MORE_SIGNS;
+const int MORE_SIGN_SIZES[MORE_SIGNS] = {KINDS * 108, KINDS * 27, KINDS * 81, KINDS * 54,
+                                         KINDS * 25};
+const int SIGN_SET = 24;      // mixing weights of a sign: of ALL_SIGNS estimates, of the logit
+const int64_t FIRST_SIGN_SLOT =
+    int64_t(LEVELS + KINDS * 64 + 729 + 12 * 12 * 12 + 7 * 7 * 7 * 7 + 12 * 12 * KINDS) * DECISIONS;
+const int LOGIT_BIN = 85;     // a third, in 1/256: width of the classes of the logit
+
+// Order of the further weights, behind the sets of contexts and signs. The caller's sets have LANES
+// weights each, these have no gaps.
+const int64_t BASE_WEIGHTS = int64_t(KINDS * DECISIONS + 64 * DECISIONS + KINDS) * LANES;
+const int64_t SIGN_LINEAR = BASE_WEIGHTS + KINDS * SIGN_SET;
+const int64_t SIGN_END = SIGN_LINEAR + int64_t(KINDS) * 2 * SIGN_INPUTS;
+
+// Rows of logarithms around a row; each points to the entry at x = 0.
+struct ReferenceLogs {
+    const int16_t *centre, *up, *down, *below, *above, *before;
+    int shift, last;
+    bool same;  // whether its vertices are those of the row
+};
+struct Logs {
+    const int16_t *own, *up, *up2;
+    const int16_t *below[3], *below2;   // layer z - 1 at y - 1, y, y + 1; layer z - 2
+    const int16_t *before[3], *before2;  // step t - 1 at y - 1, y, y + 1; step t - 2
+    const int16_t *before_below, *before_above;  // step t - 1 at z - 1 and z + 1
+    ReferenceLogs references[REFERENCE_COUNT];
+};
+
+// Logarithms of a band as rows.
+struct LogRows {
+    const int16_t* first;  // null for a band without integers
+    const int* size;
+    const int16_t* nothing;
+    FHASH_INLINE const int16_t* at(int t, int z, int y) const {
+        if (!first || t < 0 || z < 0 || y < 0 || t >= size[0] || z >= size[1] || y >= size[2])
+            return nothing;
+        return first + (((int64_t)t * size[1] + z) * size[2] + y) * (size[3] + 2 * LOG_PADDING);
+    }
+};
+
+FHASH_INLINE LogRows rows_of(const Band& band, const int16_t* nothing) {
+    return {band.any ? band.logs.data() + LOG_PADDING : nullptr, band.size, nothing};
+}
+
+// The rows around the row (t, z, y) of a band.
+inline void find_logs(const std::vector<Band>& bands, const Band& band, int t, int z, int y,
+                      const int16_t* nothing, Logs& logs) {
+    const LogRows rows = rows_of(band, nothing);
+    logs.own = rows.at(t, z, y);
+    logs.up = rows.at(t, z, y - 1);
+    logs.up2 = rows.at(t, z, y - 2);
+    for (int i = 0; i < 3; i++) {
+        logs.below[i] = rows.at(t, z - 1, y + i - 1);
+        logs.before[i] = rows.at(t - 1, z, y + i - 1);
+    }
+    logs.below2 = rows.at(t, z - 2, y);
+    logs.before2 = rows.at(t - 2, z, y);
+    logs.before_below = rows.at(t - 1, z - 1, y);
+    logs.before_above = rows.at(t - 1, z + 1, y);
+    for (int k = 0; k < REFERENCE_COUNT; k++) {
+        const Reference& to = band.references[k];
+        ReferenceLogs& reference = logs.references[k];
+        if (to.band < 0 || !bands[to.band].any) {
+            reference = {nothing, nothing, nothing, nothing, nothing, nothing, 0, 0, false};
+            continue;
+        }
+        const Band& other = bands[to.band];
+        const LogRows there = rows_of(other, nothing);
+        const int tt = min(t >> to.shift[0], other.size[0] - 1);
+        const int zz = min(z >> to.shift[1], other.size[1] - 1);
+        const int yy = min(y >> to.shift[2], other.size[2] - 1);
+        reference = {there.at(tt, zz, yy),     there.at(tt, zz, yy - 1), there.at(tt, zz, yy + 1),
+                     there.at(tt, zz - 1, yy), there.at(tt, zz + 1, yy), there.at(tt - 1, zz, yy),
+                     to.shift[3],              other.size[3] - 1,        to.shift[3] == 0};
+    }
+}
+
+// Four logarithms in a row.
+FHASH_INLINE void put_four(int16_t* to, const int16_t* from) { std::memcpy(to, from, 8); }
+
+// The inputs of the sign at x: those of the same band; the parent's centre with the parity of x and
+// of y; those of the references; and for references of the same size the products of a neighbour
+// here, the same neighbour there and the centre there: their signs, and the least magnitude.
+FHASH_INLINE void gather_signs(const Logs& logs, int x, int y, int16_t* FHASH_RESTRICT to) {
+    put_four(to, logs.own + x - 4);
+    put_four(to + 4, logs.up + x - 2);
+    for (int row = 0; row < 3; row++) {
+        put_four(to + 8 + 4 * row, logs.below[row] + x - 1);
+        put_four(to + 20 + 4 * row, logs.before[row] + x - 1);
+    }
+    to[32] = logs.up[x + 2];
+    to[33] = logs.up2[x];
+    to[34] = logs.below2[x];
+    to[35] = logs.before_below[x];
+    to[36] = logs.before_above[x];
+    to[37] = logs.before2[x];
+    int16_t there[24], centres[24];
+    for (int k = 0; k < REFERENCE_COUNT; k++) {
+        const ReferenceLogs& from = logs.references[k];
+        const int i = min(x >> from.shift, from.last);
+        const int16_t centre = from.centre[i];
+        int16_t* const at = to + 40 + 8 * k;
+        put_four(at, from.centre + i - 1);
+        at[4] = from.up[i];
+        at[5] = from.down[i];
+        at[6] = from.below[i];
+        at[7] = from.above[i];
+        if (k == 0) {
+            to[38] = (int16_t)(x & 1 ? centre : -centre);
+            to[39] = (int16_t)(y & 1 ? centre : -centre);
+        }
+        int16_t* const other = there + 6 * k;
+        other[0] = from.centre[i - 1];
+        other[1] = from.up[i];
+        other[2] = from.below[i];
+        other[3] = from.before[i];
+        other[4] = from.up[i - 1];
+        other[5] = from.up[i + 1];
+        const int16_t counted = from.same ? centre : (int16_t)0;
+        for (int n = 0; n < 6; n++) centres[6 * k + n] = counted;
+    }
+    const int16_t here[6] = {logs.own[x - 1],       logs.up[x],     logs.below[1][x],
+                             logs.before[1][x], logs.up[x - 1], logs.up[x + 1]};
+    int16_t beside[24];
+    for (int n = 0; n < 24; n++) beside[n] = here[n % 6];
+    for (int n = 0; n < 24; n++) {
+        const int16_t a = beside[n], b = there[n], c = centres[n];
+        const int16_t sign = (int16_t)((int16_t)(a ^ b ^ c) >> 15);
+        auto size = [](int16_t v) FHASH_LAMBDA { return (int16_t)(v < 0 ? -v : v); };
+        const int16_t least = min(min(size(a), size(b)), size(c));
+        to[72 + n] = (int16_t)((least ^ sign) - sign);
+    }
+}
+
+// The estimates of signs, their mixing and the linear predictors, as one run adapts them.
+struct Signs {
+    Slot* slots[ALL_SIGNS];
+    std::vector<int16_t> mixing;  // SIGN_SET weights by kind
+    LinearSets<SIGN_INPUTS> linear;
+    alignas(64) int16_t inputs[SIGN_INPUTS] = {};
+
+    // weights: the caller's, which stay where they are.
+    Signs(State& state, int32_t* weights)
+        : mixing(weights + BASE_WEIGHTS, weights + SIGN_LINEAR),
+          linear(weights + SIGN_LINEAR, KINDS, linear_tables.sign_rate) {
+        Slot* at = state.slots.data() + FIRST_SIGN_SLOT;
+        for (int i = 0; i < ALL_SIGNS; i++) {
+            slots[i] = at;
+            at += i < SIGN_CONTEXTS ? SIGN_SIZES[i] : MORE_SIGN_SIZES[i - SIGN_CONTEXTS];
+        }
+    }
+    void keep(int32_t* weights) const {
+        std::copy(mixing.begin(), mixing.end(), weights + BASE_WEIGHTS);
+        linear.keep();
+    }
+
+    // Code the sign at (t, y, x) of the row that `logs` lies around; 1 for a negative one.
+    template <class Range>
+    FHASH_INLINE int code(Range& range, const Logs& logs, int kind, int t, int y, int x, int bit) {
+        gather_signs(logs, x, y, inputs);
+        Linear<SIGN_INPUTS>& predictor = linear.at(kind);
+        const int logit = predictor.logit(inputs);
+        const int left = sign_of(logs.own[x - 1]), left2 = sign_of(logs.own[x - 2]);
+        const int up = sign_of(logs.up[x]), up2 = sign_of(logs.up2[x]);
+        const int up_left = sign_of(logs.up[x - 1]), up_right = sign_of(logs.up[x + 1]);
+        const int below = sign_of(logs.below[1][x]);
+        const int before = sign_of(logs.before[1][x]), before2 = sign_of(logs.before2[x]);
+        int there[REFERENCE_COUNT];
+        for (int k = 0; k < REFERENCE_COUNT; k++) {
+            const ReferenceLogs& reference = logs.references[k];
+            there[k] = sign_of(reference.centre[min(x >> reference.shift, reference.last)]);
+        }
+        const int bin = min(max((logit + 12 * LOGIT_BIN + LOGIT_BIN / 2) / LOGIT_BIN, 0), 24);
+        const int context[ALL_SIGNS] = {
+            kind * 27 + (left * 3 + up) * 3 + before,
+            kind * 81 + ((left * 3 + left2) * 3 + up) * 3 + up2,
+            kind * 27 + (before * 3 + below) * 3 + left,
+            kind * 108 + ((there[0] * 3 + there[1]) * 3 + there[2]) * 4 + (x & 1) * 2 + (y & 1),
+            kind * 27 + (there[3] * 3 + left) * 3 + up,
+            kind * 81 + ((up_left * 3 + up_right) * 3 + left) * 3 + up,
+            kind * 54 + ((before * 3 + before2) * 3 + there[1]) * 2 + (t & 1),
+            kind * 25 + bin,
+        };
+        Mixed<ALL_SIGNS> sign;
+        for (int i = 0; i < ALL_SIGNS; i++) sign.slots[i] = slots[i] + context[i];
+        int16_t* const weights = mixing.data() + kind * SIGN_SET;
+        int16_t& trust = weights[2 * ALL_SIGNS];
+        sign.first = sign.second = weights;
+        const int p = mix<ALL_SIGNS, false>(sign, (trust * logit) >> 2);
+        bit = range.code(bit, p);
+        const int32_t error = (((bit ? 65535 : 0) - p) * LEARNING_RATE) >> 4;
+        trust = (int16_t)min(max(trust + ((error * logit + 32768) >> 16), -32767), 32767);
+        learn<ALL_SIGNS, false>(sign, bit, SIGN_LIMIT);
+        predictor.learn(inputs, logit, bit, linear_tables.sign_rate);
+        return bit;
+    }
+};
+
+}  // namespace

@@ -1,0 +1,175 @@
+"""Choice of the tiles by trial: its prices are those of files, and the wish for access is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import fhash_codec
+from fhash_codec import EncodeConfig
+from fhash_codec.compact.attempt import GainLog, PlanTask
+from fhash_codec.compact.choices import tilings
+from fhash_codec.compact.choices.tilings import choose_tiling, largest_tile
+from fhash_codec.compact.goal import goal_of
+from fhash_codec.compact.stages import first_guess, first_settings
+from fhash_codec.compact.tiles import access
+from fhash_codec.compact.tiles.access import PRICES, Tiling, region_vertices
+from fhash_codec.compact.tiles.blocks import Blocks
+from fhash_codec.config import ACCESSES
+from fhash_codec.coreset.selection import select_features
+from fhash_codec.progress import silent
+from fhash_formats.series import ArraySeries
+
+Values = npt.NDArray[Any]
+
+
+def shell() -> Values:
+    """A plateau with a thin shell that grows unevenly; constant at the first step."""
+    z, y, x = np.mgrid[:24, :24, :24].astype(np.float32)
+    r = np.sqrt((z - 11.5) ** 2 + (y - 11.5) ** 2 + (x - 11.5) ** 2)
+    steps = [np.ones_like(r)]
+    steps += [1 + 3 * np.exp(-((r - radius) ** 2)) for radius in (2.0, 3.5, 4.0, 6.5, 7.0, 9.0)]
+    return np.array(steps, np.float32)
+
+
+def noise() -> Values:
+    return np.random.default_rng(3).normal(size=(4, 24, 32, 32)).astype(np.float32)
+
+
+def waves(shape: tuple[int, int, int, int]) -> Values:
+    t, z, y, x = np.meshgrid(*(np.arange(n) for n in shape), indexing="ij")
+    values = np.sin(0.21 * x + 0.1 * t) + np.cos(0.17 * y - 0.2 * t) * np.sin(0.3 * z + 0.05 * t)
+    return (values + 0.02 * np.random.default_rng(1).normal(size=shape)).astype(np.float32)
+
+
+def labels() -> Values:
+    return (waves((6, 24, 32, 32)) * 3).astype(np.uint8)
+
+
+KINDS: dict[str, Callable[[], Values]] = {
+    "plateau with a shell": shell,
+    "noise": noise,
+    "one thin axis": lambda: waves((8, 2, 60, 80)),
+    "many steps": lambda: waves((160, 8, 10, 12)),
+    "few steps": lambda: waves((2, 40, 40, 40)),
+}
+
+
+@pytest.fixture
+def workers() -> Iterator[ThreadPoolExecutor]:
+    with ThreadPoolExecutor(2) as pool:
+        yield pool
+
+
+def chosen(
+    values: Values, wish: str, workers: ThreadPoolExecutor, **promise: Any
+) -> tuple[Tiling, PlanTask]:
+    series, config = ArraySeries(values), EncodeConfig(effort=2, **(promise or {"psnr": 40.0}))
+    selection = select_features(series, config, silent)
+    task = PlanTask(
+        blocks=Blocks(series, selection.extent, series.shape),
+        value_range=selection.scanned.value_range,
+        features=selection.features,
+        config=config,
+        goal=goal_of(config, selection.scanned.value_range, 1, 0),
+        fixed_tile=None,
+        workers=workers,
+        gains=GainLog(100),
+    )
+    guess = first_guess(task, task.blocks, first_settings(task, task.blocks))
+    return choose_tiling(task, guess.settings, guess.coding, wish), task
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_prices_of_trials_are_those_of_files(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The default costs at most a tenth more than one tile, whatever the series is like."""
+    monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 12)
+    values = KINDS[kind]()
+
+    def tiles_of(**options: Any) -> tuple[int, dict[str, Any]]:
+        config = EncodeConfig(effort=2, psnr=40.0, without=("ssim",), **options)
+        fhash_codec.encode(values, tmp_path / "a.fhz", config, force=True)
+        with fhash_codec.open(tmp_path / "a.fhz") as volume:
+            size = volume.container.arrays["tables/level_1"].nbytes_stored
+            return size, volume.info["model"].get("tiling", {})
+
+    size, record = tiles_of()
+    assert record["tried"] >= 2
+    one = tiles_of(tile="whole")[0]
+    best = tiles_of(tile="x".join(map(str, record["best"])))[0]
+    assert size <= 1.1 * min(one, best)
+    assert size / best == pytest.approx(record["price"], abs=0.08)
+
+
+def test_a_wish_is_kept_and_faster_ones_have_faster_regions(
+    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 10)
+    values = waves((8, 16, 48, 48))
+    works = []
+    for wish in ACCESSES:
+        tiling, task = chosen(values, wish, workers)
+        assert tiling.price is not None
+        assert tiling.price <= PRICES[wish]
+        assert values.shape in [trial.tile for trial in tiling.trials]
+        assert len(tiling.trials) <= tilings.TRIALS
+        least = min(trial.size for trial in tiling.trials)
+        size = next(trial.size for trial in tiling.trials if trial.tile == tiling.tile)
+        assert tiling.price == size / least
+        works.append(region_vertices(task.blocks.shape, tiling.tile))
+    assert works == sorted(works)
+
+
+def test_a_series_that_is_read_in_a_moment_is_one_tile(workers: ThreadPoolExecutor) -> None:
+    tiling, task = chosen(waves((4, 8, 12, 16)), "fast", workers)
+    assert (tiling.tile, tiling.price, tiling.trials) == (task.blocks.shape, 1.0, [])
+
+
+def test_a_large_series_is_tried_on_a_part(
+    workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 10)
+    for module in (tilings, access):
+        monkeypatch.setattr(module, "MAX_WHOLE_VERTICES", 1 << 16)
+    monkeypatch.setattr(tilings, "MAX_VERTICES", 1 << 14)
+    tiling, task = chosen(waves((8, 16, 48, 48)), "balanced", workers)
+    assert tiling.part == largest_tile(task.blocks.shape)
+    assert all(n <= m for n, m in zip(tiling.tile, tiling.part, strict=True))
+    assert tiling.part in [trial.tile for trial in tiling.trials]
+
+
+@pytest.mark.parametrize("promise", [{"max_error_rel": 0.01}, {"max_error": 0.0}, {"ratio": 20.0}])
+def test_every_promise_has_a_price(
+    promise: dict[str, float], workers: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 10)
+    tiling, _ = chosen(shell(), "balanced", workers, **promise)
+    assert tiling.price is not None
+    assert 1 <= tiling.price <= PRICES["balanced"]
+
+
+def test_labels_are_tried_as_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "FAST_ENOUGH", 1 << 12)
+    values = labels()
+    for effort, tried in ((1, False), (2, True)):
+        config = EncodeConfig(effort=effort, max_error=0.0)
+        fhash_codec.encode(values, tmp_path / "a.fhz", config, force=True)
+        with fhash_codec.open(tmp_path / "a.fhz") as volume:
+            np.testing.assert_array_equal(volume[...], values)
+            assert (volume.info["model"]["tiling"]["tried"] > 0) == tried
+
+
+def test_some_vertices_may_be_outside_the_coreset(tmp_path: Path) -> None:
+    values = waves((4, 24, 32, 32))
+    config = EncodeConfig(effort=2, psnr=40.0, features=("interval:0:9",))
+    fhash_codec.encode(values, tmp_path / "a.fhz", config)
+    with fhash_codec.open(tmp_path / "a.fhz") as volume:
+        assert volume.info["model"]["tiling"]["price"] <= PRICES["balanced"]
