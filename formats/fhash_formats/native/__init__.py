@@ -52,6 +52,7 @@ _SIZED = (ARRAY, INTEGER)
 _STATE = _SIZED * 3
 """Slots, weights and simple estimates of an adaptive coder (`State`), each with its length."""
 _TRANSFORM = (ARRAY,) * 9
+_RECONSTRUCT = (*_TRANSFORM, ARRAY, INTEGER)
 _HEAD = (ARRAY, ARRAY, *(INTEGER,) * 3, *(ARRAY,) * 5, INTEGER, INTEGER, ARRAY)
 _QUANTISE = (ARRAY, INTEGER, REAL, REAL, REAL, ARRAY, ARRAY)
 _DEQUANTISE = (ARRAY, INTEGER, REAL, ARRAY, ARRAY)
@@ -94,6 +95,7 @@ PROTOTYPES: Prototypes = {
     # lifting.cpp
     **{f"fhash_transform_forward_{kind}": _TRANSFORM for kind in _TYPES},
     **{f"fhash_transform_inverse_{kind}": _TRANSFORM for kind in _TYPES},
+    **{f"fhash_reconstruct_{kind}": _RECONSTRUCT for kind in _TYPES},
     # head.cpp
     "fhash_head_apply": _HEAD,
     # quantise.cpp

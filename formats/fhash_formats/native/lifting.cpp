@@ -5,334 +5,10 @@
 // levels in place (level l at stride 2^l), and scattered to the bands, low first. Along x a row is
 // split into its even and odd halves. Coupled y and x go level by level through one plane at a
 // time.
-#include <cstdlib>
-#include <cstring>
-#include <memory>
-
 #include "core.hpp"
-#include "lifting.hpp"
+#include "lifting_tile.hpp"
 
 namespace {
-
-constexpr i64 BAD_ARGUMENT = -1;
-constexpr i64 OUT_OF_MEMORY = -2;
-constexpr i64 MAX_DEPTH = 10;
-constexpr i64 BLOCK = 8192;  // numbers in the column buffer: 32 kB of float32
-constexpr i64 ROWS = 32;     // rows of x that go through a matrix product at once
-constexpr i64 GAP = 32;      // numbers between the even and the odd half of a row
-
-template <class T>
-struct Axis {
-    i64 n, kind, depth, rank;
-    const T* matrix;  // forward (rank, n), inverse (n, rank); along x the transpose
-
-    FHASH_INLINE bool idle() const {
-        return kind == NONE || (kind != KLT && (depth == 0 || n == 1));
-    }
-    // Rows and columns of the matrix.
-    FHASH_INLINE i64 outputs(bool inverse) const { return inverse ? n : rank; }
-    FHASH_INLINE i64 inputs(bool inverse) const { return inverse ? rank : n; }
-};
-
-// The place in a lifted block, slot[i], of each entry i of the bands.
-FHASH_INLINE void band_slots(i64 n, i64 depth, i64* slot) {
-    i64 entry = 0;
-    for (i64 low = 0; low < n; low += i64(1) << depth) slot[entry++] = low;
-    for (i64 level = depth; level >= 1; level--)
-        for (i64 high = i64(1) << (level - 1); high < n; high += i64(1) << level)
-            slot[entry++] = high;
-}
-
-// One level of lifting on a block of rows, of which every 2^level-th takes part.
-template <class T>
-FHASH_INLINE void lift_level(T* block, i64 n, i64 level, i64 pitch, i64 width, i64 kind,
-                             bool inverse) {
-    lift_rows(block, (n + (i64(1) << level) - 1) >> level, pitch << level, width, kind, inverse);
-}
-
-// One axis of (n, inner), in place or from `in` to `out`. `work` holds a block of columns.
-template <class T>
-FHASH_INLINE void along_rows(const T* in, T* out, i64 inner, const Axis<T>& axis, bool inverse,
-                             T* work, i64* slot) {
-    const i64 n = axis.n;
-    const i64 pitch = padded(larger(32, smaller(smaller(BLOCK / n, 1024), inner) / 32 * 32));
-    if (axis.kind != KLT) band_slots(n, axis.depth, slot);
-    for (i64 from = 0; from < inner; from += pitch) {
-        const i64 width = smaller(pitch, inner - from);
-        const std::size_t bytes = bytes_of<T>(width);
-        if (axis.kind == KLT) {
-            const i64 inputs = axis.inputs(inverse), outputs = axis.outputs(inverse);
-            for (i64 r = 0; r < inputs; r++)
-                std::memcpy(work + r * pitch, in + r * inner + from, bytes);
-            product(axis.matrix, inputs, work, pitch, out + from, inner, outputs, inputs, width);
-            for (i64 r = outputs; r < n; r++) std::memset(out + r * inner + from, 0, bytes);
-        } else if (inverse) {
-            for (i64 r = 0; r < n; r++)
-                std::memcpy(work + slot[r] * pitch, in + r * inner + from, bytes);
-            for (i64 l = axis.depth - 1; l >= 0; l--)
-                lift_level(work, n, l, pitch, width, axis.kind, true);
-            for (i64 r = 0; r < n; r++)
-                std::memcpy(out + r * inner + from, work + r * pitch, bytes);
-        } else {
-            for (i64 r = 0; r < n; r++)
-                std::memcpy(work + r * pitch, in + r * inner + from, bytes);
-            for (i64 l = 0; l < axis.depth; l++)
-                lift_level(work, n, l, pitch, width, axis.kind, false);
-            for (i64 r = 0; r < n; r++)
-                std::memcpy(out + r * inner + from, work + slot[r] * pitch, bytes);
-        }
-    }
-}
-
-// A KLT along x of `rows` rows, in place. `work` holds ROWS rows, `matrix` the padded matrix.
-template <class T>
-FHASH_INLINE void product_x(T* first, i64 rows, const Axis<T>& axis, bool inverse, T* work,
-                            const T* matrix) {
-    const i64 n = axis.n, inputs = axis.inputs(inverse), outputs = axis.outputs(inverse);
-    for (i64 r = 0; r < rows; r += ROWS) {
-        const i64 count = smaller(ROWS, rows - r);
-        T* block = first + r * n;
-        std::memcpy(work, block, bytes_of<T>(count * n));
-        product(work, n, matrix, padded(outputs), block, n, count, inputs, outputs);
-        if (outputs == n) continue;
-        for (i64 i = 0; i < count; i++)
-            std::memset(block + i * n + outputs, 0, bytes_of<T>(n - outputs));
-    }
-}
-
-// The x axis on its own, of `rows` rows in place. `work` holds the halves of a row or ROWS rows,
-// `matrix` the padded matrix of a KLT.
-template <class T>
-FHASH_INLINE void along_x(T* first, i64 rows, const Axis<T>& axis, bool inverse, T* work,
-                          const T* matrix) {
-    if (axis.kind == KLT) {
-        product_x(first, rows, axis, inverse, work, matrix);
-        return;
-    }
-    T* even = work;
-    T* odd = work + half(axis.n) + GAP;
-    i64 lengths[MAX_DEPTH + 1];
-    lengths[0] = axis.n;
-    for (i64 l = 0; l < axis.depth; l++) lengths[l + 1] = half(lengths[l]);
-    for (i64 r = 0; r < rows; r++) {
-        T* row = first + r * axis.n;
-        for (i64 step = 0; step < axis.depth; step++) {
-            const i64 m = lengths[inverse ? axis.depth - 1 - step : step];
-            if (m < 2) continue;
-            if (inverse) {
-                std::memcpy(even, row, bytes_of<T>(half(m)));
-                std::memcpy(odd, row + half(m), bytes_of<T>(m / 2));
-                lift_halves(even, odd, m, axis.kind, true);
-                merge(row, even, odd, m);
-            } else {
-                split(row, even, odd, m);
-                lift_halves(even, odd, m, axis.kind, false);
-                std::memcpy(row, even, bytes_of<T>(half(m)));
-                std::memcpy(row + half(m), odd, bytes_of<T>(m / 2));
-            }
-        }
-    }
-}
-
-// One level along y of the (ny, nx) corner of a plane, a strip of columns at a time.
-template <class T>
-FHASH_INLINE void plane_y(T* plane, i64 ny, i64 nx, i64 stride, i64 kind, bool inverse) {
-    const i64 strip = larger(64, smaller(BLOCK / larger(ny, 1), 1024) / 16 * 16);
-    for (i64 from = 0; from < nx; from += strip)
-        lift_rows(plane + from, ny, stride, smaller(strip, nx - from), kind, inverse);
-}
-
-// Coupled y and x of one plane, then the norms: each level goes along y, then x, of the low-low
-// corner. `plane` is overwritten; `out` may not overlap it.
-template <class T>
-FHASH_INLINE void plane_forward(T* plane, T* out, const Axis<T>& y, const Axis<T>& x, T scale,
-                                const T* scales, T* work) {
-    const i64 stride = x.n;
-    i64 ny = y.n, nx = x.n;
-    T* even = work;
-    T* odd = work + half(nx) + GAP;
-    for (i64 l = 0; l < y.depth; l++) {
-        const i64 low_y = half(ny), low_x = half(nx);
-        plane_y(plane, ny, nx, stride, y.kind, false);
-        for (i64 r = 0; r < ny; r++) {
-            const i64 at = (r % 2 ? low_y + r / 2 : r / 2) * stride;
-            const bool in_low_band = r % 2 == 0 && l + 1 < y.depth;
-            const T* low = plane + r * stride;
-            if (nx > 1) {
-                split(plane + r * stride, even, odd, nx);
-                lift_halves(even, odd, nx, x.kind, false);
-                low = even;
-                scaled(odd, out + at + low_x, scale, scales + at + low_x, nx - low_x);
-            }
-            if (in_low_band) {
-                std::memmove(plane + at, low, bytes_of<T>(low_x));
-            } else {
-                scaled(low, out + at, scale, scales + at, low_x);
-            }
-        }
-        ny = low_y;
-        nx = low_x;
-    }
-}
-
-// The inverse of plane_forward, from `in` to `plane`, which may not overlap.
-template <class T>
-FHASH_INLINE void plane_inverse(const T* in, T* plane, const Axis<T>& y, const Axis<T>& x, T scale,
-                                const T* scales, T* work) {
-    const i64 stride = x.n;
-    i64 ys[MAX_DEPTH + 1], xs[MAX_DEPTH + 1];
-    ys[0] = y.n;
-    xs[0] = x.n;
-    for (i64 l = 0; l < y.depth; l++) {
-        ys[l + 1] = half(ys[l]);
-        xs[l + 1] = half(xs[l]);
-    }
-    T* even = work;
-    T* odd = work + half(x.n) + GAP;
-    for (i64 l = y.depth - 1; l >= 0; l--) {
-        const i64 ny = ys[l], nx = xs[l], low_y = ys[l + 1], low_x = xs[l + 1];
-        for (i64 r = ny - 1; r >= 0; r--) {
-            const i64 at = (r % 2 ? low_y + r / 2 : r / 2) * stride;
-            if (r % 2 == 0 && l + 1 < y.depth) {
-                std::memcpy(even, plane + at, bytes_of<T>(low_x));
-            } else {
-                scaled(in + at, even, scale, scales + at, low_x);
-            }
-            if (nx > 1) {
-                scaled(in + at + low_x, odd, scale, scales + at + low_x, nx - low_x);
-                lift_halves(even, odd, nx, x.kind, true);
-                merge(plane + r * stride, even, odd, nx);
-            } else {
-                plane[r * stride] = even[0];
-            }
-        }
-        plane_y(plane, ny, nx, stride, y.kind, true);
-    }
-}
-
-// The passes over a tile, compiled once per type and machine.
-#define FHASH_PASSES(T) \
-    FHASH_CLONES void pass_rows(const T* in, T* out, i64 inner, const Axis<T>& axis, bool inverse, \
-                                T* work, i64* slot) { \
-        along_rows<T>(in, out, inner, axis, inverse, work, slot); \
-    } \
-    FHASH_CLONES void pass_x(T* first, i64 rows, const Axis<T>& axis, bool inverse, T* work, \
-                             const T* matrix) { \
-        along_x<T>(first, rows, axis, inverse, work, matrix); \
-    } \
-    FHASH_CLONES void pass_scale(const T* in, T* out, T scale, const T* scales, i64 n) { \
-        for (i64 i = 0; i < n; i++) out[i] = (in[i] * scale) * scales[i]; \
-    } \
-    FHASH_CLONES void pass_plane_forward(T* plane, T* out, const Axis<T>& y, const Axis<T>& x, \
-                                         T scale, const T* scales, T* work) { \
-        plane_forward<T>(plane, out, y, x, scale, scales, work); \
-    } \
-    FHASH_CLONES void pass_plane_inverse(const T* in, T* plane, const Axis<T>& y, \
-                                         const Axis<T>& x, T scale, const T* scales, T* work) { \
-        plane_inverse<T>(in, plane, y, x, scale, scales, work); \
-    }
-
-FHASH_PASSES(float)
-FHASH_PASSES(double)
-
-struct Free {
-    void operator()(void* memory) const { std::free(memory); }
-};
-
-template <class T>
-std::unique_ptr<T[], Free> allocate(i64 n) {
-    return std::unique_ptr<T[], Free>(static_cast<T*>(std::malloc(bytes_of<T>(n))));
-}
-
-// The transform of one tile: its axes, the factors of (t, z) and (y, x), and scratch memory.
-template <class T>
-class Tile {
-public:
-    Tile(const Axis<T>* axes, const T* scale_tz_, const T* scale_yx_, bool inverse)
-        : t(axes[0]), z(axes[1]), y(axes[2]), x(axes[3]), plane(y.n * x.n),
-          coupled(y.kind == x.kind && y.depth == x.depth && y.kind != NONE && y.kind != KLT &&
-                  y.depth > 0),
-          scale_tz(scale_tz_), scale_yx(scale_yx_) {
-        i64 longest = 1;
-        for (int a = 0; a < 4; a++) longest = larger(longest, axes[a].n);
-        const i64 pitch = padded(x.outputs(inverse));
-        const i64 matrix_room = x.kind == KLT ? x.inputs(inverse) * pitch + 64 : 0;
-        const i64 block_room = larger(BLOCK, longest * 32) + 64 * longest;
-        const i64 work_room = larger(block_room, ROWS * x.n) + x.n + 256;
-        memory = allocate<T>(work_room + matrix_room + plane);
-        slots = allocate<i64>(longest);
-        if (!allocated()) return;
-        work = memory.get();
-        matrix = work + work_room;
-        spare = matrix + matrix_room;
-        std::memset(work, 0, bytes_of<T>(work_room + matrix_room));
-        if (x.kind != KLT) return;
-        const i64 columns = x.outputs(inverse);
-        for (i64 k = 0; k < x.inputs(inverse); k++)
-            std::memcpy(matrix + k * pitch, x.matrix + k * columns, bytes_of<T>(columns));
-    }
-
-    bool allocated() const { return memory && slots; }
-
-    void forward(const T* in, T* out) {
-        if (!t.idle()) {
-            pass_rows(in, out, z.n * plane, t, false, work, slots.get());
-            in = out;
-        }
-        for (i64 i = 0; i < t.n; i++) {
-            const T* from = in + i * z.n * plane;
-            T* to = out + i * z.n * plane;
-            if (!z.idle()) {
-                pass_rows(from, to, plane, z, false, work, slots.get());
-                from = to;
-            }
-            for (i64 k = 0; k < z.n; k++)
-                forward_plane(from + k * plane, to + k * plane, scale_tz[i * z.n + k]);
-        }
-    }
-
-    void inverse(const T* in, T* out) {
-        for (i64 i = 0; i < t.n; i++) {
-            const T* from = in + i * z.n * plane;
-            T* to = out + i * z.n * plane;
-            for (i64 k = 0; k < z.n; k++)
-                inverse_plane(from + k * plane, to + k * plane, scale_tz[i * z.n + k]);
-            if (!z.idle()) pass_rows(to, to, plane, z, true, work, slots.get());
-        }
-        if (!t.idle()) pass_rows(out, out, z.n * plane, t, true, work, slots.get());
-    }
-
-private:
-    void forward_plane(const T* from, T* to, T scale) {
-        if (coupled) {
-            std::memcpy(spare, from, bytes_of<T>(plane));
-            pass_plane_forward(spare, to, y, x, scale, scale_yx, work);
-            return;
-        }
-        if (from != to) std::memcpy(to, from, bytes_of<T>(plane));
-        if (!y.idle()) pass_rows(to, to, x.n, y, false, work, slots.get());
-        if (!x.idle()) pass_x(to, y.n, x, false, work, matrix);
-        pass_scale(to, to, scale, scale_yx, plane);
-    }
-
-    void inverse_plane(const T* from, T* to, T scale) {
-        if (coupled) {
-            pass_plane_inverse(from, to, y, x, scale, scale_yx, work);
-            return;
-        }
-        pass_scale(from, to, scale, scale_yx, plane);
-        if (!x.idle()) pass_x(to, y.n, x, true, work, matrix);
-        if (!y.idle()) pass_rows(to, to, x.n, y, true, work, slots.get());
-    }
-
-    const Axis<T> t, z, y, x;
-    const i64 plane;
-    const bool coupled;
-    const T *scale_tz, *scale_yx;
-    std::unique_ptr<T[], Free> memory;
-    std::unique_ptr<i64[], Free> slots;
-    T *work = nullptr, *matrix = nullptr, *spare = nullptr;
-};
 
 template <class T>
 bool sound(const Axis<T>& axis) {
@@ -341,15 +17,23 @@ bool sound(const Axis<T>& axis) {
     return axis.kind != KLT || (axis.rank >= 0 && axis.rank <= axis.n && axis.matrix);
 }
 
+// The axes of a tile; whether all are in range.
+template <class T>
+bool read_axes(const i64* shape, const i64* kinds, const i64* depths, const i64* ranks,
+               const T* const* matrices, Axis<T>* axes) {
+    for (int a = 0; a < 4; a++) {
+        axes[a] = {shape[a], kinds[a], depths[a], ranks[a], matrices[a]};
+        if (!sound(axes[a])) return false;
+    }
+    return true;
+}
+
 template <class T>
 i64 transform(const T* in, T* out, const i64* shape, const i64* kinds, const i64* depths,
               const i64* ranks, const T* const* matrices, const T* scale_tz, const T* scale_yx,
               bool inverse) {
     Axis<T> axes[4];
-    for (int a = 0; a < 4; a++) {
-        axes[a] = {shape[a], kinds[a], depths[a], ranks[a], matrices[a]};
-        if (!sound(axes[a])) return BAD_ARGUMENT;
-    }
+    if (!read_axes(shape, kinds, depths, ranks, matrices, axes)) return BAD_ARGUMENT;
     Tile<T> tile(axes, scale_tz, scale_yx, inverse);
     if (!tile.allocated()) return OUT_OF_MEMORY;
     if (inverse) {
@@ -358,6 +42,21 @@ i64 transform(const T* in, T* out, const i64* shape, const i64* kinds, const i64
         tile.forward(in, out);
     }
     return 0;
+}
+
+// numbers: step, the six offsets, then center, low and high.
+template <class T>
+i64 reconstruct(const std::int32_t* in, T* out, const i64* shape, const i64* kinds,
+                const i64* depths, const i64* ranks, const T* const* matrices, const T* scale_tz,
+                const T* scale_yx, const double* numbers, i64 crc) {
+    Axis<T> axes[4];
+    if (!read_axes(shape, kinds, depths, ranks, matrices, axes)) return BAD_ARGUMENT;
+    Tile<T> tile(axes, scale_tz, scale_yx, true);
+    if (!tile.allocated()) return OUT_OF_MEMORY;
+    Reconstruction<T> values = {(T)numbers[0], {}};
+    for (int i = 1; i <= 6; i++) values.offsets[i] = (T)numbers[i];
+    const Limits<T> limits = {(T)numbers[7], (T)numbers[8], (T)numbers[9]};
+    return tile.reconstruct(in, out, values, limits, (std::uint32_t)crc);
 }
 
 }  // namespace
@@ -388,4 +87,28 @@ FHASH_EXPORT i64 fhash_transform_inverse_f64(const double* in, double* out, cons
                                              const double* const* matrices, const double* tz,
                                              const double* yx) {
     return transform<double>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, true);
+}
+
+// The values of a tile from its integers: numbers as in quantise.cpp, the inverse transform, and
+// the clip of values.cpp, in one run. Zeros that only differ in sign before `center` is added may
+// differ from those of the three.
+//
+// in: may be the memory of a float `out`.
+// numbers: step, six offsets (of |q| = 1, 2, 3, 4, odd ones from 5 on, even ones from 6 on, in
+// steps), center (not -0), low, high.
+//
+// The other arguments are those of the inverse transform. Returns the CRC-32 of the integers in
+// little-endian order, continued from `crc`, or one of the errors above.
+FHASH_EXPORT i64 fhash_reconstruct_f32(const std::int32_t* in, float* out, const i64* shape,
+                                       const i64* kinds, const i64* depths, const i64* ranks,
+                                       const float* const* matrices, const float* tz,
+                                       const float* yx, const double* numbers, std::int64_t crc) {
+    return reconstruct<float>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, numbers, crc);
+}
+FHASH_EXPORT i64 fhash_reconstruct_f64(const std::int32_t* in, double* out, const i64* shape,
+                                       const i64* kinds, const i64* depths, const i64* ranks,
+                                       const double* const* matrices, const double* tz,
+                                       const double* yx, const double* numbers, std::int64_t crc) {
+    return reconstruct<double>(in, out, shape, kinds, depths, ranks, matrices, tz, yx, numbers,
+                               crc);
 }

@@ -39,6 +39,12 @@ int64_t fhash_transform_inverse_f32(const float*, float*, const int64_t*, const 
 int64_t fhash_transform_inverse_f64(const double*, double*, const int64_t*, const int64_t*,
                                     const int64_t*, const int64_t*, const double* const*,
                                     const double*, const double*);
+int64_t fhash_reconstruct_f32(const std::int32_t*, float*, const int64_t*, const int64_t*,
+                              const int64_t*, const int64_t*, const float* const*, const float*,
+                              const float*, const double*, int64_t);
+int64_t fhash_reconstruct_f64(const std::int32_t*, double*, const int64_t*, const int64_t*,
+                              const int64_t*, const int64_t*, const double* const*, const double*,
+                              const double*, const double*, int64_t);
 int64_t fhash_transform_forward_f32(const float*, float*, const int64_t*, const int64_t*,
                                     const int64_t*, const int64_t*, const float* const*,
                                     const float*, const float*);
@@ -113,7 +119,8 @@ void decode_predicted(Reader& in) {
                            static_cast<int64_t>(data.size()));
 }
 
-template <class T, class F> void transform(Reader& in, F function) {
+template <class T, class F, class R>
+void transform(Reader& in, F function, R reconstruct, bool whole) {
     const std::vector<int64_t> shape = small_shape(in, 7);
     int64_t kinds[4], depths[4], ranks[4];
     std::vector<T> matrices[4];
@@ -139,17 +146,26 @@ template <class T, class F> void transform(Reader& in, F function) {
     const std::vector<T> tz = some(shape[0] * shape[1]), yx = some(shape[2] * shape[3]),
                          values = some(volume(shape));
     std::vector<T> out(values.size());
+    if (whole) {
+        const std::vector<double> numbers = in.numbers<double>(10);
+        const std::vector<std::int32_t> from = integers(in, volume(shape));
+        reconstruct(from.data(), out.data(), shape.data(), kinds, depths, ranks, pointers,
+                    tz.data(), yx.data(), numbers.data(), 0);
+        return;
+    }
     function(values.data(), out.data(), shape.data(), kinds, depths, ranks, pointers, tz.data(),
              yx.data());
 }
 
 void transform(Reader& in) {
     const std::uint8_t which = in.byte();
-    const bool inverse = which & 2;
+    const bool inverse = which & 2, whole = which & 4;
     if (which & 1)
-        transform<float>(in, inverse ? fhash_transform_inverse_f32 : fhash_transform_forward_f32);
+        transform<float>(in, inverse ? fhash_transform_inverse_f32 : fhash_transform_forward_f32,
+                         fhash_reconstruct_f32, whole);
     else
-        transform<double>(in, inverse ? fhash_transform_inverse_f64 : fhash_transform_forward_f64);
+        transform<double>(in, inverse ? fhash_transform_inverse_f64 : fhash_transform_forward_f64,
+                          fhash_reconstruct_f64, whole);
 }
 
 // A positive float16, as scales are stored.

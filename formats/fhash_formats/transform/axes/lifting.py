@@ -10,6 +10,8 @@ The native library and the portable twin give the same bits.
 from __future__ import annotations
 
 import ctypes
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -34,6 +36,7 @@ MAX_LOD = 10
 """Most halvings of a reduced resolution."""
 
 Values = NDArray[Any]
+Integers = NDArray[np.int32]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,31 +70,62 @@ class _Plan:
 
     def _run_native(self, library: ctypes.CDLL, values: Values, inverse: bool) -> Values:
         direction, width = "inverse" if inverse else "forward", values.dtype.itemsize * 8
-        function = getattr(library, f"fhash_transform_{direction}_f{width}")
         result = np.empty(values.shape, values.dtype)
-        rank_axis = 1 if inverse else 0
-        ranks = [0 if matrix is None else matrix.shape[rank_axis] for matrix in self.matrices]
-        # Along x the library takes the transpose, so that its rows lie along the results.
-        matrices = [
+        _checked_code(
+            getattr(library, f"fhash_transform_{direction}_f{width}")(
+                *self._native_arguments(values, result, inverse)
+            )
+        )
+        return result
+
+    def reconstruct(
+        self, library: ctypes.CDLL, integers: Integers, result: Values, numbers: Sequence[float]
+    ) -> int:
+        """Write the values of integers into `result`; the CRC-32 of the integers."""
+        return _checked_code(
+            getattr(library, f"fhash_reconstruct_f{result.dtype.itemsize * 8}")(
+                *self._native_arguments(integers, result, inverse=True),
+                (ctypes.c_double * len(numbers))(*numbers),
+                0,
+            )
+        )
+
+    @cached_property
+    def _native_matrices(self) -> list[Values | None]:
+        """The matrices as the library takes them: along x transposed, so that its rows lie along
+        the results.
+        """
+        return [
             None if matrix is None else np.ascontiguousarray(matrix.T if axis == 3 else matrix)
             for axis, matrix in enumerate(self.matrices)
         ]
+
+    def _native_arguments(self, source: Values, result: Values, inverse: bool) -> list[Any]:
+        """The arguments of the native transforms."""
+        rank_axis = 1 if inverse else 0
+        ranks = [0 if matrix is None else matrix.shape[rank_axis] for matrix in self.matrices]
         four = ctypes.c_int64 * 4
-        code = function(
-            ctypes.c_void_p(values.ctypes.data),
-            ctypes.c_void_p(result.ctypes.data),
-            four(*values.shape),
+        matrices = self._native_matrices
+        pointers = (ctypes.c_void_p * 4)(*(None if m is None else m.ctypes.data for m in matrices))
+        return [
+            source.ctypes.data_as(ctypes.c_void_p),
+            result.ctypes.data_as(ctypes.c_void_p),
+            four(*source.shape),
             four(*(KIND_NUMBERS[kind] for kind in self.kinds)),
             four(*self.depths),
             four(*ranks),
-            (ctypes.c_void_p * 4)(*(None if m is None else m.ctypes.data for m in matrices)),
-            ctypes.c_void_p(self.scale_tz.ctypes.data),
-            ctypes.c_void_p(self.scale_yx.ctypes.data),
-        )
-        if code == -2:
-            raise MemoryError("no memory for the transform of a tile")
-        assert code == 0, f"the native transform refused its arguments ({code})"
-        return result
+            pointers,
+            self.scale_tz.ctypes.data_as(ctypes.c_void_p),
+            self.scale_yx.ctypes.data_as(ctypes.c_void_p),
+        ]
+
+
+def _checked_code(code: int) -> int:
+    """The code that a native transform returned; raises MemoryError where it had no memory."""
+    if code == -2:
+        raise MemoryError("no memory for the transform of a tile")
+    assert code >= 0, f"the native transform refused its arguments ({code})"
+    return code
 
 
 class Transform:
@@ -164,6 +198,31 @@ class Transform:
             for _ in range(lod - min(lod, transform.depth)):
                 result = _halved(result, axis)
         return result
+
+    def reconstruct(
+        self, integers: Integers, numbers: Sequence[float], *, in_place: bool = False
+    ) -> tuple[Values, int] | None:
+        """Values of a tile from its quantised coefficients, and the CRC-32 of these.
+
+        They are `dequantise`, `inverse` and `clip_shifted` in one run over the memory. The result
+        is None where only those three can do it.
+
+        Args:
+            integers: int32 of the tile's shape, C-contiguous.
+            numbers: quantiser step, six offsets in steps (of magnitudes 1, 2, 3, 4, odd ones from
+                5 on, even ones from 6 on), then the centre and the ends of the range.
+            in_place: whether the values may overwrite the integers, which they then do where they
+                have the same size.
+        """
+        library = native.library()
+        # Zeros may have another sign until a centre is added that is not -0.
+        if library is None or (numbers[7] == 0 and math.copysign(1.0, numbers[7]) < 0):
+            return None
+        over = in_place and self.dtype == np.float32 and integers.flags.writeable
+        result = integers.view(np.float32) if over else np.empty(self.shape, self.dtype)
+        if 0 not in self._plans:
+            self._plans[0] = self._inverse_plan(0)
+        return result, self._plans[0].reconstruct(library, integers, result, numbers)
 
     @cached_property
     def _forward_plan(self) -> _Plan:

@@ -13,6 +13,7 @@ import base64
 import binascii
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 from fhash_formats.errors import DamagedFileError, InputError
@@ -147,7 +148,9 @@ def _axis(key: str, value: Any) -> AxisTransform:
         raise InputError(f"transform, key {key!r}: {error}") from error
 
 
+@lru_cache(maxsize=64)
 def _basis_from_text(text: str) -> Basis:
+    # Decoding a basis, and coding it again to check it, takes a third of what opening a file does.
     if len(text) > _MAX_TEXT:
         raise InputError(f"a packed basis has at most {_MAX_TEXT} characters, not {len(text)}")
     try:

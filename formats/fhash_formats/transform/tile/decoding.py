@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_formats.errors import DamagedFileError, InputError
+from fhash_formats.support.threads import in_threads
 from fhash_formats.transform.axes.bands import band_table
 from fhash_formats.transform.axes.lifting import Transform
 from fhash_formats.transform.axes.spec import TransformSpec
@@ -37,7 +38,7 @@ from fhash_formats.transform.tile.sections import (
 )
 from fhash_formats.transform.tile.settings import TileSettings
 from fhash_formats.transform.values.elementwise import cast, clip_shifted, clipped, corrected
-from fhash_formats.transform.values.quantise import dequantise
+from fhash_formats.transform.values.quantise import OFFSET_UNIT, dequantise
 
 __all__ = [
     "blank_unoccupied",
@@ -128,8 +129,7 @@ def decode_tile_table(
         return values
     assert stream.body is not None
     _check_numbers(settings, np.dtype(dtype))
-    integers, transform, _ = _transformed_integers(stream, stream.body, shape, settings)
-    return linear_values(integers, transform, settings, lod)
+    return _linear_and_residual(stream, stream.body, shape, settings, lod)[0]
 
 
 def _decode(
@@ -200,7 +200,7 @@ def _decode_predicted(
     if settings.predictor is None:
         raise DamagedFileError("a tile is coded by prediction, but its settings have no predictor")
     integers = decode_predicted(body, shape, settings.predictor)
-    _check_digest(stream, integers, None)
+    _check_digest(stream, zlib.crc32(little_endian(integers)), None)
     values = predicted_values(integers, settings.predictor, settings)
     if lod:
         return cast(values[_every(lod)], kind), None
@@ -221,11 +221,9 @@ def _decode_transformed(
 
     largest: the largest number of the type of the source and of the working type.
     """
-    integers, transform, residual = _transformed_integers(stream, body, shape, settings)
+    linear, residual = _linear_and_residual(stream, body, shape, settings, lod)
     if lod:
-        values = cast(linear_values(integers, transform, settings, lod), kind)
-        return within_range(values, settings), None
-    linear = linear_values(integers, transform, settings)
+        return within_range(cast(linear, kind), settings), None
     mask = None if stream.mask is None else _unpack_mask(stream.mask, linear, settings)
     # The mask is decoded by now, so that the head may overwrite what it corrects.
     base = linear if settings.head is None else settings.head.apply(linear, in_place=True)
@@ -236,10 +234,13 @@ def _decode_transformed(
     return within_range(values, settings), mask
 
 
-def _transformed_integers(
-    stream: TileStream, body: memoryview, shape: Shape, settings: TileSettings
-) -> tuple[Integers, Transform, Integers | None]:
-    """The coefficients of a tile that is coded by transform, its transform, and its residual."""
+def _linear_and_residual(
+    stream: TileStream, body: memoryview, shape: Shape, settings: TileSettings, lod: int
+) -> tuple[Values, Integers | None]:
+    """The values of a tile that is coded by transform, before head and residual, and its residual.
+
+    Both are checked against the digest.
+    """
     # Built before anything is decoded: the bands of a spec that does not fit lie beyond the tile.
     try:
         transform = transform_for(settings, shape)
@@ -247,19 +248,42 @@ def _transformed_integers(
         raise DamagedFileError(
             f"the settings of a coded tile do not fit its shape: {error}"
         ) from error
-    table = band_table(settings.transform, shape)
-    integers = decode_integers(body, shape, table, coder=settings.coder, trellis=settings.trellis)
-    residual = None
-    if stream.residual is not None:
+    integers, residual = _integers_and_residual(stream, body, shape, settings)
+    # Only the coarse coefficients of a level of detail are transformed, but all are checked.
+    fused = None if lod else _reconstructed(integers, transform, settings, in_place=True)
+    if fused is None:
+        _check_digest(stream, zlib.crc32(little_endian(integers)), residual)
+        return linear_values(integers, transform, settings, lod), residual
+    linear, crc = fused
+    _check_digest(stream, crc, residual)
+    return linear, residual
+
+
+def _integers_and_residual(
+    stream: TileStream, body: memoryview, shape: Shape, settings: TileSettings
+) -> tuple[Integers, Integers | None]:
+    """The coefficients of a tile that is coded by transform, and its residual."""
+
+    def coefficients() -> Integers:
+        table = band_table(settings.transform, shape)
+        return decode_integers(body, shape, table, coder=settings.coder, trellis=settings.trellis)
+
+    def residual() -> Integers:
+        assert stream.residual is not None
         table = single_band(shape)
-        residual = decode_integers(stream.residual, shape, table, coder=settings.residual_coder)
-    _check_digest(stream, integers, residual)
-    return integers, transform, residual
+        return decode_integers(stream.residual, shape, table, coder=settings.residual_coder)
+
+    if stream.residual is None:
+        return coefficients(), None
+    integers, rest = in_threads(lambda decode: decode(), [coefficients, residual])
+    return integers, rest
 
 
-def _check_digest(stream: TileStream, integers: Integers, residual: Integers | None) -> None:
-    """Raises DamagedFileError where the digest is that of other integers."""
-    crc = zlib.crc32(little_endian(integers))
+def _check_digest(stream: TileStream, crc: int, residual: Integers | None) -> None:
+    """Raises DamagedFileError where the digest is that of other integers.
+
+    crc: CRC-32 of the integers before the residual.
+    """
     if residual is not None:
         crc = zlib.crc32(little_endian(residual), crc)
     if crc != stream.digest:
@@ -292,9 +316,22 @@ def linear_values(
         settings: settings of the tile.
         lod: level of detail, as in `decode_tile`.
     """
+    fused = None if lod else _reconstructed(integers, transform, settings)
+    if fused is not None:
+        return fused[0]
     coefficients = dequantise(integers, settings.step, settings.offsets, settings.dtype)
     values = transform.inverse(coefficients, lod)
     return clip_shifted(values, settings.center, settings.low, settings.high)
+
+
+def _reconstructed(
+    integers: Integers, transform: Transform, settings: TileSettings, *, in_place: bool = False
+) -> tuple[Values, int] | None:
+    """`linear_values` of a full tile and the CRC-32 of its integers, as `Transform.reconstruct`."""
+    one, two, *more = (offset / OFFSET_UNIT for offset in settings.offsets)
+    offsets = (one, two, *(more if len(more) > 1 else more * 4))
+    ends = (settings.center, settings.low, settings.high)
+    return transform.reconstruct(integers, (settings.step, *offsets, *ends), in_place=in_place)
 
 
 def predicted_values(

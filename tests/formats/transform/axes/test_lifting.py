@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import zlib
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -12,9 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from specs import MIXES, SHAPES, TYPES, axis_of, mixes_and_depths, noise, spec_of
 
+from fhash_formats import native
 from fhash_formats.errors import InputError
 from fhash_formats.transform.axes.lifting import MAX_LOD, Transform
 from fhash_formats.transform.axes.spec import KINDS, AxisTransform, TransformSpec
+from fhash_formats.transform.values.elementwise import clip_shifted
+from fhash_formats.transform.values.quantise import OFFSET_UNIT, dequantise
 
 
 @pytest.mark.parametrize("dtype", TYPES)
@@ -45,6 +49,45 @@ def test_any_mix_comes_back(
     transform = Transform(spec_of(kinds, depths, shape), shape, np.float64)
     values = noise(shape, np.float64, seed)
     assert np.abs(transform.inverse(transform.forward(values)) - values).max() < 1e-10
+
+
+@pytest.mark.parametrize("center", [3.25, 0.0])
+@pytest.mark.parametrize("offsets", [(5, -9, 2), (5, -9, 2, 1, -3, 7)])
+@pytest.mark.parametrize("dtype", TYPES)
+@pytest.mark.parametrize(("kinds", "depth"), mixes_and_depths(MIXES, [1, 4]))
+@pytest.mark.parametrize("shape", [(3, 4, 9, 37), (1, 1, 16, 64), (4, 1, 1, 5)])
+def test_one_run_gives_the_bits_of_its_three_steps(
+    shape: tuple[int, ...],
+    kinds: tuple[str, ...],
+    depth: int,
+    dtype: Any,
+    offsets: Any,
+    center: float,
+) -> None:
+    if native.library() is None:
+        pytest.skip("the native library is not built")
+    transform = Transform(spec_of(kinds, (depth,) * 4, shape), shape, dtype)
+    random = np.random.default_rng(5)
+    integers = (random.integers(-9, 10, shape) * (random.random(shape) < 0.1)).astype(np.int32)
+    integers[-1] = 0  # a step, rows and planes without anything
+    coefficients = dequantise(integers, 0.75, offsets, dtype)
+    expected = clip_shifted(transform.inverse(coefficients), center, -20.0, 20.0)
+    one, two, *more = (offset / OFFSET_UNIT for offset in offsets)
+    six = (one, two, *(more if len(more) > 1 else more * 4))
+    checksum = zlib.crc32(integers.astype("<i4"))
+    for in_place in (False, True):
+        result = transform.reconstruct(
+            integers, (0.75, *six, center, -20.0, 20.0), in_place=in_place
+        )
+        assert result is not None
+        assert result[0].tobytes() == expected.tobytes()
+        assert result[1] == checksum
+
+
+def test_a_centre_of_minus_zero_takes_three_steps() -> None:
+    transform = Transform(spec_of(("none",) * 4, (0,) * 4, (1, 1, 2, 2)), (1, 1, 2, 2))
+    numbers = (1.0, *(0.0,) * 6, -0.0, -1.0, 1.0)
+    assert transform.reconstruct(np.zeros((1, 1, 2, 2), np.int32), numbers) is None
 
 
 def test_a_coupled_plane_splits_only_the_low_low_quadrant() -> None:
