@@ -20,10 +20,9 @@ from fhash_codec.compact.choices.mask import mask_levels
 from fhash_codec.compact.choices.predictor import choose_predictor
 from fhash_codec.compact.choices.quantiser import (
     allows_trellis,
-    is_smaller,
+    choose_quantiser,
+    coders_of,
     off_trellis,
-    on_trellis,
-    step_after,
 )
 from fhash_codec.compact.choices.search import SLOPE
 from fhash_codec.compact.choices.step import AIM, CLOSE, find_step, require_reach, with_step
@@ -97,6 +96,7 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
         ]
     mean = float(np.average(means, weights=sample.weights))
     center = mean if math.isfinite(mean) else center
+    coder, residual_coder = coders_of(task.config.effort)
     settings = TileSettings(
         transform=usual_transform(sample.blocks.tile),
         step=1.0,
@@ -105,7 +105,8 @@ def first_settings(task: PlanTask, tiled: Blocks) -> TileSettings:
         high=value_range.high,
         offsets=OFFSETS,
         double=True,
-        coder="signs",
+        coder=coder,
+        residual_coder=residual_coder,
     )
     return with_step(settings, step, goal)
 
@@ -202,32 +203,11 @@ def choose_step(task: PlanTask, attempt: Attempt) -> Attempt:
     with stage("step", "largest step of the quantiser at which a sample keeps the promise"):
         if not allows_trellis(attempt.settings, task.goal, task.config.effort):
             return _searched_step(task, attempt)
-        return _searched_step(task, _choose_quantiser(task, attempt))
-
-
-def _choose_quantiser(task: PlanTask, attempt: Attempt) -> Attempt:
-    """Return the attempt with the trellis if that makes the sample smaller, and a better step.
-
-    The trial of the plain quantiser tells where the search for the step begins.
-    """
-    sample, goal = attempt.sample, task.goal
-    plain = sample.run(attempt.settings, goal.bounded(attempt.coding))
-    attempt = replace(
-        attempt,
-        settings=replace(attempt.settings, step=step_after(attempt.settings, plain, goal)),
-        outcome=plain,
-    )
-    settings, coding = on_trellis(attempt.settings, attempt.coding)
-    tried: list[Outcome] = []
-    outcome = sample.run(settings, goal.bounded(coding))
-    tried.append(outcome)
-    if goal.psnr is not None:
-        settings = replace(settings, step=step_after(settings, outcome, goal))
-        outcome = sample.run(settings, coding)
-        tried.append(outcome)
-    if not is_smaller(outcome, plain, tried, goal):
-        return attempt
-    return replace(attempt, settings=settings, coding=coding, outcome=outcome)
+        settings, coding, outcome = choose_quantiser(
+            attempt.sample, attempt.settings, attempt.coding, task.goal
+        )
+        attempt = replace(attempt, settings=settings, coding=coding, outcome=outcome)
+        return _searched_step(task, attempt)
 
 
 def _searched_step(task: PlanTask, attempt: Attempt) -> Attempt:

@@ -15,10 +15,13 @@ from dataclasses import replace
 from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.tiles.coding import OFFSETS, WEIGHT, Coding, Outcome
+from fhash_codec.compact.tiles.sample import Sample
 from fhash_formats.transform.tile.settings import TileSettings
 
 __all__ = [
     "allows_trellis",
+    "choose_quantiser",
+    "coders_of",
     "is_smaller",
     "off_trellis",
     "on_trellis",
@@ -26,6 +29,9 @@ __all__ = [
     "step_after",
 ]
 
+LINEAR_EFFORT = 8
+"""Least effort that codes magnitudes by linear predictors: decoding takes two to three times as
+long as with predicted signs alone."""
 MIN_EFFORT = 2
 """Least effort that uses the trellis."""
 SHARE = 0.65
@@ -47,6 +53,39 @@ def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
     """
     exact = goal.error == 0 or goal.data_range <= 0
     return effort >= MIN_EFFORT and not exact and not settings.double
+
+
+def coders_of(effort: int) -> tuple[str, str]:
+    """Return the models of coefficients and residual, by the names of their settings.
+
+    Effort 1 takes the fastest model. From effort 2 on signs are predicted, which costs time at
+    coefficients other than 0 alone.
+    """
+    if effort >= LINEAR_EFFORT:
+        return "linear", "linear"
+    return "contexts" if effort < MIN_EFFORT else "signs", "contexts"
+
+
+def choose_quantiser(
+    sample: Sample, settings: TileSettings, coding: Coding, goal: Goal
+) -> tuple[TileSettings, Coding, Outcome]:
+    """Return settings and coding with the trellis if that makes a sample smaller, and the outcome.
+
+    Otherwise those with the plain quantiser are returned. Either have a better step: the trial of
+    the plain quantiser tells where the search for the step begins.
+    """
+    plain = sample.run(settings, goal.bounded(coding))
+    settings = replace(settings, step=step_after(settings, plain, goal))
+    other, other_coding = on_trellis(settings, coding)
+    outcome = sample.run(other, goal.bounded(other_coding))
+    tried = [outcome]
+    if goal.psnr is not None:
+        other = replace(other, step=step_after(other, outcome, goal))
+        outcome = sample.run(other, other_coding)
+        tried.append(outcome)
+    if is_smaller(outcome, plain, tried, goal):
+        return other, other_coding, outcome
+    return settings, coding, plain
 
 
 def on_trellis(settings: TileSettings, coding: Coding) -> tuple[TileSettings, Coding]:

@@ -35,10 +35,14 @@ FHASH_CLONES int64_t choose(const Task& task) { return run<CHOOSE, BY_CONTEXTS, 
 FHASH_CLONES int64_t decode(const Task& task) { return run<DECODE, BY_CONTEXTS, false>(task); }
 FHASH_CLONES int64_t decode_two(const Task& task) { return run<DECODE, BY_CONTEXTS, true>(task); }
 FHASH_CLONES int64_t encode_signs(const Task& task) { return run<ENCODE, BY_SIGNS, false>(task); }
-FHASH_CLONES int64_t encode_signs_two(const Task& task) { return run<ENCODE, BY_SIGNS, true>(task); }
+FHASH_CLONES int64_t encode_signs_two(const Task& task) {
+    return run<ENCODE, BY_SIGNS, true>(task);
+}
 FHASH_CLONES int64_t choose_signs(const Task& task) { return run<CHOOSE, BY_SIGNS, false>(task); }
 FHASH_CLONES int64_t decode_signs(const Task& task) { return run<DECODE, BY_SIGNS, false>(task); }
-FHASH_CLONES int64_t decode_signs_two(const Task& task) { return run<DECODE, BY_SIGNS, true>(task); }
+FHASH_CLONES int64_t decode_signs_two(const Task& task) {
+    return run<DECODE, BY_SIGNS, true>(task);
+}
 
 FHASH_CLONES int64_t encode_linear(const Task& task) { return run<ENCODE, BY_LINEAR, false>(task); }
 FHASH_CLONES int64_t encode_linear_two(const Task& task) {
@@ -108,8 +112,8 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
                                  simples, simple_count, LANES);
         const Predictors with(model, state, weights);
         std::vector<uint8_t> out;
-        const Task task = {&state, with.signs.get(), with.magnitudes.get(), q, scaled, lambda / 2048,
-                           shape, table, count, &out, nullptr, 0};
+        const Task task = {&state, with.signs.get(), with.magnitudes.get(), q, scaled,
+                           lambda / 2048, shape, table, count, &out, nullptr, 0};
         const int64_t code = encode_task(task, model, trellis);
         if (code < 0) return code;
         const int64_t size = put(out, data, capacity);

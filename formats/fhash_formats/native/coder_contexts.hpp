@@ -49,7 +49,8 @@ const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET, SIGNS = SECOND + 64 * D
 const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;
 
 enum Mode { ENCODE, DECODE, CHOOSE };  // CHOOSE encodes magnitudes chosen by rate and distortion
-enum Model { BY_CONTEXTS, BY_SIGNS, BY_LINEAR };  // what predicts, in the order of CODERS in coder.py
+// What predicts, in the order of CODERS in coder.py.
+enum Model { BY_CONTEXTS, BY_SIGNS, BY_LINEAR };
 
 // Class, 0 to 6, of a magnitude or of a sum of some. No table, so that the compiler makes vectors.
 FHASH_INLINE int seven(int v) { return (v > 0) + (v > 1) + (v > 2) + (v > 4) + (v > 6) + (v > 9); }

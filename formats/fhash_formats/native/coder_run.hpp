@@ -31,7 +31,8 @@ struct Task {
 template <Model MODEL>
 using Decision = typename std::conditional<MODEL == BY_LINEAR, Guess, Prediction>::type;
 
-template <Mode MODE> using Range = typename std::conditional<MODE == DECODE, Decoder, Encoder>::type;
+template <Mode MODE>
+using Range = typename std::conditional<MODE == DECODE, Decoder, Encoder>::type;
 
 template <Mode MODE> FHASH_INLINE Range<MODE> range_of(const Task& task) {
     if constexpr (MODE == DECODE) return Decoder(task.data, task.size);
@@ -140,7 +141,8 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
     std::vector<uint16_t> zeros((size_t)widest + 2 * PADDING + VECTOR, 0);
     const uint16_t* const nothing = zeros.data() + PADDING;
     Sums sums((size_t)widest + VECTOR);
-    const std::vector<int16_t> no_logs(MODEL != BY_CONTEXTS ? (size_t)widest + 2 * LOG_PADDING : 0, 0);
+    const size_t logs = MODEL != BY_CONTEXTS ? (size_t)widest + 2 * LOG_PADDING : 0;
+    const std::vector<int16_t> no_logs(logs, 0);
     const int16_t* const no_log = no_logs.data() + (MODEL != BY_CONTEXTS ? LOG_PADDING : 0);
     Logs logs;
     int trellis = 0;

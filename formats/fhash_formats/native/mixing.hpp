@@ -164,8 +164,8 @@ FHASH_INLINE __m128i half(const void* from) {
     return _mm_loadl_epi64(static_cast<const __m128i*>(from));
 }
 
-// Probability of a 1, mixed from N estimates with one or two (PAIR) sets of weights. more: a term of
-// the sum that comes from elsewhere.
+// Probability of a 1, mixed from N estimates with one or two (PAIR) sets of weights.
+// more: a term of the sum that comes from elsewhere.
 template <int N, bool PAIR, int N_MAX> FHASH_INLINE int mix(Mixed<N_MAX>& now, int32_t more = 0) {
     const __m128i zero = _mm_setzero_si128();
     __m128i dot = zero;

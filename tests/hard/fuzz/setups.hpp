@@ -43,7 +43,8 @@ public:
             std::fprintf(stderr, "FHASH_FUZZ_SETUPS names no file that can be read\n");
             std::exit(2);
         }
-        for (State* state : {&coders[0], &coders[1], &coders[2], &mask, &predictor, &labels, &wide_labels}) {
+        for (State* state : {&coders[0], &coders[1], &coders[2], &mask, &predictor, &labels,
+                             &wide_labels}) {
             get(file, state->slots);
             get(file, state->weights);
             get(file, state->simples);

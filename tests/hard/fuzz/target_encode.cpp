@@ -9,8 +9,8 @@ using std::int64_t;
 
 extern "C" {
 int64_t fhash_encode(std::int32_t*, const float*, double, int64_t, int64_t, const int64_t*,
-                     const std::int32_t*, int64_t, std::uint16_t*, int64_t, std::int32_t*, int64_t, std::uint16_t*,
-                     int64_t, int64_t, std::uint8_t*, int64_t);
+                     const std::int32_t*, int64_t, std::uint16_t*, int64_t, std::int32_t*, int64_t,
+                     std::uint16_t*, int64_t, int64_t, std::uint8_t*, int64_t);
 int64_t fhash_decode(std::int32_t*, int64_t, int64_t, const int64_t*, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::int32_t*, int64_t,
                      const std::uint16_t*, int64_t, const std::uint8_t*, int64_t);
@@ -113,7 +113,9 @@ void of_integers(Reader& in) {
     for (std::size_t i = 0; i < scaled.size(); i++)
         scaled[i] =
             static_cast<float>(q[i]) + static_cast<float>(static_cast<int>(i % 15) - 7) / 16;
-    const std::vector<std::int32_t> decoded = there_and_back(with, q, scaled, lambda, room, (how >> 1) % 3);
+    const int model = (how >> 1) % 3;
+    const std::vector<std::int32_t> decoded =
+        there_and_back(with, q, scaled, lambda, room, model);
     for (std::size_t i = 0; i < q.size(); i++)
         require(decoded[i] == (inside(number)[i] ? q[i] : 0), "other integers");
 }

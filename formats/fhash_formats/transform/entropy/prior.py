@@ -184,7 +184,7 @@ def _share(state: State) -> None:
 
 
 def pack_signs(state: State) -> bytes:
-    """What a learned state has beyond a blank one of "contexts" for signs, as a file.
+    """Bytes of what a learned state has beyond a blank one of "contexts" for signs, as a file.
 
     These are the further estimates, each as its logit plus 256 times its count; then the mixing
     weights of signs and their linear predictors.
@@ -204,7 +204,7 @@ def unpack_signs(data: bytes, state: State) -> None:
 
 
 def pack_linear(state: State) -> bytes:
-    """What a learned state of "linear" has beyond one of "signs", as a file."""
+    """Bytes of what a learned state of "linear" has beyond one of "signs", as a file."""
     return _pack_numbers(state.weights[SIGN_END:])
 
 
