@@ -19,6 +19,7 @@ COMPACT = "compact"
 """Profile whose headers are lean."""
 
 CONFIG_DEFAULTS: dict[str, Any] = {
+    "access": "balanced",
     "batch": 0,
     "brick": "auto",
     "device": "auto",

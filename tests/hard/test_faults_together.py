@@ -162,7 +162,7 @@ def test_a_source_that_may_not_be_read_is_said_in_one_line(
 
 PLACES = [
     ("encode compact", "fhash_codec.coreset.scan", "range_and_sum"),
-    ("encode compact", "fhash_formats.transform.tile.encoding", "encode_integers"),
+    ("encode compact", "fhash_formats.transform.tile.integers", "encode_integers"),
     ("encode compact", "fhash_codec.compact.tiles_to_promise", "code"),
     ("encode compact", "fhash_codec.encoding", "measure"),
     ("encode compact", "fhash_formats.container.writer", "ContainerWriter._tail"),

@@ -141,8 +141,8 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
     std::vector<uint16_t> zeros((size_t)widest + 2 * PADDING + VECTOR, 0);
     const uint16_t* const nothing = zeros.data() + PADDING;
     Sums sums((size_t)widest + VECTOR);
-    const size_t logs = MODEL != BY_CONTEXTS ? (size_t)widest + 2 * LOG_PADDING : 0;
-    const std::vector<int16_t> no_logs(logs, 0);
+    const size_t log_count = MODEL != BY_CONTEXTS ? (size_t)widest + 2 * LOG_PADDING : 0;
+    const std::vector<int16_t> no_logs(log_count, 0);
     const int16_t* const no_log = no_logs.data() + (MODEL != BY_CONTEXTS ? LOG_PADDING : 0);
     Logs logs;
     int trellis = 0;

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fhash_codec.compact.choices.bases import MAX_BASIS_LENGTH, Bases, CountedBases
+from fhash_codec.compact.choices.bases import MAX_BASIS_LENGTH, Bases, CountedBases, Gram
 from fhash_codec.compact.tiles.blocks import Tile
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_formats.transform.axes.spec import AxisTransform, TransformSpec
@@ -24,6 +24,7 @@ class OneTile:
         lines = [np.cos(np.arange(n) * 0.7) + 1.5 for n in (6, 9, 12, 20)]
         values = np.einsum("t,z,y,x->tzyx", *lines)
         self.lines, self.tiles = lines, [Tile(values.astype(np.float32), None)]
+        self.grams: dict[tuple[int, float, int | None], Gram] = {}
 
     def map_all(self, work: Callable[[Tile], Any]) -> Iterator[Any]:
         yield from map(work, self.tiles)

@@ -12,10 +12,10 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
+from fhash_codec.compact.choices.bases import Bases
 from fhash_codec.compact.choices.coarser_bases import coarser_bases
 from fhash_codec.compact.choices.step import find_step
 from fhash_codec.compact.choices.transform import (
-    _Bases,
     basis_bytes,
     refit,
     usual_transform,
@@ -63,7 +63,7 @@ def begun(sample: Sample, fineness: float) -> TileSettings:
         low=-4.0,
         high=4.0,
     )
-    basis = _Bases(sample, replace(settings, step=settings.step / fineness)).along(3)
+    basis = Bases(sample, replace(settings, step=settings.step / fineness)).along(3)
     spec = TransformSpec(axes=(*usual[:3], basis))
     return find_step(sample, replace(settings, transform=spec), Coding(), GOAL, tries=6)[0]
 
