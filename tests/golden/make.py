@@ -71,6 +71,9 @@ GOLDENS = {
         max_error=0.02, effort=2, timings=False, tile="5x6x4x9", features=("interval:0.5:2",)
     ),
     "compact-1.5-lean-head": EncodeConfig(psnr=50.0, effort=2, timings=False, tile="3x6x4x9"),
+    "compact-1.5-trellis": EncodeConfig(psnr=50.0, effort=2, timings=False),
+    "compact-1.5-linear": EncodeConfig(max_error=8.0, effort=8, timings=False),
+    "compact-1.5-signs": EncodeConfig(psnr=40.0, effort=2, timings=False),
     "paper-1.1-transform": EncodeConfig(
         profile="paper",
         hidden_layers=1,
@@ -232,6 +235,8 @@ SERIES = {
     "compact-1.2-labels": basins,
     "compact-1.3-many-labels": grains,
     "compact-1.5-lean-head": cells,
+    "compact-1.5-linear": fronts,
+    "compact-1.5-trellis": fronts,
 }
 """Sources of the goldens that are not made from `series`."""
 

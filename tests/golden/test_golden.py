@@ -33,6 +33,9 @@ COMPACT = [
     "compact-1.4-cross",
     "compact-1.4-head",
     "compact-1.5-lean-head",
+    "compact-1.5-linear",
+    "compact-1.5-signs",
+    "compact-1.5-trellis",
 ]
 NAMES = [
     "paper-1.0-plain",
