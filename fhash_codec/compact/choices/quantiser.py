@@ -58,12 +58,11 @@ def allows_trellis(settings: TileSettings, goal: Goal, effort: int) -> bool:
 def coders_of(effort: int) -> tuple[str, str]:
     """Return the models of coefficients and residual, by the names of their settings.
 
-    Effort 1 takes the fastest model. From effort 2 on signs are predicted, which costs time at
-    coefficients other than 0 alone.
+    Predicted signs cost time at coefficients other than 0 alone.
     """
     if effort >= LINEAR_EFFORT:
         return "linear", "linear"
-    return "contexts" if effort < MIN_EFFORT else "signs", "contexts"
+    return "signs", "contexts"
 
 
 def choose_quantiser(

@@ -27,6 +27,7 @@ from fhash_codec.compact.tiles.access import (
     PRICES,
     Tiling,
     TilingTrial,
+    burden,
     region_vertices,
     tiles_to_try,
 )
@@ -46,7 +47,7 @@ FITTED_LINES = 1 << 15
 """Lines of a series that the data's own bases are fitted on, for trials."""
 MIN_LINES = 256
 """The least of them in each tile."""
-TRIALS = 6
+TRIALS = 9
 """Tilings that are coded at most."""
 STEEPNESS = 0.75
 """Power of the cuts that the extra bytes grow with."""
@@ -165,14 +166,15 @@ def choose_tiling(task: PlanTask, settings: TileSettings, coding: Coding, access
         blocks = task.blocks.window(largest_tile(task.blocks.shape))
         part = blocks.shape
     trials = _Trials(task, blocks, settings, coding)
-    tile = _search(trials, blocks.shape, max(PRICES[access] - MARGIN, 1.0))
+    tile = _search(trials, blocks.shape, access)
     tried = [TilingTrial(tile=tile, size=size) for tile, size in trials.sizes.items()]
     price = trials.price(tile) if tried else 1.0
     return Tiling(tile=tile, price=price, trials=tried, part=part)
 
 
-def _search(trials: _Trials, shape: Shape, allowed: float) -> Shape:
-    """Return the tile of the fastest region among those tried whose price is allowed."""
+def _search(trials: _Trials, shape: Shape, access: str) -> Shape:
+    """Return the tile of the least burden among those tried whose price is allowed."""
+    allowed = max(PRICES[access] - MARGIN, 1.0)
     candidates = tiles_to_try(shape, MAX_WHOLE_VERTICES)
     if candidates == [shape]:
         return shape
@@ -190,20 +192,27 @@ def _search(trials: _Trials, shape: Shape, allowed: float) -> Shape:
         lowest = trials.sizes[shape] / min(trials.sizes.values())
         return lowest * prod(1 + cut.extra(tile) for cut in cuts)
 
-    def fastest() -> Shape:
-        return min((tile for tile in trials.sizes if trials.price(tile) <= allowed), key=work)
+    def burden_of(tile: Shape) -> float:
+        return burden(access, trials.price(tile), work(tile))
+
+    def best() -> Shape:
+        return min((tile for tile in trials.sizes if trials.price(tile) <= allowed), key=burden_of)
 
     while len(trials.sizes) < TRIALS:
-        limit = FASTER * work(fastest())
-        likely = (tile for tile in candidates if work(tile) < limit and foretold(tile) <= allowed)
-        tile = next((tile for tile in likely if tile not in trials.sizes), None)
-        if tile is None:
+        least, limit = burden_of(best()), FASTER * work(best())
+        likely = [
+            (burden(access, foretold(tile), work(tile)), tile)
+            for tile in candidates
+            if tile not in trials.sizes and work(tile) < limit and foretold(tile) <= allowed
+        ]
+        told, tile = min(likely, default=(math.inf, shape))
+        if told >= least:
             break
         expected = foretold(tile) - 1
         found = trials.price(tile) - 1
         if expected > 0:
             _blame(cuts, tile, min(max(found / expected, 0.5), 6.0))
-    return fastest()
+    return best()
 
 
 class _Cuts:
