@@ -39,7 +39,7 @@ Prices of whole files were up to 0.09 above those of the trials (turbulence with
 most of the worst cases.
 """
 MARGIN_FORETOLD = 0.035
-"""Part of an allowed price that no foretold one may take: those are too high rather than too low."""
+"""Part of an allowed price that no foretold one may take, which is too high rather than too low."""
 WORTH = {"fast": 1.0, "balanced": 0.01, "small": 0.0}
 """Share of the bytes that half the work for a region is worth, by the wish for access."""
 REGION = 16
