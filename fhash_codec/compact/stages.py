@@ -63,6 +63,8 @@ LARGE = 1.5
 """Vertices of a tile, in TRIAL_VERTICES, from which on a part of it stands for it in trials."""
 MIN_HEAD_EFFORT = 5
 """Least effort that trains a head."""
+PARTS = 4
+"""Parts of a large tile on which a transform is chosen, in all of TRIAL_VERTICES."""
 SAMPLE_WHY = "tiles on which the choices are tried"
 """Reason for the stage that reads and fills a sample."""
 HEAD_TRIES = 3
@@ -150,15 +152,16 @@ def choose_tiles(task: PlanTask, attempt: Attempt) -> Attempt:
 
 
 def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
-    """Return settings with a transform that is chosen on a part of a large tile.
+    """Return settings with a transform that is chosen on parts of a large tile.
 
-    The part has all steps and all of z where it can; what it cannot tell, bases as long as the
-    tile, competes with its choice on the sample itself.
+    The parts are a sample by their costs: one place may be a plateau. They have all steps and all
+    of z where they can; what they cannot tell, bases as long as the tile, competes with their
+    choice on the sample itself.
     """
     sample, coding = attempt.sample, task.goal.bounded(attempt.coding)
-    part = task.blocks.window(part_of(sample.blocks.tile, TRIAL_VERTICES))
-    usual = replace(attempt.settings, transform=usual_transform(part.tile))
-    small = Sample(part, TRIAL_VERTICES, task.workers, tick=task.parts.tick).filled(usual, 1)
+    parts = task.blocks.retile(part_of(sample.blocks.tile, TRIAL_VERTICES // PARTS))
+    usual = replace(attempt.settings, transform=usual_transform(parts.tile))
+    small = _sample(task, parts, usual, TRIAL_VERTICES)
     found = choose_transform(small, usual, coding)[0].transform.axes
     return own_or_found(sample, attempt.settings, found, coding)
 
