@@ -26,9 +26,12 @@ MIB = 2**20
 LIMITS = (
     (1, 2, 4, 8, 12, 16, 20, 24, 28, 32, 40, 48, 64, 80, 96, 128, 192, 256, 400)
     if LONG
-    else (2, 128)
+    else (2, 256)
 )
-"""Data in MiB that a command may use beyond what the interpreter and the libraries use already."""
+"""Data in MiB that a command may use beyond what the interpreter and the libraries use already.
+
+The last one suffices: the series may be coded as one tile of 3 M vertices.
+"""
 SHAPE = (12, 48, 64, 80)
 
 
