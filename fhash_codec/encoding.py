@@ -205,9 +205,8 @@ def _take_decoded(container: Container, decoded: DecodedTiles) -> None:
     for number, (index, values) in enumerate(decoded.items()):
         if number % DECODED_AGAIN == 0:
             read = container.arrays[name].decode_chunk(index)
-            assert np.array_equal(read, values, equal_nan=values.dtype.kind == "f"), (
-                f"tile {index} decodes to other values than its encoder found"
-            )
+            if not np.array_equal(read, values, equal_nan=values.dtype.kind == "f"):
+                raise RuntimeError(f"tile {index} decodes to other values than its encoder found")
     container.take_decoded(name, decoded)
 
 

@@ -1,17 +1,27 @@
-"""Options of the benches that compare with other codecs: peers, and series that are generated."""
+"""Options of the benches that compare with other codecs: qualities, peers, generated series."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
-from fhash_cli.options import SourceOptions
+from fhash_cli.options import RealRange, SourceOptions
 
-__all__ = ["Peer", "PeerType", "filters_of", "opened", "peer_option", "programs_of"]
+__all__ = [
+    "Peer",
+    "PeerType",
+    "filters_of",
+    "opened",
+    "peer_option",
+    "programs_of",
+    "quality_options",
+]
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 NONE = "none"
 """Name that stands for no peer at all."""
@@ -61,6 +71,30 @@ peer_option = click.option(
     " a program: tthresh, qoz, hpez, sz3, or an ffmpeg for hevc, av1 or vvc.",
 )
 """Option for the codecs to compare with."""
+
+
+def quality_options(command: Command) -> Command:
+    """Add the options for qualities that are compared at: PSNRs and bounds."""
+    for option in (
+        click.option(
+            "--bound",
+            "bounds",
+            type=RealRange(1e-9, 0.5),
+            multiple=True,
+            metavar="X",
+            help="Largest error as a share of the range; repeat.",
+        ),
+        click.option(
+            "--target",
+            "targets",
+            type=RealRange(5, 200),
+            multiple=True,
+            metavar="X",
+            help="PSNR over all frames in dB; repeat.",
+        ),
+    ):
+        command = option(command)
+    return command
 
 
 def filters_of(peers: Sequence[Peer]) -> list[str]:

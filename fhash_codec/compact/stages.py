@@ -24,16 +24,16 @@ from fhash_codec.compact.choices.quantiser import (
     coders_of,
     off_trellis,
 )
-from fhash_codec.compact.choices.search import SLOPE
+from fhash_codec.compact.choices.search import step_after_gain
 from fhash_codec.compact.choices.step import AIM, CLOSE, find_step, require_reach, with_step
-from fhash_codec.compact.choices.tilings import choose_tiling
+from fhash_codec.compact.choices.tilings import choose_tiling, tiling_without_trials
 from fhash_codec.compact.choices.transform import (
     choose_transform,
     own_or_found,
     refit,
     usual_transform,
 )
-from fhash_codec.compact.tiles.access import Tiling, cheap_tiling, part_of
+from fhash_codec.compact.tiles.access import Tiling, part_of
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import OFFSETS, Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
@@ -168,11 +168,14 @@ def _transform_of_large_tile(task: PlanTask, attempt: Attempt) -> TileSettings:
 
 def _tiling(task: PlanTask, attempt: Attempt) -> Tiling:
     """Return the choice of the tiles: by trial from effort 2 on."""
-    access, config = task.config.access, task.config
-    if config.effort == 1 or not _asked(task, "tiles"):
-        if config.effort == 1:
+    access = task.config.access
+    cheap = tiling_without_trials(task, attempt.outcome.size)
+    if cheap is not None:
+        if task.config.effort == 1:
             skip("tiles", "effort 1 foretells what tiles cost; from 2 on they are tried")
-        return cheap_tiling(task.blocks.shape, attempt.outcome.size, access)
+        else:
+            skip("tiles", "--without tiles")
+        return cheap
     with stage("tiles", f"trials for --access {access}"):
         tiling = choose_tiling(task, attempt.settings, attempt.coding, access)
     tell("tiles", f"--access {access}: {tiling.describe()}")
@@ -286,7 +289,7 @@ def _at_the_promise(task: PlanTask, attempt: Attempt) -> tuple[TileSettings, Out
     if abs(missing) < CLOSE or math.isinf(missing):
         return attempt.settings, attempt.outcome
     settings = attempt.settings
-    settings = replace(settings, step=settings.step * math.exp(-missing / SLOPE))
+    settings = replace(settings, step=step_after_gain(settings.step, -missing))
     return find_step(attempt.sample, settings, attempt.coding, goal, tries=HEAD_TRIES)
 
 

@@ -10,7 +10,6 @@ import click
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
-    RealRange,
     SourceOptions,
     check_writable,
     force_option,
@@ -20,7 +19,14 @@ from fhash_cli.options import (
     setting_options,
 )
 from fhash_cli.output import Progress, emit, extent, number, size, table
-from fhash_cli.peer_options import Peer, filters_of, opened, peer_option, programs_of
+from fhash_cli.peer_options import (
+    Peer,
+    filters_of,
+    opened,
+    peer_option,
+    programs_of,
+    quality_options,
+)
 
 if TYPE_CHECKING:
     from fhash_codec.bench.rate.results import RateBench
@@ -54,22 +60,7 @@ class ProfileType(click.ParamType[str]):
 )
 @click.argument("data", type=click.Path())
 @series_options
-@click.option(
-    "--target",
-    "targets",
-    type=RealRange(5, 200),
-    multiple=True,
-    metavar="X",
-    help="PSNR over all frames in dB; repeat.",
-)
-@click.option(
-    "--bound",
-    "bounds",
-    type=RealRange(1e-9, 0.5),
-    multiple=True,
-    metavar="X",
-    help="Largest error as a share of the range; repeat.",
-)
+@quality_options
 @peer_option
 @click.option(
     "--profile",

@@ -10,7 +10,6 @@ import click
 
 from fhash_cli.base_command import BaseCommand
 from fhash_cli.options import (
-    RealRange,
     SourceOptions,
     json_option,
     quiet_option,
@@ -18,7 +17,14 @@ from fhash_cli.options import (
     setting_options,
 )
 from fhash_cli.output import Progress, emit
-from fhash_cli.peer_options import Peer, filters_of, opened, peer_option, programs_of
+from fhash_cli.peer_options import (
+    Peer,
+    filters_of,
+    opened,
+    peer_option,
+    programs_of,
+    quality_options,
+)
 
 
 @click.command(
@@ -29,22 +35,7 @@ from fhash_cli.peer_options import Peer, filters_of, opened, peer_option, progra
 @click.option(
     "--generated", "with_generated", is_flag=True, help="Add every generated series to DATA."
 )
-@click.option(
-    "--target",
-    "targets",
-    type=RealRange(5, 200),
-    multiple=True,
-    metavar="X",
-    help="PSNR over all frames in dB; repeat.",
-)
-@click.option(
-    "--bound",
-    "bounds",
-    type=RealRange(1e-9, 0.5),
-    multiple=True,
-    metavar="X",
-    help="Largest error as a share of the range; repeat.",
-)
+@quality_options
 @peer_option
 @click.option(
     "--speed/--no-speed",

@@ -6,7 +6,7 @@ small file they are a fifth of it; a head also corrects what they leave.
 
 from __future__ import annotations
 
-from fhash_codec.compact.choices.head import octave_gain
+from fhash_codec.compact.choices.octave import octave_gain
 from fhash_codec.compact.choices.step import find_step
 from fhash_codec.compact.choices.transform import basis_bytes, refit
 from fhash_codec.compact.goal import Goal

@@ -22,14 +22,15 @@ from fhash_codec.compact.choices.head_prospects import (
 )
 from fhash_codec.compact.choices.head_samples import Pair
 from fhash_codec.compact.choices.head_training import TrainedHead, train_head
-from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
+from fhash_codec.compact.choices.octave import octave_gain
+from fhash_codec.compact.choices.search import step_after_gain
 from fhash_codec.compact.tiles.coding import Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
 from fhash_codec.progress import Parts
 from fhash_codec.stage_clock import skip, stage
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["HeadHistory", "choose_head", "octave_gain", "training_pairs"]
+__all__ = ["HeadHistory", "choose_head", "training_pairs"]
 
 HeadHistory = list[dict[str, float | None]]
 """Training of a head: `seconds`, `epoch` (training updates), `psnr` of held-out samples in dB.
@@ -112,7 +113,7 @@ def choose_head(
         skip("head", f"{gained}: no head would save what it takes itself")
         return settings, outcome, []
     # A head is trained on what it will meet: coarser data, which it lifts to the quality asked for.
-    coarser = replace(settings, step=settings.step * math.exp(trial.gain_db / SLOPE))
+    coarser = replace(settings, step=step_after_gain(settings.step, trial.gain_db))
     why = f"at effort {effort}; its trial gained {trial.gain_db:.2f} dB"
     with stage("head", why):
         if trial.gain_db > NEAR_GAIN or not sample.complete:
@@ -185,7 +186,7 @@ def _searched(
     missing = without.aim - best.outcome.psnr(without.data_range)
     if abs(missing) < CLOSE or without.extra_bytes(best) > POINTLESS * without.outcome.size:
         return best
-    nearer = replace(best.settings, step=best.settings.step * math.exp(-missing / SLOPE))
+    nearer = replace(best.settings, step=step_after_gain(best.settings.step, -missing))
     return _Candidate(best.trained, *find_step(nearer))
 
 
@@ -238,14 +239,6 @@ def _side_by_side(
 def _finite(psnr: float) -> float | None:
     """Return a PSNR that the header can hold: None for that of values without an error."""
     return psnr if math.isfinite(psnr) else None
-
-
-def octave_gain(tried: list[Outcome], data_range: float) -> float:
-    """Return the dB that an octave of bytes buys."""
-    points = [
-        (math.log2(outcome.size), outcome.psnr(data_range)) for outcome in tried if outcome.size
-    ]
-    return exchange(points, EXCHANGE)
 
 
 def training_pairs(sample: Sample, settings: TileSettings, coding: Coding) -> list[Pair]:

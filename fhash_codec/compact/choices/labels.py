@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fhash_codec.compact.attempt import Attempt, PlanTask
-from fhash_codec.compact.choices.tilings import choose_tiling
-from fhash_codec.compact.tiles.access import Tiling, cheap_tiling
+from fhash_codec.compact.choices.tilings import choose_tiling, tiling_without_trials
+from fhash_codec.compact.tiles.access import Tiling
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import Coding
 from fhash_codec.compact.tiles.sample import Sample
@@ -152,10 +152,8 @@ def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelT
 
 def _tiling(task: PlanTask, settings: TileSettings, coding: Coding, size: float) -> Tiling:
     """Return the choice of the tiles for labels: by trial from effort 2 on."""
-    access, config = task.config.access, task.config
-    if config.effort == 1 or "tiles" in config.without:
-        return cheap_tiling(task.blocks.shape, size, access)
-    return choose_tiling(task, settings, coding, access)
+    cheap = tiling_without_trials(task, size)
+    return choose_tiling(task, settings, coding, task.config.access) if cheap is None else cheap
 
 
 def _entropy(values: npt.NDArray[Any]) -> float:

@@ -12,7 +12,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from fhash_codec.compact.choices.search import EXCHANGE, SLOPE, exchange
+from fhash_codec.compact.choices.octave import octave_gain
+from fhash_codec.compact.choices.search import SLOPE, step_after_gain
 from fhash_codec.compact.goal import Goal
 from fhash_codec.compact.tiles.coding import OFFSETS, WEIGHT, Coding, Outcome
 from fhash_codec.compact.tiles.sample import Sample
@@ -30,8 +31,8 @@ __all__ = [
 ]
 
 LINEAR_EFFORT = 8
-"""Least effort that codes magnitudes by linear predictors: decoding takes two to three times as
-long as with predicted signs alone."""
+"""Least effort that codes magnitudes by linear predictors: decoding takes almost
+four times as long as by contexts."""
 MIN_EFFORT = 2
 """Least effort that uses the trellis."""
 SHARE = 0.65
@@ -114,8 +115,7 @@ def step_after(settings: TileSettings, outcome: Outcome, goal: Goal) -> float:
     psnr = outcome.psnr(goal.data_range)
     if goal.psnr is None or not math.isfinite(psnr):
         return settings.step
-    moved = (psnr - goal.psnr) / SLOPE
-    return settings.step * math.exp(min(max(moved, -1.0), 1.0))
+    return step_after_gain(settings.step, min(max(psnr - goal.psnr, -SLOPE), SLOPE))
 
 
 def is_smaller(outcome: Outcome, plain: Outcome, tried: Sequence[Outcome], goal: Goal) -> bool:
@@ -128,5 +128,4 @@ def is_smaller(outcome: Outcome, plain: Outcome, tried: Sequence[Outcome], goal:
     better = plain.psnr(goal.data_range) - outcome.psnr(goal.data_range)
     if goal.error is not None or not math.isfinite(better) or not plain.size:
         return outcome.size < plain.size
-    points = [(math.log2(one.size), one.psnr(goal.data_range)) for one in tried if one.size]
-    return outcome.size < plain.size * 2 ** (-better / exchange(points, EXCHANGE))
+    return outcome.size < plain.size * 2 ** (-better / octave_gain(tried, goal.data_range))

@@ -69,6 +69,11 @@ class PsnrSearch:
         return math.exp(min(max(log_step, low), high))
 
 
+def step_after_gain(step: float, gain: float) -> float:
+    """Return the step whose PSNR is lower by `gain` dB than that of `step`, by the usual slope."""
+    return step * math.exp(gain / SLOPE)
+
+
 def arithmetic_mean(low: float, high: float) -> float:
     """Return the middle of an interval of logarithms."""
     return (low + high) / 2

@@ -28,6 +28,7 @@ from fhash_codec.compact.tiles.access import (
     Tiling,
     TilingTrial,
     burden,
+    cheap_tiling,
     region_vertices,
     tiles_to_try,
 )
@@ -39,7 +40,7 @@ from fhash_formats.transform.axes.spec import AxisTransform
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["choose_tiling", "largest_tile"]
+__all__ = ["choose_tiling", "largest_tile", "tiling_without_trials"]
 
 PICKED_VERTICES = 1 << 19
 """Vertices coded for each trial of a transform."""
@@ -57,6 +58,17 @@ FASTER = 0.8
 """Ratio of a region's vertices below which it is worth another trial."""
 ENTRY_BYTES = 16
 """Bytes of the directory of a file for each tile."""
+
+
+def tiling_without_trials(task: PlanTask, size: float) -> Tiling | None:
+    """Return tiles by what is foretold where none are tried, at effort 1 or if asked; else None.
+
+    size: bytes of the series, roughly.
+    """
+    config = task.config
+    if config.effort > 1 and "tiles" not in config.without:
+        return None
+    return cheap_tiling(task.blocks.shape, size, config.access)
 
 
 class _Trials:

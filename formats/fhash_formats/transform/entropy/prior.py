@@ -150,19 +150,22 @@ def blank_state(coder: str = CODERS[0]) -> State:
 @cache
 def prior_state(coder: str = CODERS[0], trellis: bool = False) -> State:
     """The prior of a coder of integers, or of indices of two quantisers; it is read-only."""
-    old = unpack_state(zlib.decompress(_FILE.read_bytes()), blank_state())
-    old.slots[:] = _reordered(old.slots, for_file=False)
-    state = old
-    if coder != CODERS[0]:
-        state = blank_state(coder)
-        state.slots[: len(old.slots)] = old.slots
-        state.weights[: len(old.weights)] = old.weights
-        state.simples[:] = old.simples
-        unpack_signs(_SIGNS_FILE.read_bytes(), state)
-    if coder == CODERS[2]:
-        state.weights[SIGN_END:] = _unpack_numbers(_LINEAR_FILE.read_bytes())
     if trellis:
+        state = prior_state(coder).copy()
         _share(state)
+    elif coder == CODERS[0]:
+        state = unpack_state(zlib.decompress(_FILE.read_bytes()), blank_state())
+        state.slots[:] = _reordered(state.slots, for_file=False)
+    else:
+        base = prior_state(CODERS[CODERS.index(coder) - 1])
+        state = blank_state(coder)
+        state.slots[: len(base.slots)] = base.slots
+        state.weights[: len(base.weights)] = base.weights
+        state.simples[:] = base.simples
+        if coder == CODERS[1]:
+            unpack_signs(_SIGNS_FILE.read_bytes(), state)
+        else:
+            state.weights[SIGN_END:] = _unpack_numbers(_LINEAR_FILE.read_bytes())
     return state.frozen()
 
 

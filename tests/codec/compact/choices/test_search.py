@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from fhash_codec.compact.choices.search import (
+    SLOPE,
     Bracket,
     PsnrSearch,
     arithmetic_mean,
@@ -15,6 +16,7 @@ from fhash_codec.compact.choices.search import (
     exchange,
     geometric_mean,
     secant,
+    step_after_gain,
 )
 
 
@@ -38,6 +40,14 @@ def test_a_psnr_of_uniform_rounding_is_found_in_a_few_steps() -> None:
     assert -10 * math.log10(step**2 / 12) == pytest.approx(60.0, abs=1e-6)
     search.add(step, -1e9)
     assert search.step_for(60.0) == pytest.approx(1e-9)
+
+
+def test_a_gain_moves_the_step_by_the_usual_slope() -> None:
+    assert step_after_gain(0.5, 0.0) == 0.5
+    assert step_after_gain(0.5, SLOPE) == pytest.approx(0.5 * math.e)
+    assert secant([(math.log(0.5), 40.0)], 40.0 - 2.0, SLOPE) == pytest.approx(
+        math.log(step_after_gain(0.5, 2.0))
+    )
 
 
 @pytest.mark.parametrize("mean", [arithmetic_mean, geometric_mean])
