@@ -11,7 +11,15 @@ from typing import Any
 from fhash_codec.compact.attempt import Attempt, GainLog, PlanTask
 from fhash_codec.compact.choices.estimate import estimated_size, estimated_step
 from fhash_codec.compact.choices.head import HeadHistory
-from fhash_codec.compact.choices.labels import LabelTrial, has_labels, is_hopeless, plan_labels
+from fhash_codec.compact.choices.labels import (
+    LabelTrial,
+    has_labels,
+    is_hopeless,
+    look_at_labels,
+    may_be_many,
+    tiled_labels,
+    with_step_of,
+)
 from fhash_codec.compact.choices.step import with_step
 from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.goal import Goal
@@ -47,6 +55,8 @@ MIN_RANGE = 1e-145
 """Smallest range of values, other than 0, whose squared errors fit float64."""
 MAX_BYTES_KEPT = 128 << 20
 """Largest size of the box over all steps, in bytes, whose decoded values effort 1 keeps."""
+LIKELY = 1.5
+"""Ratio of labels to the rest up to which tiles are chosen for labels, which may then win."""
 STAGES = 7
 """Number of parts of the planning that its progress counts."""
 
@@ -115,10 +125,10 @@ def plan(
     with stage("first guess", "mean and approximate bytes, by which tiles are chosen"):
         settings = first_settings(task, tiled)
     trial = _label_trial(task, tiled, settings)
-    if trial is not None and trial.clearly:
+    if trial is not None and trial.clearly and goal.lossless:
         parts.end()
-        return _label_plan(task, trial.attempt)
-    if _can_estimate(task, tiled, settings):
+        return _label_plan(task, tiled_labels(task, trial))
+    if _can_estimate(task, tiled, settings) and not _beats_estimate(trial, task, tiled, settings):
         with stage("estimate", "effort 1: step and tiles from coefficients, without trials"):
             estimated_plan = _estimated_plan(task, tiled, settings)
         parts.end()
@@ -129,11 +139,20 @@ def plan(
 
 
 def _label_trial(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelTrial | None:
-    """Return the trial of coding as labels; None where values are no labels, or may change."""
-    if not task.goal.lossless:
+    """Return the trial of coding as labels; None where values are no labels, and for a ratio."""
+    if task.goal.size is not None:
         return None
-    with stage("labels", "exact values, of which few may differ"):
-        return plan_labels(task, tiled, settings) if has_labels(task, tiled) else None
+    with stage("labels", "values of which few may differ"):
+        return look_at_labels(task, tiled, settings) if has_labels(task, tiled) else None
+
+
+def _beats_estimate(
+    trial: LabelTrial | None, task: PlanTask, tiled: Blocks, settings: TileSettings
+) -> bool:
+    """Whether labels take fewer bytes than effort 1 estimates for a transform."""
+    if trial is None:
+        return False
+    return trial.attempt.outcome.size < _estimated_bytes(task, tiled, settings)
 
 
 def _by_trial(
@@ -142,16 +161,20 @@ def _by_trial(
     """Return the plan after trials of all choices, or of labels where these need fewer bytes."""
     with stage("first guess", "approximate bytes, by which tiles are chosen"):
         attempt = first_guess(task, tiled, settings)
+    if trial is not None and not task.goal.lossless:
+        trial = with_step_of(trial, attempt)
     if trial is not None and is_hopeless(
         trial.attempt.outcome.size, attempt.outcome.size, trial.entropy, trial.rank
     ):
-        return _label_plan(task, trial.attempt)
+        return _label_plan(task, tiled_labels(task, trial))
     attempt = _improved(task, attempt)
     settings = attempt.settings
-    if trial is not None:
-        if trial.attempt.outcome.size <= attempt.outcome.size:
-            return _label_plan(task, trial.attempt)
-        many = trial.attempt.settings.many_labels
+    if trial is not None and trial.attempt.outcome.size <= LIKELY * attempt.outcome.size:
+        labelled = tiled_labels(task, trial)
+        if labelled.outcome.size <= attempt.outcome.size:
+            return _label_plan(task, labelled)
+    if trial is not None and task.goal.lossless:
+        many = may_be_many(task.value_range, attempt.sample)
         settings = replace(settings, labels=True, many_labels=many)
     return CodingPlan(
         blocks=attempt.sample.blocks,
@@ -238,6 +261,15 @@ def _can_estimate(task: PlanTask, tiled: Blocks, settings: TileSettings) -> bool
     )
 
 
+def _estimated_bytes(task: PlanTask, tiled: Blocks, settings: TileSettings) -> float:
+    """Return the bytes of all tiles at the promised PSNR, by their coefficients."""
+    psnr = task.goal.even_psnr
+    assert psnr is not None
+    return estimated_size(
+        tiled, settings, psnr=psnr, data_range=task.goal.data_range, workers=task.workers
+    )
+
+
 def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> CodingPlan:
     """Return the plan of effort 1: tiles and step from estimates, the usual transform."""
     goal = task.goal
@@ -245,9 +277,7 @@ def _estimated_plan(task: PlanTask, tiled: Blocks, settings: TileSettings) -> Co
     assert goal.even_psnr is not None
     tiling = None
     if task.fixed_tile is None:
-        size = estimated_size(
-            tiled, settings, psnr=goal.even_psnr, data_range=goal.data_range, workers=task.workers
-        )
+        size = _estimated_bytes(task, tiled, settings)
         tiling = cheap_tiling(task.blocks.shape, size, task.config.access)
         tiled = task.blocks.retile(tiling.tile)
     settings = replace(settings, transform=usual_transform(tiled.tile))

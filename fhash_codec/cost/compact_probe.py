@@ -15,7 +15,7 @@ import numpy as np
 
 from fhash_codec.compact.attempt import Attempt, GainLog, PlanTask
 from fhash_codec.compact.choices.estimate import tile_costs
-from fhash_codec.compact.choices.labels import LabelTrial, has_labels, plan_labels
+from fhash_codec.compact.choices.labels import LabelTrial, has_labels, look_at_labels
 from fhash_codec.compact.choices.predictor import TRIAL_ROWS, IntegerTile, fit_weights
 from fhash_codec.compact.choices.step import find_step
 from fhash_codec.compact.choices.transform import likely_transform, usual_transform
@@ -129,8 +129,8 @@ def look_at(part: Series, steps: int, config: EncodeConfig, workers: ThreadPoolE
     tiled = blocks.retile(fixed or first_tile(blocks.shape))
     settings = first_settings(task, tiled)
     labels, labels_begun = None, now()
-    if goal.lossless and has_labels(task, tiled):
-        labels = plan_labels(task, tiled, settings)
+    if goal.size is None and has_labels(task, tiled):
+        labels = look_at_labels(task, tiled, settings)
     costs_begun = now()
     labelling = costs_begun - labels_begun
     tile_costs(tiled, settings, workers)

@@ -1,4 +1,8 @@
-"""Choice of coding as labels: of values that are few, equal over regions, and kept exactly."""
+"""Choice of coding as labels: of values that are few or equal over regions.
+
+Labels are exact. They are tried for exact values, and for any other promise of quality too: at
+edges a transform takes many bytes for values that are nearly right.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,7 @@ import numpy.typing as npt
 
 from fhash_codec.compact.attempt import Attempt, PlanTask
 from fhash_codec.compact.choices.tilings import choose_tiling, tiling_without_trials
+from fhash_codec.compact.choices.transform import usual_transform
 from fhash_codec.compact.tiles.access import Tiling
 from fhash_codec.compact.tiles.blocks import Blocks
 from fhash_codec.compact.tiles.coding import Coding
@@ -22,7 +27,16 @@ from fhash_formats.transform.entropy.mask_levels import MaskLevels
 from fhash_formats.transform.tile.labelled import has_regions
 from fhash_formats.transform.tile.settings import TileSettings
 
-__all__ = ["LabelTrial", "has_labels", "is_hopeless", "plan_labels", "rank_share"]
+__all__ = [
+    "LabelTrial",
+    "has_labels",
+    "is_hopeless",
+    "look_at_labels",
+    "may_be_many",
+    "rank_share",
+    "tiled_labels",
+    "with_step_of",
+]
 
 LOOK_VERTICES = 1 << 18
 """Vertices that are looked at, and coded for the size estimate."""
@@ -41,8 +55,8 @@ class LabelTrial:
     """Outcome of coding as labels.
 
     Attributes:
-        attempt: tiles and settings.
-        clearly: whether nothing else can take fewer bytes.
+        attempt: tiles that were looked at, and settings.
+        clearly: whether nothing else that is exact can take fewer bytes.
         entropy: bytes of the values by how often each occurs in its tile, whatever stands around.
         rank: see `rank_share`.
     """
@@ -109,6 +123,10 @@ def has_labels(task: PlanTask, tiled: Blocks) -> bool:
     # Vertices that are not occupied take a label of their own.
     spare = not tiled.complete
     for tile in sample.tiles:
+        # A look at some values is enough for most tiles of other data.
+        few = np.unique(tile.values.reshape(-1)[:: max(1, tile.values.size // 4096)])
+        if few.size > MAX_NARROW - spare and not has_regions(tile.values):
+            continue
         distinct = np.unique(tile.values).size
         if distinct <= MAX_NARROW - spare:
             return True
@@ -117,8 +135,8 @@ def has_labels(task: PlanTask, tiled: Blocks) -> bool:
     return False
 
 
-def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelTrial:
-    """Return tiles and settings for labels, and what they promise."""
+def look_at_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelTrial:
+    """Return the trial of labels on a sample of some tiles."""
     if not task.blocks.complete:
         settings = replace(settings, mask=MaskLevels())
     settings = replace(settings, labels=True, many_labels=True, quantum=0.0, clip=False)
@@ -138,16 +156,38 @@ def plan_labels(task: PlanTask, tiled: Blocks, settings: TileSettings) -> LabelT
         ]
     )
     clearly = CLEARLY * outcome.size <= sample.run(settings, exact).size
+    task.gains.note("labels", outcome)
+    attempt = Attempt(sample=sample, settings=settings, outcome=outcome, coding=coding)
+    return LabelTrial(attempt=attempt, clearly=clearly, entropy=entropy, rank=rank)
+
+
+def with_step_of(trial: LabelTrial, guess: Attempt) -> LabelTrial:
+    """Return a trial whose tiles of too many values keep the promise of a first guess.
+
+    guess: its outcome has the promise that is not an exact one.
+    """
+    mask = trial.attempt.settings.mask
+    settings = replace(guess.settings, labels=True, many_labels=True, mask=mask)
+    coding = replace(trial.attempt.coding, bulk=guess.coding.bulk)
+    return replace(trial, attempt=replace(trial.attempt, settings=settings, coding=coding))
+
+
+def tiled_labels(task: PlanTask, trial: LabelTrial) -> Attempt:
+    """Return the attempt of labels with the tiles that are best for them."""
+    attempt = trial.attempt
+    settings, sample, outcome = attempt.settings, attempt.sample, attempt.outcome
     tiling = None
     if task.fixed_tile is None:
-        tiling = _tiling(task, settings, coding, outcome.size)
+        tiling = _tiling(task, settings, attempt.coding, outcome.size)
         sample = Sample(task.blocks.retile(tiling.tile), LOOK_VERTICES, task.workers)
-    settings = replace(settings, many_labels=_may_be_many(task.value_range, sample))
-    task.gains.note("labels", outcome)
-    attempt = Attempt(
-        sample=sample, settings=settings, outcome=outcome, coding=coding, tiling=tiling
+        sizes = {trial.tile: trial.size for trial in tiling.trials if tiling.part is None}
+        outcome = replace(outcome, size=round(sizes.get(tiling.tile, outcome.size)))
+    settings = replace(
+        settings,
+        many_labels=may_be_many(task.value_range, sample),
+        transform=usual_transform(sample.blocks.tile),
     )
-    return LabelTrial(attempt=attempt, clearly=clearly, entropy=entropy, rank=rank)
+    return replace(attempt, sample=sample, settings=settings, outcome=outcome, tiling=tiling)
 
 
 def _tiling(task: PlanTask, settings: TileSettings, coding: Coding, size: float) -> Tiling:
@@ -162,7 +202,7 @@ def _entropy(values: npt.NDArray[Any]) -> float:
     return float(-(counts * np.log2(counts / max(values.size, 1))).sum()) / 8
 
 
-def _may_be_many(value_range: ValueRange, sample: Sample) -> bool:
+def may_be_many(value_range: ValueRange, sample: Sample) -> bool:
     """Whether a tile of the series may have more than MAX_NARROW labels."""
     most = MAX_NARROW - (not sample.blocks.complete)
     if sample.blocks.dtype.kind in "iu" and value_range.high - value_range.low < most:

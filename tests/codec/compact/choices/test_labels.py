@@ -1,4 +1,4 @@
-"""Labels are planned where nothing else could take fewer bytes, and only for exact values."""
+"""Labels are planned where nothing else takes fewer bytes, whatever quality is promised."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ def moving_regions() -> np.ndarray:
 
 def encoded(tmp_path, values: np.ndarray, **changes) -> tuple[int, set[str], np.ndarray]:
     path = tmp_path / "a.fhz"
-    config = EncodeConfig(timings=False, **{"max_error": 0.0, "effort": 2, **changes})
+    promise = {} if "psnr" in changes or "max_error" in changes else {"max_error": 0.0}
+    config = EncodeConfig(timings=False, **{"effort": 2, **promise, **changes})
     figures = fhash_codec.encode(values, path, config, force=True)
     with fhash_codec.open(path) as volume:
         return figures["bytes"], set(volume.info["required_features"]), volume[...]
@@ -50,10 +51,39 @@ def test_labels_in_floats_and_with_a_feature(tmp_path) -> None:
     np.testing.assert_array_equal(decoded, np.where(inside, values, np.nan))
 
 
-def test_other_promises_and_many_values_need_no_labels(tmp_path) -> None:
-    assert "labels" not in encoded(tmp_path, moving_regions(), max_error=1.0, effort=1)[1]
-    noise = np.random.default_rng(0).integers(0, 9999, (2, 4, 20, 20)).astype("i2")
-    assert "labels" not in encoded(tmp_path, noise, effort=1)[1]
+@pytest.mark.parametrize("promise", [{"psnr": 45.0}, {"max_error": 1.0}])
+@pytest.mark.parametrize("effort", [1, 2])
+def test_labels_keep_other_promises_in_fewer_bytes(
+    tmp_path, promise: dict[str, float], effort: int
+) -> None:
+    values = moving_regions()
+    size, features, decoded = encoded(tmp_path, values, effort=effort, **promise)
+    assert "labels" in features
+    np.testing.assert_array_equal(decoded, values)
+    exact_size, _, _ = encoded(tmp_path, values, effort=effort)
+    assert size < 1.02 * exact_size
+
+
+def test_labels_under_a_promise_with_tiles_that_have_none(tmp_path) -> None:
+    """Tiles of too many different values keep the promise by a transform."""
+    values = np.tile(moving_regions(), (1, 1, 2, 2)).astype("f4")
+    noise = np.random.default_rng(0).normal(0, 20, (6, 12, 8, 8))
+    values[:, :, -8:, -8:] = noise
+    size, features, decoded = encoded(tmp_path, values, max_error=2.0, tile="6x12x16x16")
+    assert "labels" in features
+    assert np.abs(decoded - values).max() <= 2.0
+    np.testing.assert_array_equal(decoded[:, :, :48, :48], values[:, :, :48, :48])
+    assert size < encoded(tmp_path, values, tile="6x12x16x16")[0]
+
+
+def test_values_that_a_transform_codes_in_fewer_bytes_are_no_labels(tmp_path) -> None:
+    smooth = np.indices((4, 10, 24, 24)).sum(0).astype("f4") ** 2 / 16
+    assert "labels" not in encoded(tmp_path, smooth.astype("u1"), psnr=30.0)[1]
+    noise = np.random.default_rng(0).integers(0, 200, (2, 4, 20, 20)).astype("u1")
+    assert "labels" not in encoded(tmp_path, noise, psnr=30.0, effort=1)[1]
+    assert "labels" not in encoded(tmp_path, noise, max_error=20.0)[1]
+    many = np.random.default_rng(0).integers(0, 9999, (2, 4, 20, 20)).astype("i2")
+    assert "labels" not in encoded(tmp_path, many, effort=1)[1]
 
 
 def grains(count: int) -> np.ndarray:
