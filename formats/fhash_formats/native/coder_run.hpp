@@ -146,6 +146,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
     const int16_t* const no_log = no_logs.data() + (MODEL != BY_CONTEXTS ? LOG_PADDING : 0);
     Logs logs;
     int trellis = 0;
+    int settled[2] = {0, 0};  // by class: probability of a 0 among zeros, as long as it stays
 
     for (int64_t number = 0; number < count; number++) {
         Band& band = bands[number];
@@ -162,6 +163,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
             }
         any = simple(any, EMPTIES + kind);
         band.any = any != 0;
+        settled[0] = settled[1] = 0;
         if (!any) {
             if (TRELLIS) trellis = after_zeros(trellis, (int64_t)n0 * n1 * n2 * n3);
             continue;
@@ -210,8 +212,27 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
             int filled = 0, left = 0, left2 = 0;
             if (MODEL == BY_LINEAR) find_logs(bands, band, t, z, y, no_log, logs);
 
+            // Whether the integer at x is, or may be read as, 0 without a choice.
+            auto may_be_zero = [&](const int32_t* from, int x) FHASH_LAMBDA {
+                if (MODE == DECODE) return true;
+                if (MODE == ENCODE) return from[x] == 0;
+                if (!(std::fabs(scaled[from - q + x]) < 0.5F)) return false;
+                out[x] = 0;
+                return true;
+            };
+
             for (int x = 0; x < n3; x++) {
                 const uint32_t mu = (uint32_t)(expected[x] + LEFT * left + LEFT2 * left2);
+                const int one = TRELLIS ? trellis & 1 : 0;  // class of the quantiser
+                // Where all around is 0 and nothing moves any more, only the range does.
+                int begun = 0;
+                if (MODEL != BY_LINEAR && !mu && settled[one] && may_be_zero(out, x)) {
+                    if (range.code(1, (uint32_t)settled[one])) {
+                        if (TRELLIS) trellis = TRELLIS_NEXT[trellis][0];
+                        continue;
+                    }
+                    begun = 1;
+                }
                 const int level = mu ? min((log16(mu) + offset) / 4 + 1, LEVELS - 1) : 0;
                 const int coarse = level / 2;
                 const int near = plane[x] + 2 * left + left2;
@@ -226,7 +247,6 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 Slot* places[CONTEXTS];
                 for (int i = 0; i < CONTEXTS; i++)
                     places[i] = slots[i] + (int64_t)context[i] * DECISIONS;
-                const int one = TRELLIS ? trellis & 1 : 0;  // class of the quantiser
                 const Vertex vertex = {kind,
                                        coarse,
                                        near,
@@ -261,8 +281,14 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                     out[x] = value = s < 0 ? -best : best;
                 }
                 int magnitude = TRELLIS ? (std::abs(value) + one) / 2 : std::abs(value);
-                const int zero = range.code(magnitude == 0, p);
-                learn_from(now, zero);
+                const int zero = begun ? 0 : range.code(magnitude == 0, p);
+                if constexpr (MODEL != BY_LINEAR) {
+                    const bool stays = !mu && zero && settled_at_one<CONTEXTS>(now, SLOW_LIMIT);
+                    settled[one] = stays ? p : 0;
+                    if (!stays) learn_from(now, zero);
+                } else {
+                    learn_from(now, zero);
+                }
                 left2 = left;
                 left = 0;
                 if (zero) {
