@@ -111,13 +111,15 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
         State state = make_state(slots, slot_count, weights, min(weight_count, BASE_WEIGHTS),
                                  simples, simple_count, LANES);
         const Predictors with(model, state, weights);
+        Flags flags(state);
         std::vector<uint8_t> out;
-        const Task task = {&state, with.signs.get(), with.magnitudes.get(), q, scaled,
+        const Task task = {&state, &flags, with.signs.get(), with.magnitudes.get(), q, scaled,
                            lambda / 2048, shape, table, count, &out, nullptr, 0};
         const int64_t code = encode_task(task, model, trellis);
         if (code < 0) return code;
         const int64_t size = put(out, data, capacity);
         if (keep && size <= capacity) {
+            flags.keep(state);
             keep_state(state, slots, weights, simples, LANES);
             with.keep(weights);
         }
@@ -137,7 +139,8 @@ FHASH_EXPORT int64_t fhash_decode(int32_t* q, int64_t model, int64_t trellis, co
         State state = make_state(slots, slot_count, weights, min(weight_count, BASE_WEIGHTS),
                                  simples, simple_count, LANES);
         const Predictors with(model, state, const_cast<int32_t*>(weights));
-        const Task task = {&state, with.signs.get(), with.magnitudes.get(), q, nullptr, 0,
+        Flags flags(state);
+        const Task task = {&state, &flags, with.signs.get(), with.magnitudes.get(), q, nullptr, 0,
                            shape, table, count, nullptr, data, size};
         return decode_task(task, model, trellis);
     });

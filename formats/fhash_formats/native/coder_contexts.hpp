@@ -40,6 +40,8 @@ const int BEFORE = 102, AROUND = 20, BEFORE2 = 31;  // before along t or z, arou
 const int REFERENCE = 62;  // the vertex of a reference; the sum around it has weight AROUND
 
 const int SIZES[CONTEXTS] = {LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS};
+const int64_t ALL_CONTEXTS =
+    int64_t(LEVELS + KINDS * 64 + 729 + 12 * 12 * 12 + 7 * 7 * 7 * 7 + 12 * 12 * KINDS);
 const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27};
 
 // Order of the state. Slots: by context, those of the decisions of a context together; then those
@@ -47,6 +49,27 @@ const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27};
 // Simple estimates: of the escape code; from ROWS on of empty rows; from EMPTIES on of empty bands.
 const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET, SIGNS = SECOND + 64 * DECISIONS * SET;
 const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;
+
+// The slots of zero flags, those of both classes of a context together: few lines of the cache hold
+// what most vertices use. As long as a run lasts, the slots of the state have none of them.
+struct Flags {
+    std::vector<Slot> slots;
+
+    explicit Flags(const State& state) : slots((size_t)(2 * ALL_CONTEXTS)) {
+        const Slot* from = state.slots.data();
+        for (size_t i = 0; i < slots.size(); i += 2, from += DECISIONS) {
+            slots[i] = from[0];
+            slots[i + 1] = from[UNARY];
+        }
+    }
+    void keep(State& state) const {
+        Slot* to = state.slots.data();
+        for (size_t i = 0; i < slots.size(); i += 2, to += DECISIONS) {
+            to[0] = slots[i];
+            to[UNARY] = slots[i + 1];
+        }
+    }
+};
 
 enum Mode { ENCODE, DECODE, CHOOSE };  // CHOOSE encodes magnitudes chosen by rate and distortion
 // What predicts, in the order of CODERS in coder.py.
@@ -86,6 +109,11 @@ FHASH_INLINE int sign_of(int32_t v) { return v > 0 ? 2 : v < 0 ? 0 : 1; }
 
 using Prediction = Mixed<CONTEXTS>;
 
+// Level of a weighted sum; offset: added to 16ths of its octaves.
+FHASH_INLINE int level_of(uint32_t mu, int offset) {
+    return mu ? min((log16(mu) + offset) / 4 + 1, LEVELS - 1) : 0;
+}
+
 // Numbers by vertex of a row, from the neighbours that are known before the row.
 struct Sums {
     std::vector<int32_t> room;
@@ -93,10 +121,11 @@ struct Sums {
     int32_t *plane, *before, *below;  // sums over the rows above, the step before, the layer below
     int32_t *both, *nearest, *sides, *others, *parent;  // shares in the contexts
     int32_t *share, *level;           // by vertex of a reference: share in `expected`, class
-    explicit Sums(size_t width) : room(11 * width) {
+    int32_t *near, *wide;             // contexts where both neighbours to the left are 0
+    explicit Sums(size_t width) : room(13 * width) {
         int32_t* at = room.data();
         for (int32_t** array : {&expected, &plane, &before, &below, &both, &nearest, &sides,
-                                &others, &parent, &share, &level}) {
+                                &others, &parent, &share, &level, &near, &wide}) {
             *array = at;
             at += width;
         }
@@ -147,7 +176,8 @@ inline bool read_bands(const int32_t* table, const int64_t* shape, std::vector<B
     return true;
 }
 
-// Find the row of each reference that stands for this row. Whether the row of the parent is filled.
+// Find the row of each reference that stands for this row; none where it and the rows above and
+// below it are zeros, which add nothing. Whether the row of the parent is filled.
 FHASH_INLINE int find_references(const std::vector<Band>& bands, const Band& band, Row& row) {
     int parent_filled = 0;
     for (int k = 0; k < REFERENCE_COUNT; k++) {
@@ -160,10 +190,12 @@ FHASH_INLINE int find_references(const std::vector<Band>& bands, const Band& ban
         const int z = min(row.z >> to.shift[1], other.size[1] - 1);
         const int y = min(row.y >> to.shift[2], other.size[2] - 1);
         row.reference_y[k] = y;
-        row.references[k] = other.magnitudes.data() + t * other.stride[0] + z * other.stride[1] +
-                            y * other.stride[2] + PADDING;
-        if (k == 0)
-            parent_filled = other.filled[((int64_t)t * other.size[1] + z) * other.size[2] + y];
+        const uint8_t* const filled =
+            other.filled.data() + ((int64_t)t * other.size[1] + z) * other.size[2] + y;
+        if (k == 0) parent_filled = filled[0];
+        if (filled[0] || (y > 0 && filled[-1]) || (y + 1 < other.size[2] && filled[1]))
+            row.references[k] = other.magnitudes.data() + t * other.stride[0] +
+                                z * other.stride[1] + y * other.stride[2] + PADDING;
     }
     return parent_filled;
 }
@@ -292,7 +324,23 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
             share[i] = REFERENCE * p[i] + AROUND * sum;
             level[i] = twelve(sum);
         }
-        for (int x = 0; x < n3; x++) {
+        int done = 0;
+        if (shift == 1) {
+            done = 2 * needed;
+            FHASH_INDEPENDENT
+            for (int i = 0; i < needed; i++) {
+                const int digit = min(level[i], 6) * scale;
+                expected[2 * i] += share[i];
+                expected[2 * i + 1] += share[i];
+                others[2 * i] += digit;
+                others[2 * i + 1] += digit;
+            }
+            if (k == 0) {
+                FHASH_INDEPENDENT
+                for (int i = 0; i < needed; i++) parent[2 * i] = parent[2 * i + 1] = level[i];
+            }
+        }
+        for (int x = done; x < n3; x++) {
             const int i = min(x >> shift, last);
             expected[x] += share[i];
             others[x] += min(level[i], 6) * scale;
@@ -311,6 +359,8 @@ FHASH_INLINE void prepare_contexts(const Band& band, const Row& row, int lanes,
     const uint16_t* const before = row.t > 0 ? row.magnitudes - band.stride[0] : nothing;
     int32_t *FHASH_RESTRICT const both = sums.both, *FHASH_RESTRICT const nearest = sums.nearest;
     int32_t *FHASH_RESTRICT const sides = sums.sides, *FHASH_RESTRICT const parent = sums.parent;
+    int32_t *FHASH_RESTRICT const near = sums.near, *FHASH_RESTRICT const wide = sums.wide;
+    const int32_t* FHASH_RESTRICT const plane = sums.plane;
     FHASH_INDEPENDENT
     for (int x = 0; x < lanes; x++) {
         const int sum_before = sums.before[x], sum_below = sums.below[x];
@@ -321,6 +371,8 @@ FHASH_INLINE void prepare_contexts(const Band& band, const Row& row, int lanes,
         sides[x] = twelve(sum_before) * 12 + twelve(sum_below);
         both[x] = sum_before + sum_below;
         parent[x] = parent[x] * KINDS + kind;
+        near[x] = twelve(plane[x]) * 144 + sides[x];
+        wide[x] = twelve((plane[x] + both[x]) >> 1) * (12 * KINDS) + parent[x];
     }
 }
 

@@ -14,6 +14,7 @@ namespace {
 // to read.
 struct Task {
     State* state;
+    Flags* flags;
     Signs* signs;            // null BY_CONTEXTS
     Magnitudes* magnitudes;  // null but BY_LINEAR
     int32_t* q;
@@ -125,12 +126,14 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
     if (!read_bands(task.table, shape, bands)) return -1;
     int widest = 0;
     for (const Band& band : bands) widest = max(widest, band.size[3]);
-    Slot* slots[CONTEXTS];
+    Slot *slots[CONTEXTS], *flags[CONTEXTS];
     Slot* signs[SIGN_CONTEXTS];
-    Slot* at = state->slots.data();
+    Slot *at = state->slots.data(), *flag_at = task.flags->slots.data();
     for (int i = 0; i < CONTEXTS; i++) {
         slots[i] = at;
+        flags[i] = flag_at;
         at += (int64_t)SIZES[i] * DECISIONS;
+        flag_at += (int64_t)SIZES[i] * 2;
     }
     for (int i = 0; i < SIGN_CONTEXTS; i++) {
         signs[i] = at;
@@ -209,6 +212,8 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
             const int32_t* FHASH_RESTRICT const sides = sums.sides;
             const int32_t* FHASH_RESTRICT const others = sums.others;
             const int32_t* FHASH_RESTRICT const parent = sums.parent;
+            const int32_t* FHASH_RESTRICT const nears = sums.near;
+            const int32_t* FHASH_RESTRICT const wide = sums.wide;
             int filled = 0, left = 0, left2 = 0;
             if (MODEL == BY_LINEAR) find_logs(bands, band, t, z, y, no_log, logs);
 
@@ -233,20 +238,15 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                     }
                     begun = 1;
                 }
-                const int level = mu ? min((log16(mu) + offset) / 4 + 1, LEVELS - 1) : 0;
-                const int coarse = level / 2;
+                const int level = level_of(mu, offset), coarse = level / 2;
                 const int near = plane[x] + 2 * left + left2;
-                const int context[CONTEXTS] = {
-                    level,
-                    kind * 64 + coarse,
-                    min(left, 2) * 243 + nearest[x],
-                    small(near) * 144 + sides[x],
-                    others[x],
-                    small((near + both[x]) / 2) * (12 * KINDS) + parent[x],
-                };
-                Slot* places[CONTEXTS];
-                for (int i = 0; i < CONTEXTS; i++)
-                    places[i] = slots[i] + (int64_t)context[i] * DECISIONS;
+                int context[CONTEXTS] = {level,    kind * 64 + coarse, nearest[x],
+                                         nears[x], others[x],          wide[x]};
+                if (left | left2) {
+                    context[2] += min(left, 2) * 243;
+                    context[3] = small(near) * 144 + sides[x];
+                    context[5] = small((near + both[x]) / 2) * (12 * KINDS) + parent[x];
+                }
                 const Vertex vertex = {kind,
                                        coarse,
                                        near,
@@ -257,10 +257,15 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 if constexpr (MODEL == BY_LINEAR) task.magnitudes->gather(logs, x, vertex);
                 auto predict = [&](Decision<MODEL>& to, int asked) FHASH_LAMBDA {
                     const int k = TRELLIS && one && asked < SHARED ? UNARY + asked : asked;
+                    Slot** places;
+                    if constexpr (MODEL == BY_LINEAR) places = to.contexts.slots;
+                    else places = to.slots;
+                    for (int i = 0; i < CONTEXTS; i++)
+                        places[i] = asked ? slots[i] + (int64_t)context[i] * DECISIONS + k
+                                          : flags[i] + (int64_t)context[i] * 2 + one;
                     if constexpr (MODEL == BY_LINEAR) {
-                        return task.magnitudes->predict(to, places, vertex, k);
+                        return task.magnitudes->predict(to, vertex, k);
                     } else {
-                        for (int i = 0; i < CONTEXTS; i++) to.slots[i] = places[i] + k;
                         to.first = weights + ((int64_t)k * KINDS + kind) * SET;
                         to.second = weights + SECOND + ((int64_t)k * 64 + coarse) * SET;
                         return mix<CONTEXTS, true>(to);

@@ -15,8 +15,7 @@ const int ALL_SIGNS = SIGN_CONTEXTS + MORE_SIGNS;
 const int MORE_SIGN_SIZES[MORE_SIGNS] = {KINDS * 108, KINDS * 27, KINDS * 81, KINDS * 54,
                                          KINDS * 25};
 const int SIGN_SET = 24;      // mixing weights of a sign: of ALL_SIGNS estimates, of the logit
-const int64_t FIRST_SIGN_SLOT =
-    int64_t(LEVELS + KINDS * 64 + 729 + 12 * 12 * 12 + 7 * 7 * 7 * 7 + 12 * 12 * KINDS) * DECISIONS;
+const int64_t FIRST_SIGN_SLOT = ALL_CONTEXTS * DECISIONS;
 const int LOGIT_BIN = 85;     // a third, in 1/256: width of the classes of the logit
 
 // Order of the further weights, behind the sets of contexts and signs. The caller's sets have LANES
