@@ -301,7 +301,8 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                     continue;
                 }
 
-                // The sign.
+                // The sign. What it takes to predict the magnitude is computed beside it.
+                p = predict(now, 1);
                 int negative;
                 if (MODEL != BY_CONTEXTS) {
                     if (MODEL == BY_SIGNS && !filled)
@@ -315,7 +316,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 // The magnitude.
                 int k = 1;
                 for (; k < UNARY; k++) {
-                    p = predict(now, k);
+                    if (k > 1) p = predict(now, k);
                     const int more = range.code(magnitude > k, p);
                     learn_from(now, more);
                     if (!more) break;
@@ -327,7 +328,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 if (MODE == DECODE) {
                     magnitude = k;
                     if (TRELLIS) k = (int)(min<int64_t>(2 * (int64_t)k - one, 0x7fffffff));
-                    out[x] = negative ? -k : k;
+                    out[x] = (k ^ -negative) + negative;
                 }
                 if (TRELLIS) trellis = TRELLIS_NEXT[trellis][magnitude & 1];
                 if (MODEL != BY_CONTEXTS)

@@ -293,7 +293,7 @@ template <int N_MAX> FHASH_INLINE void inputs_of(const Mixed<N_MAX>& now, int16_
 // `learn` for a bit that is known where it is called.
 template <int N, bool PAIR, int RATE, int N_MAX>
 FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
-    const __m128i error = _mm_set1_epi16((int16_t)((((bit ? 65535 : 0) - now.p) * RATE) >> 4));
+    const __m128i error = _mm_set1_epi16((int16_t)((((-bit & 65535) - now.p) * RATE) >> 4));
     for (int v = 0; 4 * v < N; v++) {
         const __m128i step = rounded_high(error, now.inputs[v]);
         follow(now.first + 8 * v, step);
@@ -308,6 +308,12 @@ template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
 FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
     if (bit) learn_bit<N, PAIR, RATE>(now, 1, limit);
     else learn_bit<N, PAIR, RATE>(now, 0, limit);
+}
+
+// The same for a bit that nobody can foresee: without a branch, which would often be mistaken.
+template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
+FHASH_INLINE void learn_evenly(Mixed<N_MAX>& now, int bit, int limit) {
+    learn_bit<N, PAIR, RATE>(now, bit, limit);
 }
 
 #else
@@ -360,6 +366,11 @@ FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
         if (PAIR) now.second[i] = (int16_t)min(max(now.second[i] + step, -32767), 32767);
     }
     learn_slots<N>(now, bit, limit);
+}
+
+template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
+FHASH_INLINE void learn_evenly(Mixed<N_MAX>& now, int bit, int limit) {
+    learn<N, PAIR, RATE>(now, bit, limit);
 }
 
 #endif
