@@ -201,10 +201,11 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 }
             }
 
-            const int weight = sum_neighbours(band, row, lanes, sums) +
-                               sum_references(bands, band, row, lanes, nothing, sums);
+            const Around around = rows_around(band, row, nothing);
+            const int weight =
+                around.weight + sum_references(bands, band, row, lanes, nothing, sums);
             const int offset = 160 - log16(weight);
-            prepare_contexts(band, row, lanes, nothing, sums);
+            sum_neighbours(around, kind, lanes, sums);
             const int32_t* FHASH_RESTRICT const expected = sums.expected;
             const int32_t* FHASH_RESTRICT const plane = sums.plane;
             const int32_t* FHASH_RESTRICT const both = sums.both;
