@@ -315,26 +315,30 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
         }
         int32_t *FHASH_RESTRICT const share = sums.share, *FHASH_RESTRICT const level = sums.level;
         const int needed = min((n3 - 1) >> shift, last) + 1;
-        FHASH_INDEPENDENT
-        for (int i = 0; i < needed; i++) {
-            const int sum = around(i);
-            share[i] = REFERENCE * p[i] + AROUND * sum;
-            level[i] = twelve(sum);
+        for (int begin = 0; begin < needed; begin += VECTOR / 2) {
+            FHASH_INDEPENDENT
+            for (int i = begin; i < begin + VECTOR / 2; i++) {
+                const int sum = around(i);
+                share[i] = REFERENCE * p[i] + AROUND * sum;
+                level[i] = twelve(sum);
+            }
         }
         int done = 0;
-        if (shift == 1) {
+        if (shift == 1 && 2 * needed >= n3) {
             done = 2 * needed;
-            FHASH_INDEPENDENT
-            for (int i = 0; i < needed; i++) {
-                const int digit = min(level[i], 6) * scale;
-                expected[2 * i] += share[i];
-                expected[2 * i + 1] += share[i];
-                others[2 * i] += digit;
-                others[2 * i + 1] += digit;
-            }
-            if (k == 0) {
+            for (int begin = 0; begin < needed; begin += VECTOR / 2) {
                 FHASH_INDEPENDENT
-                for (int i = 0; i < needed; i++) parent[2 * i] = parent[2 * i + 1] = level[i];
+                for (int i = begin; i < begin + VECTOR / 2; i++) {
+                    const int digit = min(level[i], 6) * scale;
+                    expected[2 * i] += share[i];
+                    expected[2 * i + 1] += share[i];
+                    others[2 * i] += digit;
+                    others[2 * i + 1] += digit;
+                }
+                if (k) continue;
+                FHASH_INDEPENDENT
+                for (int i = begin; i < begin + VECTOR / 2; i++)
+                    parent[2 * i] = parent[2 * i + 1] = level[i];
             }
         }
         for (int x = done; x < n3; x++) {
