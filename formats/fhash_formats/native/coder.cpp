@@ -28,29 +28,40 @@ template <Mode MODE, Model MODEL, bool TRELLIS> FHASH_INLINE int64_t run(const T
     });
 }
 
-// The plain functions that are compiled for several machines.
-FHASH_CLONES int64_t encode(const Task& task) { return run<ENCODE, BY_CONTEXTS, false>(task); }
-FHASH_CLONES int64_t encode_two(const Task& task) { return run<ENCODE, BY_CONTEXTS, true>(task); }
-FHASH_CLONES int64_t choose(const Task& task) { return run<CHOOSE, BY_CONTEXTS, false>(task); }
-FHASH_CLONES int64_t decode(const Task& task) { return run<DECODE, BY_CONTEXTS, false>(task); }
-FHASH_CLONES int64_t decode_two(const Task& task) { return run<DECODE, BY_CONTEXTS, true>(task); }
-FHASH_CLONES int64_t encode_signs(const Task& task) { return run<ENCODE, BY_SIGNS, false>(task); }
-FHASH_CLONES int64_t encode_signs_two(const Task& task) {
+// The plain functions, compiled for two machines but for those that nothing but tests calls.
+FHASH_TWO_CLONES int64_t encode(const Task& task) { return run<ENCODE, BY_CONTEXTS, false>(task); }
+int64_t encode_two(const Task& task) { return run<ENCODE, BY_CONTEXTS, true>(task); }
+int64_t choose(const Task& task) { return run<CHOOSE, BY_CONTEXTS, false>(task); }
+FHASH_TWO_CLONES int64_t decode(const Task& task) { return run<DECODE, BY_CONTEXTS, false>(task); }
+int64_t decode_two(const Task& task) { return run<DECODE, BY_CONTEXTS, true>(task); }
+FHASH_TWO_CLONES int64_t encode_signs(const Task& task) {
+    return run<ENCODE, BY_SIGNS, false>(task);
+}
+FHASH_TWO_CLONES int64_t encode_signs_two(const Task& task) {
     return run<ENCODE, BY_SIGNS, true>(task);
 }
-FHASH_CLONES int64_t choose_signs(const Task& task) { return run<CHOOSE, BY_SIGNS, false>(task); }
-FHASH_CLONES int64_t decode_signs(const Task& task) { return run<DECODE, BY_SIGNS, false>(task); }
-FHASH_CLONES int64_t decode_signs_two(const Task& task) {
+FHASH_TWO_CLONES int64_t choose_signs(const Task& task) {
+    return run<CHOOSE, BY_SIGNS, false>(task);
+}
+FHASH_TWO_CLONES int64_t decode_signs(const Task& task) {
+    return run<DECODE, BY_SIGNS, false>(task);
+}
+FHASH_TWO_CLONES int64_t decode_signs_two(const Task& task) {
     return run<DECODE, BY_SIGNS, true>(task);
 }
-
-FHASH_CLONES int64_t encode_linear(const Task& task) { return run<ENCODE, BY_LINEAR, false>(task); }
-FHASH_CLONES int64_t encode_linear_two(const Task& task) {
+FHASH_TWO_CLONES int64_t encode_linear(const Task& task) {
+    return run<ENCODE, BY_LINEAR, false>(task);
+}
+FHASH_TWO_CLONES int64_t encode_linear_two(const Task& task) {
     return run<ENCODE, BY_LINEAR, true>(task);
 }
-FHASH_CLONES int64_t choose_linear(const Task& task) { return run<CHOOSE, BY_LINEAR, false>(task); }
-FHASH_CLONES int64_t decode_linear(const Task& task) { return run<DECODE, BY_LINEAR, false>(task); }
-FHASH_CLONES int64_t decode_linear_two(const Task& task) {
+FHASH_TWO_CLONES int64_t choose_linear(const Task& task) {
+    return run<CHOOSE, BY_LINEAR, false>(task);
+}
+FHASH_TWO_CLONES int64_t decode_linear(const Task& task) {
+    return run<DECODE, BY_LINEAR, false>(task);
+}
+FHASH_TWO_CLONES int64_t decode_linear_two(const Task& task) {
     return run<DECODE, BY_LINEAR, true>(task);
 }
 

@@ -236,7 +236,8 @@ FHASH_INLINE Around rows_around(const Band& band, const Row& row, const uint16_t
 }
 
 // Add the neighbours within the band, but those to the left, for `lanes` vertices: to the expected
-// magnitude, and as shares in the contexts.
+// magnitude, and with SHARES as shares in the contexts.
+template <bool SHARES>
 FHASH_INLINE void sum_neighbours(const Around& rows, int kind, int lanes, Sums& sums) {
     const uint16_t *const a = rows.above, *const a2 = rows.above2;
     const uint16_t *const b = rows.before, *const b2 = rows.before2;
@@ -258,6 +259,7 @@ FHASH_INLINE void sum_neighbours(const Around& rows, int kind, int lanes, Sums& 
             expected[x] += ABOVE * a[x] + DIAGONAL * a_sides + ABOVE2 * a2[x] +
                            BEFORE * (b[x] + d[x]) + BEFORE2 * (b2[x] + d2[x]) +
                            AROUND * (b_sides + b_near + d_sides + d_near);
+            if (!SHARES) continue;
             const int in_plane = 2 * a[x] + a_sides + a2[x];
             const int before = 2 * b[x] + b_sides + b_near, below = 2 * d[x] + d_sides + d_near;
             const int side = twelve(before) * 12 + twelve(below), sum = before + below;
@@ -276,7 +278,8 @@ FHASH_INLINE void sum_neighbours(const Around& rows, int kind, int lanes, Sums& 
     }
 }
 
-// Begin the sums of a row with those over its references. Sum of the weights of the references that exist.
+// Begin the sums of a row with those over its references. Sum of the weights of the references that
+// exist.
 FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band, const Row& row,
                                 int lanes, const uint16_t* nothing, Sums& sums) {
     const int n3 = band.size[3];

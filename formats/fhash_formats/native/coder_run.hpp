@@ -62,16 +62,18 @@ template <Mode MODE, Model MODEL, bool TRELLIS> struct Coder {
         Decision<MODEL> other;
         const double zero = s * s + lambda * tables.cost[p];
         const double other_than_zero = lambda * (tables.cost[65536 - p] + 2048);
+        // The probabilities that it is more than `nearest` - 1, if that is asked, and `nearest`.
+        const int first = max(nearest - 1, 1);
+        int more[2];
+        for (int k = first; k <= nearest; k++) more[k - first] = predict(other, k);
         if (nearest == 1) {
-            const int stop = predict(other, 1);
-            const double one = (s - 1) * (s - 1) + lambda * tables.cost[65536 - stop];
+            const double one = (s - 1) * (s - 1) + lambda * tables.cost[65536 - more[0]];
             return zero <= one + other_than_zero ? 0 : 1;
         }
-        const int before = predict(other, nearest - 1), stop = predict(other, nearest);
         const double same = (s - nearest) * (s - nearest) +
-                            lambda * (tables.cost[before] + tables.cost[65536 - stop]);
+                            lambda * (tables.cost[more[0]] + tables.cost[65536 - more[1]]);
         const double less = (s - nearest + 1) * (s - nearest + 1) +
-                            lambda * tables.cost[65536 - before];
+                            lambda * tables.cost[65536 - more[0]];
         if (nearest == 2 && zero < min(same, less) + other_than_zero) return 0;
         return less < same ? nearest - 1 : nearest;
     }
@@ -205,7 +207,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
             const int weight =
                 around.weight + sum_references(bands, band, row, lanes, nothing, sums);
             const int offset = 160 - log16(weight);
-            sum_neighbours(around, kind, lanes, sums);
+            sum_neighbours<true>(around, kind, lanes, sums);
             const int32_t* FHASH_RESTRICT const expected = sums.expected;
             const int32_t* FHASH_RESTRICT const plane = sums.plane;
             const int32_t* FHASH_RESTRICT const both = sums.both;

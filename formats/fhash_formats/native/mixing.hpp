@@ -375,8 +375,8 @@ FHASH_INLINE void learn_evenly(Mixed<N_MAX>& now, int bit, int limit) {
 
 #endif
 
-// Whether `learn` changes nothing when a 1 comes after `mix`: no estimate moves, and the error is so
-// small that the step of every weight is rounded to 0.
+// Whether `learn` changes nothing when a 1 comes after `mix`: no estimate moves, and the error is
+// so small that the step of every weight is rounded to 0.
 template <int N, int RATE = LEARNING_RATE, int N_MAX>
 FHASH_INLINE bool settled_at_one(const Mixed<N_MAX>& now, int limit) {
     const int error = ((65535 - now.p) * RATE) >> 4;
