@@ -28,29 +28,40 @@ template <Mode MODE, Model MODEL, bool TRELLIS> FHASH_INLINE int64_t run(const T
     });
 }
 
-// The plain functions that are compiled for several machines.
-FHASH_CLONES int64_t encode(const Task& task) { return run<ENCODE, BY_CONTEXTS, false>(task); }
-FHASH_CLONES int64_t encode_two(const Task& task) { return run<ENCODE, BY_CONTEXTS, true>(task); }
-FHASH_CLONES int64_t choose(const Task& task) { return run<CHOOSE, BY_CONTEXTS, false>(task); }
-FHASH_CLONES int64_t decode(const Task& task) { return run<DECODE, BY_CONTEXTS, false>(task); }
-FHASH_CLONES int64_t decode_two(const Task& task) { return run<DECODE, BY_CONTEXTS, true>(task); }
-FHASH_CLONES int64_t encode_signs(const Task& task) { return run<ENCODE, BY_SIGNS, false>(task); }
-FHASH_CLONES int64_t encode_signs_two(const Task& task) {
+// The plain functions, compiled for two machines but for those that nothing but tests calls.
+FHASH_TWO_CLONES int64_t encode(const Task& task) { return run<ENCODE, BY_CONTEXTS, false>(task); }
+int64_t encode_two(const Task& task) { return run<ENCODE, BY_CONTEXTS, true>(task); }
+int64_t choose(const Task& task) { return run<CHOOSE, BY_CONTEXTS, false>(task); }
+FHASH_TWO_CLONES int64_t decode(const Task& task) { return run<DECODE, BY_CONTEXTS, false>(task); }
+int64_t decode_two(const Task& task) { return run<DECODE, BY_CONTEXTS, true>(task); }
+FHASH_TWO_CLONES int64_t encode_signs(const Task& task) {
+    return run<ENCODE, BY_SIGNS, false>(task);
+}
+FHASH_TWO_CLONES int64_t encode_signs_two(const Task& task) {
     return run<ENCODE, BY_SIGNS, true>(task);
 }
-FHASH_CLONES int64_t choose_signs(const Task& task) { return run<CHOOSE, BY_SIGNS, false>(task); }
-FHASH_CLONES int64_t decode_signs(const Task& task) { return run<DECODE, BY_SIGNS, false>(task); }
-FHASH_CLONES int64_t decode_signs_two(const Task& task) {
+FHASH_TWO_CLONES int64_t choose_signs(const Task& task) {
+    return run<CHOOSE, BY_SIGNS, false>(task);
+}
+FHASH_TWO_CLONES int64_t decode_signs(const Task& task) {
+    return run<DECODE, BY_SIGNS, false>(task);
+}
+FHASH_TWO_CLONES int64_t decode_signs_two(const Task& task) {
     return run<DECODE, BY_SIGNS, true>(task);
 }
-
-FHASH_CLONES int64_t encode_linear(const Task& task) { return run<ENCODE, BY_LINEAR, false>(task); }
-FHASH_CLONES int64_t encode_linear_two(const Task& task) {
+FHASH_TWO_CLONES int64_t encode_linear(const Task& task) {
+    return run<ENCODE, BY_LINEAR, false>(task);
+}
+FHASH_TWO_CLONES int64_t encode_linear_two(const Task& task) {
     return run<ENCODE, BY_LINEAR, true>(task);
 }
-FHASH_CLONES int64_t choose_linear(const Task& task) { return run<CHOOSE, BY_LINEAR, false>(task); }
-FHASH_CLONES int64_t decode_linear(const Task& task) { return run<DECODE, BY_LINEAR, false>(task); }
-FHASH_CLONES int64_t decode_linear_two(const Task& task) {
+FHASH_TWO_CLONES int64_t choose_linear(const Task& task) {
+    return run<CHOOSE, BY_LINEAR, false>(task);
+}
+FHASH_TWO_CLONES int64_t decode_linear(const Task& task) {
+    return run<DECODE, BY_LINEAR, false>(task);
+}
+FHASH_TWO_CLONES int64_t decode_linear_two(const Task& task) {
     return run<DECODE, BY_LINEAR, true>(task);
 }
 
@@ -111,13 +122,15 @@ FHASH_EXPORT int64_t fhash_encode(int32_t* q, const float* scaled, double lambda
         State state = make_state(slots, slot_count, weights, min(weight_count, BASE_WEIGHTS),
                                  simples, simple_count, LANES);
         const Predictors with(model, state, weights);
+        Flags flags(state);
         std::vector<uint8_t> out;
-        const Task task = {&state, with.signs.get(), with.magnitudes.get(), q, scaled,
+        const Task task = {&state, &flags, with.signs.get(), with.magnitudes.get(), q, scaled,
                            lambda / 2048, shape, table, count, &out, nullptr, 0};
         const int64_t code = encode_task(task, model, trellis);
         if (code < 0) return code;
         const int64_t size = put(out, data, capacity);
         if (keep && size <= capacity) {
+            flags.keep(state);
             keep_state(state, slots, weights, simples, LANES);
             with.keep(weights);
         }
@@ -137,7 +150,8 @@ FHASH_EXPORT int64_t fhash_decode(int32_t* q, int64_t model, int64_t trellis, co
         State state = make_state(slots, slot_count, weights, min(weight_count, BASE_WEIGHTS),
                                  simples, simple_count, LANES);
         const Predictors with(model, state, const_cast<int32_t*>(weights));
-        const Task task = {&state, with.signs.get(), with.magnitudes.get(), q, nullptr, 0,
+        Flags flags(state);
+        const Task task = {&state, &flags, with.signs.get(), with.magnitudes.get(), q, nullptr, 0,
                            shape, table, count, nullptr, data, size};
         return decode_task(task, model, trellis);
     });

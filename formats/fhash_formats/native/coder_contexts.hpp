@@ -40,6 +40,8 @@ const int BEFORE = 102, AROUND = 20, BEFORE2 = 31;  // before along t or z, arou
 const int REFERENCE = 62;  // the vertex of a reference; the sum around it has weight AROUND
 
 const int SIZES[CONTEXTS] = {LEVELS, KINDS * 64, 729, 12 * 12 * 12, 7 * 7 * 7 * 7, 12 * 12 * KINDS};
+const int64_t ALL_CONTEXTS =
+    int64_t(LEVELS + KINDS * 64 + 729 + 12 * 12 * 12 + 7 * 7 * 7 * 7 + 12 * 12 * KINDS);
 const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27};
 
 // Order of the state. Slots: by context, those of the decisions of a context together; then those
@@ -47,6 +49,27 @@ const int SIGN_SIZES[SIGN_CONTEXTS] = {KINDS * 27, KINDS * 81, KINDS * 27};
 // Simple estimates: of the escape code; from ROWS on of empty rows; from EMPTIES on of empty bands.
 const int64_t SECOND = int64_t(KINDS) * DECISIONS * SET, SIGNS = SECOND + 64 * DECISIONS * SET;
 const int64_t ROWS = LEVELS * 64, EMPTIES = ROWS + 8;
+
+// The slots of zero flags, those of both classes of a context together: few lines of the cache hold
+// what most vertices use. As long as a run lasts, the slots of the state have none of them.
+struct Flags {
+    std::vector<Slot> slots;
+
+    explicit Flags(const State& state) : slots((size_t)(2 * ALL_CONTEXTS)) {
+        const Slot* from = state.slots.data();
+        for (size_t i = 0; i < slots.size(); i += 2, from += DECISIONS) {
+            slots[i] = from[0];
+            slots[i + 1] = from[UNARY];
+        }
+    }
+    void keep(State& state) const {
+        Slot* to = state.slots.data();
+        for (size_t i = 0; i < slots.size(); i += 2, to += DECISIONS) {
+            to[0] = slots[i];
+            to[UNARY] = slots[i + 1];
+        }
+    }
+};
 
 enum Mode { ENCODE, DECODE, CHOOSE };  // CHOOSE encodes magnitudes chosen by rate and distortion
 // What predicts, in the order of CODERS in coder.py.
@@ -82,21 +105,27 @@ FHASH_INLINE int after_zeros(int state, int64_t n) {
 }
 
 // 0 for a negative number, 1 for 0, 2 for a positive number.
-FHASH_INLINE int sign_of(int32_t v) { return v > 0 ? 2 : v < 0 ? 0 : 1; }
+FHASH_INLINE int sign_of(int32_t v) { return 1 + (v > 0) - (v < 0); }
 
 using Prediction = Mixed<CONTEXTS>;
+
+// Level of a weighted sum; offset: added to 16ths of its octaves.
+FHASH_INLINE int level_of(uint32_t mu, int offset) {
+    return mu ? min((log16(mu) + offset) / 4 + 1, LEVELS - 1) : 0;
+}
 
 // Numbers by vertex of a row, from the neighbours that are known before the row.
 struct Sums {
     std::vector<int32_t> room;
     int32_t *expected;                // weighted sum for the expected magnitude
-    int32_t *plane, *before, *below;  // sums over the rows above, the step before, the layer below
-    int32_t *both, *nearest, *sides, *others, *parent;  // shares in the contexts
+    int32_t *plane, *both;            // sums over the rows above; the step before and layer below
+    int32_t *nearest, *sides, *others, *parent;  // shares in the contexts
     int32_t *share, *level;           // by vertex of a reference: share in `expected`, class
+    int32_t *near, *wide;             // contexts where both neighbours to the left are 0
     explicit Sums(size_t width) : room(11 * width) {
         int32_t* at = room.data();
-        for (int32_t** array : {&expected, &plane, &before, &below, &both, &nearest, &sides,
-                                &others, &parent, &share, &level}) {
+        for (int32_t** array : {&expected, &plane, &both, &nearest, &sides,
+                                &others, &parent, &share, &level, &near, &wide}) {
             *array = at;
             at += width;
         }
@@ -147,7 +176,8 @@ inline bool read_bands(const int32_t* table, const int64_t* shape, std::vector<B
     return true;
 }
 
-// Find the row of each reference that stands for this row. Whether the row of the parent is filled.
+// Find the row of each reference that stands for this row; none where it and the rows above and
+// below it are zeros, which add nothing. Whether the row of the parent is filled.
 FHASH_INLINE int find_references(const std::vector<Band>& bands, const Band& band, Row& row) {
     int parent_filled = 0;
     for (int k = 0; k < REFERENCE_COUNT; k++) {
@@ -160,101 +190,102 @@ FHASH_INLINE int find_references(const std::vector<Band>& bands, const Band& ban
         const int z = min(row.z >> to.shift[1], other.size[1] - 1);
         const int y = min(row.y >> to.shift[2], other.size[2] - 1);
         row.reference_y[k] = y;
-        row.references[k] = other.magnitudes.data() + t * other.stride[0] + z * other.stride[1] +
-                            y * other.stride[2] + PADDING;
-        if (k == 0)
-            parent_filled = other.filled[((int64_t)t * other.size[1] + z) * other.size[2] + y];
+        const uint8_t* const filled =
+            other.filled.data() + ((int64_t)t * other.size[1] + z) * other.size[2] + y;
+        if (k == 0) parent_filled = filled[0];
+        if (filled[0] || (y > 0 && filled[-1]) || (y + 1 < other.size[2] && filled[1]))
+            row.references[k] = other.magnitudes.data() + t * other.stride[0] +
+                                z * other.stride[1] + y * other.stride[2] + PADDING;
     }
     return parent_filled;
 }
 
-// Sum over the neighbours of a row within its band, but those to the left, for `lanes` vertices.
-// Sum of the weights of the neighbours that exist, those to the left included.
-FHASH_INLINE int sum_neighbours(const Band& band, const Row& row, int lanes, Sums& sums) {
+// The rows around a row of a band, each a row of zeros where there is none.
+struct Around {
+    const uint16_t *above, *above2;
+    const uint16_t *before, *before2, *before_near[4];  // step t - 1: z and y by -1 and by +1
+    const uint16_t *below, *below2, *below_near[2];     // layer z - 1: y by -1 and by +1
+    int weight;  // sum of the weights of the neighbours that exist, those to the left included
+};
+
+FHASH_INLINE Around rows_around(const Band& band, const Row& row, const uint16_t* nothing) {
     const int t = row.t, z = row.z, y = row.y, n1 = band.size[1], n2 = band.size[2];
-    const bool has_y = y > 0, has_z = z > 0, has_t = t > 0;
-    // Magnitudes and flags of this row, and the strides of both.
     const uint16_t* const M = row.magnitudes;
-    const uint8_t* const F = row.filled;
     const int64_t M0 = band.stride[0], M1 = band.stride[1], M2 = band.stride[2];
-    const int64_t R1 = n2, R0 = (int64_t)n1 * n2;
-    int32_t* FHASH_RESTRICT const expected = sums.expected;
-    int32_t* FHASH_RESTRICT const plane = sums.plane;
-    for (int32_t* array : {sums.expected, sums.plane, sums.before, sums.below})
-        std::memset(array, 0, 4 * (size_t)lanes);
-    int weight = LEFT + LEFT2;
-    if (has_y) {
-        weight += ABOVE + 2 * DIAGONAL;
-        if (F[-1]) {
-            const uint16_t* p = M - M2;
-            FHASH_INDEPENDENT
-            for (int x = 0; x < lanes; x++) {
-                const int sides = p[x - 1] + p[x + 1];
-                expected[x] += ABOVE * p[x] + DIAGONAL * sides;
-                plane[x] += 2 * p[x] + sides;
-            }
-        }
-        if (y > 1) weight += ABOVE2;
-        if (y > 1 && F[-2]) {
-            const uint16_t* p = M - 2 * M2;
-            FHASH_INDEPENDENT
-            for (int x = 0; x < lanes; x++) {
-                expected[x] += ABOVE2 * p[x];
-                plane[x] += p[x];
-            }
-        }
-    }
-    // Add the row p one step or layer before; r is the offset of its flag.
-    auto centre = [&](int32_t* FHASH_RESTRICT sum, int64_t r, const uint16_t* p) FHASH_LAMBDA {
-        if (!F[r]) return;
-        FHASH_INDEPENDENT
-        for (int x = 0; x < lanes; x++) {
-            const int sides = p[x - 1] + p[x + 1];
-            expected[x] += BEFORE * p[x] + AROUND * sides;
-            sum[x] += 2 * p[x] + sides;
-        }
+    auto at = [&](bool exists, int64_t offset) FHASH_LAMBDA {
+        return exists ? M + offset : nothing;
     };
-    // Add a row beside that one, if it exists.
-    auto neighbour = [&](int32_t* FHASH_RESTRICT sum, bool exists, int64_t r,
-                         const uint16_t* p) FHASH_LAMBDA {
-        if (!exists || !F[r]) return;
-        FHASH_INDEPENDENT
-        for (int x = 0; x < lanes; x++) {
-            expected[x] += AROUND * p[x];
-            sum[x] += p[x];
-        }
-    };
-    // Add the row two steps or layers before.
-    auto second = [&](int64_t r, const uint16_t* p) FHASH_LAMBDA {
-        if (!F[r]) return;
-        FHASH_INDEPENDENT
-        for (int x = 0; x < lanes; x++) expected[x] += BEFORE2 * p[x];
-    };
-    if (has_t) {
-        weight += BEFORE + 4 * AROUND + (t > 1 ? BEFORE2 : 0);
-        centre(sums.before, -R0, M - M0);
-        neighbour(sums.before, has_y, -R0 - 1, M - M0 - M2);
-        neighbour(sums.before, y + 1 < n2, -R0 + 1, M - M0 + M2);
-        neighbour(sums.before, has_z, -R0 - R1, M - M0 - M1);
-        neighbour(sums.before, z + 1 < n1, -R0 + R1, M - M0 + M1);
-        if (t > 1) second(-2 * R0, M - 2 * M0);
-    }
-    if (has_z) {
-        weight += BEFORE + 4 * AROUND + (z > 1 ? BEFORE2 : 0);
-        centre(sums.below, -R1, M - M1);
-        neighbour(sums.below, has_y, -R1 - 1, M - M1 - M2);
-        neighbour(sums.below, y + 1 < n2, -R1 + 1, M - M1 + M2);
-        if (z > 1) second(-2 * R1, M - 2 * M1);
-    }
-    return weight;
+    Around to;
+    to.above = at(y > 0, -M2);
+    to.above2 = at(y > 1, -2 * M2);
+    to.before = at(t > 0, -M0);
+    to.before2 = at(t > 1, -2 * M0);
+    to.before_near[0] = at(t > 0 && z > 0, -M0 - M1);
+    to.before_near[1] = at(t > 0 && z + 1 < n1, -M0 + M1);
+    to.before_near[2] = at(t > 0 && y > 0, -M0 - M2);
+    to.before_near[3] = at(t > 0 && y + 1 < n2, -M0 + M2);
+    to.below = at(z > 0, -M1);
+    to.below2 = at(z > 1, -2 * M1);
+    to.below_near[0] = at(z > 0 && y > 0, -M1 - M2);
+    to.below_near[1] = at(z > 0 && y + 1 < n2, -M1 + M2);
+    to.weight = LEFT + LEFT2;
+    if (y > 0) to.weight += ABOVE + 2 * DIAGONAL + (y > 1 ? ABOVE2 : 0);
+    if (t > 0) to.weight += BEFORE + 4 * AROUND + (t > 1 ? BEFORE2 : 0);
+    if (z > 0) to.weight += BEFORE + 4 * AROUND + (z > 1 ? BEFORE2 : 0);
+    return to;
 }
 
-// Sum over the references of a row. Sum of the weights of the references that exist.
+// Add the neighbours within the band, but those to the left, for `lanes` vertices: to the expected
+// magnitude, and with SHARES as shares in the contexts.
+template <bool SHARES>
+FHASH_INLINE void sum_neighbours(const Around& rows, int kind, int lanes, Sums& sums) {
+    const uint16_t *const a = rows.above, *const a2 = rows.above2;
+    const uint16_t *const b = rows.before, *const b2 = rows.before2;
+    const uint16_t *const bp = rows.before_near[0], *const bf = rows.before_near[1];
+    const uint16_t *const bn = rows.before_near[2], *const bs = rows.before_near[3];
+    const uint16_t *const d = rows.below, *const d2 = rows.below2;
+    const uint16_t *const dn = rows.below_near[0], *const ds = rows.below_near[1];
+    int32_t *FHASH_RESTRICT const expected = sums.expected, *FHASH_RESTRICT const both = sums.both;
+    int32_t *FHASH_RESTRICT const plane = sums.plane, *FHASH_RESTRICT const parent = sums.parent;
+    int32_t *FHASH_RESTRICT const near = sums.near, *FHASH_RESTRICT const wide = sums.wide;
+    int32_t *FHASH_RESTRICT const sides = sums.sides;
+    int32_t* FHASH_RESTRICT const nearest = sums.nearest;
+    for (int begin = 0; begin < lanes; begin += VECTOR) {
+        FHASH_INDEPENDENT
+        for (int x = begin; x < begin + VECTOR; x++) {
+            const int a_sides = a[x - 1] + a[x + 1];
+            const int b_sides = b[x - 1] + b[x + 1], b_near = bp[x] + bf[x] + bn[x] + bs[x];
+            const int d_sides = d[x - 1] + d[x + 1], d_near = dn[x] + ds[x];
+            expected[x] += ABOVE * a[x] + DIAGONAL * a_sides + ABOVE2 * a2[x] +
+                           BEFORE * (b[x] + d[x]) + BEFORE2 * (b2[x] + d2[x]) +
+                           AROUND * (b_sides + b_near + d_sides + d_near);
+            if (!SHARES) continue;
+            const int in_plane = 2 * a[x] + a_sides + a2[x];
+            const int before = 2 * b[x] + b_sides + b_near, below = 2 * d[x] + d_sides + d_near;
+            const int side = twelve(before) * 12 + twelve(below), sum = before + below;
+            int digits = min<int>(a[x], 2) * 3 + min<int>(a[x - 1], 2);
+            digits = digits * 3 + min<int>(a[x + 1], 2);
+            digits = digits * 3 + min<int>(b[x], 2);
+            nearest[x] = digits * 3 + min<int>(d[x], 2);
+            plane[x] = in_plane;
+            sides[x] = side;
+            both[x] = sum;
+            const int of_parent = parent[x] * KINDS + kind;
+            parent[x] = of_parent;
+            near[x] = twelve(in_plane) * 144 + side;
+            wide[x] = twelve((in_plane + sum) >> 1) * (12 * KINDS) + of_parent;
+        }
+    }
+}
+
+// Begin the sums of a row with those over its references. Sum of the weights of the references that
+// exist.
 FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band, const Row& row,
                                 int lanes, const uint16_t* nothing, Sums& sums) {
     const int n3 = band.size[3];
     int32_t* FHASH_RESTRICT const expected = sums.expected;
     int32_t *FHASH_RESTRICT const others = sums.others, *FHASH_RESTRICT const parent = sums.parent;
+    std::memset(sums.expected, 0, 4 * (size_t)lanes);
     std::memset(sums.others, 0, 4 * (size_t)lanes);
     std::memset(sums.parent, 0, 4 * (size_t)lanes);
     int weight = 0;
@@ -272,27 +303,48 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
             return 2 * p[i] + p[i - 1] + p[i + 1] + up[i] + down[i];
         };
         if (shift == 0 && last >= n3 - 1) {
-            FHASH_INDEPENDENT
-            for (int x = 0; x < lanes; x++) {
-                const int sum = around(x);
-                expected[x] += REFERENCE * p[x] + AROUND * sum;
-                others[x] += seven(sum) * scale;
-            }
-            if (k == 0) {
+            for (int begin = 0; begin < lanes; begin += VECTOR) {
                 FHASH_INDEPENDENT
-                for (int x = 0; x < lanes; x++) parent[x] = twelve(around(x));
+                for (int x = begin; x < begin + VECTOR; x++) {
+                    const int sum = around(x);
+                    expected[x] += REFERENCE * p[x] + AROUND * sum;
+                    others[x] += seven(sum) * scale;
+                }
+                if (k) continue;
+                FHASH_INDEPENDENT
+                for (int x = begin; x < begin + VECTOR; x++) parent[x] = twelve(around(x));
             }
             continue;
         }
         int32_t *FHASH_RESTRICT const share = sums.share, *FHASH_RESTRICT const level = sums.level;
         const int needed = min((n3 - 1) >> shift, last) + 1;
-        FHASH_INDEPENDENT
-        for (int i = 0; i < needed; i++) {
-            const int sum = around(i);
-            share[i] = REFERENCE * p[i] + AROUND * sum;
-            level[i] = twelve(sum);
+        for (int begin = 0; begin < needed; begin += VECTOR / 2) {
+            FHASH_INDEPENDENT
+            for (int i = begin; i < begin + VECTOR / 2; i++) {
+                const int sum = around(i);
+                share[i] = REFERENCE * p[i] + AROUND * sum;
+                level[i] = twelve(sum);
+            }
         }
-        for (int x = 0; x < n3; x++) {
+        int done = 0;
+        if (shift == 1 && 2 * needed >= n3) {
+            done = 2 * needed;
+            for (int begin = 0; begin < needed; begin += VECTOR / 2) {
+                FHASH_INDEPENDENT
+                for (int i = begin; i < begin + VECTOR / 2; i++) {
+                    const int digit = min(level[i], 6) * scale;
+                    expected[2 * i] += share[i];
+                    expected[2 * i + 1] += share[i];
+                    others[2 * i] += digit;
+                    others[2 * i + 1] += digit;
+                }
+                if (k) continue;
+                FHASH_INDEPENDENT
+                for (int i = begin; i < begin + VECTOR / 2; i++)
+                    parent[2 * i] = parent[2 * i + 1] = level[i];
+            }
+        }
+        for (int x = done; x < n3; x++) {
             const int i = min(x >> shift, last);
             expected[x] += share[i];
             others[x] += min(level[i], 6) * scale;
@@ -300,28 +352,6 @@ FHASH_INLINE int sum_references(const std::vector<Band>& bands, const Band& band
         }
     }
     return weight;
-}
-
-// Shares in the contexts of a row that do not depend on the vertices to the left.
-FHASH_INLINE void prepare_contexts(const Band& band, const Row& row, int lanes,
-                                   const uint16_t* nothing, Sums& sums) {
-    const int kind = band.kind;
-    const uint16_t* const above = row.y > 0 ? row.magnitudes - band.stride[2] : nothing;
-    const uint16_t* const below = row.z > 0 ? row.magnitudes - band.stride[1] : nothing;
-    const uint16_t* const before = row.t > 0 ? row.magnitudes - band.stride[0] : nothing;
-    int32_t *FHASH_RESTRICT const both = sums.both, *FHASH_RESTRICT const nearest = sums.nearest;
-    int32_t *FHASH_RESTRICT const sides = sums.sides, *FHASH_RESTRICT const parent = sums.parent;
-    FHASH_INDEPENDENT
-    for (int x = 0; x < lanes; x++) {
-        const int sum_before = sums.before[x], sum_below = sums.below[x];
-        int digits = min<int>(above[x], 2) * 3 + min<int>(above[x - 1], 2);
-        digits = digits * 3 + min<int>(above[x + 1], 2);
-        digits = digits * 3 + min<int>(before[x], 2);
-        nearest[x] = digits * 3 + min<int>(below[x], 2);
-        sides[x] = twelve(sum_before) * 12 + twelve(sum_below);
-        both[x] = sum_before + sum_below;
-        parent[x] = parent[x] * KINDS + kind;
-    }
 }
 
 }  // namespace

@@ -170,10 +170,9 @@ struct Magnitudes {
         to[63] = (int16_t)(linear_tables.log[min(x, MAX_INPUT_MAGNITUDE)] / 4);
     }
 
-    // Predict decision k (with the classes of the quantisers). slots: of the estimates.
-    FHASH_INLINE int predict(Guess& to, Slot* const* slots, const Vertex& vertex, int k) {
+    // Predict decision k (with the classes of the quantisers). The slots of its estimates are set.
+    FHASH_INLINE int predict(Guess& to, const Vertex& vertex, int k) {
         static const int16_t none[MIX_INPUTS] = {};
-        for (int i = 0; i < CONTEXTS; i++) to.contexts.slots[i] = slots[i] + k;
         to.contexts.first = to.contexts.second = const_cast<int16_t*>(none);
         mix<CONTEXTS, false>(to.contexts);
         inputs_of(to.contexts, to.inputs);

@@ -14,6 +14,7 @@ namespace {
 // to read.
 struct Task {
     State* state;
+    Flags* flags;
     Signs* signs;            // null BY_CONTEXTS
     Magnitudes* magnitudes;  // null but BY_LINEAR
     int32_t* q;
@@ -61,16 +62,18 @@ template <Mode MODE, Model MODEL, bool TRELLIS> struct Coder {
         Decision<MODEL> other;
         const double zero = s * s + lambda * tables.cost[p];
         const double other_than_zero = lambda * (tables.cost[65536 - p] + 2048);
+        // The probabilities that it is more than `nearest` - 1, if that is asked, and `nearest`.
+        const int first = max(nearest - 1, 1);
+        int more[2];
+        for (int k = first; k <= nearest; k++) more[k - first] = predict(other, k);
         if (nearest == 1) {
-            const int stop = predict(other, 1);
-            const double one = (s - 1) * (s - 1) + lambda * tables.cost[65536 - stop];
+            const double one = (s - 1) * (s - 1) + lambda * tables.cost[65536 - more[0]];
             return zero <= one + other_than_zero ? 0 : 1;
         }
-        const int before = predict(other, nearest - 1), stop = predict(other, nearest);
         const double same = (s - nearest) * (s - nearest) +
-                            lambda * (tables.cost[before] + tables.cost[65536 - stop]);
+                            lambda * (tables.cost[more[0]] + tables.cost[65536 - more[1]]);
         const double less = (s - nearest + 1) * (s - nearest + 1) +
-                            lambda * tables.cost[65536 - before];
+                            lambda * tables.cost[65536 - more[0]];
         if (nearest == 2 && zero < min(same, less) + other_than_zero) return 0;
         return less < same ? nearest - 1 : nearest;
     }
@@ -125,12 +128,14 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
     if (!read_bands(task.table, shape, bands)) return -1;
     int widest = 0;
     for (const Band& band : bands) widest = max(widest, band.size[3]);
-    Slot* slots[CONTEXTS];
+    Slot *slots[CONTEXTS], *flags[CONTEXTS];
     Slot* signs[SIGN_CONTEXTS];
-    Slot* at = state->slots.data();
+    Slot *at = state->slots.data(), *flag_at = task.flags->slots.data();
     for (int i = 0; i < CONTEXTS; i++) {
         slots[i] = at;
+        flags[i] = flag_at;
         at += (int64_t)SIZES[i] * DECISIONS;
+        flag_at += (int64_t)SIZES[i] * 2;
     }
     for (int i = 0; i < SIGN_CONTEXTS; i++) {
         signs[i] = at;
@@ -146,6 +151,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
     const int16_t* const no_log = no_logs.data() + (MODEL != BY_CONTEXTS ? LOG_PADDING : 0);
     Logs logs;
     int trellis = 0;
+    int settled[2] = {0, 0};  // by class: probability of a 0 among zeros, as long as it stays
 
     for (int64_t number = 0; number < count; number++) {
         Band& band = bands[number];
@@ -162,6 +168,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
             }
         any = simple(any, EMPTIES + kind);
         band.any = any != 0;
+        settled[0] = settled[1] = 0;
         if (!any) {
             if (TRELLIS) trellis = after_zeros(trellis, (int64_t)n0 * n1 * n2 * n3);
             continue;
@@ -196,10 +203,11 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 }
             }
 
-            const int weight = sum_neighbours(band, row, lanes, sums) +
-                               sum_references(bands, band, row, lanes, nothing, sums);
+            const Around around = rows_around(band, row, nothing);
+            const int weight =
+                around.weight + sum_references(bands, band, row, lanes, nothing, sums);
             const int offset = 160 - log16(weight);
-            prepare_contexts(band, row, lanes, nothing, sums);
+            sum_neighbours<true>(around, kind, lanes, sums);
             const int32_t* FHASH_RESTRICT const expected = sums.expected;
             const int32_t* FHASH_RESTRICT const plane = sums.plane;
             const int32_t* FHASH_RESTRICT const both = sums.both;
@@ -207,26 +215,41 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
             const int32_t* FHASH_RESTRICT const sides = sums.sides;
             const int32_t* FHASH_RESTRICT const others = sums.others;
             const int32_t* FHASH_RESTRICT const parent = sums.parent;
+            const int32_t* FHASH_RESTRICT const nears = sums.near;
+            const int32_t* FHASH_RESTRICT const wide = sums.wide;
             int filled = 0, left = 0, left2 = 0;
             if (MODEL == BY_LINEAR) find_logs(bands, band, t, z, y, no_log, logs);
 
+            // Whether the integer at x is, or may be read as, 0 without a choice.
+            auto may_be_zero = [&](const int32_t* from, int x) FHASH_LAMBDA {
+                if (MODE == DECODE) return true;
+                if (MODE == ENCODE) return from[x] == 0;
+                if (!(std::fabs(scaled[from - q + x]) < 0.5F)) return false;
+                out[x] = 0;
+                return true;
+            };
+
             for (int x = 0; x < n3; x++) {
                 const uint32_t mu = (uint32_t)(expected[x] + LEFT * left + LEFT2 * left2);
-                const int level = mu ? min((log16(mu) + offset) / 4 + 1, LEVELS - 1) : 0;
-                const int coarse = level / 2;
-                const int near = plane[x] + 2 * left + left2;
-                const int context[CONTEXTS] = {
-                    level,
-                    kind * 64 + coarse,
-                    min(left, 2) * 243 + nearest[x],
-                    small(near) * 144 + sides[x],
-                    others[x],
-                    small((near + both[x]) / 2) * (12 * KINDS) + parent[x],
-                };
-                Slot* places[CONTEXTS];
-                for (int i = 0; i < CONTEXTS; i++)
-                    places[i] = slots[i] + (int64_t)context[i] * DECISIONS;
                 const int one = TRELLIS ? trellis & 1 : 0;  // class of the quantiser
+                // Where all around is 0 and nothing moves any more, only the range does.
+                int begun = 0;
+                if (MODEL != BY_LINEAR && !mu && settled[one] && may_be_zero(out, x)) {
+                    if (range.code(1, (uint32_t)settled[one])) {
+                        if (TRELLIS) trellis = TRELLIS_NEXT[trellis][0];
+                        continue;
+                    }
+                    begun = 1;
+                }
+                const int level = level_of(mu, offset), coarse = level / 2;
+                const int near = plane[x] + 2 * left + left2;
+                int context[CONTEXTS] = {level,    kind * 64 + coarse, nearest[x],
+                                         nears[x], others[x],          wide[x]};
+                if (left | left2) {
+                    context[2] += min(left, 2) * 243;
+                    context[3] = small(near) * 144 + sides[x];
+                    context[5] = small((near + both[x]) / 2) * (12 * KINDS) + parent[x];
+                }
                 const Vertex vertex = {kind,
                                        coarse,
                                        near,
@@ -237,10 +260,15 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 if constexpr (MODEL == BY_LINEAR) task.magnitudes->gather(logs, x, vertex);
                 auto predict = [&](Decision<MODEL>& to, int asked) FHASH_LAMBDA {
                     const int k = TRELLIS && one && asked < SHARED ? UNARY + asked : asked;
+                    Slot** places;
+                    if constexpr (MODEL == BY_LINEAR) places = to.contexts.slots;
+                    else places = to.slots;
+                    for (int i = 0; i < CONTEXTS; i++)
+                        places[i] = asked ? slots[i] + (int64_t)context[i] * DECISIONS + k
+                                          : flags[i] + (int64_t)context[i] * 2 + one;
                     if constexpr (MODEL == BY_LINEAR) {
-                        return task.magnitudes->predict(to, places, vertex, k);
+                        return task.magnitudes->predict(to, vertex, k);
                     } else {
-                        for (int i = 0; i < CONTEXTS; i++) to.slots[i] = places[i] + k;
                         to.first = weights + ((int64_t)k * KINDS + kind) * SET;
                         to.second = weights + SECOND + ((int64_t)k * 64 + coarse) * SET;
                         return mix<CONTEXTS, true>(to);
@@ -261,8 +289,14 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                     out[x] = value = s < 0 ? -best : best;
                 }
                 int magnitude = TRELLIS ? (std::abs(value) + one) / 2 : std::abs(value);
-                const int zero = range.code(magnitude == 0, p);
-                learn_from(now, zero);
+                const int zero = begun ? 0 : range.code(magnitude == 0, p);
+                if constexpr (MODEL != BY_LINEAR) {
+                    const bool stays = !mu && zero && settled_at_one<CONTEXTS>(now, SLOW_LIMIT);
+                    settled[one] = stays ? p : 0;
+                    if (!stays) learn_from(now, zero);
+                } else {
+                    learn_from(now, zero);
+                }
                 left2 = left;
                 left = 0;
                 if (zero) {
@@ -270,7 +304,8 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                     continue;
                 }
 
-                // The sign.
+                // The sign. What it takes to predict the magnitude is computed beside it.
+                p = predict(now, 1);
                 int negative;
                 if (MODEL != BY_CONTEXTS) {
                     if (MODEL == BY_SIGNS && !filled)
@@ -284,7 +319,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 // The magnitude.
                 int k = 1;
                 for (; k < UNARY; k++) {
-                    p = predict(now, k);
+                    if (k > 1) p = predict(now, k);
                     const int more = range.code(magnitude > k, p);
                     learn_from(now, more);
                     if (!more) break;
@@ -296,7 +331,7 @@ FHASH_INLINE int64_t Coder<MODE, MODEL, TRELLIS>::run() {
                 if (MODE == DECODE) {
                     magnitude = k;
                     if (TRELLIS) k = (int)(min<int64_t>(2 * (int64_t)k - one, 0x7fffffff));
-                    out[x] = negative ? -k : k;
+                    out[x] = (k ^ -negative) + negative;
                 }
                 if (TRELLIS) trellis = TRELLIS_NEXT[trellis][magnitude & 1];
                 if (MODEL != BY_CONTEXTS)

@@ -15,8 +15,7 @@ const int ALL_SIGNS = SIGN_CONTEXTS + MORE_SIGNS;
 const int MORE_SIGN_SIZES[MORE_SIGNS] = {KINDS * 108, KINDS * 27, KINDS * 81, KINDS * 54,
                                          KINDS * 25};
 const int SIGN_SET = 24;      // mixing weights of a sign: of ALL_SIGNS estimates, of the logit
-const int64_t FIRST_SIGN_SLOT =
-    int64_t(LEVELS + KINDS * 64 + 729 + 12 * 12 * 12 + 7 * 7 * 7 * 7 + 12 * 12 * KINDS) * DECISIONS;
+const int64_t FIRST_SIGN_SLOT = ALL_CONTEXTS * DECISIONS;
 const int LOGIT_BIN = 85;     // a third, in 1/256: width of the classes of the logit
 
 // Order of the further weights, behind the sets of contexts and signs. The caller's sets have LANES
@@ -94,7 +93,86 @@ FHASH_INLINE void put_four(int16_t* to, const int16_t* from) { std::memcpy(to, f
 // The inputs of the sign at x: those of the same band; the parent's centre with the parity of x and
 // of y; those of the references; and for references of the same size the products of a neighbour
 // here, the same neighbour there and the centre there: their signs, and the least magnitude.
-FHASH_INLINE void gather_signs(const Logs& logs, int x, int y, int16_t* FHASH_RESTRICT to) {
+// weights: of the predictor. BEYOND more numbers may be read and written behind either.
+// Result: the product of weights and inputs.
+#if defined(FHASH_SSE2)
+
+// Eight logarithms: four in a row, and four in another one.
+FHASH_INLINE __m128i two_fours(const int16_t* one, const int16_t* two) {
+    return _mm_unpacklo_epi64(half(one), half(two));
+}
+
+// The signs of products of three, and the least of their magnitudes.
+FHASH_INLINE __m128i least_of(__m128i a, __m128i b, __m128i c) {
+    auto size = [](__m128i v) FHASH_LAMBDA {
+        return _mm_max_epi16(v, _mm_sub_epi16(_mm_setzero_si128(), v));
+    };
+    const __m128i sign = _mm_srai_epi16(_mm_xor_si128(_mm_xor_si128(a, b), c), 15);
+    const __m128i least = _mm_min_epi16(_mm_min_epi16(size(a), size(b)), size(c));
+    return _mm_sub_epi16(_mm_xor_si128(least, sign), sign);
+}
+
+// The vectors of inputs stay in registers until they are multiplied: what was written in small
+// parts is slow to read as a whole.
+FHASH_INLINE uint32_t gather_signs(const Logs& logs, int x, int y, const int16_t* weights,
+                                   int16_t* FHASH_RESTRICT to) {
+    __m128i dot = _mm_setzero_si128();
+    auto take = [&](int at, __m128i in) FHASH_LAMBDA {
+        _mm_storeu_si128(reinterpret_cast<__m128i*>(to + at), in);
+        const __m128i by = _mm_loadu_si128(reinterpret_cast<const __m128i*>(weights + at));
+        dot = _mm_add_epi32(dot, _mm_madd_epi16(in, by));
+    };
+    take(0, two_fours(logs.own + x - 4, logs.up + x - 2));
+    take(8, two_fours(logs.below[0] + x - 1, logs.below[1] + x - 1));
+    take(16, two_fours(logs.below[2] + x - 1, logs.before[0] + x - 1));
+    take(24, two_fours(logs.before[1] + x - 1, logs.before[2] + x - 1));
+    __m128i here = _mm_setzero_si128();
+    here = _mm_insert_epi16(here, logs.own[x - 1], 0);
+    here = _mm_insert_epi16(here, logs.up[x], 1);
+    here = _mm_insert_epi16(here, logs.below[1][x], 2);
+    here = _mm_insert_epi16(here, logs.before[1][x], 3);
+    here = _mm_insert_epi16(here, logs.up[x - 1], 4);
+    here = _mm_insert_epi16(here, logs.up[x + 1], 5);
+    for (int k = 0; k < REFERENCE_COUNT; k++) {
+        const ReferenceLogs& from = logs.references[k];
+        const int i = min(x >> from.shift, from.last);
+        const int16_t centre = from.centre[i];
+        __m128i in = half(from.centre + i - 1);
+        in = _mm_insert_epi16(in, from.up[i], 4);
+        in = _mm_insert_epi16(in, from.down[i], 5);
+        in = _mm_insert_epi16(in, from.below[i], 6);
+        in = _mm_insert_epi16(in, from.above[i], 7);
+        take(40 + 8 * k, in);
+        if (k == 0) {
+            __m128i rest = _mm_cvtsi32_si128((uint16_t)logs.up[x + 2]);
+            rest = _mm_insert_epi16(rest, logs.up2[x], 1);
+            rest = _mm_insert_epi16(rest, logs.below2[x], 2);
+            rest = _mm_insert_epi16(rest, logs.before_below[x], 3);
+            rest = _mm_insert_epi16(rest, logs.before_above[x], 4);
+            rest = _mm_insert_epi16(rest, logs.before2[x], 5);
+            rest = _mm_insert_epi16(rest, x & 1 ? centre : -centre, 6);
+            rest = _mm_insert_epi16(rest, y & 1 ? centre : -centre, 7);
+            take(32, rest);
+        }
+        __m128i there = _mm_cvtsi32_si128((uint16_t)from.centre[i - 1]);
+        there = _mm_insert_epi16(there, from.up[i], 1);
+        there = _mm_insert_epi16(there, from.below[i], 2);
+        there = _mm_insert_epi16(there, from.before[i], 3);
+        there = _mm_insert_epi16(there, from.up[i - 1], 4);
+        there = _mm_insert_epi16(there, from.up[i + 1], 5);
+        const __m128i counted = _mm_set1_epi16(from.same ? centre : (int16_t)0);
+        // Six numbers; the two zeros behind them give way to what follows.
+        take(72 + 6 * k, least_of(here, there, counted));
+    }
+    dot = _mm_add_epi32(dot, _mm_shuffle_epi32(dot, 0x4e));
+    dot = _mm_add_epi32(dot, _mm_shuffle_epi32(dot, 0xb1));
+    return (uint32_t)_mm_cvtsi128_si32(dot);
+}
+
+#else
+
+FHASH_INLINE uint32_t gather_signs(const Logs& logs, int x, int y, const int16_t* weights,
+                                   int16_t* FHASH_RESTRICT to) {
     put_four(to, logs.own + x - 4);
     put_four(to + 4, logs.up + x - 2);
     for (int row = 0; row < 3; row++) {
@@ -143,14 +221,17 @@ FHASH_INLINE void gather_signs(const Logs& logs, int x, int y, int16_t* FHASH_RE
         const int16_t least = min(min(size(a), size(b)), size(c));
         to[72 + n] = (int16_t)((least ^ sign) - sign);
     }
+    return dot_of<SIGN_INPUTS>(weights, to);
 }
+
+#endif
 
 // The estimates of signs, their mixing and the linear predictors, as one run adapts them.
 struct Signs {
     Slot* slots[ALL_SIGNS];
     std::vector<int16_t> mixing;  // SIGN_SET weights by kind
     LinearSets<SIGN_INPUTS> linear;
-    alignas(64) int16_t inputs[SIGN_INPUTS] = {};
+    alignas(64) int16_t inputs[SIGN_INPUTS + BEYOND] = {};
 
     // weights: the caller's, which stay where they are.
     Signs(State& state, int32_t* weights)
@@ -170,9 +251,8 @@ struct Signs {
     // Code the sign at (t, y, x) of the row that `logs` lies around; 1 for a negative one.
     template <class Range>
     FHASH_INLINE int code(Range& range, const Logs& logs, int kind, int t, int y, int x, int bit) {
-        gather_signs(logs, x, y, inputs);
         Linear<SIGN_INPUTS>& predictor = linear.at(kind);
-        const int logit = predictor.logit(inputs);
+        const int logit = logit_of(gather_signs(logs, x, y, predictor.weights, inputs));
         const int left = sign_of(logs.own[x - 1]), left2 = sign_of(logs.own[x - 2]);
         const int up = sign_of(logs.up[x]), up2 = sign_of(logs.up2[x]);
         const int up_left = sign_of(logs.up[x - 1]), up_right = sign_of(logs.up[x + 1]);
@@ -200,10 +280,10 @@ struct Signs {
         int16_t& trust = weights[2 * ALL_SIGNS];
         sign.first = sign.second = weights;
         const int p = mix<ALL_SIGNS, false>(sign, (trust * logit) >> 2);
-        bit = range.code(bit, p);
-        const int32_t error = (((bit ? 65535 : 0) - p) * LEARNING_RATE) >> 4;
+        bit = range.code_even(bit, p);
+        const int32_t error = (((-bit & 65535) - p) * LEARNING_RATE) >> 4;
         trust = (int16_t)min(max(trust + ((error * logit + 32768) >> 16), -32767), 32767);
-        learn<ALL_SIGNS, false>(sign, bit, SIGN_LIMIT);
+        learn_evenly<ALL_SIGNS, false>(sign, bit, SIGN_LIMIT);
         predictor.learn(inputs, logit, bit, linear_tables.sign_rate);
         return bit;
     }

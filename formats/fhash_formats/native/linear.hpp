@@ -16,6 +16,7 @@ const int INPUT_ONE = 256;        // 1 as an input: an octave of a magnitude
 const int LINEAR_MAX = 2047;      // largest logit, in 1/256
 const int GRADIENT_MAX = 181;     // largest gradient, in 1/128: the sums below stay in 16 bits
 const int PERIOD = 32;            // uses after which mean squares and rates are made anew
+const int BEYOND = 32;  // numbers behind weights and inputs that vectors may touch
 const int RATE_CLASSES = 16 * 15 + 1;
 const int MAX_INPUT_MAGNITUDE = 4095;  // as MAX_MAGNITUDE of the contexts
 
@@ -42,10 +43,24 @@ FHASH_INLINE int16_t signed_log(int magnitude, bool negative) {
     return negative ? (int16_t)-log : log;
 }
 
+// The product of weights and inputs; it wraps at 32 bits.
+template <int N>
+FHASH_INLINE uint32_t dot_of(const int16_t* FHASH_RESTRICT weights,
+                             const int16_t* FHASH_RESTRICT inputs) {
+    uint32_t dot = 0;
+    for (int i = 0; i < N; i++) dot += (uint32_t)((int32_t)weights[i] * inputs[i]);
+    return dot;
+}
+
+// The logit of such a product, in 1/256.
+FHASH_INLINE int logit_of(uint32_t dot) {
+    return min(max((int32_t)dot >> 14, -LINEAR_MAX), LINEAR_MAX);
+}
+
 // N inputs, in 1/256, a multiple of 32; those that are not used are 0.
 template <int N> struct Linear {
-    int16_t weights[N];   // 1 is 16384
-    int16_t rates[N];     // by mean square
+    int16_t weights[N + BEYOND] = {};  // 1 is 16384
+    int16_t rates[N];  // by mean square
     uint16_t sums[N];     // of squares of gradients since the rates were made
     uint16_t squares[N];  // mean square of the gradient: 1 is 16384
     int uses = 0;
@@ -72,9 +87,7 @@ template <int N> struct Linear {
 
     // The logit of a 1, in 1/256.
     FHASH_INLINE int logit(const int16_t* FHASH_RESTRICT inputs) const {
-        uint32_t dot = 0;
-        for (int i = 0; i < N; i++) dot += (uint32_t)((int32_t)weights[i] * inputs[i]);
-        return min(max((int32_t)dot >> 14, -LINEAR_MAX), LINEAR_MAX);
+        return logit_of(dot_of<N>(weights, inputs));
     }
 
 #if defined(FHASH_SSE2)
@@ -114,7 +127,7 @@ template <int N> struct Linear {
     FHASH_INLINE void learn(const int16_t* FHASH_RESTRICT inputs, int logit, int bit,
                             const int16_t* table) {
         const int32_t p = tables.squash[logit + STRETCH_MAX];
-        const int32_t error = ((bit ? 65535 : 0) - p) >> 1;
+        const int32_t error = ((-bit & 65535) - p) >> 1;
         adapt(inputs, (int16_t)error);
         if (++uses % PERIOD) return;
         for (int i = 0; i < N; i++) {

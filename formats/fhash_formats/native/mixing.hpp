@@ -264,6 +264,20 @@ FHASH_INLINE void learn_slots_bit(Mixed<N_MAX>& now, const int bit, int limit) {
     }
 }
 
+// Whether estimates stay as they are when a 1 comes after `mix`.
+template <int N, int N_MAX> FHASH_INLINE bool stay_at_one(const Mixed<N_MAX>& now, int limit) {
+    __m128i moves = _mm_setzero_si128();
+    for (int v = 0; 4 * v < N; v++) {
+        const __m128i far = _mm_xor_si128(now.chances[v], _mm_set1_epi16(-1));
+        const int n = min(N - 4 * v, 4);
+        const __m128i used = _mm_setr_epi32(-1, -(n > 1), -(n > 2), -(n > 3));
+        const __m128i grows = _mm_cmplt_epi32(now.counts[v], _mm_set1_epi32(limit));
+        moves = _mm_or_si128(moves, _mm_mulhi_epu16(far, now.rates[v]));
+        moves = _mm_or_si128(moves, _mm_and_si128(grows, used));
+    }
+    return _mm_movemask_epi8(_mm_cmpeq_epi8(moves, _mm_setzero_si128())) == 0xffff;
+}
+
 // Adapt the estimates alone to the bit that came after `mix`.
 template <int N, int N_MAX> FHASH_INLINE void learn_slots(Mixed<N_MAX>& now, int bit, int limit) {
     if (bit) learn_slots_bit<N>(now, 1, limit);
@@ -279,7 +293,7 @@ template <int N_MAX> FHASH_INLINE void inputs_of(const Mixed<N_MAX>& now, int16_
 // `learn` for a bit that is known where it is called.
 template <int N, bool PAIR, int RATE, int N_MAX>
 FHASH_INLINE void learn_bit(Mixed<N_MAX>& now, const int bit, int limit) {
-    const __m128i error = _mm_set1_epi16((int16_t)((((bit ? 65535 : 0) - now.p) * RATE) >> 4));
+    const __m128i error = _mm_set1_epi16((int16_t)((((-bit & 65535) - now.p) * RATE) >> 4));
     for (int v = 0; 4 * v < N; v++) {
         const __m128i step = rounded_high(error, now.inputs[v]);
         follow(now.first + 8 * v, step);
@@ -294,6 +308,12 @@ template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
 FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
     if (bit) learn_bit<N, PAIR, RATE>(now, 1, limit);
     else learn_bit<N, PAIR, RATE>(now, 0, limit);
+}
+
+// The same for a bit that nobody can foresee: without a branch, which would often be mistaken.
+template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
+FHASH_INLINE void learn_evenly(Mixed<N_MAX>& now, int bit, int limit) {
+    learn_bit<N, PAIR, RATE>(now, bit, limit);
 }
 
 #else
@@ -323,6 +343,16 @@ template <int N, int N_MAX> FHASH_INLINE void learn_slots(Mixed<N_MAX>& now, int
     }
 }
 
+template <int N, int N_MAX> FHASH_INLINE bool stay_at_one(const Mixed<N_MAX>& now, int limit) {
+    for (int i = 0; i < N; i++) {
+        const Slot& s = *now.slots[i];
+        const Pace& pace = tables.pace[s.count];
+        if (s.count < limit || ((65535 - s.slow) * (int64_t)pace.slow) >> 16) return false;
+        if (((65535 - s.fast) * (int64_t)pace.fast) >> 16) return false;
+    }
+    return true;
+}
+
 template <int N_MAX> FHASH_INLINE void inputs_of(const Mixed<N_MAX>& now, int16_t* to) {
     for (int i = 0; i < 2 * N_MAX; i++) to[i] = (int16_t)now.inputs[i];
 }
@@ -338,7 +368,20 @@ FHASH_INLINE void learn(Mixed<N_MAX>& now, int bit, int limit) {
     learn_slots<N>(now, bit, limit);
 }
 
+template <int N, bool PAIR, int RATE = LEARNING_RATE, int N_MAX>
+FHASH_INLINE void learn_evenly(Mixed<N_MAX>& now, int bit, int limit) {
+    learn<N, PAIR, RATE>(now, bit, limit);
+}
+
 #endif
+
+// Whether `learn` changes nothing when a 1 comes after `mix`: no estimate moves, and the error is
+// so small that the step of every weight is rounded to 0.
+template <int N, int RATE = LEARNING_RATE, int N_MAX>
+FHASH_INLINE bool settled_at_one(const Mixed<N_MAX>& now, int limit) {
+    const int error = ((65535 - now.p) * RATE) >> 4;
+    return error * STRETCH_MAX < 32768 && stay_at_one<N>(now, limit);
+}
 
 // Code a bit that N estimates predict together, and adapt them.
 template <int N, bool PAIR, int RATE, class Range, int N_MAX>

@@ -31,6 +31,7 @@ struct Encoder {
         }
         return bit;
     }
+    FHASH_INLINE int code_even(int bit, uint32_t p) { return code(bit, p); }
 
     // Append the fewest bytes that name a number from low to high, 4 at most, and drop zeros at the
     // end: the decoder reads zeros past the end.
@@ -69,6 +70,20 @@ struct Decoder {
             value = (value << 8) | next();
         }
         return bit;
+    }
+
+    // The same for a bit that nobody can foresee: without a branch, which would often be mistaken.
+    FHASH_INLINE int code_even(int, uint32_t p) {
+        const uint32_t middle = low + (uint32_t)(((uint64_t)(high - low) * p) >> 16);
+        const uint32_t bit = value <= middle, ones = 0 - bit;
+        high = (middle & ones) | (high & ~ones);
+        low = (low & ones) | ((middle + 1) & ~ones);
+        while (((low ^ high) & 0xff000000u) == 0) {
+            low <<= 8;
+            high = (high << 8) | 255;
+            value = (value << 8) | next();
+        }
+        return (int)bit;
     }
 };
 

@@ -134,8 +134,9 @@ FHASH_INLINE void find_buckets(const int64_t* shape, const std::vector<Band>& ba
         if (!(F[0] || (y > 0 && F[-1]) || (z > 0 && F[-R1]) || (t > 0 && F[-R0]) || parent_filled))
             return;
         const int lanes = (n + VECTOR - 1) / VECTOR * VECTOR;
-        const int weight = sum_neighbours(band, row, lanes, sums) +
-                           sum_references(bands, band, row, lanes, nothing, sums);
+        const Around around = rows_around(band, row, nothing);
+        const int weight = around.weight + sum_references(bands, band, row, lanes, nothing, sums);
+        sum_neighbours<false>(around, 0, lanes, sums);
         const float scale = 1.0f / (float)weight;
         const int32_t* FHASH_RESTRICT const expected = sums.expected;
         FHASH_INDEPENDENT

@@ -207,6 +207,46 @@ def test_compiled_and_native_agree_on_a_larger_tile(monkeypatch: pytest.MonkeyPa
         assert np.array_equal(left, right) if isinstance(left, np.ndarray) else left == right
 
 
+def almost_nothing(shape: Shape) -> Integers:
+    """Zeros but for the begin of each row and some places, so that estimates come to an end."""
+    integers = np.zeros(shape, dtype=np.int32)
+    integers[..., 0] = 2
+    integers[np.random.default_rng(1).random(shape) < 0.0005] = -1
+    return integers
+
+
+@pytest.mark.parametrize("coder", CODERS)
+@pytest.mark.parametrize("mode", ["integers", "trellis", "choice"])
+def test_engines_agree_where_nothing_moves_any_more(
+    coder: str, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shape, trellis = (1, 3, 40, 150), mode == "trellis"
+    table, integers, scaled = single_band(shape), almost_nothing(shape), None
+    if trellis:
+        integers = of_two_quantisers(integers, table)
+    if mode == "choice":
+        noise = np.random.default_rng(2).uniform(-0.6, 0.6, shape)
+        scaled = (integers + np.where(integers == 0, noise, 0.2)).astype(np.float32)
+        integers = nearest(scaled)
+    results = []
+    for name in ("native", "compiled"):
+        use(name, monkeypatch)
+        state = blank_state(coder)
+        coded = encode_integers(
+            integers, table, scaled=scaled, weight=0.3, state=state, coder=coder, trellis=trellis
+        )
+        again = encode_integers(coded.integers, table, coder=coder, trellis=trellis)
+        decoded = decode_integers(again.data, shape, table, coder=coder, trellis=trellis)
+        assert np.array_equal(decoded, coded.integers)
+        results.append((coded.data, coded.integers.tobytes(), again.data, state.slots.tobytes()))
+    assert results[0] == results[1]
+    # The estimate of a zero where all around is zero has seen all it counts, and stays.
+    slow, fast, count, _ = (int(number) for number in state.slots[0])
+    assert count == 400
+    assert slow > 65000
+    assert fast > 65500
+
+
 def rows_that_are_chosen_away() -> NDArray[np.float32]:
     """Lone coefficients that are not worth their bits, then many that exceed the first buffer."""
     scaled = np.zeros((1, 1, 600, 16), dtype=np.float32)
