@@ -103,6 +103,11 @@ def placed(
     return result
 
 
+def filled(values: npt.NDArray[Any], fill: Number | None) -> npt.NDArray[Any]:
+    """Floats with a fill value in place of NaN; None leaves them as they are."""
+    return values if fill is None else np.where(np.isnan(values), values.dtype.type(fill), values)
+
+
 def rounded(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     """Floats as the nearest integers of a type, 0 for NaN.
 

@@ -28,7 +28,7 @@ from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.sampling import interpolable
 from fhash_codec.times import Time, times_of
-from fhash_codec.value_type import ValueType, placed, rounded
+from fhash_codec.value_type import ValueType, filled, placed, rounded
 from fhash_codec.volume_model import open_model
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
@@ -396,8 +396,3 @@ class Volume(Card):
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))
         return f"<fhash Volume '{self.name}' {sizes} {self.dtype} of {self.path}>"
-
-
-def filled(values: npt.NDArray[Any], fill: int | float | None) -> npt.NDArray[Any]:
-    """Floats with a fill value in place of NaN; None leaves them as they are."""
-    return values if fill is None else np.where(np.isnan(values), values.dtype.type(fill), values)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import struct
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import product
 from math import prod
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.container.ahead import Ahead, chunks_after
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.coding import without_crc32c
@@ -21,6 +23,7 @@ from fhash_formats.container.sharding import ENTRY_BYTES, Sharding, parse_entry,
 from fhash_formats.container.source import Source
 from fhash_formats.container.zip_checked import check_member, read_member
 from fhash_formats.errors import DamagedFileError, RegionError
+from fhash_formats.support.slabs import common_part, region_bounds
 from fhash_formats.support.threads import in_threads
 
 SPARSE_SHARE = 4
@@ -99,6 +102,7 @@ class StoredArray:
         self._indices: dict[ChunkIndex, npt.NDArray[np.int64]] = {}
         self._entries: dict[tuple[ChunkIndex, int], tuple[int, int]] = {}
         self._lock = threading.Lock()
+        self._ahead = Ahead()
 
     def read(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[Any]:
         """The values in `region`, in a new array.
@@ -145,12 +149,8 @@ class StoredArray:
 
             def fill(index: ChunkIndex) -> None:
                 chunk = read(index, keep=region is not None)
-                in_region, in_chunk = [], []
-                for i, (start, stop), size in zip(index, bounds, self.chunk_shape, strict=True):
-                    low, high = max(start, i * size), min(stop, (i + 1) * size)
-                    in_region.append(slice(low - start, high - start))
-                    in_chunk.append(slice(low - i * size, high - i * size))
-                values[tuple(in_region)] = chunk[tuple(in_chunk)]
+                in_region, in_chunk = common_part(index, self.chunk_shape, bounds)
+                values[in_region] = chunk[in_chunk]
 
             spans = [
                 range(start // chunk, -(-stop // chunk))
@@ -158,7 +158,7 @@ class StoredArray:
             ]
             # `_for_chunks` reads the indices of shards at once, so that hostile shards are refused
             # before the result is allocated. The chunks are decoded as its iterator is consumed.
-            filling = self._for_chunks(fill, spans)
+            filling = self._for_chunks(fill, spans, ahead=region is not None)
             values = np.empty(lengths, dtype=dtype)
             for _ in filling:
                 pass
@@ -227,12 +227,15 @@ class StoredArray:
         self._decode(index)
 
     def _for_chunks(
-        self, work: Callable[[ChunkIndex], None], spans: Sequence[range]
+        self, work: Callable[[ChunkIndex], None], spans: Sequence[range], ahead: bool = False
     ) -> Iterator[None]:
         """Do `work` for each chunk whose index lies in `spans`, as the result is iterated.
 
         The indices of shards are read before this returns. Where there are shards and several
         chunks to decode, the work is done in threads.
+
+        ahead: whether threads without work may decode the chunks that a reader who goes along the
+            first axis will want next.
         """
         sharding = self._metadata.sharding
         if sharding is None:
@@ -240,20 +243,29 @@ class StoredArray:
         # The indices are read once for all chunks of a shard, before threads that all need them.
         self._read_indices(sharding, spans)
         indices = list(product(*spans))
-        missing = sum(self._cache.get((self.name, index, 0)) is None for index in indices)
-        return in_threads(work, indices) if missing > 1 else map(work, indices)
+
+        def cached(index: ChunkIndex) -> bool:
+            return self._cache.get((self.name, index, 0)) is not None
+
+        missing = sum(not cached(index) for index in indices)
+        after: list[ChunkIndex] = []
+        if ahead and (layers := self._ahead.layers(spans)):
+            room = self._cache.limit // self._metadata.chunk_bytes
+            after = chunks_after(spans, self.grid, layers, missing, room, cached)
+        if missing + len(after) < 2:
+            return map(work, indices)
+
+        def decode(index: ChunkIndex) -> None:
+            # What fails now fails again once it is wanted.
+            with suppress(DamagedFileError, MemoryError):
+                self._decoded(index, 0, keep=True)
+
+        wanted = [partial(work, index) for index in indices]
+        return in_threads(lambda do: do(), wanted + [partial(decode, index) for index in after])
 
     def _read_indices(self, sharding: Sharding, spans: Sequence[range]) -> None:
         """Read what the chunks of `spans` need of each shard's index: all of it, or entries."""
-        shards = (
-            range(span.start // count, (span.stop - 1) // count + 1)
-            for span, count in zip(spans, sharding.counts, strict=True)
-        )
-        for shard in product(*shards):
-            in_shard = [
-                range(max(span.start, s * n), min(span.stop, (s + 1) * n))
-                for span, s, n in zip(spans, shard, sharding.counts, strict=True)
-            ]
+        for shard, in_shard in sharding.parts(spans):
             if SPARSE_SHARE * prod(map(len, in_shard)) >= prod(sharding.counts):
                 self._shard_index(sharding, shard)
             else:
@@ -378,23 +390,7 @@ class StoredArray:
         """(start, stop) of a region along each axis; raises RegionError."""
         if region is None:
             return [(0, n) for n in self.shape]
-        if len(region) != len(self.shape):
-            raise RegionError(
-                f"{self._path}: {self.name}: a region of {len(region)} axes; "
-                f"the array has {len(self.shape)}"
-            )
-        return [self._axis_bounds(axis, span) for axis, span in enumerate(region)]
-
-    def _axis_bounds(self, axis: int, span: slice) -> tuple[int, int]:
-        length = self.shape[axis]
-        start = 0 if span.start is None else int(span.start)
-        stop = length if span.stop is None else int(span.stop)
-        if span.step not in (None, 1) or not 0 <= start <= stop <= length:
-            raise RegionError(
-                f"{self._path}: {self.name}: {span} on axis {axis}; "
-                f"slices without step within 0..{length} are allowed"
-            )
-        return start, stop
+        return region_bounds(region, self.shape, f"{self._path}: {self.name}")
 
     def __repr__(self) -> str:
         return f"<StoredArray {self.name} {self.shape} {self.dtype}>"

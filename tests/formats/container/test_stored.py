@@ -8,9 +8,11 @@ from itertools import product
 import numpy as np
 import pytest
 import zarr
+from sharded_files import NAME, random_values, write_sharded
 
 from fhash_formats.container import FORMAT_VERSION, Container, ContainerWriter
 from fhash_formats.container.array import DTYPES
+from fhash_formats.container.stored import StoredArray
 from fhash_formats.errors import DamagedFileError, RegionError
 
 
@@ -200,3 +202,33 @@ def test_what_does_not_fit_in_memory_is_not_called_damaged(sample, monkeypatch) 
         )
         with pytest.raises(MemoryError):
             array.read()
+
+
+def test_reads_that_go_on_decode_the_next_chunk_in_a_thread_that_is_free(
+    tmp_path, samples, monkeypatch
+) -> None:
+    values = random_values((5, 4))
+    path = write_sharded(tmp_path / "a.fhz", samples, values, (1, 4), (5, 4))
+    decoded: list[tuple[int, ...]] = []
+    real = StoredArray._decode
+
+    def decode(self, index, lod=0, *, table=False):
+        decoded.append(tuple(index))
+        if tuple(index) == (4, 0):
+            raise DamagedFileError("a damaged chunk")
+        return real(self, index, lod, table=table)
+
+    monkeypatch.setattr(StoredArray, "_decode", decode)
+    expected = {"1": [0, 1, 2, 3], "2": [0, 1, 2, 3, 4]}
+    for threads, chunks in expected.items():
+        monkeypatch.setenv("FHASH_THREADS", threads)
+        with Container.open(path) as container:
+            array = container.arrays[NAME]
+            decoded.clear()
+            for step in range(4):
+                part = array.read((slice(step, step + 1), slice(0, 4)))
+                np.testing.assert_array_equal(part[0], values[step])
+            assert sorted(decoded) == [(step, 0) for step in chunks]
+            # What was damaged ahead of the reader is damaged when it is read.
+            with pytest.raises(DamagedFileError, match="a damaged chunk"):
+                array.read((slice(4, 5), slice(0, 4)))

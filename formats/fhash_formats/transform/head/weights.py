@@ -46,7 +46,8 @@ def _bits() -> npt.NDArray[np.float64]:
     squares = np.array(_SPREADS, np.int64)[:, None] ** 2
     weights = np.arange(-MAX_WEIGHT, MAX_WEIGHT + 1)
     frequencies = 1 + (squares * squares << 16) // (squares + weights * weights) ** 2
-    return np.log2(frequencies.sum(axis=1, keepdims=True) / frequencies)
+    bits: npt.NDArray[np.float64] = np.log2(frequencies.sum(axis=1, keepdims=True) / frequencies)
+    return bits
 
 
 def best_spread(weights: Sequence[int]) -> int:
