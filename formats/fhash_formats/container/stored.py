@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -20,7 +19,7 @@ from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.coding import without_crc32c
 from fhash_formats.container.layout import Member
 from fhash_formats.container.sharding import ENTRY_BYTES, Sharding, parse_entry, parse_index
-from fhash_formats.container.source import Source
+from fhash_formats.container.source import Source, damage_named
 from fhash_formats.container.zip_checked import check_member, read_member
 from fhash_formats.errors import DamagedFileError, RegionError
 from fhash_formats.support.slabs import common_part, region_bounds
@@ -32,29 +31,11 @@ MASK = ":mask"
 """Suffix of an array's name for its masks in the cache."""
 TABLE = ":table"
 """Suffix of an array's name for its chunks before their corrections in the cache."""
+UNCORRECTED = ":uncorrected"
+"""Suffix of an array's name for its chunks of which only a part was corrected so far."""
 
 ChunkIndex = tuple[int, ...]
-
-
-@contextmanager
-def damage_named(path: object) -> Iterator[None]:
-    """A block whose errors about a file begin with its path.
-
-    Other errors that a hostile or unreadable file provokes become DamagedFileError. MemoryError
-    passes: the coders refuse sizes that the bytes of a chunk cannot hold, so that only a machine
-    with too little memory for a sound file is left as its cause. A user who is told that a file is
-    damaged may delete it.
-    """
-    try:
-        yield
-    except DamagedFileError as error:
-        raise type(error)(f"{path}: {error}") from error
-    except (RecursionError, OverflowError, UnicodeError, struct.error) as error:
-        raise DamagedFileError(f"{path}: the file is damaged: {type(error).__name__}") from error
-    except OSError as error:
-        if error.errno is None:
-            raise
-        raise DamagedFileError(f"{path}: the file cannot be read: {error.strerror}") from error
+Part = tuple[slice, ...]
 
 
 class StoredArray:
@@ -121,7 +102,7 @@ class StoredArray:
             RegionError: for a region outside the array.
             DamagedFileError: for a damaged chunk.
         """
-        return self._gathered(region, self._chunk, self.dtype)
+        return self._gathered(region, self._part, self.dtype)
 
     def read_mask(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[np.bool_]:
         """A mask of the occupied values in `region`, which is that of `read`.
@@ -132,7 +113,7 @@ class StoredArray:
         """
         if not self.masked:
             return np.ones([stop - start for start, stop in self._bounds(region)], dtype=bool)
-        return self._gathered(region, self._mask, np.dtype(bool))
+        return self._gathered(region, self._mask_part, np.dtype(bool))
 
     def _gathered(
         self,
@@ -140,7 +121,7 @@ class StoredArray:
         read: Callable[..., npt.NDArray[Any]],
         dtype: np.dtype[Any],
     ) -> npt.NDArray[Any]:
-        """A region, gathered from the arrays that `read` returns for each of its chunks."""
+        """A region, gathered from the parts that `read` returns of each of its chunks."""
         bounds = self._bounds(region)
         with damage_named(self._path):
             lengths = [stop - start for start, stop in bounds]
@@ -148,9 +129,8 @@ class StoredArray:
                 return np.empty(lengths, dtype=dtype)
 
             def fill(index: ChunkIndex) -> None:
-                chunk = read(index, keep=region is not None)
                 in_region, in_chunk = common_part(index, self.chunk_shape, bounds)
-                values[in_region] = chunk[in_chunk]
+                values[in_region] = read(index, in_chunk, keep=region is not None)
 
             spans = [
                 range(start // chunk, -(-stop // chunk))
@@ -277,6 +257,25 @@ class StoredArray:
         cached = self._cache.get((self.name, index, lod))
         return self._decoded(index, lod, keep)[0] if cached is None else cached
 
+    def _part(self, index: ChunkIndex, part: Part, *, keep: bool) -> npt.NDArray[Any]:
+        """A part of a chunk; of one that was not read before, where it can, without the rest."""
+        coder = self._metadata.coder
+        places = (self.name, index, 0), (self.name + UNCORRECTED, index, 0)
+        known = any(self._cache.get(place) is not None for place in places)
+        if known or not (keep and coder.parted):
+            return self._chunk(index, keep=keep)[part]
+        with self._stored_chunk(index) as data:
+            table = coder.uncorrected(data, part)
+            values = coder.decode(data) if table is None else coder.corrected(table, part)
+        kept = values if table is None else table
+        kept.flags.writeable = False
+        self._cache.put(places[table is not None], kept)
+        return values[part] if table is None else values
+
+    def _mask_part(self, index: ChunkIndex, part: Part, *, keep: bool) -> npt.NDArray[Any]:
+        """A part of the mask of a chunk."""
+        return self._mask(index, keep=keep)[part]
+
     def _mask(self, index: ChunkIndex, *, keep: bool) -> npt.NDArray[Any]:
         """The mask of a chunk's occupied values, from the cache or decoded."""
         cached = self._cache.get((self.name + MASK, index, 0))
@@ -288,7 +287,12 @@ class StoredArray:
         self, index: ChunkIndex, lod: int, keep: bool
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
         """A full chunk and its mask, decoded and read-only; `keep` puts both into the cache."""
-        values, mask = self._decode(index, lod)
+        table = self._cache.get((self.name + UNCORRECTED, index, lod))
+        if table is None:
+            values, mask = self._decode(index, lod)
+        else:
+            whole = tuple(slice(0, n) for n in table.shape)
+            values, mask = self._metadata.coder.corrected(table, whole), None
         for name, array in ((self.name, values), (self.name + MASK, mask)):
             if array is not None:
                 array.flags.writeable = False
