@@ -69,6 +69,13 @@ def _positions(part: int | slice, length: int, axis: str) -> range:
     return range(part % length, part % length + 1)
 
 
+def slice_of(positions: range, first: int) -> slice:
+    """The slice that takes positions of an axis from an array that begins at `first` of it."""
+    start, stop = positions.start - first, positions.stop - first
+    # A stop before the first position would count from the end.
+    return slice(start, stop if stop >= 0 else None, positions.step)
+
+
 def checked_region(region: Spans | None, shape: Sequence[int], path: str) -> Box:
     """The box of a region in vertices (z, y, x) of a domain; the whole domain for None.
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_codec.coreset.boxes import Box, Sizes
 from fhash_formats.container import Container
 
 Number = int | float
@@ -86,6 +87,25 @@ def holds(dtype: np.dtype[Any], number: Number) -> bool:
     if not np.isfinite(float(number)) or number != int(number):
         return False
     return bool(limits.min <= int(number) <= limits.max)
+
+
+def placed(
+    values: npt.NDArray[Any], where: npt.NDArray[np.bool_], box: Box, shape: Sizes
+) -> npt.NDArray[Any]:
+    """Values (z, y, x) where a mask is True, in a box of an array of a shape that is NaN elsewhere.
+
+    The values themselves where they are all of the array.
+    """
+    if box.shape == shape and where.all():
+        return values
+    result = np.full(shape, np.nan, dtype=values.dtype)
+    np.copyto(result[box.slices()], values, where=where)
+    return result
+
+
+def filled(values: npt.NDArray[Any], fill: Number | None) -> npt.NDArray[Any]:
+    """Floats with a fill value in place of NaN; None leaves them as they are."""
+    return values if fill is None else np.where(np.isnan(values), values.dtype.type(fill), values)
 
 
 def rounded(values: npt.NDArray[Any], dtype: np.dtype[Any]) -> npt.NDArray[Any]:

@@ -16,12 +16,19 @@ from fhash_codec.coreset.boxes import Box, Spans
 from fhash_codec.coreset.key_frames import KeyTimes, strictly_monotonic, time_axis
 from fhash_codec.header import OUTSIDE as OUTSIDE_IS_MISSING
 from fhash_codec.header import describe_file, read_missing
-from fhash_codec.indexing import Index, checked_region, coarse_vertices, expand_index, index_ranges
+from fhash_codec.indexing import (
+    Index,
+    checked_region,
+    coarse_vertices,
+    expand_index,
+    index_ranges,
+    slice_of,
+)
 from fhash_codec.measure.value_range import ValueRange
 from fhash_codec.progress import Progress, silent
 from fhash_codec.sampling import interpolable
 from fhash_codec.times import Time, times_of
-from fhash_codec.value_type import ValueType, rounded
+from fhash_codec.value_type import ValueType, filled, placed, rounded
 from fhash_codec.volume_model import open_model
 from fhash_formats.container import Container
 from fhash_formats.errors import InputError, RegionError
@@ -144,15 +151,16 @@ class Volume(Card):
             raise InputError(f"outside is '{outside}'; allowed: {', '.join(OUTSIDE)}")
         key = self._key_index(t)
         region = self._checked(region)
-        result = np.full(region.shape, np.nan, dtype=self.float_dtype)
         common = self._within_box(region)
-        if common is not None:
+        if common is None:
+            result: npt.NDArray[Any] = np.full(region.shape, np.nan, dtype=self.float_dtype)
+        else:
             in_region, in_box = common
             requested = self._occupied(key, in_box)
             values = self._model.read(key, in_box, requested).astype(self.float_dtype, copy=False)
             if not key.is_integer():
                 values = self._in_range(values)
-            np.copyto(result[in_region.slices()], values, where=requested)
+            result = placed(values, requested, in_region, region.shape)
         if outside == "background" and not self._outside_is_missing:
             result[np.isnan(result)] = self.background
         missing = self._missing_at(t)
@@ -228,8 +236,7 @@ class Volume(Card):
         result = np.empty([len(positions) for positions in ranges], dtype=self.dtype)
         if result.size:
             region = Box.of((min(positions), max(positions) + 1) for positions in space)
-            offsets = zip(space, region.first, strict=True)
-            local = np.ix_(*(np.array(positions) - first for positions, first in offsets))
+            local = tuple(map(slice_of, space, region.first))
             for number, step in enumerate(steps):
                 result[number] = self.values(step, region)[local]
         return result[tuple(slice(None) if isinstance(part, slice) else 0 for part in parts)]
@@ -389,8 +396,3 @@ class Volume(Card):
     def __repr__(self) -> str:
         sizes = " ".join(f"{axis}={n}" for axis, n in zip(AXES, self.shape, strict=True))
         return f"<fhash Volume '{self.name}' {sizes} {self.dtype} of {self.path}>"
-
-
-def filled(values: npt.NDArray[Any], fill: int | float | None) -> npt.NDArray[Any]:
-    """Floats with a fill value in place of NaN; None leaves them as they are."""
-    return values if fill is None else np.where(np.isnan(values), values.dtype.type(fill), values)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from fhash_formats.container import StoredArray
 from fhash_formats.errors import DamagedFileError, InputError
-from fhash_formats.support.slabs import chunk_region
+from fhash_formats.support.slabs import chunk_region, common_part
 from fhash_formats.transform.head.head import Layer, NeighbourHead
 from fhash_formats.transform.values.elementwise import cast
 
@@ -129,15 +129,11 @@ class PlainArray:
         if self.head is None:  # no value depends on others of its tile
             return self._decode(region)
         result = np.empty([along.stop - along.start for along in region], self.dtype)
+        bounds = [(along.start, along.stop) for along in region]
         tiles = zip(region, self.chunk_shape, strict=True)
         for index in product(*(range(a.start // n, -(-a.stop // n)) for a, n in tiles)):
-            tile = self._tile(index)
-            target, source = [], []
-            for i, along, n in zip(index, region, self.chunk_shape, strict=True):
-                low, high = max(along.start, i * n), min(along.stop, (i + 1) * n)
-                target.append(slice(low - along.start, high - along.start))
-                source.append(slice(low - i * n, high - i * n))
-            result[tuple(target)] = tile[tuple(source)]
+            target, source = common_part(index, self.chunk_shape, bounds)
+            result[target] = self._tile(index)[source]
         return result
 
     def _decode_tile(self, index: tuple[int, ...]) -> npt.NDArray[Any]:

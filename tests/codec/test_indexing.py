@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fhash_codec.indexing import expand_index, index_ranges
+from fhash_codec.indexing import expand_index, index_ranges, slice_of
 
 SHAPE = (3, 4, 1, 5)
 ENDS = st.none() | st.integers(-7, 7)
@@ -38,6 +38,16 @@ def test_an_index_names_the_positions_that_numpy_takes(
     grid = np.stack(np.meshgrid(*positions, indexing="ij"), axis=-1)
     expected = vertices[(*index, slice(None)) if ... in index else (*index, ...)]
     np.testing.assert_array_equal(grid.reshape(expected.shape), expected)
+
+
+@given(along=st.builds(slice, ENDS, ENDS, st.none() | st.sampled_from([1, 2, 3, -1, -2])))
+def test_a_slice_takes_the_positions_of_a_range_from_an_array_that_begins_later(
+    along: slice,
+) -> None:
+    positions = range(9)[along]
+    if positions:
+        first = min(positions)
+        assert list(range(first, 9)[slice_of(positions, first)]) == list(positions)
 
 
 @pytest.mark.parametrize("index", [(0,) * 5, (..., ...), None, [0], True, 1.0, "t"], ids=repr)

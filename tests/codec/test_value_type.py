@@ -7,7 +7,8 @@ import pytest
 
 import fhash_codec
 from fhash_codec import EncodeConfig
-from fhash_codec.value_type import decoded_type, holds, rounded
+from fhash_codec.coreset.boxes import Box
+from fhash_codec.value_type import decoded_type, holds, placed, rounded
 from fhash_formats.series import ArraySeries
 
 QUICK = {"effort": 1, "timings": False}
@@ -142,3 +143,17 @@ def test_rounding_stays_within_the_type(dtype) -> None:
     assert whole[0] == whole[5] == limits.min
     assert int(whole[1]) == int(whole[4]) >= limits.max - 2 ** max(limits.bits - 53, 0)
     assert whole[2:4].tolist() == [0, 2]
+
+
+def test_values_are_placed_where_the_mask_says_and_nan_elsewhere() -> None:
+    values = np.arange(8, dtype=np.float32).reshape(2, 2, 2)
+    mask = values != 3
+    box = Box.of(((1, 3), (0, 2), (2, 4)))
+    result = placed(values, mask, box, (3, 2, 5))
+    assert result.dtype == np.float32
+    assert result.shape == (3, 2, 5)
+    assert np.isnan(result).sum() == 30 - 7
+    np.testing.assert_array_equal(result[1:, :, 2:4][mask], values[mask])
+    whole = Box.of_shape((2, 2, 2))
+    assert placed(values, np.ones_like(mask), whole, (2, 2, 2)) is values
+    assert np.isnan(placed(values, mask, whole, (2, 2, 2))[0, 1, 1])

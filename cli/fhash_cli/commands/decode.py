@@ -345,9 +345,9 @@ class Statistics:
 
         from fhash_codec.measure.value_range import pieces
 
-        values = frame[~np.isnan(frame)]
-        self.all += frame.size
-        self.inside += inside
+        gaps = np.isnan(frame)
+        values = frame[~gaps] if gaps.any() else frame.reshape(-1)
+        self.all, self.inside = self.all + frame.size, self.inside + inside
         if values.size:
             self.low, self.high = (
                 min(self.low, float(values.min())),

@@ -17,10 +17,13 @@ class ChunkCache:
     """The most recently used chunks, up to `limit` bytes together; safe for several threads.
 
     The least recently used chunks are dropped first. A chunk larger than `limit` is not kept.
+
+    Attributes:
+        limit: most bytes.
     """
 
     def __init__(self, limit: int) -> None:
-        self._limit = limit
+        self.limit = limit
         self._bytes = 0
         self._chunks: OrderedDict[Key, npt.NDArray[Any]] = OrderedDict()
         self._lock = threading.Lock()
@@ -35,14 +38,14 @@ class ChunkCache:
 
     def put(self, key: Key, chunk: np.ndarray[Any, Any]) -> None:
         """Keep a chunk, and drop others until the limit holds."""
-        if chunk.nbytes > self._limit:
+        if chunk.nbytes > self.limit:
             return
         with self._lock:
             if key in self._chunks:
                 return
             self._chunks[key] = chunk
             self._bytes += chunk.nbytes
-            while self._bytes > self._limit:
+            while self._bytes > self.limit:
                 _, dropped = self._chunks.popitem(last=False)
                 self._bytes -= dropped.nbytes
 

@@ -46,13 +46,15 @@ _LITTLE: Codec = {"name": "bytes", "configuration": {"endian": "little"}}
 class ChunkCoder(Protocol):
     """A coder of chunks of one number type and full shape.
 
-    `decode` raises DamagedFileError before it allocates for bytes that do not fit. Two abilities
+    `decode` raises DamagedFileError before it allocates for bytes that do not fit. Three abilities
     are optional:
 
     - A coder that can decode with less detail has `decode(data, lod)`; level of detail 0 is all.
     - A coder whose chunks say which values are occupied has `masked` True and
       `decode_masked(data)`, which returns values and mask. Masks may lie in an array of their own:
       `join(data, mask)` makes the chunk that has its mask itself.
+    - A coder that corrects its values last has `parted` True, `uncorrected(data, part)` and
+      `corrected(table, part)`, by which a part of a chunk is had sooner than all of it.
     """
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
@@ -213,6 +215,26 @@ class CheckedCoder:
         coded = self._whole(data, mask)
         decode = getattr(self._coder, "decode_table", None)
         values: npt.NDArray[Any] = decode(coded, lod) if decode else self._coder.decode(coded)
+        return values
+
+    @property
+    def parted(self) -> bool:
+        """Whether a part of a chunk may be had sooner than all of it, by the next two."""
+        return bool(getattr(self._coder, "parted", False))
+
+    def uncorrected(self, data: memoryview, part: tuple[slice, ...]) -> npt.NDArray[Any] | None:
+        """The chunk as `corrected` takes it, for a coder that is `parted`.
+
+        part: slices with explicit ends, of the values that will be wanted. The result is None
+            where they are so many that `decode` takes no longer, and for chunks that are coded
+            otherwise. Raises DamagedFileError.
+        """
+        table: npt.NDArray[Any] | None = self._coder.uncorrected(without_crc32c(data), part)  # type: ignore[attr-defined]
+        return table
+
+    def corrected(self, table: npt.NDArray[Any], part: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """A part of a chunk, with the bits of `decode`. table: what `uncorrected` gave."""
+        values: npt.NDArray[Any] = self._coder.corrected(table, part)  # type: ignore[attr-defined]
         return values
 
     @property

@@ -18,8 +18,8 @@ from fhash_formats.container.expected_arrays import check_arrays, check_key_fram
 from fhash_formats.container.header import POSITIONS
 from fhash_formats.container.hierarchy import Hierarchy, read_hierarchy
 from fhash_formats.container.mask_array import MaskArray
-from fhash_formats.container.source import CountedSource, FileSource, Source
-from fhash_formats.container.stored import StoredArray, damage_named
+from fhash_formats.container.source import CountedSource, FileSource, Source, damage_named
+from fhash_formats.container.stored import StoredArray
 from fhash_formats.container.zip_checked import (
     DOCUMENT,
     check_member,

@@ -83,6 +83,22 @@ class Sharding:
             number = number * count + local
         return tuple(shard for shard, _ in places), number
 
+    def parts(self, spans: Sequence[range]) -> Iterator[tuple[Index, list[range]]]:
+        """The shards of some inner chunks of an array, and the inner chunks in each, by axis.
+
+        spans: of inner chunks along each axis.
+        """
+        shards = (
+            range(span.start // count, (span.stop - 1) // count + 1)
+            for span, count in zip(spans, self.counts, strict=True)
+        )
+        for shard in product(*shards):
+            in_shard = (
+                range(max(span.start, s * n), min(span.stop, (s + 1) * n))
+                for span, s, n in zip(spans, shard, self.counts, strict=True)
+            )
+            yield shard, list(in_shard)
+
     def chunks_of(self, shard: Index, shape: Sequence[int]) -> Iterator[Index]:
         """The inner chunks present in a shard of an array of `shape`, in C order.
 

@@ -3,11 +3,35 @@
 from __future__ import annotations
 
 import stat
+import struct
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
 from fhash_formats.errors import DamagedFileError, InputError, MissingInputError
+
+
+@contextmanager
+def damage_named(path: object) -> Iterator[None]:
+    """A block whose errors about a file begin with its path.
+
+    Other errors that a hostile or unreadable file provokes become DamagedFileError. MemoryError
+    passes: the coders refuse sizes that the bytes of a chunk cannot hold, so that only a machine
+    with too little memory for a sound file is left as its cause. A user who is told that a file is
+    damaged may delete it.
+    """
+    try:
+        yield
+    except DamagedFileError as error:
+        raise type(error)(f"{path}: {error}") from error
+    except (RecursionError, OverflowError, UnicodeError, struct.error) as error:
+        raise DamagedFileError(f"{path}: the file is damaged: {type(error).__name__}") from error
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise DamagedFileError(f"{path}: the file cannot be read: {error.strerror}") from error
 
 
 class Source(Protocol):

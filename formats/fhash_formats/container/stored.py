@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import struct
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import product
 from math import prod
 from typing import Any
@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fhash_formats.container.ahead import Ahead, chunks_after
 from fhash_formats.container.array import ArrayMetadata
 from fhash_formats.container.cache import ChunkCache
 from fhash_formats.container.coding import without_crc32c
 from fhash_formats.container.layout import Member
 from fhash_formats.container.sharding import ENTRY_BYTES, Sharding, parse_entry, parse_index
-from fhash_formats.container.source import Source
+from fhash_formats.container.source import Source, damage_named
 from fhash_formats.container.zip_checked import check_member, read_member
 from fhash_formats.errors import DamagedFileError, RegionError
+from fhash_formats.support.slabs import common_part, region_bounds
 from fhash_formats.support.threads import in_threads
 
 SPARSE_SHARE = 4
@@ -29,29 +31,11 @@ MASK = ":mask"
 """Suffix of an array's name for its masks in the cache."""
 TABLE = ":table"
 """Suffix of an array's name for its chunks before their corrections in the cache."""
+UNCORRECTED = ":uncorrected"
+"""Suffix of an array's name for its chunks of which only a part was corrected so far."""
 
 ChunkIndex = tuple[int, ...]
-
-
-@contextmanager
-def damage_named(path: object) -> Iterator[None]:
-    """A block whose errors about a file begin with its path.
-
-    Other errors that a hostile or unreadable file provokes become DamagedFileError. MemoryError
-    passes: the coders refuse sizes that the bytes of a chunk cannot hold, so that only a machine
-    with too little memory for a sound file is left as its cause. A user who is told that a file is
-    damaged may delete it.
-    """
-    try:
-        yield
-    except DamagedFileError as error:
-        raise type(error)(f"{path}: {error}") from error
-    except (RecursionError, OverflowError, UnicodeError, struct.error) as error:
-        raise DamagedFileError(f"{path}: the file is damaged: {type(error).__name__}") from error
-    except OSError as error:
-        if error.errno is None:
-            raise
-        raise DamagedFileError(f"{path}: the file cannot be read: {error.strerror}") from error
+Part = tuple[slice, ...]
 
 
 class StoredArray:
@@ -99,6 +83,7 @@ class StoredArray:
         self._indices: dict[ChunkIndex, npt.NDArray[np.int64]] = {}
         self._entries: dict[tuple[ChunkIndex, int], tuple[int, int]] = {}
         self._lock = threading.Lock()
+        self._ahead = Ahead()
 
     def read(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[Any]:
         """The values in `region`, in a new array.
@@ -117,7 +102,7 @@ class StoredArray:
             RegionError: for a region outside the array.
             DamagedFileError: for a damaged chunk.
         """
-        return self._gathered(region, self._chunk, self.dtype)
+        return self._gathered(region, self._part, self.dtype)
 
     def read_mask(self, region: tuple[slice, ...] | None = None) -> npt.NDArray[np.bool_]:
         """A mask of the occupied values in `region`, which is that of `read`.
@@ -128,7 +113,7 @@ class StoredArray:
         """
         if not self.masked:
             return np.ones([stop - start for start, stop in self._bounds(region)], dtype=bool)
-        return self._gathered(region, self._mask, np.dtype(bool))
+        return self._gathered(region, self._mask_part, np.dtype(bool))
 
     def _gathered(
         self,
@@ -136,7 +121,7 @@ class StoredArray:
         read: Callable[..., npt.NDArray[Any]],
         dtype: np.dtype[Any],
     ) -> npt.NDArray[Any]:
-        """A region, gathered from the arrays that `read` returns for each of its chunks."""
+        """A region, gathered from the parts that `read` returns of each of its chunks."""
         bounds = self._bounds(region)
         with damage_named(self._path):
             lengths = [stop - start for start, stop in bounds]
@@ -144,13 +129,8 @@ class StoredArray:
                 return np.empty(lengths, dtype=dtype)
 
             def fill(index: ChunkIndex) -> None:
-                chunk = read(index, keep=region is not None)
-                in_region, in_chunk = [], []
-                for i, (start, stop), size in zip(index, bounds, self.chunk_shape, strict=True):
-                    low, high = max(start, i * size), min(stop, (i + 1) * size)
-                    in_region.append(slice(low - start, high - start))
-                    in_chunk.append(slice(low - i * size, high - i * size))
-                values[tuple(in_region)] = chunk[tuple(in_chunk)]
+                in_region, in_chunk = common_part(index, self.chunk_shape, bounds)
+                values[in_region] = read(index, in_chunk, keep=region is not None)
 
             spans = [
                 range(start // chunk, -(-stop // chunk))
@@ -158,7 +138,7 @@ class StoredArray:
             ]
             # `_for_chunks` reads the indices of shards at once, so that hostile shards are refused
             # before the result is allocated. The chunks are decoded as its iterator is consumed.
-            filling = self._for_chunks(fill, spans)
+            filling = self._for_chunks(fill, spans, ahead=region is not None)
             values = np.empty(lengths, dtype=dtype)
             for _ in filling:
                 pass
@@ -227,12 +207,15 @@ class StoredArray:
         self._decode(index)
 
     def _for_chunks(
-        self, work: Callable[[ChunkIndex], None], spans: Sequence[range]
+        self, work: Callable[[ChunkIndex], None], spans: Sequence[range], ahead: bool = False
     ) -> Iterator[None]:
         """Do `work` for each chunk whose index lies in `spans`, as the result is iterated.
 
         The indices of shards are read before this returns. Where there are shards and several
         chunks to decode, the work is done in threads.
+
+        ahead: whether threads without work may decode the chunks that a reader who goes along the
+            first axis will want next.
         """
         sharding = self._metadata.sharding
         if sharding is None:
@@ -240,20 +223,29 @@ class StoredArray:
         # The indices are read once for all chunks of a shard, before threads that all need them.
         self._read_indices(sharding, spans)
         indices = list(product(*spans))
-        missing = sum(self._cache.get((self.name, index, 0)) is None for index in indices)
-        return in_threads(work, indices) if missing > 1 else map(work, indices)
+
+        def cached(index: ChunkIndex) -> bool:
+            return self._cache.get((self.name, index, 0)) is not None
+
+        missing = sum(not cached(index) for index in indices)
+        after: list[ChunkIndex] = []
+        if ahead and (layers := self._ahead.layers(spans)):
+            room = self._cache.limit // self._metadata.chunk_bytes
+            after = chunks_after(spans, self.grid, layers, missing, room, cached)
+        if missing + len(after) < 2:
+            return map(work, indices)
+
+        def decode(index: ChunkIndex) -> None:
+            # What fails now fails again once it is wanted.
+            with suppress(DamagedFileError, MemoryError):
+                self._decoded(index, 0, keep=True)
+
+        wanted = [partial(work, index) for index in indices]
+        return in_threads(lambda do: do(), wanted + [partial(decode, index) for index in after])
 
     def _read_indices(self, sharding: Sharding, spans: Sequence[range]) -> None:
         """Read what the chunks of `spans` need of each shard's index: all of it, or entries."""
-        shards = (
-            range(span.start // count, (span.stop - 1) // count + 1)
-            for span, count in zip(spans, sharding.counts, strict=True)
-        )
-        for shard in product(*shards):
-            in_shard = [
-                range(max(span.start, s * n), min(span.stop, (s + 1) * n))
-                for span, s, n in zip(spans, shard, sharding.counts, strict=True)
-            ]
+        for shard, in_shard in sharding.parts(spans):
             if SPARSE_SHARE * prod(map(len, in_shard)) >= prod(sharding.counts):
                 self._shard_index(sharding, shard)
             else:
@@ -264,6 +256,25 @@ class StoredArray:
         """The values of a chunk, from the cache or decoded; `keep` puts them into the cache."""
         cached = self._cache.get((self.name, index, lod))
         return self._decoded(index, lod, keep)[0] if cached is None else cached
+
+    def _part(self, index: ChunkIndex, part: Part, *, keep: bool) -> npt.NDArray[Any]:
+        """A part of a chunk; of one that was not read before, where it can, without the rest."""
+        coder = self._metadata.coder
+        places = (self.name, index, 0), (self.name + UNCORRECTED, index, 0)
+        known = any(self._cache.get(place) is not None for place in places)
+        if known or not (keep and coder.parted):
+            return self._chunk(index, keep=keep)[part]
+        with self._stored_chunk(index) as data:
+            table = coder.uncorrected(data, part)
+            values = coder.decode(data) if table is None else coder.corrected(table, part)
+        kept = values if table is None else table
+        kept.flags.writeable = False
+        self._cache.put(places[table is not None], kept)
+        return values[part] if table is None else values
+
+    def _mask_part(self, index: ChunkIndex, part: Part, *, keep: bool) -> npt.NDArray[Any]:
+        """A part of the mask of a chunk."""
+        return self._mask(index, keep=keep)[part]
 
     def _mask(self, index: ChunkIndex, *, keep: bool) -> npt.NDArray[Any]:
         """The mask of a chunk's occupied values, from the cache or decoded."""
@@ -276,7 +287,12 @@ class StoredArray:
         self, index: ChunkIndex, lod: int, keep: bool
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any] | None]:
         """A full chunk and its mask, decoded and read-only; `keep` puts both into the cache."""
-        values, mask = self._decode(index, lod)
+        table = self._cache.get((self.name + UNCORRECTED, index, lod))
+        if table is None:
+            values, mask = self._decode(index, lod)
+        else:
+            whole = tuple(slice(0, n) for n in table.shape)
+            values, mask = self._metadata.coder.corrected(table, whole), None
         for name, array in ((self.name, values), (self.name + MASK, mask)):
             if array is not None:
                 array.flags.writeable = False
@@ -378,23 +394,7 @@ class StoredArray:
         """(start, stop) of a region along each axis; raises RegionError."""
         if region is None:
             return [(0, n) for n in self.shape]
-        if len(region) != len(self.shape):
-            raise RegionError(
-                f"{self._path}: {self.name}: a region of {len(region)} axes; "
-                f"the array has {len(self.shape)}"
-            )
-        return [self._axis_bounds(axis, span) for axis, span in enumerate(region)]
-
-    def _axis_bounds(self, axis: int, span: slice) -> tuple[int, int]:
-        length = self.shape[axis]
-        start = 0 if span.start is None else int(span.start)
-        stop = length if span.stop is None else int(span.stop)
-        if span.step not in (None, 1) or not 0 <= start <= stop <= length:
-            raise RegionError(
-                f"{self._path}: {self.name}: {span} on axis {axis}; "
-                f"slices without step within 0..{length} are allowed"
-            )
-        return start, stop
+        return region_bounds(region, self.shape, f"{self._path}: {self.name}")
 
     def __repr__(self) -> str:
         return f"<StoredArray {self.name} {self.shape} {self.dtype}>"

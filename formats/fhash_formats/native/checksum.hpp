@@ -95,4 +95,30 @@ inline std::uint32_t crc32_of(const std::int32_t* in, std::int64_t n, std::uint3
     return ~crc32_plain(in, n, crc);
 }
 
+// The product of two polynomials modulo that of the CRC, reflected as the CRC is.
+FHASH_INLINE std::uint32_t crc32_product(std::uint32_t a, std::uint32_t b) {
+    std::uint32_t product = 0;
+    for (; a; a <<= 1) {
+        if (a & 0x80000000U) product ^= b;
+        b = (b >> 1) ^ (b & 1 ? 0xedb88320U : 0);
+    }
+    return product;
+}
+
+// What n integers of 0 multiply a CRC by: x^(32 n).
+inline std::uint32_t crc32_power(std::int64_t n) {
+    std::uint32_t power = 0x80000000U, square = 0x40000000U;  // 1 and x
+    for (int k = 0; k < 5; k++) square = crc32_product(square, square);
+    for (; n; n >>= 1) {
+        if (n & 1) power = crc32_product(power, square);
+        square = crc32_product(square, square);
+    }
+    return power;
+}
+
+// As crc32_of, for as many integers of 0 as `power` is of.
+FHASH_INLINE std::uint32_t crc32_of_zeros(std::uint32_t power, std::uint32_t crc) {
+    return ~crc32_product(power, ~crc);
+}
+
 }  // namespace

@@ -37,6 +37,14 @@ constexpr std::int64_t FHASH_ABI = 10;
 #define FHASH_INDEPENDENT
 #endif
 
+// FHASH_UNROLLED before a short loop of constant length: written out, so that tables of constants
+// that it reads are folded.
+#if defined(__GNUC__) && !defined(__clang__)
+#define FHASH_UNROLLED _Pragma("GCC unroll 32")
+#else
+#define FHASH_UNROLLED
+#endif
+
 // FHASH_CLONES before a function: compiled for AVX-512, AVX2 and the baseline; one is chosen when
 // the library is loaded. It works on plain functions only, neither templates nor inlines: put the
 // body into a FHASH_INLINE template and call that from a small cloned function per type. Elsewhere

@@ -116,14 +116,14 @@ inline float evaluate(const Kernels& kernels, const Stage* stages, std::int64_t 
 }
 
 // Correct some rows of one time step. source: gathers the inputs of the first of the stages from
-// the rows of the first `neighbours` neighbours.
-template <class Source>
-void correct(const Frames& frames, const Source& source, std::int64_t neighbours,
-             const Kernels& kernels, const Stage* stages, std::int64_t layers, std::int64_t step,
+// the rows of the first NEAR neighbours.
+template <int NEAR, class Source>
+void correct(const Frames& frames, const Source& source, const Kernels& kernels,
+             const Stage* stages, std::int64_t layers, std::int64_t step,
              const Rows& some, Rooms& rooms, Last& last, float* out) {
     for (std::int64_t r = some.begin; r < some.end; ++r) {
         std::int64_t row_of[NEIGHBOURS];
-        frames.neighbours(step, r, neighbours, row_of);
+        frames.neighbours<NEAR>(step, r, row_of);
         const std::int64_t own = frames.row(step, 0, r);
         for (std::int64_t b = 0; b < frames.blocks; ++b) {
             const float* const centre = frames.block(own, b);
@@ -183,7 +183,7 @@ inline std::int64_t apply(Frames& frames, const Kernels& kernels, const Stage* s
     frames.load(0, seen);
     for (std::int64_t step = 0; step < frames.t; ++step) {
         if (step + 1 < frames.t) frames.load(step + 1, seen);
-        correct(frames, frames, NEIGHBOURS, kernels, stages, layers, step, some, rooms, last, out);
+        correct<NEIGHBOURS>(frames, frames, kernels, stages, layers, step, some, rooms, last, out);
     }
     return 0;
 }
@@ -201,7 +201,7 @@ inline std::int64_t apply_cross(Frames& frames, const Kernels& kernels, const St
         if (ahead + 1 < frames.t) frames.load(ahead + 1, seen);
         if (ahead < frames.t) hidden.fill(ahead, needed, rooms.first);
         if (ahead > 0)
-            correct(frames, hidden, CROSS - 1, kernels, stages + 1, 2, ahead - 1, some, rooms, last,
+            correct<CROSS - 1>(frames, hidden, kernels, stages + 1, 2, ahead - 1, some, rooms, last,
                     out);
     }
     return 0;

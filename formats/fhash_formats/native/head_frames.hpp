@@ -114,12 +114,17 @@ public:
         return step % held * rows + zi * y + yi;
     }
 
-    // The rows of the first `count` neighbours of row r of a frame.
-    void neighbours(std::int64_t step, std::int64_t r, std::int64_t count,
-                    std::int64_t* row_of) const {
-        for (std::int64_t k = 0; k < count; ++k)
-            row_of[k] = row(clamped(step + OFFSETS[k][0], t), clamped(r / y + OFFSETS[k][1], z),
-                            clamped(r % y + OFFSETS[k][2], y));
+    // The rows of the first COUNT neighbours of row r of a frame.
+    template <int COUNT>
+    FHASH_INLINE void neighbours(std::int64_t step, std::int64_t r, std::int64_t* row_of) const {
+        std::int64_t ts[3], zs[5], ys[5];
+        const std::int64_t zi = r / y, yi = r % y;
+        for (int d = 0; d < 3; ++d) ts[d] = row(clamped(step + d - 1, t), 0, 0);
+        for (int d = 0; d < 5; ++d) zs[d] = clamped(zi + d - 2, z) * y;
+        for (int d = 0; d < 5; ++d) ys[d] = clamped(yi + d - 2, y);
+        FHASH_UNROLLED
+        for (int k = 0; k < COUNT; ++k)
+            row_of[k] = ts[OFFSETS[k][0] + 1] + zs[OFFSETS[k][1] + 2] + ys[OFFSETS[k][2] + 2];
     }
 
     const float* block(std::int64_t row_index, std::int64_t b) const {
@@ -153,8 +158,10 @@ public:
                 std::int64_t b, std::int64_t groups, std::int32_t* room,
                 const std::int32_t** inputs) const {
         const float* moved[NEIGHBOURS];
+        FHASH_UNROLLED
         for (int k = 0; k < NEIGHBOURS; ++k) moved[k] = block(row_of[k], b) + OFFSETS[k][3];
         kernels.first_inputs(moved, block(own, b), range, groups, room);
+        FHASH_UNROLLED
         for (int pair = 0; pair < INPUTS / 2; ++pair) inputs[pair] = room + pair * BLOCK;
     }
 
@@ -185,7 +192,7 @@ public:
     void fill(std::int64_t step, const Rows& some, std::int32_t* room) {
         for (std::int64_t r = some.begin; r < some.end; ++r) {
             std::int64_t row_of[NEIGHBOURS];
-            frames.neighbours(step, r, NEIGHBOURS, row_of);
+            frames.neighbours<NEIGHBOURS>(step, r, row_of);
             const std::int64_t own = frames.row(step, 0, r);
             for (std::int64_t b = 0; b < frames.blocks; ++b) fill_block(own, row_of, b, room);
             std::int32_t* const row = values.get() + own * width * pitch;

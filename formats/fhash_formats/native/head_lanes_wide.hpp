@@ -72,6 +72,8 @@ struct Avx512Lanes {
     static constexpr int COUNT = 16;
     static constexpr int TILE = 8;
     static constexpr unsigned UPPER = 0xaaaaaaaaU;  // the upper halves of all lanes
+    // Choices of _mm512_range_ps: of the smaller magnitude, without sign and with the first's sign.
+    static constexpr int SMALLER_MAGNITUDE = 10, SMALLER_WITH_SIGN = 2;
     using Floats = __m512;
     using Ints = __m512i;
 
@@ -97,9 +99,11 @@ struct Avx512Lanes {
         return sum;
     }
     static FHASH_AVX512 FHASH_INLINE Ints octaves(Floats d) {
-        const __m512 sized = _mm512_and_ps(d, _mm512_castsi512_ps(all(MAGNITUDE_BITS)));
-        const __m512 more = _mm512_add_ps(sized, _mm512_castsi512_ps(all(ONE_BITS)));
-        return _mm512_castps_si512(_mm512_min_ps(more, _mm512_castsi512_ps(all(LARGEST_BITS))));
+        // The magnitude is bounded before 1 is added: the largest result is a whole number of its
+        // units away from 1.
+        const __m512 most = all(float_of(LARGEST_BITS) - 1.0F);
+        const __m512 sized = _mm512_range_ps(d, most, SMALLER_MAGNITUDE);
+        return _mm512_castps_si512(_mm512_add_ps(sized, all(1.0F)));
     }
     static FHASH_AVX512 FHASH_INLINE Ints differences(Floats a, Floats b, Floats centre,
                                                       Floats inverse) {
@@ -121,9 +125,7 @@ struct Avx512Lanes {
     static FHASH_AVX512 FHASH_INLINE Ints activated(Ints sum, Floats scale, Floats bias) {
         const __m512 p = weighted(sum, scale, bias);
         const __m512 leaky = _mm512_max_ps(_mm512_mul_ps(p, all(0.125F)), p);
-        const __m512 above = _mm512_max_ps(leaky, all(-LIMIT));
-        const __m512 within = _mm512_min_ps(above, all(LIMIT));
-        return _mm512_cvtps_epi32(within);
+        return _mm512_cvtps_epi32(_mm512_range_ps(leaky, all(LIMIT), SMALLER_WITH_SIGN));
     }
     static FHASH_AVX512 FHASH_INLINE Ints pairs(Ints first, Ints second) {
         return _mm512_mask_blend_epi16(UPPER, first, _mm512_slli_epi32(second, 16));

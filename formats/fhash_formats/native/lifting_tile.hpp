@@ -64,27 +64,54 @@ FHASH_INLINE void lift_level(T* block, i64 n, i64 level, i64 pitch, i64 width, i
     lift_rows(block, (n + (i64(1) << level) - 1) >> level, pitch << level, width, kind, inverse);
 }
 
-// One axis of (n, inner), in place or from `in` to `out`. `work` holds a block of columns. limits:
-// null, or what the results of the inverse are moved by and clipped to.
+// Columns of a block of some rows of `inner` numbers.
+FHASH_INLINE i64 pitch_of(i64 rows, i64 inner) {
+    return padded(larger(32, smaller(smaller(BLOCK / larger(rows, 1), 1024), inner) / 32 * 32));
+}
+
+// The product of a KLT along one axis of (n, inner), in place or from `in` to `out`. filled: null,
+// or which rows of `in` have a number other than 0; the others are not read. `work` holds a block
+// of columns, `matrix` has room for the columns of the matrix that are left.
 template <class T>
-FHASH_INLINE void along_rows(const T* in, T* out, i64 inner, const Axis<T>& axis, bool inverse,
-                             T* work, i64* slot, const Limits<T>* limits) {
-    const i64 n = axis.n;
-    const i64 pitch = padded(larger(32, smaller(smaller(BLOCK / n, 1024), inner) / 32 * 32));
-    if (axis.kind != KLT) band_slots(n, axis.depth, slot);
+FHASH_INLINE void product_rows(const T* in, T* out, i64 inner, const Axis<T>& axis, bool inverse,
+                               T* work, i64* slot, const Limits<T>* limits,
+                               const unsigned char* filled, T* matrix) {
+    const i64 n = axis.n, inputs = axis.inputs(inverse), outputs = axis.outputs(inverse);
+    i64 terms = 0;
+    for (i64 r = 0; r < inputs; r++)
+        if (!filled || filled[r]) slot[terms++] = r;
+    const T* used = axis.matrix;
+    if (terms < inputs) {
+        for (i64 i = 0; i < outputs; i++)
+            for (i64 k = 0; k < terms; k++)
+                matrix[i * terms + k] = axis.matrix[i * inputs + slot[k]];
+        used = matrix;
+    }
+    const i64 pitch = pitch_of(terms, inner);
     for (i64 from = 0; from < inner; from += pitch) {
         const i64 width = smaller(pitch, inner - from);
         const std::size_t bytes = bytes_of<T>(width);
-        if (axis.kind == KLT) {
-            const i64 inputs = axis.inputs(inverse), outputs = axis.outputs(inverse);
-            for (i64 r = 0; r < inputs; r++)
-                std::memcpy(work + r * pitch, in + r * inner + from, bytes);
-            product(axis.matrix, inputs, work, pitch, out + from, inner, outputs, inputs, width);
-            for (i64 r = outputs; r < n; r++) std::memset(out + r * inner + from, 0, bytes);
-            if (limits)
-                for (i64 r = 0; r < n; r++)
-                    limited(out + r * inner + from, out + r * inner + from, width, *limits);
-        } else if (inverse) {
+        for (i64 k = 0; k < terms; k++)
+            std::memcpy(work + k * pitch, in + slot[k] * inner + from, bytes);
+        product(used, terms, work, pitch, out + from, inner, outputs, terms, width);
+        for (i64 r = outputs; r < n; r++) std::memset(out + r * inner + from, 0, bytes);
+        if (limits)
+            for (i64 r = 0; r < n; r++)
+                limited(out + r * inner + from, out + r * inner + from, width, *limits);
+    }
+}
+
+// The wavelet along one axis of (n, inner), in place or from `in` to `out`. `work` holds a block of
+// columns. limits: null, or what the results of the inverse are moved by and clipped to.
+template <class T>
+FHASH_INLINE void along_rows(const T* in, T* out, i64 inner, const Axis<T>& axis, bool inverse,
+                             T* work, i64* slot, const Limits<T>* limits) {
+    const i64 n = axis.n, pitch = pitch_of(n, inner);
+    band_slots(n, axis.depth, slot);
+    for (i64 from = 0; from < inner; from += pitch) {
+        const i64 width = smaller(pitch, inner - from);
+        const std::size_t bytes = bytes_of<T>(width);
+        if (inverse) {
             for (i64 r = 0; r < n; r++)
                 std::memcpy(work + slot[r] * pitch, in + r * inner + from, bytes);
             for (i64 l = axis.depth - 1; l >= 0; l--)
@@ -245,33 +272,46 @@ struct Reconstruction {
     T step, offsets[7];
 };
 
-// Rows of integers to numbers; filled: which rows have one other than 0. Whether any has.
+// Whether any of n integers is not 0.
+FHASH_CLONES bool any_integer(const std::int32_t* in, i64 n) {
+    for (i64 from = 0; from < n; from += 1024) {
+        const i64 end = smaller(from + 1024, n);
+        std::int32_t all = 0;
+        for (i64 i = from; i < end; i++) all |= in[i];
+        if (all) return true;
+    }
+    return false;
+}
+
+// Rows of integers to numbers; filled: which rows have one other than 0.
 template <class T>
-FHASH_INLINE bool reconstructed_rows(const std::int32_t* in, i64 rows, i64 columns,
+FHASH_INLINE void reconstructed_rows(const std::int32_t* in, i64 rows, i64 columns,
                                      const Reconstruction<T>& values, T* FHASH_RESTRICT out,
                                      unsigned char* FHASH_RESTRICT filled) {
-    const T signs[2] = {1, -1}, step = values.step;
-    T offsets[8] = {};
-    for (int i = 0; i < 7; i++) offsets[i] = values.offsets[i];
-    bool any = false;
+    const Reconstruction<T> of = values;
     for (i64 r = 0; r < rows; r++) {
         const std::int32_t* const row = in + r * columns;
         T* FHASH_RESTRICT const to = out + r * columns;
         std::int32_t all = 0;
         for (i64 i = 0; i < columns; i++) all |= row[i];
         filled[r] = all != 0;
-        any |= all != 0;
         if (!all) {
             std::memset(to, 0, bytes_of<T>(columns));
             continue;
         }
         for (i64 i = 0; i < columns; i++) {
+            // Choices one after the other, which are faster than a table.
             const std::int32_t q = row[i], magnitude = q < 0 ? -q : q;
-            const std::int32_t place = magnitude < 5 ? magnitude : 6 - (magnitude & 1);
-            to[i] = (((T)magnitude + offsets[place]) * step) * signs[q < 0];
+            T offset = magnitude & 1 ? of.offsets[5] : of.offsets[6];
+            offset = magnitude == 4 ? of.offsets[4] : offset;
+            offset = magnitude == 3 ? of.offsets[3] : offset;
+            offset = magnitude == 2 ? of.offsets[2] : offset;
+            offset = magnitude == 1 ? of.offsets[1] : offset;
+            offset = magnitude == 0 ? of.offsets[0] : offset;
+            const T value = ((T)magnitude + offset) * of.step;
+            to[i] = q < 0 ? -value : value;
         }
     }
-    return any;
 }
 
 // The passes over a tile, compiled once per type and machine.
@@ -279,6 +319,11 @@ FHASH_INLINE bool reconstructed_rows(const std::int32_t* in, i64 rows, i64 colum
     FHASH_CLONES void pass_rows(const T* in, T* out, i64 inner, const Axis<T>& axis, bool inverse, \
                                 T* work, i64* slot, const Limits<T>* limits) { \
         along_rows<T>(in, out, inner, axis, inverse, work, slot, limits); \
+    } \
+    FHASH_CLONES void pass_product(const T* in, T* out, i64 inner, const Axis<T>& axis, \
+                                   bool inverse, T* work, i64* slot, const Limits<T>* limits, \
+                                   const unsigned char* filled, T* matrix) { \
+        product_rows<T>(in, out, inner, axis, inverse, work, slot, limits, filled, matrix); \
     } \
     FHASH_CLONES void pass_x(T* first, i64 rows, const Axis<T>& axis, bool inverse, T* work, \
                              const T* matrix) { \
@@ -299,10 +344,10 @@ FHASH_INLINE bool reconstructed_rows(const std::int32_t* in, i64 rows, i64 colum
     FHASH_CLONES void pass_limits(T* values, i64 n, const Limits<T>& limits) { \
         limited<T>(values, values, n, limits); \
     } \
-    FHASH_CLONES bool pass_integers(const std::int32_t* in, i64 rows, i64 columns, \
+    FHASH_CLONES void pass_integers(const std::int32_t* in, i64 rows, i64 columns, \
                                     const Reconstruction<T>& values, T* out, \
                                     unsigned char* filled) { \
-        return reconstructed_rows<T>(in, rows, columns, values, out, filled); \
+        reconstructed_rows<T>(in, rows, columns, values, out, filled); \
     }
 
 FHASH_PASSES(float)
@@ -326,38 +371,42 @@ public:
           coupled(y.kind == x.kind && y.depth == x.depth && y.kind != NONE && y.kind != KLT &&
                   y.depth > 0),
           scale_tz(scale_tz_), scale_yx(scale_yx_) {
-        i64 longest = 1;
-        for (int a = 0; a < 4; a++) longest = larger(longest, axes[a].n);
+        i64 longest = 1, room = 0;
+        for (int a = 0; a < 4; a++) {
+            longest = larger(longest, axes[a].n);
+            if (a < 3 && axes[a].kind == KLT) room = larger(room, axes[a].n * axes[a].rank);
+        }
         const i64 pitch = padded(x.outputs(inverse));
         const i64 matrix_room = x.kind == KLT ? x.inputs(inverse) * pitch + 64 : 0;
         const i64 block_room = larger(BLOCK, longest * 32) + 64 * longest;
         const i64 work_room = larger(block_room, ROWS * x.n) + x.n + 256;
-        memory = allocate<T>(work_room + matrix_room + plane);
+        memory = allocate<T>(work_room + matrix_room + plane + room);
         slots = allocate<i64>(longest);
-        filled = allocate<unsigned char>(y.n);
+        filled = allocate<unsigned char>(y.n + z.n + t.n);
         if (!allocated()) return;
         work = memory.get();
         matrix = work + work_room;
         spare = matrix + matrix_room;
+        columns = spare + plane;
         std::memset(work, 0, bytes_of<T>(work_room + matrix_room));
         if (x.kind != KLT) return;
-        const i64 columns = x.outputs(inverse);
+        const i64 width = x.outputs(inverse);
         for (i64 k = 0; k < x.inputs(inverse); k++)
-            std::memcpy(matrix + k * pitch, x.matrix + k * columns, bytes_of<T>(columns));
+            std::memcpy(matrix + k * pitch, x.matrix + k * width, bytes_of<T>(width));
     }
 
     bool allocated() const { return memory && slots && filled; }
 
     void forward(const T* in, T* out) {
         if (!t.idle()) {
-            pass_rows(in, out, z.n * plane, t, false, work, slots.get(), nullptr);
+            rows(in, out, z.n * plane, t, false);
             in = out;
         }
         for (i64 i = 0; i < t.n; i++) {
             const T* from = in + i * z.n * plane;
             T* to = out + i * z.n * plane;
             if (!z.idle()) {
-                pass_rows(from, to, plane, z, false, work, slots.get(), nullptr);
+                rows(from, to, plane, z, false);
                 from = to;
             }
             for (i64 k = 0; k < z.n; k++)
@@ -371,42 +420,61 @@ public:
             T* to = out + i * z.n * plane;
             for (i64 k = 0; k < z.n; k++)
                 inverse_plane(from + k * plane, to + k * plane, scale_tz[i * z.n + k], nullptr);
-            if (!z.idle()) pass_rows(to, to, plane, z, true, work, slots.get(), nullptr);
+            if (!z.idle()) rows(to, to, plane, z, true);
         }
-        if (!t.idle()) pass_rows(out, out, z.n * plane, t, true, work, slots.get(), nullptr);
+        if (!t.idle()) rows(out, out, z.n * plane, t, true);
     }
 
     // The inverse from integers, moved and clipped. in: may be the memory of `out` where numbers
     // have the size of integers. crc: of what is before the integers; the result is that with them.
     std::uint32_t reconstruct(const std::int32_t* in, T* out, const Reconstruction<T>& values,
                               const Limits<T>& limits, std::uint32_t crc) {
+        unsigned char *const planes = filled.get() + y.n, *const frames = planes + z.n;
+        const std::uint32_t zeros = crc32_power(plane);
         for (i64 i = 0; i < t.n; i++) {
             T* const frame = out + i * z.n * plane;
-            bool any = false;
+            frames[i] = 0;
             for (i64 k = 0; k < z.n; k++) {
                 const std::int32_t* const from = in + (i * z.n + k) * plane;
-                crc = crc32_of(from, plane, crc);
                 T* const to = frame + k * plane;
-                if (pass_integers(from, y.n, x.n, values, spare, filled.get())) {
+                planes[k] = any_integer(from, plane);
+                if (planes[k]) {
+                    crc = crc32_of(from, plane, crc);
+                    pass_integers(from, y.n, x.n, values, spare, filled.get());
                     inverse_plane(spare, to, scale_tz[i * z.n + k], filled.get());
-                    any = true;
+                    frames[i] = 1;
                 } else {
-                    std::memset(to, 0, bytes_of<T>(plane));
+                    crc = crc32_of_zeros(zeros, crc);
+                    // A product does not read what is 0, and writes all.
+                    if (z.kind != KLT) std::memset(to, 0, bytes_of<T>(plane));
                 }
             }
             // The last of the axes that are not idle clips.
             const Limits<T>* const last = t.idle() ? &limits : nullptr;
-            if (!z.idle() && (any || last)) {
-                pass_rows(frame, frame, plane, z, true, work, slots.get(), last);
+            if (!frames[i]) {
+                if (t.kind != KLT) std::memset(frame, 0, bytes_of<T>(z.n * plane));
+                if (last) pass_limits(frame, z.n * plane, limits);
+            } else if (!z.idle()) {
+                rows(frame, frame, plane, z, true, last, planes);
             } else if (last) {
                 pass_limits(frame, z.n * plane, limits);
             }
         }
-        if (!t.idle()) pass_rows(out, out, z.n * plane, t, true, work, slots.get(), &limits);
+        if (!t.idle()) rows(out, out, z.n * plane, t, true, &limits, frames);
         return crc;
     }
 
 private:
+    // One axis of (n, inner); the arguments are those of product_rows.
+    void rows(const T* from, T* to, i64 inner, const Axis<T>& axis, bool inverse,
+              const Limits<T>* limits = nullptr, const unsigned char* some = nullptr) {
+        if (axis.kind == KLT) {
+            pass_product(from, to, inner, axis, inverse, work, slots.get(), limits, some, columns);
+        } else {
+            pass_rows(from, to, inner, axis, inverse, work, slots.get(), limits);
+        }
+    }
+
     void forward_plane(const T* from, T* to, T scale) {
         if (coupled) {
             std::memcpy(spare, from, bytes_of<T>(plane));
@@ -414,19 +482,19 @@ private:
             return;
         }
         if (from != to) std::memcpy(to, from, bytes_of<T>(plane));
-        if (!y.idle()) pass_rows(to, to, x.n, y, false, work, slots.get(), nullptr);
+        if (!y.idle()) rows(to, to, x.n, y, false);
         if (!x.idle()) pass_x(to, y.n, x, false, work, matrix);
         pass_scale(to, to, scale, scale_yx, plane);
     }
 
-    void inverse_plane(const T* from, T* to, T scale, const unsigned char* rows) {
+    void inverse_plane(const T* from, T* to, T scale, const unsigned char* some) {
         if (coupled) {
-            pass_plane_inverse(from, to, y, x, scale, scale_yx, work, rows);
+            pass_plane_inverse(from, to, y, x, scale, scale_yx, work, some);
             return;
         }
         pass_scale(from, to, scale, scale_yx, plane);
         if (!x.idle()) pass_x(to, y.n, x, true, work, matrix);
-        if (!y.idle()) pass_rows(to, to, x.n, y, true, work, slots.get(), nullptr);
+        if (!y.idle()) rows(to, to, x.n, y, true);
     }
 
     const Axis<T> t, z, y, x;
@@ -436,7 +504,7 @@ private:
     std::unique_ptr<T[], Free> memory;
     std::unique_ptr<i64[], Free> slots;
     std::unique_ptr<unsigned char[], Free> filled;
-    T *work = nullptr, *matrix = nullptr, *spare = nullptr;
+    T *work = nullptr, *matrix = nullptr, *spare = nullptr, *columns = nullptr;
 };
 
 }  // namespace

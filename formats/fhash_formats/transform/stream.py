@@ -14,6 +14,7 @@ from fhash_formats.transform.apart import apart_message, without_names
 from fhash_formats.transform.tile.apart import join_mask
 from fhash_formats.transform.tile.decoding import decode_tile, decode_tile_mask, decode_tile_table
 from fhash_formats.transform.tile.encoding import encode_tile
+from fhash_formats.transform.tile.part import corrected_part, uncorrected
 from fhash_formats.transform.tile.sections import Shape
 from fhash_formats.transform.tile.settings import TileSettings
 
@@ -32,6 +33,7 @@ class TransformCoder:
         settings: settings that all chunks share; None where each stream has its own.
         features: features that a container with these settings requires besides `transform`.
         masked: whether the chunks say which of their values are occupied.
+        parted: whether a part of a chunk may be had sooner than all of it.
         apart: arrays that hold the head or the masks. Such a coder does not decode; a container
             gives its coder these parts.
     """
@@ -73,6 +75,8 @@ class TransformCoder:
         self._shape, self._dtype = shape, dtype.newbyteorder("=")
         t, z, y, x = (1,) * (4 - len(shape)) + shape
         self._tile_shape: Shape = (t, z, y, x)
+        has_head = self.settings is not None and self.settings.head is not None
+        self.parted = has_head and not self.masked and len(shape) == 4
 
     def encode(self, chunk: npt.NDArray[Any]) -> bytes:
         """The stream of a full chunk."""
@@ -100,6 +104,22 @@ class TransformCoder:
         self._check_complete()
         values = decode_tile_table(data, self._tile_shape, self._dtype, self.settings, lod)
         return values.reshape(values.shape[4 - len(self._shape) :])
+
+    def uncorrected(
+        self, data: memoryview | bytes, part: tuple[slice, ...]
+    ) -> npt.NDArray[Any] | None:
+        """The chunk as `corrected` takes it; None where all of it is as well decoded.
+
+        Raises DamagedFileError.
+        """
+        self._check_complete()
+        assert self.settings is not None, "the coder is parted"
+        return uncorrected(data, self._tile_shape, self._dtype, self.settings, part)
+
+    def corrected(self, table: npt.NDArray[Any], part: tuple[slice, ...]) -> npt.NDArray[Any]:
+        """A part of the chunk, with the bits of `decode`. table: what `uncorrected` gave."""
+        assert self.settings is not None
+        return corrected_part(table, part, self._dtype, self.settings)
 
     def join(self, data: memoryview, mask: memoryview) -> bytes:
         """The stream of a chunk whose mask lies in an array of its own; raises DamagedFileError."""

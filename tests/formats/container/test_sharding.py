@@ -17,6 +17,7 @@ from fhash_formats.container.sharding import (
     ABSENT,
     MAX_SHARD_CHUNKS,
     SINGLE_SHARD_CHUNKS,
+    Sharding,
     parse_index,
     sharding_codecs,
 )
@@ -246,3 +247,14 @@ def test_a_large_grid_has_a_shard_for_each_layer_in_time() -> None:
     tile = (2, 3, 4, 5)
     assert shard_shape(tile, (4, 16, 8, 8)) == (8, 48, 32, 40)
     assert shard_shape(tile, (5, 16, 8, 8)) == (2, 48, 32, 40)
+
+
+def test_the_parts_of_shards_hold_each_chunk_once() -> None:
+    sharding = Sharding(shard_shape=(4, 6), chunk_shape=(2, 2), codecs=())
+    spans = [range(1, 5), range(2, 4)]
+    chunks = []
+    for shard, in_shard in sharding.parts(spans):
+        for index in product(*in_shard):
+            assert sharding.place(index)[0] == shard
+            chunks.append(index)
+    assert sorted(chunks) == list(product(*spans))

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 import zarr
+from sharded_files import NAME, random_values, write_sharded
+from table_files import HEAD, PLAIN
 
 from fhash_formats.container import FORMAT_VERSION, Container, ContainerWriter
 from fhash_formats.container.array import DTYPES
+from fhash_formats.container.coding import transform_codecs
+from fhash_formats.container.stored import StoredArray
 from fhash_formats.errors import DamagedFileError, RegionError
+from fhash_formats.transform.head.head import NeighbourHead
+from fhash_formats.transform.tile.decoding import decode_tile
+from fhash_formats.transform.tile.encoding import encode_tile
 
 
 def values_of(dtype, shape):
@@ -200,3 +208,69 @@ def test_what_does_not_fit_in_memory_is_not_called_damaged(sample, monkeypatch) 
         )
         with pytest.raises(MemoryError):
             array.read()
+
+
+def test_reads_that_go_on_decode_the_next_chunk_in_a_thread_that_is_free(
+    tmp_path, samples, monkeypatch
+) -> None:
+    values = random_values((5, 4))
+    path = write_sharded(tmp_path / "a.fhz", samples, values, (1, 4), (5, 4))
+    decoded: list[tuple[int, ...]] = []
+    real = StoredArray._decode
+
+    def decode(self, index, lod=0, *, table=False):
+        decoded.append(tuple(index))
+        if tuple(index) == (4, 0):
+            raise DamagedFileError("a damaged chunk")
+        return real(self, index, lod, table=table)
+
+    monkeypatch.setattr(StoredArray, "_decode", decode)
+    expected = {"1": [0, 1, 2, 3], "2": [0, 1, 2, 3, 4]}
+    for threads, chunks in expected.items():
+        monkeypatch.setenv("FHASH_THREADS", threads)
+        with Container.open(path) as container:
+            array = container.arrays[NAME]
+            decoded.clear()
+            for step in range(4):
+                part = array.read((slice(step, step + 1), slice(0, 4)))
+                np.testing.assert_array_equal(part[0], values[step])
+            assert sorted(decoded) == [(step, 0) for step in chunks]
+            # What was damaged ahead of the reader is damaged when it is read.
+            with pytest.raises(DamagedFileError, match="a damaged chunk"):
+                array.read((slice(4, 5), slice(0, 4)))
+
+
+def test_a_small_part_of_a_tile_comes_without_the_rest_and_the_rest_later(
+    tmp_path, samples, monkeypatch
+) -> None:
+    shape = (2, 9, 10, 11)
+    settings = replace(PLAIN, head=HEAD)
+    values = np.random.default_rng(1).normal(0.5, 0.8, shape).clip(-2, 3).astype("f4")
+    stream = encode_tile(values, settings).data
+    whole = decode_tile(stream, shape, "f4", settings)
+    path = write_sharded(
+        tmp_path / "a.fhz",
+        samples,
+        values,
+        shape,
+        shape,
+        [stream],
+        codecs=transform_codecs(settings),
+    )
+    corrected: list[tuple[int, ...]] = []
+    real = NeighbourHead.apply
+
+    def apply(self, decoded, **options):
+        corrected.append(decoded.shape)
+        return real(self, decoded, **options)
+
+    monkeypatch.setattr(NeighbourHead, "apply", apply)
+    part = (slice(1, 2), slice(0, 2), slice(3, 5), slice(9, 11))
+    with Container.open(path) as container:
+        array = container.arrays[NAME]
+        for _ in range(3):
+            assert array.read(part).tobytes() == whole[part].tobytes()
+        # First the part and what its head sees, then all of it, then from the cache.
+        assert corrected == [(2, 4, 6, 4), shape]
+        assert array.decode_chunk((0, 0, 0, 0)).tobytes() == whole.tobytes()
+        assert array.read().tobytes() == whole.tobytes()

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fhash_formats.support.slabs import chunk_region, slab_shape
+from fhash_formats.errors import RegionError
+from fhash_formats.support.slabs import chunk_region, common_part, region_bounds, slab_shape
 
 
 @pytest.mark.parametrize(
@@ -49,3 +50,22 @@ def test_regions_of_chunks_tile_the_array(axes: list[tuple[int, int]]) -> None:
     for index in np.ndindex(*(-(-n // c) for n, c in axes)):
         covered[chunk_region(index, chunk, shape)] += 1
     np.testing.assert_array_equal(covered, 1)
+
+
+def test_the_common_parts_of_all_chunks_make_the_region() -> None:
+    values = np.arange(5 * 7).reshape(5, 7)
+    bounds, chunk = [(1, 5), (2, 6)], (2, 3)
+    region = np.zeros((4, 4), int)
+    for index in np.ndindex(3, 2):
+        in_region, in_chunk = common_part(index, chunk, bounds)
+        region[in_region] += values[chunk_region(index, chunk, values.shape)][in_chunk]
+    np.testing.assert_array_equal(region, values[1:5, 2:6])
+
+
+def test_bounds_of_a_region() -> None:
+    assert region_bounds((slice(None), slice(1, 3, 1)), (4, 5), "a") == [(0, 4), (1, 3)]
+    for region in [(slice(0, 5),), (slice(2, 1),), (slice(0, 4, 2),), (slice(-1, 2),)]:
+        with pytest.raises(RegionError, match=r"a: .* within 0\.\.4"):
+            region_bounds(region, (4,), "a")
+    with pytest.raises(RegionError, match="2 axes; the array has 1"):
+        region_bounds((slice(0, 1), slice(0, 1)), (4,), "a")

@@ -13,10 +13,17 @@ from functools import lru_cache
 from itertools import accumulate
 from math import log2
 
+import numpy as np
+import numpy.typing as npt
+
 __all__ = ["MAX_WEIGHT", "best_spread", "decode_weights", "encode_weights"]
 
 MAX_WEIGHT = 31
 """Largest magnitude of a quantised weight (6 bits)."""
+_SPREADS = range(1, 256)
+"""Spreads that a layer may have."""
+_ROUNDING = 1e-9
+"""Relative error that a sum of bits has at most, in whatever order and by whatever logarithm."""
 
 
 @lru_cache(maxsize=256)
@@ -33,6 +40,16 @@ def _model(spread: int) -> tuple[list[int], list[int]]:
     return frequencies, [0, *accumulate(frequencies)]
 
 
+@lru_cache(maxsize=1)
+def _bits() -> npt.NDArray[np.float64]:
+    """The bits of each weight -MAX_WEIGHT to MAX_WEIGHT by each of the spreads, nearly."""
+    squares = np.array(_SPREADS, np.int64)[:, None] ** 2
+    weights = np.arange(-MAX_WEIGHT, MAX_WEIGHT + 1)
+    frequencies = 1 + (squares * squares << 16) // (squares + weights * weights) ** 2
+    bits: npt.NDArray[np.float64] = np.log2(frequencies.sum(axis=1, keepdims=True) / frequencies)
+    return bits
+
+
 def best_spread(weights: Sequence[int]) -> int:
     """The spread in 1 to 255 whose frequencies code the weights in the fewest bits."""
     counts = sorted(Counter(weights).items())
@@ -43,7 +60,11 @@ def best_spread(weights: Sequence[int]) -> int:
             count * log2(starts[-1] / frequencies[weight + MAX_WEIGHT]) for weight, count in counts
         )
 
-    return min(range(1, 256), key=bits)
+    # Nearly equal sums are formed again in the order that is the same on every machine.
+    places = [weight + MAX_WEIGHT for weight, _ in counts]
+    sums = (_bits()[:, places] * [count for _, count in counts]).sum(axis=1)
+    near = np.flatnonzero(sums <= sums.min() * (1 + _ROUNDING) + _ROUNDING)
+    return min((_SPREADS[place] for place in near.tolist()), key=bits)
 
 
 def encode_weights(state: int, weights: Sequence[int], spread: int) -> int:

@@ -56,6 +56,7 @@ def test_any_mix_comes_back(
 @pytest.mark.parametrize("dtype", TYPES)
 @pytest.mark.parametrize(("kinds", "depth"), mixes_and_depths(MIXES, [1, 4]))
 @pytest.mark.parametrize("shape", [(3, 4, 9, 37), (1, 1, 16, 64), (4, 1, 1, 5)])
+@pytest.mark.parametrize("empty", ["last", "first", "planes", "but one", "all"])
 def test_one_run_gives_the_bits_of_its_three_steps(
     shape: tuple[int, ...],
     kinds: tuple[str, ...],
@@ -63,13 +64,19 @@ def test_one_run_gives_the_bits_of_its_three_steps(
     dtype: Any,
     offsets: Any,
     center: float,
+    empty: str,
 ) -> None:
     if native.library() is None:
         pytest.skip("the native library is not built")
     transform = Transform(spec_of(kinds, (depth,) * 4, shape), shape, dtype)
     random = np.random.default_rng(5)
     integers = (random.integers(-9, 10, shape) * (random.random(shape) < 0.1)).astype(np.int32)
-    integers[-1] = 0  # a step, rows and planes without anything
+    kept = {"last": slice(-1), "first": slice(1, None)}.get(empty, slice(0))
+    some = np.zeros(shape, bool)
+    some[kept] = True
+    some[:, 1::2] |= empty == "planes"
+    some[-1, -1] |= empty == "but one"
+    integers[~some] = 0  # steps and planes without anything; some rows have nothing anyway
     coefficients = dequantise(integers, 0.75, offsets, dtype)
     expected = clip_shifted(transform.inverse(coefficients), center, -20.0, 20.0)
     one, two, *more = (offset / OFFSET_UNIT for offset in offsets)

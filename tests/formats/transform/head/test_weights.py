@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from math import log2
+
 import numpy as np
 import pytest
 
@@ -33,6 +36,22 @@ def test_the_best_spread_takes_the_fewest_bits(spread: float) -> None:
     bits = [encode_weights(1, weights, trial).bit_length() for trial in range(1, 256)]
     assert bits[best - 1] <= min(bits) + 1
     assert bits[best - 1] < 6 * len(weights)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.4, 1.0, 3.0, 9.0, 31.0, 100.0])
+@pytest.mark.parametrize("count", [0, 1, 7, 336])
+def test_the_best_spread_is_the_first_of_the_fewest_bits(spread: float, count: int) -> None:
+    weights = weights_of(spread, count)
+
+    def frequency(spread: int, weight: int) -> int:
+        return 1 + (spread**4 << 16) // (spread**2 + weight**2) ** 2
+
+    def bits(spread: int) -> float:
+        total = sum(frequency(spread, weight) for weight in range(-MAX_WEIGHT, MAX_WEIGHT + 1))
+        counts = sorted(Counter(weights).items())
+        return sum(count * log2(total / frequency(spread, weight)) for weight, count in counts)
+
+    assert best_spread(weights) == min(range(1, 256), key=bits)
 
 
 def test_a_spread_of_0_is_refused() -> None:
